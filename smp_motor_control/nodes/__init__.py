@@ -1,0 +1,1 @@
+"""Thin ROS shells: parameters to validated settings, topics to calls of the core."""

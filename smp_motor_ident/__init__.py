@@ -1,0 +1,1 @@
+"""Knowing DC motors: from a recording to parameters, their certainty, and gains."""

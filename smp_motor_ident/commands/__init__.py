@@ -1,0 +1,1 @@
+"""Command-line tools: arguments, progress and exit codes, nothing else."""

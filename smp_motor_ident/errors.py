@@ -1,0 +1,36 @@
+"""Errors of the identification side; exit codes as in the command-line contract."""
+
+from __future__ import annotations
+
+from smp_motor_control.errors import ParameterError, SmpError
+
+__all__ = [
+    "BagError",
+    "DesignError",
+    "InsufficientExcitationError",
+    "ParameterError",
+    "SignalError",
+    "SmpError",
+]
+
+
+class BagError(SmpError):
+    """A recording cannot be read, or does not hold what was asked for."""
+
+
+class SignalError(SmpError):
+    """A signal of a record contradicts itself, another signal, or physics."""
+
+    exit_code = 1
+
+
+class InsufficientExcitationError(SmpError):
+    """The data do not support the answer; the message says what to record next."""
+
+    exit_code = 1
+
+
+class DesignError(SmpError):
+    """No gains meet what was asked; the message tells the limit and the nearest design."""
+
+    exit_code = 1

@@ -1,0 +1,311 @@
+"""What an estimation returns: numbers with their certainty, status and reasons.
+
+Plain data, written to and read from ``identification.json`` without loss.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smp_motor_ident.record import Hardware
+
+Array = NDArray[np.float64]
+Status = Literal["estimated", "fixed", "unidentifiable"]
+
+UNITS: Mapping[str, str] = {
+    "resistance": "ohm",
+    "inductance": "H",
+    "motor_constant": "N m/A",
+    "inertia": "kg m^2",
+    "viscous_friction": "N m s/rad",
+    "coulomb_friction": "N m",
+    "coulomb_friction_reverse": "N m",
+    "delay": "s",
+    "dc_gain": "rad/s/V",
+    "time_constant": "s",
+    "time_constant_product": "s^2",
+    "static_voltage": "V",
+    "static_voltage_reverse": "V",
+    "load_voltage": "V",
+    "averaging_window": "s",
+}
+"""Unit of every quantity that a model may report, at the motor shaft."""
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """One estimated number.
+
+    Attributes
+    ----------
+    value : float or None
+        None where the data cannot tell it.
+    std : float or None
+        Standard deviation; None where value is None or the user fixed it.
+    ci95 : tuple of float or None
+        95 % confidence interval.
+    unit : str
+        SI unit.
+    status : {'estimated', 'fixed', 'unidentifiable'}
+        Where the number comes from.
+    """
+
+    value: float | None
+    std: float | None = None
+    ci95: tuple[float, float] | None = None
+    unit: str = ""
+    status: Status = "estimated"
+
+
+@dataclass(frozen=True)
+class FitPercent:
+    """Normalised fit ``100 (1 - |y - yhat| / |y - mean y|)`` of the simulated speed."""
+
+    estimation: float | None = None
+    validation: float | None = None
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One rung of the model ladder, as it did on the data."""
+
+    model: str
+    fit_percent: float | None
+    bic: float | None
+    chosen: bool = False
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class ResidualTests:
+    """Whiteness of the residuals and their independence from the input (95 % bands)."""
+
+    white: bool | None = None
+    independent_of_input: bool | None = None
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """The answer for one motor; keys and meanings of ``identification.json``.
+
+    Attributes
+    ----------
+    wheel, model : str
+        Name of the wheel, and of the rung of the ladder that was chosen.
+    parameters : mapping of str to Quantity
+        Physical parameters at the motor shaft, with ``unidentifiable`` ones listed as such.
+    combinations : mapping of str to Quantity
+        What voltage and speed alone tell: ``dc_gain``, ``time_constant``,
+        ``time_constant_product``, ``static_voltage``, ``delay`` as far as the model has them.
+    names : tuple of str
+        Quantities that ``covariance`` is about, in its order.
+    covariance : ndarray, shape (p, p)
+        Covariance of the estimation error of ``names``, in their own units squared.
+    """
+
+    wheel: str
+    model: str
+    parameters: Mapping[str, Quantity]
+    combinations: Mapping[str, Quantity]
+    names: tuple[str, ...] = ()
+    covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    fit_percent: FitPercent = FitPercent()
+    candidates: tuple[Candidate, ...] = ()
+    residuals: ResidualTests = ResidualTests()
+    warnings: tuple[str, ...] = ()
+    advice: tuple[str, ...] = ()
+    samples: int = 0
+    duration: float = 0.0
+    sample_time: float = 0.0
+    sources: tuple[str, ...] = ()
+    hardware: Hardware = Hardware()
+
+    @property
+    def unidentifiable(self) -> tuple[str, ...]:
+        """Parameters that the data cannot tell."""
+        return tuple(n for n, q in self.parameters.items() if q.status == "unidentifiable")
+
+    @property
+    def identifiable(self) -> bool:
+        """Whether every parameter of the model could be told."""
+        return not self.unidentifiable
+
+    def value(self, name: str, default: float = 0.0) -> float:
+        """Return the value of a parameter or combination.
+
+        Parameters
+        ----------
+        name : str
+            Such as ``dc_gain``.
+        default : float
+            Returned where the estimate does not hold it.
+
+        Returns
+        -------
+        float
+            In the unit of ``UNITS[name]``.
+        """
+        quantity = self.combinations.get(name) or self.parameters.get(name)
+        return default if quantity is None or quantity.value is None else quantity.value
+
+    def samples_of(self, names: Sequence[str], n: int, rng: np.random.Generator) -> Array:
+        """Draw from the distribution of the estimation error around the estimate.
+
+        Quantities that are positive by nature are drawn log-normally, so that no draw has
+        the wrong sign.  A name that has no covariance is returned as its value.
+
+        Parameters
+        ----------
+        names : sequence of str
+            Parameters or combinations.
+        n : int
+            Number of draws.
+        rng : numpy.random.Generator
+            Source of randomness.
+
+        Returns
+        -------
+        ndarray, shape (n, len(names))
+            One draw a row.
+        """
+        drawn = np.tile([self.value(name) for name in names], (n, 1)).astype(np.float64)
+        held = [name for name in names if name in self.names and self.value(name) > 0]
+        if not held:
+            return drawn
+        index = [self.names.index(name) for name in held]
+        mean = np.array([self.value(name) for name in held])
+        relative = self.covariance[np.ix_(index, index)] / np.outer(mean, mean)
+        # A log-normal with this log-covariance has exactly the relative covariance above.
+        log_covariance = np.log1p(np.maximum(relative, -1 + 1e-12))
+        draws = rng.multivariate_normal(np.zeros(len(held)), log_covariance, n, method="eigh")
+        for column, name in enumerate(held):
+            drawn[:, list(names).index(name)] = mean[column] * np.exp(draws[:, column])
+        return drawn
+
+    def to_document(self) -> dict[str, Any]:
+        """Return the motor's entry of ``identification.json``.
+
+        Returns
+        -------
+        dict
+            Of plain types; numbers that do not exist are None.
+        """
+        hardware = self.hardware
+        return {
+            "model": self.model,
+            "parameters": {n: _quantity_to_document(q) for n, q in self.parameters.items()},
+            "identifiable": self.identifiable,
+            "unidentifiable": list(self.unidentifiable),
+            "combinations": {n: _quantity_to_document(q) for n, q in self.combinations.items()},
+            "covariance": {
+                "names": list(self.names),
+                "matrix": [[_number(x) for x in row] for row in self.covariance],
+            },
+            "fit_percent": {
+                "estimation": _number(self.fit_percent.estimation),
+                "validation": _number(self.fit_percent.validation),
+            },
+            "candidates": [
+                {
+                    "model": c.model,
+                    "fit_percent": _number(c.fit_percent),
+                    "bic": _number(c.bic),
+                    "chosen": c.chosen,
+                    "reason": c.reason,
+                }
+                for c in self.candidates
+            ],
+            "residuals": {
+                "white": self.residuals.white,
+                "independent_of_input": self.residuals.independent_of_input,
+            },
+            "warnings": list(self.warnings),
+            "advice": list(self.advice),
+            "samples": self.samples,
+            "duration": _number(self.duration),
+            "sample_time": _number(self.sample_time),
+            "sources": list(self.sources),
+            "hardware": {
+                "gear_ratio": _number(hardware.gear_ratio),
+                "counts_per_revolution": _number(hardware.counts_per_revolution),
+                "encoder_bits": hardware.encoder_bits,
+                "supply_voltage": _number(hardware.supply_voltage),
+                "resistance": _number(hardware.resistance),
+            },
+        }
+
+    @classmethod
+    def from_document(cls, wheel: str, document: Mapping[str, Any]) -> Estimate:
+        """Read a motor's entry of ``identification.json``.
+
+        Parameters
+        ----------
+        wheel : str
+            Key of the entry.
+        document : mapping
+            As written by :meth:`to_document`; keys beyond the contract may be missing.
+
+        Returns
+        -------
+        Estimate
+            The same estimate.
+
+        Raises
+        ------
+        KeyError
+            When a key of the contract is missing.
+        """
+        covariance = document.get("covariance", {"names": [], "matrix": []})
+        names = tuple(covariance["names"])
+        matrix = np.array(covariance["matrix"], dtype=np.float64).reshape(len(names), len(names))
+        fit = document.get("fit_percent", {})
+        return cls(
+            wheel=wheel,
+            model=document["model"],
+            parameters={n: _quantity_from(q) for n, q in document["parameters"].items()},
+            combinations={n: _quantity_from(q) for n, q in document["combinations"].items()},
+            names=names,
+            covariance=matrix,
+            fit_percent=FitPercent(fit.get("estimation"), fit.get("validation")),
+            candidates=tuple(Candidate(**c) for c in document.get("candidates", [])),
+            residuals=ResidualTests(**document.get("residuals", {})),
+            warnings=tuple(document.get("warnings", ())),
+            advice=tuple(document.get("advice", ())),
+            samples=document.get("samples", 0),
+            duration=document.get("duration") or 0.0,
+            sample_time=document.get("sample_time") or 0.0,
+            sources=tuple(document.get("sources", ())),
+            hardware=Hardware(**document.get("hardware", {})),
+        )
+
+
+def _number(value: float | None) -> float | None:
+    return None if value is None or not math.isfinite(value) else float(value)
+
+
+def _quantity_to_document(quantity: Quantity) -> dict[str, Any]:
+    interval = quantity.ci95
+    return {
+        "value": _number(quantity.value),
+        "std": _number(quantity.std),
+        "ci95": None if interval is None else [_number(interval[0]), _number(interval[1])],
+        "unit": quantity.unit,
+        "status": quantity.status,
+    }
+
+
+def _quantity_from(document: Mapping[str, Any]) -> Quantity:
+    interval = document.get("ci95")
+    return Quantity(
+        value=document["value"],
+        std=document.get("std"),
+        ci95=None if interval is None else (interval[0], interval[1]),
+        unit=document.get("unit", ""),
+        status=document.get("status", "estimated"),
+    )
