@@ -181,9 +181,12 @@ class Estimate:
         index = [self.names.index(name) for name in held]
         mean = np.array([self.value(name) for name in held])
         relative = self.covariance[np.ix_(index, index)] / np.outer(mean, mean)
-        # A log-normal with this log-covariance has exactly the relative covariance above.
+        # A log-normal with this log-mean and log-covariance has exactly the estimate as its
+        # mean and the relative covariance above.
         log_covariance = np.log1p(np.maximum(relative, -1 + 1e-12))
-        draws = rng.multivariate_normal(np.zeros(len(held)), log_covariance, n, method="eigh")
+        draws = rng.multivariate_normal(
+            -np.diag(log_covariance) / 2, log_covariance, n, method="eigh", check_valid="ignore"
+        )
         for column, name in enumerate(held):
             drawn[:, list(names).index(name)] = mean[column] * np.exp(draws[:, column])
         return drawn
