@@ -1,0 +1,140 @@
+"""Settings of the PID controller, validated before they are used."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+from smp_motor_control.errors import ParameterError
+
+EPSILON = 2.220446049250313e-16
+"""Smallest number that counts as other than zero: of an error, a gain or a time step."""
+
+STRATEGIES = ("none", "back_calculation", "conditional_integration")
+"""What may keep the integral from winding up while the output is clamped."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PidGains:
+    """Validated settings of a PID controller; names as in control_toolbox.
+
+    Attributes
+    ----------
+    p, i, d : float
+        Proportional, integral and derivative gain: [V s/rad], [V/rad] and [V s^2/rad] where
+        the controller makes volts of wheel speeds.
+    u_clamp_min, u_clamp_max : float
+        Limits of the output; infinite where there is none.
+    i_clamp_min, i_clamp_max : float
+        Limits of the integral term, on either side of zero.
+    antiwindup_strategy : {'none', 'back_calculation', 'conditional_integration'}
+        What the integral does while the output is clamped: go on, be driven back with
+        ``tracking_time_constant``, or stand still while the error would wind it up further.
+    tracking_time_constant : float
+        [s]; 0 takes ``sqrt(d/i)``, or ``p/i`` without derivative action.
+    error_deadband : float
+        The integral rests while ``|r - y|`` is not above this.
+    setpoint_weight_p, setpoint_weight_d : float
+        Share of the reference that the proportional and the derivative action see.
+    derivative_filter_time_constant : float
+        [s]; 0 differentiates unfiltered.
+    feedforward_static : float
+        Output [V] that overcomes dry friction, in the direction of the reference.
+    feedforward_velocity : float
+        Output per unit of the reference.
+    feedforward_acceleration : float
+        Output per unit of the acceleration of the reference.
+
+    Raises
+    ------
+    ParameterError
+        When a value is NaN, a gain is infinite, a time constant, dead band or static
+        feed-forward is negative, the output limits are not in order, the limits of the
+        integral do not enclose zero, or the strategy is unknown.
+
+    Examples
+    --------
+    >>> PidGains(p=2.0, u_clamp_min=-12.0, u_clamp_max=12.0).p
+    2.0
+    """
+
+    p: float = 1.0
+    i: float = 0.0
+    d: float = 0.0
+    u_clamp_min: float = -math.inf
+    u_clamp_max: float = math.inf
+    i_clamp_min: float = -math.inf
+    i_clamp_max: float = math.inf
+    antiwindup_strategy: str = "none"
+    tracking_time_constant: float = 0.0
+    error_deadband: float = EPSILON
+    setpoint_weight_p: float = 1.0
+    setpoint_weight_d: float = 0.0
+    derivative_filter_time_constant: float = 0.0
+    feedforward_static: float = 0.0
+    feedforward_velocity: float = 0.0
+    feedforward_acceleration: float = 0.0
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.name == "antiwindup_strategy":
+                _check_strategy(value)
+            elif isinstance(value, (bool, str)) or not hasattr(value, "__float__"):
+                raise ParameterError(f"{field.name} is {value!r}: must be a number")
+            else:
+                _check_number(field.name, float(value))
+                object.__setattr__(self, field.name, float(value))
+        if not self.u_clamp_min < self.u_clamp_max:
+            raise ParameterError(
+                f"u_clamp_min is {self.u_clamp_min} and u_clamp_max {self.u_clamp_max}: "
+                "the first must be below the second"
+            )
+        if self.i_clamp_min > 0.0 or self.i_clamp_max < 0.0:
+            raise ParameterError(
+                f"i_clamp_min is {self.i_clamp_min} and i_clamp_max {self.i_clamp_max}: "
+                "the first must not be above zero, the second not below"
+            )
+
+    @property
+    def effective_tracking_time_constant(self) -> float:
+        """Time constant [s] of back-calculation with the default for 0 filled in.
+
+        It is 0 where that default is 0 too: the integral then follows the clamp at once.
+        """
+        given = self.tracking_time_constant
+        if given > EPSILON or abs(self.i) <= EPSILON:
+            return given
+        if abs(self.d) > EPSILON:
+            return math.sqrt(abs(self.d / self.i))
+        return abs(self.p / self.i)
+
+
+_CLAMPS = frozenset(("u_clamp_min", "u_clamp_max", "i_clamp_min", "i_clamp_max"))
+_NOT_NEGATIVE = frozenset(
+    (
+        "tracking_time_constant",
+        "error_deadband",
+        "derivative_filter_time_constant",
+        "feedforward_static",
+    )
+)
+
+
+def _check_strategy(value: object) -> None:
+    if value == "legacy":
+        raise ParameterError(
+            "antiwindup_strategy 'legacy' is not offered: use 'none' with i_clamp_min and "
+            "i_clamp_max, which limits the integral as legacy_antiwindup did"
+        )
+    if value not in STRATEGIES:
+        raise ParameterError(
+            f"antiwindup_strategy is {value!r}: must be one of {', '.join(STRATEGIES)}"
+        )
+
+
+def _check_number(name: str, value: float) -> None:
+    if math.isnan(value) or (math.isinf(value) and name not in _CLAMPS):
+        raise ParameterError(f"{name} is {value}: must be a finite number")
+    if value < 0.0 and name in _NOT_NEGATIVE:
+        raise ParameterError(f"{name} is {value}: must not be negative")
