@@ -1,0 +1,204 @@
+"""Estimates as files: ``identification.json`` and ``motors.yaml``, written all or none."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shutil
+import tempfile
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from smp_motor_ident.errors import BagError, ParameterError
+from smp_motor_ident.result import Estimate, Quantity
+
+SCHEMA = 1
+PHYSICAL = ("resistance", "inductance", "motor_constant", "inertia", "viscous_friction")
+COMBINATIONS = ("dc_gain", "time_constant", "time_constant_product", "static_voltage")
+
+
+def identification_document(estimates: Mapping[str, Estimate]) -> dict[str, Any]:
+    """Return the content of ``identification.json``.
+
+    Parameters
+    ----------
+    estimates : mapping of str to Estimate
+        By wheel.
+
+    Returns
+    -------
+    dict
+        Of plain types, with the keys of the contract.
+    """
+    motors = {wheel: estimate.to_document() for wheel, estimate in estimates.items()}
+    return {"schema": SCHEMA, "motors": motors}
+
+
+def read_identification(path: Path) -> dict[str, Estimate]:
+    """Read ``identification.json``.
+
+    Parameters
+    ----------
+    path : Path
+        The file, or the folder that ``identify`` wrote it to.
+
+    Returns
+    -------
+    dict of str to Estimate
+        By wheel, in the file's order.
+
+    Raises
+    ------
+    BagError
+        When the file cannot be read, is not JSON, or lacks a key of the contract.
+    """
+    if path.is_dir():
+        path = path / "identification.json"
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise BagError(f"{path}: cannot be read ({error.strerror})") from None
+    except ValueError as error:
+        raise BagError(f"{path}: is not JSON ({error}); give a file that identify wrote") from None
+    if not isinstance(document, dict) or document.get("schema") != SCHEMA:
+        raise BagError(f"{path}: is not an identification of schema {SCHEMA}; run identify again")
+    try:
+        motors = document["motors"]
+        return {wheel: Estimate.from_document(wheel, entry) for wheel, entry in motors.items()}
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise BagError(f"{path}: is damaged ({error!r}); run identify again") from None
+
+
+def _known(quantity: Quantity | None) -> bool:
+    return quantity is not None and quantity.value is not None and math.isfinite(quantity.value)
+
+
+def motor_entry(estimate: Estimate) -> dict[str, float | int]:
+    """Return what ``motor_plant`` needs to know to be this motor.
+
+    Physical parameters where the data could tell all of them, else the combinations: a motor
+    of the same response from voltage to speed.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        Of one motor.
+
+    Returns
+    -------
+    dict
+        Entry of ``motors.yaml``.
+    """
+    parameters = estimate.parameters
+    physical = all(_known(parameters.get(name)) for name in PHYSICAL)
+    names = (*PHYSICAL, "coulomb_friction") if physical else COMBINATIONS
+    held = parameters if physical else estimate.combinations
+    entry: dict[str, float | int] = {
+        name: float(estimate.value(name)) for name in names if _known(held.get(name))
+    }
+    if estimate.value("delay") > 0:
+        entry["delay"] = float(estimate.value("delay"))
+    hardware = estimate.hardware
+    entry["gear_ratio"] = float(hardware.gear_ratio)
+    if hardware.counts_per_revolution:
+        entry["counts_per_revolution"] = float(hardware.counts_per_revolution)
+        entry["encoder_bits"] = int(hardware.encoder_bits)
+    if hardware.supply_voltage:
+        entry["supply_voltage"] = float(hardware.supply_voltage)
+    return entry
+
+
+def motors_yaml(estimates: Mapping[str, Estimate], provenance: Iterable[str] = ()) -> str:
+    """Return ``motors.yaml``: a ROS 2 parameter file that ``motor_plant`` loads as it is.
+
+    Parameters
+    ----------
+    estimates : mapping of str to Estimate
+        By wheel.
+    provenance : iterable of str
+        Lines that become comments at the file's head.
+
+    Returns
+    -------
+    str
+        YAML.
+    """
+    motors = {wheel: motor_entry(estimate) for wheel, estimate in estimates.items()}
+    tree = {"/motor_plant": {"ros__parameters": {"motors": motors}}}
+    head = "".join(f"# {line}\n" for line in provenance)
+    return head + yaml.safe_dump(tree, sort_keys=False)
+
+
+def check_free(paths: Iterable[Path], force: bool) -> None:
+    """Refuse to overwrite.
+
+    Parameters
+    ----------
+    paths : iterable of Path
+        Files about to be written.
+    force : bool
+        Whether overwriting was asked for.
+
+    Raises
+    ------
+    ParameterError
+        When a file exists and `force` is false, or a path is a folder.
+    """
+    for path in paths:
+        if path.is_dir():
+            raise ParameterError(f"{path}: is a folder, not a file; choose another --output")
+        if path.exists() and not force:
+            raise ParameterError(f"{path}: exists already; use --force to replace it")
+
+
+def write_together(files: Mapping[Path, str | bytes], force: bool = False) -> None:
+    """Write several files of one folder so that all of them appear, or none.
+
+    Parameters
+    ----------
+    files : mapping of Path to str or bytes
+        Contents by path; all in the same folder, which is made if needed.
+    force : bool
+        Replace files that exist.
+
+    Raises
+    ------
+    ParameterError
+        When a file exists and `force` is false, or the folder cannot be written.
+    """
+    check_free(files, force)
+    (folder,) = {path.parent for path in files}
+    made = next((p for p in reversed((folder, *folder.parents)) if not p.exists()), None)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder, prefix=".writing-") as draft:
+            _exchange({Path(draft) / p.name: (p, body) for p, body in files.items()})
+    except OSError as error:
+        if made is not None:
+            shutil.rmtree(made, ignore_errors=True)
+        raise ParameterError(f"{folder}: cannot be written ({error.strerror})") from None
+
+
+def _exchange(drafts: Mapping[Path, tuple[Path, str | bytes]]) -> None:
+    """Write the drafts in full, then rename them into place; undo the renames on failure."""
+    for draft, (_, body) in drafts.items():
+        draft.write_bytes(body.encode() if isinstance(body, str) else body)
+    done: list[tuple[Path, Path | None]] = []
+    try:
+        for draft, (path, _) in drafts.items():
+            old = draft.with_name(draft.name + ".old") if path.exists() else None
+            if old is not None:
+                os.replace(path, old)
+            done.append((path, old))
+            os.replace(draft, path)
+    except BaseException:
+        for path, old in reversed(done):
+            if old is not None:
+                os.replace(old, path)
+            else:
+                path.unlink(missing_ok=True)
+        raise

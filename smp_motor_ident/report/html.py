@@ -1,0 +1,154 @@
+"""The page ``report.html``: one file that needs nothing else, for a reader who was not there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import resources
+
+import jinja2
+from markupsafe import Markup
+
+from smp_motor_ident.report import figures, words
+from smp_motor_ident.report.series import Comparison
+from smp_motor_ident.result import Candidate, Estimate, Quantity
+
+
+@dataclass(frozen=True)
+class Report:
+    """All that the page tells.
+
+    Attributes
+    ----------
+    estimates : mapping of str to Estimate
+        By wheel.
+    comparisons : mapping of str to sequence of Comparison
+        Measured and simulated speed by wheel.
+    failures : mapping of str to str
+        Wheels that could not be identified, each with the reason.
+    notes : mapping of str to sequence of str
+        What was repaired or assumed while reading, by wheel.
+    provenance : mapping of str to str
+        How the page came about: command, sources, date, versions.
+    """
+
+    estimates: Mapping[str, Estimate]
+    comparisons: Mapping[str, Sequence[Comparison]] = field(default_factory=dict)
+    failures: Mapping[str, str] = field(default_factory=dict)
+    notes: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    provenance: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of a table of quantities, in words."""
+
+    symbol: str
+    name: str
+    meaning: str
+    value: str
+    std: str
+    interval: str
+    unit: str
+    status: str
+    kind: str
+
+
+def render(report: Report) -> str:
+    """Return the page.
+
+    Parameters
+    ----------
+    report : Report
+        What it tells.
+
+    Returns
+    -------
+    str
+        HTML, complete in itself: no script, and no resource from elsewhere.
+    """
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("smp_motor_ident.report", "."),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {"label": words.label, "number": words.number}
+    style = resources.files("smp_motor_ident.report").joinpath("report.css").read_text("utf-8")
+    return environment.get_template("report.html.jinja").render(
+        report=report,
+        style=Markup(style),
+        side_by_side=Markup(figures.side_by_side(report.estimates))
+        if len(report.estimates) > 1
+        else "",
+        motors={
+            wheel: _motor(estimate, report.comparisons.get(wheel, ()))
+            for wheel, estimate in report.estimates.items()
+        },
+    )
+
+
+def _motor(estimate: Estimate, parts: Sequence[Comparison]) -> dict[str, object]:
+    """Return what the template shows of one motor."""
+    wheel = estimate.wheel
+    drawn = {}
+    if parts:
+        drawn = {
+            "speed": figures.speed(wheel, parts),
+            "detail": figures.detail(wheel, parts),
+            "residuals": figures.residuals(wheel, parts),
+        }
+    drawn["certainty"] = figures.certainty(estimate)
+    drawn["matrix"] = figures.correlation_matrix(estimate)
+    return {
+        "estimate": estimate,
+        "verdict": _verdict(estimate),
+        "headline": [
+            _row(name, words.scaled(estimate.combinations[name]))
+            for name in ("dc_gain", "time_constant", "static_voltage", "delay")
+            if name in estimate.combinations
+        ],
+        "combinations": [_row(name, q) for name, q in estimate.combinations.items()],
+        "parameters": [_row(name, q) for name, q in estimate.parameters.items()],
+        "candidates": _ranked(estimate.candidates),
+        "figures": {name: Markup(svg) for name, svg in drawn.items()},
+    }
+
+
+def _row(name: str, quantity: Quantity) -> Row:
+    symbol, title, meaning = words.EXPLAINED.get(name, ("", words.label(name), ""))
+    std = quantity.std
+    interval = "—"
+    if quantity.ci95 is not None:
+        low, high = (words.number(bound, std) for bound in quantity.ci95)
+        interval = f"{low} … {high}"
+    return Row(
+        symbol=symbol,
+        name=title,
+        meaning=meaning,
+        value=words.number(quantity.value, std),
+        std=words.spread(std),
+        interval=interval,
+        unit=quantity.unit,
+        status=words.status(quantity),
+        kind=quantity.status,
+    )
+
+
+def _ranked(candidates: Sequence[Candidate]) -> list[Candidate]:
+    """Order the rungs by their information criterion, those without one last."""
+    return sorted(candidates, key=lambda c: (c.bic is None, c.bic or 0.0))
+
+
+def _verdict(estimate: Estimate) -> tuple[str, str]:
+    """Return a class (good, fair, poor) and one sentence about how far to trust the model."""
+    fit = estimate.fit_percent.validation
+    if fit is None:
+        return "fair", "No data was held out, so nothing shows yet how the model does elsewhere."
+    told = f"It explains {fit:.1f} % of the speed in data that it was not fitted to"
+    if estimate.warnings:
+        return "fair", f"{told}; read the warnings below before you rely on it."
+    if fit < 80.0:
+        return "poor", f"{told}: too little to build a controller on."
+    return "good", f"{told}."

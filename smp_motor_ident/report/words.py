@@ -1,0 +1,150 @@
+"""Names, units and explanations in the reader's words."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+
+from smp_motor_ident.result import Quantity
+
+EXPLAINED: Mapping[str, tuple[str, str, str]] = {
+    "resistance": ("R", "Resistance", "of the armature winding"),
+    "inductance": ("L", "Inductance", "of the armature winding"),
+    "motor_constant": ("K", "Motor constant", "torque per ampere, and back-EMF per rad/s"),
+    "inertia": ("J", "Inertia", "of rotor and load, at the motor shaft"),
+    "viscous_friction": ("b", "Viscous friction", "torque per rad/s"),
+    "coulomb_friction": ("Tc", "Coulomb friction", "constant torque against the motion"),
+    "coulomb_friction_reverse": ("Tc−", "Coulomb friction, reverse", "turning backwards"),
+    "delay": ("τd", "Delay", "from voltage to speed, sensor filters included"),
+    "dc_gain": ("k", "DC gain", "steady motor speed per volt beyond the static voltage"),
+    "time_constant": ("τ", "Time constant", "how slowly the speed follows"),
+    "time_constant_product": ("τ²", "Lag product", "of the electrical and mechanical lag"),
+    "static_voltage": ("v0", "Static voltage", "needed to keep the motor barely turning"),
+    "static_voltage_reverse": ("v0−", "Static voltage, reverse", "turning backwards"),
+    "load_voltage": ("vl", "Load voltage", "offset that a constant load or sensor makes"),
+    "averaging_window": ("w", "Averaging window", "over which the sensor averages the speed"),
+}
+"""Symbol, name and meaning of every quantity."""
+
+MODELS: Mapping[str, str] = {
+    "static": "static gain",
+    "first_order": "first order: one time constant",
+    "second_order": "second order: electrical and mechanical lag",
+    "electromechanical": "electromechanical: winding, rotor and friction",
+}
+
+
+def label(name: str) -> str:
+    """Return a wheel, quantity or model in words.
+
+    Parameters
+    ----------
+    name : str
+        Such as ``front_left`` or ``dc_gain``.
+
+    Returns
+    -------
+    str
+        Such as ``Front left``, ``DC gain``.
+    """
+    if name in EXPLAINED:
+        return EXPLAINED[name][1]
+    return name.replace("_", " ").strip().capitalize()
+
+
+def number(value: float | None, std: float | None = None) -> str:
+    """Return a number with the digits that its standard deviation supports.
+
+    Parameters
+    ----------
+    value : float or None
+        The number.
+    std : float or None
+        Its standard deviation; without it five digits are given.
+
+    Returns
+    -------
+    str
+        Such as ``25.52`` or ``1.130e-06``.
+
+    Examples
+    --------
+    >>> number(25.51832, 0.0123)
+    '25.518'
+    >>> number(1.13047e-6, 2e-9)
+    '1.1305e-06'
+    >>> number(None)
+    '—'
+    """
+    if value is None or not math.isfinite(value):
+        return "—"
+    digits = 5
+    if std is not None and std > 0 and value != 0:
+        digits = 2 + math.floor(math.log10(abs(value))) - math.floor(math.log10(std))
+        digits = min(max(digits, 2), 9)
+    if value != 0 and not 1e-3 <= abs(value) < 1e6:
+        return f"{value:.{digits - 1}e}"
+    places = digits - 1 - math.floor(math.log10(abs(value))) if value else 3
+    return f"{value:.{max(places, 0)}f}"
+
+
+def spread(std: float | None) -> str:
+    """Return a standard deviation with two digits.
+
+    Parameters
+    ----------
+    std : float or None
+        The deviation.
+
+    Returns
+    -------
+    str
+        Such as ``0.012``.
+    """
+    if std is None or not math.isfinite(std):
+        return "—"
+    if std == 0 or 1e-3 <= std < 1e3:
+        return f"{std:.2g}"
+    return f"{std:.1e}"
+
+
+def scaled(quantity: Quantity) -> Quantity:
+    """Return a time in milliseconds, anything else as it is.
+
+    Parameters
+    ----------
+    quantity : Quantity
+        In SI units.
+
+    Returns
+    -------
+    Quantity
+        In a unit that makes its digits easy to read.
+    """
+    unit, factor = {"s": ("ms", 1e3), "s^2": ("ms²", 1e6)}.get(quantity.unit, (quantity.unit, 1.0))
+    value, std, ci95 = quantity.value, quantity.std, quantity.ci95
+    return replace(
+        quantity,
+        value=None if value is None else value * factor,
+        std=None if std is None else std * factor,
+        ci95=None if ci95 is None else (ci95[0] * factor, ci95[1] * factor),
+        unit=unit,
+    )
+
+
+def status(quantity: Quantity) -> str:
+    """Return in words where a number comes from.
+
+    Parameters
+    ----------
+    quantity : Quantity
+        One number of an estimate.
+
+    Returns
+    -------
+    str
+        For the status column.
+    """
+    words = {"estimated": "estimated", "fixed": "given", "unidentifiable": "cannot be told"}
+    return words[quantity.status]
