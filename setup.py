@@ -20,7 +20,7 @@ TOOLS = ("identify", "tune", "commission", "demo")
 setup(
     name=NAME,
     version="0.1.0",
-    description="Identifies the DC motors of a four-wheeled robot from bags and controls its wheels.",
+    description="Identifies the DC motors of a robot from bags and controls its wheels.",
     license="Apache-2.0",
     maintainer="smp_motor_control maintainers",
     maintainer_email="maintainers@smp-motor-control.invalid",

@@ -16,7 +16,7 @@ from typing import IO
 
 import pytest
 
-# DDS derives UDP ports from the domain; up to 101 they stay below the ports that Linux hands out itself.
+# DDS derives UDP ports from the domain; up to 101 they stay below those that Linux hands out.
 DOMAINS = range(1, 102)
 
 
@@ -24,7 +24,7 @@ def claim_domain() -> tuple[int, IO[str]]:
     """Claim a ROS domain id that no other test on this machine holds, until the file is closed."""
     folder = Path(tempfile.gettempdir()) / f"smp_test_domains_{os.getuid()}"
     folder.mkdir(mode=0o700, exist_ok=True)
-    # Start at different ids, so that a domain rests between two tests and late datagrams find no one.
+    # Start at different ids: a domain rests between two tests, so late datagrams find no one.
     start = time.monotonic_ns() // 1_000_000 % len(DOMAINS)
     for offset in range(len(DOMAINS)):
         domain = DOMAINS[(start + offset) % len(DOMAINS)]

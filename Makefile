@@ -1,0 +1,32 @@
+# make setup | demo | test | check | paper | clean. Each but clean sets up first, which is skipped when it is done.
+# PYTHON=/path/to/python3 chooses the Python (3.10 to 3.13); ARGS="..." is passed on to demo, test and paper.
+SHELL := bash
+ROOT := $(patsubst %/,%,$(dir $(abspath $(lastword $(MAKEFILE_LIST)))))
+IN := cd '$(ROOT)' && . ./setup.bash &&
+
+.PHONY: setup demo test check format paper lock clean
+
+setup:
+	@PYTHON='$(PYTHON)' '$(ROOT)/scripts/setup.sh'
+
+demo: setup
+	@$(IN) exec demo $(ARGS)
+
+test: setup
+	@$(IN) exec python -m pytest $(ARGS)
+
+check: setup
+	@$(IN) exec scripts/check.sh
+
+format: setup
+	@$(IN) ruff format && ruff check --fix
+
+paper: setup
+	@$(IN) exec python benchmarks/paper.py $(ARGS)
+
+# Resolve the pins of requirements/*.in anew (needs uv, and only when they are to change).
+lock:
+	@cd '$(ROOT)' && exec scripts/lock.sh $(ARGS)
+
+clean:
+	@cd '$(ROOT)' && rm -rf .venv build install log .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis

@@ -1,0 +1,19 @@
+#!/bin/sh
+# Resolve requirements/*.in into lock files that hold for Python 3.10 to 3.13: `make lock`. Needs uv (pip install uv).
+# Pins that are already in a lock file stay, unless `make lock ARGS=--upgrade`.
+set -eu
+cd -- "$(dirname -- "$0")/../requirements"
+command -v uv >/dev/null || { echo "lock: uv not found: pip install uv" >&2; exit 1; }
+lock() {
+  output=$1 python=$2
+  shift 2
+  uv pip compile --quiet --universal --no-annotate --no-header --python-version "$python" "$@" --output-file "$output"
+  sed -i "/sys_platform == 'win32'/d; s/ ; sys_platform != 'win32'\$//; s/ ; sys_platform == 'linux'\$//" "$output"
+}
+lock wheels.txt 3.10 ros.in base.in dev.in "$@"
+# With ROS 2 Jazzy the rest comes from apt, at apt's versions, and must not be hidden by others.
+lock jazzy.txt 3.12 base.in colcon.in dev.in "$@" --override jazzy-apt.in
+packaged=$(sed -n 's/^\([a-z0-9-]*\)==.*/\1/p' jazzy-apt.in | paste -sd '|')
+sed -i -E "/^($packaged)==/d" jazzy.txt
+sed -i "1i # What Ubuntu 24.04 with ROS 2 Jazzy lacks; made by \`make lock\` from base.in, colcon.in, dev.in less jazzy-apt.in." jazzy.txt
+sed -i "1i # All that is needed without ROS, Python 3.10 to 3.13; made by \`make lock\` from ros.in, base.in, dev.in." wheels.txt
