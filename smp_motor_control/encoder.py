@@ -1,0 +1,223 @@
+"""Incremental encoders: counts from an angle, rollover, and speed from counts."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from smp_motor_control.errors import ParameterError
+
+MAX_BITS = 63
+
+
+@dataclass(frozen=True)
+class Encoder:
+    """An incremental encoder on the motor shaft.
+
+    Attributes
+    ----------
+    counts_per_revolution : float
+        Counts (after quadrature decoding) per revolution of the motor, positive.
+    bits : int
+        Width of the hardware's counter, read as two's complement; 0 never wraps.
+
+    Raises
+    ------
+    ParameterError
+        When a value is out of range.
+
+    Examples
+    --------
+    >>> Encoder(500.0, bits=8).count(2 * math.pi * 0.26)   # 130 counts in eight bits
+    -126
+    """
+
+    counts_per_revolution: float = 500.0
+    bits: int = 0
+
+    def __post_init__(self) -> None:
+        value = self.counts_per_revolution
+        if not (math.isfinite(value) and value > 0):
+            raise ParameterError(f"counts_per_revolution is {value!r}; it must be positive")
+        _check_bits(self.bits)
+
+    @property
+    def angle_per_count(self) -> float:
+        """Motor angle of one count [rad]."""
+        return 2 * math.pi / self.counts_per_revolution
+
+    def count(self, angle: float) -> int:
+        """Return what the counter shows at a motor angle.
+
+        Parameters
+        ----------
+        angle : float
+            Of the motor shaft [rad].
+
+        Returns
+        -------
+        int
+            Whole counts, wrapped to the counter's width.
+        """
+        return wrap(math.floor(angle * self.counts_per_revolution / (2 * math.pi)), self.bits)
+
+
+def _check_bits(bits: int) -> None:
+    if not (isinstance(bits, (int, np.integer)) and (bits == 0 or 2 <= bits <= MAX_BITS)):
+        raise ParameterError(f"encoder_bits is {bits!r}; it must be 0 or 2 to {MAX_BITS}")
+
+
+def wrap(count: int, bits: int) -> int:
+    """Return a count as a two's complement counter of this width shows it.
+
+    Parameters
+    ----------
+    count : int
+        Total counts.
+    bits : int
+        Width; 0 never wraps.
+
+    Returns
+    -------
+    int
+        In ``[-2^(bits-1), 2^(bits-1))``.
+    """
+    if bits == 0:
+        return count
+    half = 1 << (bits - 1)
+    return ((count + half) & ((1 << bits) - 1)) - half
+
+
+def unwrap(counts: ArrayLike, bits: int) -> NDArray[np.int64]:
+    """Return total counts from what a wrapping counter showed.
+
+    Parameters
+    ----------
+    counts : array_like of int, shape (n,)
+        As the hardware reports them, signed or unsigned.
+    bits : int
+        Width of the counter; 0 never wraps.
+
+    Returns
+    -------
+    ndarray of int64, shape (n,)
+        Starts at ``counts[0]``; correct while the motor moves less than half the
+        counter's range from one sample to the next.
+
+    Raises
+    ------
+    ParameterError
+        When ``bits`` is out of range.
+    """
+    _check_bits(bits)
+    shown = np.asarray(counts, dtype=np.int64)
+    if bits == 0 or shown.size == 0:
+        return shown.copy()
+    half = np.int64(1 << (bits - 1))
+    mask = np.int64((1 << bits) - 1)
+    moved = ((np.diff(shown) + half) & mask) - half
+    return np.concatenate((shown[:1], shown[0] + np.cumsum(moved))).astype(np.int64)
+
+
+class Unwrapper:
+    """The same as :func:`unwrap`, one count at a time.
+
+    Parameters
+    ----------
+    bits : int
+        Width of the counter; 0 never wraps.
+
+    Raises
+    ------
+    ParameterError
+        When ``bits`` is out of range.
+    """
+
+    def __init__(self, bits: int) -> None:
+        _check_bits(bits)
+        self._bits = int(bits)
+        self._shown: int | None = None
+        self._total = 0
+
+    def reset(self) -> None:
+        """Forget the counter, as after a restart of the hardware."""
+        self._shown = None
+
+    def __call__(self, count: int) -> int:
+        """Return the total counts after the counter showed ``count``.
+
+        Parameters
+        ----------
+        count : int
+            As the hardware reports it.
+
+        Returns
+        -------
+        int
+            Total counts; the first call returns ``count`` itself.
+        """
+        if self._shown is None:
+            self._total = count
+        else:
+            self._total += wrap(count - self._shown, self._bits)
+        self._shown = count
+        return self._total
+
+
+class DifferencedSpeed:
+    """Motor speed as counts moved over a window of samples.
+
+    Averages over the window: one sample is the noisiest and the fastest.
+
+    Parameters
+    ----------
+    encoder : Encoder
+        Its counts and width.
+    window : int
+        Length of the window in samples, at least 1.
+
+    Raises
+    ------
+    ParameterError
+        When the window is not positive.
+    """
+
+    def __init__(self, encoder: Encoder, window: int = 1) -> None:
+        if window < 1:
+            raise ParameterError(f"difference window is {window!r} samples; it must be at least 1")
+        self._scale = encoder.angle_per_count
+        self._unwrap = Unwrapper(encoder.bits)
+        self._past: deque[tuple[float, int]] = deque(maxlen=window + 1)
+
+    def reset(self) -> None:
+        """Forget the past, as after lost feedback."""
+        self._unwrap.reset()
+        self._past.clear()
+
+    def step(self, time: float, count: int) -> float:
+        """Take one sample.
+
+        Parameters
+        ----------
+        time : float
+            Instant of the sample [s], later than the one before.
+        count : int
+            As the hardware reports it.
+
+        Returns
+        -------
+        float
+            Mean motor speed over the window [rad/s]; NaN at the first sample.
+        """
+        total = self._unwrap(count)
+        past = self._past
+        past.append((time, total))
+        first_time, first = past[0]
+        elapsed = time - first_time
+        if elapsed <= 0:
+            return math.nan
+        return (total - first) * self._scale / elapsed
