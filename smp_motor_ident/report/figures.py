@@ -200,7 +200,7 @@ def certainty(estimate: Estimate) -> str:
     axes.minorticks_off()
     axes.tick_params(left=False)
     axes.grid(axis="y", visible=False)
-    axes.set_title("Half-width of the 95 % interval, in percent of the value")
+    axes.set_title("How well each is known (95 %)")
     return to_svg(figure, f"certainty-{estimate.wheel}", "How well each quantity is known")
 
 
@@ -253,22 +253,18 @@ def correlation_matrix(estimate: Estimate) -> str:
         return ""
     matrix = estimate.covariance[np.ix_(known, known)] / np.outer(std[known], std[known])
     names = [label(estimate.names[k]) for k in known]
-    size = 1.6 + 0.36 * known.size
-    figure, axes = canvas(max(size, 3.4), size * 0.8)
+    figure, axes = canvas(4.7, 1.3 + 0.3 * known.size)
     for row, column in np.ndindex(*matrix.shape):
         value = matrix[row, column]
-        axes.scatter(
-            column,
-            row,
-            s=300 * abs(value),
-            color=COLOR["measured" if value > 0 else "simulated"],
-            alpha=0.8,
-            lw=0,
-        )
         if row > column:
-            axes.text(column, row, f"{value:.2f}", ha="center", va="center", fontsize=8)
+            axes.text(column, row, f"{value:+.2f}", ha="center", va="center", fontsize=9)
+        elif row < column:
+            color = COLOR["measured" if value > 0 else "simulated"]
+            axes.scatter(column, row, s=280 * abs(value), color=color, alpha=0.85, lw=0)
+        else:
+            axes.scatter(column, row, s=8, color=COLOR["muted"], lw=0)
     axes.set(xlim=(-0.5, known.size - 0.5), ylim=(known.size - 0.5, -0.5))
-    axes.set_xticks(range(known.size), names, rotation=40, ha="right")
+    axes.set_xticks(range(known.size), names, rotation=30, ha="right")
     axes.set_yticks(range(known.size), names)
     axes.tick_params(length=0)
     axes.set_title("Correlation of the errors")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import resources
@@ -10,6 +11,7 @@ import jinja2
 from markupsafe import Markup
 
 from smp_motor_ident.report import figures, words
+from smp_motor_ident.report.alike import same_response
 from smp_motor_ident.report.series import Comparison
 from smp_motor_ident.result import Candidate, Estimate, Quantity
 
@@ -111,6 +113,7 @@ def _motor(estimate: Estimate, parts: Sequence[Comparison]) -> dict[str, object]
         ],
         "combinations": [_row(name, q) for name, q in estimate.combinations.items()],
         "parameters": [_row(name, q) for name, q in estimate.parameters.items()],
+        "alike": _alike(estimate),
         "candidates": _ranked(estimate.candidates),
         "figures": {name: Markup(svg) for name, svg in drawn.items()},
     }
@@ -130,10 +133,22 @@ def _row(name: str, quantity: Quantity) -> Row:
         value=words.number(quantity.value, std),
         std=words.spread(std),
         interval=interval,
-        unit=quantity.unit,
+        unit=words.typeset(quantity.unit),
         status=words.status(quantity),
         kind=quantity.status,
     )
+
+
+def _alike(estimate: Estimate) -> list[tuple[str, str, str]]:
+    """Return symbol, name and range of what other motors of the same response may have."""
+    rows = []
+    for name, (low, high) in same_response(estimate).items():
+        symbol, title, _ = words.EXPLAINED[name]
+        end = f"… {high:.3g}" if math.isfinite(high) else "or more"
+        rows.append(
+            (symbol, title, f"{low:.3g} {end} {words.typeset(estimate.parameters[name].unit)}")
+        )
+    return rows
 
 
 def _ranked(candidates: Sequence[Candidate]) -> list[Candidate]:

@@ -109,6 +109,22 @@ def spread(std: float | None) -> str:
     return f"{std:.1e}"
 
 
+def typeset(unit: str) -> str:
+    """Return a unit as one prints it.
+
+    Parameters
+    ----------
+    unit : str
+        Such as ``kg m^2``.
+
+    Returns
+    -------
+    str
+        Such as ``kg m²``.
+    """
+    return unit.replace("^2", "²").replace("ohm", "Ω")
+
+
 def scaled(quantity: Quantity) -> Quantity:
     """Return a time in milliseconds, anything else as it is.
 

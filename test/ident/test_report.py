@@ -1,0 +1,237 @@
+"""The report: a document that reads back, a page that stands alone, files all or none."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from smp_motor_ident.errors import BagError, ParameterError
+from smp_motor_ident.record import Hardware
+from smp_motor_ident.report.document import (
+    identification_document,
+    motors_yaml,
+    read_identification,
+    write_together,
+)
+from smp_motor_ident.report.html import Report, render
+from smp_motor_ident.report.series import Comparison, correlations, thin
+from smp_motor_ident.result import Candidate, Estimate, FitPercent, Quantity, ResidualTests
+
+PHYSICAL = {
+    "resistance": (12.919, "ohm"),
+    "inductance": (0.30994, "H"),
+    "motor_constant": (0.011029, "N m/A"),
+    "inertia": (1.13e-6, "kg m^2"),
+    "viscous_friction": (2.4e-5, "N m s/rad"),
+    "coulomb_friction": (1e-4, "N m"),
+}
+
+
+def estimate(wheel: str = "front_left", *, current: bool = True) -> Estimate:
+    """One motor's result, with current measured or from voltage and speed alone."""
+    known = {n: Quantity(v, v / 100, (0.98 * v, 1.02 * v), u) for n, (v, u) in PHYSICAL.items()}
+    hidden = {n: Quantity(None, unit=u, status="unidentifiable") for n, (_, u) in PHYSICAL.items()}
+    combinations = {
+        "dc_gain": Quantity(25.5, 0.1, (25.3, 25.7), "rad/s/V"),
+        "time_constant": Quantity(0.04, 1e-4, (0.0398, 0.0402), "s"),
+    }
+    return Estimate(
+        wheel=wheel,
+        model="electromechanical" if current else "second_order",
+        parameters=known if current else hidden,
+        combinations=combinations,
+        names=("dc_gain", "time_constant"),
+        covariance=np.array([[1e-2, 5e-6], [5e-6, 1e-8]]),
+        fit_percent=FitPercent(97.2, 96.8),
+        candidates=(Candidate("first_order", 91.0, -10.0, False, "slower lag <b>missed</b>"),),
+        residuals=ResidualTests(True, False),
+        warnings=("The delay & the inductance look alike at 100 Hz.",),
+        advice=("Measure the current.",),
+        samples=1000,
+        duration=10.0,
+        sample_time=0.01,
+        sources=("<script>alert('bag')</script>",),
+        hardware=Hardware(65.5, 500.0, 16, 12.0, None),
+    )
+
+
+def comparison(role: str, n: int = 4000) -> Comparison:
+    """A first-order response with white noise."""
+    rng = np.random.default_rng(7)
+    time = np.arange(n) * 0.005
+    voltage = 8 * np.sign(np.sin(2 * np.pi * 0.37 * time))
+    speed = 25 * voltage
+    return Comparison(role, "bag", time, voltage, speed + rng.normal(0, 2, n), speed)  # type: ignore[arg-type]
+
+
+class Outside(HTMLParser):
+    """Collects every address that a page would load, and the tags that were left open."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.addresses: list[str] = []
+        self.scripts = 0
+        self.identifiers: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.scripts += tag == "script"
+        for name, value in attrs:
+            if name in ("src", "href", "xlink:href") and not (value or "").startswith("#"):
+                self.addresses.append(value or "")
+            if name == "id":
+                self.identifiers.append(value or "")
+
+
+@pytest.fixture(scope="module")
+def page() -> str:
+    wheels = {
+        "front_left": estimate(),
+        "rear_right": estimate("rear_right", current=False),
+    }
+    parts = [comparison("estimation"), comparison("validation")]
+    failures = {"rear_left": "voltage is constant; excite the motor"}
+    return render(Report(wheels, {"front_left": parts}, failures, {}, {"Command": "identify a b"}))
+
+
+def test_page_loads_nothing_from_elsewhere(page: str) -> None:
+    outside = Outside()
+    outside.feed(page)
+    assert outside.addresses == []
+    assert outside.scripts == 0
+    assert "@import" not in page
+    assert not re.search(r"url\((?!#)", page)
+
+
+def test_identifiers_of_the_figures_do_not_collide(page: str) -> None:
+    outside = Outside()
+    outside.feed(page)
+    assert len(outside.identifiers) == len(set(outside.identifiers))
+
+
+def test_names_of_users_are_escaped(page: str) -> None:
+    assert "<script>alert" not in page
+    assert "&lt;script&gt;" in page
+    assert "<b>missed</b>" not in page
+
+
+def test_page_tells_failures_warnings_and_unidentifiable_parameters(page: str) -> None:
+    assert "voltage is constant; excite the motor" in page
+    assert "look alike at 100 Hz" in page
+    assert page.count("cannot be told") >= len(PHYSICAL)
+
+
+def test_every_colour_of_the_figures_is_a_variable_of_the_page(page: str) -> None:
+    used = set(re.findall(r"var\(--([a-z0-9-]+)\)", page))
+    defined = set(re.findall(r"--([a-z0-9-]+):", page))
+    assert used <= defined
+    assert "#0100" not in page
+
+
+def test_document_reads_back_as_the_same_estimates(tmp_path: Path) -> None:
+    wheels = {"front_left": estimate(), "rear_left": estimate("rear_left", current=False)}
+    path = tmp_path / "identification.json"
+    path.write_text(json.dumps(identification_document(wheels), allow_nan=False))
+    again = read_identification(tmp_path)
+    assert identification_document(again) == identification_document(wheels)
+
+
+def test_motors_file_has_parameters_where_known_and_combinations_where_not() -> None:
+    wheels = {"front_left": estimate(), "rear_left": estimate("rear_left", current=False)}
+    text = motors_yaml(wheels, ["from a bag"])
+    motors = yaml.safe_load(text)["/motor_plant"]["ros__parameters"]["motors"]
+    assert text.startswith("# from a bag\n")
+    assert motors["front_left"]["inertia"] == PHYSICAL["inertia"][0]
+    assert "dc_gain" not in motors["front_left"]
+    assert motors["rear_left"]["dc_gain"] == 25.5
+    assert "inertia" not in motors["rear_left"]
+    assert motors["rear_left"]["gear_ratio"] == 65.5
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [("{", "is not JSON"), ("[]", "schema"), ('{"schema": 1, "motors": {"a": {}}}', "damaged")],
+)
+def test_a_damaged_document_is_named_with_its_reason(
+    tmp_path: Path, text: str, reason: str
+) -> None:
+    path = tmp_path / "identification.json"
+    path.write_text(text)
+    with pytest.raises(BagError, match=reason) as error:
+        read_identification(path)
+    assert str(path) in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_files_appear_together_and_nothing_is_overwritten_without_force(tmp_path: Path) -> None:
+    folder = tmp_path / "a" / "b"
+    files: dict[Path, str | bytes] = {folder / "x.json": "1", folder / "y.yaml": b"2"}
+    write_together(files)
+    assert sorted(p.name for p in folder.iterdir()) == ["x.json", "y.yaml"]
+    with pytest.raises(ParameterError, match="--force"):
+        write_together({folder / "z": "3", folder / "y.yaml": "4"})
+    assert sorted(p.name for p in folder.iterdir()) == ["x.json", "y.yaml"]
+    assert (folder / "y.yaml").read_text() == "2"
+    write_together({folder / "y.yaml": "4"}, force=True)
+    assert (folder / "y.yaml").read_text() == "4"
+
+
+def test_a_failure_half_way_restores_what_was_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_together({tmp_path / "a": "old a", tmp_path / "c": "old c"})
+    rename = os.replace
+
+    def full(source: Path, target: Path) -> None:
+        if Path(target).name == "c" and Path(source).read_text() == "new c":
+            raise OSError(28, "No space left on device")
+        rename(source, target)
+
+    monkeypatch.setattr(os, "replace", full)
+    new: dict[Path, str | bytes] = {tmp_path / n: f"new {n}" for n in ("a", "b", "c")}
+    with pytest.raises(ParameterError, match="No space left"):
+        write_together(new, force=True)
+    kept = {p.name: p.read_text() for p in tmp_path.iterdir()}
+    assert kept == {"a": "old a", "c": "old c"}
+
+
+def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ParameterError, match="cannot be written"):
+        write_together({tmp_path / "file" / "sub" / "x": "1"})
+
+
+def test_correlations_stay_in_their_bands_for_white_residuals() -> None:
+    auto, cross = correlations([comparison("validation")])
+    # 95 % bands: of 40 and 81 lags, 2 and 4 are expected outside; 8 and 14 are beyond chance
+    # (the lags of the cross-correlation are not independent of each other).
+    assert np.sum(np.abs(auto.value[1:]) > auto.band) <= 8
+    assert np.sum(np.abs(cross.value) > cross.band) <= 14
+    assert auto.value[0] == pytest.approx(1.0, abs=1e-12)  # by definition, but for rounding
+
+
+def test_cross_correlation_shows_a_missed_delay_at_positive_lags() -> None:
+    voltage = np.random.default_rng(3).choice([-8.0, 8.0], 4000)
+    late = 25 * np.roll(voltage, 3)
+    missed = Comparison("validation", "b", np.arange(4000) * 0.005, voltage, late, 25 * voltage)
+    _, cross = correlations([missed])
+    assert cross.lag[np.argmax(cross.value)] == 3
+    # The residual is the difference of two equal signals: each correlates with it by 1/sqrt(2).
+    assert cross.value.max() == pytest.approx(0.5**0.5, abs=0.05)
+
+
+def test_thinning_keeps_peaks_and_order() -> None:
+    time = np.arange(100_000) * 1e-3
+    values = np.sin(time)
+    values[54_321] = 9.0
+    values[77] = np.nan
+    short_time, short = thin(time, values, 1000)
+    assert short.size <= 1004
+    assert np.nanmax(short) == 9.0
+    assert np.all(np.diff(short_time) > 0)
