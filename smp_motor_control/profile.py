@@ -19,6 +19,7 @@ from smp_motor_control.transition import (
 __all__ = [
     "PEAK_ACCELERATION",
     "PEAK_JERK",
+    "UNLIMITED",
     "Limited",
     "MinimumJerk",
     "Profile",
@@ -28,6 +29,9 @@ __all__ = [
     "peak_voltage",
     "shortest_common_transition",
 ]
+
+UNLIMITED = ProfileLimits()
+"""A reference that jumps."""
 
 _STRETCH = 1.1
 _LOOKS = tuple(k / 32.0 for k in range(32))
@@ -57,9 +61,7 @@ class Profile:
     Reference(velocity=0.5, acceleration=2.0, jerk=0.0)
     """
 
-    def __init__(
-        self, limits: ProfileLimits = ProfileLimits(), transition_time: float = 0.0
-    ) -> None:
+    def __init__(self, limits: ProfileLimits = UNLIMITED, transition_time: float = 0.0) -> None:
         self.configure(limits, transition_time)
         self.reset()
 
