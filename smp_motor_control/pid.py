@@ -187,7 +187,8 @@ class Pid:
         d_term = self._d * rate
         feedforward = self._feedforward(reference, acceleration)
         unsaturated = p_term + i_term + d_term + feedforward
-        if unsaturated != unsaturated or error - error != 0.0:
+        inputs = error + acceleration + (error_rate or 0.0)
+        if inputs - inputs != 0.0 or unsaturated != unsaturated:  # NaN, or an infinite input
             return self._refuse()
         output = unsaturated
         if output > self._u_max:
