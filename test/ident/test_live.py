@@ -1,0 +1,106 @@
+"""The live window: what it keeps, and what it demands before an estimate is made."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from smp_motor_ident.live import Demands, Window, missing
+from smp_motor_ident.record import Hardware
+
+RATIO, COUNTS, STEP = 65.5, 500.0, 0.005
+
+
+def filled(seconds: float, voltage: object = None, length: float = 60.0) -> Window:
+    """A window that saw a motor of 25 rad/s/V without lag."""
+    window = Window("front_left", length)
+    window.hardware = Hardware(RATIO, COUNTS, 16, 12.0)
+    time = np.arange(round(seconds / STEP)) * STEP
+    volts = (
+        6 * np.sin(2 * np.pi * 0.83 * time) + 3 * np.sin(2 * np.pi * 2.3 * time)
+        if voltage is None
+        else np.broadcast_to(np.asarray(voltage, dtype=float), time.shape)
+    )
+    angle = np.cumsum(25 * volts) * STEP
+    counts = np.floor(angle * COUNTS / (2 * np.pi)).astype(int)
+    for t, v, a, c in zip(time, volts, angle, counts, strict=True):
+        wrapped = (int(c) + 2**15) % 2**16 - 2**15
+        window.add(1e9 + t, v, np.nan, 25 * v / RATIO, a / RATIO, wrapped)
+    return window
+
+
+def test_record_is_at_the_motor_shaft_with_counts_unwrapped() -> None:
+    record = filled(20.0).record()
+    assert record is not None
+    assert record.current is None
+    assert record.velocity is not None
+    assert record.count is not None
+    np.testing.assert_allclose(record.velocity, 25 * record.voltage, rtol=1e-12)
+    assert np.abs(np.diff(record.count)).max() < 2**15
+    # Counts and speed tell the same motion, to one count per sample of quantisation.
+    moved = np.diff(record.count) * 2 * np.pi / COUNTS / STEP
+    assert np.abs(moved - record.velocity[1:]).max() < 2 * np.pi / COUNTS / STEP * 1.01
+
+
+def test_window_keeps_only_its_length_and_no_more_memory_than_that() -> None:
+    window = filled(300.0, length=10.0)
+    record = window.record()
+    assert record is not None
+    assert record.duration == pytest.approx(10.0, abs=2 * STEP)  # whole samples
+    assert window._values.shape[0] <= 8192  # 2000 samples held, doubling from 4096
+
+
+def test_a_gap_begins_a_segment_and_a_late_sample_is_left_out() -> None:
+    window = filled(5.0)
+    before = len(window)
+    window.add(1e9 + 2.0, 1.0, np.nan, 0.0, 0.0, 0)
+    assert len(window) == before
+    window.add(1e9 + 7.0, 1.0, np.nan, 0.0, 0.0, 0)
+    record = window.record()
+    assert record is not None
+    assert record.starts == (0, before)
+
+
+def test_a_clock_that_was_set_back_begins_the_window_anew() -> None:
+    window = filled(5.0, length=3.0)
+    window.add(1e9 - 3600.0, 1.0, np.nan, 0.0, 0.0, 0)
+    assert len(window) == 1
+
+
+def test_samples_without_voltage_or_time_are_left_out() -> None:
+    window = filled(1.0)
+    before = len(window)
+    window.add(1e9 + 50, np.nan, np.nan, 0.0, 0.0, 0)
+    window.add(np.inf, 1.0, np.nan, 0.0, 0.0, 0)
+    assert len(window) == before
+
+
+def test_rich_motion_meets_every_demand() -> None:
+    assert missing(filled(10.0).record(), Demands()) == []
+
+
+@pytest.mark.parametrize(
+    ("seconds", "voltage", "word"),
+    [
+        (2.0, None, "of 5 s"),
+        (10.0, 0.0, "turned for 0.0"),
+        (10.0, 5.0, "levels of voltage"),
+        (10.0, 5.0, "changes of voltage"),
+        (10.0, 5.0, "backward 0 %"),
+    ],
+)
+def test_what_is_missing_is_named(seconds: float, voltage: float | None, word: str) -> None:
+    assert word in "; ".join(missing(filled(seconds, voltage).record(), Demands()))
+
+
+def test_nothing_heard_is_named() -> None:
+    assert missing(Window("w", 5.0).record(), Demands()) == ["no motor_state yet"]
+
+
+def test_demands_do_not_depend_on_the_unit_of_speed() -> None:
+    record = filled(10.0).record()
+    assert record is not None
+    slow = replace(record, velocity=record.velocity * 1e-6, count=None)
+    assert missing(slow, Demands()) == missing(record, Demands()) == []
