@@ -120,7 +120,8 @@ def unwrap(counts: ArrayLike, bits: int) -> NDArray[np.int64]:
     half = np.int64(1 << (bits - 1))
     mask = np.int64((1 << bits) - 1)
     moved = ((np.diff(shown) + half) & mask) - half
-    return np.concatenate((shown[:1], shown[0] + np.cumsum(moved))).astype(np.int64)
+    total: NDArray[np.int64] = np.concatenate((shown[:1], shown[0] + np.cumsum(moved)))
+    return total
 
 
 class Unwrapper:

@@ -89,7 +89,8 @@ class MotorParameters:
 
         Voltage and speed do not tell the physical parameters apart; of all motors with the
         same response this takes the one without viscous friction: ``K = a0``,
-        ``J = a1 K / R``, ``L = a2 R / a1``.
+        ``J = a1 K / R``, ``L = a2 R / a1``.  The response is the same while the motor
+        slides; where friction switches, it is if the original has no viscous friction.
 
         Parameters
         ----------

@@ -1,0 +1,304 @@
+"""ROS parameters as a frozen dataclass that is replaced as a whole, or not at all.
+
+A node describes its parameters once::
+
+    @dataclass(frozen=True, kw_only=True)
+    class Settings:
+        timeout: float = described(0.5, "Silence after which the wheel stops [s].", minimum=0.0)
+
+        def __post_init__(self) -> None:  # relations between values; raises ParameterError
+            ...
+
+    parameters = Parameters(node, Settings)
+    parameters.settings.timeout
+
+A change is validated, as one with all that is set in the same call, before it takes effect;
+a refused one leaves the node as it was and the service call says why.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, Generic, TypeVar
+
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from smp_motor_control.errors import ParameterError
+
+S = TypeVar("S")
+
+_OF_EVERY_NODE = ("use_sim_time", "start_type_description_service")
+
+
+def described(
+    default: Any,
+    description: str,
+    *,
+    minimum: float | None = None,
+    maximum: float | None = None,
+    read_only: bool = False,
+) -> Any:
+    """Return a dataclass field that becomes a ROS parameter.
+
+    Parameters
+    ----------
+    default : bool, int, float, str or tuple of one of them
+        Its type is the parameter's; a whole number is taken for a float too.
+    description : str
+        One sentence with the unit.
+    minimum, maximum : float, optional
+        Range of a number, both ends allowed.
+    read_only : bool
+        Whether it can be set only at the start.
+
+    Returns
+    -------
+    dataclasses.Field
+        For the body of a dataclass.
+    """
+    limits = {"minimum": minimum, "maximum": maximum}
+    metadata = {"description": description, "read_only": read_only, **limits}
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+def nested(default: Any, descriptions: Mapping[str, str], *, prefix: str = "") -> Any:
+    """Return a dataclass field whose own fields become ROS parameters.
+
+    Parameters
+    ----------
+    default : dataclass instance
+        Frozen; it is rebuilt, and so validated, from the parameters.
+    descriptions : mapping of str to str
+        One sentence for each of its fields; fields without one are no parameters.
+    prefix : str
+        Before the names of the parameters, such as ``model.``.
+
+    Returns
+    -------
+    dataclasses.Field
+        For the body of a dataclass.
+    """
+    metadata = {"descriptions": descriptions, "prefix": prefix}
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Entry:
+    """One ROS parameter and the place in the settings it belongs to."""
+
+    path: tuple[str, ...]
+    default: Any
+    description: str
+    minimum: float | None = None
+    maximum: float | None = None
+    read_only: bool = False
+
+
+def _entries(settings: type) -> dict[str, _Entry]:
+    found = {}
+    for field in dataclasses.fields(settings):
+        data = field.metadata
+        if "descriptions" in data:
+            for name, description in data["descriptions"].items():
+                default = getattr(field.default, name)
+                found[data["prefix"] + name] = _Entry((field.name, name), default, description)
+        elif "description" in data:
+            found[field.name] = _Entry((field.name,), field.default, **data)
+    return found
+
+
+def coerce(name: str, value: Any, default: Any) -> Any:
+    """Return a parameter's value in the type of its default.
+
+    Parameters
+    ----------
+    name : str
+        For the message.
+    value : object
+        As ROS, a YAML file or a command line gave it.
+    default : bool, int, float, str or tuple
+        Of the type that is wanted.
+
+    Returns
+    -------
+    object
+        Of the type of ``default``; sequences become tuples.
+
+    Raises
+    ------
+    ParameterError
+        When the value is of another type.
+    """
+    wanted = type(default)
+    if wanted is float and type(value) is int:
+        return float(value)
+    if wanted is tuple:
+        if isinstance(value, (str, bytes)) or not isinstance(value, Sequence):
+            raise ParameterError(f"{name} is {value!r}; it must be a list")
+        inner = default[0] if default else ""
+        return tuple(coerce(f"{name}[{k}]", one, inner) for k, one in enumerate(value))
+    if type(value) is not wanted:
+        word = {float: "a number", int: "a whole number", bool: "true or false", str: "text"}
+        raise ParameterError(f"{name} is {value!r}; it must be {word[wanted]}")
+    return value
+
+
+def _check_range(name: str, value: Any, entry: _Entry) -> None:
+    low, high = entry.minimum, entry.maximum
+    if low is None and high is None:
+        return
+    low, high = (-math.inf if low is None else low), (math.inf if high is None else high)
+    if not low <= value <= high:
+        raise ParameterError(f"{name} is {value!r}; it must be in [{low:g}, {high:g}]")
+
+
+class Parameters(Generic[S]):
+    """Declares a node's parameters and keeps the settings made of them.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+        Owner of the parameters.
+    settings : type
+        Frozen dataclass with fields of :func:`described` and :func:`nested`.
+    changed : callable, optional
+        Called with the new settings after every change, not at the start.
+    also_known : iterable of str
+        Names or, with a final dot, prefixes of given parameters that the node reads itself.
+
+    Attributes
+    ----------
+    settings : object
+        The present settings.
+
+    Raises
+    ------
+    ParameterError
+        When a given value is refused, or a given name is not a parameter of the node.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        settings: type[S],
+        changed: Callable[[S], None] | None = None,
+        also_known: Iterable[str] = (),
+    ) -> None:
+        self._type = settings
+        self._entries = _entries(settings)
+        self._changed = changed
+        self._node = node
+        given = given_parameters(node)
+        self._refuse_unknown(given, tuple(also_known))
+        values = {
+            name: coerce(name, given.get(name, entry.default), entry.default)
+            for name, entry in self._entries.items()
+        }
+        self._values = values
+        self.settings = self._build(values)
+        for name, entry in self._entries.items():
+            value = values[name]
+            # Given values were validated above; the override would be checked again, worse.
+            node.declare_parameter(
+                name,
+                list(value) if isinstance(value, tuple) else value,
+                _descriptor(entry),
+                ignore_override=True,
+            )
+        node.add_on_set_parameters_callback(self._validate)
+        node.add_post_set_parameters_callback(self._replace)
+
+    def _refuse_unknown(self, given: Iterable[str], also_known: tuple[str, ...]) -> None:
+        prefixes = tuple(name for name in also_known if name.endswith("."))
+        known = {*self._entries, *also_known, *_OF_EVERY_NODE}
+        for name in given:
+            if name not in known and not name.startswith(("qos_overrides.", *prefixes)):
+                raise ParameterError(
+                    f"unknown parameter {name!r}; known are {', '.join(sorted(self._entries))}"
+                )
+
+    def _build(self, values: Mapping[str, Any]) -> S:
+        top: dict[str, Any] = {}
+        inner: dict[str, dict[str, Any]] = {}
+        for name, entry in self._entries.items():
+            _check_range(name, values[name], entry)
+            if len(entry.path) == 1:
+                top[entry.path[0]] = values[name]
+            else:
+                inner.setdefault(entry.path[0], {})[entry.path[1]] = values[name]
+        defaults = {field.name: field.default for field in dataclasses.fields(self._type)}  # type: ignore[arg-type]
+        for name, parts in inner.items():
+            top[name] = dataclasses.replace(defaults[name], **parts)
+        return self._type(**top)
+
+    def _with(self, parameters: Iterable[Parameter]) -> dict[str, Any]:
+        mine = (p for p in parameters if p.name in self._entries)
+        new = {p.name: coerce(p.name, p.value, self._entries[p.name].default) for p in mine}
+        return {**self._values, **new}
+
+    def _validate(self, parameters: list[Parameter]) -> SetParametersResult:
+        try:
+            self._build(self._with(parameters))
+        except ParameterError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _replace(self, parameters: list[Parameter]) -> None:
+        values = self._with(parameters)
+        if values == self._values:
+            return
+        self._values = values
+        self.settings = self._build(values)
+        if self._changed is not None:
+            self._changed(self.settings)
+
+
+def given_parameters(node: Node) -> dict[str, Any]:
+    """Return what the command line, launch and parameter files set for a node.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+        The node.
+
+    Returns
+    -------
+    dict
+        Plain values by name.
+    """
+    return {name: parameter.value for name, parameter in node._parameter_overrides.items()}
+
+
+def _descriptor(entry: _Entry) -> ParameterDescriptor:
+    descriptor = ParameterDescriptor(
+        description=entry.description,
+        read_only=entry.read_only,
+        # Types are checked by `coerce`, which takes 1 for 1.0 and says what it wants.
+        dynamic_typing=True,
+    )
+    if entry.minimum is None and entry.maximum is None:
+        return descriptor
+    low, high = entry.minimum, entry.maximum
+    if isinstance(entry.default, float):
+        limits = (-1.8e308 if low is None else low, 1.7e308 if high is None else high)
+        limits = (max(limits[0], -1.7e308), limits[1])
+        descriptor.floating_point_range = [
+            FloatingPointRange(from_value=float(limits[0]), to_value=float(limits[1]))
+        ]
+    else:
+        descriptor.integer_range = [
+            IntegerRange(
+                from_value=int(-(2**31) if low is None else low),
+                to_value=int(2**31 - 1 if high is None else high),
+            )
+        ]
+    return descriptor

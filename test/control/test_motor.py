@@ -1,0 +1,248 @@
+"""The motor against an independent integrator, and against what friction must do."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from smp_motor_control.errors import ParameterError
+from smp_motor_control.motor import Gearbox, Motor, MotorParameters
+
+PAPER = {  # Table 1 of the paper: J, K, L, R, b
+    1: (1.13e-6, 0.011029, 0.30994, 12.919, 2.40e-5),
+    2: (6.60e-7, 0.001761, 0.06754, 4.5516, 2.23e-5),
+    3: (1.40e-5, 0.030117, 0.06383, 3.2843, 5.53e-5),
+    4: (2.21e-5, 0.035314, 0.03995, 2.7031, 6.45e-5),
+}
+
+
+def paper_motor(number: int, static_voltage: float = 0.0, inductance: float | None = None):
+    J, K, L, R, b = PAPER[number]
+    return MotorParameters(
+        resistance=R,
+        inductance=L if inductance is None else inductance,
+        motor_constant=K,
+        inertia=J,
+        viscous_friction=b,
+        coulomb_friction=static_voltage * K / R,
+    )
+
+
+def reference_step(p: MotorParameters, state, voltage, dt, load):
+    """One interval by an adaptive integrator with events, mode by mode."""
+    i, w, angle = state
+    t = 0.0
+
+    def drive(i):
+        return p.motor_constant * i - load
+
+    released = 0.0  # direction in which the rotor has just broken loose
+    for _ in range(50):
+        stuck = w == 0.0 and released == 0.0 and abs(drive(i)) <= p.coulomb_friction
+        sign = 0.0 if stuck else math.copysign(1.0, w or released or drive(i))
+
+        def field(_, x, sign=sign, stuck=stuck):
+            di = (voltage - p.resistance * x[0] - p.motor_constant * x[1]) / p.inductance
+            if stuck:
+                return [di, 0.0, 0.0]
+            torque = p.motor_constant * x[0] - p.viscous_friction * x[1]
+            return [di, (torque - p.coulomb_friction * sign - load) / p.inertia, x[1]]
+
+        def event(_, x, sign=sign, stuck=stuck):
+            return abs(drive(x[0])) - p.coulomb_friction if stuck else x[1] * sign
+
+        event.terminal = True  # a short first step keeps the start from counting as a crossing
+        event.direction = 1.0 if stuck else -1.0
+        solution = solve_ivp(
+            field, (t, dt), [i, w, angle], "DOP853", events=event, rtol=1e-11,
+            atol=[1e-12, 1e-10, 1e-11], max_step=(dt - t) / 20,
+            first_step=min(1e-7, dt - t),
+        )  # fmt: skip
+        i, w, angle = solution.y[:, -1]
+        t = solution.t[-1]
+        if solution.status == 0:
+            return i, 0.0 if stuck else w, angle
+        w = 0.0
+        released = math.copysign(1.0, drive(i)) if stuck else 0.0
+    raise AssertionError("more than 50 changes of mode in one interval")
+
+
+def random_case(rng: np.random.Generator):
+    number = int(rng.integers(1, 5))
+    inductance = PAPER[number][2] * 10 ** rng.uniform(-2, 1)
+    return paper_motor(number, static_voltage=rng.uniform(0.2, 2.0), inductance=inductance)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_step_equals_an_adaptive_integrator_through_sticking_and_reversal(seed):
+    rng = np.random.default_rng(seed)
+    p = random_case(rng)
+    motor = Motor(p)
+    state = (0.0, 0.0, 0.0)
+    load = 0.0
+    for _ in range(40):
+        voltage = float(rng.choice([0.0, rng.uniform(-3, 3), rng.uniform(-12, 12)]))
+        dt = float(10 ** rng.uniform(-3.5, -0.7))
+        if rng.uniform() < 0.3:
+            load = float(rng.uniform(-2, 2)) * p.coulomb_friction
+        state = reference_step(p, state, voltage, dt, load)
+        motor.step(voltage, dt, load)
+        # The integrator's own tolerance is 1e-11 relative over some hundred steps an interval.
+        assert motor.current == pytest.approx(state[0], abs=2e-8)
+        assert motor.speed == pytest.approx(state[1], abs=2e-6)
+        assert motor.angle == pytest.approx(state[2], abs=2e-7)
+
+
+@pytest.mark.parametrize("number", PAPER)
+@pytest.mark.parametrize("inductance", [0.0, 1e-9, 1e-4, None])
+def test_one_long_step_equals_many_short_ones(number, inductance):
+    p = paper_motor(number, static_voltage=0.6, inductance=inductance)
+    whole, parts = Motor(p), Motor(p)
+    for voltage in (8.0, -3.0, 0.3, 0.0, -0.7, 11.0):
+        whole.step(voltage, 0.317)
+        for _ in range(200):
+            parts.step(voltage, 0.317 / 200)
+        # Both are exact up to rounding, which 200 steps let grow to some 1e-12 of the state.
+        assert parts.speed == pytest.approx(whole.speed, abs=1e-8)
+        assert parts.angle == pytest.approx(whole.angle, abs=1e-8)
+        assert parts.current == pytest.approx(whole.current, abs=1e-9)
+
+
+def test_underdamped_motor_that_dips_below_zero_inside_a_long_step_is_not_missed():
+    p = MotorParameters(
+        resistance=0.5, inductance=0.5, motor_constant=0.05, inertia=1e-4,
+        viscous_friction=0.0, coulomb_friction=1e-4,
+    )  # fmt: skip
+    whole, parts = Motor(p, speed=30.0), Motor(p, speed=30.0)
+    whole.step(0.2, 8.0)
+    for _ in range(4000):
+        parts.step(0.2, 0.002)
+    assert whole.speed == pytest.approx(parts.speed, abs=1e-8)
+    assert whole.angle == pytest.approx(parts.angle, abs=1e-7)
+
+
+@pytest.mark.parametrize("inductance", [0.0, 0.05])
+def test_motor_sticks_below_the_static_voltage_and_turns_above(inductance):
+    p = paper_motor(4, static_voltage=0.5, inductance=inductance)
+    motor = Motor(p)
+    motor.step(0.499, 60.0)
+    assert motor.speed == 0.0 and motor.angle == 0.0
+    motor.step(0.501, 60.0)
+    assert motor.speed > 0.0
+
+
+def test_load_below_friction_does_not_turn_a_resting_motor_and_above_it_does():
+    p = paper_motor(3, static_voltage=0.5)
+    motor = Motor(p)
+    motor.step(0.0, 5.0, 0.99 * p.coulomb_friction)
+    assert motor.angle == 0.0
+    motor.step(0.0, 5.0, 1.01 * p.coulomb_friction)
+    assert motor.speed < 0.0
+
+
+def test_steady_state_is_the_dc_gain_times_voltage_above_static():
+    p = paper_motor(1, static_voltage=0.7)
+    motor = Motor(p)
+    motor.step(9.0, 100.0)
+    assert motor.speed == pytest.approx(p.dc_gain * (9.0 - 0.7), rel=1e-12)
+
+
+def test_vanishing_inductance_approaches_none_at_all():
+    tiny, none = (Motor(paper_motor(4, 0.5, inductance=x)) for x in (1e-12, 0.0))
+    for voltage in (5.0, -4.0, 0.2):
+        tiny.step(voltage, 0.05)
+        none.step(voltage, 0.05)
+    assert tiny.speed == pytest.approx(none.speed, rel=1e-6)
+    assert tiny.current == pytest.approx(none.current, rel=1e-6)
+
+
+def test_energy_balance_closes_over_a_stick_slip_run():
+    p = paper_motor(2, static_voltage=1.0)
+    motor = Motor(p)
+    supplied = lost = 0.0
+    dt = 1e-5
+    for k in range(20_000):
+        voltage = 3.0 * math.sin(2 * math.pi * 4 * k * dt)
+        i, w = motor.current, motor.speed
+        motor.step(voltage, dt)
+        i, w = 0.5 * (i + motor.current), 0.5 * (w + motor.speed)
+        supplied += voltage * i * dt
+        friction = p.viscous_friction * w**2 + p.coulomb_friction * abs(w)
+        lost += (p.resistance * i**2 + friction) * dt
+    stored = 0.5 * (p.inductance * motor.current**2 + p.inertia * motor.speed**2)
+    # The trapezoidal sums of power are good to some dt^2, far below 1e-4.
+    assert supplied == pytest.approx(lost + stored, rel=1e-4)
+
+
+def twin_of(p: MotorParameters) -> MotorParameters:
+    return MotorParameters.from_combinations(
+        dc_gain=p.dc_gain,
+        time_constant=p.time_constant,
+        time_constant_product=p.time_constant_product,
+        static_voltage=p.static_voltage,
+        resistance=3.0,
+    )
+
+
+def test_combinations_survive_the_way_there_and_back():
+    p = paper_motor(1, static_voltage=0.4)
+    for name in ("a0", "a1", "a2", "static_voltage"):
+        assert getattr(twin_of(p), name) == pytest.approx(getattr(p, name), rel=1e-12)
+
+
+def test_motor_made_of_combinations_answers_a_voltage_like_the_original():
+    # Exact without dry friction, and with it where there is no viscous friction.
+    sliding = paper_motor(1)
+    rubbing = MotorParameters(
+        resistance=3.0, inductance=0.05, motor_constant=0.03, inertia=2e-5,
+        viscous_friction=0.0, coulomb_friction=0.005,
+    )  # fmt: skip
+    for p in (sliding, rubbing):
+        one, two = Motor(p), Motor(twin_of(p))
+        for voltage in (7.0, -0.3, -5.0, 0.2):
+            one.step(voltage, 0.05)
+            two.step(voltage, 0.05)
+            assert two.speed == pytest.approx(one.speed, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("inertia", -1e-6),
+        ("inertia", 0.0),
+        ("resistance", 0.0),
+        ("motor_constant", math.nan),
+        ("inductance", -1.0),
+        ("coulomb_friction", math.inf),
+        ("viscous_friction", "much"),
+        ("resistance", True),
+    ],
+)
+def test_impossible_parameter_is_refused_by_name(name, value):
+    good = {
+        "resistance": 1.0,
+        "inductance": 0.1,
+        "motor_constant": 0.1,
+        "inertia": 1e-5,
+        "viscous_friction": 0.0,
+    }
+    with pytest.raises(ParameterError, match=name):
+        MotorParameters(**{**good, name: value})
+
+
+@pytest.mark.parametrize("bad", [(math.nan, 0.01, 0.0), (1.0, -0.01, 0.0), (1.0, 0.01, math.inf)])
+def test_step_with_nonsense_is_refused_and_leaves_the_motor_as_it_was(bad):
+    motor = Motor(paper_motor(1), speed=3.0)
+    with pytest.raises(ParameterError):
+        motor.step(*bad)
+    assert motor.speed == 3.0
+
+
+def test_gearbox_converts_there_and_back_and_refuses_nonsense():
+    gearbox = Gearbox(65.5)
+    assert gearbox.to_wheel(gearbox.to_motor(2.5)) == pytest.approx(2.5, rel=1e-15)
+    with pytest.raises(ParameterError, match="gear ratio"):
+        Gearbox(0.0)
