@@ -1,0 +1,392 @@
+"""design: from an estimate and a loop to gains, with their margins and the reason.
+
+Methods work at the motor shaft; the gains that come out are per wheel rad/s.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from smp_motor_control.pid import PidGains
+from smp_motor_ident.errors import DesignError
+from smp_motor_ident.result import Estimate
+from smp_motor_ident.tune.feedback import Feedback
+from smp_motor_ident.tune.loop import Loop
+from smp_motor_ident.tune.margins import Margins, loop_margins
+from smp_motor_ident.tune.methods import METHODS
+from smp_motor_ident.tune.performance import Performance, measure
+from smp_motor_ident.tune.plant import Plant, draw_motors, motors_of, sample
+from smp_motor_ident.tune.problem import Method, Problem, Promise, ripple
+from smp_motor_ident.tune.reference import Reference, plan_reference, two_degrees
+from smp_motor_ident.tune.response import TwoDegrees
+from smp_motor_ident.tune.robust import Jury, Robustness, back_off
+
+COMMON = ("max_velocity", "max_acceleration", "transition_time", "samples", "seed", "lag")
+"""Targets that every method understands."""
+
+
+@dataclass(frozen=True)
+class Design:
+    """Gains for one wheel, what they keep, and why they are as they are.
+
+    Attributes
+    ----------
+    gains : PidGains
+        Of the running controller, per wheel rad/s.
+    margins : Margins
+        Of the nominal sampled loop.
+    reason : str
+        In words for the user.
+    method : str
+        Name of the method.
+    loop : Loop
+        What it was designed for.
+    robustness : Robustness
+        Over the distribution of the estimate.
+    performance : Performance
+        Of the simulated loop.
+    reference : Reference
+        Limits and duration of set-point changes, at the motor shaft.
+    motor : mapping of str to float
+        Combinations that it was designed from, at the motor shaft.
+    wheel : str
+        Whose gains these are.
+    warnings : tuple of str
+        What the user should know beside.
+    """
+
+    gains: PidGains
+    margins: Margins
+    reason: str
+    method: str
+    loop: Loop
+    robustness: Robustness
+    performance: Performance
+    reference: Reference
+    motor: dict[str, float]
+    wheel: str = ""
+    warnings: tuple[str, ...] = ()
+    feedback: Feedback = field(default_factory=lambda: Feedback(0.0, 0.0))
+
+
+def design(estimate: Estimate, loop: Loop, method: str = "margin", **targets: Any) -> Design:
+    """Design the speed controller of one motor for the loop that will run.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        Combinations suffice: ``dc_gain``, ``time_constant``, ``time_constant_product``, ``delay``,
+        ``static_voltage``.
+    loop : Loop
+        Sampling, delay, encoder, gearbox, supply.
+    method : str
+        One of :data:`METHODS`.
+    **targets
+        What the method understands, such as ``phase_margin`` [deg] or ``bandwidth`` [rad/s], and
+        for all: ``max_velocity`` [rad/s, wheel], ``max_acceleration`` [rad/s^2, wheel],
+        ``transition_time`` [s], ``samples`` (draws of the distribution), ``seed``.
+
+    Returns
+    -------
+    Design
+
+    Raises
+    ------
+    DesignError
+        When the demand cannot be met; the message tells the limit and the nearest design.
+    """
+    case = prepare(estimate, loop, method, targets)
+    ruled = case.method.solve(case.problem)
+    feedback, factor, robustness = back_off(case.jury, ruled)
+    if factor == 0.0:
+        raise DesignError(
+            f"{estimate.wheel}: no gains of this kind keep a phase margin of "
+            f"{case.promise.phase:g} deg and Ms {case.promise.sensitivity:g} over the motors that "
+            f"the data allow (only {robustness.holds:.0%} do); record more, or ask for smaller "
+            "margins"
+        )
+    return finish(case, feedback, factor, robustness)
+
+
+@dataclass(frozen=True)
+class Case:
+    """One motor, one loop, one method: what is needed to judge and to finish a design.
+
+    Attributes
+    ----------
+    wheel : str
+        Whose motor.
+    method : Method
+        The method that was asked for.
+    problem : Problem
+        The nominal motor and the targets.
+    promise : Promise
+        What the gains must keep.
+    jury : Jury
+        The motors that the data allow.
+    drawn : bool
+        Whether these were drawn; else the jury is the nominal motor alone.
+    """
+
+    wheel: str
+    method: Method
+    problem: Problem
+    promise: Promise
+    jury: Jury
+    drawn: bool
+
+
+def prepare(estimate: Estimate, loop: Loop, method: str, targets: dict[str, Any]) -> Case:
+    """Sample the motor and the draws of its distribution; see :func:`design`.
+
+    Parameters
+    ----------
+    estimate, loop, method
+        As for :func:`design`.
+    targets : dict
+        Its keywords.
+
+    Returns
+    -------
+    Case
+
+    Raises
+    ------
+    DesignError
+        When method or targets are unknown.
+    """
+    chosen = _method(method, targets)
+    plant = sample(motors_of(estimate), loop)
+    problem = Problem(plant, loop, targets)
+    promise = _promise(chosen, problem)
+    n = int(targets.get("samples") or 1000)
+    motors = draw_motors(estimate, n, np.random.default_rng(int(targets.get("seed") or 0)))
+    jury = Jury(plant if motors is None else sample(motors, loop), promise)
+    return Case(estimate.wheel, chosen, problem, promise, jury, motors is not None)
+
+
+def finish(case: Case, feedback: Feedback, factor: float, robustness: Robustness) -> Design:
+    """Add feed-forward, reference, figures and words to feedback gains.
+
+    Parameters
+    ----------
+    case : Case
+        From :func:`prepare`.
+    feedback : Feedback
+        At the motor shaft.
+    factor : float
+        By which the rule's gains were backed off; 1 where they were not.
+    robustness : Robustness
+        Of these gains.
+
+    Returns
+    -------
+    Design
+    """
+    problem, plant, loop = case.problem, case.problem.plant, case.problem.loop
+    controller, reference = _follow(plant, loop, feedback, problem.targets)
+    margins = loop_margins(plant, feedback)
+    figures = measure(problem, controller, reference, ripple(problem, feedback))
+    reason, warnings = _explain(case, margins, factor, robustness, figures)
+    m = plant.motors
+    return Design(
+        gains=wheel_gains(controller, loop, float(m.static_voltage[0])),
+        margins=margins,
+        reason=reason,
+        method=case.method.name,
+        loop=loop,
+        robustness=robustness,
+        performance=figures,
+        reference=reference,
+        motor={
+            "dc_gain": 1 / float(m.a0[0]),
+            "time_constant": float(m.a1[0] / m.a0[0]),
+            "time_constant_product": float(m.a2[0] / m.a0[0]),
+            "static_voltage": float(m.static_voltage[0]),
+            "delay": float(m.delay[0]),
+        },
+        wheel=case.wheel,
+        warnings=warnings,
+        feedback=feedback,
+    )
+
+
+def compare(
+    estimate: Estimate, loop: Loop, methods: Sequence[str] | None = None, **targets: Any
+) -> dict[str, Design | DesignError]:
+    """Design by every method, for one table.
+
+    Parameters
+    ----------
+    estimate, loop
+        As for :func:`design`.
+    methods : sequence of str or None
+        Names; None takes all.
+    **targets
+        Each method is given those that it understands.
+
+    Returns
+    -------
+    dict of str to Design or DesignError
+        A method that cannot meet the demand is told by its error.
+    """
+    results: dict[str, Design | DesignError] = {}
+    for name in METHODS if methods is None else methods:
+        known = (*COMMON, *METHODS[name].targets)
+        own = {key: value for key, value in targets.items() if key in known}
+        try:
+            results[name] = design(estimate, loop, name, **own)
+        except DesignError as error:
+            results[name] = error
+    return results
+
+
+def recommend(results: dict[str, Design | DesignError]) -> tuple[str, str]:
+    """Choose among compared designs.
+
+    Parameters
+    ----------
+    results : dict
+        From :func:`compare`.
+
+    Returns
+    -------
+    name : str
+    reason : str
+        One sentence.
+
+    Raises
+    ------
+    DesignError
+        When no method met the demand.
+    """
+    sound = {
+        name: r
+        for name, r in results.items()
+        if isinstance(r, Design)
+        and r.margins.stable
+        and r.margins.sensitivity <= 1.6
+        and r.performance.ripple <= 1.05 * r.loop.noise_limit
+        and math.isfinite(r.performance.settling)
+    }
+    if not sound:
+        raise DesignError("no method keeps Ms below 1.6 within the ripple that the loop allows")
+    name = min(sound, key=lambda n: sound[n].performance.load_integral)
+    others = sorted(r.performance.load_integral for n, r in sound.items() if n != name)
+    best = sound[name]
+    better = f", {others[0] / best.performance.load_integral:.2f} times the next" if others else ""
+    return name, (
+        f"{METHODS[name].title}: of the methods that keep Ms below 1.6 and the ripple below "
+        f"{best.loop.noise_limit:.2g} V it rejects a load best{better}, with a phase margin of "
+        f"{best.margins.phase:.0f} deg"
+    )
+
+
+def wheel_gains(controller: TwoDegrees, loop: Loop, static_voltage: float) -> PidGains:
+    """Return the running controller's settings, per wheel rad/s.
+
+    Parameters
+    ----------
+    controller : TwoDegrees
+        At the motor shaft.
+    loop : Loop
+        Its gear ratio and supply.
+    static_voltage : float
+        What dry friction takes [V].
+
+    Returns
+    -------
+    PidGains
+    """
+    ratio, fb = loop.gear_ratio, controller.feedback
+    tracking = controller.tracking
+    limit = loop.supply_voltage
+    return PidGains(
+        p=fb.p * ratio,
+        i=fb.i * ratio,
+        d=fb.d * ratio,
+        u_clamp_min=-limit,
+        u_clamp_max=limit,
+        i_clamp_min=-limit,
+        i_clamp_max=limit,
+        antiwindup_strategy="back_calculation" if math.isfinite(tracking) else "none",
+        tracking_time_constant=tracking if math.isfinite(tracking) else 0.0,
+        setpoint_weight_p=controller.weight,
+        setpoint_weight_d=0.0,
+        derivative_filter_time_constant=fb.filter_time,
+        feedforward_static=static_voltage,
+        feedforward_velocity=controller.velocity * ratio,
+        feedforward_acceleration=controller.acceleration * ratio,
+    )
+
+
+def _method(name: str, targets: dict[str, Any]) -> Method:
+    if name not in METHODS:
+        raise DesignError(f"method is {name!r}; it must be one of {', '.join(METHODS)}")
+    known = (*METHODS[name].targets, *COMMON)
+    unknown = [key for key in targets if key not in known]
+    if unknown:
+        raise DesignError(
+            f"the method {name!r} knows no target {unknown[0]!r}; it knows {', '.join(known)}"
+        )
+    return METHODS[name]
+
+
+def _promise(method: Method, problem: Problem) -> Promise:
+    """Return what the method promises, as far as the caller's targets leave it."""
+    promise = method.promise
+    return Promise(
+        phase=problem.target("phase_margin", promise.phase),
+        gain=promise.gain,
+        sensitivity=problem.target("maximum_sensitivity", promise.sensitivity, least=1.0),
+    )
+
+
+def _follow(
+    plant: Plant, loop: Loop, feedback: Feedback, targets: Mapping[str, Any]
+) -> tuple[TwoDegrees, Reference]:
+    controller, lag = two_degrees(plant, loop, feedback, targets.get("lag"))
+    ratio = loop.gear_ratio
+    speed, rate = targets.get("max_velocity"), targets.get("max_acceleration")
+    reference = plan_reference(
+        plant,
+        loop,
+        controller,
+        lag,
+        max_velocity=None if speed is None else speed * ratio,
+        max_acceleration=None if rate is None else rate * ratio,
+        transition_time=targets.get("transition_time"),
+    )
+    return controller, reference
+
+
+def _explain(
+    case: Case, margins: Margins, factor: float, robustness: Robustness, figures: Performance
+) -> tuple[str, tuple[str, ...]]:
+    loop = case.problem.loop
+    words = [
+        f"{case.method.title} at {loop.rate:g} Hz with {1e3 * loop.loop_delay:.3g} ms of delay: "
+        f"phase margin {margins.phase:.0f} deg, Ms {margins.sensitivity:.2f}, crossover "
+        f"{margins.crossover:.3g} rad/s"
+    ]
+    warnings = []
+    if case.drawn:
+        words.append(
+            f"{robustness.holds:.1%} of {robustness.samples} motors that the data allow keep the "
+            f"promised margins, {robustness.stable:.1%} are stable"
+        )
+    else:
+        warnings.append("the estimate tells no uncertainty: the margins are those of one motor")
+    if factor < 1:
+        words.append(f"gains backed off to {factor:.0%} of the rule's so that 99 % hold")
+    if figures.ripple > 1.05 * loop.noise_limit:
+        warnings.append(
+            f"encoder quantisation makes {figures.ripple:.2g} V of ripple, above "
+            f"{loop.noise_limit:.2g} V"
+        )
+    return "; ".join(words), tuple(warnings)

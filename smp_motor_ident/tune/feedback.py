@@ -1,0 +1,144 @@
+"""The feedback path of the controller, and the loop that it closes.
+
+All at the motor shaft: volts per motor rad/s.  The integral is forward Euler and is used one
+step later, the derivative is backward Euler behind its filter, exactly as the running PID does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from smp_motor_ident.tune.arrays import Array, Complex
+from smp_motor_ident.tune.plant import Plant
+
+
+@dataclass(frozen=True)
+class Feedback:
+    """Gains that act on the measurement.
+
+    Attributes
+    ----------
+    p : float
+        [V s/rad].
+    i : float
+        [V/rad].
+    d : float
+        [V s^2/rad].
+    filter_time : float
+        Time constant of the derivative's filter [s].
+    """
+
+    p: float
+    i: float
+    d: float = 0.0
+    filter_time: float = 0.0
+
+    def scaled(self, factor: float) -> Feedback:
+        """Return the same controller with every gain multiplied by ``factor``."""
+        return replace(self, p=self.p * factor, i=self.i * factor, d=self.d * factor)
+
+    def response(self, omega: Array, sample_time: float) -> Complex:
+        """Return the frequency response from error to volts.
+
+        Parameters
+        ----------
+        omega : ndarray, shape (f,), [rad/s]
+            Frequencies above 0.
+        sample_time : float
+            [s].
+
+        Returns
+        -------
+        ndarray of complex, shape (f,), [V s/rad]
+        """
+        integral, derivative = terms(omega, sample_time, self.filter_time)
+        return self.p + self.i * integral + self.d * derivative
+
+
+def terms(omega: Array, sample_time: float, filter_time: float) -> tuple[Complex, Complex]:
+    """Return the responses of integrator and filtered derivative, each with unit gain.
+
+    Parameters
+    ----------
+    omega : ndarray, shape (f,), [rad/s]
+    sample_time, filter_time : float
+        [s].
+
+    Returns
+    -------
+    integral, derivative : ndarray of complex, shape (f,)
+    """
+    z = np.exp(1j * np.asarray(omega) * sample_time)
+    keep = filter_time / (filter_time + sample_time)
+    return sample_time / (z - 1), (1 - keep) * (z - 1) / (sample_time * (z - keep))
+
+
+def closed_loop(plant: Plant, feedback: Feedback) -> Array:
+    """Return the state matrices of the closed loop of every plant of a batch.
+
+    The state is: motor, the angles run through in the last ``window`` steps, the voltages still
+    under way, integral, and derivative filter.
+
+    Parameters
+    ----------
+    plant : Plant
+        A batch of ``n``.
+    feedback : Feedback
+        One controller for all of them.
+
+    Returns
+    -------
+    ndarray, shape (n, q, q)
+        Stable where every eigenvalue lies inside the unit circle.
+    """
+    n, m, s = plant.taps.shape
+    T, window = plant.sample_time, plant.window
+    angles, volts, integral = s, s + window, s + window + m - 1
+    size = integral + 2
+    speed = np.zeros((n, size))
+    if window:
+        speed[:, angles:volts] = 1 / (window * T)
+    else:
+        speed[:, 0] = 1.0
+    keep = feedback.filter_time / (feedback.filter_time + T)
+    unit = np.eye(size)
+    # filtered[k] = keep filtered[k-1] + (1 - keep) speed[k]; the last state is filtered[k-1].
+    filtered = keep * unit[-1] + (1 - keep) * speed
+    rate = (filtered - unit[-1]) / T
+    output = unit[integral] - feedback.p * speed - feedback.d * rate
+    A = np.zeros((n, size, size))
+    A[:, :s, :s] = plant.phi
+    A[:, :s] += plant.taps[:, 0, :, None] * output[:, None, :]
+    A[:, :s, volts:integral] += np.swapaxes(plant.taps[:, 1:], 1, 2)
+    if window:
+        A[:, angles, :s] = plant.phi_angle
+        A[:, angles] += plant.taps_angle[:, :1] * output
+        A[:, angles, volts:integral] += plant.taps_angle[:, 1:]
+        A[:, angles + 1 : volts] = unit[angles : volts - 1]
+    if m > 1:
+        A[:, volts] = output
+        A[:, volts + 1 : integral] = unit[volts : integral - 1]
+    A[:, integral] = unit[integral] - feedback.i * T * speed
+    A[:, -1] = filtered
+    return A
+
+
+def spectral_radius(plant: Plant, feedback: Feedback) -> Array:
+    """Return the largest eigenvalue magnitude of every closed loop of a batch.
+
+    Parameters
+    ----------
+    plant : Plant
+        A batch of ``n``.
+    feedback : Feedback
+        One controller for all of them.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        Below 1 where the loop is stable.
+    """
+    eigenvalues = np.linalg.eigvals(closed_loop(plant, feedback))
+    return np.asarray(np.abs(eigenvalues).max(axis=1), dtype=np.float64)

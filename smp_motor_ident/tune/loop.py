@@ -1,0 +1,105 @@
+"""Loop: the sampled loop that will run, as far as the design must know it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from typing import Literal
+
+from smp_motor_control.errors import ParameterError
+
+SpeedSource = Literal["measured", "difference", "observer"]
+SPEED_SOURCES: tuple[SpeedSource, ...] = ("measured", "difference", "observer")
+
+
+@dataclass(frozen=True)
+class Loop:
+    """One wheel's speed loop: sampling, delay, encoder, gearbox and supply.
+
+    Attributes
+    ----------
+    sample_time : float
+        Interval of the controller's steps [s].
+    delay : float or None
+        From the stamp of a measurement to the instant at which the voltage answering it is
+        applied: computation and transport, beyond the hold [s].  None takes one sample, which
+        every node that answers within its period keeps.  A delay of the motor itself (that of
+        the estimate) is added to it.
+    gear_ratio : float
+        Motor revolutions per wheel revolution [-].
+    counts_per_revolution : float or None
+        Encoder counts per motor revolution; None where speed is not made from counts.
+    supply_voltage : float
+        Largest voltage of either sign [V].
+    speed_source : {'measured', 'difference', 'observer'}
+        What the controller feeds back: the speed in the message, counts differenced over
+        ``difference_window`` samples, or the observer's estimate.
+    difference_window : int
+        Samples over which the speed is averaged: by the controller for ``difference``, by the
+        hardware for ``measured`` (0: an instantaneous speed, as of a tachometer).
+    derivative_filter_time_constant : float or None
+        Of the derivative [s]; None leaves it to the design.
+    observer_bandwidth : float or None
+        Bandwidth of the speed observer [rad/s]; None leaves it to the design.
+    noise_voltage : float or None
+        Largest voltage ripple [V rms] that encoder quantisation may cause at the output;
+        None takes 4 % of the supply.
+    speed_noise : float
+        Standard deviation of the noise on a measured speed [rad/s, motor], beside quantisation.
+
+    Raises
+    ------
+    ParameterError
+        When a value is not finite, has the wrong sign, or names no speed source.
+    """
+
+    sample_time: float = 0.005
+    delay: float | None = None
+    gear_ratio: float = 65.5
+    counts_per_revolution: float | None = 500.0
+    supply_voltage: float = 12.0
+    speed_source: SpeedSource = "measured"
+    difference_window: int = 1
+    derivative_filter_time_constant: float | None = None
+    observer_bandwidth: float | None = None
+    noise_voltage: float | None = None
+    speed_noise: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.speed_source not in SPEED_SOURCES:
+            raise ParameterError(
+                f"speed_source is {self.speed_source!r}; it must be one of "
+                f"{', '.join(SPEED_SOURCES)}"
+            )
+        positive = ("sample_time", "gear_ratio", "counts_per_revolution", "supply_voltage")
+        for entry in fields(self):
+            value = getattr(self, entry.name)
+            if entry.name == "speed_source" or value is None:
+                continue
+            bound = "positive" if entry.name in positive else "not negative"
+            good = value > 0 if bound == "positive" else value >= 0
+            if not (math.isfinite(value) and good):
+                raise ParameterError(f"{entry.name} is {value}; it must be finite and {bound}")
+        if self.speed_source == "difference" and self.difference_window < 1:
+            raise ParameterError("difference_window is 0; a difference needs at least 1 sample")
+
+    @property
+    def rate(self) -> float:
+        """Steps per second [Hz]."""
+        return 1.0 / self.sample_time
+
+    @property
+    def loop_delay(self) -> float:
+        """Delay beyond the hold [s]: as given, or one sample."""
+        return self.sample_time if self.delay is None else self.delay
+
+    @property
+    def noise_limit(self) -> float:
+        """Largest voltage ripple from quantisation [V rms]: as given, or 4 % of the supply."""
+        return 0.04 * self.supply_voltage if self.noise_voltage is None else self.noise_voltage
+
+    @property
+    def count_angle(self) -> float:
+        """One encoder count [rad, motor]; 0 where speed is not made from counts."""
+        counts = self.counts_per_revolution
+        return 0.0 if counts is None else 2 * math.pi / counts

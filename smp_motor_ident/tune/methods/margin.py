@@ -1,0 +1,185 @@
+"""Bandwidth under a margin: the best gains of all that keep phase margin, Ms and ripple.
+
+Crossover, phase margin and share of the derivative span every PI and PID controller; the
+search looks at thousands at once on the sampled loop's frequency response, then zooms in.
+
+References
+----------
+.. [1] K. J. Astrom, H. Panagopoulos, T. Hagglund, Design of PI controllers based on
+   non-convex optimization, Automatica 34 (1998), 585-601: largest integral gain under Ms.
+.. [2] K. J. Astrom, T. Hagglund, Advanced PID Control (2006), sections 4.6 and 6.7.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from smp_motor_ident.errors import DesignError
+from smp_motor_ident.tune.arrays import Array, Complex
+from smp_motor_ident.tune.feedback import Feedback, spectral_radius
+from smp_motor_ident.tune.problem import Method, Problem, Promise, noise_filter
+
+FOCUS = ("balanced", "tracking", "load")
+PEAK = {"balanced": 1.25, "tracking": 1.05, "load": math.inf}
+"""Largest peak of the complementary sensitivity, by what the design is for."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidates:
+    p: Array
+    i: Array
+    d: Array
+    filter_time: Array
+    crossover: Array
+    margin: Array
+    share: Array
+
+
+def _solve(problem: Problem) -> Feedback:
+    focus = str(problem.targets.get("focus") or "balanced")
+    if focus not in FOCUS:
+        raise DesignError(f"focus is {focus!r}; it must be one of {', '.join(FOCUS)}")
+    margin = problem.target("phase_margin", 60.0)
+    if margin >= 90:
+        raise DesignError(f"phase_margin is {margin:g} deg; it must be below 90")
+    peak = problem.target("maximum_sensitivity", 1.4, least=1.0)
+    if "bandwidth" in problem.targets and problem.targets["bandwidth"] is not None:
+        return _at_bandwidth(problem, problem.target("bandwidth", 1.0), margin, peak)
+    found = _search(problem, margin, peak, focus)
+    if found is None:
+        raise DesignError(
+            f"no controller keeps a phase margin of {margin:g} deg, Ms {peak:g} and a ripple of "
+            f"{problem.loop.noise_limit:.3g} V; allow a higher Ms or ripple, or shorten the delay"
+        )
+    return found[0]
+
+
+def _search(
+    problem: Problem, margin: float, peak: float, focus: str, bandwidth: float | None = None
+) -> tuple[Feedback, float] | None:
+    """Return the best feedback and its crossover, zooming in twice, or None."""
+    omega = problem.omega
+    shares = np.zeros(1) if problem.targets.get("structure") == "pi" else _SHARES
+    if bandwidth is None:
+        crossovers = np.geomspace(omega[0], 0.6 * omega[-1], 60)
+    else:
+        crossovers = np.array([bandwidth])
+    margins = np.linspace(margin, min(margin + 35, 95), 8)
+    best: tuple[Feedback, float] | None = None
+    for zoom in (1.0, 0.3, 0.08):
+        found = _best(problem, crossovers, margins, shares, margin, peak, focus)
+        if found is None:
+            return best
+        best = found[0], found[1]
+        crossover, phase, share = found[1:]
+        ratio = (omega[-1] / omega[0]) ** (zoom / 60)
+        if bandwidth is None:
+            crossovers = np.append(crossover * np.geomspace(1 / ratio, ratio, 17), crossover)
+        margins = np.append(np.clip(phase + np.linspace(-5, 5, 8) * zoom, margin, 95), phase)
+        if shares.size > 1:
+            shares = np.append(np.clip(share + np.linspace(-0.2, 0.2, 7) * zoom, 0, 1.5), share)
+    return best
+
+
+_SHARES = np.array([0.0, 0.15, 0.3, 0.45, 0.6, 0.8, 1.0])
+
+
+def _best(
+    problem: Problem,
+    crossovers: Array,
+    margins: Array,
+    shares: Array,
+    margin: float,
+    peak: float,
+    focus: str,
+) -> tuple[Feedback, float, float, float] | None:
+    c = _candidates(problem, crossovers, margins, shares)
+    if c.p.size == 0:
+        return None
+    good = _hold(problem, c, margin, peak, PEAK[focus])
+    merit = np.where(good, c.crossover if focus == "tracking" else c.i, -np.inf)
+    for k in np.argsort(-merit)[:20]:
+        if not good[k]:
+            return None
+        feedback = Feedback(
+            float(c.p[k]), float(c.i[k]), float(c.d[k]), float(c.filter_time[k]) if c.d[k] else 0.0
+        )
+        if spectral_radius(problem.plant, feedback)[0] < 1:
+            return feedback, float(c.crossover[k]), float(c.margin[k]), float(c.share[k])
+    return None
+
+
+def _candidates(problem: Problem, crossovers: Array, margins: Array, shares: Array) -> _Candidates:
+    """Return the gains that cross over where asked with the phase that is asked."""
+    T = problem.loop.sample_time
+    w, pm, share = (x.ravel() for x in np.meshgrid(crossovers, margins, shares, indexing="ij"))
+    plant = np.repeat(problem.plant.response(crossovers)[0], margins.size * shares.size)
+    needed = -np.exp(1j * np.deg2rad(pm)) / plant
+    d = share * np.abs(needed) / w
+    filter_time = np.array([problem.filter_time(0.1 / x) for x in crossovers])
+    filter_time = np.repeat(filter_time, margins.size * shares.size)
+    integral, derivative = _terms(w, T, filter_time)
+    rest = needed - d * derivative
+    i = rest.imag / integral.imag
+    p = rest.real - i * integral.real
+    keep = (i > 0) & (p >= 0)
+    return _Candidates(*(x[keep] for x in (p, i, d, filter_time, w, pm, share)))
+
+
+def _terms(omega: Array, T: float, filter_time: Array) -> tuple[Complex, Complex]:
+    z = np.exp(1j * omega * T)
+    keep = filter_time / (filter_time + T)
+    return T / (z - 1), (1 - keep) * (z - 1) / (T * (z - keep))
+
+
+def _hold(problem: Problem, c: _Candidates, margin: float, peak: float, hump: float) -> Array:
+    """Return which candidates keep Ms, the hump of T, phase and gain margin, and ripple."""
+    omega, T = problem.omega, problem.loop.sample_time
+    integral, derivative = _terms(omega, T, c.filter_time[:, None])
+    control = c.p[:, None] + c.i[:, None] * integral + c.d[:, None] * derivative
+    loop = control * problem.response
+    back = 1 / (1 + loop)
+    sensitivity = np.abs(back)
+    good = sensitivity.max(axis=1) <= peak
+    good &= np.abs(loop * back).max(axis=1) <= hump
+    # Nyquist: 1 + L comes from -90 deg and must end at 0 without having gone around.
+    turned = np.angle(1 / back[:, 0]) + np.sum(np.angle(back[:, :-1] / back[:, 1:]), axis=1)
+    good &= np.abs(turned) < 0.5
+    # Outside the unit circle of Ms there may still be a later crossover: check each of them.
+    near = np.abs(np.abs(loop) - 1) < 0.1
+    good &= np.where(near, np.abs(np.angle(-loop)), np.pi).min(axis=1) >= np.deg2rad(0.9 * margin)
+    power = np.abs(control * back) ** 2 * noise_filter(problem, omega)
+    ripple = np.sqrt(np.trapezoid(power, omega, axis=1) / omega[-1])
+    return np.asarray(good & (ripple <= problem.loop.noise_limit))
+
+
+def _at_bandwidth(problem: Problem, wished: float, margin: float, peak: float) -> Feedback:
+    nyquist = math.pi / problem.loop.sample_time
+    found = None
+    if wished < nyquist:
+        found = _search(problem, margin, peak, "load", bandwidth=wished)
+    if found is not None:
+        return found[0]
+    nearest = _search(problem, margin, peak, "tracking")
+    hint = (
+        "no bandwidth holds" if nearest is None else f"the nearest that holds is {nearest[1]:.4g}"
+    )
+    delay = 1e3 * (problem.loop.loop_delay + float(problem.plant.motors.delay[0]))
+    raise DesignError(
+        f"bandwidth {wished:.4g} rad/s cannot keep a phase margin of {margin:g} deg, Ms {peak:g} "
+        f"and a ripple of {problem.loop.noise_limit:.3g} V with {delay:.3g} ms of delay at "
+        f"{problem.loop.rate:.4g} Hz (Nyquist {nyquist:.4g} rad/s); {hint} rad/s"
+    )
+
+
+MARGIN = Method(
+    "margin",
+    "largest integral gain under phase margin, Ms and ripple",
+    "Astrom, Panagopoulos and Hagglund 1998",
+    Promise(phase=60.0, gain=2.0, sensitivity=1.4),
+    _solve,
+    ("phase_margin", "maximum_sensitivity", "focus", "bandwidth", "structure"),
+)

@@ -1,0 +1,70 @@
+"""Ziegler-Nichols and Tyreus-Luyben: rules from the ultimate gain and period.
+
+The ultimate point is that of the model in the sampled loop, with its hold and delay.
+
+References
+----------
+.. [1] J. G. Ziegler, N. B. Nichols, Optimum settings for automatic controllers,
+   Trans. ASME 64 (1942), 759-768.
+.. [2] B. D. Tyreus, W. L. Luyben, Tuning PI controllers for integrator/dead time processes,
+   Ind. Eng. Chem. Res. 31 (1992), 2625-2628; PID values: W. L. Luyben, M. L. Luyben,
+   Essentials of Process Control (1997), p. 97.
+"""
+
+from __future__ import annotations
+
+from smp_motor_ident.tune.feedback import Feedback
+from smp_motor_ident.tune.problem import Method, Problem, Promise
+
+RULES = {
+    # rule, structure: gain as a share of Ku, integral and derivative time as shares of Tu
+    ("ziegler_nichols", "pi"): (0.45, 1 / 1.2, 0.0),
+    ("ziegler_nichols", "pid"): (0.6, 0.5, 0.125),
+    ("tyreus_luyben", "pi"): (1 / 3.2, 2.2, 0.0),
+    ("tyreus_luyben", "pid"): (1 / 2.2, 2.2, 1 / 6.3),
+}
+
+
+def from_ultimate(problem: Problem, rule: str, gain: float, period: float) -> Feedback:
+    """Apply a rule to an ultimate point, whoever found it.
+
+    Parameters
+    ----------
+    problem : Problem
+        Its target ``structure`` is ``pi`` (default) or ``pid``.
+    rule : str
+        ``ziegler_nichols`` or ``tyreus_luyben``.
+    gain : float
+        Ultimate gain [V s/rad].
+    period : float
+        Ultimate period [s].
+
+    Returns
+    -------
+    Feedback
+    """
+    share, integral, derivative = RULES[rule, str(problem.targets.get("structure") or "pi")]
+    p, td = share * gain, derivative * period
+    return Feedback(p, p / (integral * period), p * td, problem.filter_time(td / 10) if td else 0.0)
+
+
+def _solve(rule: str, problem: Problem) -> Feedback:
+    return from_ultimate(problem, rule, *problem.ultimate)
+
+
+ZIEGLER_NICHOLS = Method(
+    "ziegler_nichols",
+    "Ziegler-Nichols from the ultimate point",
+    "Ziegler and Nichols 1942",
+    Promise(phase=20.0, gain=1.5, sensitivity=3.5),
+    lambda problem: _solve("ziegler_nichols", problem),
+    ("structure",),
+)
+TYREUS_LUYBEN = Method(
+    "tyreus_luyben",
+    "Tyreus-Luyben from the ultimate point",
+    "Tyreus and Luyben 1992",
+    Promise(phase=30.0, gain=2.0, sensitivity=2.2),
+    lambda problem: _solve("tyreus_luyben", problem),
+    ("structure",),
+)

@@ -1,0 +1,103 @@
+"""How a design performs in simulation: the columns of the comparison."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from smp_motor_ident.tune.problem import Problem
+from smp_motor_ident.tune.reference import Reference
+from smp_motor_ident.tune.response import (
+    TwoDegrees,
+    load_figures,
+    minimum_jerk,
+    simulate,
+    step_figures,
+)
+
+
+@dataclass(frozen=True)
+class Performance:
+    """What the simulated loop does; speeds at the motor shaft.
+
+    Attributes
+    ----------
+    rise, settling : float
+        Of a set-point step through the reference [s]: 10 to 90 %, and until within 2 %.
+    overshoot : float
+        Of the same [%].
+    step_settling, step_overshoot : float
+        The same for an abrupt step with the feedback gains alone.
+    load_peak : float
+        Speed lost per volt of load [rad/s/V].
+    load_integral : float
+        Integral of the magnitude of the error per volt of load [rad/V].
+    load_recovery : float
+        Until a tenth of the loss is left [s].
+    peak_voltage : float
+        Largest voltage of the set-point step [V].
+    ripple : float
+        Voltage from quantisation at constant speed [V rms].
+    """
+
+    rise: float
+    settling: float
+    overshoot: float
+    step_settling: float
+    step_overshoot: float
+    load_peak: float
+    load_integral: float
+    load_recovery: float
+    peak_voltage: float
+    ripple: float
+
+
+def measure(
+    problem: Problem, controller: TwoDegrees, reference: Reference, ripple: float
+) -> Performance:
+    """Simulate set-point and load steps of one design.
+
+    Parameters
+    ----------
+    problem : Problem
+        Plant and loop.
+    controller : TwoDegrees
+        The design.
+    reference : Reference
+        How set-points change.
+    ripple : float
+        From :func:`smp_motor_ident.tune.problem.ripple` [V rms].
+
+    Returns
+    -------
+    Performance
+    """
+    T, fb = problem.loop.sample_time, controller.feedback
+    speed = reference.max_velocity
+    horizon = reference.transition_time + 5 * problem.reduced.time_constant
+    if fb.i > 0:
+        horizon += 4 * (fb.p + 1 / problem.reduced.gain) / fb.i
+    time = T * np.arange(min(max(int(horizon / T), 50), 20_000))
+    smooth, rate = minimum_jerk(speed, reference.transition_time, time)
+    run = simulate(problem.plant, controller, smooth, acceleration=rate)
+    planned = step_figures(time, run.speed[0], run.voltage[0], speed)
+    # Small, so that saturation does not hide the loop.
+    alone = TwoDegrees(fb, limit=math.inf)
+    run_step = simulate(problem.plant, alone, np.ones(time.size))
+    abrupt = step_figures(time, run_step.speed[0], run_step.voltage[0], 1.0)
+    pushed = simulate(problem.plant, alone, np.zeros(time.size), load=np.ones(time.size))
+    load = load_figures(time, pushed.speed[0])
+    return Performance(
+        rise=planned.rise,
+        settling=planned.settling,
+        overshoot=planned.overshoot,
+        step_settling=abrupt.settling,
+        step_overshoot=abrupt.overshoot,
+        load_peak=load.peak,
+        load_integral=load.integral,
+        load_recovery=load.recovery,
+        peak_voltage=planned.peak_voltage,
+        ripple=ripple,
+    )

@@ -1,0 +1,226 @@
+"""What every tuning method is given: the sampled plant, its reductions and its noise."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from smp_motor_ident.errors import DesignError
+from smp_motor_ident.tune.arrays import Array, Complex
+from smp_motor_ident.tune.feedback import Feedback, terms
+from smp_motor_ident.tune.loop import Loop
+from smp_motor_ident.tune.margins import grid_for
+from smp_motor_ident.tune.plant import Plant
+
+
+@dataclass(frozen=True)
+class Promise:
+    """Margins that a method's gains keep on the loop that runs.
+
+    Attributes
+    ----------
+    phase : float
+        Least phase margin [deg].
+    gain : float
+        Least gain margin, as a factor [-].
+    sensitivity : float
+        Largest Ms [-].
+    """
+
+    phase: float
+    gain: float
+    sensitivity: float
+
+
+@dataclass(frozen=True)
+class FirstOrderDelay:
+    """``gain e^{-delay s} / (time_constant s + 1)``: what the classical rules start from.
+
+    Attributes
+    ----------
+    gain : float
+        [rad/s/V].
+    time_constant, delay : float
+        [s].
+    """
+
+    gain: float
+    time_constant: float
+    delay: float
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One motor in one loop, and what is asked of it.
+
+    Attributes
+    ----------
+    plant : Plant
+        The sampled motor, a batch of one.
+    loop : Loop
+        The loop that will run.
+    targets : mapping of str to Any
+        What the caller asks of the method.
+    """
+
+    plant: Plant
+    loop: Loop
+    targets: Mapping[str, Any] = field(default_factory=dict)
+
+    @cached_property
+    def omega(self) -> Array:
+        """Frequency grid for searches, shape (f,), [rad/s]."""
+        return grid_for(self.plant, 160)
+
+    @cached_property
+    def response(self) -> Complex:
+        """Response of the plant on the grid, shape (f,)."""
+        response: Complex = self.plant.response(self.omega)[0]
+        return response
+
+    @cached_property
+    def reduced(self) -> FirstOrderDelay:
+        """Half-rule reduction; hold and averaging window count as delay.
+
+        A pair of complex poles is taken as a double real one of the same sum.
+        """
+        m, T = self.plant.motors, self.loop.sample_time
+        tau = float(m.a1[0] / m.a0[0])
+        root = math.sqrt(max(tau**2 - 4 * float(m.a2[0] / m.a0[0]), 0.0))
+        fast = 0.5 * (tau - root)
+        dead = self.loop.loop_delay + float(m.delay[0]) + 0.5 * T * (1 + self.plant.window)
+        return FirstOrderDelay(1 / float(m.a0[0]), tau - fast / 2, dead + fast / 2)
+
+    @cached_property
+    def ultimate(self) -> tuple[float, float]:
+        """Ultimate gain [V s/rad] and period [s] of the sampled loop under P control."""
+        omega = grid_for(self.plant, 2000)
+        response = self.plant.response(omega)[0]
+        phase = np.unwrap(np.angle(response))
+        beyond = np.flatnonzero(phase <= -np.pi)
+        if beyond.size == 0 or beyond[0] == 0:
+            return 1 / float(np.abs(response[-1])), 2 * math.pi / float(omega[-1])
+        k = int(beyond[0])
+        share = (phase[k - 1] + np.pi) / (phase[k - 1] - phase[k])
+        w = float(omega[k - 1] + share * (omega[k] - omega[k - 1]))
+        return 1 / float(np.abs(self.plant.response(np.array([w]))[0, 0])), 2 * math.pi / w
+
+    def filter_time(self, natural: float) -> float:
+        """Return the derivative filter: the loop's if it names one, else ``natural`` [s]."""
+        given = self.loop.derivative_filter_time_constant
+        return max(natural, 0.5 * self.loop.sample_time) if given is None else given
+
+    def target(self, name: str, default: float, *, least: float = 0.0) -> float:
+        """Return a numeric target, checked.
+
+        Parameters
+        ----------
+        name : str
+            Keyword of the target.
+        default : float
+            Where it is not given.
+        least : float
+            The target must be above this.
+
+        Returns
+        -------
+        float
+
+        Raises
+        ------
+        DesignError
+            When it is not a finite number above ``least``.
+        """
+        value = self.targets.get(name)
+        if value is None:
+            return default
+        if not (math.isfinite(value) and value > least):
+            raise DesignError(f"{name} is {value}; it must be a finite number above {least:g}")
+        return float(value)
+
+
+@dataclass(frozen=True)
+class Method:
+    """One way of choosing gains.
+
+    Attributes
+    ----------
+    name, title, source : str
+        Keyword, words for the table, and where it was published.
+    promise : Promise
+        What its gains keep; scaled back where the rule alone would not.
+    solve : callable
+        From the problem to the feedback gains.
+    targets : tuple of str
+        Keywords that it understands beside the common ones.
+    """
+
+    name: str
+    title: str
+    source: str
+    promise: Promise
+    solve: Callable[[Problem], Feedback]
+    targets: tuple[str, ...] = ()
+
+
+def noise_filter(problem: Problem, omega: Array) -> Array:
+    """Return the noise density of the measured speed.
+
+    Quantisation of the count is taken as white and uniform over one count, then differenced.
+
+    Parameters
+    ----------
+    problem : Problem
+        Encoder and averaging window.
+    omega : ndarray, shape (f,), [rad/s]
+
+    Returns
+    -------
+    ndarray, shape (f,), [rad^2/s^2]
+        Variance per share of the band up to Nyquist.
+    """
+    loop, window = problem.loop, problem.plant.window
+    density = np.full(omega.shape, loop.speed_noise**2)
+    if window and loop.count_angle:
+        T = loop.sample_time
+        difference = 2 * np.sin(0.5 * omega * window * T) / (window * T)
+        density = density + difference**2 * loop.count_angle**2 / 12
+    return density
+
+
+def ripple(problem: Problem, feedback: Feedback) -> float:
+    """Return the voltage that measurement noise causes at the controller's output.
+
+    Parameters
+    ----------
+    problem : Problem
+        Loop and encoder.
+    feedback : Feedback
+        The gains.
+
+    Returns
+    -------
+    float
+        [V rms].
+    """
+    omega = problem.omega
+    control = feedback.response(omega, problem.loop.sample_time)
+    through = np.abs(control / (1 + problem.response * control)) ** 2
+    power = np.trapezoid(through * noise_filter(problem, omega), omega) / omega[-1]
+    return math.sqrt(float(power))
+
+
+__all__ = [
+    "FirstOrderDelay",
+    "Method",
+    "Problem",
+    "Promise",
+    "noise_filter",
+    "ripple",
+    "terms",
+]

@@ -1,0 +1,141 @@
+"""Gains that hold for the motors that the data allow, not for the estimate alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from smp_motor_ident.tune.feedback import Feedback, spectral_radius
+from smp_motor_ident.tune.margins import batch_margins, grid_for
+from smp_motor_ident.tune.plant import Plant
+from smp_motor_ident.tune.problem import Promise
+
+SHARE = 0.99
+"""Share of the distribution for which a promise must hold."""
+
+
+@dataclass(frozen=True)
+class Robustness:
+    """What the gains do over the distribution of the estimate.
+
+    Attributes
+    ----------
+    samples : int
+        Motors drawn; 0 where the estimate tells no uncertainty.
+    stable : float
+        Share with a stable loop [0..1].
+    holds : float
+        Share that keeps every promised margin [0..1].
+    phase, gain, sensitivity : float
+        Phase margin [deg], gain margin [-] and Ms [-] that 99 % keep.
+    """
+
+    samples: int
+    stable: float
+    holds: float
+    phase: float
+    gain: float
+    sensitivity: float
+
+
+class Jury:
+    """Judges gains over a batch of motors, whose response is computed once.
+
+    Parameters
+    ----------
+    plant : Plant
+        The draws.
+    promise : Promise
+        What the gains must keep.
+    """
+
+    def __init__(self, plant: Plant, promise: Promise) -> None:
+        self.plant = plant
+        self.promise = promise
+        self.omega = grid_for(plant, 200)
+        self.response = plant.response(self.omega)
+
+    def judge(self, feedback: Feedback) -> Robustness:
+        """Return what the gains do over the batch.
+
+        Parameters
+        ----------
+        feedback : Feedback
+            The gains.
+
+        Returns
+        -------
+        Robustness
+        """
+        loop = self.response * feedback.response(self.omega, self.plant.sample_time)
+        m = batch_margins(loop, self.omega)
+        stable = spectral_radius(self.plant, feedback) < 1
+        p = self.promise
+        # A hundredth of slack: the grid's resolution.
+        holds = stable & (m.phase >= 0.99 * p.phase) & (m.gain >= 0.99 * p.gain)
+        holds &= m.sensitivity <= 1.01 * p.sensitivity
+        low, high = 1 - SHARE, SHARE
+        return Robustness(
+            samples=len(self.plant),
+            stable=float(np.mean(stable)),
+            holds=float(np.mean(holds)),
+            phase=float(np.quantile(m.phase, low, method="lower")),
+            gain=float(np.quantile(m.gain, low, method="lower")),
+            sensitivity=float(np.quantile(m.sensitivity, high, method="higher")),
+        )
+
+
+def back_off(jury: Jury, feedback: Feedback) -> tuple[Feedback, float, Robustness]:
+    """Scale gains down until 99 % of the motors keep the promise.
+
+    Proportional and derivative action shrink with the factor, integral action with its square,
+    so that the loop keeps its shape while its crossover moves down.
+
+    Parameters
+    ----------
+    jury : Jury
+        The motors and the promise.
+    feedback : Feedback
+        What the rule gave.
+
+    Returns
+    -------
+    feedback : Feedback
+        With the largest factor that holds.
+    factor : float
+        1 where nothing had to give.
+    robustness : Robustness
+    """
+    verdict = jury.judge(feedback)
+    if verdict.holds >= SHARE:
+        return feedback, 1.0, verdict
+    good, bad = None, 1.0
+    factor = 0.97
+    while factor > 0.01:
+        trial = _softer(feedback, factor)
+        verdict = jury.judge(trial)
+        if verdict.holds >= SHARE:
+            good = factor, trial, verdict
+            break
+        bad, factor = factor, factor * factor
+    if good is None:
+        return feedback, 0.0, jury.judge(feedback)
+    for _ in range(6):
+        middle = 0.5 * (good[0] + bad)
+        trial = _softer(feedback, middle)
+        verdict = jury.judge(trial)
+        if verdict.holds >= SHARE:
+            good = middle, trial, verdict
+        else:
+            bad = middle
+    return good[1], good[0], good[2]
+
+
+def _softer(feedback: Feedback, factor: float) -> Feedback:
+    return Feedback(
+        feedback.p * factor,
+        feedback.i * factor**2,
+        feedback.d * factor,
+        feedback.filter_time,
+    )

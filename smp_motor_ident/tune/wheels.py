@@ -1,0 +1,131 @@
+"""One robot's wheels together: gains each or for all, and one reference for all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+from smp_motor_ident.errors import DesignError
+from smp_motor_ident.result import Estimate
+from smp_motor_ident.tune.designer import Case, Design, design, finish, prepare
+from smp_motor_ident.tune.feedback import Feedback
+from smp_motor_ident.tune.loop import Loop
+from smp_motor_ident.tune.robust import SHARE
+
+Sets = Literal["auto", "one", "each"]
+
+WORTH = 1.1
+"""Loss of load rejection, as a factor, up to which one set of gains is preferred."""
+
+
+@dataclass(frozen=True)
+class WheelSet:
+    """Designs of all wheels, made to move together.
+
+    Attributes
+    ----------
+    designs : mapping of str to Design
+        By wheel; every one has the same duration and limits of its reference.
+    one_set : bool
+        Whether all share their feedback gains.
+    reason : str
+        Why one or each, and which motor sets the pace.
+    """
+
+    designs: Mapping[str, Design]
+    one_set: bool
+    reason: str
+
+
+def design_wheels(
+    estimates: Mapping[str, Estimate],
+    loops: Mapping[str, Loop],
+    method: str = "margin",
+    sets: Sets = "auto",
+    **targets: Any,
+) -> WheelSet:
+    """Design for every wheel of a robot.
+
+    Parameters
+    ----------
+    estimates : mapping of str to Estimate
+        By wheel.
+    loops : mapping of str to Loop
+        By wheel.
+    method : str
+        As for :func:`smp_motor_ident.tune.design`.
+    sets : {'auto', 'one', 'each'}
+        One set of feedback gains for all, one for each, or decided by the spread: one set where
+        no wheel loses more than a tenth of its load rejection by it.
+    **targets
+        As for :func:`smp_motor_ident.tune.design`.
+
+    Returns
+    -------
+    WheelSet
+
+    Raises
+    ------
+    DesignError
+        When a wheel has no design, or one set was asked for and does not hold for all.
+    """
+    if not estimates:
+        raise DesignError("no motor was identified; identify a bag that holds one")
+    own = {w: design(e, loops[w], method, **targets) for w, e in estimates.items()}
+    pace = max(own, key=lambda w: own[w].reference.transition_time)
+    slow = min(own, key=lambda w: own[w].reference.max_velocity / loops[w].gear_ratio)
+    common = {
+        **targets,
+        "transition_time": own[pace].reference.transition_time,
+        "max_velocity": own[slow].reference.max_velocity / loops[slow].gear_ratio,
+    }
+    cases = {w: prepare(e, loops[w], method, common) for w, e in estimates.items()}
+    shared, reason = _choose(cases, own, sets)
+    together = {wheel: _finish(case, own[wheel], shared) for wheel, case in cases.items()}
+    if len(own) > 1:
+        reason += (
+            f"; {pace} needs {own[pace].reference.transition_time:g} s for a change of speed and "
+            f"{slow} is the slowest: all take that time, up to {common['max_velocity']:.3g} rad/s"
+        )
+    return WheelSet(together, shared is not None, reason)
+
+
+def _finish(case: Case, own: Design, shared: Feedback | None) -> Design:
+    """Finish a design for the common reference, with its own or the shared gains."""
+    if shared is None:
+        done = finish(case, own.feedback, 1.0, own.robustness)
+        return replace(done, reason=own.reason)
+    mine = shared.scaled(1 / case.problem.loop.gear_ratio)
+    return finish(case, mine, 1.0, case.jury.judge(mine))
+
+
+def _choose(
+    cases: Mapping[str, Case], own: Mapping[str, Design], sets: Sets
+) -> tuple[Feedback | None, str]:
+    """Return the feedback for all, per wheel rad/s, or None, and why."""
+    if sets == "each" or len(own) == 1:
+        return None, "one set of gains each"
+    best: tuple[float, Feedback] | None = None
+    for wheel, one in own.items():
+        candidate = one.feedback.scaled(cases[wheel].problem.loop.gear_ratio)
+        loss = max(other.feedback.i * other.loop.gear_ratio / candidate.i for other in own.values())
+        holds = all(
+            case.jury.judge(candidate.scaled(1 / case.problem.loop.gear_ratio)).holds >= SHARE
+            for case in cases.values()
+        )
+        if holds and (best is None or loss < best[0]):
+            best = loss, candidate
+    if best is None:
+        if sets == "one":
+            raise DesignError(
+                "no wheel's gains keep the promised margins on all wheels: the motors differ too "
+                "much for one set; ask for one each, or for smaller margins"
+            )
+        return None, "one set of gains each: no wheel's gains keep the margins on all wheels"
+    if sets == "auto" and best[0] > WORTH:
+        return None, (
+            f"one set of gains each: a set that holds for all would let a load pull a wheel down "
+            f"{best[0]:.2f} times as far"
+        )
+    return best[1], f"one set of gains for all: no wheel loses more than {best[0] - 1:.0%} by it"

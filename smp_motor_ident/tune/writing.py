@@ -1,0 +1,140 @@
+"""Designs as files: the parameter file of the wheel nodes, and ``gains.json``."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import yaml
+
+from smp_motor_ident.tune.designer import Design
+
+SCHEMA = 1
+
+
+def parameters(design: Design) -> dict[str, Any]:
+    """Return the parameters of one wheel's ``wheel_pid`` node.
+
+    Parameters
+    ----------
+    design : Design
+        Of that wheel.
+
+    Returns
+    -------
+    dict
+        Nested as ROS 2 parameter files are; every number with a decimal point.
+    """
+    gains = dataclasses.asdict(design.gains)
+    gains.pop("error_deadband")
+    ratio, reference = design.loop.gear_ratio, design.reference
+    return {
+        **gains,
+        "max_velocity": float(reference.max_velocity / ratio),
+        "max_acceleration": float(reference.max_acceleration / ratio),
+        "transition_time": float(reference.transition_time),
+        "speed_source": str(design.loop.speed_source),
+        "difference_window": int(max(design.loop.difference_window, 1)),
+        "model": {name: float(value) for name, value in design.motor.items()},
+    }
+
+
+def gains_yaml(designs: Mapping[str, Design], provenance: Iterable[str]) -> str:
+    """Return the parameter file of all wheel nodes.
+
+    Parameters
+    ----------
+    designs : mapping of str to Design
+        By wheel.
+    provenance : iterable of str
+        Lines that become comments at the file's head.
+
+    Returns
+    -------
+    str
+        YAML.
+    """
+    tree = {
+        f"/{wheel}/wheel_pid": {"ros__parameters": parameters(design)}
+        for wheel, design in designs.items()
+    }
+    head = "".join(f"# {line}\n" for line in provenance)
+    return head + yaml.safe_dump(tree, sort_keys=False)
+
+
+def gains_document(
+    designs: Mapping[str, Design], provenance: Mapping[str, Any], reason: str
+) -> dict[str, Any]:
+    """Return the content of ``gains.json``.
+
+    Parameters
+    ----------
+    designs : mapping of str to Design
+        By wheel.
+    provenance : mapping of str to Any
+        Sources, date and command; plain types.
+    reason : str
+        Why one set of gains or one each.
+
+    Returns
+    -------
+    dict
+        Of plain types; numbers that do not exist are None.
+    """
+    return {
+        "schema": SCHEMA,
+        "provenance": dict(provenance),
+        "reason": reason,
+        "wheels": {wheel: _entry(design) for wheel, design in designs.items()},
+    }
+
+
+def _entry(design: Design) -> dict[str, Any]:
+    entry = {
+        "method": design.method,
+        "reason": design.reason,
+        "warnings": list(design.warnings),
+        "gains": dataclasses.asdict(design.gains),
+        "margins": dataclasses.asdict(design.margins),
+        "robustness": dataclasses.asdict(design.robustness),
+        "performance": dataclasses.asdict(design.performance),
+        "reference": {
+            "max_velocity": design.reference.max_velocity / design.loop.gear_ratio,
+            "max_acceleration": design.reference.max_acceleration / design.loop.gear_ratio,
+            "transition_time": design.reference.transition_time,
+            "lag": design.reference.lag,
+        },
+        "loop": {**dataclasses.asdict(design.loop), "delay": design.loop.loop_delay},
+        "motor": dict(design.motor),
+    }
+    plain: dict[str, Any] = _plain(entry)
+    return plain
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _plain(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value
+
+
+def to_json(document: Mapping[str, Any]) -> str:
+    """Return a document as text.
+
+    Parameters
+    ----------
+    document : mapping
+        Of plain types without NaN.
+
+    Returns
+    -------
+    str
+        JSON, indented.
+    """
+    return json.dumps(document, indent=2, allow_nan=False) + "\n"
