@@ -1,0 +1,80 @@
+"""How long a velocity command holds (behaviour_cases of diff_drive_cases.json)."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from smp_motor_control.errors import ParameterError
+from smp_motor_control.skid_steer import BodyCommand, Verdict
+
+
+def test_nothing_is_asked_before_the_first_command_even_if_that_is_nan() -> None:
+    command = BodyCommand()
+    assert command.at(0.0) is None
+    assert command.receive(math.nan, 0.0, 0.0, 0.0) is Verdict.NOT_FINITE
+    assert command.at(0.0) is None
+
+
+def test_command_brakes_after_the_timeout_and_not_before() -> None:
+    command = BodyCommand(0.5)
+    assert command.receive(1.0, 0.0, 0.0, 10.0) is Verdict.ACCEPTED
+    assert command.at(10.5) == (1.0, 0.0)
+    assert command.at(10.501) == (0.0, 0.0)
+    command.receive(1.0, 0.0, 0.0, 11.0)
+    assert command.at(11.0) == (1.0, 0.0)
+
+
+def test_timeout_of_zero_lets_a_command_hold() -> None:
+    command = BodyCommand(0.0)
+    command.receive(1.0, 0.0, 100.0, 1.0)
+    assert command.at(11.0) == (1.0, 0.0)
+
+
+def test_zero_stamp_is_taken_as_now() -> None:
+    command = BodyCommand(0.5)
+    assert command.receive(1.0, 0.0, None, 10.0) is Verdict.ZERO_STAMP
+    assert command.at(10.4) == (1.0, 0.0)
+
+
+@pytest.mark.parametrize(("age", "accepted"), [(0.499, True), (0.5, False), (3.0, False)])
+def test_stale_command_is_dropped_on_arrival(age: float, accepted: bool) -> None:
+    command = BodyCommand(0.5)
+    verdict = command.receive(1.0, 0.0, age, 10.0)
+    assert (verdict is Verdict.ACCEPTED) == accepted
+    assert (command.at(10.0) is not None) == accepted
+
+
+def test_age_on_arrival_counts_for_the_timeout() -> None:
+    command = BodyCommand(0.5)
+    command.receive(1.0, 0.0, 0.4, 10.0)
+    assert command.at(10.11) == (0.0, 0.0)
+
+
+def test_stamp_from_the_future_does_not_hold_any_longer() -> None:
+    command = BodyCommand(0.5)
+    command.receive(1.0, 0.0, -3600.0, 10.0)
+    assert command.at(10.51) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("bad", [(math.nan, 0.0), (0.0, math.inf), (-math.inf, math.nan)])
+def test_command_that_is_not_finite_keeps_the_one_before_and_its_clock(bad: tuple) -> None:
+    command = BodyCommand(0.5)
+    command.receive(1.0, 0.5, 0.0, 10.0)
+    assert command.receive(*bad, 0.0, 10.4) is Verdict.NOT_FINITE
+    assert command.at(10.8) == (1.0, 0.5)
+    assert command.at(10.91) == (0.0, 0.0)
+
+
+def test_reset_forgets_the_command() -> None:
+    command = BodyCommand(0.5)
+    command.receive(1.0, 0.5, 0.0, 10.0)
+    command.reset()
+    assert command.at(10.0) is None
+
+
+@pytest.mark.parametrize("timeout", [-0.1, math.nan, math.inf])
+def test_impossible_timeout_is_refused(timeout: float) -> None:
+    with pytest.raises(ParameterError, match="timeout"):
+        BodyCommand(timeout)

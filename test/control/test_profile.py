@@ -1,0 +1,191 @@
+"""References within limits, smooth, and on time."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from smp_motor_control.errors import ParameterError
+from smp_motor_control.motor import MotorParameters
+from smp_motor_control.profile import (
+    PEAK_ACCELERATION,
+    PEAK_JERK,
+    MinimumJerk,
+    Profile,
+    ProfileLimits,
+    Reference,
+    minimum_jerk_duration,
+    peak_voltage,
+    shortest_common_transition,
+)
+
+# Table 1 of the paper: J, K, L, R, b.
+PAPER = [
+    (1.13e-6, 0.011029, 0.30994, 12.919, 2.40e-5),
+    (6.60e-7, 0.001761, 0.06754, 4.5516, 2.23e-5),
+    (1.40e-5, 0.030117, 0.06383, 3.2843, 5.53e-5),
+    (2.21e-5, 0.035314, 0.03995, 2.7031, 6.45e-5),
+]
+MOTORS = [
+    MotorParameters(inertia=j, motor_constant=k, inductance=l, resistance=r, viscous_friction=b)
+    for j, k, l, r, b in PAPER
+]
+REST = Reference(0.0, 0.0, 0.0)
+
+
+def test_minimum_jerk_has_its_stated_peaks() -> None:
+    transition = MinimumJerk(Reference(1.0, 0.0, 0.0), 4.0, 0.2)
+    seen = [transition.at(t) for t in np.linspace(0.0, 0.2, 20001)]
+    # The grid misses a parabola's top by (1/40000)^2 at most.
+    assert max(x.acceleration for x in seen) == pytest.approx(PEAK_ACCELERATION * 3.0 / 0.2, 1e-6)
+    assert max(x.jerk for x in seen) == pytest.approx(PEAK_JERK * 3.0 / 0.2**2, rel=1e-6)
+
+
+def test_minimum_jerk_meets_its_six_boundary_conditions() -> None:
+    start = Reference(1.0, -3.0, 40.0)
+    transition = MinimumJerk(start, 4.0, 0.2)
+    tiny = 1e-9
+    assert transition.at(tiny) == pytest.approx(start, abs=1e-3)
+    assert transition.at(0.2 - tiny) == pytest.approx((4.0, 0.0, 0.0), abs=1e-3)
+    assert transition.at(0.2) == Reference(4.0, 0.0, 0.0)
+
+
+def test_wheels_with_different_steps_arrive_at_the_same_instant() -> None:
+    profiles = [Profile(transition_time=0.15) for _ in range(3)]
+    for profile, target in zip(profiles, (0.1, -2.0, 5.0), strict=True):
+        profile.set_target(target)
+    for _ in range(149):
+        for profile in profiles:
+            profile.step(0.001)
+    assert all(profile.moving for profile in profiles)
+    shares = [profile.now.velocity / profile.target for profile in profiles]
+    assert shares == pytest.approx([shares[0]] * 3, abs=1e-12)
+    for profile in profiles:
+        profile.step(0.00101)  # the sum of 149 steps of 1 ms may be short of 149 ms by rounding
+    assert [profile.now.velocity for profile in profiles] == [0.1, -2.0, 5.0]
+
+
+def test_limit_stretches_the_transition_just_enough() -> None:
+    limits = ProfileLimits(acceleration=10.0)
+    profile = Profile(limits, transition_time=0.15)
+    profile.set_target(4.0)
+    expected = minimum_jerk_duration(4.0, limits, 0.15)
+    assert expected == pytest.approx(15.0 / 8.0 * 4.0 / 10.0)
+    elapsed = 0.0
+    while profile.moving:
+        assert abs(profile.step(0.001).acceleration) <= 10.0 * (1 + 1e-9)
+        elapsed += 0.001
+    assert elapsed == pytest.approx(expected, abs=0.0011)  # one step
+
+
+targets = st.lists(st.tuples(st.floats(-6.0, 6.0), st.integers(1, 80)), min_size=1, max_size=8)
+
+
+@settings(deadline=None)
+@pytest.mark.parametrize("transition_time", [0.0, 0.15])
+@given(targets=targets)
+def test_reference_keeps_its_limits_through_any_change_of_mind(
+    transition_time: float, targets: list
+) -> None:
+    limits = ProfileLimits(velocity=5.0, acceleration=30.0, jerk=600.0)
+    profile = Profile(limits, transition_time)
+    dt = 0.002
+    for target, steps in targets:
+        profile.set_target(target)
+        for _ in range(steps):
+            before = profile.now
+            now = profile.step(dt)
+            # The profile checks moving polynomials on a grid: up to 2 % between its points.
+            assert abs(now.velocity) <= 5.0
+            assert abs(now.acceleration) <= 30.0 * 1.02
+            assert abs(now.velocity - before.velocity) <= 30.0 * 1.02 * dt + 1e-12
+    for _ in range(5000):
+        profile.step(dt)
+    assert profile.now == Reference(min(max(targets[-1][0], -5.0), 5.0), 0.0, 0.0)
+
+
+def test_fastest_transition_within_limits_is_as_fast_as_the_formula() -> None:
+    profile = Profile(ProfileLimits(acceleration=10.0, jerk=100.0))
+    profile.set_target(4.0)
+    elapsed = 0.0
+    while profile.moving:
+        profile.step(0.001)
+        elapsed += 0.001
+    assert elapsed == pytest.approx(4.0 / 10.0 + 10.0 / 100.0, abs=0.0011)  # D/a + a/j, one step
+
+
+def test_retargeting_half_way_keeps_velocity_acceleration_and_jerk() -> None:
+    profile = Profile(transition_time=0.2)
+    profile.set_target(4.0)
+    for _ in range(80):
+        profile.step(0.001)
+    before = profile.now
+    profile.set_target(-1.0)
+    after = profile.step(1e-7)
+    assert after == pytest.approx(before, abs=1e-2)  # snap times 0.1 us
+    for _ in range(201):
+        profile.step(0.001)
+    assert profile.now == Reference(-1.0, 0.0, 0.0)
+
+
+def test_repeated_target_does_not_start_again() -> None:
+    profile = Profile(transition_time=0.1)
+    for _ in range(101):
+        profile.set_target(2.0)
+        profile.step(0.001)
+    assert profile.now == Reference(2.0, 0.0, 0.0)
+
+
+def test_without_limits_the_reference_jumps() -> None:
+    profile = Profile()
+    profile.set_target(3.0)
+    assert profile.step(0.001) == Reference(3.0, 0.0, 0.0)
+
+
+def test_looking_ahead_moves_nothing() -> None:
+    profile = Profile(transition_time=0.1)
+    profile.set_target(2.0)
+    profile.step(0.02)
+    ahead = profile.ahead(0.03)
+    assert profile.now != ahead
+    assert profile.step(0.03) == pytest.approx(ahead, abs=1e-12)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_target_that_is_not_finite_leaves_the_old_one(bad: float) -> None:
+    profile = Profile(transition_time=0.1)
+    profile.set_target(2.0)
+    with pytest.raises(ParameterError, match="target"):
+        profile.set_target(bad)
+    assert profile.target == 2.0
+
+
+@pytest.mark.parametrize("name", ["velocity", "acceleration", "jerk"])
+@pytest.mark.parametrize("value", [0.0, -1.0, math.nan])
+def test_limit_that_stops_everything_is_refused(name: str, value: float) -> None:
+    with pytest.raises(ParameterError, match=name):
+        ProfileLimits(**{name: value})
+
+
+def test_parameters_of_zero_mean_no_limit() -> None:
+    assert ProfileLimits.from_parameters(0.0, 0.0, 0.0) == ProfileLimits()
+
+
+def test_paper_motors_reach_100_rad_s_together_in_about_66_ms_below_11_volts() -> None:
+    duration = shortest_common_transition(MOTORS, [0.0] * 4, [100.0] * 4, 11.0)
+    assert peak_voltage(MOTORS, [0.0] * 4, [100.0] * 4, duration) == pytest.approx(11.0, abs=1e-4)
+    # 62 ms by the linear motors of Table 1; dry friction takes the rest of the 66.
+    assert 0.060 < duration < 0.066
+
+
+def test_speed_that_a_motor_cannot_hold_is_refused_with_the_motor_named() -> None:
+    with pytest.raises(ParameterError, match="motor 2 needs"):
+        shortest_common_transition(MOTORS, [0.0] * 4, [200.0] * 4, 11.0)
+
+
+def test_standing_still_takes_no_time() -> None:
+    assert shortest_common_transition(MOTORS, [5.0] * 4, [5.0] * 4, 11.0) == 0.0
