@@ -24,7 +24,7 @@ _smp_source() {
       *":$root/.venv:"*) ;;
       *) export AMENT_PREFIX_PATH="$root/.venv${AMENT_PREFIX_PATH:+:$AMENT_PREFIX_PATH}" ;;
     esac
-    export _ROS_WHEELS_BOOTSTRAP_COMPLETE=1 ROS_DISTRO=jazzy ROS_VERSION=2 ROS_PYTHON_VERSION=3
+    export _ROS_WHEELS_BOOTSTRAP_COMPLETE=1
   fi
   . "$root/install/local_setup.$shell" || return
   for bin in "$root/.venv/bin" "$root/install/smp_motor_control/lib/smp_motor_control"; do

@@ -29,6 +29,7 @@ VENV = ROOT / ".venv"
 READY = VENV / "ready"  # exists only while everything is in place; its first line is the ROS prefix
 STAMPS = VENV / "stamps.json"
 LOG = VENV / "setup.log"
+PYTHON = str(getattr(sys, "_base_executable", sys.executable))  # not that of a virtual environment
 LAYOUT = "1"  # to be raised when this file prepares something in another way
 NETWORK = re.compile(
     r"NewConnectionError|NameResolutionError|ConnectTimeout|ReadTimeout|ProxyError|Retrying \("
@@ -125,9 +126,7 @@ def fingerprint(*parts: str, files: Iterable[Path] = (), names: Iterable[Path] =
 
 def stage_keys(ros: str) -> dict[str, str]:
     """Return a key per stage over all that its result depends on."""
-    python = fingerprint(
-        LAYOUT, str(ROOT), sys.version, os.path.realpath(sys._base_executable), ros
-    )
+    python = fingerprint(LAYOUT, str(ROOT), sys.version, os.path.realpath(PYTHON), ros)
     packages = fingerprint(python, files=[requirements(ros)])
     interfaces = fingerprint(
         python,
@@ -170,9 +169,7 @@ def environment(ros: str) -> dict[str, str]:
     return env
 
 
-def run(
-    command: list[str], env: dict[str, str], lock: IO[str], count: str = "", total: int = 0
-) -> None:
+def run(command: list[str], env: dict[str, str], lock: IO[str], count: str = "") -> None:
     """Run a command with its output in the log; show how many of its lines begin with `count`."""
     with LOG.open("a", encoding="utf-8") as log:
         log.write(f"\n$ {' '.join(command)}\n")
@@ -196,7 +193,7 @@ def run(
                 lines.append(line)
                 seen += bool(count) and line.startswith(count)
                 if count and time.monotonic() - shown > 5.0:
-                    say(f"      {seen} of {total}")
+                    say(f"      {seen} so far")
                     shown = time.monotonic()
     if process.returncode:
         text = "".join(lines)
@@ -218,20 +215,18 @@ def make_venv(ros: str, lock: IO[str]) -> None:
     VENV.mkdir()
     (VENV / "COLCON_IGNORE").touch()
     options = ["--system-site-packages"] if ros else []
-    run([sys._base_executable, "-m", "venv", *options, str(VENV)], environment(ros), lock)
+    run([PYTHON, "-m", "venv", *options, str(VENV)], environment(ros), lock)
 
 
 def install_packages(ros: str, lock: IO[str]) -> None:
     """Install the lock file as it stands; every transitive dependency is in it."""
     lockfile = requirements(ros)
-    total = sum(line[0] not in "# " for line in lockfile.read_text().splitlines() if line)
     options = ["--no-deps", "--no-input", "--disable-pip-version-check", "--progress-bar=off"]
     run(
         [f"{VENV}/bin/python", "-m", "pip", "install", *options, "-r", str(lockfile)],
         environment(ros),
         lock,
         count="Collecting ",
-        total=total,
     )
     if not ros:
         patch_cmake_files(environment(ros))
@@ -330,8 +325,12 @@ def write(path: Path, text: str) -> None:
     partial.replace(path)
 
 
+def interrupt(number: int, frame: object) -> None:
+    raise KeyboardInterrupt
+
+
 def main() -> int:
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    signal.signal(signal.SIGTERM, interrupt)
     started = time.monotonic()
     with (ROOT / ".setup.lock").open("w", encoding="ascii") as lock:
         try:

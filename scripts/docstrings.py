@@ -1,0 +1,55 @@
+"""Check the sections of docstrings with numpydoc's validator, as [tool.numpydoc_validation] says.
+
+One rule is milder: what takes no argument and says in its summary what it returns (a property, or
+``"Return the ..."``) needs no Returns section that would say it again. Functions within functions
+are nobody's interface and are left alone.
+"""
+
+from __future__ import annotations
+
+import ast
+import sys
+from pathlib import Path
+
+from numpydoc.hooks.validate_docstrings import parse_config, process_file
+
+
+def says_what_it_returns(node: ast.FunctionDef) -> bool:
+    """Tell whether the summary line stands for a Returns section."""
+    decorators = {ast.unparse(decorator) for decorator in node.decorator_list}
+    if decorators & {"property", "cached_property", "functools.cached_property"}:
+        return True
+    arguments = node.args
+    count = len(arguments.posonlyargs + arguments.args + arguments.kwonlyargs)
+    alone = count == 0 or (count == 1 and arguments.args[0].arg in ("self", "cls"))
+    return alone and (ast.get_docstring(node) or "").startswith("Return")
+
+
+def main(files: list[str]) -> int:
+    """Print the findings; return 1 if there are any."""
+    config = parse_config(Path(__file__).parent.parent)
+    findings = 0
+    for file in files:
+        functions = [
+            node
+            for node in ast.walk(ast.parse(Path(file).read_text(encoding="utf-8")))
+            if isinstance(node, ast.FunctionDef)
+        ]
+        mild = {node.lineno for node in functions if says_what_it_returns(node)}
+        inner = {
+            node.lineno
+            for outer in functions
+            for node in ast.walk(outer)
+            if isinstance(node, ast.FunctionDef) and node is not outer
+        }
+        for place, name, check, description in process_file(file, config):
+            line = int(place.rpartition(":")[2])
+            if line in inner or (check == "RT01" and line in mild):
+                continue
+            print(f"{place}: {name}: {check} {description}")
+            findings += 1
+    return int(findings > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
