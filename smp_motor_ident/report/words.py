@@ -53,6 +53,22 @@ def label(name: str) -> str:
     return name.replace("_", " ").strip().capitalize()
 
 
+def model(name: str) -> str:
+    """Return a model's name in words.
+
+    Parameters
+    ----------
+    name : str
+        Rung of the ladder.
+
+    Returns
+    -------
+    str
+        What it describes.
+    """
+    return MODELS.get(name, name.replace("_", " "))
+
+
 def number(value: float | None, std: float | None = None) -> str:
     """Return a number with the digits that its standard deviation supports.
 
