@@ -20,7 +20,7 @@ import subprocess
 import sys
 import sysconfig
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import IO
 
@@ -288,7 +288,7 @@ def prepare(lock: IO[str]) -> bool:
     check_machine(ros)
     READY.unlink(missing_ok=True)
     version = ".".join(map(str, sys.version_info[:3]))
-    stages = {
+    stages: dict[str, tuple[str, Callable[[], None]]] = {
         "python": (f"Python {version} in .venv", lambda: make_venv(ros, lock)),
         "packages": (
             f"the packages of {requirements(ros).relative_to(ROOT)} (about a minute)",
