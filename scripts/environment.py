@@ -254,13 +254,20 @@ def patch_cmake_files(env: dict[str, str]) -> None:
 
 
 def build(package: str, ros: str, lock: IO[str]) -> None:
-    """Build one package from scratch; its Python and data files are links into the source."""
-    for folder in ("build", "install"):
-        shutil.rmtree(ROOT / folder / package, ignore_errors=True)
+    """Build one package; its Python and data files become links into the source."""
     arguments = [f"-DPython3_EXECUTABLE={VENV}/bin/python", "-DBUILD_TESTING=OFF"]
     command = [f"{VENV}/bin/python", "-m", "colcon", "build", "--symlink-install"]
     command += ["--packages-select", package, "--event-handlers", "console_direct+"]
     run([*command, "--cmake-args", *arguments], environment(ros), lock)
+    for path in (ROOT / "install" / package).rglob("*"):
+        if path.is_symlink() and not path.exists():
+            path.unlink()  # its source is gone
+
+
+def build_interfaces(ros: str, lock: IO[str]) -> None:
+    for folder in ("build", "install"):
+        shutil.rmtree(ROOT / folder / "smp_interfaces", ignore_errors=True)
+    build("smp_interfaces", ros, lock)
 
 
 def verify(ros: str, lock: IO[str]) -> None:
@@ -296,7 +303,7 @@ def prepare(lock: IO[str]) -> bool:
         ),
         "interfaces": (
             "the messages of smp_interfaces",
-            lambda: build("smp_interfaces", ros, lock),
+            lambda: build_interfaces(ros, lock),
         ),
         "package": ("smp_motor_control", lambda: build("smp_motor_control", ros, lock)),
     }

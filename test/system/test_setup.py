@@ -1,0 +1,180 @@
+"""The set-up: one clear line when something is missing, redone only when its inputs change."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+INPUTS = ["scripts", "requirements", "smp_interfaces", "resource", "setup.py", "setup.cfg"]
+INPUTS += ["package.xml", "setup.bash", "colcon_defaults.yaml"]
+BASE = str(getattr(sys, "_base_executable", sys.executable))
+# The ROS of the shell that runs the tests, if there is one.
+ROS = {
+    k: os.environ[k] for k in ("ROS_DISTRO", "AMENT_PREFIX_PATH", "PYTHONPATH") if k in os.environ
+}
+# What the script itself calls, and none of the tools that it has to find.
+SHELL_TOOLS = ("sh", "bash", "dirname", "uname", "env")
+
+
+@pytest.fixture
+def clone(tmp_path):
+    """A copy of the files that the set-up reads, in which nothing is set up."""
+    folder = tmp_path / "clone"
+    folder.mkdir()
+    for name in INPUTS:
+        if (ROOT / name).is_dir():
+            shutil.copytree(ROOT / name, folder / name)
+        else:
+            shutil.copy2(ROOT / name, folder / name)
+    return folder
+
+
+@pytest.fixture
+def machine(tmp_path):
+    """A folder for PATH that holds little more than a shell."""
+    folder = tmp_path / "bin"
+    folder.mkdir()
+    for tool in SHELL_TOOLS:
+        found = shutil.which(tool)
+        assert found
+        (folder / tool).symlink_to(found)
+    return folder
+
+
+def run(clone, path, *, command=("scripts/setup.sh",), **extra):
+    return subprocess.run(
+        command,
+        cwd=clone,
+        env={"PATH": str(path), "HOME": str(clone), **extra},
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+def assert_refused(result, clone, *words):
+    """The last line is the only one on stderr, holds the words, and nothing counts as set up."""
+    assert result.returncode == 1
+    assert result.stderr.count("\n") == 1, result.stderr
+    for word in words:
+        assert word in result.stderr
+    assert not (clone / ".venv" / "ready").exists()
+
+
+def test_missing_python_says_what_to_install(clone, machine):
+    assert_refused(run(clone, machine), clone, "no Python 3.10 to 3.13", "apt install python3")
+
+
+def test_python_out_of_range_is_named(clone, machine):
+    false = shutil.which("false")
+    assert_refused(run(clone, machine, PYTHON=false), clone, false, "not a Python 3.10 to 3.13")
+
+
+def test_unsupported_processor_is_named(clone, machine):
+    (machine / "uname").unlink()
+    (machine / "uname").write_text('#!/bin/sh\n[ "$1" = -s ] && echo Linux || echo aarch64\n')
+    (machine / "uname").chmod(0o755)
+    assert_refused(run(clone, machine), clone, "Linux on aarch64 is not supported", "x86_64")
+
+
+def test_missing_build_tools_are_all_named_at_once(clone, machine):
+    result = run(clone, machine, PYTHON=BASE)
+    assert_refused(result, clone, "C compiler", "C++ compiler", "cmake", "make", "apt install")
+    assert not (clone / ".venv").exists()
+
+
+def test_another_ros_distribution_is_refused(clone):
+    result = run(clone, os.environ["PATH"], PYTHON=BASE, ROS_DISTRO="humble")
+    assert_refused(result, clone, "humble", "Jazzy")
+
+
+def test_ros_that_is_only_half_sourced_is_refused(clone):
+    result = run(clone, os.environ["PATH"], PYTHON=BASE, ROS_DISTRO="jazzy")
+    assert_refused(result, clone, "AMENT_PREFIX_PATH", "source /opt/ros/jazzy/setup.bash")
+
+
+def test_failed_installation_is_not_taken_as_done(clone):
+    # Port 9 of this machine: nothing listens there, as where no network is.
+    network = {"PIP_INDEX_URL": "http://127.0.0.1:9/simple", "PIP_RETRIES": "1"}
+    network |= {"PIP_CONFIG_FILE": os.devnull, "PIP_NO_CACHE_DIR": "1"}
+    result = run(clone, os.environ["PATH"], PYTHON=BASE, **network)
+    assert_refused(result, clone, "package index cannot be reached", "setup.log")
+    shell = run(clone, os.environ["PATH"], command=("bash", "-uc", ". ./setup.bash"))
+    assert_refused(shell, clone, "not set up yet", "make -C")
+
+
+def keys(clone):
+    script = "import json, environment; print(json.dumps(environment.stage_keys('')))"
+    result = run(clone / "scripts", os.environ["PATH"], command=(BASE, "-c", script))
+    return json.loads(result.stdout)
+
+
+@pytest.mark.parametrize(
+    ("path", "stages"),
+    [
+        ("requirements/wheels.txt", {"packages"}),
+        ("smp_interfaces/msg/MotorState.msg", {"interfaces", "package"}),
+        ("setup.py", {"package"}),
+        ("config/new.yaml", {"package"}),
+        ("smp_motor_control/motor.py", set()),
+    ],
+)
+def test_change_redoes_only_the_stages_that_depend_on_it(clone, path, stages):
+    before = keys(clone)
+    changed = clone / path
+    changed.parent.mkdir(exist_ok=True)
+    with changed.open("a", encoding="utf-8") as file:
+        file.write("# changed\n")
+    after = keys(clone)
+    assert {name for name in before if before[name] != after[name]} == stages
+
+
+def test_second_set_up_waits_for_the_first(clone, process, eventually):
+    with (clone / ".setup.lock").open("w", encoding="ascii") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        second = process("scripts/setup.sh", cwd=clone, env={"PYTHON": BASE, "ROS_DISTRO": "jazzy"})
+        eventually(lambda: "waiting" in second.output)
+        assert second.returncode is None
+    # Let in, it goes on to what is wrong with this machine: no ROS where one is said to be.
+    assert second.wait(30.0) == 1
+
+
+@pytest.fixture
+def ready():
+    if not (ROOT / ".venv" / "ready").is_file():
+        pytest.skip("this tree was built by colcon alone")
+
+
+def test_set_up_that_is_done_has_nothing_to_say(ready):
+    for _ in range(2):  # the first may still have something to do
+        started = time.monotonic()
+        result = run(ROOT, os.environ["PATH"], **ROS)
+        elapsed = time.monotonic() - started
+    assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
+    assert elapsed < 3.0  # what a second `make test` may take before it begins to test
+
+
+def test_shell_from_another_folder_finds_the_executables_and_the_messages(ready, tmp_path):
+    script = (
+        f"set -eu; . '{ROOT}/setup.bash'; command -v wheel_pid identify demo;"
+        " python -c 'import rclpy; from smp_interfaces.msg import MotorState; print(MotorState())'"
+    )
+    result = run(tmp_path, "/usr/bin:/bin", command=("bash", "-c", script))
+    assert result.returncode == 0, result.stderr
+    assert "encoder_count=0" in result.stdout
+
+
+def test_shell_leaves_discovery_to_its_user(ready, tmp_path):
+    script = f". '{ROOT}/setup.bash'; env | grep -c '^ROS_AUTOMATIC_DISCOVERY_RANGE'"
+    assert run(tmp_path, "/usr/bin:/bin", command=("bash", "-c", script)).stdout == "0\n"
