@@ -160,6 +160,12 @@ class Plant:
         """Return the number of motors."""
         return int(self.phi.shape[0])
 
+    def repeated(self, n: int) -> Plant:
+        """Return a batch of ``n`` copies of a batch of one, for ``n`` controllers."""
+        arrays = (self.phi, self.taps, self.phi_angle, self.taps_angle)
+        phi, taps, phi_angle, taps_angle = (np.repeat(x, n, axis=0) for x in arrays)
+        return Plant(phi, taps, phi_angle, taps_angle, self.sample_time, self.window, self.motors)
+
     def response(self, omega: Array, *, window: int | None = None) -> Complex:
         """Return the frequency response from controller output to measured speed.
 

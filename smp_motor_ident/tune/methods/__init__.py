@@ -2,13 +2,25 @@
 
 from smp_motor_ident.tune.methods.amigo import AMIGO
 from smp_motor_ident.tune.methods.margin import MARGIN
+from smp_motor_ident.tune.methods.optimise import OPTIMISE
 from smp_motor_ident.tune.methods.pole_placement import POLE_PLACEMENT
+from smp_motor_ident.tune.methods.relay import RELAY
 from smp_motor_ident.tune.methods.simc import LAMBDA, SIMC
 from smp_motor_ident.tune.methods.ziegler_nichols import TYREUS_LUYBEN, ZIEGLER_NICHOLS
 
 METHODS = {
     method.name: method
-    for method in (MARGIN, POLE_PLACEMENT, SIMC, LAMBDA, AMIGO, ZIEGLER_NICHOLS, TYREUS_LUYBEN)
+    for method in (
+        MARGIN,
+        OPTIMISE,
+        POLE_PLACEMENT,
+        SIMC,
+        LAMBDA,
+        AMIGO,
+        ZIEGLER_NICHOLS,
+        TYREUS_LUYBEN,
+        RELAY,
+    )
 }
 """Every method by its name."""
 
