@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import datetime
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -68,6 +69,12 @@ def parser() -> argparse.ArgumentParser:
     aim.add_argument("--transition-time", type=float, help="of a change of set-point [s]")
     p.add_argument("--sets", choices=("auto", "one", "each"), default="auto",
                    help="one set of gains for all wheels, or one each")  # fmt: skip
+    p.add_argument(
+        "--apply",
+        action="store_true",
+        help="set the gains in the running wheels, watch, take them back if a loop misbehaves",
+    )
+    p.add_argument("--watch", type=float, default=3.0, help="trial after --apply [s]")
     p.add_argument("--force", action="store_true", help="replace files that exist")
     return p
 
@@ -115,6 +122,10 @@ def _work(arguments: argparse.Namespace) -> int:
         document = to_json(gains_document(wheels.designs, told, wheels.reason))
         write_together(dict(zip(files, (text, document), strict=True)), arguments.force)
         print(f"written: {files[0]} and {files[1].name}")
+    if arguments.apply:
+        from smp_motor_ident.commands.applying import apply
+
+        return 0 if apply(wheels.designs, arguments.watch) else 1
     return 0
 
 
@@ -285,3 +296,7 @@ def _provenance(
         lines.append(f"  {design.reason}")
         lines.extend(f"  warning: {warning}" for warning in design.warnings)
     return lines
+
+
+if __name__ == "__main__":
+    sys.exit(main())
