@@ -159,7 +159,6 @@ def read_estimates(source: Path) -> dict[str, Estimate]:
     if source.suffix not in (".yaml", ".yml"):
         return read_identification(source)
     from smp_motor_control.motor_file import load_motors
-
     from smp_motor_ident.record import Hardware
 
     estimates = {}
