@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from smp_motor_ident._compile import compiled
 from smp_motor_ident.tune.arrays import Array
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.plant import Plant
@@ -91,42 +92,91 @@ def simulate(
     -------
     Response
     """
-    n, m, s = plant.taps.shape
-    T, window = plant.sample_time, plant.window
-    fb = controller.feedback
+    n, steps, fb = len(plant), reference.size, controller.feedback
+    numbers = (
+        fb.p,
+        fb.i,
+        fb.d,
+        fb.filter_time,
+        controller.weight,
+        controller.velocity,
+        controller.acceleration,
+        controller.limit,
+        1.0 / np.asarray(controller.tracking),
+    )
+    speed, voltage = _run(
+        plant.phi,
+        plant.taps,
+        plant.phi_angle,
+        plant.taps_angle,
+        plant.sample_time,
+        plant.window,
+        np.stack([np.broadcast_to(np.asarray(x, dtype=np.float64), n) for x in numbers], axis=1),
+        np.asarray(reference, dtype=np.float64),
+        np.zeros(steps) if acceleration is None else acceleration,
+        np.zeros(steps) if load is None else load,
+        count_angle,
+    )
+    return Response(plant.sample_time * np.arange(steps), speed, voltage)
+
+
+@compiled
+def _run(
+    phi: Array,
+    taps: Array,
+    phi_angle: Array,
+    taps_angle: Array,
+    T: float,
+    window: int,
+    controllers: Array,
+    reference: Array,
+    acceleration: Array,
+    load: Array,
+    count_angle: float,
+) -> tuple[Array, Array]:
+    n, m, s = taps.shape
     steps = reference.size
-    x, past = np.zeros((n, s)), np.zeros((n, m))
-    # The load acts at once, the controller's voltage after its delay.
-    direct, direct_angle = plant.taps.sum(axis=1), plant.taps_angle.sum(axis=1)
-    loads = np.zeros(steps) if load is None else load
-    ahead = np.zeros(steps) if acceleration is None else acceleration
-    angle = np.zeros((window + 1, n))
-    integral, previous, rate = np.zeros(n), np.zeros(n), np.zeros(n)
-    speed, voltage = np.empty((steps, n)), np.empty((steps, n))
-    for k in range(steps):
-        speed[k] = x[:, 0]
-        if window:
-            seen = np.floor(angle / count_angle) * count_angle if count_angle else angle
-            measured = (seen[0] - seen[-1]) / (window * T)
-        else:
-            measured = x[:, 0]
-        rate = (fb.filter_time * rate + (previous - measured)) / (fb.filter_time + T)
-        previous = measured
-        feedforward = controller.velocity * reference[k] + controller.acceleration * ahead[k]
-        wanted = fb.p * (controller.weight * reference[k] - measured) + integral + fb.d * rate
-        wanted = wanted + feedforward
-        given = np.clip(wanted, -controller.limit, controller.limit)
-        integral = integral + T * (
-            fb.i * (reference[k] - measured) + (given - wanted) / controller.tracking
-        )
-        voltage[k] = given
-        past = np.concatenate([np.broadcast_to(given, n)[:, None], past[:, :-1]], axis=1)
-        swept = np.einsum("ns,ns->n", plant.phi_angle, x)
-        swept += np.einsum("nm,nm->n", plant.taps_angle, past) - direct_angle * loads[k]
-        angle = np.concatenate([(angle[0] + swept)[None], angle[:-1]])
-        x = np.einsum("nij,nj->ni", plant.phi, x) + np.einsum("nms,nm->ns", plant.taps, past)
-        x -= direct * loads[k]
-    return Response(T * np.arange(steps), speed.T, voltage.T)
+    speed, voltage = np.empty((n, steps)), np.empty((n, steps))
+    for j in range(n):
+        p, i, d, filter_time, weight, velocity, lead, limit, back = controllers[j]
+        x, following, past = np.zeros(s), np.zeros(s), np.zeros(m)
+        angle = np.zeros(window + 1)
+        integral = previous = rate = 0.0
+        for k in range(steps):
+            measured = x[0]
+            if window > 0:
+                newest, oldest = angle[0], angle[window]
+                if count_angle > 0.0:
+                    newest = math.floor(newest / count_angle) * count_angle
+                    oldest = math.floor(oldest / count_angle) * count_angle
+                measured = (newest - oldest) / (window * T)
+            rate = (filter_time * rate + previous - measured) / (filter_time + T)
+            previous = measured
+            wanted = p * (weight * reference[k] - measured) + integral + d * rate
+            wanted += velocity * reference[k] + lead * acceleration[k]
+            given = min(max(wanted, -limit), limit)
+            integral += T * (i * (reference[k] - measured) + (given - wanted) * back)
+            speed[j, k], voltage[j, k] = x[0], given
+            for q in range(m - 1, 0, -1):
+                past[q] = past[q - 1]
+            past[0] = given
+            swept = 0.0
+            following[:] = 0.0
+            for a in range(s):
+                swept += phi_angle[j, a] * x[a]
+                for b in range(s):
+                    following[a] += phi[j, a, b] * x[b]
+            # The load acts at once, the controller's voltage after its delay.
+            for q in range(m):
+                volts = past[q] - load[k]
+                swept += taps_angle[j, q] * volts
+                for a in range(s):
+                    following[a] += taps[j, q, a] * volts
+            for q in range(window, 0, -1):
+                angle[q] = angle[q - 1]
+            angle[0] += swept
+            x[:] = following
+    return speed, voltage
 
 
 def minimum_jerk(distance: float, duration: float, time: Array) -> tuple[Array, Array]:
