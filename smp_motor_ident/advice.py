@@ -1,0 +1,121 @@
+"""What the result means in words: doubts about it, and what to record to know more."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from smp_motor_ident import models
+from smp_motor_ident import recursion as rc
+from smp_motor_ident.answer import Answer
+from smp_motor_ident.experiments import Experiments
+from smp_motor_ident.fit import Fit
+from smp_motor_ident.models import PHYSICAL
+from smp_motor_ident.result import ResidualTests
+
+
+def doubts(
+    fit: Fit,
+    result: Answer,
+    estimation: float,
+    validation: float | None,
+    tests: ResidualTests,
+    data: Experiments,
+) -> list[str]:
+    """Return warnings about an estimate.
+
+    Parameters
+    ----------
+    fit, result : Fit, Answer
+        The estimate.
+    estimation, validation : float
+        Fit percent.
+    tests : ResidualTests
+        Of the innovations.
+    data : Experiments
+        What was fitted.
+
+    Returns
+    -------
+    list of str
+        Empty where nothing speaks against the result.
+    """
+    out = []
+    s = fit.structure
+    if not fit.converged:
+        out.append("doubtful: the fit did not settle; record a longer or stronger excitation")
+    if estimation < 70:
+        out.append(f"doubtful: the model explains only {estimation:.0f} % of the speed")
+    if validation is not None and validation < estimation - 15:
+        out.append(
+            f"doubtful: held-out data fit {validation:.0f} % against {estimation:.0f} %; the "
+            "motor or its load changed, or the excitation was too poor"
+        )
+    if tests.independent_of_input is False and estimation < 95:
+        out.append(
+            "the residuals still follow the voltage: the motor does something that the model does not"
+        )
+    if s.offset and s.current:
+        offset = fit.z[models.OFFSET]
+        out.append(
+            f"current has an offset of {1e3 * offset:.3g} mA, removed; zero the sensor at rest"
+        )
+    if s.window or "window" in s.held:
+        window = fit.z[models.WINDOW]
+        out.append(
+            f"the speed is averaged over {1e3 * window:.3g} ms: {1e3 * window / 2:.3g} ms of what "
+            "looks like a delay is that filter, not the motor"
+        )
+    if fit.ratio > 0 and data.kind == rc.ANGLE:
+        out.append("the load torque fluctuates; the estimate allows for it (innovations form)")
+    return out
+
+
+def advise(fit: Fit, result: Answer, known: Mapping[str, float]) -> list[str]:
+    """Return what to record or measure to know what is not known.
+
+    Parameters
+    ----------
+    fit, result : Fit, Answer
+        The estimate.
+    known : mapping of str to float
+        What the user fixed.
+
+    Returns
+    -------
+    list of str
+        One sentence each.
+    """
+    missing = [n for n in PHYSICAL if result.parameters[n].status == "unidentifiable"]
+    out = []
+    s = fit.structure
+    if missing and not s.current:
+        words = ", ".join(missing)
+        out.append(
+            f"voltage and speed alone cannot separate {words}: any of a family of motors answers "
+            "the same; record the motor current too, the combinations are what is known"
+        )
+        if "resistance" not in known:
+            out.append(
+                "with the resistance measured by ohmmeter one unknown less remains, yet not all "
+                "can be separated without current"
+            )
+    if missing and s.current:
+        if "inductance" in missing:
+            out.append(
+                "inductance does not show at this rate: sample faster or excite at higher frequency"
+            )
+        others = [n for n in missing if n != "inductance"]
+        if others:
+            out.append(
+                f"{', '.join(others)}: excite harder, longer, over more frequencies and in both directions"
+            )
+    free = s.free()
+    if models.VC_PLUS in free and s.friction != "none":
+        cov = fit.covariance()
+        i = free.index(models.VC_PLUS)
+        std = float(np.sqrt(cov[i, i]))
+        if std > 0.5 * abs(fit.z[models.VC_PLUS]) and std > 0.05:
+            out.append("static friction hardly shows: drive both directions, slowly through zero")
+    return out

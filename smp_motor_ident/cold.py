@@ -1,0 +1,328 @@
+"""From a cold start to the right minimum: rank candidates, grow the horizon, find the noise.
+
+Derivation: docs/derivations.md, sections 8 and 10.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smp_motor_ident import fit as fitting
+from smp_motor_ident import models, start
+from smp_motor_ident import recursion as rc
+from smp_motor_ident.experiments import Experiments
+from smp_motor_ident.fit import Fit, Prior, solve
+from smp_motor_ident.models import Structure
+
+Array = NDArray[np.float64]
+Progress = Callable[[str], None]
+
+HEAD = 12_000  # samples on which candidates and noise levels are compared
+
+
+@dataclass(frozen=True)
+class Options:
+    """What the user asked of a fit.
+
+    Attributes
+    ----------
+    huber : float
+        Bound of the robust loss [standard deviations]; infinite for least squares.
+    priors : tuple of Prior
+        Physical parameters that are known.
+    lower, upper : ndarray, shape (11,), optional
+        Bounds of z.
+    """
+
+    huber: float = np.inf
+    priors: tuple[Prior, ...] = ()
+    lower: Array | None = None
+    upper: Array | None = None
+
+
+def ratio_of(bandwidth: float, step: float, kind: int) -> float:
+    """Return the torque-noise ratio at which the innovations follow with a bandwidth.
+
+    Parameters
+    ----------
+    bandwidth : float
+        [rad/s].
+    step : float
+        Sampling interval [s].
+    kind : int
+        Of the output.
+
+    Returns
+    -------
+    float
+        For `fit.kalman_gain`.
+    """
+    return bandwidth ** (4 if kind == rc.ANGLE else 2) * step
+
+
+def first_noise(data: Experiments) -> Array:
+    """Return a first guess of the residuals' covariance, from resolution and scatter."""
+    y = data.output[:HEAD]
+    rough = np.nanvar(np.diff(y, n=4)) / 70 if y.size > 8 else np.nanvar(y)
+    v0 = max(data.quantum**2 / 12, 1e-12 * np.nanvar(y), 1e-4 * rough, 1e-18)
+    v1 = 1.0
+    if data.current.size:
+        i = data.current[:HEAD]
+        v1 = max(np.nanvar(np.diff(i, n=2)) / 6 * 0.1, 1e-8 * np.nanvar(i), 1e-12)
+    return np.diag([float(v0), float(v1)])
+
+
+def candidates(data: Experiments, structure: Structure) -> list[Array]:
+    """Return starting coordinates for a structure, from linear regressions.
+
+    Parameters
+    ----------
+    data : Experiments
+        Prepared records.
+    structure : Structure
+        What will be fitted.
+
+    Returns
+    -------
+    list of ndarray, shape (11,)
+        Unranked.
+    """
+    found = start.current_candidates(data) if structure.current else []
+    if not found:
+        found = start.speed_candidates(data, structure.order)
+    if not found and structure.order == 2:
+        for z in start.speed_candidates(data, 1):
+            z[models.A2] = 2 * z[models.A1] - z[models.A0] - np.log(20)
+            z[models.TE] = z[models.A2] - z[models.A1]
+            found.append(z)
+    for z in found:
+        if structure.window:
+            z[models.WINDOW] = 2 * data.step
+    return found
+
+
+def _bandwidth(z: Array, data: Experiments) -> float:
+    return float(min(np.exp(z[models.A0] - z[models.A1]), 0.2 / data.step))
+
+
+def cold_fit(
+    data: Experiments,
+    structure: Structure,
+    options: Options,
+    extra: Sequence[Array] = (),
+    keep: int = 3,
+    own: bool = True,
+) -> Fit | None:
+    """Fit a structure without any guess.
+
+    Parameters
+    ----------
+    data : Experiments
+        Prepared records.
+    structure : Structure
+        What is free.
+    options : Options
+        Loss and prior knowledge.
+    extra : sequence of ndarray, shape (11,)
+        Further starts, such as a simpler structure's answer.
+    keep : int
+        How many of the ranked candidates are refined.
+    own : bool
+        Whether the regressions' candidates join ``extra``.
+
+    Returns
+    -------
+    Fit or None
+        None where no candidate could be simulated.
+    """
+    head = data.head(min(8.0, HEAD * data.step))
+    starts = [
+        structure.complete(z) for z in [*extra, *(candidates(data, structure) if own else [])]
+    ]
+    starts = [z for z in starts if np.all(np.isfinite(z))]
+    if not starts:
+        return None
+    ranked = sorted(starts, key=lambda z: _score(head, structure, z))
+    best: Fit | None = None
+    tried: list[Array] = []
+    for z in ranked:
+        if any(_alike(z, other, data.step) for other in tried):
+            continue
+        tried.append(z)
+        ratio = ratio_of(_bandwidth(z, head), head.step, head.kind)
+        one = _solve(head, structure, z, head.initial, first_noise(head), ratio, options, 25)
+        if best is None or one.deviance < best.deviance:
+            best = one
+        if len(tried) == keep:
+            break
+    assert best is not None
+    return grow(data, structure, best, options)
+
+
+def _alike(z: Array, other: Array, step: float) -> bool:
+    d = np.abs(z - other)
+    late = max(d[models.DELAY], d[models.WINDOW]) / step
+    return bool(d[:5].max() < 0.05 and late < 0.5)
+
+
+def refine(data: Experiments, structure: Structure, near: Fit, z: Array, options: Options) -> Fit:
+    """Fit a structure from another's answer on the same data.
+
+    Parameters
+    ----------
+    data : Experiments
+        Prepared records.
+    structure : Structure
+        What is free now.
+    near : Fit
+        The other's answer.
+    z : ndarray, shape (11,)
+        Coordinates to start from.
+    options : Options
+        Loss and prior knowledge.
+
+    Returns
+    -------
+    Fit
+        With the noise ratio of ``near``.
+    """
+    return _solve(data, structure, z, _initial(data, near), near.noise, near.ratio, options, 30)
+
+
+def _score(head: Experiments, structure: Structure, z: Array) -> float:
+    """Return the deviance of a candidate on the innovations (robust against drift)."""
+    ratio = ratio_of(_bandwidth(z, head), head.step, head.kind)
+    noise = first_noise(head)
+    relative = noise[1, 1] / noise[0, 0] if head.current.size else 0.0
+    gain, _ = fitting.kalman_gain(z, structure.order, head.kind, head.step, ratio, relative)
+    spread = fitting.run_spread(head, structure, z, gain, noise)
+    value = fitting.deviance(spread)
+    return value if np.isfinite(value) else np.inf
+
+
+def _solve(
+    data: Experiments,
+    structure: Structure,
+    z: Array,
+    initial: Array,
+    noise: Array,
+    ratio: float,
+    options: Options,
+    iterations: int,
+) -> Fit:
+    return solve(
+        data,
+        structure,
+        z,
+        initial,
+        noise,
+        ratio,
+        options.huber,
+        options.priors,
+        iterations,
+        lower=options.lower,
+        upper=options.upper,
+    )
+
+
+def grow(data: Experiments, structure: Structure, first: Fit, options: Options) -> Fit:
+    """Find the noise ratio on a growing horizon, then fit all data.
+
+    Parameters
+    ----------
+    data : Experiments
+        Prepared records.
+    structure : Structure
+        What is free.
+    first : Fit
+        On the head of the data, with a high ratio.
+    options : Options
+        Loss and prior knowledge.
+
+    Returns
+    -------
+    Fit
+        On all data.
+    """
+    part = data.head(min(HEAD * data.step, 60.0))
+    best = _find_ratio(part, structure, first, options)
+    if part.size == data.size:
+        return best
+    horizon = part.size * 4
+    while horizon < data.size and best.ratio == 0:
+        longer = data.head(horizon * data.step)
+        best = _solve(
+            longer, structure, best.z, _initial(longer, best), best.noise, best.ratio, options, 8
+        )
+        horizon *= 6
+    return _solve(
+        data, structure, best.z, _initial(data, best), best.noise, best.ratio, options, 25
+    )
+
+
+def _initial(data: Experiments, fit: Fit) -> Array:
+    initial = data.initial.copy()
+    n = min(len(initial), len(fit.initial))
+    initial[:n] = fit.initial[:n]
+    return initial
+
+
+def _find_ratio(part: Experiments, structure: Structure, first: Fit, options: Options) -> Fit:
+    """Walk from following to free run; keep the likeliest ratio of torque noise."""
+    # A speed output survives torque noise in free run, and free run has no bias where the
+    # model is not the motor; the innovations form is for angles, which drift.
+    if part.kind != rc.ANGLE:
+        return _at_rest(
+            part,
+            structure,
+            _solve(part, structure, first.z, _initial(part, first), first.noise, 0.0, options, 30),
+            options,
+        )
+    band = _bandwidth(first.z, part)
+    path: list[tuple[float, Fit]] = []
+    here = first
+    for factor in (1.0, 0.3, 0.1, 0.03, 0.01, 0.0):
+        ratio = ratio_of(band * factor, part.step, part.kind)
+        here = _at_rest(
+            part,
+            structure,
+            _solve(part, structure, here.z, _initial(part, here), here.noise, ratio, options, 20),
+            options,
+        )
+        path.append((factor, here))
+        worst = here.deviance - min(f.deviance for _, f in path)
+        if worst > 60 and factor > 0 and here.converged:
+            break
+    factor, best = min(path, key=lambda item: item[1].deviance)
+    if factor == 0.0:
+        return best
+    for finer in (1.8, 1 / 1.8):
+        while True:
+            ratio = ratio_of(band * factor * finer, part.step, part.kind)
+            here = _solve(part, structure, best.z, best.initial, best.noise, ratio, options, 12)
+            if here.deviance >= best.deviance - 0.5:
+                break
+            best, factor = here, factor * finer
+            if factor > 30:
+                break
+    return best
+
+
+def _at_rest(data: Experiments, structure: Structure, fit: Fit, options: Options) -> Fit:
+    """Try whether segments that begin slowly began at rest: friction makes that a kink."""
+    if structure.friction == "none":
+        return fit
+    first = np.abs(fit.initial[:, 1])
+    slow = (first > 0) & (
+        first < 0.05 * np.exp(-fit.z[models.A0]) * np.abs(data.section_value).max()
+    )
+    if not slow.any():
+        return fit
+    initial = fit.initial.copy()
+    initial[slow, :2] = 0.0
+    other = _solve(data, structure, fit.z, initial, fit.noise, fit.ratio, options, 12)
+    return other if other.deviance < fit.deviance else fit

@@ -1,0 +1,294 @@
+"""The one door: records of a motor in, an `Estimate` out, or a refusal that says why."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smp_motor_ident import ladder, models, validate
+from smp_motor_ident import recursion as rc
+from smp_motor_ident.advice import advise, doubts
+from smp_motor_ident.answer import Answer, answer
+from smp_motor_ident.cold import Options, refine
+from smp_motor_ident.errors import InsufficientExcitationError, ParameterError, SignalError
+from smp_motor_ident.experiments import Experiments, prepare
+from smp_motor_ident.fit import Fit, Prior
+from smp_motor_ident.ladder import Rung
+from smp_motor_ident.models import MODELS, PHYSICAL, Structure
+from smp_motor_ident.record import Record
+from smp_motor_ident.result import Candidate, Estimate, FitPercent
+from smp_motor_ident.screening import screen
+
+Array = NDArray[np.float64]
+
+LOSSES = {"linear": np.inf, "huber": 2.0}
+FIXABLE = (*PHYSICAL, "delay", "averaging_window")
+WORST_FIT = 30.0
+
+
+def estimate(
+    records: Record | Sequence[Record],
+    model: str = "auto",
+    *,
+    fixed: Mapping[str, float] | None = None,
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    loss: str = "linear",
+    validation: Sequence[Record] | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> Estimate:
+    """Estimate a motor from recordings, from cold, with what is and is not known.
+
+    Output-error or innovations least squares on counts, angle or speed (and current where
+    it is measured) with analytic sensitivities; no initial guess is needed.
+
+    Parameters
+    ----------
+    records : Record or sequence of Record
+        Of one motor; each record (and segment) has its own initial state.
+    model : str
+        ``auto``, or a rung of the ladder: ``static_gain``, ``first_order``,
+        ``second_order``, ``electromechanical``.
+    fixed : mapping of str to float, optional
+        Parameters that the user knows, by the names of `models.PHYSICAL` or ``delay``,
+        ``averaging_window``; SI, at the motor shaft.
+    bounds : mapping of str to (float, float), optional
+        Limits of parameters or combinations.
+    loss : {'linear', 'huber'}
+        Least squares, or a robust loss where there are outliers.
+    validation : sequence of Record, optional
+        Held-out records; by default the last part of ``records`` is held out for the
+        validation figure, and used again for the final estimate.
+    progress : callable, optional
+        Told in words what is being done.
+
+    Returns
+    -------
+    Estimate
+        Values with standard deviations; what cannot be told has no value.
+
+    Raises
+    ------
+    InsufficientExcitationError
+        When the data do not support the answer.
+    SignalError
+        When the data contradict themselves or a motor's physics.
+    ParameterError
+        When ``model``, ``fixed``, ``bounds`` or ``loss`` make no sense.
+
+    References
+    ----------
+    docs/derivations.md; Ljung, System Identification, 2nd ed., sections 7.4 and 9.
+    """
+    group = [records] if isinstance(records, Record) else list(records)
+    say = progress or (lambda _: None)
+    known = _checked(model, fixed, loss, group)
+    warnings = screen(group)
+    warnings += [note for r in group for note in r.notes]
+    use_current = _has_current(group) and model in ("auto", "electromechanical")
+    data = prepare(group, use_current)
+    base = _structure(model, use_current, known, group)
+    if base.window or "window" in base.held:
+        data = data.as_mean_speed()
+    options = Options(huber=LOSSES[loss])
+    rungs = ladder.explore(data, base, options, model == "auto", say)
+    if not rungs:
+        raise InsufficientExcitationError(
+            f"{_where(group)}: no motor model explains these data; record 20 s or more of a "
+            "square or Fourier voltage that turns the motor in both directions"
+        )
+    chosen = _constrain(_for_final(data, rungs[-1].fit), rungs[-1].fit, options, known, bounds)
+    final = _for_final(data, chosen)
+    result = answer(chosen, known)
+    fitted = validate.speed_fit(group, final, chosen)
+    _refuse(group, chosen, result, fitted)
+    say("validating")
+    held = _validation(group, validation, chosen, options, use_current)
+    tests = validate.residual_tests(final, chosen)
+    return Estimate(
+        wheel=group[0].wheel,
+        model=_name(chosen.structure),
+        parameters=result.parameters,
+        combinations=result.combinations,
+        names=result.names,
+        covariance=result.covariance,
+        fit_percent=FitPercent(fitted, held),
+        candidates=_candidates(rungs, chosen, group, data),
+        residuals=tests,
+        warnings=tuple(
+            dict.fromkeys(warnings + doubts(chosen, result, fitted, held, tests, final))
+        ),
+        advice=tuple(advise(chosen, result, known)),
+        samples=data.size,
+        duration=float(sum(r.duration for r in group)),
+        sample_time=data.step,
+        sources=tuple(dict.fromkeys(r.source for r in group if r.source)),
+        hardware=group[0].hardware,
+    )
+
+
+def _where(group: Sequence[Record]) -> str:
+    sources = ", ".join(dict.fromkeys(r.source for r in group if r.source))
+    return f"{sources or 'record'}: {group[0].wheel}"
+
+
+def _checked(
+    model: str, fixed: Mapping[str, float] | None, loss: str, group: Sequence[Record]
+) -> dict[str, float]:
+    if not group:
+        raise ParameterError("estimate needs at least one record")
+    if model != "auto" and model.removesuffix("_asymmetric") not in MODELS:
+        raise ParameterError(f"model {model!r} is not one of auto, {', '.join(MODELS)}")
+    if loss not in LOSSES:
+        raise ParameterError(f"loss {loss!r} is not one of {', '.join(LOSSES)}")
+    known = dict(fixed or {})
+    for name, value in known.items():
+        if name not in FIXABLE:
+            raise ParameterError(f"fixed {name!r} is not one of {', '.join(FIXABLE)}")
+        positive = name in PHYSICAL[:4] or name == "averaging_window"
+        if not np.isfinite(value) or value < 0 or (positive and value == 0):
+            raise ParameterError(f"fixed {name} = {value} is not a motor's")
+    wheels = {r.wheel for r in group}
+    if len(wheels) > 1:
+        raise ParameterError(f"records of one motor are needed, got {', '.join(sorted(wheels))}")
+    ohmmeter = group[0].hardware.resistance
+    if "resistance" not in known and ohmmeter and np.isfinite(ohmmeter) and not _has_current(group):
+        known["resistance"] = float(ohmmeter)
+    return known
+
+
+def _has_current(group: Sequence[Record]) -> bool:
+    there = [r.current for r in group if r.current is not None]
+    finite = sum(int(np.isfinite(c).sum()) for c in there)
+    return finite > 0.3 * sum(len(r) for r in group) and any(np.nanstd(c) > 0 for c in there)
+
+
+def _structure(
+    model: str, use_current: bool, known: Mapping[str, float], group: Sequence[Record]
+) -> Structure:
+    held: dict[str, float] = {}
+    if use_current and "resistance" in known:
+        held["ln_r"] = float(np.log(known["resistance"]))
+        if "inductance" in known:
+            held["ln_te"] = float(np.log(known["inductance"] / known["resistance"]))
+    if "delay" in known:
+        held["delay"] = known["delay"]
+    window = known.get("averaging_window", max(r.velocity_window for r in group))
+    if window > 0:
+        held["window"] = window
+    rung = model.removesuffix("_asymmetric")
+    asymmetric = model.endswith("_asymmetric")
+    friction = "asymmetric" if asymmetric else "symmetric"
+    if use_current:
+        return Structure("electromechanical", 2, friction, current=True, load=asymmetric, held=held)
+    if rung in ("auto", "electromechanical"):
+        rung = "second_order"
+    order = 2 if rung == "second_order" else 1
+    return Structure(rung, order, friction, load=asymmetric, held=held)
+
+
+def _for_final(data: Experiments, fit: Fit) -> Experiments:
+    return data.as_mean_speed() if fit.kind == rc.MEAN_SPEED else data
+
+
+def _name(structure: Structure) -> str:
+    return structure.name + ("_asymmetric" if structure.friction == "asymmetric" else "")
+
+
+def _constrain(
+    data: Experiments,
+    fit: Fit,
+    options: Options,
+    known: Mapping[str, float],
+    bounds: Mapping[str, tuple[float, float]] | None,
+) -> Fit:
+    """Refit under what the user holds fixed or bounded, and what physics forbids."""
+    if not fit.structure.current:
+        return fit
+    values, _ = models.physical(fit.z)
+    scale = {n: abs(values[n]) for n in PHYSICAL}
+    scale["viscous_friction"] = values["motor_constant"] ** 2 / values["resistance"]
+    priors = [
+        Prior(n, known[n], 1e-4 * max(abs(known[n]), 1e-2 * scale[n]))
+        for n in PHYSICAL
+        if n in known
+        and not (n == "resistance" or (n == "inductance" and "ln_te" in fit.structure.held))
+    ]
+    for name, (low, high) in (bounds or {}).items():
+        if name not in values:
+            raise ParameterError(f"bounds of {name!r}: not a parameter of this model")
+        if not low <= values[name] <= high:
+            priors.append(Prior(name, float(np.clip(values[name], low, high)), 1e-4 * scale[name]))
+    if values["viscous_friction"] < 0 and "viscous_friction" not in known:
+        priors.append(
+            Prior(
+                "viscous_friction",
+                1e-9 * scale["viscous_friction"],
+                1e-4 * scale["viscous_friction"],
+            )
+        )
+    if not priors:
+        return fit
+    bound = Options(options.huber, tuple(priors), options.lower, options.upper)
+    return refine(data, fit.structure, fit, fit.z, bound)
+
+
+def _refuse(group: Sequence[Record], fit: Fit, result: Answer, fitted: float) -> None:
+    where = _where(group)
+    if not np.isfinite(fitted) or fitted < WORST_FIT:
+        raise SignalError(
+            f"{where}: the voltage does not explain the motion (fit {fitted:.0f} %); check that "
+            "voltage and encoder belong to the same motor, and that nothing else drives it"
+        )
+    loose = [
+        n
+        for n in ("dc_gain", "time_constant")
+        if (q := result.combinations.get(n)) and (q.std or 0) > 0.5 * abs(q.value or 1)
+    ]
+    if loose:
+        raise InsufficientExcitationError(
+            f"{where}: the data do not tell {' and '.join(loose)}; record a longer excitation "
+            "with several frequencies, in both directions and well above the friction"
+        )
+
+
+def _validation(
+    group: Sequence[Record],
+    validation: Sequence[Record] | None,
+    fit: Fit,
+    options: Options,
+    use_current: bool,
+) -> float | None:
+    if validation is not None:
+        value = validate.held_out(list(validation), fit)
+    else:
+        fitted, kept = validate.split(group)
+        if not kept:
+            return None
+        data = _for_final(prepare(fitted, use_current), fit)
+        if np.ptp(data.section_value) == 0:
+            return None
+        start = Fit(**{**vars(fit), "initial": data.initial})
+        value = validate.held_out(kept, refine(data, fit.structure, start, fit.z, options))
+    return value if np.isfinite(value) else None
+
+
+def _candidates(
+    rungs: Sequence[Rung], chosen: Fit, group: Sequence[Record], data: Experiments
+) -> tuple[Candidate, ...]:
+    out = []
+    for n, rung in enumerate(rungs):
+        last = n == len(rungs) - 1
+        fit = chosen if last else rung.fit
+        value = validate.speed_fit(group, _for_final(data, fit), fit)
+        out.append(
+            Candidate(
+                rung.label,
+                value if np.isfinite(value) else None,
+                rung.bic,
+                last,
+                rung.reason,
+            )
+        )
+    return tuple(out)

@@ -1,0 +1,250 @@
+"""Bad data named for what it is, before any number is made of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smp_motor_ident.errors import InsufficientExcitationError, SignalError
+from smp_motor_ident.record import Record
+
+Array = NDArray[np.float64]
+
+FEWEST = 40
+MOST_LOST = 0.3
+
+
+def screen(records: Sequence[Record]) -> list[str]:
+    """Refuse records that cannot lead to a right answer; name the reason and the remedy.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        Of one motor.
+
+    Returns
+    -------
+    list of str
+        Warnings about what can be lived with.
+
+    Raises
+    ------
+    SignalError
+        When signals contradict each other or physics: lost samples, dead encoder, swapped
+        sign, wrong ratio between counts and speed, saturated sensor.
+    InsufficientExcitationError
+        When the voltage or the motion does not suffice.
+    """
+    warnings: list[str] = []
+    where = _where(records)
+    _length(records, where)
+    for record in records:
+        warnings += _lost(record)
+    _excitation(records, where)
+    for record in records:
+        _ratio(record)
+        warnings += _saturation(record)
+    _motion(records, where)
+    _signs(records, where)
+    return list(dict.fromkeys(warnings))
+
+
+def _where(records: Sequence[Record]) -> str:
+    sources = ", ".join(dict.fromkeys(r.source for r in records if r.source))
+    return f"{sources or 'record'}: {records[0].wheel}"
+
+
+def _length(records: Sequence[Record], where: str) -> None:
+    samples = sum(len(r) for r in records)
+    if samples < FEWEST:
+        duration = sum(r.duration for r in records)
+        raise InsufficientExcitationError(
+            f"{where}: too short, {samples} samples in {duration:.3g} s; record at least "
+            f"{FEWEST} samples, better 20 s or more with the voltage changing all the time"
+        )
+
+
+def _lost(record: Record) -> list[str]:
+    where = _where([record])
+    out = []
+    for name in ("velocity", "position"):
+        values = getattr(record, name)
+        if values is None or (record.count is not None and record.hardware.counts_per_revolution):
+            continue
+        lost = float(np.mean(~np.isfinite(values)))
+        if lost > MOST_LOST and (name == "velocity" or record.velocity is None):
+            raise SignalError(
+                f"{where}: {name} is NaN in {lost:.0%} of the samples; "
+                "repair the sensor or its connection and record again"
+            )
+        if lost > 0:
+            out.append(f"{name} is NaN in {lost:.1%} of the samples; they were left out")
+    if record.current is not None:
+        lost = float(np.mean(~np.isfinite(record.current)))
+        if 0 < lost < 1:
+            out.append(f"current is NaN in {lost:.1%} of the samples; they were left out")
+    return out
+
+
+def _excitation(records: Sequence[Record], where: str) -> None:
+    largest = max(float(np.abs(r.voltage).max()) for r in records)
+    if largest == 0.0:
+        raise InsufficientExcitationError(
+            f"{where}: no excitation, the voltage is 0 V throughout; drive the motor with a "
+            "sine, square or Fourier voltage while recording"
+        )
+    if all(float(np.ptp(r.voltage)) < 1e-3 * largest for r in records):
+        raise InsufficientExcitationError(
+            f"{where}: the voltage is constant at {records[0].voltage[0]:.4g} V; a constant "
+            "input cannot tell dynamics: record a square or Fourier voltage in both directions"
+        )
+
+
+def measured_speed(record: Record) -> Array:
+    """Return the best speed at hand: from counts, angle, or as recorded.
+
+    Parameters
+    ----------
+    record : Record
+        One motor's signals.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        [rad/s]; NaN at segment starts where differenced.
+    """
+    per_turn = record.hardware.counts_per_revolution
+    if record.count is not None and per_turn:
+        angle = record.count * (2 * np.pi / per_turn)
+    elif record.velocity is not None:
+        return record.velocity
+    elif record.position is not None:
+        angle = record.position
+    else:
+        return np.full(len(record), np.nan)
+    speed = np.full(len(record), np.nan)
+    speed[1:] = np.diff(angle) / np.diff(record.time)
+    speed[list(record.starts)] = np.nan
+    return speed
+
+
+def _ratio(record: Record) -> None:
+    """Hold counts against the recorded velocity: their ratio is one, or something is wrong."""
+    if record.count is None or record.velocity is None:
+        return
+    if not record.hardware.counts_per_revolution:
+        return
+    where = _where([record])
+    angle = record.count * (2 * np.pi / record.hardware.counts_per_revolution)
+    lag = max(1, min(10, len(record) // 10))
+    dt = record.time[lag:] - record.time[:-lag]
+    counted = (angle[lag:] - angle[:-lag]) / dt
+    charge = np.concatenate([[0.0], np.cumsum(record.velocity[1:] * np.diff(record.time))])
+    told = (charge[lag:] - charge[:-lag]) / dt
+    ok = np.isfinite(told) & np.isfinite(counted)
+    for s in record.starts[1:]:
+        ok[max(0, s - lag) : s] = False
+    a, b = counted[ok], told[ok]
+    if a.size < 20 or b.std() == 0:
+        return
+    if not np.any(a):
+        raise SignalError(
+            f"{where}: dead encoder, the count stays at {record.count[0]} while the velocity "
+            f"reaches {np.abs(b).max():.3g} rad/s; check the encoder's cable"
+        )
+    slope = float(a @ b / (a @ a))
+    together = float(a @ b / np.sqrt((a @ a) * (b @ b)))
+    if together < -0.5:
+        raise SignalError(
+            f"{where}: encoder counts run against the velocity (swapped sign); exchange the "
+            "encoder's channels A and B or the sign of the velocity"
+        )
+    if together > 0.9 and not 0.95 < slope < 1.05:
+        raise SignalError(
+            f"{where}: velocity is {slope:.4g} times what the encoder counts say; wrong gear "
+            f"ratio (now {record.hardware.gear_ratio:g}) or counts per revolution (now "
+            f"{record.hardware.counts_per_revolution:g}), correct the motor description"
+        )
+
+
+def _saturation(record: Record) -> list[str]:
+    where = _where([record])
+    for name, unit in (("velocity", "rad/s"), ("current", "A")):
+        values = getattr(record, name)
+        if values is None:
+            continue
+        ok = np.isfinite(values)
+        x, v = values[ok], record.voltage[ok]
+        if x.size < 50 or np.unique(x).size < 20:
+            continue
+        for limit in (x.max(), x.min()):
+            at = x == limit
+            share = float(at.mean())
+            inner = x[1:-1][(x[1:-1] != x.max()) & (x[1:-1] != x.min())]
+            repeats = float(np.mean(np.diff(inner) == 0)) if inner.size > 10 else 1.0
+            runs = at[1:] & at[:-1]
+            if share < 0.01 or repeats > 0.3 or runs.sum() < 0.5 * at.sum() or limit == 0.0:
+                continue
+            if np.ptp(v[at]) < 0.02 * np.ptp(v):
+                continue
+            raise SignalError(
+                f"{where}: saturated sensor, {name} rests at {limit:.4g} {unit} in "
+                f"{share:.1%} of the samples while the voltage moves; widen its range or "
+                "lower the excitation"
+            )
+    return []
+
+
+def _motion(records: Sequence[Record], where: str) -> None:
+    moved = [
+        np.nanmax(np.abs(s)) if np.isfinite(s).any() else 0.0 for s in map(measured_speed, records)
+    ]
+    largest = max(float(np.abs(r.voltage).max()) for r in records)
+    counts = [int(np.ptp(r.count)) for r in records if r.count is not None]
+    if max(moved) == 0.0:
+        raise SignalError(
+            f"{where}: dead encoder or a motor that does not turn: the output stays constant "
+            f"while the voltage reaches {largest:.3g} V; check the encoder, or drive harder"
+        )
+    if counts and len(counts) == len(records) and max(counts) < 20:
+        raise InsufficientExcitationError(
+            f"{where}: the motor moved by {max(counts)} encoder counts only; "
+            "excite with more voltage or for longer"
+        )
+
+
+def _signs(records: Sequence[Record], where: str) -> None:
+    """Refuse speed or current that answers the voltage with the wrong sign."""
+    for what, remedy in (
+        ("speed", "swap the motor's leads or the encoder's channels"),
+        ("current", "swap the current sensor's sign"),
+    ):
+        total = power = 0.0
+        for record in records:
+            y = measured_speed(record) if what == "speed" else record.current
+            if y is None:
+                continue
+            ok = np.isfinite(y)
+            if ok.sum() < 20:
+                continue
+            v = record.voltage[ok]
+            if what == "current":
+                total += float(v @ y[ok])
+            else:
+                total += _slow_product(v, y[ok])
+            power += float(np.sqrt((v @ v) * (y[ok] @ y[ok])))
+        if power > 0 and total < -0.2 * power:
+            raise SignalError(
+                f"{where}: swapped sign, {what} runs against the voltage "
+                f"(correlation {total / power:.2f}); {remedy}"
+            )
+
+
+def _slow_product(v: Array, y: Array) -> float:
+    """Return the largest (by size) inner product of voltage and a later speed."""
+    n = len(v)
+    lags = np.unique(np.minimum(np.geomspace(1, max(2, n // 50), 12).astype(int), n // 4)) - 1
+    products = [float(v[: n - k] @ y[k:]) for k in lags]
+    return max(products, key=abs)

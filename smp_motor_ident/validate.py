@@ -1,0 +1,251 @@
+"""Validation: fit on held-out data, tests of the residuals, comparison of wheels."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+from smp_motor_ident import fit as fitting
+from smp_motor_ident import recursion as rc
+from smp_motor_ident.experiments import Experiments, prepare
+from smp_motor_ident.fit import Fit
+from smp_motor_ident.record import Record
+from smp_motor_ident.result import Estimate, ResidualTests
+
+Array = NDArray[np.float64]
+
+
+def percent(measured: Array, predicted: Array) -> float:
+    """Return the normalised fit ``100 (1 - |y - yhat| / |y - mean y|)``.
+
+    Parameters
+    ----------
+    measured, predicted : ndarray, shape (n,)
+        NaN where lost.
+
+    Returns
+    -------
+    float
+        100 is perfect, 0 is no better than the mean.
+    """
+    ok = np.isfinite(measured) & np.isfinite(predicted)
+    y, z = measured[ok], predicted[ok]
+    scatter = np.linalg.norm(y - y.mean()) if y.size else 0.0
+    if scatter == 0.0:
+        return float("nan")
+    return float(100 * (1 - np.linalg.norm(y - z) / scatter))
+
+
+def speed_fit(records: Sequence[Record], data: Experiments, fit: Fit) -> float:
+    """Return the fit percent of the freely simulated speed.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        What ``data`` was prepared from.
+    data : Experiments
+        With the initial states of ``fit``.
+    fit : Fit
+        The motor.
+
+    Returns
+    -------
+    float
+        Against the recorded velocity; where there is none, against counts or angles
+        differenced over one sample, with the model's mean speed over the same interval.
+    """
+    predicted = fitting.simulate(data, fit)
+    at_once = predicted[:, 1] if data.kind != rc.ANGLE else predicted[:, 0]
+    if data.kind != rc.ANGLE:
+        return percent(data.output, at_once)
+    mean = _differences(data, predicted[:, 1])
+    given = [r.velocity for r in records]
+    if all(v is not None for v in given):
+        velocity = np.concatenate([v for v in given if v is not None])
+        return max(percent(velocity, at_once), percent(velocity, mean))
+    return percent(_differences(data, data.output), mean)
+
+
+def _differences(data: Experiments, angle: Array) -> Array:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        speed = np.diff(angle, prepend=np.nan) / np.diff(data.time, prepend=np.nan)
+    speed[data.starts[:-1]] = np.nan
+    return np.asarray(speed)
+
+
+def held_out(records: Sequence[Record], fit: Fit) -> float:
+    """Return the fit percent on records that the fit has not seen.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        Only their initial states are fitted.
+    fit : Fit
+        The motor.
+
+    Returns
+    -------
+    float
+        See `speed_fit`.
+    """
+    kind = "speed" if fit.kind != rc.ANGLE else "auto"
+    data = prepare(records, False, kind)
+    if fit.kind == rc.MEAN_SPEED and data.kind == rc.SPEED:
+        data = data.as_mean_speed()
+    return speed_fit(records, data, fitting.settle(data, fit))
+
+
+def split(records: Sequence[Record], share: float = 0.7) -> tuple[list[Record], list[Record]]:
+    """Divide records into a part to fit and a part to hold out.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        Of one motor.
+    share : float
+        Part to fit: whole records where there are three or more, else time.
+
+    Returns
+    -------
+    fitted, kept : list of Record
+        ``kept`` is empty where the records are too short to divide.
+    """
+    if len(records) >= 3:
+        n = max(1, round((1 - share) * len(records)))
+        kept = list(range(1, len(records), max(1, len(records) // n)))[:n]
+        return (
+            [r for i, r in enumerate(records) if i not in kept],
+            [r for i, r in enumerate(records) if i in kept],
+        )
+    fitted, kept_records = [], []
+    for record in records:
+        cut = int(share * len(record))
+        if cut < 50 or len(record) - cut < 25:
+            fitted.append(record)
+            continue
+        fitted.append(record.slice(0, cut))
+        kept_records.append(record.slice(cut, len(record)))
+    return fitted, kept_records
+
+
+def residual_tests(data: Experiments, fit: Fit, lags: int = 25) -> ResidualTests:
+    """Test the innovations for whiteness and for independence from the input.
+
+    Autocorrelations (cross-correlations with the voltage) at up to ``lags`` lags stay, with
+    95 % confidence for all of them together, inside ``+- z / sqrt(n)``.
+
+    Parameters
+    ----------
+    data : Experiments
+        What was fitted.
+    fit : Fit
+        With its innovation gain.
+    lags : int
+        How many.
+
+    Returns
+    -------
+    ResidualTests
+        Of the mechanical output.
+    """
+    residual = data.output - fitting.simulate(data, fit, gain=True)[:, 1]
+    voltage = np.interp(data.time, data.section_end, data.section_value)
+    if len(data.starts) > 2:
+        voltage = np.concatenate(
+            [
+                np.interp(data.time[a:b], *_input_of(data, g))
+                for g, (a, b) in enumerate(zip(data.starts[:-1], data.starts[1:]))
+            ]
+        )
+    ok = np.isfinite(residual)
+    e = np.where(ok, residual - residual[ok].mean(), 0.0)
+    u = voltage - voltage.mean()
+    n = int(ok.sum())
+    if n < 4 * lags or e.std() == 0 or u.std() == 0:
+        return ResidualTests()
+    band = norm.ppf(1 - 0.025 / lags) / np.sqrt(n)
+    auto = np.array([e[k:] @ e[:-k] for k in range(1, lags + 1)]) / (e @ e)
+    # The input's own colour widens the band of the cross-correlation where e is not white.
+    shift = [e[k:] @ u[: len(u) - k] for k in range(lags + 1)]
+    cross = np.array(shift) / np.sqrt((e @ e) * (u @ u))
+    own = np.array([u[k:] @ u[:-k] for k in range(1, lags + 1)]) / (u @ u)
+    widen = np.sqrt(max(1.0, 1 + 2 * float((auto * own).sum())))
+    return ResidualTests(
+        white=bool(np.abs(auto).max() < band),
+        independent_of_input=bool(np.abs(cross).max() < band * widen),
+    )
+
+
+def _input_of(data: Experiments, g: int) -> tuple[Array, Array]:
+    first = int(data.section_start[g])
+    last = int(data.section_start[g + 1]) if g + 2 < len(data.starts) else len(data.section_end)
+    return data.section_end[first:last], data.section_value[first:last]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One quantity across wheels.
+
+    Attributes
+    ----------
+    name : str
+        Quantity.
+    mean : float
+        Over the wheels.
+    spread : float
+        Largest minus smallest over the mean.
+    outlier : str or None
+        Wheel that stands out most from the others.
+    sigmas : float
+        By how many standard deviations of the difference.
+    """
+
+    name: str
+    mean: float
+    spread: float
+    outlier: str | None
+    sigmas: float
+
+
+def compare(estimates: Mapping[str, Estimate]) -> list[Comparison]:
+    """Put wheels side by side.
+
+    Parameters
+    ----------
+    estimates : mapping of str to Estimate
+        By wheel.
+
+    Returns
+    -------
+    list of Comparison
+        For every quantity that all wheels have; ``sigmas`` compares the wheel with the
+        mean of the others, by both their uncertainties and the others' own scatter.
+    """
+    names = [n for e in estimates.values() for n in (*e.parameters, *e.combinations)]
+    out = []
+    for name in dict.fromkeys(names):
+        wheels, values, stds = [], [], []
+        for wheel, estimate in estimates.items():
+            q = estimate.combinations.get(name) or estimate.parameters.get(name)
+            if q is not None and q.value is not None and q.std is not None:
+                wheels.append(wheel)
+                values.append(q.value)
+                stds.append(q.std)
+        if len(wheels) < 2 or len(wheels) != len(estimates):
+            continue
+        v, s = np.array(values), np.array(stds)
+        sigmas = np.zeros(len(v))
+        for i in range(len(v)):
+            others = np.delete(v, i)
+            scatter = others.var(ddof=1) if len(others) > 1 else 0.0
+            variance = s[i] ** 2 + (np.delete(s, i) ** 2).sum() / len(others) ** 2 + scatter
+            sigmas[i] = abs(v[i] - others.mean()) / np.sqrt(max(variance, 1e-300))
+        worst = int(np.argmax(sigmas))
+        mean = float(v.mean())
+        spread = float(np.ptp(v) / abs(mean)) if mean else float("nan")
+        out.append(Comparison(name, mean, spread, wheels[worst], float(sigmas[worst])))
+    return out
