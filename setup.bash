@@ -30,7 +30,7 @@ _smp_source() {
   for bin in "$root/.venv/bin" "$root/install/smp_motor_control/lib/smp_motor_control"; do
     case ":$PATH:" in *":$bin:"*) ;; *) PATH="$bin:$PATH" ;; esac
   done
-  export PATH VIRTUAL_ENV="$root/.venv" COLCON_DEFAULTS_FILE="$root/colcon_defaults.yaml"
+  export PATH VIRTUAL_ENV="$root/.venv"
 }
 
 if [ -n "${ZSH_VERSION:-}" ]; then

@@ -31,6 +31,7 @@ STAMPS = VENV / "stamps.json"
 LOG = VENV / "setup.log"
 PYTHON = str(getattr(sys, "_base_executable", sys.executable))  # not that of a virtual environment
 LAYOUT = "1"  # to be raised when this file prepares something in another way
+APT = ["numpy", "scipy", "matplotlib", "yaml"]  # left to apt where ROS is installed
 NETWORK = re.compile(
     r"NewConnectionError|NameResolutionError|ConnectTimeout|ReadTimeout|ProxyError|Retrying \("
     r"|Temporary failure in name resolution|Network is unreachable|SSLError"
@@ -64,12 +65,13 @@ def find_ros() -> str:
             "ROS_DISTRO=jazzy is set, but no folder of AMENT_PREFIX_PATH holds rclpy:"
             " source /opt/ros/jazzy/setup.bash, or unset ROS_DISTRO to use the wheels"
         )
-    probe = subprocess.run([sys.executable, "-c", "import rclpy"], capture_output=True, check=False)
-    if probe.returncode:
-        raise SetupError(
-            f"{sys.executable} cannot import rclpy of {prefix}: name the Python that ROS was built"
-            " for (make setup PYTHON=/usr/bin/python3)"
-        )
+    for names, advice in (
+        (["rclpy"], "name the Python that ROS was built for (make setup PYTHON=/usr/bin/python3)"),
+        (APT, "apt install " + " ".join(f"python3-{name}" for name in APT)),
+    ):
+        code = f"import {', '.join(names)}"
+        if subprocess.run([PYTHON, "-c", code], capture_output=True, check=False).returncode:
+            raise SetupError(f"{PYTHON} cannot {code} beside the ROS of {prefix}: {advice}")
     return str(prefix)
 
 
@@ -156,14 +158,19 @@ def environment(ros: str) -> dict[str, str]:
         "PIP_PREFIX",
         "PIP_CONSTRAINT",
     ]
-    foreign += ["PIP_REQUIRE_VIRTUALENV", "PIP_NO_BINARY", "COLCON_PREFIX_PATH", "COLCON_HOME"]
+    foreign += [
+        "PIP_REQUIRE_VIRTUALENV",
+        "PIP_NO_BINARY",
+        "COLCON_PREFIX_PATH",
+        "COLCON_HOME",
+        "COLCON_DEFAULTS_FILE",
+    ]
     if not ros:
         foreign += ["PYTHONPATH", "LD_LIBRARY_PATH", "AMENT_PREFIX_PATH", "CMAKE_PREFIX_PATH"]
         foreign += ["_ROS_WHEELS_BOOTSTRAP_COMPLETE"]
     for name in foreign:
         env.pop(name, None)
     env["PATH"] = f"{VENV}/bin{os.pathsep}{env['PATH']}"
-    env["COLCON_DEFAULTS_FILE"] = str(ROOT / "colcon_defaults.yaml")
     if not ros:
         env["AMENT_PREFIX_PATH"] = env["CMAKE_PREFIX_PATH"] = str(VENV)
     return env
