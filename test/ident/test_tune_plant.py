@@ -1,0 +1,182 @@
+"""The sampled motor, its margins and its simulation, against simulators that share no code."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from smp_motor_control.pid import Pid, PidGains
+from smp_motor_ident.tune.feedback import Feedback, closed_loop, spectral_radius
+from smp_motor_ident.tune.loop import Loop
+from smp_motor_ident.tune.margins import batch_margins, grid_for, loop_margins
+from smp_motor_ident.tune.plant import Motors, sample
+from smp_motor_ident.tune.response import TwoDegrees, minimum_jerk, simulate
+
+# Motor 1 of the paper's Table 1, and a first-order motor.
+MOTOR_1 = (0.039142, 0.0019981, 3.1755e-5)
+FIRST_ORDER = (0.04, 0.002, 0.0)
+
+
+def motors(a0: float, a1: float, a2: float, delay: float = 0.0) -> Motors:
+    return Motors(*(np.array([x]) for x in (a0, a1, a2, delay, 0.0)))
+
+
+def integrate(coefficients, delay, sample_time, inputs):
+    """Speed and angle at the sampling instants, by a general-purpose ODE solver."""
+    a0, a1, a2 = coefficients
+
+    def rates(t, x, volts):
+        if a2 == 0:
+            return [(volts - a0 * x[0]) / a1, 0.0, x[0]]
+        return [x[1], (volts - a1 * x[1] - a0 * x[0]) / a2, x[0]]
+
+    x, history = np.zeros(3), [np.zeros(3)]
+    whole = int(delay // sample_time)
+    late = delay - whole * sample_time
+    for k in range(len(inputs)):
+        older = inputs[k - whole - 1] if k - whole - 1 >= 0 else 0.0
+        newer = inputs[k - whole] if k - whole >= 0 else 0.0
+        for volts, length in ((older, late), (newer, sample_time - late)):
+            if length > 0:
+                run = solve_ivp(rates, (0, length), x, args=(volts,), rtol=1e-10, atol=1e-12)
+                x = run.y[:, -1]
+        history.append(x.copy())
+    return np.array(history)[:, 0], np.array(history)[:, 2]
+
+
+@pytest.mark.parametrize("coefficients", [MOTOR_1, FIRST_ORDER], ids=["second", "first"])
+@pytest.mark.parametrize("delay", [0.0, 0.003, 0.01, 0.0275])
+@pytest.mark.parametrize("window", [0, 1, 3])
+def test_sampled_motor_with_any_delay_and_window_is_exact(coefficients, delay, window):
+    T = 0.01
+    rng = np.random.default_rng(1)
+    inputs = rng.uniform(-12, 12, 25)
+    speed, angle = integrate(coefficients, delay, T, inputs)
+    plant = sample(
+        motors(*coefficients), Loop(sample_time=T, delay=delay, difference_window=window)
+    )
+    # A controller that is nothing but feed-forward plays the inputs into the loop.
+    run = simulate(plant, TwoDegrees(Feedback(0.0, 0.0), velocity=1.0), inputs)
+    # 1e-7 of the largest speed: the ODE solver's own tolerance, accumulated.
+    np.testing.assert_allclose(run.speed[0], speed[:-1], atol=1e-7 * np.abs(speed).max())
+    measured = speed.copy()
+    if window:
+        padded = np.concatenate([np.zeros(window), angle])
+        measured = (padded[window:] - padded[:-window]) / (window * T)
+    # The transfer function at a point outside the unit circle, where the sums converge.
+    z = 2.5 * np.exp(0.7j)
+    powers = z ** -np.arange(26.0)
+    ratio = np.sum(measured * powers) / np.sum(inputs * powers[:-1])
+    found = plant.transfer(np.array([z]))[0, 0]
+    # 2.5^-25 = 1e-10 of the sum is cut off by the record's end, delays make a few powers less.
+    assert abs(found - ratio) < 1e-6 * abs(ratio)
+
+
+def test_frequency_response_tends_to_the_motor_at_low_frequency():
+    plant = sample(motors(*MOTOR_1), Loop(sample_time=0.001, delay=0.0))
+    # At 1 mrad/s what differs from the static gain is below 1e-4.
+    assert abs(plant.response(np.array([1e-3]))[0, 0]) == pytest.approx(1 / MOTOR_1[0], rel=1e-4)
+
+
+@pytest.mark.parametrize("window", [0, 1, 4])
+def test_closed_loop_matrix_and_simulation_agree_on_the_decay(window):
+    plant = sample(motors(*MOTOR_1), Loop(sample_time=0.005, delay=0.008, difference_window=window))
+    feedback = Feedback(0.03, 0.9, 0.0008, 0.004)
+    eigenvalues = np.linalg.eigvals(closed_loop(plant, feedback)[0])
+    run = simulate(plant, TwoDegrees(feedback), np.ones(400))
+    left = np.abs(run.speed[0] - 1)
+    # The slowest mode alone is left after 100 samples; 3 % for what the others still add.
+    slope = (left[360:].max() / left[100:140].max()) ** (1 / 260)
+    assert slope == pytest.approx(np.abs(eigenvalues).max(), rel=0.03)
+
+
+def test_simulated_controller_is_the_running_one():
+    """The batch simulation against Pid itself, saturation and anti-windup included."""
+    T, limit = 0.005, 4.5
+    plant = sample(motors(*MOTOR_1), Loop(sample_time=T, delay=T))
+    feedback = Feedback(0.05, 1.2, 0.0009, 0.003)
+    controller = TwoDegrees(feedback, 0.6, 0.03, 0.001, limit, 0.05)
+    time = T * np.arange(300)
+    reference, rate = minimum_jerk(100.0, 0.1, time)
+    run = simulate(plant, controller, reference, acceleration=rate)
+    pid = Pid(
+        PidGains(
+            p=0.05, i=1.2, d=0.0009, u_clamp_min=-limit, u_clamp_max=limit,
+            antiwindup_strategy="back_calculation", tracking_time_constant=0.05,
+            setpoint_weight_p=0.6, derivative_filter_time_constant=0.003,
+            feedforward_velocity=0.03, feedforward_acceleration=0.001,
+        )
+    )  # fmt: skip
+    phi, taps = plant.phi[0], plant.taps[0]
+    x, past, swept = np.zeros(2), np.zeros(taps.shape[0]), 0.0
+    for k in range(time.size):
+        out = pid.step(reference[k], swept / T, T, rate[k])
+        assert out.output == pytest.approx(run.voltage[0, k], abs=1e-9)
+        past = np.concatenate([[out.output], past[:-1]])
+        swept = plant.phi_angle[0] @ x + plant.taps_angle[0] @ past
+        x = phi @ x + past @ taps
+    assert np.abs(run.voltage).max() == limit
+
+
+@pytest.mark.parametrize("sample_time", [0.01, 0.005, 0.001])
+def test_batch_margins_agree_with_python_control(sample_time):
+    plant = sample(motors(*MOTOR_1), Loop(sample_time=sample_time))
+    feedback = Feedback(0.02, 0.5, 0.0004, sample_time)
+    nominal = loop_margins(plant, feedback)
+    omega = grid_for(plant, 400)
+    loop = plant.response(omega) * feedback.response(omega, sample_time)
+    batch = batch_margins(loop, omega)
+    # The grid of 400 points over three decades resolves a margin to about half a percent.
+    assert batch.phase[0] == pytest.approx(nominal.phase, rel=5e-3)
+    assert batch.gain[0] == pytest.approx(nominal.gain, rel=5e-3)
+    assert batch.sensitivity[0] == pytest.approx(nominal.sensitivity, rel=5e-3)
+    assert batch.crossover[0] == pytest.approx(nominal.crossover, rel=5e-3)
+
+
+@pytest.mark.parametrize("sample_time", [0.01, 0.001])
+def test_gain_and_delay_margin_are_where_the_loop_turns_unstable(sample_time):
+    loop = Loop(sample_time=sample_time)
+    plant = sample(motors(*MOTOR_1), loop)
+    feedback = Feedback(0.02, 0.5, 0.0002, sample_time)
+    margins = loop_margins(plant, feedback)
+    for share, stable in ((0.99, True), (1.01, False)):
+        scaled = feedback.scaled(1 + share * (margins.gain - 1))
+        assert (spectral_radius(plant, scaled)[0] < 1) == stable
+        later = Loop(sample_time=sample_time, delay=sample_time + share * margins.delay)
+        assert (spectral_radius(sample(motors(*MOTOR_1), later), feedback)[0] < 1) == stable
+
+
+def test_batch_of_motors_is_the_motors_one_by_one():
+    rng = np.random.default_rng(2)
+    a0, a1, a2 = (x * rng.uniform(0.5, 2, 20) for x in MOTOR_1)
+    delay = rng.uniform(0, 0.02, 20)
+    loop = Loop(sample_time=0.005, delay=0.004)
+    feedback = Feedback(0.02, 0.4, 0.0003, 0.005)
+    batch = spectral_radius(sample(Motors(a0, a1, a2, delay, np.zeros(20)), loop), feedback)
+    single = [
+        spectral_radius(sample(motors(*row), loop), feedback)[0]
+        for row in zip(a0, a1, a2, delay, strict=True)
+    ]
+    # Rounding of the eigenvalue solver, larger for the longer state of the batch.
+    np.testing.assert_allclose(batch, single, rtol=1e-6)
+
+
+def test_very_small_inductance_is_the_first_order_motor():
+    loop = Loop(sample_time=0.01)
+    omega = np.array([1.0, 10.0, 100.0])
+    tiny = sample(motors(0.04, 0.002, 0.002 * 1e-7), loop).response(omega)
+    none = sample(motors(0.04, 0.002, 0.0), loop).response(omega)
+    # An electrical time constant of 0.1 us against 10 ms of sampling.
+    np.testing.assert_allclose(tiny, none, rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("sample_time", 0.0), ("delay", -1.0), ("supply_voltage", math.nan), ("gear_ratio", math.inf)],
+)
+def test_impossible_loop_is_refused_by_name(name, value):
+    with pytest.raises(ValueError, match=name):
+        Loop(**{name: value})
