@@ -224,6 +224,24 @@ class Odometry:
         self._integrate((linear - half) * dt, (linear + half) * dt)
         return True
 
+    def twist_variances(self, span: float) -> tuple[float, float]:
+        """Return how sure the reported velocity is.
+
+        Parameters
+        ----------
+        span : float
+            Time that the velocity is averaged over [s].
+
+        Returns
+        -------
+        tuple of float
+            Variance of the linear [m^2/s^2] and of the angular velocity [rad^2/s^2].
+        """
+        half = self.angular * self._separation / 2.0
+        rolled = self._travel_noise * (abs(self.linear - half) + abs(self.linear + half)) / span
+        skidded = self._turn_noise * abs(self.angular) / span
+        return rolled / 4.0, rolled / self._separation**2 + skidded
+
     def _integrate(self, left: float, right: float) -> None:
         """Move along an arc of the given lengths of both sides [m]."""
         travel, turn = (left + right) / 2.0, (right - left) / self._separation

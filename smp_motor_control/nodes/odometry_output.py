@@ -1,0 +1,155 @@
+"""Odometry and joint states as messages: /odom, /joint_states and, where possible, /tf."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Protocol
+
+from geometry_msgs.msg import TransformStamped
+from nav_msgs.msg import Odometry as OdometryMessage
+from rclpy.node import Node
+from rclpy.time import Time
+from sensor_msgs.msg import JointState
+
+from smp_motor_control import WHEELS
+from smp_motor_control.odometry import Odometry
+from smp_motor_control.wheel_feedback import WheelSample
+
+UNKNOWN = 1e6
+"""Variance of what wheels on a plane cannot tell: height, roll and pitch."""
+
+SIDEWAYS = 1e-3
+"""Variance of the sideways velocity of a body that skids [m^2/s^2]."""
+
+STILL = 1e-6
+"""Least variance of a velocity, for filters that divide by it."""
+
+
+class FrameSettings(Protocol):
+    """The parameters of the node that are about its output."""
+
+    odom_frame_id: str
+    base_frame_id: str
+    tf_frame_prefix_enable: bool
+    tf_frame_prefix: str
+    enable_odom_tf: bool
+    publish_rate: float
+    velocity_rolling_window_size: int
+
+
+def frame_prefix(enable: bool, prefix: str, namespace: str) -> str:
+    """Return what comes before the names of the frames.
+
+    Parameters
+    ----------
+    enable : bool
+        Whether there is a prefix at all.
+    prefix : str
+        As given; the namespace where it is empty.
+    namespace : str
+        Of the node.
+
+    Returns
+    -------
+    str
+        Empty, or with a slash at its end alone.
+    """
+    inner = (prefix or namespace).strip("/") if enable else ""
+    return f"{inner}/" if inner else ""
+
+
+class OdometryOutput:
+    """Publishers of a node that knows where the body is.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+        Owner of the publishers.
+    settings : FrameSettings
+        Names of frames and what to publish.
+    """
+
+    def __init__(self, node: Node, settings: FrameSettings) -> None:
+        prefix = frame_prefix(
+            settings.tf_frame_prefix_enable, settings.tf_frame_prefix, node.get_namespace()
+        )
+        self._span = settings.velocity_rolling_window_size / settings.publish_rate
+        self._odometry = OdometryMessage()
+        self._odometry.header.frame_id = prefix + settings.odom_frame_id
+        self._odometry.child_frame_id = prefix + settings.base_frame_id
+        self._publisher = node.create_publisher(OdometryMessage, "odom", 10)
+        self._joints = node.create_publisher(JointState, "joint_states", 10)
+        self._tf = None
+        if settings.enable_odom_tf:
+            self._advertise_transform(node)
+
+    def _advertise_transform(self, node: Node) -> None:
+        try:
+            from tf2_msgs.msg import TFMessage
+        except ImportError:
+            node.get_logger().info("tf2_msgs is not installed: nothing is published on /tf")
+            return
+        self._tf = node.create_publisher(TFMessage, "/tf", 100)
+        self._transform = TransformStamped(child_frame_id=self._odometry.child_frame_id)
+        self._transforms = TFMessage(transforms=[self._transform])
+
+    def publish(self, odometry: Odometry, stamp: float) -> None:
+        """Publish pose and velocity.
+
+        Parameters
+        ----------
+        odometry : Odometry
+            Where the body is.
+        stamp : float
+            ROS time [s].
+        """
+        message = self._odometry
+        message.header.stamp = Time(nanoseconds=round(stamp * 1e9)).to_msg()
+        pose, twist = message.pose, message.twist
+        pose.pose.position.x, pose.pose.position.y = odometry.x, odometry.y
+        half = math.remainder(odometry.heading, 2.0 * math.pi) / 2.0
+        pose.pose.orientation.z, pose.pose.orientation.w = math.sin(half), math.cos(half)
+        p = odometry.covariance
+        pose.covariance = _spread(p.xx, p.xy, p.xh, p.yy, p.yh, p.hh)
+        twist.twist.linear.x, twist.twist.angular.z = odometry.linear, odometry.angular
+        linear, angular = odometry.twist_variances(self._span)
+        twist.covariance = _spread(linear + STILL, 0.0, 0.0, SIDEWAYS, 0.0, angular + STILL)
+        self._publisher.publish(message)
+        if self._tf is not None:
+            self._transform.header = message.header
+            self._transform.transform.translation.x = odometry.x
+            self._transform.transform.translation.y = odometry.y
+            self._transform.transform.rotation = pose.pose.orientation
+            self._tf.publish(self._transforms)
+
+    def publish_joints(self, wheels: Mapping[str, WheelSample], stamp: float) -> None:
+        """Publish the wheels that were heard.
+
+        Parameters
+        ----------
+        wheels : mapping of str to WheelSample
+            Newest sample of each.
+        stamp : float
+            ROS time [s].
+        """
+        heard = [wheel for wheel in WHEELS if wheel in wheels]
+        if not heard:
+            return
+        message = JointState(
+            name=[f"{wheel}_wheel_joint" for wheel in heard],
+            position=[wheels[wheel].position for wheel in heard],
+            velocity=[wheels[wheel].velocity for wheel in heard],
+        )
+        message.header.stamp = Time(nanoseconds=round(stamp * 1e9)).to_msg()
+        self._joints.publish(message)
+
+
+def _spread(xx: float, xy: float, xh: float, yy: float, yh: float, hh: float) -> list[float]:
+    """Return the 6 x 6 covariance of (x, y, z, roll, pitch, yaw), row by row."""
+    matrix = [0.0] * 36
+    matrix[0], matrix[1], matrix[5] = xx, xy, xh
+    matrix[6], matrix[7], matrix[11] = xy, yy, yh
+    matrix[30], matrix[31], matrix[35] = xh, yh, hh
+    matrix[14] = matrix[21] = matrix[28] = UNKNOWN
+    return matrix

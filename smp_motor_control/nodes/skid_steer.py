@@ -1,0 +1,338 @@
+"""skid_steer: velocity commands of the body to set-points of four wheels, and odometry back.
+
+Parameters are named as those of diff_drive_controller where they mean the same.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass, fields
+from functools import partial
+
+from geometry_msgs.msg import Twist, TwistStamped
+from rclpy.node import Node
+from sensor_msgs.msg import Imu, JointState
+
+from smp_interfaces.msg import MotorState
+from smp_motor_control.errors import ParameterError
+from smp_motor_control.nodes import runtime
+from smp_motor_control.nodes.odometry_output import OdometryOutput
+from smp_motor_control.nodes.settings import Parameters, described, nested
+from smp_motor_control.skid_steer import (
+    LEFT,
+    RIGHT,
+    BodyCommand,
+    HeadingHold,
+    Odometry,
+    SkidSteer,
+    SpeedLimiter,
+    Verdict,
+)
+from smp_motor_control.wheel_feedback import WheelFeedback, WheelSample
+
+IMPLAUSIBLE = 4.0
+"""Wheels that seem to turn this many times faster than they can have had their counter reset."""
+
+_LIMITS = {
+    "min_velocity": "Lowest velocity; NaN takes the negative of max_velocity.",
+    "max_velocity": "Highest velocity [m/s] or [rad/s]; NaN for no limit.",
+    "max_acceleration_reverse": "Speeding up in reverse, not positive; NaN as forward.",
+    "max_acceleration": "Speeding up forward [m/s^2] or [rad/s^2]; NaN for no limit.",
+    "max_deceleration": "Slowing down from forward, not positive; NaN as speeding up.",
+    "max_deceleration_reverse": "Slowing down from reverse, not negative; NaN as speeding up.",
+    "min_jerk": "Lowest jerk; NaN takes the negative of max_jerk.",
+    "max_jerk": "Highest jerk [m/s^3] or [rad/s^3]; NaN for no limit.",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class AxisLimits:
+    """Limits of one component of the body's velocity; NaN for none."""
+
+    min_velocity: float = math.nan
+    max_velocity: float = math.nan
+    max_acceleration_reverse: float = math.nan
+    max_acceleration: float = math.nan
+    max_deceleration: float = math.nan
+    max_deceleration_reverse: float = math.nan
+    min_jerk: float = math.nan
+    max_jerk: float = math.nan
+
+    def limiter(self) -> SpeedLimiter:
+        """Return the limiter with these limits."""
+        return SpeedLimiter(**{item.name: getattr(self, item.name) for item in fields(self)})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """Parameters of the node, validated together."""
+
+    wheel_separation: float = described(0.4, "Between left and right wheels [m].")
+    wheel_radius: float = described(0.1, "Radius of the wheels [m].")
+    wheel_separation_multiplier: float = described(
+        1.0, "Above 1 for a body that turns less than its wheels would roll it."
+    )
+    left_wheel_radius_multiplier: float = described(1.0, "Correction of the left radius.")
+    right_wheel_radius_multiplier: float = described(1.0, "Correction of the right radius.")
+    max_wheel_velocity: float = described(
+        2.9, "What every wheel reaches [rad/s]; commands beyond are scaled. 0: no limit.", minimum=0
+    )
+    publish_rate: float = described(
+        50.0,
+        "Set-points and odometry per second [Hz].",
+        minimum=1.0,
+        maximum=1000.0,
+        read_only=True,
+    )
+    cmd_vel_timeout: float = described(
+        0.5, "Age of a command at which the body brakes [s]; 0: never.", minimum=0.0
+    )
+    use_stamped_vel: bool = described(
+        True, "Commands are TwistStamped (true) or Twist (false).", read_only=True
+    )
+    feedback_timeout: float = described(
+        0.5, "Silence of a wheel that is reported [s].", minimum=0.01
+    )
+    open_loop: bool = described(False, "Odometry from commands instead of wheels.")
+    velocity_rolling_window_size: int = described(
+        10, "Steps that the reported velocity is averaged over.", minimum=1, read_only=True
+    )
+    odom_frame_id: str = described("odom", "Frame of the odometry.", read_only=True)
+    base_frame_id: str = described("base_link", "Frame of the body.", read_only=True)
+    tf_frame_prefix_enable: bool = described(
+        True, "Prefix the frames with tf_frame_prefix, or else the namespace.", read_only=True
+    )
+    tf_frame_prefix: str = described("", "Prefix of the frames.", read_only=True)
+    enable_odom_tf: bool = described(True, "Publish odom to base on /tf.", read_only=True)
+    travel_noise: float = described(
+        1e-4, "Variance that one metre of a side's travel adds [m^2/m].", minimum=0.0
+    )
+    turn_noise: float = described(
+        1e-2, "Variance of the heading that one radian of turning adds [rad^2/rad].", minimum=0.0
+    )
+    heading_hold: bool = described(False, "Correct the heading by the yaw of the topic imu.")
+    heading_p: float = described(2.0, "Proportional gain of the heading [1/s].", minimum=0.0)
+    heading_i: float = described(0.5, "Integral gain of the heading [1/s^2].", minimum=0.0)
+    heading_max_correction: float = described(0.5, "Largest yaw rate that is added [rad/s].")
+    heading_max_error: float = described(
+        0.7, "Beyond this the present heading is taken for the wanted one [rad]."
+    )
+    imu_timeout: float = described(0.2, "Age at which a yaw is not used [s].", minimum=0.01)
+    linear: AxisLimits = nested(AxisLimits(), _LIMITS, prefix="linear.x.")  # noqa: RUF009
+    angular: AxisLimits = nested(AxisLimits(), _LIMITS, prefix="angular.z.")  # noqa: RUF009
+
+    def __post_init__(self) -> None:
+        self.robot()
+        self.hold()
+        for name, axis in (("linear.x", self.linear), ("angular.z", self.angular)):
+            try:
+                axis.limiter()
+            except ParameterError as error:
+                raise ParameterError(f"{name}: {error}") from None
+
+    def robot(self) -> SkidSteer:
+        """Return the geometry."""
+        return SkidSteer(
+            wheel_separation=self.wheel_separation,
+            wheel_radius=self.wheel_radius,
+            wheel_separation_multiplier=self.wheel_separation_multiplier,
+            left_wheel_radius_multiplier=self.left_wheel_radius_multiplier,
+            right_wheel_radius_multiplier=self.right_wheel_radius_multiplier,
+            max_wheel_speed=self.max_wheel_velocity or math.inf,
+        )
+
+    def hold(self) -> HeadingHold:
+        """Return a heading controller."""
+        return HeadingHold(
+            self.heading_p, self.heading_i, self.heading_max_correction, self.heading_max_error
+        )
+
+
+class SkidSteerNode(Node):
+    """Takes commands of the body and feedback of the wheels; runs on a steady timer."""
+
+    def __init__(self) -> None:
+        super().__init__("skid_steer")
+        self._parameters = Parameters(self, Settings, self._configure)
+        settings = self._parameters.settings
+        robot = settings.robot()
+        self._command = BodyCommand()
+        self._feedback = WheelFeedback(LEFT, RIGHT)
+        self._odometry = Odometry(
+            robot.effective_separation,
+            robot.left_radius,
+            robot.right_radius,
+            settings.velocity_rolling_window_size,
+        )
+        self._configure(settings)
+        self._given = [(0.0, 0.0), (0.0, 0.0)]  # (linear, angular) of the last two steps
+        self._share = 1.0
+        self._refused = ""
+        self._yaw, self._yaw_time, self._imu_stamp = math.nan, -math.inf, -math.inf
+        self._last_tick = time.monotonic()
+        self._connect(settings)
+
+    def _connect(self, settings: Settings) -> None:
+        self._setpoint = JointState(name=[f"{wheel}_wheel_joint" for wheel in (*LEFT, *RIGHT)])
+        self._setpoints = self.create_publisher(
+            JointState, "wheel_setpoints", runtime.STREAM_PUBLISHER
+        )
+        self._output = OdometryOutput(self, settings)
+        best_effort = runtime.STREAM_SUBSCRIBER
+        if settings.use_stamped_vel:
+            self.create_subscription(TwistStamped, "cmd_vel", self._on_stamped, best_effort)
+        else:
+            self.create_subscription(Twist, "cmd_vel", self._on_twist, best_effort)
+        for wheel in (*LEFT, *RIGHT):
+            self.create_subscription(
+                MotorState, f"{wheel}/motor_state", partial(self._on_state, wheel), best_effort
+            )
+        self.create_subscription(Imu, "imu", self._on_imu, best_effort)
+        self._timer = runtime.steady_timer(self, 1.0 / settings.publish_rate, self._tick)
+        self._diagnostics = runtime.Diagnostics(self, self._assess)
+
+    def _configure(self, settings: Settings) -> None:
+        robot = settings.robot()
+        self._robot = robot
+        self._linear, self._angular = settings.linear.limiter(), settings.angular.limiter()
+        self._command.configure(settings.cmd_vel_timeout)
+        self._feedback.max_speed = IMPLAUSIBLE * robot.max_wheel_speed
+        self._hold = settings.hold()
+        self._odometry.configure(
+            robot.effective_separation,
+            robot.left_radius,
+            robot.right_radius,
+            settings.travel_noise,
+            settings.turn_noise,
+        )
+
+    def _now(self) -> float:
+        return self.get_clock().now().nanoseconds * 1e-9
+
+    def _on_stamped(self, message: TwistStamped) -> None:
+        stamp = runtime.seconds(message.header.stamp)
+        self._on_command(message.twist, None if stamp == 0.0 else self._now() - stamp)
+
+    def _on_twist(self, message: Twist) -> None:
+        self._on_command(message, 0.0)
+
+    def _on_command(self, twist: Twist, age: float | None) -> None:
+        verdict = self._command.receive(twist.linear.x, twist.angular.z, age, time.monotonic())
+        self._refused = verdict.value if verdict in (Verdict.STALE, Verdict.NOT_FINITE) else ""
+        if verdict is Verdict.ZERO_STAMP:
+            self.get_logger().warning(f"cmd_vel {verdict.value}", once=True)
+        elif verdict is Verdict.STALE:
+            self.get_logger().warning(
+                f"cmd_vel {verdict.value} ({age:.3f} s)", throttle_duration_sec=1.0
+            )
+        elif verdict is Verdict.NOT_FINITE:
+            self.get_logger().warning(f"cmd_vel {verdict.value}", throttle_duration_sec=1.0)
+
+    def _on_state(self, wheel: str, message: MotorState) -> None:
+        sample = WheelSample(
+            runtime.seconds(message.header.stamp), message.position, message.velocity
+        )
+        self._feedback.receive(wheel, sample, time.monotonic())
+
+    def _on_imu(self, message: Imu) -> None:
+        """Take the yaw from the orientation, or integrate the yaw rate where there is none."""
+        now, stamp = time.monotonic(), runtime.seconds(message.header.stamp)
+        if message.orientation_covariance[0] != -1.0:
+            q = message.orientation
+            norm = q.w * q.w + q.x * q.x + q.y * q.y + q.z * q.z
+            yaw = math.atan2(2.0 * (q.w * q.z + q.x * q.y), norm - 2.0 * (q.y * q.y + q.z * q.z))
+            self._yaw = yaw if 0.25 < norm < 4.0 else math.nan
+        else:
+            dt = stamp - self._imu_stamp
+            rate = message.angular_velocity.z
+            fresh = 0.0 < dt < self._parameters.settings.imu_timeout and math.isfinite(rate)
+            before = self._yaw if math.isfinite(self._yaw) else 0.0
+            self._yaw = before + rate * dt if fresh else before
+        self._imu_stamp, self._yaw_time = stamp, now
+
+    def _tick(self) -> None:
+        now = time.monotonic()
+        settings = self._parameters.settings
+        dt = min(now - self._last_tick, 5.0 / settings.publish_rate)
+        self._last_tick = now
+        asked = self._command.at(now)
+        if asked is not None:
+            self._drive(asked, dt, now)
+        stamp = self._now()
+        if settings.open_loop:
+            updated = asked is not None and self._odometry.update_open_loop(*self._given[0], dt)
+        else:
+            travel = self._feedback.take()
+            updated = travel is not None and self._odometry.update_from_velocity(*travel)
+        if updated:
+            self._output.publish(self._odometry, stamp)
+        self._output.publish_joints(self._feedback.latest, stamp)
+
+    def _drive(self, asked: tuple[float, float], dt: float, now: float) -> None:
+        """Limit what is asked, hold the heading, and set the wheels."""
+        (v0, w0), (v1, w1) = self._given
+        linear = self._linear.limit(asked[0], v0, v1, dt).value
+        angular = self._angular.limit(asked[1], w0, w1, dt).value
+        share = self._robot.reachable_share(linear, angular)
+        linear, angular = linear * share, angular * share
+        self._given = [(linear, angular), (v0, w0)]
+        corrected = self._hold_heading(linear, angular, dt, now)
+        left, right = self._robot.reachable_wheel_speeds(linear, corrected)
+        self._share = share
+        self._set_wheels(left, right)
+
+    def _hold_heading(self, linear: float, angular: float, dt: float, now: float) -> float:
+        settings = self._parameters.settings
+        known = now - self._yaw_time <= settings.imu_timeout
+        if not settings.heading_hold or not known or (linear == 0.0 and angular == 0.0):
+            self._hold.reset()
+            return angular
+        return self._hold.step(angular, self._yaw, dt)
+
+    def _set_wheels(self, left: float, right: float) -> None:
+        self._setpoint.header.stamp = self.get_clock().now().to_msg()
+        self._setpoint.velocity = [left] * len(LEFT) + [right] * len(RIGHT)
+        self._setpoints.publish(self._setpoint)
+
+    def _assess(self) -> tuple[bytes, str, dict[str, object]]:
+        settings, now = self._parameters.settings, time.monotonic()
+        (linear, angular), asked = self._given[0], self._command.at(now)
+        values: dict[str, object] = {
+            "linear velocity": linear,
+            "angular velocity": angular,
+            "command age": self._command.age(now),
+            "scaled to": self._share,
+            "heading hold": settings.heading_hold,
+        }
+        level, message = runtime.OK, "waiting for the first cmd_vel" if asked is None else "driving"
+        silent = self._feedback.silent(now, settings.feedback_timeout)
+        if silent and (self._feedback.latest or asked is not None) and not settings.open_loop:
+            level = runtime.ERROR
+            message = "no feedback from " + ", ".join(
+                f"{wheel} ({'never' if math.isinf(age) else f'{age:.1f} s'})"
+                for wheel, age in silent.items()
+            )
+        elif self._refused:
+            level, message = runtime.WARN, f"cmd_vel {self._refused}"
+        elif asked is not None and self._command.timed_out(now):
+            level, message = runtime.WARN, "cmd_vel timed out, braking"
+        elif settings.heading_hold and now - self._yaw_time > settings.imu_timeout:
+            level, message = runtime.WARN, "heading is not held: no imu"
+        elif self._share < 1.0:
+            message = (
+                f"driving at {100.0 * self._share:.0f} % of the command: wheels at their limit"
+            )
+        return level, message, values
+
+    def on_stop(self) -> None:
+        """Leave the wheels at zero, if they were ever commanded from here."""
+        if self._setpoint.velocity:
+            self._setpoint.header.stamp = self.get_clock().now().to_msg()
+            self._setpoint.velocity = [0.0] * len(self._setpoint.name)
+            runtime.send_last(self._setpoints, self._setpoint)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the node until a signal; return its exit code."""
+    return runtime.run("skid_steer", SkidSteerNode, argv)
