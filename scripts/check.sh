@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Every guard, each to its end, then one line per guard: `make check`. Names as arguments run those only.
 set -u
-cd -- "$(dirname -- "${BASH_SOURCE[0]}")/.."
+cd -- "$(dirname -- "${BASH_SOURCE[0]}")/.." || exit
 
 python_files() { git ls-files --cached --others --exclude-standard -- "$@" | while read -r file; do [ ! -f "$file" ] || echo "$file"; done; }
 format() { ruff format --quiet --check . || { ruff format --check .; echo "run: make format"; return 1; }; }
