@@ -1,0 +1,22 @@
+"""Any robot's recordings as records: the only part of the project that reads and writes bags.
+
+`read_records` gives one `smp_motor_ident.record.Record` per wheel, whatever the format; a
+mapping says which topics, fields or columns are which signals where the messages are not ours.
+`BagWriter` writes.
+"""
+
+from smp_motor_ident.bag.mapping import MotorMap, Signal, SignalMap, load, parse
+from smp_motor_ident.bag.read import join_records, read_experiments, read_records
+from smp_motor_ident.bag.writer import BagWriter
+
+__all__ = [
+    "BagWriter",
+    "MotorMap",
+    "Signal",
+    "SignalMap",
+    "join_records",
+    "load",
+    "parse",
+    "read_experiments",
+    "read_records",
+]

@@ -1,0 +1,310 @@
+"""From columns to one motor's Record: units, clock, order, repairs, segments."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smp_motor_control.motor import Gearbox
+from smp_motor_ident.bag.axis import Series, on_one_axis
+from smp_motor_ident.bag.counter import unwrap_angle
+from smp_motor_ident.bag.mapping import MotorMap, Signal
+from smp_motor_ident.bag.table import Table
+from smp_motor_ident.bag.timing import (
+    SAME_CLOCK,
+    epochs,
+    fit_clock,
+    judge_stamps,
+    rhythm,
+)
+from smp_motor_ident.bag.units import FACTORS, factor
+from smp_motor_ident.errors import BagError
+from smp_motor_ident.record import Hardware, Record
+
+Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+_OUTPUTS = ("count", "position", "velocity")
+_SECOND = 1_000_000_000
+
+
+@dataclass(eq=False)
+class _Motor:
+    """What is known of one motor while its record is made."""
+
+    wheel: str
+    plan: MotorMap
+    hardware: Hardware
+    gearbox: Gearbox
+    tables: Mapping[str, Table]
+    where: str
+    notes: list[str] = field(default_factory=list)
+
+    def table(self, signal: Signal) -> Table:
+        return self.tables[signal.topic]
+
+
+def assemble(
+    wheel: str,
+    plan: MotorMap,
+    hardware: Hardware,
+    tables: Mapping[str, Table],
+    source: str,
+) -> Record:
+    """Make one motor's record.
+
+    Parameters
+    ----------
+    wheel : str
+        Its name.
+    plan : MotorMap
+        Signals and options.
+    hardware : Hardware
+        Gearbox, encoder and supply.
+    tables : mapping of str to Table
+        By topic; the key '' is the CSV file.
+    source : str
+        Name of the recording.
+
+    Returns
+    -------
+    Record
+        At the motor shaft, with notes on everything that was repaired or assumed.
+
+    Raises
+    ------
+    BagError
+        When signals that are needed have no samples.
+    """
+    motor = _Motor(
+        wheel, plan, hardware, Gearbox(hardware.gear_ratio), tables, f"{source}: {wheel}"
+    )
+    for topic in dict.fromkeys(s.topic for s in plan.signals.values()):
+        motor.notes += tables[topic].notes
+        if not tables[topic].log.size:
+            raise BagError(f"{motor.where}: {topic} has no messages")
+    axis_name = next((name for name in _OUTPUTS if name in plan.signals), None)
+    if axis_name is None or "voltage" not in plan.signals:
+        missing = "voltage" if axis_name else "velocity, position or count"
+        raise BagError(f"{motor.where}: the mapping gives no {missing}")
+    times = _clock(motor)
+    series = {
+        name: _series(motor, name, signal, times[signal.topic])
+        for name, signal in plan.signals.items()
+        if name != "time"
+    }
+    if plan.signals["voltage"].topic == plan.signals[axis_name].topic:
+        _drop_lost(motor, series, axis_name)
+    return on_one_axis(wheel, plan, hardware, series, axis_name, source, motor.notes)
+
+
+def _clock(motor: _Motor) -> dict[str, Integers]:
+    """Return the time [ns] of every topic's messages, all on one clock."""
+    topics = list(dict.fromkeys(signal.topic for signal in motor.plan.signals.values()))
+    tables = {topic: motor.tables[topic] for topic in topics}
+    if topics == [""]:
+        return {"": tables[""].log}
+    stamps = {topic: _stamp(motor, tables[topic]) for topic in topics}
+    if motor.plan.clock == "log":
+        motor.notes.append("time: log times, as asked")
+        return {topic: table.log for topic, table in tables.items()}
+    poor = {
+        topic: reason
+        for topic, table in tables.items()
+        if (reason := judge_stamps(stamps[topic], table.log))
+    }
+    if motor.plan.clock == "header" and poor:
+        topic, reason = next(iter(poor.items()))
+        raise BagError(f"{motor.where}: {topic} has no usable header time: {reason}")
+    fits = {
+        t: fit_clock(stamp, tables[t].log)
+        for t, stamp in stamps.items()
+        if t not in poor and stamp is not None
+    }
+    offsets = [fit.offset for fit in fits.values()]
+    if not poor and max(offsets) - min(offsets) < SAME_CLOCK:
+        motor.notes.append(
+            "time: header stamps (the instants of sampling, free of transport delay)"
+        )
+        _tell_offset(motor, topics[0], fits)
+        if any(len(epochs(stamp)) > 1 for stamp in stamps.values() if stamp is not None):
+            return _set_back(motor, tables, stamps)
+        return {topic: stamp for topic, stamp in stamps.items() if stamp is not None}
+    if not fits:
+        motor.notes.append(f"time: log times ({next(iter(poor.values()))})")
+        return {topic: table.log for topic, table in tables.items()}
+    reason = "; ".join(f"{topic}: {why}" for topic, why in poor.items())
+    motor.notes.append(
+        "time: header stamps moved to the recorder's clock by their offset and drift, because "
+        + (reason or "the topics' clocks differ")
+    )
+    times = {}
+    for topic, table in tables.items():
+        stamp = stamps[topic]
+        if topic in fits and stamp is not None:
+            _tell_offset(motor, topic, fits, always=True)
+            times[topic] = fits[topic].to_log(stamp)
+        else:
+            times[topic] = table.log
+    return times
+
+
+def _set_back(
+    motor: _Motor, tables: Mapping[str, Table], stamps: Mapping[str, Integers | None]
+) -> dict[str, Integers]:
+    """Return times for a recording during which the clock of the stamps was set back."""
+    if len(tables) > 1:
+        motor.notes[-1] = "time: log times (the clock of the header stamps was set back meanwhile)"
+        return {topic: table.log for topic, table in tables.items()}
+    topic, table = next(iter(tables.items()))
+    stamp = stamps[topic]
+    assert stamp is not None
+    time, parts = stamp.copy(), epochs(stamp)
+    pause = 3 * round(rhythm(np.sort(stamp)).gap()) + _SECOND
+    for (_, before), (begin, end) in pairwise(parts):
+        away = max(int(table.log[begin] - table.log[before - 1]), 0)
+        time[begin:end] += time[:begin].max() + max(away, pause) - time[begin:end].min()
+    motor.notes.append(
+        f"{topic}: the clock of the header stamps was set back {len(parts) - 1} times; "
+        "a new segment each"
+    )
+    return {topic: time}
+
+
+def _stamp(motor: _Motor, table: Table) -> Integers | None:
+    """Return a topic's stamps: the field that the mapping names, else the header's."""
+    signal = motor.plan.signals.get("time")
+    if signal is None or motor.tables.get(signal.topic) is not table:
+        return table.stamp
+    column = table.columns.get(signal.field)
+    if column is None:
+        return None
+    to_nanoseconds = FACTORS["time"][signal.unit] * 1e9
+    if column.dtype.kind in "iu" and signal.scale == 1 and to_nanoseconds >= 1:
+        # Whole nanoseconds since 1970 have no room in a float.
+        whole: Integers = column.astype(np.int64) * round(to_nanoseconds)
+        whole += round(signal.offset * to_nanoseconds)
+        return whole
+    values = (column.astype(np.float64) * signal.scale + signal.offset) * to_nanoseconds
+    stamp: Integers = np.rint(np.nan_to_num(values)).astype(np.int64)
+    return stamp
+
+
+def _tell_offset(motor: _Motor, topic: str, fits: Mapping[str, Any], always: bool = False) -> None:
+    fit = fits[topic]
+    if always or abs(fit.offset) > 1e9 or abs(fit.drift) > 1e-4:
+        motor.notes.append(
+            f"{topic}: the recorder's clock is {fit.offset * 1e-9:+.6f} s from the header's, "
+            f"drifting by {fit.drift * 1e6:+.0f} ppm"
+        )
+
+
+def _series(motor: _Motor, name: str, signal: Signal, time: Integers) -> Series:
+    """Return one signal in SI at the motor shaft, in order, without what is no sample."""
+    table = motor.table(signal)
+    column = table.columns.get(signal.field)
+    there = table.present.get(signal.field)
+    if column is None:
+        raise BagError(f"{motor.where}: no message of {signal.topic} has {signal.field}")
+    order = _order(motor, time, table, signal.topic)
+    keep = order if there is None else order[there[order]]
+    if not keep.size:
+        raise BagError(f"{motor.where}: no message of {signal.topic} has {signal.field}")
+    values = column if keep.size == column.size and _is_identity(keep) else column[keep]
+    return Series(time[keep], _converted(motor, name, signal, values))
+
+
+def _is_identity(order: Integers) -> bool:
+    return bool(order[0] == 0 and order[-1] == order.size - 1 and np.all(np.diff(order) == 1))
+
+
+def _order(motor: _Motor, time: Integers, table: Table, topic: str) -> Integers:
+    """Return the samples' order of time without duplicates; tell what was repaired."""
+    steps = np.diff(time)
+    if np.all(steps > 0):
+        return np.arange(time.size)
+    late = int(np.sum(steps < 0))
+    order = np.argsort(time, kind="stable")
+    ordered = time[order]
+    first = np.concatenate([[True], np.diff(ordered) > 0])
+    notes = []
+    if late:
+        notes.append(f"{late} samples came out of order and were sorted")
+    if doubles := int((~first).sum()):
+        again = order[~first]
+        before = order[np.flatnonzero(~first) - 1]
+        differ = [
+            name
+            for name, column in table.columns.items()
+            if not np.array_equal(column[again], column[before], equal_nan=column.dtype.kind == "f")
+        ]
+        notes.append(
+            f"{doubles} samples have the time of another and were left out"
+            + (f" although they differ in {', '.join(differ)}" if differ else " (duplicates)")
+        )
+    for note in notes:
+        text = f"{topic or 'rows'}: {note}"
+        if text not in motor.notes:
+            motor.notes.append(text)
+    chosen: Integers = order[first]
+    return chosen
+
+
+def _converted(motor: _Motor, name: str, signal: Signal, raw: NDArray[Any]) -> NDArray[Any]:
+    """Return values in SI at the motor shaft; counts as int64."""
+    if name == "count":
+        exact = signal.scale == 1 and signal.offset == 0
+        if raw.dtype.kind in "iu" and exact:
+            return raw.astype(np.int64, copy=False)
+        return raw.astype(np.float64) * signal.scale + signal.offset
+    values: Array = raw.astype(np.float64)
+    if signal.scale != 1:
+        values *= signal.scale
+    if signal.offset:
+        values += signal.offset
+    supply = motor.hardware.supply_voltage
+    if "supply" in motor.plan.signals and name == "voltage":
+        supply = 1.0  # the supply as it was measured comes in below
+    try:
+        by = factor(
+            name,
+            signal.unit,
+            counts_per_revolution=motor.hardware.counts_per_revolution,
+            supply_voltage=supply,
+        )
+    except BagError as error:
+        raise BagError(f"{motor.where}: {error}") from None
+    if by != 1:
+        values *= by
+    shaft = signal.shaft or motor.plan.shaft
+    if signal.unit.startswith("ticks"):
+        shaft = signal.shaft or "motor"
+    if name == "position" and not motor.plan.own:
+        values, wrapped = unwrap_angle(values)
+        if wrapped:
+            motor.notes.append("position: it wraps at one turn; wrap undone")
+    if name in ("velocity", "position") and shaft == "wheel":
+        values = motor.gearbox.to_motor(values)
+    return values
+
+
+def _drop_lost(motor: _Motor, series: dict[str, Series], axis_name: str) -> None:
+    """Leave out the samples of a common topic whose voltage or output is no number."""
+    axis, voltage = series[axis_name], series["voltage"]
+    if not np.array_equal(axis.time, voltage.time):
+        return
+    sound = np.isfinite(voltage.value)
+    values = axis.value
+    if axis_name == "count" and values.dtype.kind == "f":
+        sound &= np.isfinite(values)
+    if sound.all():
+        return
+    motor.notes.append(f"{int((~sound).sum())} samples without a finite voltage were left out")
+    for name, signal in series.items():
+        if np.array_equal(signal.time, axis.time):
+            series[name] = Series(signal.time[sound], signal.value[sound])

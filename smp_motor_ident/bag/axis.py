@@ -1,0 +1,265 @@
+"""All signals of a motor on the time axis of its main output, cut where nothing is known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smp_motor_ident.bag.counter import unwrap
+from smp_motor_ident.bag.mapping import MotorMap
+from smp_motor_ident.bag.timing import mean_held, rhythm
+from smp_motor_ident.errors import BagError
+from smp_motor_ident.record import Hardware, Record
+
+Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+BRIDGED = 2
+"""Samples that may be lost in a row before a new segment begins."""
+
+
+@dataclass(eq=False)
+class Series:
+    """One signal's samples: time [ns] strictly increasing, value in SI at the motor shaft."""
+
+    time: Integers
+    value: NDArray[Any]
+
+
+def on_one_axis(
+    wheel: str,
+    plan: MotorMap,
+    hardware: Hardware,
+    series: dict[str, Series],
+    axis_name: str,
+    source: str,
+    notes: list[str],
+) -> Record:
+    """Make a record of signals that were sampled each at its own instants.
+
+    Parameters
+    ----------
+    wheel, source : str
+        Names of motor and recording.
+    plan : MotorMap
+        Its options ``held`` and ``gap``.
+    hardware : Hardware
+        Encoder and supply.
+    series : dict of str to Series
+        Voltage and at least the output ``axis_name``.
+    axis_name : {'count', 'position', 'velocity'}
+        The output whose instants become the record's.
+    notes : list of str
+        What was found so far.
+
+    Returns
+    -------
+    Record
+        With segments, and notes on every repair.
+
+    Raises
+    ------
+    BagError
+        When fewer than two samples are left.
+    """
+    notes = list(notes)
+    held = plan.held or "after"
+    if "supply" in series:
+        _times_supply(series)
+    voltage = _finite(series["voltage"])
+    axis = series[axis_name].time
+    alike = np.array_equal(voltage.time, axis)
+    keep = np.ones(axis.size, bool) if alike else _covered(voltage, axis, notes)
+    if keep.sum() < 2:
+        raise BagError(f"{source}: {wheel}: fewer than 2 samples have a voltage and an output")
+    axis = axis[keep]
+    values = mean_held(voltage.time, voltage.value, held, axis)
+    starts = _count_starts(series, plan, hardware, keep, axis_name, notes)
+    starts |= _gaps(axis, plan, alike, held, voltage, values, notes)
+    columns: dict[str, Any] = {"voltage": values}
+    for name in ("current", "velocity", "position", "count"):
+        if name in series:
+            columns[name] = _on_axis(name, series[name], axis, keep, notes)
+    outputs = [v for n, v in columns.items() if n != "voltage" and v is not None]
+    if not outputs:
+        raise BagError(f"{source}: {wheel}: no output has a finite value")
+    axis, columns, starts = _without_stubs(axis, columns, starts, notes)
+    if axis.size < 2:
+        raise BagError(f"{source}: {wheel}: fewer than 2 samples in a row are left")
+    return Record(
+        wheel=wheel,
+        time=(axis - axis[0]) * 1e-9,
+        starts=tuple(np.flatnonzero(starts).tolist()),
+        hardware=hardware,
+        source=source,
+        notes=tuple(dict.fromkeys(notes)),
+        velocity_window=plan.velocity_window,
+        **columns,
+    )
+
+
+def _finite(series: Series) -> Series:
+    sound = np.isfinite(series.value)
+    return series if sound.all() else Series(series.time[sound], series.value[sound])
+
+
+def _times_supply(series: dict[str, Series]) -> None:
+    """Multiply the duty cycle by the supply as it was measured."""
+    supply, voltage = _finite(series.pop("supply")), series["voltage"]
+    if not supply.time.size:
+        raise BagError("the supply signal has no finite value")
+    measured = np.interp(voltage.time - supply.time[0], supply.time - supply.time[0], supply.value)
+    series["voltage"] = Series(voltage.time, voltage.value * measured)
+
+
+def _covered(voltage: Series, axis: Integers, notes: list[str]) -> Flags:
+    """Return which output samples lie where the input is known."""
+    keep: Flags = axis >= voltage.time[0] if voltage.time.size else np.zeros(axis.size, bool)
+    if not keep.all():
+        notes.append(f"{int((~keep).sum())} samples before the first voltage were left out")
+    beat = rhythm(voltage.time)
+    if beat.regular:
+        limit = beat.gap()
+        index = np.searchsorted(voltage.time, axis, "right") - 1
+        age = axis - voltage.time[np.maximum(index, 0)]
+        stale = keep & (age > limit)
+        if stale.any():
+            notes.append(
+                f"{int(stale.sum())} samples were left out: no voltage came for more than "
+                f"{limit * 1e-9:g} s"
+            )
+        keep &= ~stale
+    return keep
+
+
+def _count_starts(
+    series: dict[str, Series],
+    plan: MotorMap,
+    hardware: Hardware,
+    keep: Flags,
+    axis_name: str,
+    notes: list[str],
+) -> Flags:
+    """Unwrap the counter in place; return which kept samples begin a segment by a reset."""
+    flags = np.zeros(keep.size, bool)
+    flags[0] = True
+    if axis_name == "count":
+        counted = series["count"]
+        bits = hardware.encoder_bits if "encoder_bits" in plan.hardware else None
+        raw = counted.value
+        if raw.dtype.kind == "f":
+            raw = np.rint(raw).astype(np.int64)
+        unwrapped = unwrap(raw, bits, _expected(series, hardware))
+        notes += unwrapped.notes
+        series["count"] = Series(counted.time, unwrapped.count)
+        flags[unwrapped.resets] = True
+    # A reset at a sample that is left out begins a segment at the next that is kept.
+    resets = np.cumsum(flags)[keep]
+    return np.concatenate([[True], np.diff(resets) > 0])
+
+
+def _expected(series: dict[str, Series], hardware: Hardware) -> Array | None:
+    """Return the counts between samples by the measured speed, where both come together."""
+    speed = series.get("velocity")
+    if speed is None or hardware.counts_per_revolution is None:
+        return None
+    time = series["count"].time
+    if not np.array_equal(speed.time, time):
+        return None
+    per_radian = hardware.counts_per_revolution / (2 * np.pi)
+    mean = 0.5 * (speed.value[1:] + speed.value[:-1])
+    expected: Array = mean * (np.diff(time) * 1e-9) * per_radian
+    return np.where(np.abs(expected) < 2.0**52, expected, 0.0)
+
+
+def _gaps(
+    axis: Integers,
+    plan: MotorMap,
+    alike: bool,
+    held: str,
+    voltage: Series,
+    values: Array,
+    notes: list[str],
+) -> Flags:
+    """Return where segments begin because samples are missing; bridge the voltage over a few."""
+    beat = rhythm(axis)
+    steps, missing = np.diff(axis), beat.missing(axis)
+    limit = plan.gap * 1e9 if plan.gap else beat.gap()
+    cut = steps > limit
+    if alike and not plan.gap:
+        cut |= missing > BRIDGED
+    bridged = (missing > 0) & ~cut
+    if alike and bridged.any():
+        _bridge(values, voltage.value, missing, bridged, held)
+    if missing.any() and beat.regular:
+        notes.append(
+            f"{int(missing[bridged].sum())} samples missing in {int(bridged.sum())} places"
+            + ("; their voltage was interpolated" if alike else "; the voltage there is known")
+        ) if bridged.any() else None
+    if cut.any():
+        lost = int(missing[cut].sum())
+        longest = steps[cut].max() * 1e-9
+        notes.append(
+            f"{int(cut.sum())} gaps of up to {longest:.3g} s"
+            + (f" ({lost} samples missing)" if beat.regular else "")
+            + "; a new segment behind each"
+        )
+    if not beat.regular:
+        notes.append(
+            f"the sampling is irregular: median {beat.interval * 1e-6:.4g} ms, "
+            f"from {steps.min() * 1e-6:.4g} to {steps.max() * 1e-6:.4g} ms"
+        )
+    return np.concatenate([[True], cut])
+
+
+def _bridge(values: Array, voltage: Array, missing: Integers, which: Flags, held: str) -> None:
+    """Give intervals in which samples were lost the mean of a linearly changing voltage."""
+    k = np.flatnonzero(which)
+    lost = missing[k]
+    weight = (lost + 2 if held == "before" else lost) / (2 * (lost + 1))
+    values[k + 1] = voltage[k] + (voltage[k + 1] - voltage[k]) * weight
+
+
+def _on_axis(
+    name: str, series: Series, axis: Integers, keep: Flags, notes: list[str]
+) -> NDArray[Any] | None:
+    """Return a signal at the axis's instants, NaN where it is not known."""
+    if series.time.size == keep.size and np.array_equal(series.time[keep], axis):
+        values = series.value if keep.all() else series.value[keep]
+    else:
+        sound = _finite(series)
+        if sound.time.size < 2:
+            return None
+        origin = sound.time[0]
+        values = np.interp(axis - origin, sound.time - origin, sound.value, np.nan, np.nan)
+        after = np.clip(np.searchsorted(sound.time, axis), 1, sound.time.size - 1)
+        apart = sound.time[after] - sound.time[after - 1]
+        exact = np.isin(axis, sound.time)
+        values[(apart > 3 * rhythm(sound.time).interval) & ~exact] = np.nan
+        notes.append(f"{name}: interpolated to the instants of the main output")
+    if name == "count":
+        return values
+    if not np.isfinite(values).all():
+        values = np.where(np.isfinite(values), values, np.nan)
+        if np.isnan(values).all():
+            return None
+        notes.append(f"{name}: {int(np.isnan(values).sum())} values missing")
+    return values
+
+
+def _without_stubs(
+    axis: Integers, columns: dict[str, Any], starts: Flags, notes: list[str]
+) -> tuple[Integers, dict[str, Any], Flags]:
+    """Leave out segments of a single sample: they tell nothing."""
+    edges = np.append(np.flatnonzero(starts), axis.size)
+    short = np.diff(edges) < 2
+    if not short.any():
+        return axis, columns, starts
+    keep = np.repeat(~short, np.diff(edges))
+    notes.append(f"{int(short.sum())} single samples between gaps were left out")
+    kept = {name: None if v is None else v[keep] for name, v in columns.items()}
+    return axis[keep], kept, starts[keep]

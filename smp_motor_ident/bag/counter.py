@@ -1,0 +1,122 @@
+"""Encoder counters that wrap around, and counters that start again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+_WIDTHS = (32, 24, 20, 18, 17, 16, 15, 14, 13, 12, 11, 10, 8)
+
+
+@dataclass(frozen=True, eq=False)
+class Unwrapped:
+    """A counter that no longer wraps; ``resets`` are the samples where it started again."""
+
+    count: Integers
+    resets: Integers
+    notes: list[str] = field(default_factory=list)
+
+
+def unwrap(count: Integers, bits: int | None, expected: Array | None = None) -> Unwrapped:
+    """Undo the wrap-around of a counter, and find where it was reset.
+
+    Parameters
+    ----------
+    count : ndarray of int64, shape (n,)
+        As the hardware reports it.
+    bits : int or None
+        Width of the counter; 0 where it does not wrap.  None: not known; then it is told by
+        jumps of one power of two.
+    expected : ndarray, shape (n - 1,), or None
+        Counts from sample to sample by a measured speed, where that is known: it decides
+        between wrap and reset, and helps a narrow counter that turns more than half of its
+        range between two samples.
+
+    Returns
+    -------
+    Unwrapped
+        Starting at the first raw count; at a reset the raw count is taken on.
+    """
+    if count.size < 2:
+        return Unwrapped(count, np.zeros(0, np.int64))
+    notes = []
+    steps = np.diff(count)  # modulo 2^64, as is right for a counter of that width
+    guess = np.zeros(steps.size) if expected is None else np.nan_to_num(expected)
+    if bits is None and (found := _width(steps, guess)):
+        bits = found
+        notes.append(f"the encoder wraps at 2^{bits} counts by what it shows; wrap undone")
+    if bits:
+        near = np.rint(guess).astype(np.int64)
+        shift = np.int64(64 - bits)
+        steps = near + (((steps - near) << shift) >> shift)
+    resets = _resets(count, steps, guess, expected is not None) + 1
+    if resets.size:
+        notes.append(f"the encoder's counter was reset {resets.size} times; a new segment each")
+        steps = steps.copy()
+        steps[resets - 1] = np.diff(count)[resets - 1]
+    whole = np.concatenate([count[:1], count[:1] + np.cumsum(steps)])
+    for begin, end in zip(resets, [*resets[1:], count.size]):
+        whole[begin:end] += count[begin] - whole[begin]
+    return Unwrapped(whole, resets, notes)
+
+
+def _usual(steps: Integers, guess: Array) -> float:
+    """Return a bound that the steps of a turning motor do not reach."""
+    size = np.abs(steps - guess)
+    return 10.0 * float(np.quantile(size, 0.9)) + 100.0
+
+
+def _width(steps: Integers, guess: Array) -> int:
+    """Return the width at which a counter evidently wraps, or 0."""
+    rest = steps - guess
+    large = np.abs(rest) > _usual(steps, guess)
+    if not large.any() or large.mean() > 0.05:
+        return 0
+    for bits in _WIDTHS:
+        period = float(2**bits)
+        after = np.abs(rest[large]) - period
+        if np.all(np.abs(after) < period / 8) and np.all(np.abs(rest[~large]) < period / 4):
+            return bits
+    return 0
+
+
+def _resets(count: Integers, steps: Integers, guess: Array, measured: bool) -> Integers:
+    """Return the steps at which the counter fell to about zero without having turned there."""
+    rest = np.abs(steps - guess)
+    bound = _usual(steps, guess)
+    fell = (rest > bound) & (np.abs(count[1:]) < bound) & (np.abs(count[:-1]) > bound)
+    if not measured:
+        fell &= rest > 5 * np.maximum(np.quantile(np.abs(steps), 0.99), 1.0)
+    found: Integers = np.flatnonzero(fell)
+    return found if found.size <= max(3, 0.01 * steps.size) else np.zeros(0, np.int64)
+
+
+def unwrap_angle(angle: Array) -> tuple[Array, bool]:
+    """Undo the wrap-around of an angle that stays within one turn.
+
+    Parameters
+    ----------
+    angle : ndarray, shape (n,), [rad]
+        At the shaft where it is measured; NaN where lost.
+
+    Returns
+    -------
+    angle : ndarray, shape (n,), [rad]
+        Continuous.
+    wrapped : bool
+        Whether it did wrap.
+    """
+    sound = np.isfinite(angle)
+    values = angle[sound]
+    if values.size < 2 or np.ptp(values) > 2 * np.pi * 1.001:
+        return angle, False
+    if np.max(np.abs(np.diff(values))) < np.pi:
+        return angle, False
+    result = angle.copy()
+    result[sound] = np.unwrap(values)
+    return result, True

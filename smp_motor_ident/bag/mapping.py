@@ -1,0 +1,397 @@
+"""Which topic, field or column is which signal of which motor, and in what unit.
+
+The same mapping is written as a YAML file or as strings on the command line; docs/mapping.md
+shows both.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from smp_motor_ident.bag.layout import parse_path
+from smp_motor_ident.bag.units import check_unit
+from smp_motor_ident.errors import BagError
+
+SIGNALS = ("voltage", "current", "velocity", "position", "count", "supply", "time")
+HARDWARE = (
+    "gear_ratio",
+    "counts_per_revolution",
+    "encoder_bits",
+    "supply_voltage",
+    "resistance",
+)
+_CHOICES = {
+    "held": ("after", "before"),
+    "clock": ("auto", "header", "log"),
+    "shaft": ("wheel", "motor"),
+}
+_SECONDS = ("gap", "sample_time", "velocity_window")
+DEFAULT_MOTOR = "motor"
+"""Name of the motor where a mapping has only one and does not name it."""
+
+_NUMBER = r"(?:\d+\.?\d*(?:[eE][+-]?\d+)?|\.\d+(?:[eE][+-]?\d+)?)"
+_PRODUCT = rf"{_NUMBER}(?:\s*[*/]\s*{_NUMBER})*"
+_SPEC = re.compile(
+    rf"""(?P<source>"[^"]*"|.+?)
+    (?P<scale>(?:\s*[*/]\s*-?{_NUMBER})*)
+    (?P<offset>(?:\s*[+-]\s*{_PRODUCT})?)
+    (?:\s*:\s*(?P<unit>[A-Za-zµ%]+(?:/[a-z]+)?))?
+    (?:\s*@\s*(?P<shaft>\w+))?\s*""",
+    re.VERBOSE,
+)
+_TOPIC = re.compile(r"(?P<topic>/[\w/]+)\.(?P<field>.+)")
+
+
+@dataclass(frozen=True)
+class Signal:
+    """Where one signal comes from; its value is ``(raw * scale + offset)`` in ``unit``.
+
+    Attributes
+    ----------
+    topic : str
+        Empty for a column of a CSV file.
+    field : str
+        Path of the field, or name of the column.
+    scale, offset : float
+        Applied in this order, before the unit.
+    unit : str
+        One that `smp_motor_ident.bag.units` knows.
+    shaft : {'', 'wheel', 'motor'}
+        Where velocity and position are measured; empty for the motor's choice.
+    """
+
+    topic: str
+    field: str
+    scale: float = 1.0
+    offset: float = 0.0
+    unit: str = ""
+    shaft: str = ""
+
+
+@dataclass(frozen=True)
+class MotorMap:
+    """Signals of one motor and what is known of its hardware.
+
+    Attributes
+    ----------
+    signals : mapping of str to Signal
+        By the names in `SIGNALS`.
+    hardware : mapping of str to float
+        Any of `HARDWARE`; what is given here goes before the bag's own description.
+    held : {'', 'after', 'before'}
+        Whether a voltage holds from its instant on, or held up to it.
+    clock : {'auto', 'header', 'log'}
+        Which time the samples have.
+    shaft : {'wheel', 'motor'}
+        Where velocity and position are measured, unless a signal says so itself.
+    gap : float
+        [s]; a longer interval without samples begins a new segment; 0: chosen by the data.
+    sample_time : float
+        [s]; of a file that has no time; 0 where it has.
+    velocity_window : float
+        [s]; over which the velocity is known to be averaged.
+    own : bool
+        Whether these are our own messages, of which nothing has to be guessed.
+    """
+
+    signals: Mapping[str, Signal] = field(default_factory=dict)
+    hardware: Mapping[str, float] = field(default_factory=dict)
+    held: str = ""
+    clock: str = "auto"
+    shaft: str = "wheel"
+    gap: float = 0.0
+    sample_time: float = 0.0
+    velocity_window: float = 0.0
+    own: bool = False
+
+
+@dataclass(frozen=True)
+class SignalMap:
+    """A whole mapping.
+
+    Attributes
+    ----------
+    motors : mapping of str to MotorMap
+        By the name of the wheel.
+    defaults : MotorMap
+        What holds for all motors, also those that the bag describes itself.
+    msg_files : tuple of str
+        ``.msg`` files or folders of them for types that the bag does not define.
+    """
+
+    motors: Mapping[str, MotorMap] = field(default_factory=dict)
+    defaults: MotorMap = field(default_factory=MotorMap)
+    msg_files: tuple[str, ...] = ()
+
+    @property
+    def has_signals(self) -> bool:
+        """Whether any signal is mapped, not only hardware described."""
+        return any(motor.signals for motor in self.motors.values())
+
+
+def parse(items: Iterable[str], msg_files: Iterable[str] = ()) -> SignalMap:
+    """Read a mapping as it is written on the command line.
+
+    Parameters
+    ----------
+    items : iterable of str
+        ``[WHEEL.]KEY=VALUE``; KEY is a signal, a property of the hardware or an option.
+        A string may hold several, separated by blanks.
+    msg_files : iterable of str
+        ``.msg`` files or folders.
+
+    Returns
+    -------
+    SignalMap
+        Validated, as far as that is possible without the recording.
+
+    Raises
+    ------
+    BagError
+        Naming the item that is wrong and what it may be.
+
+    Examples
+    --------
+    >>> m = parse(["voltage=/pwm.data*12/255", "velocity=/joint_states.velocity[left]:rpm"])
+    >>> m.motors["motor"].signals["voltage"].scale
+    0.047058823529411764
+    """
+    if isinstance(items, str):
+        items = [items]
+    document: dict[str, Any] = {}
+    motors: dict[str, dict[str, Any]] = {}
+    for item in (part for whole in items for part in _separate(whole)):
+        key, equals, value = item.partition("=")
+        if not equals or not value.strip():
+            raise BagError(f"mapping {item!r}: write KEY=VALUE, such as voltage=/pwm.data*12/255")
+        wheel, dot, name = key.strip().rpartition(".")
+        target = motors.setdefault(wheel, {}) if dot else document
+        if name in target:
+            raise BagError(f"mapping {item!r}: {key.strip()} is given twice")
+        target[name] = value.strip()
+    if not motors and any(name in SIGNALS for name in document):
+        motors[DEFAULT_MOTOR] = {
+            name: document.pop(name) for name in list(document) if name in SIGNALS
+        }
+    document["motors"] = motors
+    document["types"] = list(msg_files)
+    return from_document(document, "mapping")
+
+
+def _separate(text: str) -> list[str]:
+    """Split ``a=b c=d`` at the blanks that stand before another ``KEY=``."""
+    return [part for part in re.split(r"\s+(?=[\w.]+=[^=])", text.strip()) if part]
+
+
+def load(path: str | os.PathLike[str]) -> SignalMap:
+    """Read a mapping from a YAML file.
+
+    Parameters
+    ----------
+    path : path
+        Of the file; docs/mapping.md shows what it holds.
+
+    Returns
+    -------
+    SignalMap
+        Paths of ``types`` are relative to the file.
+
+    Raises
+    ------
+    BagError
+        Naming file, key and what it may be.
+    """
+    path = Path(path)
+    try:
+        document = yaml.safe_load(path.read_text("utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise BagError(f"{path}: cannot be read ({error})") from None
+    except yaml.YAMLError as error:
+        raise BagError(f"{path}: no YAML ({' '.join(str(error).split())})") from None
+    mapping = from_document(document, str(path))
+    files = tuple(str(path.parent / name) for name in mapping.msg_files)
+    return replace(mapping, msg_files=files)
+
+
+def from_document(document: Any, where: str = "mapping") -> SignalMap:
+    """Read a mapping from plain data, as YAML gives them.
+
+    Parameters
+    ----------
+    document : dict
+        ``motors`` by wheel, ``types``, and options that hold for all motors.
+    where : str
+        What to call it in messages.
+
+    Returns
+    -------
+    SignalMap
+        Validated.
+
+    Raises
+    ------
+    BagError
+        Naming the key and what it may be.
+    """
+    if not isinstance(document, Mapping):
+        raise BagError(f"{where}: must hold keys and values, such as motors:")
+    rest = dict(document)
+    motors, types = rest.pop("motors", None) or {}, rest.pop("types", None) or []
+    if not isinstance(motors, Mapping):
+        raise BagError(f"{where}: motors must be wheel names with their signals")
+    types = [types] if isinstance(types, str) else types
+    if not isinstance(types, list) or not all(isinstance(name, str) for name in types):
+        raise BagError(f"{where}: types must be a list of .msg files or folders")
+    if signals := [name for name in rest if name in SIGNALS and name != "time"]:
+        if motors:
+            raise BagError(f"{where}: {signals[0]} needs its wheel: WHEEL.{signals[0]}=...")
+        motors = {
+            DEFAULT_MOTOR: {name: rest.pop(name) for name in (*signals, "time") if name in rest}
+        }
+    defaults = _motor(rest, where)
+    return SignalMap(
+        {
+            str(wheel): _motor(entry, f"{where}: {wheel}", defaults)
+            for wheel, entry in motors.items()
+        },
+        defaults,
+        tuple(types),
+    )
+
+
+def of(mapping: Any) -> SignalMap:
+    """Return any form of a mapping as `SignalMap`.
+
+    Parameters
+    ----------
+    mapping : SignalMap, dict, path of a YAML file, or list of command-line items
+        None is an empty mapping.
+
+    Returns
+    -------
+    SignalMap
+        Validated.
+
+    Raises
+    ------
+    BagError
+        As `parse` and `load` do.
+    """
+    if mapping is None:
+        return SignalMap()
+    if isinstance(mapping, SignalMap):
+        return mapping
+    if isinstance(mapping, Mapping):
+        return from_document(mapping)
+    if isinstance(mapping, str) and "=" in mapping:
+        return parse([mapping])
+    if isinstance(mapping, (str, os.PathLike)):
+        return load(mapping)
+    return parse(mapping)
+
+
+def _motor(entry: Any, where: str, defaults: MotorMap | None = None) -> MotorMap:
+    """Return one motor's part, validated, on top of what holds for all."""
+    if not isinstance(entry, Mapping):
+        raise BagError(f"{where}: must hold keys and values")
+    motor = defaults or MotorMap()
+    signals, hardware = dict(motor.signals), dict(motor.hardware)
+    options: dict[str, Any] = {}
+    for key, value in entry.items():
+        place = f"{where}: {key}"
+        if key in SIGNALS:
+            signals[key] = _signal(key, value, place)
+        elif key in HARDWARE:
+            hardware[key] = _positive(value, place, zero=key == "encoder_bits")
+        elif key in _SECONDS:
+            options[key] = _positive(value, place, zero=True)
+        elif key in _CHOICES:
+            options[key] = _choice(key, value, place)
+        else:
+            known = ", ".join((*SIGNALS, *HARDWARE, *_CHOICES, *_SECONDS))
+            raise BagError(f"{place} is no key of a mapping; use {known}")
+    if (bits := hardware.get("encoder_bits", 0)) != int(bits) or bits > 64:
+        raise BagError(f"{where}: encoder_bits is {bits}; it must be a whole number from 0 to 64")
+    return replace(motor, signals=signals, hardware=hardware, **options)
+
+
+def _choice(key: str, value: Any, place: str) -> str:
+    if value not in _CHOICES[key]:
+        raise BagError(f"{place} is {value!r}; use {' or '.join(_CHOICES[key])}")
+    return str(value)
+
+
+def _positive(value: Any, place: str, *, zero: bool) -> float:
+    number = _number(value, place)
+    if number < 0 or (number == 0 and not zero) or not math.isfinite(number):
+        raise BagError(f"{place} is {value}; it must be a {'' if zero else 'positive '}number")
+    return number
+
+
+def _number(value: Any, place: str) -> float:
+    """Return a number, given as such or as a product such as ``12/255``."""
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        return float(value)
+    text = str(value).strip()
+    sign = -1.0 if text.startswith("-") else 1.0
+    text = text.lstrip("+-").strip()
+    if not re.fullmatch(_PRODUCT, text):
+        raise BagError(f"{place} is {value!r}; it must be a number or a product such as 12/255")
+    result = sign
+    for operator, factor in re.findall(rf"([*/]?)\s*({_NUMBER})", text):
+        if operator == "/" and float(factor) == 0:
+            raise BagError(f"{place}: {value!r} divides by zero")
+        result = result / float(factor) if operator == "/" else result * float(factor)
+    return result
+
+
+def _signal(name: str, value: Any, place: str) -> Signal:
+    if isinstance(value, Mapping):
+        unknown = set(value) - {"topic", "field", "column", "scale", "offset", "unit", "shaft"}
+        if unknown:
+            raise BagError(f"{place}: {sorted(unknown)[0]!r} is no key of a signal")
+        source = value.get("field", value.get("column"))
+        if not isinstance(source, str):
+            raise BagError(f"{place}: needs topic and field, or a column")
+        signal = Signal(
+            str(value.get("topic", "")),
+            source,
+            _number(value.get("scale", 1.0), f"{place}: scale"),
+            _number(value.get("offset", 0.0), f"{place}: offset"),
+            str(value.get("unit", "")),
+            str(value.get("shaft", "")),
+        )
+    else:
+        signal = _written(str(value), place)
+    if signal.scale == 0 or not math.isfinite(signal.scale):
+        raise BagError(f"{place}: a scale of {signal.scale} leaves nothing of the signal")
+    if signal.shaft:
+        _choice("shaft", signal.shaft, place)
+    if signal.topic:
+        parse_path(signal.field)
+    try:
+        return replace(signal, unit=check_unit(name, signal.unit))
+    except BagError as error:
+        raise BagError(f"{place}: {error}") from None
+
+
+def _written(text: str, place: str) -> Signal:
+    """Read ``SOURCE[*SCALE][+OFFSET][:UNIT][@SHAFT]``."""
+    match = _SPEC.fullmatch(text)
+    if match is None:
+        raise BagError(f"{place}: {text!r} is not SOURCE[*SCALE][+OFFSET][:UNIT][@SHAFT]")
+    source = match["source"].strip()
+    scale = _number("1" + re.sub(r"\s", "", match["scale"]).replace("-", ""), place)
+    scale *= -1.0 if match["scale"].count("-") % 2 else 1.0
+    offset = _number(match["offset"].replace(" ", "") or "0", place)
+    named = _TOPIC.fullmatch(source)  # anything else is a column of a CSV file
+    topic, path = (named["topic"], named["field"].strip()) if named else ("", source.strip('"'))
+    return Signal(topic, path, scale, offset, match["unit"] or "", match["shaft"] or "")

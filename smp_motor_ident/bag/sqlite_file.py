@@ -1,0 +1,201 @@
+"""SQLite bags of every rosbag2 schema, whole or cut off."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from urllib.parse import quote
+
+import numpy as np
+
+from smp_motor_ident.bag.storage import Batch, Channel, join, message_type
+from smp_motor_ident.errors import BagError
+
+MAGIC = b"SQLite format 3\0"
+_ROWS = 8192
+
+
+class SqliteFile:
+    """One ``.db3`` file.
+
+    Parameters
+    ----------
+    path : Path
+        To be read; it is not changed.
+    name : str
+        The file's name for messages, where ``path`` is a temporary copy.
+
+    Raises
+    ------
+    BagError
+        Where it is no bag, or nothing of it can be read.
+    """
+
+    def __init__(self, path: Path, name: str = "") -> None:
+        self.path = path
+        self.name = name or path.name
+        self.problems: list[str] = []
+        self._folder: tempfile.TemporaryDirectory[str] | None = None
+        self._database = self._connect(self._with_journal())
+        try:
+            self._channels = self._read_channels()
+        except (sqlite3.Error, UnicodeDecodeError) as error:
+            raise BagError(f"{self.name}: not a readable bag ({error})") from None
+
+    def _with_journal(self) -> Path:
+        """Return the file, or where a journal lies beside it a copy of both.
+
+        A recorder that died leaves its last messages there, and SQLite must write to
+        bring them home.
+        """
+        journals = [
+            journal
+            for suffix in ("-wal", "-journal")
+            if (journal := self.path.with_name(self.path.name + suffix)).is_file()
+            and journal.stat().st_size
+        ]
+        if not journals:
+            return self.path
+        self._folder = tempfile.TemporaryDirectory(prefix="smp_bag_")
+        copy = Path(self._folder.name) / self.path.name
+        for original in (self.path, *journals):
+            shutil.copyfile(original, copy.with_name(original.name))
+        self.problems.append(
+            f"{self.name}: was not closed; its journal {journals[0].name} was applied to a copy"
+        )
+        return copy
+
+    def _connect(self, path: Path) -> sqlite3.Connection:
+        mode = "immutable=1" if self._folder is None else "mode=rw"
+        database = sqlite3.connect(f"file:{quote(str(path.resolve()))}?{mode}", uri=True)
+        size = path.stat().st_size
+        with path.open("rb") as file:
+            head = file.read(100)
+        page = int.from_bytes(head[16:18], "big")
+        page = 65536 if page == 1 else page
+        pages = int.from_bytes(head[28:32], "big")
+        if self._folder is None and size < pages * page:
+            self.problems.append(
+                f"{self.name}: cut off at byte {size} of {pages * page} that it had"
+            )
+            # With this, SQLite reads a file that is shorter than its head says.
+            database.execute("PRAGMA writable_schema=ON")
+        return database
+
+    def _read_channels(self) -> list[Channel]:
+        columns = {row[1] for row in self._database.execute("PRAGMA table_info(topics)")}
+        if not {"id", "name", "type"} <= columns:
+            raise BagError(f"{self.name}: a SQLite file without a bag's table of topics")
+        definitions: dict[str, tuple[str, str]] = {}
+        if self._database.execute("PRAGMA table_info(message_definitions)").fetchall():
+            query = "SELECT topic_type, encoded_message_definition, encoding"
+            for kind, text, encoding in self._database.execute(f"{query} FROM message_definitions"):
+                definitions[message_type(kind)] = (text, encoding)
+        optional = [
+            name if name in columns else "''"
+            for name in ("serialization_format", "offered_qos_profiles")
+        ]
+        query = f"SELECT id, name, type, {', '.join(optional)} FROM topics ORDER BY id"
+        return [
+            Channel(
+                key,
+                topic,
+                message_type(kind),
+                encoding or "cdr",
+                *definitions.get(message_type(kind), ("", "")),
+                qos=qos,
+            )
+            for key, topic, kind, encoding, qos in self._database.execute(query)
+        ]
+
+    def channels(self) -> list[Channel]:
+        """Return the topics of the file.
+
+        Returns
+        -------
+        list of Channel
+            In the order of their numbers.
+        """
+        return self._channels
+
+    def promised(self) -> dict[str, int] | None:
+        """Return None: the file holds no count besides its messages."""
+        return None
+
+    def batches(self, wanted: Callable[[Channel], bool]) -> Iterator[tuple[float, Batch]]:
+        """Read the messages in the order in which they were written.
+
+        Parameters
+        ----------
+        wanted : callable
+            Says of a topic whether its messages are asked for.
+
+        Yields
+        ------
+        fraction : float
+            Of the file that is read.
+        batch : Batch
+            Messages of one topic.
+        """
+        asked = {channel.id: channel for channel in self._channels if wanted(channel)}
+        if not asked:
+            return
+        ids = ",".join(str(key) for key in asked)
+        last, total, rows_per_read = -(2**62), self._last_row(), _ROWS
+        while True:
+            # A damaged page ends a read with an error: narrower reads come as near as a row.
+            query = (
+                "SELECT id, topic_id, timestamp, data FROM messages "
+                f"WHERE id > {last} AND topic_id IN ({ids}) ORDER BY id"
+            )
+            try:
+                cursor = self._database.execute(query)
+                while rows := cursor.fetchmany(rows_per_read):
+                    last = rows[-1][0]
+                    for batch in self._split(rows, asked):
+                        yield min(1.0, last / total) if total > 0 else 1.0, batch
+                return
+            except sqlite3.DatabaseError as error:
+                if rows_per_read > 1:
+                    rows_per_read = max(1, rows_per_read // 8)
+                    continue
+                self.problems.append(
+                    f"{self.name}: damaged behind message number {max(last, 0)} ({error})"
+                )
+                return
+
+    def _last_row(self) -> int:
+        try:
+            row = self._database.execute("SELECT max(id) FROM messages").fetchone()
+        except sqlite3.DatabaseError:
+            return 0
+        return int(row[0] or 0)
+
+    def _split(
+        self, rows: list[tuple[int, int, int, bytes]], asked: dict[int, Channel]
+    ) -> Iterator[Batch]:
+        """Yield rows as batches, topic by topic."""
+        _, keys, times, blobs = zip(*rows)
+        every = next(iter(asked.values()))
+        try:
+            joined = join(every, list(blobs), np.array(times, np.int64))
+        except (TypeError, OverflowError):
+            sound = [r for r in rows if isinstance(r[3], bytes) and isinstance(r[2], int)]
+            self.problems.append(
+                f"{self.name}: {len(rows) - len(sound)} messages without data were left out"
+            )
+            if sound:
+                yield from self._split(sound, asked)
+            return
+        if len(asked) == 1:
+            yield joined
+            return
+        topic = np.array(keys, np.int64)
+        for key, channel in asked.items():
+            which = np.flatnonzero(topic == key)
+            if which.size:
+                part = joined.take(which)
+                yield Batch(channel, part.data, part.offset, part.length, part.log_time)

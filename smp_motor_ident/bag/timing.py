@@ -1,0 +1,235 @@
+"""Time done right: which clock, in what order, where gaps are, and inputs held over intervals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+_SECOND = 1_000_000_000
+SAME_CLOCK = 50_000_000
+"""Clocks of two topics whose offsets differ by less [ns] are one clock: latency explains it."""
+
+
+@dataclass(frozen=True)
+class ClockFit:
+    """Recorder's time against a topic's stamps: ``log = stamp + offset + drift (stamp - origin)``.
+
+    Attributes
+    ----------
+    offset : float
+        [ns] at ``origin``, without the latency that the fastest messages had too.
+    drift : float
+        Seconds per second.
+    origin : int
+        Stamp [ns].
+    """
+
+    offset: float
+    drift: float
+    origin: int
+
+    def to_log(self, stamp: Integers) -> Integers:
+        """Return stamps on the recorder's clock [ns]."""
+        since = (stamp - self.origin).astype(np.float64)
+        shift = np.rint(self.offset + self.drift * since).astype(np.int64)
+        result: Integers = stamp + shift
+        return result
+
+
+def fit_clock(stamp: Integers, log: Integers) -> ClockFit:
+    """Fit offset and drift between header stamps and log times.
+
+    A message is logged some latency after its stamp, and latency is never negative and has
+    a tail: the line goes through the fastest messages of each part of the recording.
+
+    Parameters
+    ----------
+    stamp, log : ndarray of int64, shape (n,), [ns]
+        Of the same messages.
+
+    Returns
+    -------
+    ClockFit
+        Without drift where the recording is shorter than ten seconds.
+    """
+    origin = int(np.min(stamp))
+    since = (stamp - origin).astype(np.float64)
+    base = int(np.min(log - stamp))
+    late = (log - stamp - base).astype(np.float64)
+    span = float(since.max())
+    if span < 10 * _SECOND or stamp.size < 200:
+        return ClockFit(float(base), 0.0, origin)
+    part = np.minimum((since / span * 20).astype(np.int64), 19)
+    at, least = [], []
+    for k in range(20):
+        inside = np.flatnonzero(part == k)
+        if inside.size:
+            best = inside[np.argmin(late[inside])]
+            at.append(since[best])
+            least.append(late[best])
+    drift, offset = np.polyfit(at, least, 1)
+    return ClockFit(base + float(offset), float(drift), origin)
+
+
+def judge_stamps(stamp: Integers | None, log: Integers) -> str:
+    """Return why header stamps cannot be the samples' time; empty where they can.
+
+    Parameters
+    ----------
+    stamp : ndarray of int64, shape (n,), [ns], or None
+        Header stamps; None where messages have none.
+    log : ndarray of int64, shape (n,), [ns]
+        Log times.
+
+    Returns
+    -------
+    str
+        A reason in words.
+    """
+    if stamp is None:
+        return "the messages carry no stamp"
+    if stamp.size < 2:
+        return ""
+    set_ones = stamp[stamp > 0]
+    if set_ones.size < 0.5 * stamp.size:
+        return "the header stamps are not set"
+    distinct = np.unique(set_ones).size
+    if distinct < 0.5 * np.unique(log).size and distinct < 0.5 * set_ones.size:
+        return f"the header stamps repeat ({distinct} values in {stamp.size} messages)"
+    return ""
+
+
+def epochs(time: Integers) -> list[tuple[int, int]]:
+    """Split samples, in the order of logging, where their clock was set back.
+
+    Single samples out of order are no reason to split, nor are shuffled ones: only long runs,
+    each in order by itself, are parts of their own.
+
+    Parameters
+    ----------
+    time : ndarray of int64, shape (n,), [ns]
+        In the order of logging.
+
+    Returns
+    -------
+    list of (int, int)
+        Begin and end of each part; one part where the clock went on.
+    """
+    whole = [(0, time.size)]
+    if time.size < 40:
+        return whole
+    steps = np.diff(time)
+    usual = float(np.median(np.abs(steps)))
+    back = np.flatnonzero(steps < -max(100 * usual, 0.5 * _SECOND)) + 1
+    if not back.size or back.size > time.size / 40:
+        return whole
+    edges = [0, *back.tolist(), time.size]
+    parts = list(pairwise(edges))
+    ordered = all(b - a >= 20 and np.mean(np.diff(time[a:b]) > 0) > 0.9 for a, b in parts)
+    return parts if ordered else whole
+
+
+@dataclass(frozen=True)
+class Rhythm:
+    """How regularly samples come.
+
+    Attributes
+    ----------
+    interval : float
+        Median interval [ns].
+    regular : bool
+        Whether four of five intervals are within a quarter of it.
+    """
+
+    interval: float
+    regular: bool
+
+    def missing(self, time: Integers) -> Integers:
+        """Return how many samples are missing before each but the first."""
+        steps = np.diff(time)
+        if not self.regular or self.interval <= 0:
+            return np.zeros(steps.size, np.int64)
+        number: Integers = np.maximum(np.rint(steps / self.interval).astype(np.int64) - 1, 0)
+        return number
+
+    def gap(self) -> float:
+        """Return the interval [ns] beyond which two samples have nothing in common."""
+        return max(20 * self.interval, 0.02 * _SECOND)
+
+
+def rhythm(time: Integers) -> Rhythm:
+    """Return how regularly the samples come.
+
+    Parameters
+    ----------
+    time : ndarray of int64, shape (n,), [ns]
+        In order.
+
+    Returns
+    -------
+    Rhythm
+        Interval 0 for less than two samples.
+    """
+    if time.size < 2:
+        return Rhythm(0.0, False)
+    steps = np.diff(time)
+    median = float(np.median(steps))
+    return Rhythm(median, bool(np.mean(np.abs(steps - median) <= 0.25 * median) >= 0.8))
+
+
+def mean_held(time: Integers, value: Array, held: str, at: Integers) -> Array:
+    """Average a held input over the intervals between output samples.
+
+    Parameters
+    ----------
+    time : ndarray of int64, shape (m,), [ns]
+        Instants of the input, in order.
+    value : ndarray, shape (m,)
+        What holds from that instant on (``after``) or up to it (``before``).
+    held : {'after', 'before'}
+        Which of these.
+    at : ndarray of int64, shape (n,), [ns]
+        Output instants, in order, none before the first of the input.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        Mean over ``(at[k-1], at[k]]``; the first is what holds there.
+    """
+    origin = int(time[0])
+    seconds = (time - origin) * 1e-9
+    wanted = (at - origin) * 1e-9
+    level = value[:-1] if held == "after" else value[1:]
+    integral = np.concatenate([[0.0], np.cumsum(level * np.diff(seconds))])
+    # Beyond its last instant the input stays as it was last.
+    whole = np.interp(wanted, seconds, integral) + np.maximum(wanted - seconds[-1], 0) * value[-1]
+    mean = np.empty(at.size)
+    mean[1:] = np.diff(whole) / np.diff(wanted)
+    side = (
+        np.searchsorted(time, at[0], "right") - 1
+        if held == "after"
+        else np.searchsorted(time, at[0])
+    )
+    mean[0] = value[min(max(int(side), 0), value.size - 1)]
+    inside = _untouched(time, at)
+    # An interval without a change has exactly the level that holds there.
+    if held == "after":
+        index = np.searchsorted(time, at[:-1], "right") - 1
+    else:
+        index = np.minimum(np.searchsorted(time, at[1:], "left"), value.size - 1)
+    mean[1:][inside] = value[np.clip(index, 0, value.size - 1)][inside]
+    return mean
+
+
+def _untouched(time: Integers, at: Integers) -> NDArray[np.bool_]:
+    """Return which intervals between outputs no input instant divides."""
+    first = np.searchsorted(time, at[:-1], "right")
+    last = np.searchsorted(time, at[1:], "left")
+    divided: NDArray[np.bool_] = first >= last
+    return divided

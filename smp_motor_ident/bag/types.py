@@ -1,0 +1,224 @@
+"""Message definitions: from the bag, from the user's .msg files, from ROS, from rosbags."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from rosbags.interfaces import Nodetype
+from rosbags.typesys import (
+    Stores,
+    TypesysError,
+    get_types_from_idl,
+    get_types_from_msg,
+    get_typestore,
+)
+
+from smp_motor_ident.bag.storage import Channel, message_type
+from smp_motor_ident.errors import BagError
+
+Fields = Sequence[tuple[str, Any]]
+Definitions = Mapping[str, Fields]
+"""Fields of every message type by its full name; the field's description is rosbags'."""
+
+_STORES = (
+    Stores.ROS2_JAZZY,
+    Stores.ROS2_HUMBLE,
+    Stores.ROS2_FOXY,
+    Stores.ROS2_DASHING,
+)
+_LINE = "=" * 80 + "\n"
+
+
+def _parse(text: str, name: str, form: str) -> dict[str, Fields]:
+    """Return the fields of all messages that a definition text holds."""
+    if form == "ros2idl" or text.startswith(_LINE + "IDL: "):
+        types: dict[str, Any] = {}
+        parts = text.split(_LINE)[1:] if text.startswith(_LINE) else [f"IDL:\n{text}"]
+        for part in parts:
+            types.update(get_types_from_idl(part.partition("\n")[2]))
+    else:
+        types = dict(get_types_from_msg(text, name))
+    return {key: fields for key, (_, fields) in types.items()}
+
+
+def _references(fields: Fields) -> Iterator[str]:
+    for _, description in fields:
+        kind, detail = description
+        if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+            kind, detail = detail[0]
+        if kind == Nodetype.NAME:
+            yield detail
+
+
+@cache
+def _store(which: Stores) -> dict[str, Fields]:
+    return {name: fields for name, (_, fields) in get_typestore(which).fielddefs.items()}
+
+
+def _ament_file(name: str, suffix: str) -> Path | None:
+    """Return a file of an installed interface package, such as its ``.msg``."""
+    package, _, kind = name.split("/")
+    for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
+        path = Path(prefix, "share", package, "msg", kind + suffix)
+        if prefix and path.is_file():
+            return path
+    return None
+
+
+class Types:
+    """Finds what a message consists of.
+
+    Parameters
+    ----------
+    files : iterable of path
+        ``.msg`` files, or folders of them, that the user gives.
+
+    Raises
+    ------
+    BagError
+        When one of these does not exist or cannot be parsed.
+    """
+
+    def __init__(self, files: Iterable[str | os.PathLike[str]] = ()) -> None:
+        self._given: dict[str, Fields] = {}
+        for given in files:
+            path = Path(given)
+            found = sorted(path.rglob("*.msg")) if path.is_dir() else [path]
+            if not found or not found[0].is_file():
+                raise BagError(f"{path}: no .msg file there")
+            for file in found:
+                self._give(file)
+
+    def _give(self, file: Path) -> None:
+        folder = file.resolve().parent
+        package = folder.parent.name if folder.name == "msg" else folder.name
+        try:
+            self._given.update(_parse(file.read_text(), f"{package}/msg/{file.stem}", "ros2msg"))
+        except (TypesysError, OSError, UnicodeDecodeError) as error:
+            raise BagError(f"{file}: not a message definition ({_line(error)})") from None
+
+    def candidates(self, channel: Channel) -> list[Definitions]:
+        """Return what the channel's type may be, the most trusted first.
+
+        Several distributions changed messages without changing their name; where a bag
+        does not define its types, the one that fits the bytes is right.
+
+        Parameters
+        ----------
+        channel : Channel
+            With the definition that its file holds.
+
+        Returns
+        -------
+        list of Definitions
+            Each with the channel's type and everything it consists of.
+
+        Raises
+        ------
+        BagError
+            When nothing defines the type.
+        """
+        name, reasons, found = channel.type, [], []
+        if channel.definition:
+            try:
+                own = _parse(channel.definition, name, channel.definition_format)
+                found.append(self._closed(name, [own, self._given, *map(_store, _STORES)]))
+            except (TypesysError, BagError) as error:
+                reasons.append(f"the bag's own definition cannot be used: {_line(error)}")
+        sources: list[Mapping[str, Fields]] = [self._named(name), self._given, _Ament()]
+        for store in _STORES:
+            try:
+                found.append(self._closed(name, [*sources, _store(store)]))
+            except (TypesysError, BagError) as error:
+                reasons.append(_line(error))
+        if not found:
+            raise BagError(
+                f"{channel.topic}: the message type {name or '(none)'!r} is unknown "
+                f"({reasons[0]}); give its definition as .msg files"
+            )
+        return found
+
+    def _named(self, name: str) -> dict[str, Fields]:
+        """Return a definition by the type's last name where the user's folder says no package."""
+        if name in self._given:
+            return {}
+        same = [key for key in self._given if key.rpartition("/")[2] == name.rpartition("/")[2]]
+        return {name: self._given[same[0]]} if len(same) == 1 else {}
+
+    def _closed(self, name: str, sources: Sequence[Mapping[str, Fields]]) -> Definitions:
+        """Return the type and all that it refers to, each from the first source that has it."""
+        closed: dict[str, Fields] = {}
+        open_names = [name]
+        while open_names:
+            key = open_names.pop()
+            if key in closed:
+                continue
+            fields = next((f for s in sources if (f := s.get(key)) is not None), None)
+            if fields is None:
+                raise BagError(f"nothing defines {key!r}")
+            closed[key] = fields
+            open_names.extend(_references(fields))
+        return closed
+
+
+class _Ament(dict[str, Fields]):
+    """Types of the interface packages on AMENT_PREFIX_PATH."""
+
+    def get(self, name: str, default: Any = None) -> Any:
+        """Return a type's fields."""
+        return default if (text := _msg_text(name)) is None else _parse(text, name, "")[name]
+
+
+@cache
+def _msg_text(name: str) -> str | None:
+    if name.count("/") != 2:
+        return None
+    path = _ament_file(name, ".msg")
+    return path.read_text() if path else None
+
+
+def definition(name: str) -> tuple[str, str]:
+    """Return what a bag stores about a message type, as rosbag2 writes it.
+
+    Parameters
+    ----------
+    name : str
+        Full name such as ``std_msgs/msg/Float64``.
+
+    Returns
+    -------
+    text : str
+        Its definition followed by those of all messages in it.
+    type_hash : str
+        REP-2011 hash, ``RIHS01_`` and 64 hexadecimal digits.
+
+    Raises
+    ------
+    BagError
+        When neither ROS nor rosbags knows the type.
+    """
+    name = message_type(name)
+    types = Types()
+    closed = types.candidates(Channel(0, name, name))[0]
+    texts = {key: _msg_text(key) for key in closed}
+    if all(text is not None for text in texts.values()):
+        whole = [texts.pop(name) or ""]
+        whole += [f"MSG: {key.replace('/msg/', '/')}\n{text}" for key, text in texts.items()]
+        text = ("\n" + _LINE).join(whole)
+        if (path := _ament_file(name, ".json")) is not None:
+            hashes = json.loads(path.read_text())["type_hashes"]
+            own = [h["hash_string"] for h in hashes if h["type_name"] == name]
+            if own:
+                return text, own[0]
+    store = get_typestore(Stores.ROS2_JAZZY)
+    store.register({k: ([], list(v)) for k, v in closed.items() if k not in store.fielddefs})
+    return store.generate_msgdef(name, ros_version=2)[0], store.hash_rihs01(name)
+
+
+def _line(error: BaseException) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
