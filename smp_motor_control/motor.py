@@ -14,7 +14,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from smp_motor_control.errors import ParameterError
 
@@ -27,6 +30,7 @@ _UNITS = {
     "coulomb_friction": "N m",
 }
 _MAY_BE_ZERO = ("inductance", "viscous_friction", "coulomb_friction")
+Motion = TypeVar("Motion", float, NDArray[np.float64])
 _MAX_CACHED_STEPS = 64
 _MAX_EVENTS_PER_STEP = 100_000
 
@@ -199,32 +203,32 @@ class Gearbox:
         if not (math.isfinite(self.ratio) and self.ratio > 0):
             raise ParameterError(f"gear ratio is {self.ratio!r}; it must be positive")
 
-    def to_motor(self, wheel: float) -> float:
+    def to_motor(self, wheel: Motion) -> Motion:
         """Return the motor's angle [rad], speed [rad/s] or acceleration of a wheel's.
 
         Parameters
         ----------
-        wheel : float
+        wheel : float or ndarray
             Angle, speed or acceleration of the wheel.
 
         Returns
         -------
-        float
+        float or ndarray
             ``ratio`` times as much.
         """
         return wheel * self.ratio
 
-    def to_wheel(self, motor: float) -> float:
+    def to_wheel(self, motor: Motion) -> Motion:
         """Return the wheel's angle [rad], speed [rad/s] or acceleration of a motor's.
 
         Parameters
         ----------
-        motor : float
+        motor : float or ndarray
             Angle, speed or acceleration of the motor.
 
         Returns
         -------
-        float
+        float or ndarray
             ``1 / ratio`` times as much.
         """
         return motor / self.ratio
