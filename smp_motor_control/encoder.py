@@ -181,6 +181,11 @@ class DifferencedSpeed:
     window : int
         Length of the window in samples, at least 1.
 
+    Attributes
+    ----------
+    total : int
+        Unwrapped counts at the last sample.
+
     Raises
     ------
     ParameterError
@@ -193,6 +198,7 @@ class DifferencedSpeed:
         self._scale = encoder.angle_per_count
         self._unwrap = Unwrapper(encoder.bits)
         self._past: deque[tuple[float, int]] = deque(maxlen=window + 1)
+        self.total = 0
 
     def reset(self) -> None:
         """Forget the past, as after lost feedback."""
@@ -214,7 +220,7 @@ class DifferencedSpeed:
         float
             Mean motor speed over the window [rad/s]; NaN at the first sample.
         """
-        total = self._unwrap(count)
+        self.total = total = self._unwrap(count)
         past = self._past
         past.append((time, total))
         first_time, first = past[0]

@@ -7,6 +7,7 @@ leaving: SIGINT, SIGTERM, :func:`finish`, or an exception in a callback.
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import os
 import re
@@ -16,9 +17,11 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import rclpy
+from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
@@ -73,9 +76,20 @@ class _Stop:
             self.wake()
 
     def watch_signals(self) -> None:
-        """Wait for signals; they are blocked in every thread, so none is interrupted."""
-        while True:
-            signal.sigwait(_SIGNALS)
+        """Let signals request the stop, whatever the main thread is waiting in.
+
+        Python runs handlers in the main thread, which DDS may keep waiting; the C handler
+        below it writes to a pipe at once, and a thread reads that.
+        """
+        inlet, outlet = os.pipe()
+        os.set_blocking(outlet, False)
+        for number in _SIGNALS:
+            signal.signal(number, lambda *_: None)
+        signal.set_wakeup_fd(outlet, warn_on_full_buffer=False)
+        threading.Thread(target=self._read_signals, args=(inlet,), daemon=True).start()
+
+    def _read_signals(self, inlet: int) -> None:
+        while os.read(inlet, 1):
             if self.requested.is_set():
                 os._exit(1)
             self.request()
@@ -115,10 +129,8 @@ def run(name: str, make: Callable[[], Node], argv: list[str] | None = None) -> i
     """
     global _stop
     _stop = stop = _Stop()
-    # Blocked before any thread exists: rclpy's own handler would shut the context down, and
-    # with it the way to send a zero command.
-    signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
-    threading.Thread(target=stop.watch_signals, daemon=True).start()
+    # rclpy's own handlers would shut the context down, and with it the way to send a zero.
+    stop.watch_signals()
     arguments = [name, *(sys.argv[1:] if argv is None else argv)]
     node: Node | None = None
     try:
@@ -253,6 +265,33 @@ def wheel_of(node: Node) -> str:
         Such as ``front_left``; empty in the root namespace.
     """
     return str(node.get_namespace().rsplit("/", 1)[-1])
+
+
+def share(path: str) -> Path:
+    """Return a file of this package, installed or in its source tree.
+
+    Parameters
+    ----------
+    path : str
+        Such as ``config/motors_paper.yaml``.
+
+    Returns
+    -------
+    Path
+        Where it is.
+
+    Raises
+    ------
+    SmpError
+        When it is nowhere.
+    """
+    places = [Path(__file__).resolve().parents[2]]
+    with contextlib.suppress(PackageNotFoundError):
+        places.insert(0, Path(get_package_share_directory("smp_motor_control")))
+    for place in places:
+        if (place / path).exists():
+            return place / path
+    raise SmpError(f"{path} of smp_motor_control is not installed; build the package again")
 
 
 def seconds(stamp: Any) -> float:

@@ -1,0 +1,207 @@
+"""Simulates the motors of a robot behind the topics of its hardware.
+
+Subscribes ``<wheel>/motor_command`` and ``<wheel>/load_torque`` (``std_msgs/Float64``, [N m] at
+the wheel, positive against forward turning); publishes ``<wheel>/motor_state`` and, once,
+``<wheel>/motor_description``.  Physics runs on the steady clock over the real intervals;
+only the stamps are ROS time.
+"""
+
+from __future__ import annotations
+
+import gc
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rclpy.node import Node
+from std_msgs.msg import Float64
+
+from smp_interfaces.msg import MotorCommand, MotorDescription, MotorState
+from smp_motor_control.errors import ParameterError
+from smp_motor_control.motor_file import MotorEntry, load_motors, nest, parse_motors
+from smp_motor_control.nodes import runtime
+from smp_motor_control.nodes.settings import Parameters, described, given_parameters, nested
+from smp_motor_control.plant import DrivenMotor, DriveSettings, Supply
+
+_DRIVE = {
+    "pwm_steps": "Steps of the duty cycle from 0 to 1; 0 for a continuous one.",
+    "command_timeout": "Time after the last command at which the voltage goes to zero [s].",
+    "current_sensor": "Whether the current is measured; reported as NaN where not.",
+    "current_noise": "Standard deviation of the measured current [A].",
+    "torque_noise": "Intensity of a random load at the motor shaft [N m sqrt(s)].",
+    "velocity_window": "Samples that the reported speed is differenced over; 0 for the true one.",
+}
+
+
+_DRIVE_DEFAULTS = DriveSettings(pwm_steps=1000, current_noise=0.01)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """Parameters of the node, beside ``motors.<wheel>.<key>`` as in a motor file."""
+
+    motors_file: str = described(
+        "", "File of the motors; where none are given, those of the paper.", read_only=True
+    )
+    rate: float = described(
+        200.0, "Samples per second of every motor [Hz].", minimum=1.0, maximum=2000.0,
+        read_only=True,
+    )  # fmt: skip
+    drive: DriveSettings = nested(_DRIVE_DEFAULTS, _DRIVE)  # noqa: RUF009
+    supply_resistance: float = described(
+        0.0, "Inner resistance of the battery that all motors share [ohm].", minimum=0.0
+    )
+    ohmmeter: bool = described(
+        True, "Whether the description tells the resistance, as measured.", read_only=True
+    )
+    seed: int = described(1, "Of all noise.", read_only=True)
+
+
+class Wheel:
+    """One motor and its topics."""
+
+    def __init__(self, node: MotorPlant, name: str, motor: DrivenMotor) -> None:
+        self.name = name
+        self.motor = motor
+        self.rejected = 0
+        self.state = MotorState()
+        self.state.header.frame_id = f"{name}_wheel_joint"
+        self.publisher = node.create_publisher(
+            MotorState, f"{name}/motor_state", runtime.STREAM_PUBLISHER
+        )
+        self._description = node.create_publisher(
+            MotorDescription, f"{name}/motor_description", runtime.LATCHED
+        )
+        self._subscriptions = (
+            node.create_subscription(
+                MotorCommand, f"{name}/motor_command", self._command, runtime.STREAM_SUBSCRIBER
+            ),
+            node.create_subscription(
+                Float64, f"{name}/load_torque", self._load, runtime.STREAM_SUBSCRIBER
+            ),
+        )
+
+    def describe(self, ohmmeter: bool) -> None:
+        """Publish what a bag needs to describe itself."""
+        entry = self.motor.entry
+        self._description.publish(
+            MotorDescription(
+                joint_name=self.state.header.frame_id,
+                gear_ratio=entry.gearbox.ratio,
+                counts_per_revolution=entry.encoder.counts_per_revolution,
+                encoder_bits=entry.encoder.bits,
+                supply_voltage=entry.supply_voltage,
+                resistance=entry.resistance if ohmmeter else math.nan,
+            )
+        )
+
+    def _command(self, message: MotorCommand) -> None:
+        if not self.motor.command(time.monotonic(), message.voltage):
+            self.rejected += 1
+
+    def _load(self, message: Float64) -> None:
+        if not self.motor.load(time.monotonic(), message.data):
+            self.rejected += 1
+
+    def publish(self, now: float, stamp: Any) -> None:
+        """Sample at an instant of the steady clock and publish it with its ROS time."""
+        state, sample = self.state, self.motor.sample(now)
+        state.header.stamp = stamp
+        state.voltage = sample.voltage
+        state.current = sample.current
+        state.velocity = sample.velocity
+        state.position = sample.position
+        state.encoder_count = sample.encoder_count
+        state.duty_cycle = sample.duty
+        self.publisher.publish(state)
+
+
+class MotorPlant(Node):
+    """All motors of one robot."""
+
+    def __init__(self) -> None:
+        super().__init__("motor_plant")
+        self._parameters = Parameters(self, Settings, self._change, also_known=["motors."])
+        settings = self._parameters.settings
+        entries = self._motors(settings)
+        self._supply = Supply(0.0, settings.supply_resistance)
+        self._supply.open_voltage = max(entry.supply_voltage for entry in entries.values())
+        start = time.monotonic()
+        self._wheels = [
+            Wheel(
+                self,
+                name,
+                DrivenMotor(entry, settings.drive, self._supply, start, 97 * settings.seed + k),
+            )
+            for k, (name, entry) in enumerate(entries.items())
+        ]
+        for wheel in self._wheels:
+            wheel.describe(settings.ohmmeter)
+        self._samples = self._late = 0
+        self._period = 1.0 / settings.rate
+        self._last = start
+        self._diagnostics = runtime.Diagnostics(self, self._assess, "simulation")
+        self._timer = runtime.steady_timer(self, self._period, self._tick)
+        names = ", ".join(entries)
+        self.get_logger().info(f"simulating {names} at {settings.rate:g} Hz")
+        gc.collect()
+        gc.freeze()
+
+    def _motors(self, settings: Settings) -> dict[str, MotorEntry]:
+        given = given_parameters(self)
+        motors = {k[len("motors.") :]: v for k, v in given.items() if k.startswith("motors.")}
+        if motors and settings.motors_file:
+            raise ParameterError("give either motors_file or motors.<wheel>.<key>, not both")
+        if motors:
+            for key, value in motors.items():
+                self.declare_parameter(f"motors.{key}", value, ignore_override=True)
+            return parse_motors(nest(motors), "parameters")
+        path = settings.motors_file or str(runtime.share("config/motors_paper.yaml"))
+        return load_motors(Path(path))
+
+    def _change(self, settings: Settings) -> None:
+        self._supply.resistance = settings.supply_resistance
+        for wheel in self._wheels:
+            wheel.motor.settings = settings.drive
+
+    def _tick(self) -> None:
+        stamp = self.get_clock().now().to_msg()
+        now = time.monotonic()
+        self._late += now - self._last > 1.5 * self._period
+        self._last = now
+        self._samples += 1
+        for wheel in self._wheels:
+            wheel.publish(now, stamp)
+
+    def _assess(self) -> tuple[bytes, str, Mapping[str, object]]:
+        values: dict[str, object] = {"samples": self._samples, "late samples": self._late}
+        level, message = runtime.OK, "simulating"
+        for wheel in self._wheels:
+            values[f"{wheel.name} duty cycle"] = wheel.motor.duty
+            values[f"{wheel.name} commands"] = (
+                "none or timed out" if wheel.motor.timed_out else "fresh"
+            )
+            values[f"{wheel.name} refused messages"] = wheel.rejected
+        refused = [wheel.name for wheel in self._wheels if wheel.rejected]
+        if refused:
+            level, message = runtime.WARN, f"refused messages that are no numbers: {refused}"
+        return level, message, values
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the node until a signal.
+
+    Parameters
+    ----------
+    argv : list of str, optional
+        Arguments; those of the process where None.
+
+    Returns
+    -------
+    int
+        Exit code.
+    """
+    return runtime.run("motor_plant", MotorPlant, argv)
