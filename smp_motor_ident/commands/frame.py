@@ -11,10 +11,10 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
-from typing import Any, NoReturn
+from typing import NoReturn
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from smp_motor_control.errors import SmpError
 
@@ -94,15 +94,13 @@ def _fail(program: str, message: str, code: int) -> int:
 
 
 @contextmanager
-def progress(program: str, total: int, quiet: bool = False) -> Iterator[Callable[[str], None]]:
-    """Show what takes time: a bar on a terminal, a line per slow step elsewhere.
+def progress(program: str, quiet: bool = False) -> Iterator[Callable[[str], None]]:
+    """Show what takes time: a moving line on a terminal, a line per slow step elsewhere.
 
     Parameters
     ----------
     program : str
         Name of the tool.
-    total : int
-        How many steps there will be.
     quiet : bool
         Show nothing.
 
@@ -115,23 +113,17 @@ def progress(program: str, total: int, quiet: bool = False) -> Iterator[Callable
     if quiet:
         yield lambda text: None
     elif console.is_terminal:
-        columns: list[Any] = [SpinnerColumn(), TextColumn("{task.description}"), BarColumn()]
-        with Progress(*columns, TimeElapsedColumn(), console=console, transient=True) as bar:
-            task = bar.add_task("", total=total)
-            begun: list[str] = []
-
-            def show(text: str) -> None:
-                bar.update(task, description=text, completed=len(begun))
-                begun.append(text)
-
-            yield show
+        columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+        with Progress(*columns, console=console, transient=True) as line:
+            task = line.add_task("")
+            yield lambda text: line.update(task, description=text)
     else:
-        with _lines(program, total) as say:
+        with _lines(program) as say:
             yield say
 
 
 @contextmanager
-def _lines(program: str, total: int, patience: float = 2.0) -> Iterator[Callable[[str], None]]:
+def _lines(program: str, patience: float = 2.0) -> Iterator[Callable[[str], None]]:
     """Print each step that is still going on after `patience` seconds, once."""
     begun: list[tuple[str, float]] = []
     told: set[int] = set()
@@ -142,7 +134,7 @@ def _lines(program: str, total: int, patience: float = 2.0) -> Iterator[Callable
             k = len(begun) - 1
             if k >= 0 and k not in told and time.monotonic() - begun[k][1] > patience:
                 told.add(k)
-                print(f"{program}: [{k + 1}/{total}] {begun[k][0]} ...", file=sys.stderr)
+                print(f"{program}: {begun[k][0]} ...", file=sys.stderr, flush=True)
 
     watcher = threading.Thread(target=watch, daemon=True)
     watcher.start()

@@ -106,7 +106,7 @@ def _work(arguments: argparse.Namespace) -> int:
     loops = {wheel: loop_for(estimate, arguments) for wheel, estimate in estimates.items()}
     targets = {n: getattr(arguments, n) for n in TARGETS if getattr(arguments, n) is not None}
     method = arguments.method
-    with frame.progress("tune", 2) as say:
+    with frame.progress("tune") as say:
         if arguments.compare:
             say("comparing the methods")
             method = _compare(estimates, loops, targets)

@@ -205,7 +205,8 @@ def certainty(estimate: Estimate) -> str:
 
 
 def _without_repeats(estimate: Estimate) -> dict[str, Quantity]:
-    return {**estimate.parameters, **estimate.combinations}
+    parameters = {n: q for n, q in estimate.parameters.items() if n not in estimate.combinations}
+    return {**estimate.combinations, **parameters}
 
 
 def _certainty_bar(axes: Axes, row: int, quantity: Quantity) -> None:

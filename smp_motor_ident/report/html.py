@@ -112,7 +112,11 @@ def _motor(estimate: Estimate, parts: Sequence[Comparison]) -> dict[str, object]
             if name in estimate.combinations
         ],
         "combinations": [_row(name, q) for name, q in estimate.combinations.items()],
-        "parameters": [_row(name, q) for name, q in estimate.parameters.items()],
+        "parameters": [
+            _row(name, quantity)
+            for name, quantity in estimate.parameters.items()
+            if name not in estimate.combinations
+        ],
         "alike": _alike(estimate),
         "candidates": _ranked(estimate.candidates),
         "figures": {name: Markup(svg) for name, svg in drawn.items()},

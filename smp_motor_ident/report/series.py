@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Role = Literal["estimation", "validation"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +29,7 @@ class Comparison:
         At the motor shaft; NaN where nothing was measured.
     """
 
-    role: Literal["estimation", "validation"]
+    role: Role
     source: str
     time: Array
     voltage: Array

@@ -28,7 +28,7 @@ EXPLAINED: Mapping[str, tuple[str, str, str]] = {
 """Symbol, name and meaning of every quantity."""
 
 MODELS: Mapping[str, str] = {
-    "static": "static gain",
+    "static_gain": "static gain: no lag that these data show",
     "first_order": "first order: one time constant",
     "second_order": "second order: electrical and mechanical lag",
     "electromechanical": "electromechanical: winding, rotor and friction",
