@@ -8,6 +8,7 @@ import signal
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
@@ -63,7 +64,10 @@ def run(
         return int(end.code or 0)
     previous = {s: signal.signal(s, _interrupt) for s in (signal.SIGTERM, signal.SIGHUP)}
     try:
-        code = work(arguments) or 0
+        with warnings.catch_warnings():
+            # Numerics that fail are dealt with where they occur; standard error is for the user.
+            warnings.simplefilter("ignore", RuntimeWarning)
+            code = work(arguments) or 0
         sys.stdout.flush()
         return code
     except SmpError as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -213,3 +214,30 @@ def set_gains(robot: Robot, gains: Mapping[str, Mapping[str, Any]]) -> None:
     """
     for node, parameters in gains.items():
         robot.conductor.ask("set_parameters", node=node, parameters=dict(parameters))
+
+
+def config(name: str) -> Path:
+    """Return a file of ``config/``, from the installation or from the sources.
+
+    Parameters
+    ----------
+    name : str
+        Of the file.
+
+    Returns
+    -------
+    Path
+        Of an existing file.
+
+    Raises
+    ------
+    ParameterError
+        When there is none.
+    """
+    prefixes = [Path(p) for p in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if p]
+    places = [prefix / "share" / "smp_motor_control" / "config" for prefix in prefixes]
+    places.append(Path(__file__).resolve().parents[2] / "config")
+    for place in places:
+        if (place / name).is_file():
+            return place / name
+    raise ParameterError(f"config/{name}: not found; run 'make setup', or source the workspace")

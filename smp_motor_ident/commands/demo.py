@@ -1,0 +1,360 @@
+"""``demo``: a simulated robot from four unknown motors to four tuned wheels, checked at the end."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import shutil
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from smp_motor_control import WHEELS
+from smp_motor_control.motor_file import MotorEntry, load_motors
+from smp_motor_ident.commands import steps
+from smp_motor_ident.commands.conductor import Conductor
+from smp_motor_ident.commands.driving import Answer, read_answers
+from smp_motor_ident.commands.frame import Parser, run
+from smp_motor_ident.commands.processes import Processes, free_domain, stop_when_orphaned
+from smp_motor_ident.commands.tables import console, table
+from smp_motor_ident.errors import ParameterError
+from smp_motor_ident.report import words
+from smp_motor_ident.result import Estimate, Quantity
+
+NAME = "demo"
+
+PLAN = (
+    steps.Excitation("sine", 8.0, 10.0),
+    steps.Excitation("square", 8.0, 10.0),
+    steps.Excitation("fourier", 14.0, 11.0),
+)
+"""What moves the wheels while they are recorded."""
+
+DRIVE = (
+    ("straight", 0.20, 0.0, 2.5),
+    ("arc", 0.15, -0.5, 2.5),
+    ("spin", 0.0, 1.0, 2.5),
+    ("stop", 0.0, 0.0, 2.0),
+)
+"""Manoeuvres: name, m/s, rad/s, s."""
+
+MOST_OVERSHOOT = 2.0  # percent of the change
+MOST_GAIN_ERROR = 0.5  # percent
+MOST_DEVIATIONS = 3.0  # of its own standard deviations, for every parameter
+
+
+@dataclass(frozen=True)
+class Check:
+    """One thing that the demo must show: the worst figure, its limit, and where it occurred."""
+
+    name: str
+    worst: float
+    limit: float
+    where: str
+    unit: str
+
+    @property
+    def holds(self) -> bool:
+        """Whether the figure exists and is within its limit."""
+        return self.worst <= self.limit
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line.
+
+    Returns
+    -------
+    argparse.ArgumentParser
+        Of ``demo``.
+    """
+    made = Parser(prog=NAME, description=(
+        "Start a simulated robot as real processes, excite and record its wheels, identify and "
+        "tune them, drive it, and compare everything with the truth. Ends by itself."
+    ))  # fmt: skip
+    made.add_argument("--output", "-o", default="demo_output", metavar="DIR", help="for results")
+    made.add_argument("--motors", metavar="FILE", help="the true motors; default: the paper's")
+    made.add_argument("--rate", type=float, default=200.0, help="samples per second [Hz]")
+    made.add_argument("--domain", type=int, help="ROS domain; default: one that is free")
+    made.add_argument("--keep", action="store_true", help="refuse to replace an earlier demo")
+    return made
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the tool.
+
+    Parameters
+    ----------
+    argv : sequence of str or None
+        Arguments; None takes those of the process.
+
+    Returns
+    -------
+    int
+        0 when everything was shown, 1 when something was not.
+    """
+    return run(parser(), work, argv)
+
+
+def work(arguments: argparse.Namespace) -> int:
+    """Do what the arguments say.
+
+    Parameters
+    ----------
+    arguments : argparse.Namespace
+        Of :func:`parser`.
+
+    Returns
+    -------
+    int
+        Exit code.
+    """
+    stop_when_orphaned()
+    begun = time.monotonic()
+
+    def say(text: str) -> None:
+        print(f"[{time.monotonic() - begun:5.1f} s] {text}", flush=True)
+
+    motors = Path(arguments.motors) if arguments.motors else steps.config("motors_paper.yaml")
+    truth = load_motors(motors, WHEELS)
+    folder = _fresh(Path(arguments.output), arguments.keep)
+    domain = free_domain() if arguments.domain is None else arguments.domain
+    environment = {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    with Processes(folder / "logs", environment) as processes:
+        robot = start(processes, folder, motors, arguments.rate)
+        say(f"running: motor_plant, {len(WHEELS)} wheel_pid, skid_steer (ROS domain {domain})")
+        estimates, gains = learn(robot, say)
+        segments = drive(robot, gains, say)
+    hardware = {wheel: estimates[wheel].hardware for wheel in WHEELS}
+    answers = read_answers(folder / "drive", segments, hardware)
+    show(truth, estimates, gains, answers)
+    checks = check(truth, estimates, answers)
+    for one in checks:
+        mark = "ok  " if one.holds else "FAIL"
+        print(f"{mark} {one.name}: {one.worst:.3g} {one.unit} at most {one.limit:g} ({one.where})")
+    say("done")
+    print(f"report: {folder / 'identification' / 'report.html'}")
+    return 0 if all(one.holds for one in checks) else 1
+
+
+def _fresh(folder: Path, keep: bool) -> Path:
+    """Return an empty folder; an earlier demo's is emptied, anything else is left alone."""
+    if folder.exists():
+        if keep or not (folder / "logs").is_dir():
+            raise ParameterError(f"{folder}: exists already; choose another --output")
+        shutil.rmtree(folder)
+    return folder
+
+
+def start(processes: Processes, folder: Path, motors: Path, rate: float) -> steps.Robot:
+    """Start the simulated robot and wait until it lives; its controllers stay inactive.
+
+    Parameters
+    ----------
+    processes : Processes
+        In which the nodes are started.
+    folder : Path
+        For results.
+    motors : Path
+        Parameter file of the true motors.
+    rate : float
+        Samples per second [Hz].
+
+    Returns
+    -------
+    Robot
+        All nodes answer, all wheels report.
+    """
+    given = ["--ros-args", "-p", f"motors_file:={motors.resolve()}", "-p", f"rate:={rate}"]
+    processes.start("motor_plant", "motor_plant", *given)
+    for wheel in WHEELS:
+        place = ["--ros-args", "-r", f"__ns:=/{wheel}", "-p", "autostart:=false"]
+        processes.start(f"{wheel}.wheel_pid", "wheel_pid", *place)
+    processes.start("skid_steer", "skid_steer")
+    robot = steps.Robot(processes, Conductor(processes), WHEELS, folder)
+    nodes = ["/motor_plant", *robot.wheel_nodes(), "/skid_steer"]
+    robot.conductor.ask("wait_for_nodes", nodes=nodes, timeout=30.0)
+    robot.conductor.ask("wait_for_wheels", wheels=list(WHEELS), timeout=20.0)
+    return robot
+
+
+def learn(robot: steps.Robot, say: Any) -> tuple[dict[str, Estimate], dict[str, dict[str, Any]]]:
+    """Excite, record, identify and tune.
+
+    Parameters
+    ----------
+    robot : Robot
+        With inactive controllers.
+    say : callable
+        Told what goes on.
+
+    Returns
+    -------
+    estimates : dict of str to Estimate
+        By wheel.
+    gains : dict of str to dict
+        Parameters by full node name.
+    """
+    bag = steps.record(robot, "excitation")
+    for part in PLAN:
+        say(f"exciting all wheels: {part.signal}, {part.amplitude:g} V, {part.duration:g} s")
+        steps.excite(robot, [part])
+    robot.processes.stop("record")
+    say(f"recorded {bag}; identifying")
+    results = robot.folder / "identification"
+    estimates = steps.identify_wheels(bag, results, "--quiet")
+    say("tuning")
+    gains = steps.tune_wheels(results, robot.folder / "gains.yaml")
+    return estimates, gains
+
+
+def drive(
+    robot: steps.Robot, gains: Mapping[str, Mapping[str, Any]], say: Any
+) -> list[tuple[str, float, float]]:
+    """Set the gains, switch the controllers on, and drive through :data:`DRIVE`.
+
+    Parameters
+    ----------
+    robot : Robot
+        That runs.
+    gains : mapping of str to mapping
+        Parameters by full node name.
+    say : callable
+        Told what goes on.
+
+    Returns
+    -------
+    list of tuple of str, float, float
+        Name, begin and end of each segment [s].
+    """
+    steps.set_gains(robot, gains)
+    robot.switch("activate")
+    say("gains set in the running controllers; driving")
+    steps.record(robot, "drive")
+    answer = robot.conductor.ask("drive", segments=DRIVE, patience=60.0)
+    robot.processes.stop("record")
+    robot.switch("deactivate")
+    return [(name, begin, end) for name, begin, end in answer["segments"]]
+
+
+def true_quantities(entry: MotorEntry) -> dict[str, float]:
+    """Return all that can be compared with an estimate.
+
+    Parameters
+    ----------
+    entry : MotorEntry
+        Of the motor file.
+
+    Returns
+    -------
+    dict of str to float
+        By the estimate's names.
+    """
+    motor = entry.parameters
+    names = ("dc_gain", "time_constant", "time_constant_product", "static_voltage")
+    truth = {name: float(getattr(motor, name)) for name in names}
+    if entry.knows_current:
+        physical = ("resistance", "inductance", "motor_constant", "inertia")
+        physical += ("viscous_friction", "coulomb_friction")  # type: ignore[assignment]
+        truth |= {name: float(getattr(motor, name)) for name in physical}
+    return truth
+
+
+def _compared(entry: MotorEntry, estimate: Estimate) -> list[tuple[str, float, Quantity]]:
+    """Return name, truth and estimate of every quantity that the estimate claims to know."""
+    held = {**estimate.combinations, **estimate.parameters}
+    truth = true_quantities(entry)
+    return [(n, t, held[n]) for n, t in truth.items() if n in held and held[n].value is not None]
+
+
+def show(
+    truth: Mapping[str, MotorEntry],
+    estimates: Mapping[str, Estimate],
+    gains: Mapping[str, Mapping[str, Any]],
+    answers: Mapping[str, Sequence[Answer]],
+) -> None:
+    """Print one table per wheel.
+
+    Parameters
+    ----------
+    truth, estimates, gains, answers : mapping
+        By wheel; gains by full node name.
+    """
+    out = console()
+    for wheel in WHEELS:
+        estimate = estimates[wheel]
+        title = f"{words.label(wheel)}: {words.model(estimate.model)}"
+        made = table(title, "", "true", "identified", "std", "error/std", "unit")
+        made.columns[5].justify = "left"
+        for name, true, quantity in _compared(truth[wheel], estimate):
+            std = quantity.std or 0.0
+            error = (quantity.value or 0.0) - true
+            made.add_row(
+                name,
+                words.number(true),
+                words.number(quantity.value, quantity.std),
+                words.spread(quantity.std) if quantity.status == "estimated" else "given",
+                f"{error / std:+.1f}" if std else "",
+                quantity.unit,
+            )
+        made.add_section()
+        mine = gains[f"/{wheel}/wheel_pid"]
+        told = "  ".join(f"{n} {mine[n]:.4g}" for n in ("p", "i", "d") if n in mine)
+        made.add_row("gains", "", told, "", "", "V, rad/s (wheel)")
+        for answer in answers[wheel]:
+            step = f"{answer.segment}: {answer.before:+.2f} to {answer.after:+.2f}"
+            figures = (
+                f"rise {1e3 * answer.rise:.0f} ms  settling {1e3 * answer.settling:.0f} ms  "
+                f"overshoot {answer.overshoot:.2f} %"
+            )
+            made.add_row(step, "", figures, "", "", "rad/s (wheel)")
+        out.print(made)
+
+
+def check(
+    truth: Mapping[str, MotorEntry],
+    estimates: Mapping[str, Estimate],
+    answers: Mapping[str, Sequence[Answer]],
+) -> list[Check]:
+    """Hold the results against the limits.
+
+    Parameters
+    ----------
+    truth, estimates, answers : mapping
+        By wheel.
+
+    Returns
+    -------
+    list of Check
+        The worst case of each.
+    """
+    gain, deviation, over, settled = [], [], [], []
+    for wheel in WHEELS:
+        for name, true, quantity in _compared(truth[wheel], estimates[wheel]):
+            error = abs((quantity.value or math.nan) - true)
+            if name == "dc_gain":
+                gain.append((100.0 * error / true, wheel))
+            if quantity.status == "estimated":
+                deviation.append((error / (quantity.std or 1e-300), f"{wheel} {name}"))
+        for answer in answers[wheel]:
+            over.append((answer.overshoot, f"{wheel} {answer.segment}"))
+            settled.append((answer.settling, f"{wheel} {answer.segment}"))
+    return [
+        _worst("error of the DC gain", gain, MOST_GAIN_ERROR, "%"),
+        _worst("error of a parameter", deviation, MOST_DEVIATIONS, "standard deviations"),
+        _worst("overshoot", over, MOST_OVERSHOOT, "%"),
+        _worst("settling time", settled, min(part[3] for part in DRIVE), "s"),
+    ]
+
+
+def _worst(name: str, found: Sequence[tuple[float, str]], limit: float, unit: str) -> Check:
+    """Return the largest figure; one that does not exist (NaN), or none at all, is worst."""
+    figure, where = max(
+        found, key=lambda one: math.inf if math.isnan(one[0]) else one[0], default=(math.nan, "-")
+    )
+    return Check(name, figure, limit, where, unit)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

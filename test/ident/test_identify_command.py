@@ -1,0 +1,181 @@
+"""The tool ``identify`` as its user meets it: files, exit codes, one-line complaints."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.signal import cont2discrete, lfilter
+
+from smp_motor_control.motor_file import load_motors
+from smp_motor_ident.commands.identify import OUTPUTS, main
+
+GAIN, LAG, STEP = 25.0, 0.06, 0.01
+MAP = ("--map", "time=t", "voltage=u", "velocity=w")
+REAL = Path(__file__).parents[3] / "shared" / "data" / "prbs_gearmotor"
+
+
+def write_csv(path: Path, *, seconds: float = 20.0, level: float = 6.0, seed: int = 1) -> Path:
+    """A first-order motor under random steps; ``u`` holds from its row to the next."""
+    rng = np.random.default_rng(seed)
+    n = round(seconds / STEP)
+    voltage = np.repeat(rng.uniform(-level, level, n // 20 + 1), 20)[:n]
+    b, a, _ = cont2discrete(([GAIN], [LAG, 1.0]), STEP)
+    speed = lfilter(b.ravel(), a, voltage) + rng.normal(0.0, 0.5, n)
+    table = np.column_stack((np.arange(n) * STEP, voltage, speed))
+    np.savetxt(path, table, delimiter=",", header="t,u,w", comments="", fmt="%.9g")
+    return path
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_csv(tmp_path_factory.mktemp("data") / "log.csv")
+
+
+def complaint(capsys: pytest.CaptureFixture[str]) -> str:
+    """The one line on standard error."""
+    lines = capsys.readouterr().err.strip().splitlines()
+    lines = [line for line in lines if not line.endswith(" ...")]  # progress of slow steps
+    assert len(lines) == 1, lines
+    assert lines[0].startswith("identify: ")
+    assert "Traceback" not in lines[0]
+    return lines[0]
+
+
+def test_it_writes_its_three_files_and_recovers_the_motor(recording: Path, tmp_path: Path) -> None:
+    output = tmp_path / "result"
+    assert main([str(recording), *MAP, "--output", str(output)]) == 0
+    assert sorted(p.name for p in output.iterdir()) == sorted(OUTPUTS)
+    (motor,) = json.loads((output / "identification.json").read_text())["motors"].values()
+    for name, truth in (("dc_gain", GAIN), ("time_constant", LAG)):
+        found = motor["combinations"][name]
+        # Four standard deviations: 1 in 16,000 by chance, and the seed is fixed.
+        assert abs(found["value"] - truth) < 4 * found["std"]
+        assert found["std"] < 0.02 * truth  # 2000 samples at 0.3 % noise tell it far better
+    assert motor["sources"] == ["log"] or motor["sources"] == ["log.csv"]
+    (entry,) = load_motors(output / "motors.yaml").values()
+    assert entry.parameters.dc_gain == pytest.approx(motor["combinations"]["dc_gain"]["value"])
+    page = (output / "report.html").read_text()
+    assert "<svg" in page
+    assert "log.csv" in page
+
+
+def test_it_replaces_nothing_without_force(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "motors.yaml").write_text("mine")
+    arguments = [str(recording), *MAP, "--output", str(tmp_path), "--quiet"]
+    assert main(arguments) == 2
+    assert "motors.yaml" in complaint(capsys)
+    assert [p.name for p in tmp_path.iterdir()] == ["motors.yaml"]
+    assert (tmp_path / "motors.yaml").read_text() == "mine"
+    assert main([*arguments, "--force"]) == 0
+    assert (tmp_path / "motors.yaml").read_text() != "mine"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (["nowhere.mcap"], "nowhere.mcap"),
+        (["log.csv"], "log.csv"),  # a CSV file without a mapping
+        (["log.csv", "--map", "time=t", "voltage=u", "velocity=speed"], "speed"),
+        (["log.csv", *MAP, "--fix", "weight=3"], "weight"),
+        (["log.csv", *MAP, "--fix", "resistance=-3"], "-3"),
+        (["log.csv", *MAP, "--fix", "resistance=many"], "many"),
+        (["log.csv", *MAP, "--model", "quantum"], "quantum"),
+        (["log.csv", *MAP, "--wheel", "fifth"], "fifth"),
+        (["log.csv", *MAP, "--mapping", "m.yaml"], "--mapping"),
+        (["log.csv", "--mapping", "m.yaml"], "m.yaml"),
+        (["log.csv", *MAP, "--validate", "absent.csv"], "absent.csv"),
+        (["log.csv", *MAP, "--nonsense"], "--nonsense"),
+        ([], "BAG"),
+    ],
+)
+def test_wrong_usage_is_one_line_and_leaves_nothing(
+    arguments: list[str],
+    word: str,
+    recording: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (tmp_path / "log.csv").write_bytes(recording.read_bytes())
+    monkeypatch.chdir(tmp_path)
+    assert main([*arguments, "--output", "result"]) == 2
+    assert word in complaint(capsys)
+    assert not (tmp_path / "result").exists()
+
+
+def test_without_output_it_asks_for_one(
+    recording: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([str(recording), *MAP]) == 2
+    assert "--output" in complaint(capsys)
+
+
+def test_a_motor_that_was_not_moved_is_refused_with_advice(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    still = write_csv(tmp_path / "still.csv", level=0.0)
+    assert main([str(still), *MAP, "--output", str(tmp_path / "result")]) == 1
+    assert "record" in complaint(capsys)
+    assert not (tmp_path / "result").exists()
+
+
+def test_good_wheels_are_written_when_another_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    good, still = write_csv(tmp_path / "a.csv"), write_csv(tmp_path / "b.csv", level=0.0)
+    both = np.hstack([np.loadtxt(p, delimiter=",", skiprows=1) for p in (good, still)])
+    np.savetxt(
+        tmp_path / "both.csv", both, delimiter=",", header="t,u,w,t2,u2,w2", comments="", fmt="%g"
+    )
+    names = ["left.time=t", "left.voltage=u", "left.velocity=w"]
+    names += ["right.time=t", "right.voltage=u2", "right.velocity=w2"]
+    output = tmp_path / "result"
+    arguments = [str(tmp_path / "both.csv"), "--map", *names, "--output", str(output), "--quiet"]
+    assert main(arguments) == 1
+    assert "right" in complaint(capsys)
+    assert list(json.loads((output / "identification.json").read_text())["motors"]) == ["left"]
+    assert "not identified" in (output / "report.html").read_text()
+
+
+def test_another_recording_judges_the_model(recording: Path, tmp_path: Path) -> None:
+    other = write_csv(tmp_path / "other.csv", seed=2)
+    output = tmp_path / "result"
+    arguments = [str(recording), *MAP, "--validate", str(other), "--output", str(output)]
+    assert main(arguments) == 0
+    (motor,) = json.loads((output / "identification.json").read_text())["motors"].values()
+    # Noise of 0.5 on a speed that scatters by 85: a perfect model reaches 99.4 %.
+    assert motor["fit_percent"]["validation"] > 99.0
+    assert "other.csv" in (output / "report.html").read_text()
+
+
+def test_the_executable_complains_without_a_traceback(
+    process: Callable[..., object], tmp_path: Path
+) -> None:
+    (tmp_path / "not_a_bag.mcap").write_bytes(b"not a bag at all")
+    tool = process("identify", "not_a_bag.mcap", "--output", "result")
+    assert tool.wait(60.0) == 2  # type: ignore[attr-defined]
+    lines = tool.output.strip().splitlines()  # type: ignore[attr-defined]
+    assert len(lines) == 1
+    assert "not_a_bag.mcap" in lines[0]
+    assert not (tmp_path / "result").exists()
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="recordings of real motors are not here")
+def test_a_real_motor_is_recovered_and_predicts_another_day(tmp_path: Path) -> None:
+    first, second = REAL / "prbs_2026-08-14.csv", REAL / "prbs_2026-08-18.csv"
+    mapping = ("--map", "time=t", "voltage=u", "velocity=y:deg/s")
+    arguments = [str(first), *mapping, "--validate", str(second), "--output", str(tmp_path / "r")]
+    assert main(arguments) == 0
+    text = (tmp_path / "r" / "identification.json").read_text()
+    (motor,) = json.loads(text)["motors"].values()
+    gain = np.degrees(motor["combinations"]["dc_gain"]["value"])
+    # Limits of the project's requirements; 159.9 deg/s/V is the owner's static curve.
+    assert gain == pytest.approx(159.9, rel=0.03)
+    assert 0.030 <= motor["combinations"]["time_constant"]["value"] <= 0.042
+    assert motor["fit_percent"]["validation"] >= 93.0
