@@ -89,7 +89,9 @@ class _Stop:
         threading.Thread(target=self._read_signals, args=(inlet,), daemon=True).start()
 
     def _read_signals(self, inlet: int) -> None:
-        while os.read(inlet, 1):
+        while number := os.read(inlet, 1):
+            if number[0] not in _SIGNALS:  # such as SIGCONT, handled by a node itself
+                continue
             if self.requested.is_set():
                 os._exit(1)
             self.request()

@@ -1,0 +1,207 @@
+"""Keys of a terminal to speeds of the body or of single wheels, with a dead man's switch.
+
+A terminal tells that a key is held only by repeating it; a command ends with the repeats.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from smp_motor_control import WHEELS
+from smp_motor_control.errors import ParameterError
+
+ARROWS: Mapping[str, str] = {"A": "up", "B": "down", "C": "right", "D": "left"}
+
+BODY_KEYS: Mapping[str, tuple[float, float]] = {
+    "w": (1.0, 0.0),
+    "up": (1.0, 0.0),
+    "s": (-1.0, 0.0),
+    "down": (-1.0, 0.0),
+    "a": (0.0, 1.0),
+    "left": (0.0, 1.0),
+    "d": (0.0, -1.0),
+    "right": (0.0, -1.0),
+    "q": (1.0, 1.0),
+    "e": (1.0, -1.0),
+    "z": (-1.0, -1.0),
+    "c": (-1.0, 1.0),
+}
+"""Share of the linear and of the angular speed that a key asks for."""
+
+WHEEL_KEYS: Mapping[str, float] = {"w": 1.0, "up": 1.0, "s": -1.0, "down": -1.0}
+
+_SEQUENCE = re.compile(r"\x1b(?:\[|O)[0-9;]*([A-Za-z~])|\x1b|(.)", re.DOTALL)
+
+
+def keys_of(text: str) -> list[str]:
+    """Return the keys that a terminal's characters stand for.
+
+    Parameters
+    ----------
+    text : str
+        As read; escape sequences other than those of the arrows are dropped.
+
+    Returns
+    -------
+    list of str
+        Single characters in lower case, and ``up``, ``down``, ``left``, ``right``.
+
+    Examples
+    --------
+    >>> keys_of("W\\x1b[A\\x1b[5~+")
+    ['w', 'up', '+']
+    """
+    keys = []
+    for match in _SEQUENCE.finditer(text):
+        final, plain = match.groups()
+        if plain is not None:
+            keys.append(plain.lower())
+        elif final in ARROWS:
+            keys.append(ARROWS[final])
+    return keys
+
+
+@dataclass(frozen=True, kw_only=True)
+class Speeds:
+    """What a held key asks for.
+
+    Attributes
+    ----------
+    linear, angular, wheel : float
+        [m/s], [rad/s] of the body, [rad/s] of a wheel.
+    step : float
+        Share by which + and - change them all.
+    timeout : float
+        Time without a repeat after which the key counts as released [s].
+
+    Raises
+    ------
+    ParameterError
+        When a speed, the step or the time-out is not positive and finite.
+    """
+
+    linear: float = 0.2
+    angular: float = 0.6
+    wheel: float = 1.5
+    step: float = 0.1
+    timeout: float = 0.6
+
+    def __post_init__(self) -> None:
+        for name in ("linear", "angular", "wheel", "step", "timeout"):
+            value = getattr(self, name)
+            if not 0.0 < value < math.inf:
+                raise ParameterError(f"{name} of the keyboard is {value}: must be positive")
+
+
+class Keyboard:
+    """What the keys ask for now.
+
+    Parameters
+    ----------
+    speeds : Speeds
+        At the start.
+
+    Attributes
+    ----------
+    body_mode : bool
+        Whether keys drive the body; else the selected wheels.
+    selected : set of str
+        Wheels that the keys drive in wheel mode.
+    scale : float
+        By what + and - have changed the speeds.
+    quitting : bool
+        Whether the user asked to leave.
+    """
+
+    SLOWEST, FASTEST = 0.1, 4.0
+
+    def __init__(self, speeds: Speeds) -> None:
+        self.speeds = speeds
+        self.body_mode = True
+        self.selected = set(WHEELS)
+        self.scale = 1.0
+        self.quitting = False
+        self._held = ""
+        self._seen = -math.inf
+
+    def press(self, key: str, now: float) -> None:
+        """Take in a key.
+
+        Parameters
+        ----------
+        key : str
+            As :func:`keys_of` names it; an unknown one stops, as any mistake should.
+        now : float
+            [s].
+        """
+        motions: Mapping[str, object] = BODY_KEYS if self.body_mode else WHEEL_KEYS
+        if key in motions:
+            self._held, self._seen = key, now
+            return
+        self._held = ""
+        if key in ("+", "="):
+            self.scale = min(self.scale * (1.0 + self.speeds.step), self.FASTEST)
+        elif key in ("-", "_"):
+            self.scale = max(self.scale / (1.0 + self.speeds.step), self.SLOWEST)
+        elif key == "m":
+            self.body_mode = not self.body_mode
+        elif key == "x":
+            self.quitting = True
+        elif not self.body_mode and key == "0":
+            self.selected = set(WHEELS)
+        elif not self.body_mode and key in ("1", "2", "3", "4"):
+            self.selected = {WHEELS[int(key) - 1]}
+
+    def driving(self, now: float) -> bool:
+        """Tell whether a motion key is held.
+
+        Parameters
+        ----------
+        now : float
+            [s].
+
+        Returns
+        -------
+        bool
+            False once its repeats have stopped.
+        """
+        return bool(self._held) and now - self._seen <= self.speeds.timeout
+
+    def body(self, now: float) -> tuple[float, float]:
+        """Return the velocity asked of the body.
+
+        Parameters
+        ----------
+        now : float
+            [s].
+
+        Returns
+        -------
+        tuple of float
+            Linear [m/s] and angular [rad/s]; zero while no key is held.
+        """
+        linear, angular = BODY_KEYS.get(self._held, (0.0, 0.0)) if self.driving(now) else (0.0, 0.0)
+        return (
+            linear * self.scale * self.speeds.linear,
+            angular * self.scale * self.speeds.angular,
+        )
+
+    def wheels(self, now: float) -> dict[str, float]:
+        """Return the speed asked of every wheel.
+
+        Parameters
+        ----------
+        now : float
+            [s].
+
+        Returns
+        -------
+        dict of str to float
+            [rad/s]; zero for wheels that are not selected, or while no key is held.
+        """
+        share = WHEEL_KEYS.get(self._held, 0.0) if self.driving(now) else 0.0
+        speed = share * self.scale * self.speeds.wheel
+        return {wheel: speed if wheel in self.selected else 0.0 for wheel in WHEELS}

@@ -1,0 +1,180 @@
+"""teleop_wheels: keys of a terminal to cmd_vel or to single wheels, while they are held."""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import dataclass
+
+from geometry_msgs.msg import Twist, TwistStamped
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
+
+from smp_motor_control import WHEELS
+from smp_motor_control.errors import SmpError
+from smp_motor_control.keyboard import Keyboard, Speeds, keys_of
+from smp_motor_control.nodes import runtime
+from smp_motor_control.nodes.settings import Parameters, described
+from smp_motor_control.nodes.terminal import Terminal, require_terminal
+
+HELP = """\
+teleop_wheels: hold a key to drive; the wheels stop {timeout:g} s after it is released.
+
+  body mode                      wheel mode
+    q  w  e    arc  ahead  arc     w or up     selected wheels forward
+    a     d    turn on the spot    s or down   selected wheels backward
+    z  s  c    arc  back   arc     1 2 3 4     select front left, front right,
+    or the arrow keys                          rear left, rear right;  0  all
+
+  + -  faster, slower   m  body or wheel mode   space  stop   x or Ctrl-C  quit
+
+"""
+ZEROS_AFTER_RELEASE = 1.0
+"""Zero is commanded for so long [s] after a key, then nothing: others may drive."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """Parameters of the node."""
+
+    linear_speed: float = described(0.2, "Of the body [m/s].")
+    angular_speed: float = described(0.6, "Of the body [rad/s].")
+    wheel_speed: float = described(1.5, "Of a wheel [rad/s].")
+    speed_step: float = described(0.1, "Share by which + and - change the speeds.")
+    key_timeout: float = described(
+        0.6, "Time without a repeat after which a key counts as released [s].", maximum=5.0
+    )
+    rate: float = described(
+        20.0, "Commands per second [Hz].", minimum=5.0, maximum=100.0, read_only=True
+    )
+    use_stamped_vel: bool = described(
+        True, "Publish TwistStamped (true) or Twist (false).", read_only=True
+    )
+    frame_id: str = described("base_link", "Frame of a stamped command.", read_only=True)
+
+    def __post_init__(self) -> None:
+        self.speeds()
+
+    def speeds(self) -> Speeds:
+        """Return what held keys ask for."""
+        return Speeds(
+            linear=self.linear_speed,
+            angular=self.angular_speed,
+            wheel=self.wheel_speed,
+            step=self.speed_step,
+            timeout=self.key_timeout,
+        )
+
+
+class TeleopWheels(Node):
+    """Reads keys on a steady timer and publishes while one is held, and a little longer."""
+
+    def __init__(self) -> None:
+        super().__init__("teleop_wheels")
+        parameters = Parameters(self, Settings, self._configure)
+        self._settings = parameters.settings
+        self._keyboard = Keyboard(self._settings.speeds())
+        stamped = self._settings.use_stamped_vel
+        self._twist = TwistStamped() if stamped else Twist()
+        if stamped:
+            self._twist.header.frame_id = self._settings.frame_id
+        self._setpoint = JointState(name=[f"{wheel}_wheel_joint" for wheel in WHEELS])
+        qos = runtime.STREAM_PUBLISHER
+        self._twists = self.create_publisher(type(self._twist), "cmd_vel", qos)
+        self._setpoints = self.create_publisher(JointState, "wheel_setpoints", qos)
+        self._quiet_from = {True: 0.0, False: 0.0}  # by mode: when its zeros may end
+        self._terminal = Terminal(self._halt, runtime.finish, self._show_help)
+        self._show_help()
+        self._timer = runtime.steady_timer(self, 1.0 / self._settings.rate, self._tick)
+
+    def _configure(self, settings: Settings) -> None:
+        self._settings = settings
+        self._keyboard.speeds = settings.speeds()
+
+    def _show_help(self) -> None:
+        self._terminal.write(HELP.format(timeout=self._settings.key_timeout))
+
+    def _tick(self) -> None:
+        keyboard, now = self._keyboard, time.monotonic()
+        for key in keys_of(self._terminal.read()):
+            keyboard.press(key, now)
+        if keyboard.quitting:
+            runtime.finish()
+            return
+        if keyboard.driving(now):
+            self._quiet_from[keyboard.body_mode] = now + ZEROS_AFTER_RELEASE
+        # The other mode may still owe its zeros, when the mode was changed while driving.
+        for body_mode, until in self._quiet_from.items():
+            if now < until:
+                self._publish(body_mode, now)
+        self._show(now)
+
+    def _publish(self, body_mode: bool, now: float) -> None:
+        mine = body_mode == self._keyboard.body_mode
+        if body_mode:
+            linear, angular = self._keyboard.body(now) if mine else (0.0, 0.0)
+            self._send_twist(linear, angular)
+        else:
+            wheels = self._keyboard.wheels(now) if mine else dict.fromkeys(WHEELS, 0.0)
+            self._send_wheels([wheels[wheel] for wheel in WHEELS])
+
+    def _send_twist(self, linear: float, angular: float) -> None:
+        twist = self._twist
+        if isinstance(twist, TwistStamped):
+            twist.header.stamp = self.get_clock().now().to_msg()
+            twist = twist.twist
+        twist.linear.x, twist.angular.z = linear, angular
+        self._twists.publish(self._twist)
+
+    def _send_wheels(self, speeds: list[float]) -> None:
+        self._setpoint.header.stamp = self.get_clock().now().to_msg()
+        self._setpoint.velocity = speeds
+        self._setpoints.publish(self._setpoint)
+
+    def _show(self, now: float) -> None:
+        keyboard, speeds = self._keyboard, self._keyboard.speeds
+        state = "driving" if keyboard.driving(now) else "stopped"
+        if keyboard.body_mode:
+            linear, angular = keyboard.body(now)
+            takers = self._twists.get_subscription_count()
+            line = (
+                f"body mode  {keyboard.scale * speeds.linear:.2f} m/s  "
+                f"{keyboard.scale * speeds.angular:.2f} rad/s  | {state} "
+                f"{linear:+.2f} m/s {angular:+.2f} rad/s"
+            )
+        else:
+            takers = self._setpoints.get_subscription_count()
+            chosen = "all" if len(keyboard.selected) == len(WHEELS) else min(keyboard.selected)
+            line = f"wheel mode  {keyboard.scale * speeds.wheel:.2f} rad/s  {chosen}  | {state}"
+            if self._setpoints.get_subscription_count() and self._others():
+                line += "  (skid_steer commands the wheels too: use body mode)"
+        self._terminal.write_status(line if takers else f"{line}  (nobody listens)")
+
+    def _others(self) -> bool:
+        return self.count_publishers(self._setpoints.topic_name) > 1
+
+    def _halt(self) -> None:
+        """Command zero now to all that was driven from here."""
+        self._keyboard.press(" ", time.monotonic())
+        if self._quiet_from[False]:
+            self._send_wheels([0.0] * len(WHEELS))
+        if self._quiet_from[True]:
+            self._send_twist(0.0, 0.0)
+            runtime.send_last(self._twists, self._twist)
+        elif self._quiet_from[False]:
+            runtime.send_last(self._setpoints, self._setpoint)
+
+    def on_stop(self) -> None:
+        """Give the terminal back, which cannot fail or wait, and stop what was driven."""
+        self._terminal.restore()
+        self._halt()
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the node until x, Ctrl-C or a signal; return its exit code."""
+    try:
+        require_terminal()
+    except SmpError as error:
+        print(f"teleop_wheels: {error}", file=sys.stderr)
+        return error.exit_code
+    return runtime.run("teleop_wheels", TeleopWheels, argv)
