@@ -324,6 +324,11 @@ class Diagnostics:
         :data:`STALE`, a line for people, and a mapping of names to values.
     hardware_id : str
         Such as the joint's name.
+
+    Attributes
+    ----------
+    due : bool
+        Whether ``assess`` is asked for the report of the second, and not for one between.
     """
 
     def __init__(
@@ -337,7 +342,18 @@ class Diagnostics:
         self._name = node.get_fully_qualified_name().lstrip("/")
         self._hardware_id = hardware_id
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self._timer = steady_timer(node, 1.0, self.publish)
+        self._timer = steady_timer(node, 1.0, self._tick)
+        self.due = False
+
+    def _tick(self) -> None:
+        self.due = True
+        self.publish()
+        self.due = False
+
+    def destroy(self) -> None:
+        """Fall silent and give the topic back."""
+        self._node.destroy_timer(self._timer)
+        self._node.destroy_publisher(self._publisher)
 
     def publish(self) -> None:
         """Publish the present health now."""

@@ -46,6 +46,7 @@ def described(
     minimum: float | None = None,
     maximum: float | None = None,
     read_only: bool = False,
+    name: str = "",
 ) -> Any:
     """Return a dataclass field that becomes a ROS parameter.
 
@@ -59,6 +60,8 @@ def described(
         Range of a number, both ends allowed.
     read_only : bool
         Whether it can be set only at the start.
+    name : str
+        Of the parameter, where it is not the field's.
 
     Returns
     -------
@@ -66,7 +69,7 @@ def described(
         For the body of a dataclass.
     """
     limits = {"minimum": minimum, "maximum": maximum}
-    metadata = {"description": description, "read_only": read_only, **limits}
+    metadata = {"description": description, "read_only": read_only, "name": name, **limits}
     return dataclasses.field(default=default, metadata=metadata)
 
 
@@ -112,7 +115,9 @@ def _entries(settings: type) -> dict[str, _Entry]:
                 default = getattr(field.default, name)
                 found[data["prefix"] + name] = _Entry((field.name, name), default, description)
         elif "description" in data:
-            found[field.name] = _Entry((field.name,), field.default, **data)
+            limits = {key: data[key] for key in ("minimum", "maximum", "read_only")}
+            name = data["name"] or field.name
+            found[name] = _Entry((field.name,), field.default, data["description"], **limits)
     return found
 
 

@@ -1,0 +1,141 @@
+"""Parameters of ``wheel_pid``, and the settings of its core that they make."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from smp_motor_control.errors import ParameterError
+from smp_motor_control.motor_model import MotorModel
+from smp_motor_control.nodes.settings import described, nested
+from smp_motor_control.observer import ObserverNoise
+from smp_motor_control.pid import PidGains
+from smp_motor_control.profile import ProfileLimits
+from smp_motor_control.supervision import FaultLimits
+from smp_motor_control.wheel_loop import LoopSettings
+
+_GAINS = {
+    "p": "Proportional gain [V s/rad, wheel].",
+    "i": "Integral gain [V/rad].",
+    "d": "Derivative gain [V s^2/rad].",
+    "u_clamp_min": "Lower limit of the output [V]; the supply limits it too.",
+    "u_clamp_max": "Upper limit of the output [V]; the supply limits it too.",
+    "i_clamp_min": "Lower limit of the integral term [V].",
+    "i_clamp_max": "Upper limit of the integral term [V].",
+    "antiwindup_strategy": "none, back_calculation or conditional_integration.",
+    "tracking_time_constant": "Of back-calculation [s]; 0 for its default.",
+    "error_deadband": "Error within which the integral rests [rad/s].",
+    "setpoint_weight_p": "Share of the reference in the proportional term.",
+    "setpoint_weight_d": "Share of the reference in the derivative term.",
+    "derivative_filter_time_constant": "Of the first-order filter [s]; 0 for none.",
+    "feedforward_static": "Voltage against dry friction [V].",
+    "feedforward_velocity": "Voltage per speed [V s/rad].",
+    "feedforward_acceleration": "Voltage per acceleration [V s^2/rad].",
+}
+_FAULTS = {
+    "current_limit": "Current above which the motor is switched off [A]; 0 for none.",
+    "current_time": "Time above the limit before that [s].",
+    "stall_voltage": "Least voltage at which the wheel must turn [V].",
+    "stall_velocity": "Least speed that counts as turning [rad/s, wheel].",
+    "stall_time": "Time without turning before the motor is switched off [s]; 0: never.",
+    "runaway_time": "Time of turning against the voltage before that [s]; 0: never.",
+}
+_NOISE = {
+    "load": "Wander of the load in one second, as a voltage [V/sqrt(s)].",
+    "voltage": "White noise of the voltage [V sqrt(s)].",
+    "count": "Standard deviation of the encoder's error [counts].",
+}
+_NO_NOISE_GIVEN, _NO_GAINS_GIVEN, _NO_FAULTS_GIVEN = ObserverNoise(), PidGains(), FaultLimits()
+
+
+def _model(name: str, description: str) -> float:
+    default: float = described(0.0, description, minimum=0.0, name=f"model.{name}")
+    return default
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """Parameters of the node.
+
+    Attributes
+    ----------
+    loop : LoopSettings
+        What they make of the loop.
+    """
+
+    joint_name: str = described(
+        "", "Joint to control; empty for <namespace>_wheel_joint.", read_only=True
+    )
+    autostart: bool = described(
+        True, "Configure and activate without being asked to.", read_only=True
+    )
+    setpoint_timeout: float = described(
+        0.5, "Silence of set-points after which the wheel is braked [s].", minimum=0.01,
+        maximum=60.0,
+    )  # fmt: skip
+    feedback_timeout: float = described(
+        0.2, "Silence or lateness of feedback after which the voltage is zero [s].",
+        minimum=0.005, maximum=10.0,
+    )  # fmt: skip
+    gains: PidGains = nested(_NO_GAINS_GIVEN, _GAINS)  # noqa: RUF009
+    max_velocity: float = described(0.0, "Of the reference [rad/s]; 0 for none.", minimum=0.0)
+    max_acceleration: float = described(0.0, "Of the reference [rad/s^2]; 0 for none.", minimum=0.0)
+    max_jerk: float = described(0.0, "Of the reference [rad/s^3]; 0 for none.", minimum=0.0)
+    transition_time: float = described(
+        0.0, "Duration of every change of set-point [s]; 0: as fast as limits allow.",
+        minimum=0.0, maximum=60.0,
+    )  # fmt: skip
+    speed_source: str = described("measured", "measured, difference or observer.")
+    difference_window: int = described(
+        4, "Samples to difference counts over.", minimum=1, maximum=1000
+    )
+    model_dc_gain: float = _model("dc_gain", "Speed per volt [rad/s/V, motor]; 0: no model.")
+    model_time_constant: float = _model("time_constant", "Sum of the time constants [s].")
+    model_time_constant_product: float = _model("time_constant_product", "Their product [s^2].")
+    model_static_voltage: float = _model("static_voltage", "What dry friction takes [V].")
+    model_delay: float = _model("delay", "From voltage to effect [s].")
+    observer: ObserverNoise = nested(_NO_NOISE_GIVEN, _NOISE, prefix="observer.")  # noqa: RUF009
+    faults: FaultLimits = nested(_NO_FAULTS_GIVEN, _FAULTS)  # noqa: RUF009
+    fault_retry: float = described(
+        2.0, "Pause before a wheel at fault is tried again under a set-point that is not zero "
+        "[s], doubled every time; 0: only after a zero set-point.", minimum=0.0,
+    )  # fmt: skip
+    implausible_velocity: float = described(
+        1000.0, "Feedback beyond this speed is left out [rad/s, wheel].", minimum=0.0
+    )
+    scheduling_priority: int = described(
+        0, "SCHED_FIFO priority; 0 for the usual scheduler.", minimum=0, maximum=99,
+        read_only=True,
+    )  # fmt: skip
+    cpu_affinity: tuple[int, ...] = described(
+        (-1,), "Processors to run on; -1 for any.", read_only=True
+    )
+    loop: LoopSettings = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        limits = ProfileLimits.from_parameters(
+            self.max_velocity, self.max_acceleration, self.max_jerk
+        )
+        loop = LoopSettings(
+            gains=self.gains,
+            limits=limits,
+            transition_time=self.transition_time,
+            speed_source=self.speed_source,
+            difference_window=self.difference_window,
+            model=self._motor_model(),
+            noise=self.observer,
+        )
+        object.__setattr__(self, "loop", loop)
+
+    def _motor_model(self) -> MotorModel | None:
+        given = (self.model_dc_gain, self.model_time_constant)
+        if given == (0.0, 0.0):
+            return None
+        if 0.0 in given:
+            raise ParameterError("model.dc_gain and model.time_constant must be given together")
+        return MotorModel(
+            dc_gain=self.model_dc_gain,
+            time_constant=self.model_time_constant,
+            time_constant_product=self.model_time_constant_product,
+            static_voltage=self.model_static_voltage,
+            delay=self.model_delay,
+        )
