@@ -3,12 +3,14 @@
 set -u
 cd -- "$(dirname -- "${BASH_SOURCE[0]}")/.." || exit
 
-python_files() { git ls-files --cached --others --exclude-standard -- "$@" | while read -r file; do [ ! -f "$file" ] || echo "$file"; done; }
 format() { ruff format --quiet --check . || { ruff format --check .; echo "run: make format"; return 1; }; }
 lint() { ruff check --quiet .; }
 types() { mypy --no-error-summary; }
 imports() { lint-imports --no-logo; }
-docstrings() { python_files 'smp_motor_control/*.py' 'smp_motor_ident/*.py' | grep -v '^smp_motor_control/nodes/' | xargs python scripts/docstrings.py; }
+docstrings() {
+  find smp_motor_control smp_motor_ident -name '*.py' -not -path 'smp_motor_control/nodes/*' -print0 |
+    xargs -0 python scripts/docstrings.py
+}
 
 guards=("$@")
 [ $# -gt 0 ] || guards=(format lint types imports docstrings)
