@@ -216,7 +216,11 @@ def _series(motor: _Motor, name: str, signal: Signal, time: Integers) -> Series:
     if not keep.size:
         raise BagError(f"{motor.where}: no message of {signal.topic} has {signal.field}")
     values = column if keep.size == column.size and _is_identity(keep) else column[keep]
-    return Series(time[keep], _converted(motor, name, signal, values))
+    number = None if table.number is None else table.number[keep]
+    bits = None
+    if name == "count" and column.dtype.kind in "iu" and column.dtype.itemsize < 4:
+        bits = 8 * column.dtype.itemsize
+    return Series(time[keep], _converted(motor, name, signal, values), number, bits)
 
 
 def _is_identity(order: Integers) -> bool:
@@ -307,4 +311,4 @@ def _drop_lost(motor: _Motor, series: dict[str, Series], axis_name: str) -> None
     motor.notes.append(f"{int((~sound).sum())} samples without a finite voltage were left out")
     for name, signal in series.items():
         if np.array_equal(signal.time, axis.time):
-            series[name] = Series(signal.time[sound], signal.value[sound])
+            series[name] = signal.take(sound)

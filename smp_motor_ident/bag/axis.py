@@ -24,10 +24,21 @@ BRIDGED = 2
 
 @dataclass(eq=False)
 class Series:
-    """One signal's samples: time [ns] strictly increasing, value in SI at the motor shaft."""
+    """One signal's samples: time [ns] strictly increasing, value in SI at the motor shaft.
+
+    ``number`` is the publisher's count, where it is known; ``bits`` the width of the
+    message's field, for a counter.
+    """
 
     time: Integers
     value: NDArray[Any]
+    number: Integers | None = None
+    bits: int | None = None
+
+    def take(self, which: NDArray[Any]) -> Series:
+        """Return some of the samples."""
+        number = None if self.number is None else self.number[which]
+        return Series(self.time[which], self.value[which], number, self.bits)
 
 
 def on_one_axis(
@@ -104,7 +115,7 @@ def on_one_axis(
 
 def _finite(series: Series) -> Series:
     sound = np.isfinite(series.value)
-    return series if sound.all() else Series(series.time[sound], series.value[sound])
+    return series if sound.all() else series.take(sound)
 
 
 def _times_supply(series: dict[str, Series]) -> None:
@@ -149,7 +160,7 @@ def _count_starts(
     flags[0] = True
     if axis_name == "count":
         counted = series["count"]
-        bits = hardware.encoder_bits if "encoder_bits" in plan.hardware else None
+        bits = hardware.encoder_bits if "encoder_bits" in plan.hardware else counted.bits
         raw = counted.value
         if raw.dtype.kind == "f":
             raw = np.rint(raw).astype(np.int64)
@@ -188,6 +199,8 @@ def _gaps(
     """Return where segments begin because samples are missing; bridge the voltage over a few."""
     beat = rhythm(axis)
     steps, missing = np.diff(axis), beat.missing(axis)
+    if alike and voltage.number is not None:  # the publisher counted: nothing to be guessed
+        missing = np.maximum(np.diff(voltage.number) - 1, 0)
     limit = plan.gap * 1e9 if plan.gap else beat.gap()
     cut = steps > limit
     if alike and not plan.gap:
@@ -195,11 +208,11 @@ def _gaps(
     bridged = (missing > 0) & ~cut
     if alike and bridged.any():
         _bridge(values, voltage.value, missing, bridged, held)
-    if missing.any() and beat.regular:
+    if bridged.any():
         notes.append(
             f"{int(missing[bridged].sum())} samples missing in {int(bridged.sum())} places"
             + ("; their voltage was interpolated" if alike else "; the voltage there is known")
-        ) if bridged.any() else None
+        )
     if cut.any():
         lost = int(missing[cut].sum())
         longest = steps[cut].max() * 1e-9

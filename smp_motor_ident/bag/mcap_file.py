@@ -34,6 +34,8 @@ from smp_motor_ident.bag.storage import (
 from smp_motor_ident.errors import BagError
 
 MAGIC = b"\x89MCAP0\r\n"
+NUMBERED = "publication_sequence"
+"""Key of a channel's metadata: ``true`` where sequence numbers are the publisher's."""
 _HEAD = struct.Struct("<BQ")
 _CHUNK = struct.Struct("<QQQI")
 _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK_RECORD, _DATA_END = 3, 4, 5, 6, 15
@@ -148,25 +150,25 @@ class McapFile:
                 if op == _DATA_END:
                     break
                 whole = start + 9 + length <= size
-                if op == _MESSAGE and whole:
-                    yield from self._top_level(file, start, length, size, wanted)
-                elif op == _CHUNK_RECORD:
-                    if whole and self._skippable(start, wanted):
-                        file.seek(length, io.SEEK_CUR)
-                        continue
+                if op == _CHUNK_RECORD and not (whole and self._skippable(start, wanted)):
                     body = file.read(min(length, size - start - 9))
                     for batch in self._chunk(body, start, whole, wanted):
                         yield file.tell() / size, batch
-                    if not whole:
-                        break
                 elif op == 0 or not whole:
                     if not self._resume(file, start):
                         break
-                elif op in (_SCHEMA, _CHANNEL):
-                    self._define(op, file.read(length))
+                elif op == _MESSAGE:
+                    yield from self._top_level(file, start, length, size, wanted)
                 else:
-                    file.seek(length, io.SEEK_CUR)
+                    self._pass(file, op, length)
         self._scanned = True
+
+    def _pass(self, file: BinaryIO, op: int, length: int) -> None:
+        """Take in a schema or a channel, go behind any other record."""
+        if op in (_SCHEMA, _CHANNEL):
+            self._define(op, file.read(length))
+        else:
+            file.seek(length, io.SEEK_CUR)
 
     def _top_level(
         self,
@@ -260,7 +262,10 @@ class McapFile:
             elif wanted(channel):
                 mine = at[which]
                 log_time = gather(raw, mine + 15, "<i8")
-                yield Batch(channel, raw, mine + 31, length[which], log_time)
+                sequence = None
+                if channel.numbered:
+                    sequence = gather(raw, mine + 11, "<u4").astype(np.int64)
+                yield Batch(channel, raw, mine + 31, length[which], log_time, sequence)
 
     def _define(self, op: int, body: bytes) -> None:
         """Take in a schema or a channel; a damaged one is reported by its messages."""
@@ -284,6 +289,7 @@ class McapFile:
             definition=schema.data.decode("utf-8", "replace") if schema else "",
             definition_format=schema.encoding if schema else "",
             qos=channel.metadata.get("offered_qos_profiles", ""),
+            numbered=channel.metadata.get(NUMBERED) == "true",
         )
 
     def _skippable(self, start: int, wanted: Callable[[Channel], bool]) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -33,6 +33,8 @@ class Channel:
     definition: str = ""
     definition_format: str = ""
     qos: str = ""
+    numbered: bool = False
+    """Whether the messages' sequence is the publisher's own count, so that a gap is a loss."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +50,7 @@ class Batch:
     offset: Integers
     length: Integers
     log_time: Integers
+    sequence: Integers | None = None
 
     def __len__(self) -> int:
         """Return the number of messages."""
@@ -83,7 +86,12 @@ class Batch:
             Of the same channel.
         """
         return Batch(
-            self.channel, self.data, self.offset[which], self.length[which], self.log_time[which]
+            self.channel,
+            self.data,
+            self.offset[which],
+            self.length[which],
+            self.log_time[which],
+            None if self.sequence is None else self.sequence[which],
         )
 
 
@@ -208,6 +216,8 @@ def decompress_messages(batch: Batch) -> tuple[Batch, int]:
         blobs.append(decompress(batch.message(k), kind, 0))
     kept = np.array([bool(blob) for blob in blobs])
     joined = join(batch.channel, [b for b in blobs if b], batch.log_time[kept])
+    if batch.sequence is not None:
+        joined = replace(joined, sequence=batch.sequence[kept])
     return joined, int((~kept).sum())
 
 

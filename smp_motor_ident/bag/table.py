@@ -34,6 +34,8 @@ class Table:
         By field path, in the type of the message.
     present : dict of str to ndarray of bool
         For columns that some messages lacked.
+    number : ndarray of int64, shape (n,), or None
+        The publisher's own count, where the recorder kept it for every message.
     notes : list of str
         What was found amiss.
     """
@@ -42,6 +44,7 @@ class Table:
     stamp: Integers | None
     columns: dict[str, NDArray[Any]]
     present: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
+    number: Integers | None = None
     notes: list[str] = field(default_factory=list)
 
 
@@ -52,6 +55,7 @@ class _Collector:
         self.topic, self.paths, self.types = topic, paths, types
         self._decoders: dict[tuple[str, str, str], Decoder] = {}
         self._log: list[Integers] = []
+        self._number: list[Integers | None] = []
         self._columns: dict[str, list[NDArray[Any] | None]] = {}
         self._present: dict[str, list[NDArray[np.bool_] | None]] = {}
         self.packed = 0
@@ -66,6 +70,8 @@ class _Collector:
         if not decoded.rows.size:
             return
         self._log.append(batch.log_time[decoded.rows])
+        numbers = batch.sequence
+        self._number.append(None if numbers is None else numbers[decoded.rows])
         names = decoder.paths
         for name in {*self.paths, *STAMP}:
             k = names.index(name) if name in names else -1
@@ -94,6 +100,8 @@ class _Collector:
         sizes = [part.size for part in self._log]
         log = np.concatenate(self._log) if self._log else np.zeros(0, np.int64)
         self._log.clear()
+        numbers = [part for part in self._number if part is not None and part.all()]
+        number = np.concatenate(numbers) if 0 < len(numbers) == len(self._number) else None
         columns: dict[str, NDArray[Any]] = {}
         present: dict[str, NDArray[np.bool_]] = {}
         for name in list(self._columns):
@@ -110,7 +118,7 @@ class _Collector:
             columns[name] = np.concatenate(
                 [np.zeros(n) if p is None else p for n, p in zip(sizes, parts)]
             )
-        table = Table(log, _stamps(columns), columns, present)
+        table = Table(log, _stamps(columns), columns, present, number)
         for decoder in self._decoders.values():
             if decoder.undecodable:
                 table.notes.append(

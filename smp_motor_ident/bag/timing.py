@@ -12,6 +12,7 @@ Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 _SECOND = 1_000_000_000
+_BEATS = 32
 SAME_CLOCK = 50_000_000
 """Clocks of two topics whose offsets differ by less [ns] are one clock: latency explains it."""
 
@@ -151,11 +152,23 @@ class Rhythm:
     regular: bool
 
     def missing(self, time: Integers) -> Integers:
-        """Return how many samples are missing before each but the first."""
+        """Return how many samples are missing before each but the first.
+
+        A late sample after which the others catch up is late, not preceded by a loss: the
+        beat must stay behind by whole intervals.
+        """
         steps = np.diff(time)
+        number: Integers = np.zeros(steps.size, np.int64)
         if not self.regular or self.interval <= 0:
-            return np.zeros(steps.size, np.int64)
-        number: Integers = np.maximum(np.rint(steps / self.interval).astype(np.int64) - 1, 0)
+            return number
+        number = np.maximum(np.rint(steps / self.interval).astype(np.int64) - 1, 0)
+        late = np.flatnonzero(number)
+        behind = (time - time[0]) - self.interval * np.arange(time.size)
+        window = np.arange(_BEATS)
+        before = np.median(behind[np.maximum(late[:, None] - window, 0)], axis=1)
+        after = np.median(behind[np.minimum(late[:, None] + 1 + window, steps.size)], axis=1)
+        lasting = np.rint((after - before) / self.interval).astype(np.int64)
+        number[late] = np.clip(lasting, 0, number[late])
         return number
 
     def gap(self) -> float:

@@ -25,7 +25,7 @@ from mcap import records
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 
-from smp_motor_ident.bag.mcap_file import MAGIC
+from smp_motor_ident.bag.mcap_file import MAGIC, NUMBERED
 from smp_motor_ident.bag.types import definition
 from smp_motor_ident.errors import BagError
 
@@ -144,7 +144,12 @@ class BagWriter:
         return {name: topic.count for name, topic in self._topics.items()}
 
     def add_topic(
-        self, topic: str, type_name: str, qos: list[dict[str, Any]] | None = None
+        self,
+        topic: str,
+        type_name: str,
+        qos: list[dict[str, Any]] | None = None,
+        *,
+        numbered: bool = False,
     ) -> bool:
         """Announce a topic; `write` does it by itself where the QoS does not matter.
 
@@ -154,6 +159,8 @@ class BagWriter:
             Such as ``/pwm`` and ``std_msgs/msg/Float64``.
         qos : list of dict, optional
             One profile per publisher, keys as in `DEFAULT_QOS`.
+        numbered : bool
+            Whether `write` will be given the publisher's own numbers.
 
         Returns
         -------
@@ -166,14 +173,17 @@ class BagWriter:
                 return True
             schema, type_hash = self._schema(type_name)
             profiles = json.loads(json.dumps([{**DEFAULT_QOS, **p} for p in qos or [{}]]))
+            metadata = {
+                "offered_qos_profiles": yaml.safe_dump(profiles, sort_keys=False),
+                "topic_type_hash": type_hash,
+            }
+            if numbered:
+                metadata[NUMBERED] = "true"
             channel = records.Channel(
                 id=len(self._topics) + 1,
                 topic=topic,
                 message_encoding="cdr",
-                metadata={
-                    "offered_qos_profiles": yaml.safe_dump(profiles, sort_keys=False),
-                    "topic_type_hash": type_hash,
-                },
+                metadata=metadata,
                 schema_id=schema.id,
             )
             entry = {
@@ -210,7 +220,14 @@ class BagWriter:
         self._chunk += _taken(builder)
 
     def write(
-        self, topic: str, type_name: str, data: bytes, stamp: int, sent: int | None = None
+        self,
+        topic: str,
+        type_name: str,
+        data: bytes,
+        stamp: int,
+        *,
+        sent: int | None = None,
+        number: int = 0,
     ) -> None:
         """Write a message.
 
@@ -224,6 +241,8 @@ class BagWriter:
             When it came, in nanoseconds since 1970.
         sent : int, optional
             When it was published, where that is known.
+        number : int
+            The publisher's own number of the message; 0 where that is not known.
 
         Raises
         ------
@@ -242,7 +261,7 @@ class BagWriter:
                 Opcode.MESSAGE,
                 22 + len(data),
                 entry.channel.id,
-                entry.count & 0xFFFFFFFF,
+                number & 0xFFFFFFFF,
                 stamp,
                 stamp if sent is None else sent,
             )

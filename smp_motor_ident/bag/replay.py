@@ -1,0 +1,115 @@
+"""A bag's messages one by one in the order in which they came: what a player needs."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable, Iterator
+from itertools import count, groupby
+from pathlib import Path
+
+import yaml
+
+from smp_motor_ident.bag.source import recordings
+from smp_motor_ident.bag.storage import Batch, Channel, decompress_messages
+from smp_motor_ident.errors import BagError
+
+Entry = tuple[int, int, Batch, int]
+
+
+class Replay:
+    """The messages of one bag.
+
+    Parameters
+    ----------
+    path : Path
+        A bag's folder or a bare file.
+
+    Raises
+    ------
+    BagError
+        When it is no bag, or several.
+    """
+
+    def __init__(self, path: Path) -> None:
+        found = recordings(path)
+        if len(found) > 1:
+            names = ", ".join(recording.name for recording in found)
+            raise BagError(f"{path}: holds several bags ({names}); name one")
+        self._recording = found[0]
+        if self._recording.is_table:
+            raise BagError(f"{path}: is a table, not a bag")
+        channels = self._recording.channels()
+        self.channels = list({channel.topic: channel for channel in channels}.values())
+
+    @property
+    def notes(self) -> list[str]:
+        """What was found missing or damaged while reading."""
+        return self._recording.notes
+
+    def messages(
+        self, wanted: Callable[[Channel], bool] = lambda _: True
+    ) -> Iterator[tuple[Channel, int, bytes]]:
+        """Read the messages in the order of their log times, a few chunks at a time.
+
+        Parameters
+        ----------
+        wanted : callable
+            Says of a channel whether its messages are asked for.
+
+        Yields
+        ------
+        channel : Channel
+            Topic and type.
+        log_time : int
+            [ns].  Where chunks overlap by more than one, a late message comes late.
+        data : bytes
+            The serialized message.
+        """
+        waiting: list[Entry] = []
+        number = count()
+        self._recording.notes.clear()
+        # Batches of one chunk come together, channel by channel.
+        for _, group in groupby(self._recording.batches(wanted), key=lambda item: item[0]):
+            fresh: list[Entry] = []
+            for _, packed in group:
+                batch, _ = decompress_messages(packed)
+                fresh += [
+                    (t, next(number), batch, k) for k, t in enumerate(batch.log_time.tolist())
+                ]
+            if not fresh:
+                continue
+            begin = min(entry[0] for entry in fresh)
+            while waiting and waiting[0][0] <= begin:
+                yield _message(heapq.heappop(waiting))
+            waiting += fresh
+            heapq.heapify(waiting)
+        while waiting:
+            yield _message(heapq.heappop(waiting))
+
+
+def _message(entry: Entry) -> tuple[Channel, int, bytes]:
+    time, _, batch, k = entry
+    return batch.channel, time, batch.message(k)
+
+
+def offered(channel: Channel) -> tuple[bool, bool]:
+    """Return what the publishers of a recorded topic offered, the strongest of them.
+
+    Parameters
+    ----------
+    channel : Channel
+        With the profiles of any metadata version.
+
+    Returns
+    -------
+    reliable, transient_local : bool
+        Reliable and volatile where nothing is known.
+    """
+    try:
+        profiles = yaml.safe_load(channel.qos) if channel.qos else []
+        reliability = {str(profile["reliability"]).lower() for profile in profiles}
+        durability = {str(profile["durability"]).lower() for profile in profiles}
+    except (yaml.YAMLError, TypeError, KeyError):
+        return True, False
+    best_effort = bool(reliability) and reliability <= {"2", "best_effort"}
+    return not best_effort, bool(durability & {"1", "transient_local"})
