@@ -189,8 +189,11 @@ def _spin(node: Node, stop: _Stop) -> int:
     executor.add_node(node)
     guard = node.create_guard_condition(lambda: None)
     stop.wake = guard.trigger
-    while not stop.requested.is_set():
-        executor.spin_once()
+    try:
+        while not stop.requested.is_set():
+            executor.spin_once()
+    finally:
+        executor.shutdown()
     return stop.exit_code
 
 

@@ -1,0 +1,197 @@
+"""Sends a bounded test voltage to one wheel or to all, for a bounded time, and then zero.
+
+Ends by itself with exit code 0; sends zero to every wheel whatever the reason of leaving.
+The wheels' controllers should be inactive meanwhile: two senders of commands disturb each other.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+
+from smp_interfaces.msg import MotorCommand
+from smp_motor_control import WHEELS
+from smp_motor_control.errors import ParameterError
+from smp_motor_control.excitation import SIGNALS, Bounded, Excitation
+from smp_motor_control.nodes import runtime
+from smp_motor_control.nodes.settings import Parameters, described
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """Parameters of the node."""
+
+    signal: str = described("fourier", f"One of {', '.join(SIGNALS)}.", read_only=True)
+    wheels: tuple[str, ...] = described(("all",), "Wheels to excite, or all.", read_only=True)
+    amplitude: float = described(
+        6.0, "Largest voltage of either sign [V].", minimum=0.0, read_only=True
+    )
+    max_voltage: float = described(
+        12.0, "Amplitudes beyond this are refused [V].", minimum=0.0, read_only=True
+    )
+    duration: float = described(
+        20.0, "Length of the signal [s].", minimum=0.1, maximum=3600.0, read_only=True
+    )
+    fade: float = described(
+        0.0, "Time over which it grows and shrinks [s].", minimum=0.0, read_only=True
+    )
+    rate: float = described(
+        200.0, "Commands per second [Hz].", minimum=10.0, maximum=1000.0, read_only=True
+    )
+    wait: float = described(
+        10.0, "Longest wait for the motors' driver [s].", minimum=0.0, read_only=True
+    )
+    seed: int = described(0, "Of fourier, prbs and steps.", minimum=0, read_only=True)
+    independent: bool = described(
+        True, "Whether wheels get different fourier, prbs and steps signals.", read_only=True
+    )
+    frequency: float = described(1.0, "Of sine and square [Hz].", minimum=0.0, read_only=True)
+    lowest: float = described(
+        0.1, "Lowest frequency of fourier and chirp [Hz].", minimum=0.0, read_only=True
+    )
+    highest: float = described(
+        20.0, "Highest frequency of fourier and chirp [Hz].", minimum=0.0, read_only=True
+    )
+    tones: int = described(24, "Tones of fourier.", minimum=2, maximum=1000, read_only=True)
+    sweep: float = described(20.0, "One sweep of chirp [s].", minimum=0.0, read_only=True)
+    hold: float = described(
+        0.0, "Of prbs and steps [s]; 0 for their defaults.", minimum=0.0, read_only=True
+    )
+    period: float = described(20.0, "Of ramp [s].", minimum=0.0, read_only=True)
+
+    def __post_init__(self) -> None:
+        if self.signal not in SIGNALS:
+            raise ParameterError(f"signal is {self.signal!r}; known are {', '.join(SIGNALS)}")
+        if self.amplitude > self.max_voltage:
+            raise ParameterError(
+                f"amplitude is {self.amplitude:g} V; it must not exceed max_voltage, "
+                f"{self.max_voltage:g} V"
+            )
+        for wheel in self.wheels:
+            if wheel != "all" and wheel not in WHEELS:
+                raise ParameterError(f"wheels has {wheel!r}; known are all, {', '.join(WHEELS)}")
+        self.signal_of(0)
+
+    def chosen(self) -> tuple[str, ...]:
+        """Return the wheels to excite."""
+        return WHEELS if "all" in self.wheels else tuple(dict.fromkeys(self.wheels))
+
+    def signal_of(self, wheel: int) -> Excitation:
+        """Return the bounded signal of the n-th wheel.
+
+        Parameters
+        ----------
+        wheel : int
+            Its place among the chosen.
+
+        Returns
+        -------
+        Excitation
+            In volts of seconds.
+        """
+        kind = SIGNALS[self.signal]
+        names = {f.name for f in fields(kind)}
+        given = {n: getattr(self, n) for n in names if hasattr(self, n)}
+        if not given.get("hold", 1.0):
+            del given["hold"]
+        if "seed" in given and self.independent:
+            given["seed"] += wheel
+        return Bounded(signal=kind(**given), duration=self.duration, fade=self.fade)
+
+
+class Excite(Node):
+    """Sends the signal."""
+
+    def __init__(self) -> None:
+        super().__init__("excite")
+        settings = Parameters(self, Settings).settings
+        self._settings = settings
+        self._outputs: list[tuple[Publisher, Excitation, MotorCommand]] = []
+        for k, wheel in enumerate(settings.chosen()):
+            publisher = self.create_publisher(
+                MotorCommand, f"{wheel}/motor_command", runtime.STREAM_PUBLISHER
+            )
+            message = MotorCommand()
+            message.header.frame_id = f"{wheel}_wheel_joint"
+            signal = settings.signal_of(k)
+            signal(0.0)  # Prepared now, not in the first period.
+            self._outputs.append((publisher, signal, message))
+        self._begin: float | None = None
+        self._created = time.monotonic()
+        self._diagnostics = runtime.Diagnostics(self, self._assess)
+        self._timer = runtime.steady_timer(self, 1.0 / settings.rate, self._tick)
+
+    def _tick(self) -> None:
+        now = time.monotonic()
+        if self._begin is None:
+            if not self._heard(now):
+                return
+            self._begin = now
+            self._announce()
+        elapsed = now - self._begin
+        if elapsed >= self._settings.duration:
+            self._timer.cancel()
+            runtime.finish(0)
+            return
+        stamp = self.get_clock().now().to_msg()
+        for publisher, signal, message in self._outputs:
+            message.header.stamp = stamp
+            message.voltage = signal(elapsed)
+            publisher.publish(message)
+
+    def _heard(self, now: float) -> bool:
+        silent = [p.topic_name for p, *_ in self._outputs if not p.get_subscription_count()]
+        if silent and now - self._created > self._settings.wait:
+            raise ParameterError(
+                f"nobody listens on {', '.join(silent)}; is the driver or motor_plant running?"
+            )
+        return not silent
+
+    def _announce(self) -> None:
+        settings = self._settings
+        for publisher, *_ in self._outputs:
+            others = self.count_publishers(publisher.topic_name) - 1
+            if others > 0:
+                self.get_logger().warning(
+                    f"{others} other sender(s) on {publisher.topic_name}; deactivate wheel_pid"
+                )
+        self.get_logger().info(
+            f"{settings.signal} of {settings.amplitude:g} V for {settings.duration:g} s "
+            f"on {', '.join(settings.chosen())}"
+        )
+
+    def _assess(self) -> tuple[bytes, str, Mapping[str, object]]:
+        if self._begin is None:
+            return runtime.WARN, "waiting for the driver", {}
+        elapsed = time.monotonic() - self._begin
+        return runtime.OK, "exciting", {"elapsed [s]": elapsed, "of [s]": self._settings.duration}
+
+    def on_stop(self) -> None:
+        """Send zero to every wheel before the process ends."""
+        stamp = self.get_clock().now().to_msg()
+        for publisher, _, message in self._outputs:
+            message.header.stamp = stamp
+            message.voltage = 0.0
+            publisher.publish(message)
+        for publisher, _, message in self._outputs[-1:]:
+            runtime.send_last(publisher, message)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the node until the signal ends.
+
+    Parameters
+    ----------
+    argv : list of str, optional
+        Arguments; those of the process where None.
+
+    Returns
+    -------
+    int
+        Exit code.
+    """
+    return runtime.run("excite", Excite, argv)
