@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from smp_motor_control.encoder import DifferencedSpeed, Encoder
 from smp_motor_control.errors import ParameterError
@@ -75,6 +75,31 @@ class LoopSettings:
             raise ParameterError(
                 "speed_source is 'observer', which needs model.dc_gain and model.time_constant"
             )
+
+    def within(self, supply_voltage: float) -> LoopSettings:
+        """Return the same with the output limited to what a supply can give.
+
+        Parameters
+        ----------
+        supply_voltage : float
+            [V]; infinite where unknown.
+
+        Returns
+        -------
+        LoopSettings
+            With both output clamps within the supply.
+
+        Raises
+        ------
+        ParameterError
+            When a clamp leaves nothing within the supply.
+        """
+        gains = replace(
+            self.gains,
+            u_clamp_min=max(self.gains.u_clamp_min, -supply_voltage),
+            u_clamp_max=min(self.gains.u_clamp_max, supply_voltage),
+        )
+        return replace(self, gains=gains)
 
 
 class WheelLoop:

@@ -7,7 +7,6 @@ command is zero.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import time
 from collections.abc import Callable, Mapping
@@ -55,8 +54,8 @@ class WheelPid(LifecycleNode):
 
     def __init__(self) -> None:
         super().__init__("wheel_pid")
-        self._parameters = Parameters(self, Settings, self._change)
-        self._settings = settings = self._parameters.settings
+        self._given = Parameters(self, Settings, self._change)
+        self._settings = settings = self._given.settings
         self._joint = settings.joint_name or f"{runtime.wheel_of(self)}_wheel_joint"
         if self._joint == "_wheel_joint":
             raise ParameterError(
@@ -178,21 +177,11 @@ class WheelPid(LifecycleNode):
 
     def _change(self, settings: Settings) -> None:
         self._settings = settings
-        self._loop.configure(self._within_supply(settings))
+        self._loop.configure(settings.loop.within(self._supply))
         self._detector.limits = settings.faults
         self._latch.first_pause = settings.fault_retry
         clock = self._clock_of_feedback
         clock.max_age = clock.max_gap = settings.feedback_timeout
-
-    def _within_supply(self, settings: Settings) -> object:
-        """Return the loop's settings with the output limited to what the supply can give."""
-        gains, supply = settings.loop.gains, self._supply
-        limited = dataclasses.replace(
-            gains,
-            u_clamp_min=max(gains.u_clamp_min, -supply),
-            u_clamp_max=min(gains.u_clamp_max, supply),
-        )
-        return dataclasses.replace(settings.loop, gains=limited)
 
     def _on_description(self, message: MotorDescription) -> None:
         try:
@@ -201,8 +190,8 @@ class WheelPid(LifecycleNode):
             supply = message.supply_voltage
             if not 0.0 < supply < math.inf:
                 raise ParameterError(f"supply_voltage is {supply!r} V; it must be positive")
+            self._loop.configure(self._settings.loop.within(supply))
             self._supply = supply
-            self._loop.configure(self._within_supply(self._settings))
         except ParameterError as error:
             self._refuse(f"motor_description: {error}")
             return
