@@ -133,8 +133,8 @@ class Identifier(Node):
 
     def __init__(self) -> None:
         super().__init__("identifier")
-        self._parameters = Parameters(self, Settings)
-        settings = self._parameters.settings
+        self._given = Parameters(self, Settings)
+        settings = self._given.settings
         self._wheels = {name: Wheel(self, name, settings.window) for name in settings.wheels}
         self._worker = ThreadPoolExecutor(max_workers=1)
         self._diagnostics = runtime.Diagnostics(self, self._assess)
@@ -143,7 +143,7 @@ class Identifier(Node):
 
     def _begin_all(self) -> None:
         """Hand every window that shows enough to the worker."""
-        settings = self._parameters.settings
+        settings = self._given.settings
         for wheel in self._wheels.values():
             if wheel.running is not None:
                 continue

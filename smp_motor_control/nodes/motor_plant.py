@@ -124,8 +124,8 @@ class MotorPlant(Node):
 
     def __init__(self) -> None:
         super().__init__("motor_plant")
-        self._parameters = Parameters(self, Settings, self._change, also_known=["motors."])
-        settings = self._parameters.settings
+        self._given = Parameters(self, Settings, self._change, also_known=["motors."])
+        settings = self._given.settings
         entries = self._motors(settings)
         self._supply = Supply(0.0, settings.supply_resistance)
         self._supply.open_voltage = max(entry.supply_voltage for entry in entries.values())
