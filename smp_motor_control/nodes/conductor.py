@@ -3,17 +3,18 @@
 The tools ``demo`` and ``commission`` start it as a process of their own.  It ends when its
 standard input does, so it cannot outlive the tool, and it sends a zero ``cmd_vel`` before.
 
-====================  =============================================  ========================
+===================== =============================================  ========================
 request ``do``        with                                           answer
-====================  =============================================  ========================
+===================== =============================================  ========================
 ``wait_for_wheels``   ``wheels``, ``timeout`` [s]                    ``rates`` [Hz] by wheel
 ``wait_for_nodes``    ``nodes`` (full names), ``timeout`` [s]        nothing
+``wait_for_listener`` ``node`` (name), ``topics``, ``timeout``       nothing
 ``change_state``      ``node``, ``transition`` (``activate``, ...)   nothing
 ``set_parameters``    ``node``, ``parameters``                       nothing; all or none set
 ``get_parameters``    ``node``, ``names``                            ``parameters``
 ``drive``             ``segments`` of ``[name, m/s, rad/s, s]``      ``segments`` of ``[name,
                                                                      begin, end]`` [s, stamps]
-====================  =============================================  ========================
+===================== =============================================  ========================
 
 An answer has ``error`` (one line) when the request could not be done.
 """
@@ -122,6 +123,19 @@ class Conductor(Node):
             client = self._client(SetParametersAtomically, f"{node}/set_parameters_atomically")
             if not self._until(client.service_is_ready, timeout):
                 raise RequestError(f"{node} does not answer within {timeout:.0f} s")
+
+    def do_wait_for_listener(self, node: str, topics: Sequence[str], timeout: float) -> None:
+        """Wait until a node subscribes all of the topics."""
+
+        def missing() -> list[str]:
+            return [
+                topic
+                for topic in topics
+                if node not in {i.node_name for i in self.get_subscriptions_info_by_topic(topic)}
+            ]
+
+        if not self._until(lambda: not missing(), timeout):
+            raise RequestError(f"{node} does not listen to {', '.join(missing())}")
 
     def do_change_state(self, node: str, transition: str) -> None:
         """Ask a lifecycle node for a transition."""

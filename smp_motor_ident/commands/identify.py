@@ -247,7 +247,8 @@ def _identify(
         results.failures[wheel] = error
         return
     results.estimates[wheel] = found
-    results.notes[wheel] = [note for record in (*records, *kept) for note in record.notes]
+    notes = [note for record in (*records, *kept) for note in record.notes]
+    results.notes[wheel] = list(dict.fromkeys(notes))
     fitted, held = (records, kept) if kept else split(records)
     curves = [(r, "estimation") for r in fitted] + [(r, "validation") for r in held]
     results.comparisons[wheel] = [_compare(found, record, role) for record, role in curves]
@@ -290,9 +291,11 @@ def _tell(results: Results, paths: Sequence[Path], arguments: argparse.Namespace
         out = console()
         for estimate in results.estimates.values():
             out.print(estimate_table(estimate))
-            for kind, texts in (("warning", estimate.warnings), ("advice", estimate.advice)):
-                for text in texts:
-                    out.print(f"{kind}: {text}", soft_wrap=True)
+            notes = results.notes[estimate.wheel]
+            for text in estimate.warnings:
+                out.print(f"{'note' if text in notes else 'warning'}: {text}", soft_wrap=True)
+            for text in estimate.advice:
+                out.print(f"advice: {text}", soft_wrap=True)
             out.print()
         if results.estimates:
             out.print(f"written: {', '.join(str(path) for path in paths)}", soft_wrap=True)

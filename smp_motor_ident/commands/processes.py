@@ -136,7 +136,7 @@ class Processes:
         parent = os.getpid()
         with (self._logs / f"{name}.log").open("wb") as log:
             process = subprocess.Popen(
-                [sys.executable, "-m", f"smp_motor_control.nodes.{node}", *arguments],
+                [*_command(node), *arguments],
                 stdin=subprocess.PIPE if pipes else subprocess.DEVNULL,
                 stdout=subprocess.PIPE if pipes else log,
                 stderr=log,
@@ -230,6 +230,16 @@ class Processes:
             for pipe in (process.stdin, process.stdout):
                 if pipe is not None:
                     pipe.close()
+
+
+def _command(node: str) -> list[str]:
+    """Return how a node is started: as its installed executable, else from its module."""
+    for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
+        executable = Path(prefix) / "lib" / "smp_motor_control" / node
+        if prefix and executable.is_file():
+            return [str(executable)]
+    start = f"import sys; from smp_motor_control.nodes.{node} import main; sys.exit(main())"
+    return [sys.executable, "-c", start]
 
 
 def _end_with(parent: int) -> None:

@@ -79,7 +79,8 @@ def record(robot: Robot, name: str) -> Path:
     """
     bag = robot.folder / name
     robot.processes.start("record", "record", "--output", str(bag))
-    robot.conductor.ask("wait_for_nodes", nodes=["/record"], timeout=20.0)
+    topics = [f"/{wheel}/motor_state" for wheel in robot.wheels]
+    robot.conductor.ask("wait_for_listener", node="record", topics=topics, timeout=20.0)
     return bag
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import resources
 
 import jinja2
@@ -85,10 +85,17 @@ def render(report: Report) -> str:
         if len(report.estimates) > 1
         else "",
         motors={
-            wheel: _motor(estimate, report.comparisons.get(wheel, ()))
+            wheel: _motor(
+                _without(estimate, report.notes.get(wheel, ())), report.comparisons.get(wheel, ())
+            )
             for wheel, estimate in report.estimates.items()
         },
     )
+
+
+def _without(estimate: Estimate, notes: Sequence[str]) -> Estimate:
+    """Leave out the warnings that are told as notes on the reading."""
+    return replace(estimate, warnings=tuple(w for w in estimate.warnings if w not in notes))
 
 
 def _motor(estimate: Estimate, parts: Sequence[Comparison]) -> dict[str, object]:

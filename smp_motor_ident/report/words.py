@@ -120,7 +120,7 @@ def spread(std: float | None) -> str:
     """
     if std is None or not math.isfinite(std):
         return "—"
-    if std == 0 or 1e-3 <= std < 1e3:
+    if std == 0 or 1e-4 <= std < 1e3:
         return f"{std:.2g}"
     return f"{std:.1e}"
 
