@@ -24,7 +24,7 @@ from smp_motor_ident.bag.replay import Replay, offered
 from smp_motor_ident.bag.storage import Channel
 
 DEPTH = 1000
-FIND_EACH_OTHER = 0.5
+FIND_EACH_OTHER = 1.0
 """Shortest wait [s] before the first message, so that subscribers find the publishers."""
 FIND_AT_MOST = 5.0
 

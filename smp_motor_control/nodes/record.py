@@ -34,7 +34,7 @@ from smp_motor_control.nodes.bag_arguments import message_class, pattern, split_
 from smp_motor_ident.bag import BagWriter
 
 TAKE_PERIOD = 0.004
-LOOK_PERIOD = 0.1
+LOOK_PERIOD = 0.05
 DEPTH = 2000
 """Messages that DDS keeps for us per topic: two seconds of 1 kHz while the disk is busy."""
 

@@ -6,15 +6,19 @@ mapping says which topics, fields or columns are which signals where the message
 """
 
 from smp_motor_ident.bag.mapping import MotorMap, Signal, SignalMap, load, parse
+from smp_motor_ident.bag.offers import Listing, Offer, list_topics
 from smp_motor_ident.bag.read import join_records, read_experiments, read_records
 from smp_motor_ident.bag.writer import BagWriter
 
 __all__ = [
     "BagWriter",
+    "Listing",
     "MotorMap",
+    "Offer",
     "Signal",
     "SignalMap",
     "join_records",
+    "list_topics",
     "load",
     "parse",
     "read_experiments",
