@@ -168,6 +168,8 @@ class Odometry:
         if not (LEAST_STEP <= dt < math.inf and math.isfinite(left) and math.isfinite(right)):
             return False
         left, right = left * self._left, right * self._right
+        if not math.isfinite((abs(left) + abs(right)) * dt):
+            return False
         self._velocities.append(((left + right) / 2.0, (right - left) / self._separation))
         self._integrate(left * dt, right * dt)
         count = len(self._velocities)

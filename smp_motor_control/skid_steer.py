@@ -154,6 +154,8 @@ class SkidSteer:
             At most 1.
         """
         fastest = max(map(abs, self.wheel_speeds(linear, angular)))
+        if math.isinf(fastest):  # beyond what a number can hold
+            return 0.0
         return 1.0 if fastest <= self.max_wheel_speed else self.max_wheel_speed / fastest
 
     def reachable_wheel_speeds(self, linear: float, angular: float) -> SideSpeeds:

@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from smp_motor_control.odometry import LEAST_STEP
+LONGEST_GUESS = 0.1
+"""For so long [s] a wheel without a position is taken to have kept its velocity."""
 
 
 class WheelSample(NamedTuple):
@@ -27,19 +28,16 @@ class WheelSample(NamedTuple):
 
 
 class SideTravel(NamedTuple):
-    """How both sides turned over a time.
+    """How far the wheels of both sides turned.
 
     Attributes
     ----------
     left, right : float
-        Mean speed of the side's wheels [rad/s].
-    dt : float
-        [s].
+        Mean over the side's wheels [rad].
     """
 
     left: float
     right: float
-    dt: float
 
 
 @dataclass
@@ -113,42 +111,43 @@ class WheelFeedback:
         """The newest sample of every wheel that was ever heard."""
         return {wheel: known.latest for wheel, known in self._wheels.items()}
 
-    def take(self) -> SideTravel | None:
-        """Return how the sides turned since the last call.
+    def take(self, steady_now: float, timeout: float) -> SideTravel | None:
+        """Return how far the sides turned since the last call.
+
+        A wheel that is silent for longer than the time-out no longer counts for its side's
+        mean; when it is back, it counts from there on.
+
+        Parameters
+        ----------
+        steady_now : float
+            [s].
+        timeout : float
+            [s].
 
         Returns
         -------
         SideTravel or None
-            None while a side has no wheel that tells anything new; what its wheels tell later
-            covers the whole time.
+            None while all wheels of a side are silent, or none tells anything new.
         """
         moved = {wheel: self._moved(known) for wheel, known in self._wheels.items()}
-        sides = [
-            [step for wheel in side if (step := moved.get(wheel)) is not None]
-            for side in (self.left, self.right)
-        ]
-        if not all(sides):
+        silent = self.silent(steady_now, timeout)
+        alive = [[w for w in side if w not in silent] for side in (self.left, self.right)]
+        for wheel in silent:
+            if wheel in self._wheels:
+                self._wheels[wheel].taken = None
+        if not all(alive) or all(angle is None for angle in moved.values()):
             return None
-        for wheel, step in moved.items():
-            if step is not None:
-                self._wheels[wheel].taken = self._wheels[wheel].latest
-        left, right = (sum(speed for speed, _ in side) / len(side) for side in sides)
-        times = [dt for side in sides for _, dt in side]
-        return SideTravel(left, right, sum(times) / len(times))
+        left, right = (sum(moved[wheel] or 0.0 for wheel in side) / len(side) for side in alive)
+        return SideTravel(left, right)
 
-    def _moved(self, known: _Wheel) -> tuple[float, float] | None:
-        """Return a wheel's mean speed since it was taken and the time since, if it tells."""
+    def _moved(self, known: _Wheel) -> float | None:
+        """Return the angle that a wheel turned since it was last asked, if it tells."""
         latest, taken = known.latest, known.taken
-        if taken is None or latest.stamp < taken.stamp:
-            known.taken = latest  # the first reading, or one after time jumped, is no motion
-            return None
+        known.taken = latest
+        if taken is None or latest.stamp <= taken.stamp:
+            return None  # the first reading, or one after time jumped, is no motion
         dt = latest.stamp - taken.stamp
-        if dt < LEAST_STEP:
-            return None
-        speed = (latest.position - taken.position) / dt
-        if not math.isfinite(speed):
-            speed = latest.velocity
-        if not abs(speed) <= self.max_speed:
-            known.taken = latest
-            return None
-        return speed, dt
+        angle = latest.position - taken.position
+        if not math.isfinite(angle):
+            angle = latest.velocity * min(dt, LONGEST_GUESS)
+        return angle if abs(angle) <= self.max_speed * dt else None

@@ -133,7 +133,7 @@ class OdometryOutput:
         stamp : float
             ROS time [s].
         """
-        heard = [wheel for wheel in WHEELS if wheel in wheels]
+        heard = [w for w in WHEELS if w in wheels and math.isfinite(wheels[w].position)]
         if not heard:
             return
         message = JointState(

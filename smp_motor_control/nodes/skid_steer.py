@@ -19,6 +19,7 @@ from smp_motor_control.errors import ParameterError
 from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.odometry_output import OdometryOutput
 from smp_motor_control.nodes.settings import Parameters, described, nested
+from smp_motor_control.odometry import LEAST_STEP
 from smp_motor_control.skid_steer import (
     LEFT,
     RIGHT,
@@ -33,6 +34,8 @@ from smp_motor_control.wheel_feedback import WheelFeedback, WheelSample
 
 IMPLAUSIBLE = 4.0
 """Wheels that seem to turn this many times faster than they can have had their counter reset."""
+FASTEST = 250.0
+"""What is plausible without a limit [rad/s]."""
 
 _LIMITS = {
     "min_velocity": "Lowest velocity; NaN takes the negative of max_velocity.",
@@ -154,8 +157,8 @@ class SkidSteerNode(Node):
 
     def __init__(self) -> None:
         super().__init__("skid_steer")
-        self._parameters = Parameters(self, Settings, self._configure)
-        settings = self._parameters.settings
+        self._current = Parameters(self, Settings, self._configure)
+        settings = self._current.settings
         robot = settings.robot()
         self._command = BodyCommand()
         self._feedback = WheelFeedback(LEFT, RIGHT)
@@ -197,7 +200,7 @@ class SkidSteerNode(Node):
         self._robot = robot
         self._linear, self._angular = settings.linear.limiter(), settings.angular.limiter()
         self._command.configure(settings.cmd_vel_timeout)
-        self._feedback.max_speed = IMPLAUSIBLE * robot.max_wheel_speed
+        self._feedback.max_speed = IMPLAUSIBLE * min(robot.max_wheel_speed, FASTEST)
         self._hold = settings.hold()
         self._odometry.configure(
             robot.effective_separation,
@@ -246,15 +249,15 @@ class SkidSteerNode(Node):
         else:
             dt = stamp - self._imu_stamp
             rate = message.angular_velocity.z
-            fresh = 0.0 < dt < self._parameters.settings.imu_timeout and math.isfinite(rate)
+            fresh = 0.0 < dt < self._current.settings.imu_timeout and math.isfinite(rate)
             before = self._yaw if math.isfinite(self._yaw) else 0.0
             self._yaw = before + rate * dt if fresh else before
         self._imu_stamp, self._yaw_time = stamp, now
 
     def _tick(self) -> None:
         now = time.monotonic()
-        settings = self._parameters.settings
-        dt = min(now - self._last_tick, 5.0 / settings.publish_rate)
+        settings = self._current.settings
+        dt = min(max(now - self._last_tick, LEAST_STEP), 5.0 / settings.publish_rate)
         self._last_tick = now
         asked = self._command.at(now)
         if asked is not None:
@@ -263,8 +266,10 @@ class SkidSteerNode(Node):
         if settings.open_loop:
             updated = asked is not None and self._odometry.update_open_loop(*self._given[0], dt)
         else:
-            travel = self._feedback.take()
-            updated = travel is not None and self._odometry.update_from_velocity(*travel)
+            travel = self._feedback.take(now, settings.feedback_timeout)
+            updated = travel is not None and self._odometry.update_from_velocity(
+                travel.left / dt, travel.right / dt, dt
+            )
         if updated:
             self._output.publish(self._odometry, stamp)
         self._output.publish_joints(self._feedback.latest, stamp)
@@ -283,7 +288,7 @@ class SkidSteerNode(Node):
         self._set_wheels(left, right)
 
     def _hold_heading(self, linear: float, angular: float, dt: float, now: float) -> float:
-        settings = self._parameters.settings
+        settings = self._current.settings
         known = now - self._yaw_time <= settings.imu_timeout
         if not settings.heading_hold or not known or (linear == 0.0 and angular == 0.0):
             self._hold.reset()
@@ -296,7 +301,7 @@ class SkidSteerNode(Node):
         self._setpoints.publish(self._setpoint)
 
     def _assess(self) -> tuple[bytes, str, dict[str, object]]:
-        settings, now = self._parameters.settings, time.monotonic()
+        settings, now = self._current.settings, time.monotonic()
         (linear, angular), asked = self._given[0], self._command.at(now)
         values: dict[str, object] = {
             "linear velocity": linear,
@@ -305,25 +310,34 @@ class SkidSteerNode(Node):
             "scaled to": self._share,
             "heading hold": settings.heading_hold,
         }
-        level, message = runtime.OK, "waiting for the first cmd_vel" if asked is None else "driving"
+        problems = self._problems(settings, now)
+        if problems:
+            return max(level for level, _ in problems), "; ".join(t for _, t in problems), values
+        if asked is None:
+            return runtime.OK, "waiting for the first cmd_vel", values
+        if self._share < 1.0:
+            share = 100.0 * self._share
+            return runtime.OK, f"driving at {share:.0f} % of cmd_vel: wheels at their limit", values
+        return runtime.OK, "driving", values
+
+    def _problems(self, settings: Settings, now: float) -> list[tuple[bytes, str]]:
+        """Return what is wrong, each with its level."""
+        problems = []
+        commanded = self._command.at(now) is not None
         silent = self._feedback.silent(now, settings.feedback_timeout)
-        if silent and (self._feedback.latest or asked is not None) and not settings.open_loop:
-            level = runtime.ERROR
-            message = "no feedback from " + ", ".join(
+        if silent and not settings.open_loop and (commanded or self._feedback.latest):
+            wheels = ", ".join(
                 f"{wheel} ({'never' if math.isinf(age) else f'{age:.1f} s'})"
                 for wheel, age in silent.items()
             )
-        elif self._refused:
-            level, message = runtime.WARN, f"cmd_vel {self._refused}"
-        elif asked is not None and self._command.timed_out(now):
-            level, message = runtime.WARN, "cmd_vel timed out, braking"
-        elif settings.heading_hold and now - self._yaw_time > settings.imu_timeout:
-            level, message = runtime.WARN, "heading is not held: no imu"
-        elif self._share < 1.0:
-            message = (
-                f"driving at {100.0 * self._share:.0f} % of the command: wheels at their limit"
-            )
-        return level, message, values
+            problems.append((runtime.ERROR, f"no feedback from {wheels}"))
+        if self._refused:
+            problems.append((runtime.WARN, f"cmd_vel {self._refused}"))
+        if commanded and self._command.timed_out(now):
+            problems.append((runtime.WARN, "cmd_vel timed out, braking"))
+        if settings.heading_hold and now - self._yaw_time > settings.imu_timeout:
+            problems.append((runtime.WARN, "heading is not held: no imu"))
+        return problems
 
     def on_stop(self) -> None:
         """Leave the wheels at zero, if they were ever commanded from here."""
