@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import lz4.frame
 import yaml
@@ -191,20 +191,26 @@ def _what(path: Path, head: bytes) -> str:
 
 def _unpack(path: Path, plain: Path, zstd: bool) -> list[str]:
     """Decompress a file block by block; return what is amiss."""
-    with path.open("rb") as packed, plain.open("wb") as out:
-        source: IO[bytes] | Any
+
+    def begin() -> Any:
         if zstd:
-            source = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
-        else:
-            source = lz4.frame.LZ4FrameFile(packed)
-        try:
-            while block := source.read(1 << 16):
-                out.write(block)
-        except (zstandard.ZstdError, EOFError, RuntimeError, OSError) as error:
-            return [f"{path.name}: its compression is cut off or damaged ({error})"]
-        except MemoryError:
-            return [f"{path.name}: its compression is damaged"]
-    return []
+            return zstandard.ZstdDecompressor().decompressobj()
+        return lz4.frame.LZ4FrameDecompressor()
+
+    engine = begin()
+    try:
+        with path.open("rb") as packed, plain.open("wb") as out:
+            while block := packed.read(1 << 16):
+                while block:
+                    if engine.eof:  # another frame follows
+                        engine = begin()
+                    out.write(engine.decompress(block))
+                    block = engine.unused_data if engine.eof else b""
+    except (zstandard.ZstdError, EOFError, RuntimeError, MemoryError) as error:
+        return [f"{path.name}: its compression is damaged ({error})"]
+    except OSError as error:
+        raise BagError(f"{path}: cannot be unpacked ({error.strerror})") from None
+    return [] if engine.eof else [f"{path.name}: its compression is cut off"]
 
 
 def recordings(paths: Any) -> list[Recording]:

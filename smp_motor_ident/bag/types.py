@@ -130,10 +130,11 @@ class Types:
                 found.append(self._closed(name, [own, self._given, *map(_store, _STORES)]))
             except (TypesysError, BagError) as error:
                 reasons.append(f"the bag's own definition cannot be used: {_line(error)}")
-        sources: list[Mapping[str, Fields]] = [self._named(name), self._given, _Ament()]
-        for store in _STORES:
+        given: list[Mapping[str, Fields]] = [self._named(name), self._given]
+        known = [[_Ament(), _store(_STORES[0])], *([_store(s), _Ament()] for s in _STORES[1:])]
+        for sources in known:
             try:
-                found.append(self._closed(name, [*sources, _store(store)]))
+                found.append(self._closed(name, [*given, *sources]))
             except (TypesysError, BagError) as error:
                 reasons.append(_line(error))
         if not found:

@@ -1,0 +1,295 @@
+"""Recordings made by libraries other than the reader under test: rosbags, mcap, sqlite3."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import mcap.writer
+import numpy as np
+import pytest
+import yaml
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+ROOT = Path(__file__).resolve().parents[3]
+STATE = "smp_interfaces/msg/MotorState"
+DESCRIPTION = "smp_interfaces/msg/MotorDescription"
+START = 1_700_000_000_000_000_000
+RATIO, COUNTS = 65.5, 500.0
+
+
+def types() -> Typestore:
+    """Return a type store with our messages, read from their source."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for name in (STATE, DESCRIPTION):
+        text = (ROOT / "smp_interfaces" / "msg" / f"{name.rpartition('/')[2]}.msg").read_text()
+        store.register(get_types_from_msg(text, name))
+    return store
+
+
+TYPES = types()
+
+
+@dataclass(frozen=True)
+class Sent:
+    """One message of a recording."""
+
+    topic: str
+    type: str
+    stamp: int
+    data: bytes
+
+
+def stamp_of(nanoseconds: int) -> Any:
+    return TYPES.types["builtin_interfaces/msg/Time"](
+        *divmod(int(nanoseconds), 1_000_000_000)
+    )
+
+
+def serialized(type_name: str, *, little_endian: bool = True, **fields: Any) -> bytes:
+    """Return a message by rosbags' own serialization."""
+    message = TYPES.types[type_name](**fields)
+    return bytes(TYPES.serialize_cdr(message, type_name, little_endian=little_endian))
+
+
+def header(nanoseconds: int, frame: str = "") -> Any:
+    return TYPES.types["std_msgs/msg/Header"](stamp_of(nanoseconds), frame)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What one motor did, and its messages."""
+
+    wheel: str
+    time: np.ndarray
+    voltage: np.ndarray
+    current: np.ndarray
+    velocity: np.ndarray
+    position: np.ndarray
+    count: np.ndarray
+    bits: int = 0
+
+    def state(self, k: int, little_endian: bool = True) -> bytes:
+        raw = int(self.count[k])
+        if self.bits:
+            half = 1 << (self.bits - 1)
+            raw = (raw + half) % (1 << self.bits) - half
+        return serialized(
+            STATE,
+            little_endian=little_endian,
+            header=header(self.time[k], f"{self.wheel}_wheel_joint"),
+            voltage=float(self.voltage[k]),
+            current=float(self.current[k]),
+            velocity=float(self.velocity[k]),
+            position=float(self.position[k]),
+            encoder_count=raw,
+            duty_cycle=0.0,
+        )
+
+    def messages(self, latency: int = 150_000, description: bool = True) -> list[Sent]:
+        sent = []
+        if description:
+            text = serialized(
+                DESCRIPTION,
+                joint_name=f"{self.wheel}_wheel_joint",
+                gear_ratio=RATIO,
+                counts_per_revolution=COUNTS,
+                encoder_bits=self.bits,
+                supply_voltage=12.0,
+                resistance=float("nan"),
+            )
+            topic = f"/{self.wheel}/motor_description"
+            sent.append(Sent(topic, DESCRIPTION, int(self.time[0]), text))
+        topic = f"/{self.wheel}/motor_state"
+        sent += [
+            Sent(topic, STATE, int(t) + latency, self.state(k)) for k, t in enumerate(self.time)
+        ]
+        return sent
+
+
+def motion(
+    n: int = 200, wheel: str = "front_left", step: int = 10_000_000, seed: int = 1, bits: int = 0
+) -> Motion:
+    """Return a motor that follows a random voltage."""
+    rng = np.random.default_rng(seed)
+    voltage = rng.uniform(-12, 12, n)
+    velocity = np.cumsum(rng.normal(0, 0.1, n))
+    position = np.cumsum(velocity) * step * 1e-9
+    count = np.rint(position * RATIO * COUNTS / (2 * np.pi)).astype(np.int64)
+    time = START + step * np.arange(n, dtype=np.int64)
+    return Motion(wheel, time, voltage, rng.normal(0, 1, n), velocity, position, count, bits)
+
+
+def merged(*motions: Motion, **options: Any) -> list[Sent]:
+    """Return the messages of several motors in the order of their stamps."""
+    every = [sent for one in motions for sent in one.messages(**options)]
+    return sorted(every, key=lambda sent: sent.stamp)
+
+
+def definition(type_name: str) -> str:
+    return TYPES.generate_msgdef(type_name, ros_version=2)[0]
+
+
+def write_mcap(
+    path: Path,
+    messages: Iterable[Sent],
+    *,
+    defined: bool = True,
+    encode: Callable[[bytes], bytes] = bytes,
+    profile: str = "ros2",
+    finish: bool = True,
+    **options: Any,
+) -> Path:
+    """Write an .mcap file with the mcap library."""
+    options.setdefault("chunk_size", 4096)
+    options.setdefault("compression", mcap.writer.CompressionType.NONE)
+    with path.open("wb") as file:
+        writer = mcap.writer.Writer(file, **options)
+        writer.start(profile)
+        channels: dict[tuple[str, str], int] = {}
+        for sent in messages:
+            key = (sent.topic, sent.type)
+            if key not in channels:
+                text = definition(sent.type) if defined else ""
+                schema = writer.register_schema(sent.type, "ros2msg", text.encode())
+                channels[key] = writer.register_channel(sent.topic, "cdr", schema)
+            writer.add_message(channels[key], sent.stamp, encode(sent.data), sent.stamp)
+        if finish:
+            writer.finish()
+    return path
+
+
+TOPIC_COLUMNS = {
+    1: "",
+    2: ", offered_qos_profiles TEXT NOT NULL",
+    3: ", offered_qos_profiles TEXT NOT NULL",
+    4: ", offered_qos_profiles TEXT NOT NULL, type_description_hash TEXT NOT NULL",
+}
+
+
+def write_sqlite(
+    path: Path,
+    messages: Iterable[Sent],
+    *,
+    schema: int = 4,
+    encode: Callable[[bytes], bytes] = bytes,
+    qos: str = "",
+) -> Path:
+    """Write a .db3 file as rosbag2 laid it out in that version of its schema."""
+    database = sqlite3.connect(path)
+    database.execute(
+        "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL, "
+        f"serialization_format TEXT NOT NULL{TOPIC_COLUMNS[schema]})"
+    )
+    database.execute(
+        "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL, "
+        "timestamp INTEGER NOT NULL, data BLOB NOT NULL)"
+    )
+    database.execute("CREATE INDEX timestamp_idx ON messages (timestamp ASC)")
+    if schema >= 3:
+        database.execute("CREATE TABLE schema(schema_version INTEGER PRIMARY KEY, ros_distro TEXT)")
+        database.execute("INSERT INTO schema VALUES (?, 'test')", (schema,))
+    if schema >= 4:
+        database.execute(
+            "CREATE TABLE message_definitions(id INTEGER PRIMARY KEY, topic_type TEXT, "
+            "encoding TEXT, encoded_message_definition TEXT, type_description_hash TEXT)"
+        )
+    topics: dict[tuple[str, str], int] = {}
+    for sent in messages:
+        key = (sent.topic, sent.type)
+        if key not in topics:
+            topics[key] = len(topics) + 1
+            row: list[Any] = [topics[key], sent.topic, sent.type, "cdr"]
+            row += [qos] if schema >= 2 else []
+            row += [""] if schema >= 4 else []
+            marks = ",".join("?" * len(row))
+            database.execute(f"INSERT INTO topics VALUES ({marks})", row)
+            if schema >= 4:
+                database.execute(
+                    "INSERT INTO message_definitions(topic_type, encoding, "
+                    "encoded_message_definition, type_description_hash) VALUES (?, ?, ?, '')",
+                    (sent.type, "ros2msg", definition(sent.type)),
+                )
+        database.execute(
+            "INSERT INTO messages(topic_id, timestamp, data) VALUES (?, ?, ?)",
+            (topics[key], sent.stamp, encode(sent.data)),
+        )
+    database.commit()
+    database.close()
+    return path
+
+
+def write_metadata(
+    folder: Path,
+    files: list[str],
+    messages: list[Sent],
+    *,
+    version: int = 9,
+    storage: str = "mcap",
+    compression: tuple[str, str] = ("", ""),
+    counts: dict[str, int] | None = None,
+    qos: Any = None,
+) -> None:
+    """Write a metadata.yaml as rosbag2 of that version did."""
+    topics: dict[tuple[str, str], int] = {}
+    for sent in messages:
+        topics[sent.topic, sent.type] = topics.get((sent.topic, sent.type), 0) + 1
+    entries = []
+    for (name, kind), count in topics.items():
+        topic: dict[str, Any] = {"name": name, "type": kind, "serialization_format": "cdr"}
+        if version == 1:
+            topic = {"name": name, "type": kind.replace("/msg/", "/")}
+        if version >= 4:
+            topic["offered_qos_profiles"] = ("" if version < 9 else []) if qos is None else qos
+        if version >= 7:
+            topic["type_description_hash"] = ""
+        key = "topic_and_type" if version == 1 else "topic_metadata"
+        entries.append({key: topic, "message_count": (counts or {}).get(name, count)})
+    stamps = [sent.stamp for sent in messages] or [0]
+    information: dict[str, Any] = {
+        "version": version,
+        "storage_identifier": storage,
+        "relative_file_paths": files if version >= 4 else [f"{folder.name}/{f}" for f in files],
+        "duration": {"nanoseconds": max(stamps) - min(stamps)},
+        "starting_time": {"nanoseconds_since_epoch": min(stamps)},
+        "message_count": len(messages),
+        "topics_with_message_count": entries,
+    }
+    if version >= 3:
+        information["compression_format"], information["compression_mode"] = compression
+    if version >= 5:
+        information["files"] = [{"path": file} for file in files]
+    if version >= 6:
+        information["custom_data"] = None
+    if version >= 8:
+        information["ros_distro"] = "test"
+    document = {"rosbag2_bagfile_information": information}
+    (folder / "metadata.yaml").write_text(yaml.safe_dump(document))
+
+
+def assert_read(record: Any, truth: Motion, n: int | None = None) -> None:
+    """Assert that a record is what a motion was (its first ``n`` samples)."""
+    n = truth.time.size if n is None else n
+    assert len(record) == n
+    # Nanoseconds become float64 seconds: exact to half a unit in the last place.
+    np.testing.assert_allclose(record.time, (truth.time[:n] - truth.time[0]) * 1e-9, rtol=1e-15)
+    np.testing.assert_array_equal(record.voltage, truth.voltage[:n])
+    np.testing.assert_array_equal(record.current, truth.current[:n])
+    np.testing.assert_array_equal(record.velocity, truth.velocity[:n] * RATIO)
+    np.testing.assert_array_equal(record.position, truth.position[:n] * RATIO)
+    np.testing.assert_array_equal(record.count - record.count[0], truth.count[:n] - truth.count[0])
+
+
+@pytest.fixture(scope="session")
+def corpus() -> SimpleNamespace:
+    """What makes recordings; see the functions of this file."""
+    names = (
+        "STATE DESCRIPTION START RATIO COUNTS TYPES Sent Motion motion merged header stamp_of "
+        "serialized definition write_mcap write_sqlite write_metadata assert_read"
+    )
+    return SimpleNamespace(**{name: globals()[name] for name in names.split()})

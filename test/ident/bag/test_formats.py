@@ -1,0 +1,360 @@
+"""Every format a bag may come in, made by other libraries, reads as the same record."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import lz4.frame
+import mcap.writer
+import pytest
+import zstandard
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+
+from smp_motor_ident.bag import list_topics, read_experiments, read_records
+from smp_motor_ident.errors import BagError
+
+Pack = Callable[[bytes], bytes]
+PACKERS: dict[str, Pack] = {
+    "plain": bytes,
+    "zstd": zstandard.ZstdCompressor().compress,
+    "lz4": lz4.frame.compress,
+}
+
+
+@pytest.mark.parametrize("pack", PACKERS)
+@pytest.mark.parametrize("storage", ["mcap", "db3"])
+def test_messages_compressed_one_by_one_are_read(
+    tmp_path: Path, corpus: SimpleNamespace, storage: str, pack: str
+) -> None:
+    truth = corpus.motion()
+    write = corpus.write_mcap if storage == "mcap" else corpus.write_sqlite
+    path = write(tmp_path / f"bag.{storage}", truth.messages(), encode=PACKERS[pack])
+    records = read_records(path)
+    corpus.assert_read(records["front_left"], truth)
+
+
+@pytest.mark.parametrize("pack", PACKERS)
+@pytest.mark.parametrize("storage", ["mcap", "db3"])
+@pytest.mark.parametrize("bare", [True, False])
+def test_files_compressed_as_a_whole_are_read(
+    tmp_path: Path, corpus: SimpleNamespace, storage: str, pack: str, bare: bool
+) -> None:
+    truth = corpus.motion()
+    bag = tmp_path / "bag"
+    bag.mkdir()
+    write = corpus.write_mcap if storage == "mcap" else corpus.write_sqlite
+    plain = write(bag / f"bag_0.{storage}", truth.messages())
+    file = plain
+    if pack != "plain":
+        file = plain.with_name(f"{plain.name}.{pack}")
+        file.write_bytes(PACKERS[pack](plain.read_bytes()))
+        plain.unlink()
+    if not bare:
+        corpus.write_metadata(
+            bag,
+            [file.name],
+            truth.messages(),
+            storage="mcap" if storage == "mcap" else "sqlite3",
+            compression=(pack, "FILE") if pack != "plain" else ("", ""),
+        )
+    records = read_records(file if bare else bag)
+    corpus.assert_read(records["front_left"], truth)
+
+
+@pytest.mark.parametrize("compression", mcap.writer.CompressionType)
+@pytest.mark.parametrize("chunked", [True, False])
+@pytest.mark.parametrize("indexed", [True, False])
+def test_chunks_of_every_compression_are_read(
+    tmp_path: Path,
+    corpus: SimpleNamespace,
+    compression: mcap.writer.CompressionType,
+    chunked: bool,
+    indexed: bool,
+) -> None:
+    truth, other = corpus.motion(seed=2), corpus.motion(wheel="rear_left", seed=3)
+    path = corpus.write_mcap(
+        tmp_path / "bag.mcap",
+        corpus.merged(truth, other),
+        compression=compression,
+        use_chunking=chunked,
+        index_types=mcap.writer.IndexType.ALL if indexed else mcap.writer.IndexType.NONE,
+        repeat_channels=indexed,
+        repeat_schemas=indexed,
+        use_statistics=indexed,
+    )
+    records = read_records(path)
+    corpus.assert_read(records["front_left"], truth)
+    corpus.assert_read(records["rear_left"], other)
+
+
+@pytest.mark.parametrize("version", range(1, 10))
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_metadata_of_every_version_are_understood(
+    tmp_path: Path, corpus: SimpleNamespace, version: int, storage: str
+) -> None:
+    truth = corpus.motion()
+    bag = tmp_path / "bag"
+    bag.mkdir()
+    if storage == "mcap":
+        file = corpus.write_mcap(bag / "bag_0.mcap", truth.messages())
+    else:
+        schema = 1 if version < 4 else 2 if version < 6 else 3 if version < 7 else 4
+        file = corpus.write_sqlite(bag / "bag_0.db3", truth.messages(), schema=schema)
+    corpus.write_metadata(bag, [file.name], truth.messages(), version=version, storage=storage)
+    corpus.assert_read(read_records(bag)["front_left"], truth)
+
+
+@pytest.mark.parametrize("plugin", StoragePlugin)
+@pytest.mark.parametrize("mode", CompressionMode)
+@pytest.mark.parametrize("version", [8, 9])
+def test_bags_of_rosbags_are_read(
+    tmp_path: Path,
+    corpus: SimpleNamespace,
+    plugin: StoragePlugin,
+    mode: CompressionMode,
+    version: int,
+) -> None:
+    if plugin == StoragePlugin.SQLITE3 and mode == CompressionMode.STORAGE:
+        pytest.skip("SQLite has no compression of its own")
+    truth = corpus.motion()
+    writer = Writer(tmp_path / "bag", version=version, storage_plugin=plugin)
+    writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer:
+        connections = {}
+        for sent in truth.messages():
+            if sent.topic not in connections:
+                connections[sent.topic] = writer.add_connection(
+                    sent.topic, sent.type, typestore=corpus.TYPES
+                )
+            writer.write(connections[sent.topic], sent.stamp, sent.data)
+    corpus.assert_read(read_records(tmp_path / "bag")["front_left"], truth)
+
+
+@pytest.mark.parametrize("storage", ["mcap", "db3"])
+@pytest.mark.parametrize("described", [True, False])
+def test_split_bags_are_one_recording(
+    tmp_path: Path, corpus: SimpleNamespace, storage: str, described: bool
+) -> None:
+    truth = corpus.motion(n=300)
+    messages, bag = truth.messages(), tmp_path / "bag"
+    bag.mkdir()
+    write = corpus.write_mcap if storage == "mcap" else corpus.write_sqlite
+    # Ten and more: files must not be taken in the order of their letters.
+    parts = [messages[k * 26 : (k + 1) * 26] for k in range(12)]
+    files = [write(bag / f"bag_{k}.{storage}", part).name for k, part in enumerate(parts)]
+    if described:
+        corpus.write_metadata(bag, files, messages, storage=storage)
+    record = read_records(bag)["front_left"]
+    corpus.assert_read(record, truth)
+    assert record.starts == (0,)
+    assert ("metadata.yaml" in " ".join(record.notes)) is not described
+
+
+def test_a_missing_part_of_a_split_bag_is_told_with_its_messages(
+    tmp_path: Path, corpus: SimpleNamespace
+) -> None:
+    truth = corpus.motion(n=300)
+    messages, bag = truth.messages(), tmp_path / "bag"
+    bag.mkdir()
+    corpus.write_mcap(bag / "bag_0.mcap", messages[:101])
+    corpus.write_metadata(bag, ["bag_0.mcap", "bag_1.mcap"], messages)
+    record = read_records(bag)["front_left"]
+    corpus.assert_read(record, truth, 100)
+    notes = " ".join(record.notes)
+    assert "bag_1.mcap is missing" in notes
+    assert "100 of 300 messages" in notes
+
+
+def test_a_damaged_part_of_a_split_bag_costs_only_itself(
+    tmp_path: Path, corpus: SimpleNamespace
+) -> None:
+    truth = corpus.motion(n=300)
+    messages, bag = truth.messages(), tmp_path / "bag"
+    bag.mkdir()
+    corpus.write_mcap(bag / "bag_0.mcap", messages[:101])
+    (bag / "bag_1.mcap").write_bytes(b"")
+    corpus.write_mcap(bag / "bag_2.mcap", messages[201:])
+    corpus.write_metadata(bag, [f"bag_{k}.mcap" for k in range(3)], messages)
+    record = read_records(bag)["front_left"]
+    assert len(record) == 200
+    assert record.starts == (0, 100)
+    notes = " ".join(record.notes)
+    assert "bag_1.mcap: is empty" in notes
+    assert "200 of 300 messages" in notes
+
+
+def test_a_folder_of_bags_is_a_list_of_experiments(tmp_path: Path, corpus: SimpleNamespace) -> None:
+    truths = [corpus.motion(n=50 + k, seed=k) for k in range(3)]
+    for k, truth in enumerate(truths):
+        bag = tmp_path / f"run{k}"
+        bag.mkdir()
+        corpus.write_sqlite(bag / "x_0.db3", truth.messages())
+        corpus.write_metadata(bag, ["x_0.db3"], truth.messages(), storage="sqlite3")
+    experiments = read_experiments(tmp_path)["front_left"]
+    assert [len(record) for record in experiments] == [50, 51, 52]
+    joined = read_records(tmp_path)["front_left"]
+    assert joined.starts == (0, 50, 101)
+    assert len(joined) == 153
+    assert joined.source == "run0, run1, run2"
+
+
+def test_bare_files_of_different_names_in_a_folder_are_experiments(
+    tmp_path: Path, corpus: SimpleNamespace
+) -> None:
+    for name in ("slow.mcap", "fast.mcap"):
+        corpus.write_mcap(tmp_path / name, corpus.motion(n=20).messages())
+    assert [r.source for r in read_experiments(tmp_path)["front_left"]] == [
+        f"{tmp_path.name}/fast",
+        f"{tmp_path.name}/slow",
+    ]
+
+
+def test_qos_that_disagrees_between_metadata_and_file_hides_nothing(
+    tmp_path: Path, corpus: SimpleNamespace
+) -> None:
+    truth = corpus.motion()
+    tmp_path.joinpath("bag").mkdir()
+    bag = tmp_path / "bag"
+    corpus.write_sqlite(bag / "bag_0.db3", truth.messages(), qos="- history: 3\n  depth: 0\n")
+    corpus.write_metadata(
+        bag, ["bag_0.db3"], truth.messages(), version=5, storage="sqlite3", qos="- history: 1\n"
+    )
+    corpus.assert_read(read_records(bag)["front_left"], truth)
+
+
+def test_fewer_messages_than_the_metadata_promise_are_told(
+    tmp_path: Path, corpus: SimpleNamespace
+) -> None:
+    truth = corpus.motion()
+    bag = tmp_path / "bag"
+    bag.mkdir()
+    corpus.write_sqlite(bag / "bag_0.db3", truth.messages())
+    corpus.write_metadata(
+        bag,
+        ["bag_0.db3"],
+        truth.messages(),
+        storage="sqlite3",
+        counts={"/front_left/motor_state": 1234},
+    )
+    notes = " ".join(read_records(bag)["front_left"].notes)
+    assert "200 of 1234 messages could be read" in notes
+
+
+def test_messages_that_only_the_journal_holds_are_read(
+    tmp_path: Path, corpus: SimpleNamespace
+) -> None:
+    truth = corpus.motion()
+    messages = truth.messages()
+    path = corpus.write_sqlite(tmp_path / "bag.db3", messages[:101])
+    database = sqlite3.connect(path)
+    database.execute("PRAGMA journal_mode=WAL")
+    database.execute("PRAGMA wal_autocheckpoint=0")
+    for sent in messages[101:]:
+        database.execute(
+            "INSERT INTO messages(topic_id, timestamp, data) VALUES (2, ?, ?)",
+            (sent.stamp, sent.data),
+        )
+    database.commit()
+    # What a recorder that died leaves behind: the file and its journal, copied while open.
+    dead = tmp_path / "dead"
+    dead.mkdir()
+    for name in ("bag.db3", "bag.db3-wal"):
+        shutil.copyfile(tmp_path / name, dead / name)
+    database.close()
+    before = (dead / "bag.db3").read_bytes()
+    record = read_records(dead / "bag.db3")["front_left"]
+    corpus.assert_read(record, truth)
+    assert "journal" in " ".join(record.notes)
+    assert (dead / "bag.db3").read_bytes() == before
+
+
+def test_a_message_that_changed_between_distributions_is_read_by_what_fits(
+    tmp_path: Path, corpus: SimpleNamespace
+) -> None:
+    # Range of Foxy has no field `variance`; the bag does not define it.
+    whole = corpus.serialized(
+        "sensor_msgs/msg/Range",
+        header=corpus.header(corpus.START, "x"),
+        radiation_type=0,
+        field_of_view=1.0,
+        min_range=0.0,
+        max_range=9.0,
+        range=0.5,
+        variance=7.0,
+    )
+    sent = [
+        corpus.Sent("/range", "sensor_msgs/msg/Range", corpus.START + k * 10_000_000, whole[:-4])
+        for k in range(10)
+    ]
+    path = corpus.write_sqlite(tmp_path / "foxy.db3", sent, schema=2)
+    offers = list_topics(path)[0].offers
+    assert "range" in offers[0].fields
+    assert "variance" not in offers[0].fields
+    record = read_records(path, ["voltage=/range.range", "velocity=/range.max_range"])["motor"]
+    assert set(record.voltage) == {0.5}
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "reason"),
+    [
+        ("a.mcap", b"", "is empty"),
+        ("a.mcap", b"\x89MCAP", "cut off"),
+        ("a.mcap", b"hello world, this is no bag", "neither an MCAP nor a SQLite"),
+        ("a.db3", b"SQLite format 3\0", "not a readable bag"),
+        ("a.bag", b"#ROSBAG V2.0\n", "ROS 1"),
+        ("a.db3.zstd", b"\x28\xb5\x2f\xfd\x00", "compression is cut off"),
+        ("a.db3", b"SQLite format 3\0" + bytes(4080), "not a readable bag"),
+    ],
+)
+def test_what_is_no_bag_is_refused_with_its_reason(
+    tmp_path: Path, name: str, content: bytes, reason: str
+) -> None:
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(BagError, match=reason) as refused:
+        read_records(path)
+    assert name in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_path_that_does_not_exist_and_an_empty_folder_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(BagError, match="does not exist"):
+        read_records(tmp_path / "nothing")
+    with pytest.raises(BagError, match="holds no bag"):
+        read_records(tmp_path)
+
+
+@pytest.mark.parametrize("storage", ["mcap", "db3"])
+def test_an_empty_bag_is_refused_with_what_it_lacks(
+    tmp_path: Path, corpus: SimpleNamespace, storage: str
+) -> None:
+    write = corpus.write_mcap if storage == "mcap" else corpus.write_sqlite
+    path = write(tmp_path / f"bag.{storage}", [])
+    with pytest.raises(BagError, match="no topics at all"):
+        read_records(path)
+
+
+def test_a_topic_without_messages_is_refused_by_its_name(
+    tmp_path: Path, corpus: SimpleNamespace
+) -> None:
+    path = corpus.write_sqlite(tmp_path / "bag.db3", corpus.motion(n=20).messages())
+    with sqlite3.connect(path) as database:
+        database.execute("DELETE FROM messages WHERE topic_id = 2")
+    with pytest.raises(BagError, match="/front_left/motor_state has no messages"):
+        read_records(path)
+
+
+@pytest.mark.parametrize("text", ["", ":\n - {", "a: 1", "rosbag2_bagfile_information: 7"])
+def test_damaged_metadata_do_not_hide_the_files(
+    tmp_path: Path, corpus: SimpleNamespace, text: str
+) -> None:
+    truth = corpus.motion()
+    corpus.write_mcap(tmp_path / "x_0.mcap", truth.messages())
+    (tmp_path / "metadata.yaml").write_text(text)
+    record = read_records(tmp_path)["front_left"]
+    corpus.assert_read(record, truth)
+    assert "metadata.yaml is damaged" in " ".join(record.notes)
