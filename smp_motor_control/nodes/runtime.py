@@ -27,6 +27,7 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.lifecycle import LifecycleNode
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
@@ -313,6 +314,30 @@ def seconds(stamp: Any) -> float:
         [s]; good to some 0.1 us since 1970.
     """
     return float(stamp.sec + 1e-9 * stamp.nanosec)
+
+
+def refuse_impossible_transitions(node: LifecycleNode) -> None:
+    """Answer a request for a transition that the present state does not have, and live on.
+
+    rclpy raises in the service's callback instead, which ends the node.
+
+    Parameters
+    ----------
+    node : rclpy.lifecycle.LifecycleNode
+        Whose service is guarded.
+    """
+    service = node._service_change_state
+    change = service.callback
+
+    def guarded(request: Any, response: Any) -> Any:
+        try:
+            return change(request, response)
+        except rclpy._rclpy_pybind11.RCLError as error:
+            node.get_logger().warning(_one_line(str(error)))
+            response.success = False
+            return response
+
+    service.callback = guarded
 
 
 class Diagnostics:

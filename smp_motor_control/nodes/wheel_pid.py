@@ -54,6 +54,7 @@ class WheelPid(LifecycleNode):
 
     def __init__(self) -> None:
         super().__init__("wheel_pid")
+        runtime.refuse_impossible_transitions(self)
         self._given = Parameters(self, Settings, self._change)
         self._settings = settings = self._given.settings
         self._joint = settings.joint_name or f"{runtime.wheel_of(self)}_wheel_joint"
