@@ -176,6 +176,7 @@ def start(processes: Processes, folder: Path, motors: Path, rate: float) -> step
     nodes = ["/motor_plant", *robot.wheel_nodes(), "/skid_steer"]
     robot.conductor.ask("wait_for_nodes", nodes=nodes, timeout=30.0)
     robot.conductor.ask("wait_for_wheels", wheels=list(WHEELS), timeout=20.0)
+    robot.switch("configure")
     return robot
 
 

@@ -56,7 +56,7 @@ class Robot:
         Parameters
         ----------
         transition : str
-            ``activate`` or ``deactivate``.
+            ``configure``, ``activate`` or ``deactivate``.
         """
         for node in self.wheel_nodes():
             self.conductor.ask("change_state", node=node, transition=transition)
