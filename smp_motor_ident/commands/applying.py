@@ -6,24 +6,28 @@ What needs ROS is done by the node ``gain_setter`` in a process of its own; see 
 from __future__ import annotations
 
 import json
+import math
 import subprocess
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from smp_motor_ident.commands.processes import ProcessError, Processes
+from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.tune import Design
 from smp_motor_ident.tune.writing import parameters
 
 
-def apply(designs: Mapping[str, Design], watch: float) -> bool:
+def apply(wanted: Mapping[str, Mapping[str, Any]], watch: float) -> bool:
     """Set the gains of running wheels, watch them, and take them back if a loop misbehaves.
 
     Parameters
     ----------
-    designs : mapping of str to Design
-        By wheel; each ``/<wheel>/wheel_pid`` must be running.
+    wanted : mapping of str to mapping
+        ROS parameters by wheel; each ``/<wheel>/wheel_pid`` must be running.
     watch : float
         How long the new gains are on trial [s].
 
@@ -37,8 +41,8 @@ def apply(designs: Mapping[str, Design], watch: float) -> bool:
     ProcessError
         When a node does not answer or refuses the gains.
     """
-    wanted = {wheel: flat(parameters(design)) for wheel, design in designs.items()}
-    supply = max(design.loop.supply_voltage for design in designs.values())
+    limits = [values.get("u_clamp_max", math.inf) for values in wanted.values()]
+    supply = max((limit for limit in limits if math.isfinite(limit)), default=12.0)
     with tempfile.TemporaryDirectory() as logs, Processes(Path(logs)) as processes:
         setter = processes.start("gain_setter", "gain_setter", pipes=True)
         names = {wheel: list(values) for wheel, values in wanted.items()}
@@ -53,6 +57,56 @@ def apply(designs: Mapping[str, Design], watch: float) -> bool:
     else:
         print(f"taken back after {answer['after']:.2f} s: {answer['reason']}")
     return bool(answer["kept"])
+
+
+def from_designs(designs: Mapping[str, Design]) -> dict[str, dict[str, Any]]:
+    """Return the parameters of designed wheels by their ROS names.
+
+    Parameters
+    ----------
+    designs : mapping of str to Design
+        By wheel.
+
+    Returns
+    -------
+    dict of str to dict
+        By wheel.
+    """
+    return {wheel: flat(parameters(design)) for wheel, design in designs.items()}
+
+
+def from_file(path: Path) -> dict[str, dict[str, Any]]:
+    """Read the parameters of wheel nodes from a ROS parameter file.
+
+    Parameters
+    ----------
+    path : Path
+        As ``tune`` writes it.
+
+    Returns
+    -------
+    dict of str to dict
+        By wheel.
+
+    Raises
+    ------
+    ParameterError
+        When it cannot be read or names no ``/<wheel>/wheel_pid``.
+    """
+    try:
+        document = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ParameterError(f"{path}: cannot be read ({error.strerror})") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ParameterError(f"{path}: is not YAML: {' '.join(str(error).split())}") from None
+    found = {}
+    for node, entry in document.items() if isinstance(document, Mapping) else ():
+        wheel, _, name = str(node).strip("/").rpartition("/")
+        if name == "wheel_pid" and wheel and isinstance(entry, Mapping):
+            found[wheel] = flat(entry.get("ros__parameters") or {})
+    if not found:
+        raise ParameterError(f"{path}: holds no /<wheel>/wheel_pid; give a file that tune wrote")
+    return found
 
 
 def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

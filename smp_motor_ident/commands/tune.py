@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from smp_motor_ident.commands import frame
+from smp_motor_ident.commands import applying, frame
 from smp_motor_ident.errors import DesignError, ParameterError
 from smp_motor_ident.report.document import check_free, read_identification, write_together
 from smp_motor_ident.result import Estimate, Quantity
@@ -41,7 +41,9 @@ def parser() -> argparse.ArgumentParser:
     argparse.ArgumentParser
     """
     p = frame.Parser(prog="tune", description="Design gains that hold on the loop that will run.")
-    p.add_argument("source", type=Path, help="identification.json, its folder, or motors.yaml")
+    p.add_argument(
+        "source", type=Path, nargs="?", help="identification.json, its folder, or motors.yaml"
+    )
     p.add_argument("--output", type=Path, help="parameter file to write; gains.json goes beside it")
     p.add_argument("--method", default="margin", help=", ".join(METHODS))
     p.add_argument("--compare", action="store_true", help="show every method; take the recommended")
@@ -74,6 +76,9 @@ def parser() -> argparse.ArgumentParser:
         action="store_true",
         help="set the gains in the running wheels, watch, take them back if a loop misbehaves",
     )
+    p.add_argument(
+        "--gains", type=Path, help="with --apply and without a source: gains of this file"
+    )
     p.add_argument("--watch", type=float, default=3.0, help="trial after --apply [s]")
     p.add_argument("--force", action="store_true", help="replace files that exist")
     return p
@@ -96,6 +101,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _work(arguments: argparse.Namespace) -> int:
+    if arguments.gains is not None:
+        return _apply_file(arguments)
+    if arguments.source is None:
+        raise ParameterError("nothing to tune; give identification.json, its folder or motors.yaml")
     if arguments.method not in METHODS:
         raise ParameterError(
             f"--method is {arguments.method!r}; it must be one of {', '.join(METHODS)}"
@@ -123,10 +132,15 @@ def _work(arguments: argparse.Namespace) -> int:
         write_together(dict(zip(files, (text, document), strict=True)), arguments.force)
         print(f"written: {files[0]} and {files[1].name}")
     if arguments.apply:
-        from smp_motor_ident.commands.applying import apply
-
-        return 0 if apply(wheels.designs, arguments.watch) else 1
+        return 0 if applying.apply(applying.from_designs(wheels.designs), arguments.watch) else 1
     return 0
+
+
+def _apply_file(arguments: argparse.Namespace) -> int:
+    """Set the gains of a file, as they are."""
+    if arguments.source is not None or arguments.output is not None or not arguments.apply:
+        raise ParameterError("--gains goes with --apply alone, without a source and --output")
+    return 0 if applying.apply(applying.from_file(arguments.gains), arguments.watch) else 1
 
 
 def _files(arguments: argparse.Namespace) -> list[Path]:
