@@ -26,7 +26,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException
 from rclpy.lifecycle import LifecycleNode
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -35,6 +35,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.timer import Timer
 
 from smp_motor_control.errors import SmpError
+from smp_motor_control.nodes.executor import LeanExecutor
 
 # REP-2003: streams are published reliably and taken best effort, so that both a stock
 # reliable subscriber and a stock best-effort publisher find a partner in our nodes.
@@ -186,7 +187,7 @@ def _refuse_other_arguments(arguments: list[str]) -> None:
 
 
 def _spin(node: Node, stop: _Stop) -> int:
-    executor = SingleThreadedExecutor()
+    executor = LeanExecutor()
     executor.add_node(node)
     guard = node.create_guard_condition(lambda: None)
     stop.wake = guard.trigger

@@ -1,0 +1,294 @@
+"""Timing of ``wheel_pid`` against a bare node that only echoes, in one run.
+
+    python benchmarks/timing.py                 # everything, about two minutes
+    python benchmarks/timing.py --only echo     # ratios against the bare node
+    python benchmarks/timing.py --only wheels   # four wheels at 500 Hz for 60 s
+    python benchmarks/timing.py --only core     # one PID step
+
+The feeder publishes ``motor_state`` at a fixed rate and takes the time until the command that
+answers it arrives.  Echo and controller run in turn, several times; medians are reported.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import os
+import signal
+import statistics
+import subprocess
+import sys
+import time
+import timeit
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+CPU_LIMIT, LATENCY_LIMIT, ANSWERED_LIMIT, STEP_LIMIT = 1.4, 1.3, 0.999, 3e-6
+GAINS = {
+    "p": 2.0,
+    "i": 50.0,
+    "d": 0.05,
+    "derivative_filter_time_constant": 0.005,
+    "u_clamp_min": -12.0,
+    "u_clamp_max": 12.0,
+    "antiwindup_strategy": "back_calculation",
+    "feedforward_static": 0.4,
+    "feedforward_velocity": 2.5,
+    "feedforward_acceleration": 0.1,
+    "transition_time": 0.2,
+    "stall_time": 0.0,
+    "runaway_time": 0.0,
+}
+
+
+def echo() -> None:
+    """Be the bare node: what is the least that rclpy can do per sample."""
+    import rclpy
+    from rclpy.executors import SingleThreadedExecutor
+    from rclpy.node import Node
+    from rclpy.signals import SignalHandlerOptions
+
+    from smp_interfaces.msg import MotorCommand, MotorState
+    from smp_motor_control.nodes.runtime import STREAM_PUBLISHER, STREAM_SUBSCRIBER
+
+    rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
+    node = Node("wheel_pid", start_parameter_services=False)
+    publisher = node.create_publisher(MotorCommand, "motor_command", STREAM_PUBLISHER)
+    command = MotorCommand()
+
+    def answer(message: MotorState) -> None:
+        command.header.stamp = message.header.stamp
+        command.voltage = message.velocity
+        publisher.publish(command)
+
+    node.create_subscription(MotorState, "motor_state", answer, STREAM_SUBSCRIBER)
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    executor.spin()
+
+
+@dataclass
+class Result:
+    """Of one process under one feed."""
+
+    cpu: float
+    p50: float
+    p99: float
+    answered: float
+
+
+class Feeder:
+    """Publishes feedback and set-points of some wheels and waits for the answers."""
+
+    def __init__(self, wheels: list[str]) -> None:
+        import rclpy
+        from rclpy.executors import SingleThreadedExecutor
+        from sensor_msgs.msg import JointState
+
+        from smp_interfaces.msg import MotorCommand, MotorState
+        from smp_motor_control.nodes.runtime import STREAM_PUBLISHER, STREAM_SUBSCRIBER
+
+        rclpy.init(args=[])
+        self.node = rclpy.create_node("feeder")
+        self.wheels = wheels
+        self.states, self.messages, self.sent, self.took = {}, {}, {}, {}
+        for wheel in wheels:
+            self.states[wheel] = self.node.create_publisher(
+                MotorState, f"/{wheel}/motor_state", STREAM_PUBLISHER
+            )
+            self.messages[wheel] = MotorState()
+            self.sent[wheel], self.took[wheel] = {}, []
+            self.node.create_subscription(
+                MotorCommand,
+                f"/{wheel}/motor_command",
+                lambda message, wheel=wheel: self.answered(wheel, message),
+                STREAM_SUBSCRIBER,
+            )
+        self.setpoints = self.node.create_publisher(
+            JointState, "/wheel_setpoints", STREAM_PUBLISHER
+        )
+        self.setpoint = JointState(
+            name=[f"{w}_wheel_joint" for w in wheels], velocity=[1.0] * len(wheels)
+        )
+        self.executor = SingleThreadedExecutor()
+        self.executor.add_node(self.node)
+
+    def answered(self, wheel: str, message: object) -> None:
+        """Take the time of an answer by the stamp that it carries."""
+        stamp = message.header.stamp
+        begun = self.sent[wheel].pop((stamp.sec, stamp.nanosec), None)
+        if begun is not None:
+            self.took[wheel].append(time.perf_counter() - begun)
+
+    def feed(self, rate: float, duration: float) -> None:
+        """Publish at a rate; answers are taken in between."""
+        from builtin_interfaces.msg import Time
+
+        period = 1.0 / rate
+        begin = time.perf_counter()
+        count = round(duration * rate)
+        for k in range(count):
+            due = begin + k * period
+            while (left := due - time.perf_counter()) > 0:
+                self.executor.spin_once(timeout_sec=left)
+            now = time.time_ns()
+            stamp = Time(sec=now // 1_000_000_000, nanosec=now % 1_000_000_000)
+            if k % max(1, round(rate / 20)) == 0:
+                self.setpoints.publish(self.setpoint)
+            for wheel in self.wheels:
+                message = self.messages[wheel]
+                message.header.stamp = stamp
+                message.velocity = 0.9 + 0.1 * np.sin(k * 0.01)
+                message.encoder_count = k
+                self.sent[wheel][(stamp.sec, stamp.nanosec)] = time.perf_counter()
+                self.states[wheel].publish(message)
+        end = time.perf_counter() + 0.2
+        while time.perf_counter() < end:
+            self.executor.spin_once(timeout_sec=0.05)
+
+    def ready(self, rate: float) -> None:
+        """Feed until every wheel answers, and a second longer."""
+        deadline = time.perf_counter() + 30.0
+        while not all(self.took[wheel] for wheel in self.wheels):
+            if time.perf_counter() > deadline:
+                raise SystemExit("a controller does not answer")
+            self.feed(rate, 0.5)
+        self.feed(rate, 1.0)
+        for wheel in self.wheels:
+            self.sent[wheel].clear()
+            self.took[wheel].clear()
+
+
+def start(kind: str, wheel: str) -> subprocess.Popen[bytes]:
+    """Start the echo or the controller of one wheel."""
+    if kind == "echo":
+        command = [sys.executable, str(Path(__file__).resolve()), "--echo", "--ros-args"]
+    else:
+        given = [f"{name}:={value}" for name, value in GAINS.items()]
+        command = ["wheel_pid", "--ros-args", *(a for g in given for a in ("-p", g))]
+    return subprocess.Popen([*command, "-r", f"__ns:=/{wheel}"])
+
+
+def cpu_seconds(pid: int) -> float:
+    """Return the processor time that a process has used."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def measure(feeder: Feeder, kind: str, rate: float, duration: float) -> Result:
+    """Run one kind of node under the feed."""
+    processes = [start(kind, wheel) for wheel in feeder.wheels]
+    try:
+        for wheel in feeder.wheels:
+            feeder.took[wheel].clear()
+        feeder.ready(rate)
+        before = [cpu_seconds(p.pid) for p in processes]
+        feeder.feed(rate, duration)
+        used = [cpu_seconds(p.pid) - b for p, b in zip(processes, before)]
+        took = np.concatenate([feeder.took[wheel] for wheel in feeder.wheels])
+        count = round(duration * rate) * len(feeder.wheels)
+        in_time = float(np.count_nonzero(took < 1.0 / rate))
+        return Result(
+            cpu=sum(used) / duration / len(used),
+            p50=float(np.percentile(took, 50)),
+            p99=float(np.percentile(took, 99)),
+            answered=in_time / count,
+        )
+    finally:
+        for process in processes:
+            process.send_signal(signal.SIGKILL if kind == "echo" else signal.SIGINT)
+        for process in processes:
+            process.wait(10)
+
+
+def compare(rate: float, duration: float, repeats: int) -> bool:
+    """Measure echo and controller in turn and print their ratios."""
+    feeder = Feeder(["front_left"])
+    runs: dict[str, list[Result]] = {"echo": [], "wheel_pid": []}
+    for k in range(repeats):
+        for kind in sorted(runs, reverse=bool(k % 2)):
+            result = measure(feeder, kind, rate, duration)
+            runs[kind].append(result)
+            print(
+                f"  {kind:10s} {rate:g} Hz: cpu {100 * result.cpu:5.1f} %, "
+                f"p50 {1e3 * result.p50:.3f} ms, p99 {1e3 * result.p99:.3f} ms, "
+                f"answered in time {100 * result.answered:.2f} %",
+                flush=True,
+            )
+    held = True
+    for name, limit in (("cpu", CPU_LIMIT), ("p50", LATENCY_LIMIT), ("p99", LATENCY_LIMIT)):
+        echoed, controlled = (
+            statistics.median(getattr(r, name) for r in runs[kind]) for kind in runs
+        )
+        ratio = controlled / echoed
+        held &= ratio <= limit
+        print(f"{name} at {rate:g} Hz: {ratio:.2f} times the bare node's, limit {limit}")
+    return held
+
+
+def wheels(rate: float, duration: float) -> bool:
+    """Measure four wheels at once."""
+    from smp_motor_control import WHEELS
+
+    feeder = Feeder(list(WHEELS))
+    result = measure(feeder, "wheel_pid", rate, duration)
+    print(
+        f"four wheels at {rate:g} Hz for {duration:g} s: {100 * result.answered:.3f} % answered "
+        f"before the next sample, limit {100 * ANSWERED_LIMIT} % "
+        f"(p50 {1e3 * result.p50:.2f} ms, p99 {1e3 * result.p99:.2f} ms, "
+        f"cpu {100 * result.cpu:.1f} % each)"
+    )
+    return result.answered >= ANSWERED_LIMIT
+
+
+def core() -> bool:
+    """Measure one step of the PID, and of the whole loop around it."""
+    from smp_motor_control.pid import Pid, PidGains
+    from smp_motor_control.wheel_loop import LoopSettings, WheelLoop
+
+    names = PidGains.__dataclass_fields__
+    gains = PidGains(**{k: v for k, v in GAINS.items() if k in names})
+    pid, loop = Pid(gains), WheelLoop(LoopSettings(gains=gains, transition_time=0.2))
+    gc.disable()
+    count = 100_000
+    step = min(timeit.repeat(lambda: pid.step(1.0, 0.9, 0.002), number=count, repeat=7)) / count
+    whole = min(timeit.repeat(lambda: loop.step(1.0, 0.9, 0.002), number=count, repeat=7)) / count
+    print(f"PID step: {1e6 * step:.2f} us, limit {1e6 * STEP_LIMIT:g} us; ", end="")
+    print(f"with the reference: {1e6 * whole:.2f} us")
+    return step <= STEP_LIMIT
+
+
+def main() -> int:
+    """Run what is asked for; exit code 1 where a limit is broken."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--only", choices=("echo", "wheels", "core"))
+    parser.add_argument("--rate", type=float, default=500.0, help="of the comparison [Hz]")
+    parser.add_argument("--duration", type=float, default=10.0, help="of each run [s]")
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--wheels-duration", type=float, default=60.0)
+    arguments = parser.parse_args()
+    os.environ.setdefault("ROS_DOMAIN_ID", "98")
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    if arguments.only is None:  # one rclpy context per process
+        parts = ("core", "echo", "wheels")
+        common = sys.argv[1:]
+        codes = [
+            subprocess.call([sys.executable, __file__, "--only", part, *common]) for part in parts
+        ]
+        return max(codes)
+    held = {
+        "core": core,
+        "echo": lambda: compare(arguments.rate, arguments.duration, arguments.repeats),
+        "wheels": lambda: wheels(500.0, arguments.wheels_duration),
+    }[arguments.only]()
+    return 0 if held else 1
+
+
+if __name__ == "__main__":
+    if "--echo" in sys.argv:
+        sys.argv.remove("--echo")
+        echo()
+    else:
+        sys.exit(main())

@@ -1,0 +1,232 @@
+"""A single-threaded executor for control loops: the same callbacks for a third of the time.
+
+The stock executor gathers all entities, builds a wait set and wraps every callback in a task
+anew for every message, and wakes itself twice for each.  This one gathers again only when an
+entity was made or destroyed, and calls plain callbacks of subscriptions and timers directly.
+Everything else, and whatever is a coroutine, goes the stock way.
+"""
+
+from __future__ import annotations
+
+import inspect
+from contextlib import ExitStack
+from typing import Any
+
+from rclpy.exceptions import InvalidHandle
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
+from rclpy.subscription import Subscription
+from rclpy.waitable import NumberOfEntities
+
+_FOR_EVER = -1
+
+
+class _WaitSet:
+    """The wait set of one collection of entities, which it keeps alive."""
+
+    def __init__(self, executor: LeanExecutor) -> None:
+        self.key = executor.entities()
+        self._stack = ExitStack()
+        self._executor = executor
+        subscriptions, timers, clients, services, guards, waitables = self.key
+        self.waitables = [w for w in waitables if self._hold(w)]
+        total = NumberOfEntities()
+        for waitable in self.waitables:
+            total += waitable.get_num_entities()
+        self.by_pointer: dict[int, Any] = {}
+        self._adders: list[tuple[Any, Any]] = []
+        own = (executor._guard, executor._sigint_gc)
+        self._stack.enter_context(executor.context.handle)
+        self._waits = _rclpy.WaitSet(
+            total.num_subscriptions + len(subscriptions),
+            total.num_guard_conditions + len(guards) + len(own),
+            total.num_timers + len(timers),
+            total.num_clients + len(clients),
+            total.num_services + len(services),
+            total.num_events,
+            executor.context.handle,
+        )
+        waits = self._waits
+        for add, entities in (
+            (waits.add_subscription, subscriptions),
+            (waits.add_timer, timers),
+            (waits.add_client, clients),
+            (waits.add_service, services),
+            (waits.add_guard_condition, (*guards, *own)),
+        ):
+            for entity in entities:
+                if self._hold(entity.handle):
+                    self._adders.append((add, entity.handle))
+                    self.by_pointer[entity.handle.pointer] = entity
+
+    def _hold(self, handle: Any) -> bool:
+        try:
+            self._stack.enter_context(handle)
+        except InvalidHandle:
+            return False
+        return True
+
+    def release(self) -> None:
+        """Let go of the entities, so that destroyed ones are."""
+        self._stack.close()
+
+    def wait(self) -> None:
+        """Wait for ever, until something is ready."""
+        waits = self._waits
+        waits.clear_entities()
+        for add, handle in self._adders:
+            add(handle)
+        for waitable in self.waitables:
+            waitable.add_to_wait_set(waits)
+        waits.wait(_FOR_EVER)
+
+    def ready(self, kind: str) -> list[Any]:
+        """Return the entities of a kind that are ready."""
+        find = self.by_pointer
+        return [find[p] for p in self._waits.get_ready_entities(kind) if p in find]
+
+    def ready_waitables(self) -> list[Any]:
+        """Return the waitables that are ready."""
+        return [w for w in self.waitables if w.is_ready(self._waits)]
+
+
+class LeanExecutor(SingleThreadedExecutor):
+    """Spins one or more nodes; only waiting without a time-out is lean."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self._waits: _WaitSet | None = None
+        self._plain: dict[Any, bool] = {}
+
+    def entities(self) -> tuple[tuple[Any, ...], ...]:
+        """Return what to wait for.
+
+        Returns
+        -------
+        tuple of tuple
+            Subscriptions, timers, clients, services, guard conditions and waitables.
+        """
+        nodes = self.get_nodes()
+        kinds = ("subscriptions", "timers", "clients", "services", "guards", "waitables")
+        return tuple(tuple(e for node in nodes for e in getattr(node, kind)) for kind in kinds)
+
+    def spin_once(self, timeout_sec: float | None = None) -> None:
+        """Wait for work and do all that is ready.
+
+        Parameters
+        ----------
+        timeout_sec : float, optional
+            Longest wait [s]; with one, the stock executor does the work.
+
+        Raises
+        ------
+        ExternalShutdownException
+            When the context was shut down.
+        """
+        if timeout_sec is not None:
+            super().spin_once(timeout_sec)
+            return
+        waits = self._waits
+        if waits is None:
+            self._plain = {}
+            waits = self._waits = _WaitSet(self)
+        waits.wait()
+        if not self.context.ok():
+            raise ExternalShutdownException()
+        waitables = waits.ready_waitables()
+        for timer in waits.ready("timer"):
+            self._do_timer(timer)
+        for subscription in waits.ready("subscription"):
+            self._do_subscription(subscription)
+        for guard in waits.ready("guard_condition"):
+            self._do_guard(guard)
+        for kind, take in (("client", self._take_client), ("service", self._take_service)):
+            for entity in waits.ready(kind):
+                self._do_stock(entity, take)
+        for waitable in waitables:
+            self._do_stock(waitable, self._take_waitable)
+        if self._tasks:
+            self._do_tasks()
+
+    def _do_guard(self, guard: Any) -> None:
+        if guard is self._guard:
+            self._gather_again()
+        elif guard is not self._sigint_gc:
+            guard._executor_triggered = True
+            self._do_stock(guard, self._take_guard_condition)
+
+    def _gather_again(self) -> None:
+        if self._waits is not None and self._waits.key != self.entities():
+            self._waits.release()
+            self._waits = None
+
+    def _is_plain(self, entity: Any) -> bool:
+        plain = self._plain.get(entity)
+        if plain is None:
+            plain = self._plain[entity] = not inspect.iscoroutinefunction(entity.callback)
+        return plain
+
+    def _do_timer(self, timer: Any) -> None:
+        if not self._is_plain(timer):
+            self._do_stock(timer, self._take_timer)
+            return
+        try:
+            with timer.handle:
+                if not timer.handle.is_timer_ready():
+                    return
+                timer.handle.call_timer()
+        except InvalidHandle:
+            return
+        timer.callback()
+
+    def _do_subscription(self, subscription: Any) -> None:
+        if not self._is_plain(subscription):
+            self._do_stock(subscription, self._take_subscription)
+            return
+        try:
+            with subscription.handle:
+                taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+        except InvalidHandle:
+            return
+        if taken is None:
+            return
+        if subscription._callback_type is Subscription.CallbackType.MessageOnly:
+            subscription.callback(taken[0])
+        else:
+            subscription.callback(*taken)
+
+    def _do_stock(self, entity: Any, take: Any) -> None:
+        if not entity.callback_group.can_execute(entity):
+            return
+        handler = self._make_handler(entity, None, take)
+        handler()
+        if handler.done():
+            self._tasks = [t for t in self._tasks if t[0] is not handler]
+            handler.result()
+
+    def _do_tasks(self) -> None:
+        for task, *_ in list(self._tasks):
+            if not task.executing() and not task.done():
+                task()
+            if task.done() and not task.cancelled():
+                task.result()
+        with self._tasks_lock:
+            self._tasks = [t for t in self._tasks if not (t[0].done() or t[0].cancelled())]
+
+    def shutdown(self, timeout_sec: float | None = None) -> bool:
+        """Stop, and let go of all entities.
+
+        Parameters
+        ----------
+        timeout_sec : float, optional
+            Longest wait for callbacks that run [s].
+
+        Returns
+        -------
+        bool
+            Whether all had ended.
+        """
+        if self._waits is not None:
+            self._waits.release()
+            self._waits = None
+        return bool(super().shutdown(timeout_sec))
