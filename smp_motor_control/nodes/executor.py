@@ -108,7 +108,16 @@ class LeanExecutor(SingleThreadedExecutor):
         """
         nodes = self.get_nodes()
         kinds = ("subscriptions", "timers", "clients", "services", "guards", "waitables")
-        return tuple(tuple(e for node in nodes for e in getattr(node, kind)) for kind in kinds)
+        return tuple(
+            # A subscription whose group cannot execute is taken from by its owner (see record).
+            tuple(
+                e
+                for node in nodes
+                for e in getattr(node, kind)
+                if kind != "subscriptions" or e.callback_group.can_execute(e)
+            )
+            for kind in kinds
+        )
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
         """Wait for work and do all that is ready.
