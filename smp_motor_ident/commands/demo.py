@@ -45,6 +45,10 @@ MOST_GAIN_ERROR = 0.5  # percent
 MOST_DEVIATIONS = 3.0  # of its own standard deviations, for every parameter
 
 
+GAINS = ("p", "i", "d", "feedforward_static", "feedforward_velocity", "feedforward_acceleration")
+"""What is printed of a controller."""
+
+
 @dataclass(frozen=True)
 class Check:
     """One thing that the demo must show: the worst figure, its limit, and where it occurred."""
@@ -299,18 +303,18 @@ def show(
                 f"{error / std:+.1f}" if std else "",
                 quantity.unit,
             )
-        made.add_section()
         mine = gains[f"/{wheel}/wheel_pid"]
-        told = "  ".join(f"{n} {mine[n]:.4g}" for n in ("p", "i", "d") if n in mine)
-        made.add_row("gains", "", told, "", "", "V, rad/s (wheel)")
-        for answer in answers[wheel]:
-            step = f"{answer.segment}: {answer.before:+.2f} to {answer.after:+.2f}"
-            figures = (
-                f"rise {1e3 * answer.rise:.0f} ms  settling {1e3 * answer.settling:.0f} ms  "
-                f"overshoot {answer.overshoot:.2f} %"
+        told = ", ".join(f"{n} {mine[n]:.4g}" for n in GAINS if mine.get(n))
+        driven = table("", "manoeuvre", "from", "to", "rise", "settling", "overshoot")
+        for one in answers[wheel]:
+            times = (f"{1e3 * seconds:.0f} ms" for seconds in (one.rise, one.settling))
+            overshoot = f"{one.overshoot:.2f} %"
+            driven.add_row(
+                one.segment, f"{one.before:+.2f}", f"{one.after:+.2f} rad/s", *times, overshoot
             )
-            made.add_row(step, "", figures, "", "", "rad/s (wheel)")
         out.print(made)
+        out.print(f"gains (volts, wheel rad/s): {told}", soft_wrap=True)
+        out.print(driven)
 
 
 def check(

@@ -44,7 +44,13 @@ def table(title: str, *columns: str, left: int = 1) -> Table:
     Table
         To which rows are added.
     """
-    made = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+    made = Table(
+        title=title or None,
+        title_justify="left",
+        title_style="bold",
+        box=box.SIMPLE_HEAD,
+        pad_edge=False,
+    )
     for k, column in enumerate(columns):
         made.add_column(column, justify="left" if k < left else "right", no_wrap=True)
     return made
