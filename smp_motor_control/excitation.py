@@ -66,8 +66,10 @@ class Excitation:
             Voltage [V] within the amplitude.
         """
         times = np.atleast_1d(np.asarray(time, dtype=np.float64))
-        values = np.clip(self.amplitude * self._shape(times), -self.amplitude, self.amplitude)
-        values[~(times >= 0)] = 0.0
+        begun = times >= 0
+        shape = self._shape(np.where(begun, times, 0.0))
+        values = np.clip(self.amplitude * shape, -self.amplitude, self.amplitude)
+        values[~begun] = 0.0
         return float(values[0]) if np.ndim(time) == 0 else values
 
     def _shape(self, time: Array) -> Array:
@@ -220,7 +222,7 @@ class Prbs(Excitation):
     seed: int = 0
 
     def _shape(self, time: Array) -> Array:
-        index = np.maximum(time * DETUNING / self.hold, 0.0).astype(np.int64)
+        index = (time * DETUNING / self.hold).astype(np.int64)
         bits = _random_levels(self.seed)
         return np.where(bits[index % bits.size] < 0, -1.0, 1.0)
 
@@ -241,7 +243,7 @@ class Steps(Excitation):
     seed: int = 0
 
     def _shape(self, time: Array) -> Array:
-        index = np.maximum(time * DETUNING / self.hold, 0.0).astype(np.int64)
+        index = (time * DETUNING / self.hold).astype(np.int64)
         levels = _random_levels(self.seed)
         held: Array = levels[index % levels.size]
         return held

@@ -1,0 +1,149 @@
+"""The driven motor: commands when they arrive, voltage as it was, sensors as they are."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from smp_motor_control.errors import ParameterError
+from smp_motor_control.motor import Motor
+from smp_motor_control.motor_file import load_motors
+from smp_motor_control.plant import DrivenMotor, DriveSettings, Supply
+
+ENTRY = load_motors(Path(__file__).parents[2] / "config" / "motors_paper.yaml")["rear_right"]
+IDEAL = DriveSettings(command_timeout=math.inf)
+
+
+def test_nothing_moves_before_the_first_command():
+    plant = DrivenMotor(ENTRY, DriveSettings(current_noise=0.0))
+    sample = plant.sample(5.0)
+    assert sample[:2] == (0.0, 0.0) and sample.encoder_count == 0 and plant.timed_out
+
+
+def test_commands_act_from_the_instant_of_their_arrival():
+    plant, motor = DrivenMotor(ENTRY, IDEAL), Motor(ENTRY.parameters)
+    plant.command(0.0123, 6.0)
+    plant.command(0.0177, -3.0)
+    sample = plant.sample(0.02)
+    for voltage, dt in ((0.0, 0.0123), (6.0, 0.0054), (-3.0, 0.0023)):
+        motor.step(voltage, dt)
+    # The same steps but for the rounding of the instants.
+    assert plant.motor.speed == pytest.approx(motor.speed, rel=1e-9)
+    assert sample.voltage == pytest.approx((6.0 * 0.0054 - 3.0 * 0.0023) / 0.02, rel=1e-9)
+
+
+def test_samples_at_odd_instants_do_not_change_what_the_motor_does():
+    plants = [DrivenMotor(ENTRY, IDEAL) for _ in range(2)]
+    draw = np.random.default_rng(3)
+    for k in range(100):
+        for plant in plants:
+            plant.command(0.01 * k, 8.0 * math.sin(k))
+        for extra in sorted(draw.uniform(0.01 * k, 0.01 * (k + 1), 5)):
+            plants[1].sample(float(extra))
+        for plant in plants:
+            plant.sample(0.01 * (k + 1))
+    assert plants[0].motor.speed == pytest.approx(plants[1].motor.speed, rel=1e-9)
+
+
+def test_voltage_goes_to_zero_exactly_at_the_time_out():
+    plant = DrivenMotor(ENTRY, DriveSettings(command_timeout=0.2))
+    plant.command(0.0, 10.0)
+    assert plant.sample(0.3).voltage == pytest.approx(10.0 * 0.2 / 0.3, rel=1e-12)
+    assert plant.timed_out and plant.sample(0.4).voltage == 0.0
+    plant.command(0.4, 5.0)
+    assert plant.sample(0.5).voltage == pytest.approx(5.0, rel=1e-12)
+
+
+@pytest.mark.parametrize("voltage", [math.nan, math.inf, -math.inf])
+def test_command_that_is_no_number_is_zero_volts(voltage):
+    plant = DrivenMotor(ENTRY, IDEAL)
+    plant.command(0.0, 10.0)
+    plant.sample(0.1)
+    assert not plant.command(0.1, voltage)
+    assert plant.sample(0.2).voltage == 0.0
+
+
+def test_supply_limits_and_pwm_rounds():
+    plant = DrivenMotor(ENTRY, dataclasses.replace(IDEAL, pwm_steps=8))
+    plant.command(0.0, 100.0)
+    assert plant.sample(0.01).voltage == pytest.approx(12.0)
+    plant.command(0.01, -4.0)
+    assert plant.sample(0.02).duty == -0.375  # 2.67 of 8 steps
+
+
+def test_battery_sags_under_the_current_of_all_motors():
+    supply = Supply(12.0, resistance=0.3)
+    plants = [DrivenMotor(ENTRY, IDEAL, supply) for _ in range(2)]
+    for plant in plants:
+        plant.command(0.0, 12.0)
+        plant.load(0.0, 65.5 * 0.05)
+    for k in range(1, 400):
+        samples = [plant.sample(0.005 * k) for plant in plants]
+    expected = 12.0 - 0.3 * sum(plant.motor.current for plant in plants)
+    # Voltage is held over an interval in which the current still changes a little.
+    assert samples[0].voltage == pytest.approx(expected, abs=1e-3)
+    assert samples[0].voltage < 11.5
+
+
+def test_delay_of_the_motor_postpones_a_command():
+    plant = DrivenMotor(dataclasses.replace(ENTRY, delay=0.01), IDEAL)
+    plant.command(0.0, 6.0)
+    assert plant.sample(0.01).voltage == 0.0
+    assert plant.sample(0.02).voltage == pytest.approx(6.0, rel=1e-9)
+
+
+def test_current_is_nan_without_a_sensor_and_noisy_with_one():
+    blind = DrivenMotor(ENTRY, dataclasses.replace(IDEAL, current_sensor=False))
+    assert math.isnan(blind.sample(0.01).current)
+    noisy = DrivenMotor(ENTRY, dataclasses.replace(IDEAL, current_noise=0.05), seed=1)
+    currents = [noisy.sample(0.01 * k).current for k in range(1, 2001)]
+    # Standard error of the deviation of 2000 draws: 1.6 %.
+    assert np.std(currents) == pytest.approx(0.05, rel=0.07)
+
+
+def test_reported_speed_is_made_of_counts_and_true_without_a_window():
+    plant = DrivenMotor(ENTRY, IDEAL)
+    plant.command(0.0, 8.0)
+    for k in range(1, 300):
+        sample = plant.sample(0.005 * k)
+    quantum = ENTRY.gearbox.to_wheel(ENTRY.encoder.angle_per_count / 0.005)
+    true = ENTRY.gearbox.to_wheel(plant.motor.speed)
+    assert sample.velocity == pytest.approx(true, abs=quantum)
+    assert sample.velocity / quantum == pytest.approx(round(sample.velocity / quantum), abs=1e-6)
+    assert sample.position == pytest.approx(ENTRY.gearbox.to_wheel(plant.motor.angle), abs=1e-3)
+
+
+def test_narrow_counter_wraps_and_the_position_does_not():
+    narrow = dataclasses.replace(ENTRY, encoder=dataclasses.replace(ENTRY.encoder, bits=8))
+    plant = DrivenMotor(narrow, IDEAL)
+    plant.command(0.0, 12.0)
+    samples = [plant.sample(0.002 * k) for k in range(1, 1000)]
+    assert max(s.encoder_count for s in samples) == 127
+    assert samples[-1].position == pytest.approx(
+        ENTRY.gearbox.to_wheel(plant.motor.angle), abs=1e-3
+    )
+
+
+def test_load_at_the_wheel_slows_it_by_what_the_motor_equation_says():
+    plant = DrivenMotor(ENTRY, IDEAL)
+    plant.command(0.0, 10.0)
+    plant.load(0.0, 65.5 * 0.01)
+    plant.sample(20.0)
+    p = ENTRY.parameters
+    torque = 0.01 + p.coulomb_friction
+    expected = (p.motor_constant * 10.0 - p.resistance * torque) / (
+        p.resistance * p.viscous_friction + p.motor_constant**2
+    )
+    assert plant.motor.speed == pytest.approx(expected, rel=1e-9)
+    assert not plant.load(20.0, math.nan)
+
+
+def test_settings_out_of_range_are_refused():
+    with pytest.raises(ParameterError, match="pwm_steps"):
+        DriveSettings(pwm_steps=-1)
+    with pytest.raises(ParameterError, match="current_noise"):
+        DriveSettings(current_noise=math.nan)

@@ -1,0 +1,147 @@
+"""Loops made of the parts that run on the robot: speed sources, references, limits."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from smp_motor_control import WHEELS
+from smp_motor_control.errors import ParameterError
+from smp_motor_control.excitation import Fourier
+from smp_motor_control.motor_file import load_motors
+from smp_motor_control.motor_model import MotorModel
+from smp_motor_control.pid import PidGains
+from smp_motor_control.simulation import (
+    DriveSettings,
+    Timing,
+    simulate_closed_loop,
+    simulate_open_loop,
+)
+from smp_motor_control.wheel_loop import LoopSettings, WheelLoop
+
+MOTORS = load_motors(Path(__file__).parents[2] / "config" / "motors_paper.yaml")
+GAINS = PidGains(p=2.5, i=80.0, d=0.05, derivative_filter_time_constant=0.005)
+
+
+def model_of(wheel: str) -> MotorModel:
+    p = MOTORS[wheel].parameters
+    return MotorModel(
+        dc_gain=p.dc_gain,
+        time_constant=p.time_constant,
+        time_constant_product=p.time_constant_product,
+        static_voltage=p.static_voltage,
+    )
+
+
+def settings_of(wheel: str, **changes) -> LoopSettings:
+    ratio, p = MOTORS[wheel].gearbox.ratio, MOTORS[wheel].parameters
+    gains = replace(
+        GAINS,
+        setpoint_weight_p=0.4,
+        antiwindup_strategy="conditional_integration",
+        feedforward_static=p.static_voltage,
+        feedforward_velocity=ratio * p.a0,
+        feedforward_acceleration=ratio * p.a1,
+    )
+    values = {"gains": gains, "transition_time": 0.2, "model": model_of(wheel), **changes}
+    return LoopSettings(**values)
+
+
+def test_open_loop_reaches_the_gain_of_the_motor():
+    entry = MOTORS["rear_left"]
+    run = simulate_open_loop(entry, lambda t: 8.0, 3.0)
+    p = entry.parameters
+    expected = entry.gearbox.to_wheel(p.dc_gain * (8.0 - p.static_voltage))
+    assert run.velocity[-1] == pytest.approx(expected, rel=1e-6)
+
+
+def test_recorded_voltage_explains_the_recorded_motion_whatever_the_jitter_and_delay():
+    from smp_motor_control.motor import Motor
+
+    entry = MOTORS["rear_left"]
+    signal = Fourier(amplitude=10.0)
+    for timing in (Timing(), Timing(delay=0.005), Timing(jitter=0.001)):
+        run = simulate_open_loop(entry, signal, 5.0, timing=timing, seed=2)
+        motor = Motor(entry.parameters)
+        for dt, voltage in zip(np.diff(run.time), run.voltage[1:]):
+            motor.step(float(voltage), float(dt))
+        # Exact where a command holds a whole interval; its delay averages two within one.
+        exact = timing.delay in (0.0, timing.sample_time) and timing.jitter == 0.0
+        tolerance = 1e-6 if exact else 0.05
+        assert entry.gearbox.to_wheel(motor.speed) == pytest.approx(run.velocity[-1], abs=tolerance)
+
+
+@pytest.mark.parametrize("wheel", WHEELS)
+@pytest.mark.parametrize("source", ["measured", "difference", "observer"])
+def test_wheel_arrives_without_overshoot_by_every_speed_source(wheel, source):
+    run = simulate_closed_loop(
+        MOTORS[wheel],
+        settings_of(wheel, speed_source=source, difference_window=2),
+        lambda t: 2.0 if t >= 0.5 else 0.0,
+        2.5,
+        timing=Timing(delay=0.001),
+    )
+    assert np.max(run.velocity) < 2.0 * 1.02
+    late = run.velocity[run.time > 1.0]
+    assert np.all(np.abs(late - 2.0) < 0.02 * 2.0)
+
+
+def test_load_is_carried_by_the_integral():
+    run = simulate_closed_loop(
+        MOTORS["rear_right"],
+        settings_of("rear_right"),
+        lambda t: 1.5,
+        4.0,
+        load=lambda t: 0.6 if t > 2.0 else 0.0,
+    )
+    assert np.mean(run.velocity[run.time > 3.5]) == pytest.approx(1.5, rel=0.005)
+
+
+def test_output_never_exceeds_the_supply_whatever_the_clamps_say():
+    gains = replace(GAINS, p=100.0)
+    run = simulate_closed_loop(MOTORS["front_left"], LoopSettings(gains=gains), lambda t: 4.0, 1.0)
+    assert np.max(np.abs(run.command)) <= 12.0
+
+
+def test_same_seed_gives_the_same_run_and_another_another():
+    entry, drive = MOTORS["front_right"], DriveSettings(current_noise=0.05, torque_noise=1e-5)
+    one, same, other = (
+        simulate_open_loop(entry, lambda t: 5.0, 1.0, drive=drive, seed=seed) for seed in (1, 1, 2)
+    )
+    assert np.array_equal(one.current, same.current)
+    assert not np.array_equal(one.current, other.current)
+
+
+def test_settings_change_without_a_jump_of_the_output():
+    loop = WheelLoop(settings_of("rear_left", transition_time=0.0))
+    loop.start(1.0)
+    for _ in range(50):
+        before = loop.step(1.5, 1.45, 0.005)
+    loop.configure(settings_of("rear_left", gains=replace(GAINS, p=6.0)))
+    after = loop.step(1.5, 1.45, 0.005)
+    # One step of the integral and of the changed derivative at most.
+    assert after.output == pytest.approx(before.output, abs=0.1)
+
+
+def test_counts_without_known_hardware_fall_back_to_the_reported_speed():
+    loop = WheelLoop(settings_of("rear_left", speed_source="observer"))
+    assert loop.speed(0.005, 1.23, 77, 3.0) == 1.23
+    assert loop.source == "measured"
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"speed_source": "guess"},
+        {"difference_window": 0},
+        {"transition_time": math.nan},
+        {"speed_source": "observer", "model": None},
+    ],
+)
+def test_loop_settings_that_make_no_sense_are_refused(bad):
+    with pytest.raises(ParameterError):
+        LoopSettings(**bad)
