@@ -100,10 +100,8 @@ class McapFile:
             In the order of their numbers.
         """
         if self._summary is None and not self._scanned:
-            problems, self.problems = self.problems, []
             for _ in self.batches(lambda _: False):
                 pass
-            self.problems = problems
         return [self._channels[key] for key in sorted(self._channels)]
 
     def promised(self) -> dict[str, int] | None:

@@ -66,8 +66,7 @@ def read_experiments(
     for recording in every:
         part = recording.size() / total
         report = None if progress is None else _scaled(progress, before / total, part)
-        reader = _read_csv if recording.is_table else _read_bag
-        for record in reader(recording, asked, types, report):
+        for record in _read(recording, asked, types, report):
             found.setdefault(record.wheel, []).append(record)
         before += recording.size()
     if progress is not None:
@@ -101,6 +100,18 @@ def read_records(
     """
     experiments = read_experiments(paths, mapping, progress=progress)
     return {wheel: join_records(records) for wheel, records in experiments.items()}
+
+
+def _read(
+    recording: Recording, asked: SignalMap, types: Types, progress: Progress | None
+) -> list[Record]:
+    """Return a recording's records; an error tells also what was found amiss before."""
+    reader = _read_csv if recording.is_table else _read_bag
+    try:
+        return reader(recording, asked, types, progress)
+    except BagError as error:
+        amiss = [note for note in recording.notes if note not in str(error)]
+        raise BagError("; ".join([str(error), *amiss])) from None
 
 
 def _scaled(progress: Progress, begin: float, part: float) -> Progress:

@@ -7,7 +7,6 @@ import re
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -47,6 +46,8 @@ class Recording:
     promised: dict[str, int] | None = None
     distribution: str = ""
     notes: list[str] = field(default_factory=list)
+    _storages: dict[Path, Storage | None] = field(default_factory=dict, repr=False)
+    _folder: tempfile.TemporaryDirectory[str] | None = field(default=None, repr=False)
 
     @property
     def is_table(self) -> bool:
@@ -67,8 +68,9 @@ class Recording:
         """
         found: list[Channel] = []
         for path in self.files:
-            with self._opened(path) as storage:
-                found += [] if storage is None else storage.channels()
+            if (storage := self._storage(path)) is not None:
+                found += storage.channels()
+                self._note(*storage.problems)
         return found
 
     def batches(self, wanted: Callable[[Channel], bool]) -> Iterator[tuple[float, Batch]]:
@@ -91,16 +93,15 @@ class Recording:
         total, before = max(self.size(), 1), 0
         for path in self.files:
             size = path.stat().st_size
-            with self._opened(path) as storage:
-                if storage is None:
-                    continue
+            storage = self._storage(path)
+            if storage is not None:
                 mine: Counter[str] = Counter()
                 for fraction, batch in storage.batches(wanted):
                     mine[batch.channel.topic] += len(batch)
                     yield (before + fraction * size) / total, batch
                 asked = {c.topic for c in storage.channels() if wanted(c)}
                 seen |= asked
-                self.notes.extend(storage.problems)
+                self._note(*storage.problems)
                 for topic, count in (storage.promised() or {}).items():
                     if topic in asked and mine[topic] < count:
                         self._lost(path.name, topic, mine[topic], count)
@@ -110,25 +111,27 @@ class Recording:
             if topic in seen and counts[topic] < count:
                 self._lost("metadata.yaml", topic, counts[topic], count)
 
+    def _note(self, *notes: str) -> None:
+        self.notes += [note for note in dict.fromkeys(notes) if note not in self.notes]
+
     def _lost(self, who: str, topic: str, have: int, promised: int) -> None:
-        self.notes.append(
+        self._note(
             f"{self.name}: {topic}: {have} of {promised} messages could be read "
             f"({who} counts {promised}; {promised - have} are lost)"
         )
 
-    @contextmanager
-    def _opened(self, path: Path) -> Iterator[Storage | None]:
+    def _storage(self, path: Path) -> Storage | None:
         """Open a file; where others remain, one that cannot be read becomes a note."""
-        with tempfile.TemporaryDirectory(prefix="smp_bag_") as folder:
+        if path not in self._storages:
+            self._folder = self._folder or tempfile.TemporaryDirectory(prefix="smp_bag_")
             try:
-                storage = open_storage(path, Path(folder))
+                self._storages[path] = open_storage(path, Path(self._folder.name))
             except BagError as error:
                 if len(self.files) == 1:
                     raise
-                if str(error) not in self.notes:
-                    self.notes.append(str(error))
-                storage = None
-            yield storage
+                self._storages[path] = None
+                self._note(str(error))
+        return self._storages[path]
 
 
 def open_storage(path: Path, folder: Path) -> Storage:

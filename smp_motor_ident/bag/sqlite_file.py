@@ -11,6 +11,7 @@ from urllib.parse import quote
 
 import numpy as np
 
+from smp_motor_ident.bag.sqlite_pages import salvage
 from smp_motor_ident.bag.storage import Batch, Channel, join, message_type
 from smp_motor_ident.errors import BagError
 
@@ -39,11 +40,14 @@ class SqliteFile:
         self.name = name or path.name
         self.problems: list[str] = []
         self._folder: tempfile.TemporaryDirectory[str] | None = None
-        self._database = self._connect(self._with_journal())
+        self._cut_off = False
+        self._path_read = self._with_journal()
+        self._database = self._connect(self._path_read)
         try:
             self._channels = self._read_channels()
-        except (sqlite3.Error, UnicodeDecodeError) as error:
-            raise BagError(f"{self.name}: not a readable bag ({error})") from None
+        except (sqlite3.Error, UnicodeDecodeError, TypeError) as error:
+            reasons = "; ".join([" ".join(str(error).split()), *self.problems])
+            raise BagError(f"{self.name}: not a readable bag ({reasons})") from None
 
     def _with_journal(self) -> Path:
         """Return the file, or where a journal lies beside it a copy of both.
@@ -71,6 +75,7 @@ class SqliteFile:
     def _connect(self, path: Path) -> sqlite3.Connection:
         mode = "immutable=1" if self._folder is None else "mode=rw"
         database = sqlite3.connect(f"file:{quote(str(path.resolve()))}?{mode}", uri=True)
+        database.text_factory = lambda text: text.decode("utf-8", "replace")
         size = path.stat().st_size
         with path.open("rb") as file:
             head = file.read(100)
@@ -81,6 +86,7 @@ class SqliteFile:
             self.problems.append(
                 f"{self.name}: cut off at byte {size} of {pages * page} that it had"
             )
+            self._cut_off = True
             # With this, SQLite reads a file that is shorter than its head says.
             database.execute("PRAGMA writable_schema=ON")
         return database
@@ -88,11 +94,16 @@ class SqliteFile:
     def _read_channels(self) -> list[Channel]:
         columns = {row[1] for row in self._database.execute("PRAGMA table_info(topics)")}
         if not {"id", "name", "type"} <= columns:
-            raise BagError(f"{self.name}: a SQLite file without a bag's table of topics")
+            raise sqlite3.DatabaseError("it has no table of topics")
         definitions: dict[str, tuple[str, str]] = {}
         if self._database.execute("PRAGMA table_info(message_definitions)").fetchall():
             query = "SELECT topic_type, encoded_message_definition, encoding"
-            for kind, text, encoding in self._database.execute(f"{query} FROM message_definitions"):
+            try:
+                rows = self._database.execute(f"{query} FROM message_definitions").fetchall()
+            except sqlite3.DatabaseError as error:
+                rows = []
+                self.problems.append(f"{self.name}: its definitions cannot be read ({error})")
+            for kind, text, encoding in rows:
                 definitions[message_type(kind)] = (text, encoding)
         optional = [
             name if name in columns else "''"
@@ -144,28 +155,32 @@ class SqliteFile:
         if not asked:
             return
         ids = ",".join(str(key) for key in asked)
-        last, total, rows_per_read = -(2**62), self._last_row(), _ROWS
-        while True:
-            # A damaged page ends a read with an error: narrower reads come as near as a row.
-            query = (
-                "SELECT id, topic_id, timestamp, data FROM messages "
-                f"WHERE id > {last} AND topic_id IN ({ids}) ORDER BY id"
-            )
-            try:
-                cursor = self._database.execute(query)
-                while rows := cursor.fetchmany(rows_per_read):
-                    last = rows[-1][0]
-                    for batch in self._split(rows, asked):
-                        yield min(1.0, last / total) if total > 0 else 1.0, batch
-                return
-            except sqlite3.DatabaseError as error:
-                if rows_per_read > 1:
-                    rows_per_read = max(1, rows_per_read // 8)
-                    continue
-                self.problems.append(
-                    f"{self.name}: damaged behind message number {max(last, 0)} ({error})"
-                )
-                return
+        query = (
+            "SELECT id, topic_id, timestamp, data FROM messages "
+            f"WHERE topic_id IN ({ids}) ORDER BY id"
+        )
+        last, total = -(2**63), self._last_row()
+        try:
+            if self._cut_off:
+                raise sqlite3.DatabaseError("cut off")
+            cursor = self._database.execute(query)
+            while rows := cursor.fetchmany(_ROWS):
+                last = rows[-1][0]
+                for batch in self._split(rows, asked):
+                    yield min(1.0, last / total) if total > 0 else 1.0, batch
+        except sqlite3.DatabaseError as error:
+            if not self._cut_off:
+                self.problems.append(f"{self.name}: damaged behind message {last} ({error})")
+            yield from self._salvaged(asked, last)
+
+    def _salvaged(self, asked: dict[int, Channel], last: int) -> Iterator[tuple[float, Batch]]:
+        """Yield what single pages still hold behind the last row that the tree gave."""
+        path = self._path_read
+        for fraction, rows in salvage(path):
+            wanted = [row for row in rows if row[0] > last and row[1] in asked]
+            if wanted:
+                for batch in self._split(wanted, asked):
+                    yield fraction, batch
 
     def _last_row(self) -> int:
         try:

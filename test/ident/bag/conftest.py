@@ -46,9 +46,7 @@ class Sent:
 
 
 def stamp_of(nanoseconds: int) -> Any:
-    return TYPES.types["builtin_interfaces/msg/Time"](
-        *divmod(int(nanoseconds), 1_000_000_000)
-    )
+    return TYPES.types["builtin_interfaces/msg/Time"](*divmod(int(nanoseconds), 1_000_000_000))
 
 
 def serialized(type_name: str, *, little_endian: bool = True, **fields: Any) -> bytes:

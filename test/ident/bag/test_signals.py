@@ -1,0 +1,351 @@
+"""Any numeric field of any message becomes a signal in SI at the motor shaft."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from smp_motor_ident.bag import list_topics, read_records
+from smp_motor_ident.errors import BagError
+
+STEP = 10_000_000
+
+
+def floats(corpus: SimpleNamespace, topic: str, values: Any, shift: int = 0) -> list[Any]:
+    return [
+        corpus.Sent(
+            topic,
+            "std_msgs/msg/Float64",
+            corpus.START + k * STEP + shift,
+            corpus.serialized("std_msgs/msg/Float64", data=float(value)),
+        )
+        for k, value in enumerate(values)
+    ]
+
+
+def joint_states(
+    corpus: SimpleNamespace, names: Any, velocities: Any, frames: Any = None
+) -> list[Any]:
+    """``names(k)`` are the joints of message k, ``velocities[k]`` their speeds."""
+    sent = []
+    for k, row in enumerate(velocities):
+        time = corpus.START + k * STEP
+        data = corpus.serialized(
+            "sensor_msgs/msg/JointState",
+            header=corpus.header(time, frames(k) if frames else ""),
+            name=names(k),
+            position=np.zeros(0),
+            velocity=np.array(row, float),
+            effort=np.zeros(0),
+        )
+        sent.append(corpus.Sent("/joint_states", "sensor_msgs/msg/JointState", time, data))
+    return sent
+
+
+def in_order(*parts: list[Any]) -> list[Any]:
+    return sorted((sent for part in parts for sent in part), key=lambda sent: sent.stamp)
+
+
+MAP = ["voltage=/pwm.data*12/255", "velocity=/joint_states.velocity[left_wheel_joint]"]
+
+
+@pytest.mark.parametrize("storage", ["mcap", "db3"])
+def test_pwm_counts_and_the_joint_of_a_name(
+    tmp_path: Path, corpus: SimpleNamespace, storage: str
+) -> None:
+    n = 100
+    rng = np.random.default_rng(0)
+    pwm = rng.integers(-255, 256, n)
+    speed = rng.normal(0, 1, (n, 2))
+    messages = in_order(
+        floats(corpus, "/pwm", pwm),
+        joint_states(corpus, lambda _: ["right_wheel_joint", "left_wheel_joint"], speed),
+    )
+    write = corpus.write_mcap if storage == "mcap" else corpus.write_sqlite
+    path = write(tmp_path / f"bag.{storage}", messages)
+    record = read_records(path, MAP)["motor"]
+    np.testing.assert_array_equal(record.velocity, speed[:, 1])
+    # Both have the same instants, and a command holds from its own on.
+    np.testing.assert_allclose(record.voltage[1:], pwm[:-1] * 12 / 255, rtol=1e-15)
+
+
+def test_names_may_change_their_order_and_be_missing(
+    tmp_path: Path, corpus: SimpleNamespace
+) -> None:
+    n = 90
+    rng = np.random.default_rng(1)
+    pwm = rng.integers(-255, 256, n)
+    left = rng.normal(0, 1, n)
+    orders = [
+        ["left_wheel_joint", "tight_wheel_joint"],
+        ["tight_wheel_joint", "left_wheel_joint"],
+        ["tight_wheel_joint"],
+    ]
+    rows = [
+        [left[k], 9.0] if k % 3 == 0 else [9.0, left[k]] if k % 3 == 1 else [9.0] for k in range(n)
+    ]
+    frames = ["", "a", "long frame"]
+    messages = in_order(
+        floats(corpus, "/pwm", pwm),
+        joint_states(corpus, lambda k: orders[k % 3], rows, lambda k: frames[k % 2]),
+    )
+    record = read_records(corpus.write_mcap(tmp_path / "bag.mcap", messages), MAP)["motor"]
+    np.testing.assert_array_equal(record.velocity, left[np.arange(n) % 3 < 2])
+
+
+def test_a_topic_whose_every_message_is_laid_out_otherwise_is_read(
+    tmp_path: Path, corpus: SimpleNamespace
+) -> None:
+    n = 300
+    values = np.random.default_rng(2).normal(size=n)
+    messages = in_order(
+        floats(corpus, "/pwm", values),
+        joint_states(
+            corpus,
+            lambda k: [
+                *(f"joint{j}" for j in range(k % 7)),
+                f"n{k}" + "x" * (k % 23),
+                "left_wheel_joint",
+            ],
+            [[0.0] * (k % 7 + 1) + [values[k]] for k in range(n)],
+        ),
+    )
+    record = read_records(corpus.write_mcap(tmp_path / "bag.mcap", messages), MAP)["motor"]
+    np.testing.assert_array_equal(record.velocity, values)
+
+
+@pytest.mark.parametrize("little", [True, False])
+def test_both_byte_orders_are_read(tmp_path: Path, corpus: SimpleNamespace, little: bool) -> None:
+    truth = corpus.motion()
+    messages = [
+        corpus.Sent("/front_left/motor_state", corpus.STATE, int(t), truth.state(k, little))
+        for k, t in enumerate(truth.time)
+    ]
+    record = read_records(corpus.write_mcap(tmp_path / "bag.mcap", messages))["front_left"]
+    np.testing.assert_array_equal(record.voltage, truth.voltage)
+    np.testing.assert_array_equal(record.count, truth.count)
+
+
+NESTED = """\
+std_msgs/Header header
+string label
+Wheel[] wheels
+bool[3] flags
+int16[] raw
+"""
+WHEEL = "string name\nuint8 id\nfloat32 speed\nint32 ticks\n"
+
+
+def nested_store() -> Any:
+    store = get_typestore(Stores.ROS2_JAZZY)
+    store.register(get_types_from_msg(WHEEL, "robot_msgs/msg/Wheel"))
+    store.register(get_types_from_msg(NESTED, "robot_msgs/msg/Report"))
+    return store
+
+
+def reports(corpus: SimpleNamespace, n: int) -> tuple[list[Any], np.ndarray]:
+    store = nested_store()
+    values = np.random.default_rng(3).integers(-1000, 1000, (n, 2))
+    sent = []
+    for k in range(n):
+        wheels = [
+            store.types["robot_msgs/msg/Wheel"](name, 1, float(values[k, j]), int(values[k, j]))
+            for j, name in enumerate(("left", "right"))
+        ]
+        time = corpus.START + k * STEP
+        stamp = store.types["builtin_interfaces/msg/Time"](*divmod(time, 10**9))
+        message = store.types["robot_msgs/msg/Report"](
+            store.types["std_msgs/msg/Header"](stamp, "base"),
+            "x" * (k % 5),
+            wheels,
+            np.array([True, False, True]),
+            np.array([7, int(values[k, 0])], np.int16),
+        )
+        data = bytes(store.serialize_cdr(message, "robot_msgs/msg/Report"))
+        sent.append(corpus.Sent("/report", "robot_msgs/msg/Report", time, data))
+    return sent, values
+
+
+REPORT_MAP = [
+    "voltage=/report.raw[1]:mV held=before",
+    "velocity=/report.wheels[right].speed:rpm",
+    "count=/report.wheels[1].ticks encoder_bits=0",
+]
+
+
+def test_types_given_as_msg_files_are_used(tmp_path: Path, corpus: SimpleNamespace) -> None:
+    sent, values = reports(corpus, 60)
+    path = corpus.write_sqlite(tmp_path / "bag.db3", sent, schema=3)
+    with pytest.raises(BagError, match=r"robot_msgs/msg/Report.*unknown.*\.msg files") as refused:
+        read_records(path, REPORT_MAP)
+    assert "\n" not in str(refused.value)
+    folder = tmp_path / "robot_msgs" / "msg"
+    folder.mkdir(parents=True)
+    (folder / "Report.msg").write_text(NESTED)
+    (folder / "Wheel.msg").write_text(WHEEL)
+    mapping = tmp_path / "map.yaml"
+    mapping.write_text(
+        "types: [robot_msgs]\n"
+        "held: before\n"
+        "motors:\n"
+        "  right:\n"
+        "    voltage: {topic: /report, field: 'raw[1]', unit: mV}\n"
+        "    velocity: /report.wheels[right].speed:rpm\n"
+        "    count: /report.wheels[1].ticks\n"
+        "    encoder_bits: 0\n"
+    )
+    record = read_records(path, mapping)["right"]
+    np.testing.assert_allclose(record.voltage, values[:, 0] * 1e-3, rtol=1e-15)
+    np.testing.assert_allclose(record.velocity, values[:, 1] * math.pi / 30, rtol=1e-15)
+    np.testing.assert_array_equal(record.count, values[:, 1])
+
+
+def test_types_defined_in_the_bag_are_used(tmp_path: Path, corpus: SimpleNamespace) -> None:
+    sent, values = reports(corpus, 60)
+    store = nested_store()
+    text = store.generate_msgdef("robot_msgs/msg/Report", ros_version=2)[0]
+    path = tmp_path / "bag.mcap"
+    import mcap.writer
+
+    with path.open("wb") as file:
+        writer = mcap.writer.Writer(file, compression=mcap.writer.CompressionType.NONE)
+        writer.start("ros2")
+        schema = writer.register_schema("robot_msgs/msg/Report", "ros2msg", text.encode())
+        channel = writer.register_channel("/report", "cdr", schema)
+        for message in sent:
+            writer.add_message(channel, message.stamp, message.data, message.stamp)
+        writer.finish()
+    record = read_records(path, REPORT_MAP)["motor"]
+    np.testing.assert_array_equal(record.count, values[:, 1])
+    fields = list_topics(path)[0].offers[0].fields
+    assert {"wheels[0].speed", "wheels[1].ticks", "flags[2]", "raw[1]"} <= set(fields)
+
+
+def test_a_duty_cycle_times_the_supply_as_it_was_measured(
+    tmp_path: Path, corpus: SimpleNamespace
+) -> None:
+    n = 50
+    duty = np.linspace(-1, 1, n)
+    supply = np.linspace(12.6, 11.4, n)
+    messages = in_order(
+        floats(corpus, "/duty", duty),
+        floats(corpus, "/battery", supply),
+        floats(corpus, "/speed", np.zeros(n)),
+    )
+    path = corpus.write_mcap(tmp_path / "bag.mcap", messages)
+    mapping = ["voltage=/duty.data:duty supply=/battery.data velocity=/speed.data"]
+    record = read_records(path, mapping)["motor"]
+    np.testing.assert_allclose(record.voltage[1:], (duty * supply)[:-1], rtol=1e-12)
+    fixed = read_records(path, ["voltage=/duty.data:duty supply_voltage=12 velocity=/speed.data"])
+    np.testing.assert_allclose(fixed["motor"].voltage[1:], 12 * duty[:-1], rtol=1e-12)
+    with pytest.raises(BagError, match="supply_voltage"):
+        read_records(path, ["voltage=/duty.data:duty velocity=/speed.data"])
+
+
+def test_units_scales_and_shafts_come_out_in_si_at_the_motor(
+    tmp_path: Path, corpus: SimpleNamespace
+) -> None:
+    messages = in_order(floats(corpus, "/u", [1.0] * 9), floats(corpus, "/w", [60.0] * 9))
+    path = corpus.write_mcap(tmp_path / "bag.mcap", messages)
+
+    def speed(spec: str) -> float:
+        return float(read_records(path, f"voltage=/u.data {spec}")["motor"].velocity[0])
+
+    assert speed("velocity=/w.data:rpm") == pytest.approx(2 * math.pi)
+    assert speed("velocity=/w.data:rpm gear_ratio=10") == pytest.approx(20 * math.pi)
+    assert speed("velocity=/w.data:rpm@motor gear_ratio=10") == pytest.approx(2 * math.pi)
+    assert speed("velocity=/w.data:rpm gear_ratio=10 shaft=motor") == pytest.approx(2 * math.pi)
+    assert speed("velocity=/w.data:deg/s") == pytest.approx(math.pi / 3)
+    assert speed("velocity=/w.data*-1/2+10:deg/s") == pytest.approx(-math.pi / 9)
+    # Ticks are counted at the motor unless said otherwise.
+    ticks = "velocity=/w.data:ticks/s counts_per_revolution=120 gear_ratio=10"
+    assert speed(ticks) == pytest.approx(math.pi)
+    assert speed(ticks.replace("/s", "/s@wheel")) == pytest.approx(10 * math.pi)
+    with pytest.raises(BagError, match="counts_per_revolution"):
+        speed("velocity=/w.data:ticks/s")
+
+
+@pytest.mark.parametrize(
+    ("mapping", "reason"),
+    [
+        ("voltage=/nope.data velocity=/w.data", "has no /nope; it has /u, /w"),
+        ("voltage=/u.nope velocity=/w.data", "field 'nope' has no field 'nope'; it has data"),
+        ("voltage=/u.data[0] velocity=/w.data", "is no array"),
+        ("voltage=/u.data", "gives no velocity, position or count"),
+        ("velocity=/w.data", "gives no voltage"),
+        ("voltage=u velocity=/w.data", "a topic for voltage"),
+        ("voltage=/u.data velocity=/w.data clock=header", "no usable header time"),
+    ],
+)
+def test_a_mapping_that_does_not_fit_is_refused_with_what_is_there(
+    tmp_path: Path, corpus: SimpleNamespace, mapping: str, reason: str
+) -> None:
+    messages = in_order(floats(corpus, "/u", [1.0] * 9), floats(corpus, "/w", [60.0] * 9))
+    path = corpus.write_mcap(tmp_path / "bag.mcap", messages)
+    with pytest.raises(BagError) as refused:
+        read_records(path, mapping)
+    assert reason in str(refused.value)
+    assert "bag.mcap" in str(refused.value)
+
+
+def test_messages_that_are_not_of_their_type_are_left_out_and_told(
+    tmp_path: Path, corpus: SimpleNamespace
+) -> None:
+    truth = corpus.motion(n=100)
+    messages = truth.messages()
+    messages[50] = corpus.Sent(
+        messages[50].topic, corpus.STATE, messages[50].stamp, b"\0\1\0\0rubbish"
+    )
+    messages[70] = corpus.Sent(messages[70].topic, corpus.STATE, messages[70].stamp, b"")
+    record = read_records(corpus.write_mcap(tmp_path / "bag.mcap", messages))["front_left"]
+    assert len(record) == 98
+    assert "2 messages are no smp_interfaces/msg/MotorState" in " ".join(record.notes)
+
+
+def test_what_a_bag_offers_is_listed_with_a_mapping_that_reads_it(
+    tmp_path: Path, corpus: SimpleNamespace
+) -> None:
+    n = 30
+    messages = in_order(
+        floats(corpus, "/left/pwm", np.arange(n)),
+        floats(corpus, "/right/pwm", np.arange(n)),
+        floats(corpus, "/temperature", np.arange(n)),
+        joint_states(corpus, lambda _: ["left_wheel", "right_wheel"], [[1.0, 2.0]] * n),
+    )
+    path = corpus.write_mcap(tmp_path / "bag.mcap", messages)
+    listing = list_topics(path)[0]
+    assert listing.needs_mapping
+    offers = {offer.topic: offer for offer in listing.offers}
+    assert offers["/joint_states"].fields == ["velocity[left_wheel]", "velocity[right_wheel]"]
+    assert offers["/temperature"].count == n
+    assert offers["/temperature"].rate == pytest.approx(100.0)
+    assert "left.voltage=/left/pwm.data*12/255" in listing.suggestion
+    assert "right.velocity=/joint_states.velocity[right_wheel]" in listing.suggestion
+    records = read_records(path, listing.suggestion)
+    assert set(records) == {"left", "right"}
+    assert set(records["right"].velocity) == {2.0}
+
+
+def test_our_own_messages_need_no_mapping(tmp_path: Path, corpus: SimpleNamespace) -> None:
+    path = corpus.write_mcap(tmp_path / "bag.mcap", corpus.motion(n=20, bits=16).messages())
+    listing = list_topics(path)[0]
+    assert not listing.needs_mapping
+    assert listing.suggestion == []
+    hardware = read_records(path)["front_left"].hardware
+    assert hardware.gear_ratio == corpus.RATIO
+    assert hardware.counts_per_revolution == corpus.COUNTS
+    assert (hardware.encoder_bits, hardware.supply_voltage, hardware.resistance) == (16, 12.0, None)
+    told = read_records(path, ["gear_ratio=10", "resistance=1.5"])["front_left"].hardware
+    assert (told.gear_ratio, told.resistance, told.encoder_bits) == (10.0, 1.5, 16)
+
+
+def test_a_missing_description_is_told(tmp_path: Path, corpus: SimpleNamespace) -> None:
+    messages = corpus.motion(n=20).messages(description=False)
+    record = read_records(corpus.write_mcap(tmp_path / "bag.mcap", messages))["front_left"]
+    assert "no motor_description; a gear ratio of 1 is assumed" in " ".join(record.notes)

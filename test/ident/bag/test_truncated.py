@@ -1,0 +1,157 @@
+"""A recording cut off at any byte gives what is there, and says that something is missing."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+from types import SimpleNamespace
+
+import lz4.frame
+import mcap.writer
+import pytest
+import zstandard
+
+from smp_motor_ident.bag import BagWriter, read_records
+from smp_motor_ident.errors import BagError
+
+KILOBYTE = 1024
+LOST = ("cut off", "damaged", "could be read", "is empty", "compression", "not a readable")
+
+
+def samples_and_words(path: Path) -> tuple[int, str]:
+    """Read what can be read: number of samples, and everything that was said."""
+    try:
+        record = next(iter(read_records(path).values()))
+    except BagError as error:
+        assert "\n" not in str(error)
+        assert path.name in str(error) or path.parent.name in str(error)
+        return 0, str(error)
+    return len(record), " ".join(record.notes)
+
+
+def assert_every_cut_is_sound(whole: bytes, path: Path, samples: int, most_lost: int) -> None:
+    """Cut at every kilobyte: never an unexpected error, never silent, never losing much more."""
+    per_byte = samples / len(whole)
+    before = 0
+    for size in range(0, len(whole), KILOBYTE):
+        path.write_bytes(whole[:size])
+        count, words = samples_and_words(path)
+        if count < samples:
+            assert any(word in words for word in LOST), (size, words)
+        assert count >= before, f"a longer file gave less at {size} bytes"
+        assert count >= min(size * per_byte, samples) - most_lost, (size, count, words)
+        before = count
+    path.write_bytes(whole)
+    assert samples_and_words(path)[0] == samples
+
+
+@pytest.mark.parametrize(
+    ("options", "most_lost"),
+    [
+        # Uncompressed messages are read up to the byte of the cut; behind the data there is an
+        # index, so that at a given fraction of the file more messages are there, not less.
+        (dict(compression=mcap.writer.CompressionType.NONE), 20),
+        (dict(compression=mcap.writer.CompressionType.NONE, use_chunking=False), 20),
+        # Of a compressed chunk that is cut off the finished blocks are read; a chunk has 30.
+        (dict(compression=mcap.writer.CompressionType.ZSTD), 60),
+        (dict(compression=mcap.writer.CompressionType.LZ4), 60),
+    ],
+)
+def test_an_mcap_file_cut_at_every_kilobyte(
+    tmp_path: Path, corpus: SimpleNamespace, options: dict[str, object], most_lost: int
+) -> None:
+    truth = corpus.motion(n=400)
+    path = corpus.write_mcap(tmp_path / "bag.mcap", truth.messages(), **options)
+    assert_every_cut_is_sound(path.read_bytes(), path, 400, most_lost)
+
+
+def test_a_sqlite_file_cut_at_every_kilobyte(tmp_path: Path, corpus: SimpleNamespace) -> None:
+    truth = corpus.motion(n=400)
+    path = corpus.write_sqlite(tmp_path / "bag.db3", truth.messages())
+    # The first seven of its twenty pages hold no messages: by the bytes, those of 140.
+    assert_every_cut_is_sound(path.read_bytes(), path, 400, 140)
+
+
+@pytest.mark.parametrize("pack", [zstandard.ZstdCompressor().compress, lz4.frame.compress])
+@pytest.mark.parametrize("storage", ["mcap", "db3"])
+def test_a_compressed_file_cut_at_every_kilobyte(
+    tmp_path: Path, corpus: SimpleNamespace, storage: str, pack: object
+) -> None:
+    truth = corpus.motion(n=400)
+    write = corpus.write_mcap if storage == "mcap" else corpus.write_sqlite
+    plain = write(tmp_path / f"bag.{storage}", truth.messages())
+    assert callable(pack)
+    path = tmp_path / f"bag.{storage}.packed"
+    # One compressed block may be all there is: then only the whole file gives anything.
+    assert_every_cut_is_sound(pack(plain.read_bytes()), path, 400, 400)
+
+
+def test_a_cut_bag_tells_how_much_of_what_the_metadata_promise(
+    tmp_path: Path, corpus: SimpleNamespace
+) -> None:
+    truth = corpus.motion(n=400)
+    bag = tmp_path / "bag"
+    bag.mkdir()
+    path = corpus.write_mcap(bag / "bag_0.mcap", truth.messages())
+    corpus.write_metadata(bag, ["bag_0.mcap"], truth.messages())
+    path.write_bytes(path.read_bytes()[:20_000])
+    count, words = samples_and_words(bag)
+    assert 0 < count < 400
+    assert f"{count} of 400 messages could be read" in words
+    corpus.assert_read(read_records(bag)["front_left"], truth, count)
+
+
+def test_a_damaged_chunk_costs_only_itself(tmp_path: Path, corpus: SimpleNamespace) -> None:
+    truth = corpus.motion(n=400)
+    path = corpus.write_mcap(tmp_path / "bag.mcap", truth.messages())
+    data = bytearray(path.read_bytes())
+    data[20_000] ^= 0xFF
+    path.write_bytes(data)
+    count, words = samples_and_words(path)
+    # A chunk of 4096 bytes has about 30 messages.
+    assert 360 <= count < 400
+    assert "is damaged and was left out with" in words
+    assert f"{count} of 400 messages" in words
+
+
+def test_random_damage_never_ends_in_a_traceback(tmp_path: Path, corpus: SimpleNamespace) -> None:
+    truth = corpus.motion(n=60)
+    chance = random.Random(4)
+    for storage, write in (("mcap", corpus.write_mcap), ("db3", corpus.write_sqlite)):
+        path = write(tmp_path / f"bag.{storage}", truth.messages())
+        whole = path.read_bytes()
+        for _ in range(150):
+            data = bytearray(whole)
+            for _ in range(chance.choice((1, 3, 30))):
+                data[chance.randrange(len(data))] = chance.randrange(256)
+            path.write_bytes(data)
+            samples_and_words(path)
+
+
+def test_a_tail_of_zeros_is_no_message(tmp_path: Path, corpus: SimpleNamespace) -> None:
+    truth = corpus.motion(n=400)
+    path = corpus.write_mcap(tmp_path / "bag.mcap", truth.messages(), use_chunking=False)
+    data = path.read_bytes()
+    path.write_bytes(data[:30_000] + bytes(len(data) - 30_000))
+    count, words = samples_and_words(path)
+    assert 200 < count < 400
+    assert "cut off or damaged" in words
+    corpus.assert_read(read_records(path)["front_left"], truth, count)
+
+
+def test_a_writer_that_was_killed_leaves_a_bag_that_everybody_reads(
+    tmp_path: Path, corpus: SimpleNamespace
+) -> None:
+    from rosbags.highlevel import AnyReader
+
+    truth = corpus.motion(n=300)
+    bag = BagWriter(tmp_path / "bag")
+    for sent in truth.messages():
+        bag.write(sent.topic, sent.type, sent.data, sent.stamp)
+        bag.flush(force=True)
+    # Never closed: the files as they are now are what a kill leaves.
+    with AnyReader([tmp_path / "bag"]) as reader:
+        assert sum(1 for _ in reader.messages()) == 301
+    record = read_records(tmp_path / "bag")["front_left"]
+    corpus.assert_read(record, truth)
+    bag.close()
