@@ -6,7 +6,7 @@ Derivation: docs/derivations.md, sections 8 and 10.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from smp_motor_ident.models import Structure
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]
 
+PRICE = 12.0  # deviance that torque noise must explain before it is believed
 HEAD = 12_000  # samples on which candidates and noise levels are compared
 
 
@@ -149,6 +150,9 @@ def cold_fit(
     ranked = sorted(starts, key=lambda z: _score(head, structure, z))
     best: Fit | None = None
     tried: list[Array] = []
+    if models.TE in structure.free() and not structure.current:
+        ranked = [shaped for z in _distinct(ranked, data.step, 2) for shaped in _shapes(z)]
+        keep = len(ranked)
     for z in ranked:
         if any(_alike(z, other, data.step) for other in tried):
             continue
@@ -161,6 +165,26 @@ def cold_fit(
             break
     assert best is not None
     return grow(data, structure, best, options)
+
+
+def _distinct(ranked: Sequence[Array], step: float, keep: int) -> list[Array]:
+    out: list[Array] = []
+    for z in ranked:
+        if len(out) < keep and not any(_alike(z, other, step) for other in out):
+            out.append(z)
+    return out
+
+
+def _shapes(z: Array) -> list[Array]:
+    """Return the same response with L/R at several of the values that it leaves open."""
+    out = []
+    for factor in (1.02, 1.5, 2.5):
+        shaped = z.copy()
+        shaped[models.TE] = z[models.A2] - z[models.A1] + np.log(factor)
+        par, _ = models.to_internal(shaped, 2)
+        if factor < 1.1 or par[2] > 0.05 * np.exp(z[models.A0]):
+            out.append(shaped)
+    return out
 
 
 def _alike(z: Array, other: Array, step: float) -> bool:
@@ -191,6 +215,29 @@ def refine(data: Experiments, structure: Structure, near: Fit, z: Array, options
         With the noise ratio of ``near``.
     """
     return _solve(data, structure, z, _initial(data, near), near.noise, near.ratio, options, 30)
+
+
+def restate(data: Experiments, structure: Structure, fit: Fit, options: Options) -> Fit:
+    """Return a fit's coordinates as the answer of a structure in which more is free.
+
+    Parameters
+    ----------
+    data : Experiments
+        What was fitted.
+    structure : Structure
+        What is free in the answer.
+    fit : Fit
+        With some of it held.
+    options : Options
+        Loss and prior knowledge.
+
+    Returns
+    -------
+    Fit
+        The same coordinates, with the information on all that is free.
+    """
+    once = _solve(data, structure, fit.z, fit.initial, fit.noise, fit.ratio, options, 1)
+    return replace(once, z=fit.z, initial=fit.initial, converged=fit.converged)
 
 
 def _score(head: Experiments, structure: Structure, z: Array) -> float:
@@ -295,11 +342,12 @@ def _find_ratio(part: Experiments, structure: Structure, first: Fit, options: Op
         )
         path.append((factor, here))
         worst = here.deviance - min(f.deviance for _, f in path)
-        if worst > 60 and factor > 0 and here.converged:
+        if factor > 0 and worst > (60 if here.converged else 2000):
             break
     factor, best = min(path, key=lambda item: item[1].deviance)
-    if factor == 0.0:
-        return best
+    free_run = path[-1][1]
+    if factor == 0.0 or (free_run.ratio == 0 and free_run.deviance < best.deviance + PRICE):
+        return free_run
     for finer in (1.8, 1 / 1.8):
         while True:
             ratio = ratio_of(band * factor * finer, part.step, part.kind)
@@ -323,6 +371,6 @@ def _at_rest(data: Experiments, structure: Structure, fit: Fit, options: Options
     if not slow.any():
         return fit
     initial = fit.initial.copy()
-    initial[slow, :2] = 0.0
+    initial[slow, 1] = 0.0
     other = _solve(data, structure, fit.z, initial, fit.noise, fit.ratio, options, 12)
     return other if other.deviance < fit.deviance else fit

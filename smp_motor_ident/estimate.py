@@ -17,6 +17,7 @@ from smp_motor_ident.experiments import Experiments, prepare
 from smp_motor_ident.fit import Fit, Prior
 from smp_motor_ident.ladder import Rung
 from smp_motor_ident.models import MODELS, PHYSICAL, Structure
+from smp_motor_ident.quantisation import widened
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import Candidate, Estimate, FitPercent
 from smp_motor_ident.screening import screen
@@ -100,6 +101,7 @@ def estimate(
         )
     chosen = _constrain(_for_final(data, rungs[-1].fit), rungs[-1].fit, options, known, bounds)
     final = _for_final(data, chosen)
+    chosen = widened(final, chosen)
     result = answer(chosen, known)
     fitted = validate.speed_fit(group, final, chosen)
     _refuse(group, chosen, result, fitted)
@@ -185,7 +187,8 @@ def _structure(
     if rung in ("auto", "electromechanical"):
         rung = "second_order"
     order = 2 if rung == "second_order" else 1
-    return Structure(rung, order, friction, load=asymmetric, held=held)
+    # How friction is felt depends on L/R, which the linear response leaves open.
+    return Structure(rung, order, friction, shape=order == 2, load=asymmetric, held=held)
 
 
 def _for_final(data: Experiments, fit: Fit) -> Experiments:

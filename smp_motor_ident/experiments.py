@@ -129,8 +129,40 @@ def output_of(record: Record, kind: str = "auto") -> tuple[Array, int, float]:
             return record.position - first, rc.ANGLE, 0.0
     if record.velocity is None:
         raise ValueError("record has no velocity")
-    window = record.velocity_window
-    return record.velocity, rc.MEAN_SPEED if window > 0 else rc.SPEED, 0.0
+    kind = rc.MEAN_SPEED if record.velocity_window > 0 else rc.SPEED
+    return record.velocity, kind, speed_quantum(record.velocity)
+
+
+def speed_quantum(velocity: Array) -> float:
+    """Return the step in which a speed comes, 0 where it comes in none.
+
+    A coarse step means that the speed is a difference of counts, so a mean over a window.
+
+    Parameters
+    ----------
+    velocity : ndarray, shape (n,)
+        [rad/s].
+
+    Returns
+    -------
+    float
+        [rad/s].
+    """
+    x = velocity[:20_000]
+    x = x[np.isfinite(x)]
+    if x.size < 50:
+        return 0.0
+    span = float(np.ptp(x))
+    levels = np.unique(x)
+    steps = np.diff(levels)
+    steps = steps[steps > 1e-6 * max(span, 1e-300)]
+    if steps.size < 4:
+        return 0.0
+    quantum = float(np.median(steps))
+    whole = (levels - levels[0]) / quantum
+    # Published logs round: a twentieth of a step is allowed.
+    regular = np.mean(np.abs(whole - np.round(whole)) < 0.05)
+    return quantum if regular > 0.95 and 2e-3 * span < quantum < 0.2 * span else 0.0
 
 
 def prepare(records: Sequence[Record], use_current: bool, kind: str = "auto") -> Experiments:
@@ -194,31 +226,63 @@ def _join(arrays: Sequence[Array]) -> Array:
 
 
 def _sections(record: Record) -> tuple[Array, Array, Integers]:
-    """Return the held input, with a single switch inside an interval put where it was.
+    """Return the input as it was held, as far as the mean voltages tell.
 
-    ``voltage[k]`` is a mean.  Where the intervals before and after are steady and differ,
-    the mean between tells the instant at which a two-level command switched.
+    ``voltage[k]`` is a mean.  Where the intervals before and after are steady and differ, a
+    two-level command switched inside, and the mean tells when.  A command that changes at
+    every sample switches at the same fraction of the interval as its jumps did nearby; its
+    levels before and after follow from the trend.
     """
     v, t = record.voltage, record.time
     index = np.arange(len(v), dtype=np.int64)
-    if len(v) < 6:
+    k, before = _jumps(record)
+    if k.size == 0:
         return t, v, index
+    first, second = v.copy(), v.copy()
+    share = np.zeros(len(v))
+    if k.size >= 4:
+        share = np.interp(index, k, before)
+        step = _trend(v)
+        step[[0, *record.starts]] = 0.0
+        first -= step * (1 - share)
+        second += step * share
+    share[k] = before
+    first[k], second[k] = v[k - 1], v[k + 1]
+    split = np.flatnonzero((first != second) & (share > 0.02) & (share < 0.98))
+    split = split[split > 0]
+    switch = t[split - 1] + share[split] * (t[split] - t[split - 1])
+    value = v.copy()
+    value[split] = second[split]
+    end = np.insert(t, split, switch)
+    value = np.insert(value, split, first[split])
+    shift = np.zeros(len(v), dtype=np.int64)
+    shift[split] = 1
+    return end, value, index + np.cumsum(shift)
+
+
+def _jumps(record: Record) -> tuple[Integers, Array]:
+    """Return intervals in which a two-level command switched, and after what part of each."""
+    v = record.voltage
+    none = np.zeros(0, dtype=np.int64), np.zeros(0)
+    if len(v) < 6:
+        return none
     jump = v[3:-1] - v[1:-3]
     inside = (v[2:-2] - v[1:-3]) * (v[3:-1] - v[2:-2]) > 0
     steady = np.maximum(np.abs(v[1:-3] - v[:-4]), np.abs(v[4:] - v[3:-1])) < 0.1 * np.abs(jump)
     k = np.flatnonzero(inside & steady) + 2
-    if k.size == 0:
-        return t, v, index
-    k = k[~np.isin(k, np.array(record.starts)) & ~np.isin(k + 1, np.array(record.starts))]
-    before = (v[k + 1] - v[k]) / (v[k + 1] - v[k - 1])
-    switch = t[k - 1] + before * (t[k] - t[k - 1])
-    value = v.copy()
-    value[k] = v[k + 1]
-    end = np.insert(t, k, switch)
-    value = np.insert(value, k, v[k - 1])
-    shift = np.zeros(len(v), dtype=np.int64)
-    shift[k] = 1
-    return end, value, index + np.cumsum(shift)
+    starts = np.array(record.starts)
+    k = k[~np.isin(k, starts) & ~np.isin(k - 1, starts) & ~np.isin(k + 1, starts)]
+    return (k, (v[k + 1] - v[k]) / (v[k + 1] - v[k - 1])) if k.size else none
+
+
+def _trend(v: Array) -> Array:
+    """Return by how much a smooth command changes per sample, 0 where it is not smooth."""
+    d = np.diff(v)
+    back, ahead = np.concatenate([[0.0], d]), np.concatenate([d, [0.0]])
+    mean = 0.5 * (back + ahead)
+    limit = 2 * np.minimum(np.abs(back), np.abs(ahead))
+    same = back * ahead > 0
+    return np.where(same, np.sign(mean) * np.minimum(np.abs(mean), limit), 0.0)
 
 
 def _initial(time: Array, output: Array, starts: Integers, kind: int) -> Array:

@@ -10,11 +10,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import NDArray
 
 from smp_motor_ident import models, recursion
 from smp_motor_ident.experiments import Experiments
+from smp_motor_ident.kalman import steady_gain
 from smp_motor_ident.models import Structure, to_internal
 
 Array = NDArray[np.float64]
@@ -74,6 +74,8 @@ class Fit:
         Whether the last step was small.
     samples, kind : int
         Of the data.
+    widen : ndarray, shape (f,), optional
+        Factors on the standard deviations, see `quantisation.widened`.
     """
 
     structure: Structure
@@ -90,6 +92,7 @@ class Fit:
     converged: bool
     samples: int
     kind: int
+    widen: Array | None = None
 
     def covariance(self) -> Array:
         """Return the covariance of the free coordinates, shape (f, f).
@@ -107,6 +110,8 @@ class Fit:
             sandwich = moved.T @ moved * (n / (n - 1))
             widen = np.sqrt(np.maximum(1.0, np.diag(sandwich) / np.maximum(np.diag(cov), 1e-300)))
             cov = cov * np.outer(widen, widen)
+        if self.widen is not None:
+            cov = cov * np.outer(self.widen, self.widen)
         return cov
 
 
@@ -181,7 +186,8 @@ def _shortest(data: Experiments) -> float:
 
 def _local(data: Experiments, structure: Structure) -> tuple[int, ...]:
     order1 = structure.order == 1
-    return ((1,) if order1 else (0, 1)) + ((2,) if data.kind == recursion.ANGLE else ())
+    angle = (2,) if data.kind == recursion.ANGLE else ()
+    return ((1,) if order1 else (0, 1)) + angle + ((3,) if structure.own_load else ())
 
 
 def whitening(noise: Array) -> Array:
@@ -235,6 +241,18 @@ def _pass(
         n_common += np.outer(row, row)
         g_common += row * miss
         total += miss * miss
+    sums = total + n_common.sum() + normal.sum() + gradient.sum()
+    if not np.isfinite(sums):
+        empty = np.zeros((f, f))
+        return Pass(
+            np.inf,
+            empty,
+            empty[:0].sum(axis=0),
+            local_step=np.zeros((len(normal), len(local))),
+            local_gain=np.zeros((len(normal), len(local), f)),
+            spread=np.full(6, np.nan),
+            scores=np.zeros((0, f)),
+        )
     n_local, g_local = normal[:, f:, f:], gradient[:, f:]
     cross = normal[:, f:, :f]
     scale = np.sqrt(np.einsum("gii->gi", n_local))
@@ -277,48 +295,13 @@ def kalman_gain(
     """
     gain = np.zeros((3, 2))
     innovation = np.diag([1.0, current_noise if current_noise > 0 else 1.0])
-    if ratio <= 0 or kind == recursion.MEAN_SPEED:
+    if ratio <= 0 or kind != recursion.ANGLE:
         return gain, innovation
     par, _ = to_internal(z, order)
-    te, tm, k, be = par[:4]
-    states = ([0] if order == 2 else []) + [1] + ([2] if kind == recursion.ANGLE else [])
-    a = np.zeros((3, 3))
-    if order == 2:
-        a[0, 0], a[0, 1], a[1, 0] = -1 / te, -k / te, 1 / tm
-        a[1, 1] = -be / tm
-    else:
-        a[1, 1] = -(k + be) / tm
-    a[2, 1] = 1.0
-    a = a[np.ix_(states, states)]
-    n = len(states)
-    drive = np.zeros(n)
-    drive[states.index(1)] = 1.0
-    # Van Loan: transition and noise covariance over one interval.
-    block = np.zeros((2 * n, 2 * n))
-    block[:n, :n], block[:n, n:], block[n:, n:] = -a, ratio * np.outer(drive, drive), a.T
-    e = scipy.linalg.expm(block * step)
-    transition = e[n:, n:].T
-    q = transition @ e[:n, n:]
-    c = np.zeros((1, n))
-    c[0, states.index(2 if kind == recursion.ANGLE else 1)] = 1.0
-    noise = np.array([[1.0]])
-    if current_noise > 0 and order == 2:
-        row = np.zeros((1, n))
-        row[0, 0] = 1 / par[7]
-        c = np.vstack([c, row])
-        noise = np.diag([1.0, current_noise])
-    q = (q + q.T) / 2
-    try:
-        p = scipy.linalg.solve_discrete_are(
-            transition.T, c.T, q + 1e-14 * np.trace(q) * np.eye(n), noise
-        )
-    except (np.linalg.LinAlgError, ValueError):
+    found, spread = steady_gain(*par[:4], par[7], step, ratio, current_noise)
+    if not np.all(np.isfinite(found)):
         return gain, innovation
-    s = c @ p @ c.T + noise
-    k_gain = np.linalg.solve(s, c @ p).T
-    gain[np.ix_(states, range(c.shape[0]))] = k_gain
-    innovation[: c.shape[0], : c.shape[0]] = s
-    return gain, innovation
+    return found, spread
 
 
 def solve(
@@ -382,6 +365,8 @@ def solve(
         here = _pass(data, structure, z, initial, start, gain, noise, huber, prior)
         passes += 1
         converged = False
+        if not np.isfinite(here.objective):
+            break
         while passes < iterations:
             step, frozen = _step(here, damping, matrix, z, lower, upper)
             trial = structure.complete(np.clip(z + matrix @ step, lower, upper))
@@ -422,10 +407,31 @@ def solve(
         fresh = _noise(here.spread, noise, has_current)
         same = np.abs(np.log(np.diag(fresh) / np.diag(noise))).max() < 2e-2
         only_scale = not has_current and not np.isfinite(huber)
-        if passes >= iterations or (converged and (same or (only_scale and ratio == 0))):
+        if (
+            passes >= iterations
+            or not np.isfinite(here.objective)
+            or (converged and (same or (only_scale and ratio == 0)))
+        ):
             break
         noise = fresh
     assert here is not None
+    if not np.isfinite(here.objective):
+        return Fit(
+            structure,
+            z,
+            initial,
+            noise,
+            ratio,
+            gain,
+            np.inf,
+            np.inf,
+            here.normal,
+            here.scores,
+            passes,
+            False,
+            data.size,
+            data.kind,
+        )
     final = _noise(here.spread, noise, has_current)
     grow = noise[0, 0] / final[0, 0]
     information, scores = here.normal, here.scores
@@ -618,8 +624,32 @@ def simulate(data: Experiments, fit: Fit, gain: bool = False) -> Array:
     return predicted
 
 
+def one_step(data: Experiments, fit: Fit) -> Array:
+    """Return the Gauss-Newton step that other outputs on the same motion would ask for.
+
+    Parameters
+    ----------
+    data : Experiments
+        With the outputs replaced.
+    fit : Fit
+        Where it starts.
+
+    Returns
+    -------
+    ndarray, shape (f,)
+        Of the free coordinates.
+    """
+    here = _pass(
+        data, fit.structure, fit.z, fit.initial, fit.initial, fit.gain, fit.noise, np.inf, ()
+    )
+    scale = np.sqrt(np.maximum(np.diag(here.normal), 1e-300))
+    scaled = here.normal / np.outer(scale, scale)
+    step = np.linalg.pinv(scaled, rcond=1e-13, hermitian=True) @ (here.gradient / scale) / scale
+    return np.asarray(step)
+
+
 def settle(data: Experiments, fit: Fit, iterations: int = 12) -> Fit:
-    """Fit only the initial states of other data, the motor as it is (free run).
+    """Fit only the initial states and constant loads of other data (free run).
 
     Parameters
     ----------
@@ -633,7 +663,7 @@ def settle(data: Experiments, fit: Fit, iterations: int = 12) -> Fit:
     Returns
     -------
     Fit
-        With the initial states of ``data``.
+        With the initial states and loads of ``data``; the motor is as it was.
     """
     free = fit.structure.free()
     held = {**fit.structure.held, **{models.Z_NAMES[i]: float(fit.z[i]) for i in free}}
@@ -641,7 +671,7 @@ def settle(data: Experiments, fit: Fit, iterations: int = 12) -> Fit:
         held["ln_te"] = float(fit.z[models.TE])
     if fit.structure.friction == "symmetric":
         held["vc_minus"] = float(fit.z[models.VC_MINUS])
-    structure = fit.structure.with_(held=held)
+    structure = fit.structure.with_(held=held, own_load=True)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         done = solve(data, structure, fit.z, data.initial, fit.noise, iterations=iterations)

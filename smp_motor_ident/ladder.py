@@ -77,7 +77,25 @@ def bic(fit: Fit) -> float:
     float
         Deviance + parameters x ln(samples).
     """
-    return fit.deviance + len(fit.structure.free()) * float(np.log(fit.samples))
+    return fit.deviance + size(fit.structure) * float(np.log(fit.samples))
+
+
+def size(structure: Structure) -> int:
+    """Return the number of parameters that a structure is charged for.
+
+    Parameters
+    ----------
+    structure : Structure
+        Any.
+
+    Returns
+    -------
+    int
+        L/R beside the response's own coefficients is not charged: leaving it free is honest
+        about what is not known, it claims nothing.
+    """
+    free = structure.free()
+    return len(free) - (models.TE in free and not structure.current)
 
 
 def inflation(fit: Fit) -> float:
@@ -112,7 +130,7 @@ def needed(simple: Fit, rich: Fit) -> tuple[bool, str]:
     reason : str
         In words.
     """
-    more = len(rich.structure.free()) - len(simple.structure.free())
+    more = size(rich.structure) - size(simple.structure)
     gained = (simple.deviance - rich.deviance) / inflation(rich)
     price = more * float(np.log(simple.samples))
     if not rich.converged and gained < 10 * price:
@@ -179,7 +197,7 @@ def explore(
         if found is None:
             return []
         best = found
-    best = _variations(data, best, options, rungs, say, auto)
+    best = _variations(data, best, options, rungs, say)
     reason = next((r.reason for r in rungs if r.fit is best), "")
     return [r for r in rungs if r.fit is not best] + [Rung(best, reason)]
 
@@ -187,46 +205,27 @@ def explore(
 def _cold(data: Experiments, s: Structure, options: Options, say: Say) -> Fit | None:
     say(f"fitting {label(s)}")
     if s.delay:
-        return _with_delay(data, s.with_(delay=False), options, None)
+        return _with_delay(data, s, options, None)
     return cold.cold_fit(data, s, options)
 
 
 def _orders(
     data: Experiments, base: Structure, options: Options, say: Say, rungs: list[Rung]
 ) -> Fit | None:
-    """Climb from first order without delay as far as the data ask."""
-    first = replace(base, name="first_order", order=1, shape=False)
-    second = replace(base, name="second_order", order=2)
+    """Climb, by the number of parameters, as far as the data ask."""
     best: Fit | None = None
-    for structure in (first, first.with_(delay=True), second, second.with_(delay=True)):
-        if "delay" in base.held and structure.delay:
-            continue
+    for structure in _ladder(base, data.kind == rc.SPEED, data.quantum > 0):
         say(f"fitting {label(structure)}")
-        if structure.delay:
-            plain = next(
-                (r.fit for r in rungs if r.fit.structure == structure.with_(delay=False)), None
-            )
-            fitted = _with_delay(data, structure.with_(delay=False), options, plain)
-        else:
-            extra = []
-            if structure.order == 2 and best is not None:
-                z = best.z.copy()
-                slow = np.exp(z[models.A1] - z[models.A0])
-                z[models.A2] = z[models.A1] + np.log(max(z[models.DELAY], 0.05 * slow))
-                z[models.TE] = z[models.A2] - z[models.A1]
-                z[models.DELAY] = 0.0
-                extra = [z]
-            fitted = cold.cold_fit(data, structure, options, extra)
+        fitted = _one(data, structure, options, [r.fit for r in rungs])
         if fitted is None:
             continue
         if best is None:
             best = fitted
             rungs.append(Rung(fitted, "the simplest"))
             continue
-        same_size = len(fitted.structure.free()) == len(best.structure.free())
-        if same_size:
-            verdict = fitted.deviance < best.deviance - 2 * inflation(fitted)
-            reason = f"{'fits better' if verdict else 'fits worse'} than {label(best.structure)}"
+        if size(fitted.structure) == size(best.structure):
+            verdict = fitted.deviance < best.deviance
+            reason = f"fits {'better' if verdict else 'worse'} than {label(best.structure)}"
         else:
             verdict, reason = needed(best, fitted)
         rungs.append(Rung(fitted, reason))
@@ -235,11 +234,56 @@ def _orders(
     return best
 
 
+def _ladder(base: Structure, speed: bool, coarse: bool) -> list[Structure]:
+    """Return the rungs by number of parameters.
+
+    A speed that comes in coarse steps is a difference of counts, a mean over a window by its
+    making: a second time constant is asked for beside that window, not in its place.
+    """
+    first = replace(base, name="first_order", order=1, shape=False)
+    second = replace(base, name="second_order", order=2, shape=True)
+    late, late2 = first.with_(delay=True), second.with_(delay=True)
+    if not speed:
+        rungs = [first, late, second, late2]
+    elif coarse:
+        rungs = [first, late, first.with_(window=True), late.with_(window=True)]
+        rungs += [second.with_(window=True), late2.with_(window=True)]
+    else:
+        rungs = [first, late, first.with_(window=True), second, late.with_(window=True)]
+        rungs += [second.with_(window=True), late2]
+    return [r for r in rungs if not (r.delay and "delay" in base.held)]
+
+
+def _one(data: Experiments, structure: Structure, options: Options, known: list[Fit]) -> Fit | None:
+    """Fit one rung, started from what the rungs below it found."""
+    if structure.window:
+        late = replace(structure, name="first_order", order=1, delay=True)
+        twin = _find(known, late) or _find(known, late.with_(window=False))
+        if twin is None or structure.order == 1:
+            twin = _find(known, structure.with_(window=False, delay=True))
+        return _averaged(data, structure, options, twin)
+    if structure.delay:
+        return _with_delay(data, structure, options, _find(known, structure.with_(delay=False)))
+    extra = []
+    if structure.order == 2 and known:
+        z = min(known, key=lambda f: f.deviance).z.copy()
+        slow = np.exp(z[models.A1] - z[models.A0])
+        z[models.A2] = z[models.A1] + np.log(max(z[models.DELAY] + z[models.WINDOW], 0.05 * slow))
+        z[models.TE] = z[models.A2] - z[models.A1]
+        z[models.DELAY] = 0.0
+        extra = [z]
+    return cold.cold_fit(data, structure, options, extra)
+
+
+def _find(known: list[Fit], structure: Structure) -> Fit | None:
+    return next((f for f in known if f.structure == structure), None)
+
+
 def _with_delay(
-    data: Experiments, structure: Structure, options: Options, plain: Fit | None
+    data: Experiments, delayed: Structure, options: Options, plain: Fit | None
 ) -> Fit | None:
     """Fit with a delay, started from several: the surface has a valley for each sample."""
-    delayed = structure.with_(delay=True)
+    structure = delayed.with_(delay=False)
     starts = []
     if plain is not None:
         z = plain.z.copy()
@@ -250,19 +294,32 @@ def _with_delay(
         for z in start.lagged_candidates(data, structure, lag):
             z[models.DELAY] = max(lag - 0.5, 0.1) * data.step
             starts.append(z)
-    return cold.cold_fit(data, delayed, options, starts, keep=4, own=False)
+    return _snap(data, cold.cold_fit(data, delayed, options, starts, keep=4, own=False), options)
 
 
-def _variations(
-    data: Experiments, best: Fit, options: Options, rungs: list[Rung], say: Say, auto: bool
-) -> Fit:
+def _snap(data: Experiments, fit: Fit | None, options: Options) -> Fit | None:
+    """Try a whole number of samples of delay: the surface has a kink there.
+
+    A switch of the input that falls on a sampling instant makes the derivative by the delay
+    jump; a descent that comes near such a point stays short of it.
+    """
+    if fit is None:
+        return None
+    best = fit
+    for n in {int(fit.z[models.DELAY] / data.step), int(fit.z[models.DELAY] / data.step) + 1}:
+        whole = fit.structure.with_(held={**fit.structure.held, "delay": n * data.step})
+        other = cold.refine(data, whole, fit, fit.z, options)
+        if other.deviance < best.deviance - 1:
+            best = cold.restate(data, fit.structure, other, options)
+    return best
+
+
+def _variations(data: Experiments, best: Fit, options: Options, rungs: list[Rung], say: Say) -> Fit:
     """Add what the data ask for, take away what they do not show."""
     s = best.structure
-    if data.kind == rc.SPEED and "window" not in s.held and auto:
-        best = _averaged(data, best, options, rungs, say)
+    if best.kind == rc.MEAN_SPEED:
+        data = data.as_mean_speed()
     trials: list[dict[str, object]] = []
-    if best.structure.order == 2 and not best.structure.current and not best.structure.shape:
-        trials.append({"shape": True})
     if best.structure.current:
         trials.append({"offset": True})
         if "delay" not in s.held and not best.structure.delay:
@@ -280,6 +337,8 @@ def _variations(
             z[models.DELAY] = 0.3 * data.step
         other = cold.refine(data, richer, best, z, options)
         verdict, reason = needed(best, other)
+        if verdict and other.ratio > 0:  # what looked like torque noise may have been this
+            other = cold.grow(data, richer, other, options)
         rungs.append(Rung(other, reason))
         if verdict:
             best = other
@@ -296,34 +355,29 @@ def _variations(
     return best
 
 
-def _averaged(data: Experiments, best: Fit, options: Options, rungs: list[Rung], say: Say) -> Fit:
-    """Try whether what looks like a delay is a speed averaged over a trailing window."""
-    say("trying a speed averaged over a window")
+def _averaged(
+    data: Experiments, structure: Structure, options: Options, twin: Fit | None
+) -> Fit | None:
+    """Fit a speed averaged over a window, started from what looked like a delay."""
+    if twin is None:
+        return None
+    lag = max(twin.z[models.DELAY] + 0.5 * twin.z[models.WINDOW], 0.5 * data.step)
+    starts = []
+    if twin.structure.window:
+        z = twin.z.copy()
+        z[models.A2] = z[models.A1] + np.log(0.1 * lag)
+        z[models.TE] = z[models.A2] - z[models.A1]
+        starts.append(z)
+    for width in (0.5, 1.0, 1.6) if structure.delay else (1.0, 2.0, 3.0):
+        z = twin.z.copy()
+        z[models.WINDOW] = max(width * lag, 1.01 * data.step)
+        z[models.DELAY] = max(lag - 0.5 * z[models.WINDOW], 0.1 * data.step)
+        if not structure.delay:
+            z[models.DELAY] = 0.0
+        if structure.order == 2 and twin.structure.order == 1:
+            z[models.A2] = z[models.A1] + np.log(0.3 * lag)
+            z[models.TE] = z[models.A2] - z[models.A1]
+        starts.append(z)
     mean = data.as_mean_speed()
-    plain = best.structure.with_(window=True, delay=False)
-    lag = max(best.z[models.DELAY], data.step)
-    candidates = []
-    for structure in (plain, plain.with_(delay=True)):
-        if "delay" in best.structure.held and structure.delay:
-            continue
-        starts = []
-        for width in (1.0, 2.0, 1.5) if not structure.delay else (1.0, 1.6, 0.5):
-            z = best.z.copy()
-            z[models.WINDOW] = max(width * lag, 1.01 * data.step)
-            z[models.DELAY] = max(lag - 0.5 * z[models.WINDOW], 0.1 * data.step)
-            if not structure.delay:
-                z[models.DELAY] = 0.0
-            starts.append(z)
-        fitted = cold.cold_fit(mean, structure, options, starts, keep=3, own=False)
-        if fitted is not None:
-            candidates.append(fitted)
-    for fitted in candidates:
-        if len(fitted.structure.free()) == len(best.structure.free()):
-            verdict = fitted.deviance < best.deviance - 2 * inflation(fitted)
-            reason = f"{'fits better' if verdict else 'fits worse'} than {label(best.structure)}"
-        else:
-            verdict, reason = needed(best, fitted)
-        rungs.append(Rung(fitted, reason))
-        if verdict:
-            best = fitted
-    return best
+    fitted = cold.cold_fit(mean, structure, options, starts, keep=3, own=False)
+    return _snap(mean, fitted, options) if structure.delay else fitted

@@ -71,6 +71,8 @@ class Structure:
         Whether te is a coordinate; if not, be = 0 (te = a2/a1), the motor of equal response.
     load, delay, window, offset : bool
         Whether these are coordinates.
+    own_load : bool
+        Whether every segment has a constant load of its own.
     held : mapping of str to float
         Coordinates held at a value (by name of `Z_NAMES`).
     """
@@ -84,6 +86,7 @@ class Structure:
     delay: bool = False
     window: bool = False
     offset: bool = False
+    own_load: bool = False
     held: Mapping[str, float] = field(default_factory=dict)
 
     def free(self) -> tuple[int, ...]:
@@ -130,6 +133,12 @@ class Structure:
             Coordinates that satisfy this structure.
         """
         z = z.copy()
+        for there, index in (
+            (self.load, LOAD),
+            (self.offset, OFFSET),
+            (self.delay, DELAY),
+        ):
+            z[index] = z[index] if there else 0.0
         for name, value in self.held.items():
             z[Z_NAMES.index(name)] = value
         if self.friction == "none":

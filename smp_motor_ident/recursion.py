@@ -386,8 +386,11 @@ def run(
         s[:] = 0.0
         for n in range(3):
             x[n] = initial[g, n]
+        # A speed of exactly zero under friction is a motor at rest, not a free number: the
+        # cost has a kink there.
+        at_rest = friction and initial[g, 1] == 0.0
         for j in range(local.shape[0]):
-            if local[j] < 3:
+            if local[j] < 3 and not (at_rest and local[j] == 1):
                 s[local[j], n_common + j] = 1.0
         load = par[LOAD] + initial[g, 3]
         section = section_start[g]

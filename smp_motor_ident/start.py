@@ -14,6 +14,7 @@ from scipy.signal import lfilter
 from smp_motor_ident import models
 from smp_motor_ident import recursion as rc
 from smp_motor_ident.experiments import Experiments
+from smp_motor_ident.propagator import WIDTH, first_order, second_order
 
 Array = NDArray[np.float64]
 
@@ -162,7 +163,7 @@ def speed_candidates(data: Experiments, order: int, lag: int = 0) -> list[Array]
     out: list[Array] = []
     if not grids:
         return out
-    for cutoff in cutoffs(data):
+    for cutoff in cutoffs(data, 7 if lag == 0 else 4):
         for friction in (True, False):
             rows, rhs = [], []
             for u in grids:
@@ -229,15 +230,17 @@ def _instruments(
 
 
 def _linear_response(u: Uniform, a0: float, a1: float, a2: float, vc: float) -> Array:
-    from scipy.signal import cont2discrete
-
-    if a2 > 0:
-        system = ([1.0], [a2, a1, a0])
-    else:
-        system = ([1.0], [a1, a0])
-    num, den, _ = cont2discrete(system, u.step, "zoh")
+    """Return the speed of the linear motor, friction taken off the voltage as a dead zone."""
+    row = np.zeros(WIDTH)
     drive = u.voltage - np.clip(u.voltage, -vc, vc)
-    return np.asarray(lfilter(num.ravel(), den, np.concatenate([drive[1:], drive[-1:]])))
+    if a2 > 0:
+        second_order(row, u.step, a2 / a1, a1, a0, 0.0)
+        b = [row[7], row[2] * row[6] - row[0] * row[7]]
+        a = [1.0, -row[0] - row[3], row[0] * row[3] - row[1] * row[2]]
+    else:
+        first_order(row, u.step, a1, a0, 0.0)
+        b, a = [row[7]], [1.0, -row[3]]
+    return np.asarray(lfilter(b, a, drive))
 
 
 def _to_z(theta: Array, order: int, friction: bool) -> Array | None:

@@ -46,15 +46,18 @@ def simulate(t, v, r, l, k, j, b, tc, load, substeps):
                     else:
                         lo = mid
                 ic, _ = _rk4(i, w, lo, u, direction, r, l, k, j, b, tc, tl)
-                angle += 0.5 * w * lo
+                _, wm = _rk4(i, w, lo / 2, u, direction, r, l, k, j, b, tc, tl)
+                angle += lo / 6 * (w + 4 * wm)
                 rest = h - lo
                 net = k * ic - tl
                 if abs(net) <= tc:
                     i1 = u / r + (ic - u / r) * np.exp(-rest * r / l)
                     w1 = 0.0
                 else:
-                    i1, w1 = _rk4(ic, 0.0, rest, u, np.sign(net), r, l, k, j, b, tc, tl)
-                    angle += 0.5 * w1 * rest
+                    s = np.sign(net)
+                    i1, w1 = _rk4(ic, 0.0, rest, u, s, r, l, k, j, b, tc, tl)
+                    _, wm = _rk4(ic, 0.0, rest / 2, u, s, r, l, k, j, b, tc, tl)
+                    angle += rest / 6 * (4 * wm + w1)
             else:
                 _, wm = _rk4(i, w, h / 2, u, direction, r, l, k, j, b, tc, tl)
                 angle += h / 6 * (w + 4 * wm + w1)
