@@ -34,7 +34,7 @@ PLAN = (
 
 DRIVE = (
     ("straight", 0.20, 0.0, 2.5),
-    ("arc", 0.15, -0.5, 2.5),
+    ("arc", 0.10, -0.25, 2.5),
     ("spin", 0.0, 1.0, 2.5),
     ("stop", 0.0, 0.0, 2.0),
 )
@@ -171,11 +171,11 @@ def start(processes: Processes, folder: Path, motors: Path, rate: float) -> step
         All nodes answer, all wheels report.
     """
     given = ["--ros-args", "-p", f"motors_file:={motors.resolve()}", "-p", f"rate:={rate}"]
-    processes.start("motor_plant", "motor_plant", *given)
+    processes.start("motor_plant", "motor_plant", *given, priority=1)
     for wheel in WHEELS:
         place = ["--ros-args", "-r", f"__ns:=/{wheel}", "-p", "autostart:=false"]
-        processes.start(f"{wheel}.wheel_pid", "wheel_pid", *place)
-    processes.start("skid_steer", "skid_steer")
+        processes.start(f"{wheel}.wheel_pid", "wheel_pid", *place, priority=1)
+    processes.start("skid_steer", "skid_steer", priority=1)
     robot = steps.Robot(processes, Conductor(processes), WHEELS, folder)
     nodes = ["/motor_plant", *robot.wheel_nodes(), "/skid_steer"]
     robot.conductor.ask("wait_for_nodes", nodes=nodes, timeout=30.0)

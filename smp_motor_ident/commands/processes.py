@@ -112,7 +112,7 @@ class Processes:
                 signal.signal(number, handler)
 
     def start(
-        self, name: str, node: str, *arguments: str, pipes: bool = False
+        self, name: str, node: str, *arguments: str, pipes: bool = False, priority: int = 0
     ) -> subprocess.Popen[bytes]:
         """Start a node.
 
@@ -126,6 +126,9 @@ class Processes:
             Passed on to it.
         pipes : bool
             Whether its standard input and output are pipes rather than the log.
+        priority : int
+            Real-time priority, if the system grants it; so a busy machine does not slow the
+            simulated robot down. 0 for none.
 
         Returns
         -------
@@ -142,7 +145,7 @@ class Processes:
                 stderr=log,
                 env=self._environment,
                 start_new_session=True,
-                preexec_fn=lambda: _end_with(parent),
+                preexec_fn=lambda: _prepare(parent, priority),
             )
         self._running[name] = process
         return process
@@ -242,13 +245,16 @@ def _command(node: str) -> list[str]:
     return [sys.executable, "-c", start]
 
 
-def _end_with(parent: int) -> None:
+def _prepare(parent: int, priority: int) -> None:
     """Between fork and exec: let the kernel end this process when `parent` dies."""
     _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
     if os.getppid() != parent:
         os._exit(1)
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_DFL)  # a shell's background job ignores SIGINT
+    if priority:
+        with contextlib.suppress(PermissionError):
+            os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(priority))
 
 
 def _signal(process: subprocess.Popen[bytes], number: int) -> None:

@@ -62,8 +62,12 @@ class Robot:
             self.conductor.ask("change_state", node=node, transition=transition)
 
 
+TOPICS = "/(.*/)?(motor_.*|pid_state|wheel_setpoints|cmd_vel|odom|joint_states|diagnostics)"
+"""What is worth keeping of a robot, for ``record``."""
+
+
 def record(robot: Robot, name: str) -> Path:
-    """Begin to record everything.
+    """Begin to record.
 
     Parameters
     ----------
@@ -78,7 +82,7 @@ def record(robot: Robot, name: str) -> Path:
         Where it is written.
     """
     bag = robot.folder / name
-    robot.processes.start("record", "record", "--output", str(bag))
+    robot.processes.start("record", "record", "--output", str(bag), "--regex", TOPICS)
     topics = [f"/{wheel}/motor_state" for wheel in robot.wheels]
     robot.conductor.ask("wait_for_listener", node="record", topics=topics, timeout=20.0)
     return bag
