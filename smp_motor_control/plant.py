@@ -1,8 +1,8 @@
 """A driven motor as its hardware shows it: supply, PWM, delay, time-out, encoder and sensors.
 
 Time comes in as an argument, in seconds on a clock that only goes forward.  Commands take
-effect at the instant at which they arrive, so a sample integrates over what really happened
-since the one before.
+effect when they arrive or, latched, at the next sample; a sample integrates over what really
+happened since the one before.
 """
 
 from __future__ import annotations
@@ -63,6 +63,9 @@ class DriveSettings:
         mean has the standard deviation ``torque_noise / sqrt(dt)``.
     velocity_window : int
         Samples over which the reported speed is averaged; 0 reports the true one.
+    latch : bool
+        Whether a command waits for the next sampling instant, as in firmware whose loop has a
+        fixed rate: every reported voltage was then constant over its interval.
 
     Raises
     ------
@@ -76,6 +79,7 @@ class DriveSettings:
     current_noise: float = 0.0
     torque_noise: float = 0.0
     velocity_window: int = 1
+    latch: bool = False
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -157,6 +161,7 @@ class DrivenMotor:
         self._random = random.Random(seed)
         self._speed = DifferencedSpeed(entry.encoder, max(1, settings.velocity_window))
         self._pending: deque[tuple[float, float]] = deque()
+        self._latched: float | None = None
         self._expiry = math.inf
         self._load = 0.0
         self._now = start
@@ -181,7 +186,10 @@ class DrivenMotor:
             Whether it was a number.
         """
         finite = math.isfinite(voltage)
-        self._pending.append((time + self.entry.delay, voltage if finite else 0.0))
+        if self.settings.latch:
+            self._latched = voltage if finite else 0.0
+        else:
+            self._pending.append((time + self.entry.delay, voltage if finite else 0.0))
         return finite
 
     def load(self, time: float, wheel_torque: float) -> bool:
@@ -265,6 +273,9 @@ class DrivenMotor:
             self._last_voltage = self._volt_seconds / elapsed
             self._volt_seconds = 0.0
             self._sampled = time
+        if self._latched is not None:
+            self._pending.append((time + self.entry.delay, self._latched))
+            self._latched = None
         entry, settings = self.entry, self.settings
         count = entry.encoder.count(self.motor.angle)
         current = math.nan

@@ -32,11 +32,12 @@ _DRIVE = {
     "current_sensor": "Whether the current is measured; reported as NaN where not.",
     "current_noise": "Standard deviation of the measured current [A].",
     "torque_noise": "Intensity of a random load at the motor shaft [N m sqrt(s)].",
+    "latch": "Whether commands wait for the next sample, as in firmware with a fixed rate.",
     "velocity_window": "Samples that the reported speed is differenced over; 0 for the true one.",
 }
 
 
-_DRIVE_DEFAULTS = DriveSettings(pwm_steps=1000, current_noise=0.01)
+_DRIVE_DEFAULTS = DriveSettings(pwm_steps=1000, current_noise=0.01, latch=True)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -147,3 +147,12 @@ def test_settings_out_of_range_are_refused():
         DriveSettings(pwm_steps=-1)
     with pytest.raises(ParameterError, match="current_noise"):
         DriveSettings(current_noise=math.nan)
+
+
+def test_a_latched_command_waits_for_the_next_sample():
+    plant = DrivenMotor(ENTRY, DriveSettings(latch=True))
+    plant.sample(0.01)
+    plant.command(0.012, 5.0)
+    plant.command(0.017, 6.0)  # the later one counts
+    assert plant.sample(0.02).voltage == 0.0
+    assert plant.sample(0.03).voltage == pytest.approx(6.0, rel=1e-12)  # rounding of a mean
