@@ -62,7 +62,7 @@ class ObserverNoise:
         When a value is not positive.
     """
 
-    load: float = 3.0
+    load: float = 1.0
     voltage: float = 0.005
     count: float = 1.0 / math.sqrt(12.0)
 
