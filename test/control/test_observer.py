@@ -1,0 +1,264 @@
+"""The speed observer against the exact motor and counts as an encoder gives them."""
+
+from __future__ import annotations
+
+import math
+import timeit
+
+import numpy as np
+import pytest
+
+from smp_motor_control.encoder import DifferencedSpeed, Encoder
+from smp_motor_control.errors import ParameterError
+from smp_motor_control.motor import Motor, MotorParameters
+from smp_motor_control.motor_model import MotorModel
+from smp_motor_control.observer import ObserverNoise, SpeedObserver
+
+# Table 1 of the paper, motors 1 (oscillating poles) and 2 (real poles), and one without L.
+MOTORS = {
+    "motor 1": MotorParameters(
+        resistance=12.919,
+        inductance=0.30994,
+        motor_constant=0.011029,
+        inertia=1.13e-6,
+        viscous_friction=2.4e-5,
+        coulomb_friction=3.8e-4,
+    ),
+    "motor 2": MotorParameters(
+        resistance=4.5516,
+        inductance=0.06754,
+        motor_constant=0.001761,
+        inertia=6.6e-7,
+        viscous_friction=2.23e-5,
+        coulomb_friction=1.5e-4,
+    ),
+    "first order": MotorParameters(
+        resistance=3.0,
+        inductance=0.0,
+        motor_constant=0.03,
+        inertia=1.4e-5,
+        viscous_friction=5e-5,
+        coulomb_friction=0.0,
+    ),
+}
+ENCODER = Encoder(500.0)
+
+
+def model_of(p: MotorParameters, **changes: float) -> MotorModel:
+    names = ("dc_gain", "time_constant", "time_constant_product", "static_voltage")
+    return MotorModel(**{**{name: getattr(p, name) for name in names}, **changes})
+
+
+def volts(t: float) -> float:
+    # Incommensurate with every sampling here, so that quantisation does not repeat.
+    return 6.0 + 2.0 * math.sin(8.3 * t) + 1.0 * math.sin(2.0 * math.pi * 0.31 * t)
+
+
+def errors_of(
+    p: MotorParameters,
+    observer: SpeedObserver,
+    dt: float,
+    duration: float = 2.0,
+    load: float = 0.0,
+    jitter: float = 0.0,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Errors of the observer and of differenced counts after the first 0.5 s [rad/s]."""
+    rng = np.random.default_rng(3)
+    motor, differenced = Motor(p), DifferencedSpeed(ENCODER)
+    time, seen, counted = 0.0, [], []
+    torque = load * p.motor_constant / p.resistance
+    while time < duration:
+        step = dt * (1.0 + jitter * rng.uniform(-1.0, 1.0))
+        voltage = volts(time)
+        motor.step(voltage, step, torque)
+        time += step
+        count = ENCODER.count(motor.angle)
+        speed, difference = observer.step(count, voltage, step), differenced.step(time, count)
+        if time > 0.5:
+            seen.append(speed - motor.speed)
+            counted.append(difference - motor.speed)
+    return np.array(seen), np.array(counted)
+
+
+def rms(x: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(x**2)))
+
+
+@pytest.mark.parametrize("name", MOTORS)
+@pytest.mark.parametrize("rate", [200.0, 1000.0])
+def test_error_is_at_most_half_of_differenced_counts(name: str, rate: float) -> None:
+    p = MOTORS[name]
+    # Every number of the model wrong by 1 %, as after a mediocre identification.
+    wrong = {n: 1.01 * getattr(p, n) for n in ("dc_gain", "time_constant")}
+    observer = SpeedObserver(model_of(p, **wrong), 1.0 / rate, ENCODER)
+    seen, counted = errors_of(p, observer, 1.0 / rate)
+    assert rms(seen) <= 0.5 * rms(counted)  # the issue's claim
+
+
+@pytest.mark.parametrize("name", MOTORS)
+def test_unknown_load_leaves_no_bias_and_is_told(name: str) -> None:
+    p = MOTORS[name]
+    observer = SpeedObserver(model_of(p), 0.005, ENCODER)
+    seen, _ = errors_of(p, observer, 0.005, duration=4.0, load=1.5)
+    # 700 samples of an error that is correlated over some 20 ms: mean known to 1/sqrt(175) of
+    # its rms of 0.4; a load that is not observed would leave 25 rad/s.
+    assert np.mean(seen) == pytest.approx(0.0, abs=0.1)
+    assert observer.load == pytest.approx(1.5, abs=0.3)  # its own steady deviation is 0.1 V
+    assert observer.trusted
+
+
+def test_jitter_of_a_fifth_of_the_interval_does_not_matter() -> None:
+    p = MOTORS["motor 1"]
+    observer = SpeedObserver(model_of(p), 0.005, ENCODER)
+    seen, _ = errors_of(p, observer, 0.005, jitter=0.2)
+    steady, _ = errors_of(p, SpeedObserver(model_of(p), 0.005, ENCODER), 0.005)
+    # The voltage is known exactly over every interval; gains are those of the nearest one.
+    assert rms(seen) <= 1.2 * rms(steady)
+
+
+def test_lost_samples_are_bridged_by_the_model() -> None:
+    p, dt = MOTORS["motor 1"], 0.005
+    motor, observer = Motor(p), SpeedObserver(model_of(p), dt, ENCODER)
+    errors = []
+    for k in range(600):
+        lost = 3 if k % 20 == 0 else 1
+        motor.step(6.0, lost * dt)
+        speed = observer.step(ENCODER.count(motor.angle), 6.0, lost * dt)
+        errors.append(speed - motor.speed)
+    assert rms(np.array(errors[200:])) < 0.5
+    assert observer.trusted
+
+
+def test_wrapping_counter_makes_no_difference() -> None:
+    p = MOTORS["motor 1"]
+    narrow, wide = Encoder(500.0, bits=12), Encoder(500.0)
+    motor = Motor(p)
+    observers = [SpeedObserver(model_of(p), 0.005, e) for e in (narrow, wide)]
+    for _ in range(800):
+        motor.step(8.0, 0.005)
+        speeds = [
+            observer.step(encoder.count(motor.angle), 8.0, 0.005)
+            for observer, encoder in zip(observers, (narrow, wide), strict=True)
+        ]
+        assert speeds[0] == pytest.approx(speeds[1], nan_ok=True)
+
+
+def test_known_delay_is_taken_into_account() -> None:
+    p, dt, delay = MOTORS["motor 2"], 0.005, 0.0075
+    motor = Motor(p)
+    aware = SpeedObserver(model_of(p, delay=delay), dt, ENCODER)
+    unaware = SpeedObserver(model_of(p), dt, ENCODER)
+    held, errors = [0.0] * 4, {aware: [], unaware: []}
+    for k in range(600):
+        voltage = 6.0 if k % 40 < 20 else 3.0
+        held.append(voltage)
+        # 1.5 samples late: half an interval of each of two earlier voltages.
+        motor.step(held[-3], dt / 2.0)
+        motor.step(held[-2], dt / 2.0)
+        for observer, found in errors.items():
+            found.append(observer.step(ENCODER.count(motor.angle), voltage, dt) - motor.speed)
+    late, right = rms(np.array(errors[unaware][200:])), rms(np.array(errors[aware][200:]))
+    assert right < 0.6
+    assert late > 2.0 * right
+
+
+@pytest.mark.parametrize("factor", [3.0, 0.3])
+def test_wrong_model_is_noticed_and_counts_take_over(factor: float) -> None:
+    p = MOTORS["motor 1"]
+    wrong = model_of(p, dc_gain=factor * p.dc_gain, time_constant=p.time_constant / factor)
+    observer = SpeedObserver(wrong, 0.005, ENCODER, window=1)
+    motor, differenced, fell_back = Motor(p), DifferencedSpeed(ENCODER), 0
+    for k in range(800):
+        voltage = 8.0 if k % 100 < 50 else 2.0
+        motor.step(voltage, 0.005)
+        count = ENCODER.count(motor.angle)
+        speed = observer.step(count, voltage, 0.005)
+        counted = differenced.step(0.005 * k, count)
+        if not observer.trusted:
+            fell_back += 1
+            assert speed == pytest.approx(counted)
+    assert fell_back > 40
+
+
+def test_trust_comes_back_when_model_and_counts_agree_again() -> None:
+    p = MOTORS["motor 1"]
+    motor, observer = Motor(p), SpeedObserver(model_of(p), 0.005, ENCODER)
+    trusted = []
+    for k in range(1200):
+        # For a second the motor gets another voltage than is reported.
+        reported = 6.0
+        motor.step(reported if not 400 <= k < 600 else (-6.0 if k % 40 < 20 else 6.0), 0.005)
+        observer.step(ENCODER.count(motor.angle), reported, 0.005)
+        trusted.append(observer.trusted)
+    assert all(trusted[100:400])
+    assert not all(trusted[400:600])
+    assert all(trusted[-200:])
+    assert observer.speed == pytest.approx(motor.speed, abs=1.5)  # four deviations of 0.35
+
+
+def test_load_beyond_what_is_possible_is_not_trusted() -> None:
+    p = MOTORS["motor 1"]
+    motor = Motor(p)
+    observer = SpeedObserver(model_of(p), 0.005, ENCODER, max_load=18.0)
+    trusted = True
+    for k in range(1000):
+        # The encoder counts backwards: the model needs twice the voltage as a load.
+        motor.step(11.0, 0.005)
+        observer.step(-ENCODER.count(motor.angle), 11.0, 0.005)
+        trusted = trusted and (observer.trusted or k < 200)
+    assert not trusted
+    assert observer.speed < 0.0
+
+
+def test_standstill_is_zero_whatever_voltage_sticks() -> None:
+    p = MOTORS["motor 1"]
+    motor, observer = Motor(p), SpeedObserver(model_of(p), 0.005, ENCODER)
+    for _ in range(400):
+        motor.step(0.3, 0.005)  # below the 0.45 V of dry friction
+        observer.step(ENCODER.count(motor.angle), 0.3, 0.005)
+    assert motor.speed == 0.0
+    assert observer.speed == pytest.approx(0.0, abs=1e-6)
+    assert observer.trusted
+
+
+@pytest.mark.parametrize("bad", [(math.nan, 0.005), (1.0, 0.0), (1.0, -0.1), (1.0, math.nan)])
+def test_sample_that_makes_no_sense_is_refused_and_changes_nothing(bad: tuple) -> None:
+    p = MOTORS["motor 1"]
+    disturbed, calm = (SpeedObserver(model_of(p), 0.005, ENCODER) for _ in range(2))
+    for observer in (disturbed, calm):
+        for k in range(20):
+            observer.step(3 * k, 6.0, 0.005)
+    with pytest.raises(ParameterError, match="observer"):
+        disturbed.step(60, *bad)
+    assert disturbed.step(61, 6.0, 0.005) == calm.step(61, 6.0, 0.005)
+
+
+def test_long_gap_begins_again_from_the_counts() -> None:
+    p = MOTORS["motor 1"]
+    motor, observer = Motor(p), SpeedObserver(model_of(p), 0.005, ENCODER)
+    for step in [0.005] * 200 + [3.0] + [0.005] * 200:
+        motor.step(6.0, step)
+        observer.step(ENCODER.count(motor.angle), 6.0, step)
+    assert observer.speed == pytest.approx(motor.speed, abs=1.5)
+
+
+@pytest.mark.parametrize("name", ["load", "voltage", "count"])
+@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf])
+def test_impossible_noise_is_refused_by_name(name: str, value: float) -> None:
+    with pytest.raises(ParameterError, match=name):
+        ObserverNoise(**{name: value})
+
+
+@pytest.mark.parametrize("name", ["dc_gain", "time_constant", "static_voltage", "delay"])
+@pytest.mark.parametrize("value", [-1.0, math.nan, math.inf])
+def test_impossible_model_is_refused_by_name(name: str, value: float) -> None:
+    numbers = {"dc_gain": 25.0, "time_constant": 0.05, name: value}
+    with pytest.raises(ParameterError, match=name):
+        MotorModel(**numbers)
+
+
+def test_one_step_takes_at_most_5_microseconds() -> None:
+    observer = SpeedObserver(model_of(MOTORS["motor 1"]), 0.005, ENCODER)
+    runs = timeit.repeat(lambda: observer.step(7, 6.0, 0.005), number=1000, repeat=20)
+    # 1 us on a quiet machine; the fastest of many short runs, as this one is shared.
+    assert min(runs) / 1000 <= 5e-6
