@@ -139,7 +139,11 @@ class LeanExecutor(SingleThreadedExecutor):
         if waits is None:
             self._plain = {}
             waits = self._waits = _WaitSet(self)
-        waits.wait()
+        try:
+            waits.wait()
+        except InvalidHandle:  # an event of something that was just destroyed
+            self._release()
+            return
         if not self.context.ok():
             raise ExternalShutdownException()
         waitables = waits.ready_waitables()
@@ -166,6 +170,10 @@ class LeanExecutor(SingleThreadedExecutor):
 
     def _gather_again(self) -> None:
         if self._waits is not None and self._waits.key != self.entities():
+            self._release()
+
+    def _release(self) -> None:
+        if self._waits is not None:
             self._waits.release()
             self._waits = None
 
@@ -235,7 +243,5 @@ class LeanExecutor(SingleThreadedExecutor):
         bool
             Whether all had ended.
         """
-        if self._waits is not None:
-            self._waits.release()
-            self._waits = None
+        self._release()
         return bool(super().shutdown(timeout_sec))
