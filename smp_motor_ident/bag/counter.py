@@ -90,6 +90,11 @@ def _resets(count: Integers, steps: Integers, guess: Array, measured: bool) -> I
     rest = np.abs(steps - guess)
     bound = _usual(steps, guess)
     fell = (rest > bound) & (np.abs(count[1:]) < bound) & (np.abs(count[:-1]) > bound)
+    # A reset is one jump between usual steps: what jumps to and fro is noise, not a reset.
+    usual = rest <= bound
+    fell[1:] &= usual[:-1]
+    fell[:-1] &= usual[1:]
+    fell[[0, -1]] = False
     if not measured:
         fell &= rest > 5 * np.maximum(np.quantile(np.abs(steps), 0.99), 1.0)
     found: Integers = np.flatnonzero(fell)

@@ -389,8 +389,11 @@ def _written(text: str, place: str) -> Signal:
     if match is None:
         raise BagError(f"{place}: {text!r} is not SOURCE[*SCALE][+OFFSET][:UNIT][@SHAFT]")
     source = match["source"].strip()
-    scale = _number("1" + re.sub(r"\s", "", match["scale"]).replace("-", ""), place)
-    scale *= -1.0 if match["scale"].count("-") % 2 else 1.0
+    scale = 1.0
+    for operator, number in re.findall(rf"([*/])\s*(-?{_NUMBER})", match["scale"]):
+        if operator == "/" and float(number) == 0:
+            raise BagError(f"{place}: {text!r} divides by zero")
+        scale = scale / float(number) if operator == "/" else scale * float(number)
     offset = _number(match["offset"].replace(" ", "") or "0", place)
     named = _TOPIC.fullmatch(source)  # anything else is a column of a CSV file
     topic, path = (named["topic"], named["field"].strip()) if named else ("", source.strip('"'))

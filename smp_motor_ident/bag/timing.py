@@ -67,15 +67,12 @@ def fit_clock(stamp: Integers, log: Integers) -> ClockFit:
     if span < 10 * _SECOND or stamp.size < 200:
         return ClockFit(float(base), 0.0, origin)
     part = np.minimum((since / span * 20).astype(np.int64), 19)
-    at, least = [], []
-    for k in range(20):
-        inside = np.flatnonzero(part == k)
-        if inside.size:
-            best = inside[np.argmin(late[inside])]
-            at.append(since[best])
-            least.append(late[best])
-    drift, offset = np.polyfit(at, least, 1)
-    return ClockFit(base + float(offset), float(drift), origin)
+    parts = [inside for k in range(20) if (inside := np.flatnonzero(part == k)).size]
+    drift = offset = 0.0
+    for _ in range(3):  # the fastest message of a part is judged without the drift inside it
+        best = np.array([inside[np.argmin((late - drift * since)[inside])] for inside in parts])
+        drift, offset = np.polyfit(since[best], late[best], 1).tolist()
+    return ClockFit(base + offset, drift, origin)
 
 
 def judge_stamps(stamp: Integers | None, log: Integers) -> str:
@@ -173,7 +170,9 @@ class Rhythm:
 
     def gap(self) -> float:
         """Return the interval [ns] beyond which two samples have nothing in common."""
-        return max(20 * self.interval, 0.02 * _SECOND)
+        if self.regular:
+            return max(20 * self.interval, 0.02 * _SECOND)
+        return max(100 * self.interval, 1.0 * _SECOND)
 
 
 def rhythm(time: Integers) -> Rhythm:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +34,7 @@ _STORES = (
 _LINE = "=" * 80 + "\n"
 
 
+@lru_cache(maxsize=512)
 def _parse(text: str, name: str, form: str) -> dict[str, Fields]:
     """Return the fields of all messages that a definition text holds."""
     if form == "ros2idl" or text.startswith(_LINE + "IDL: "):

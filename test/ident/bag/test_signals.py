@@ -102,7 +102,7 @@ def test_names_may_change_their_order_and_be_missing(
 def test_a_topic_whose_every_message_is_laid_out_otherwise_is_read(
     tmp_path: Path, corpus: SimpleNamespace
 ) -> None:
-    n = 300
+    n = 150
     values = np.random.default_rng(2).normal(size=n)
     messages = in_order(
         floats(corpus, "/pwm", values),

@@ -1,0 +1,128 @@
+"""The mapping's grammar, on the command line and in YAML."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from smp_motor_ident.bag import Signal, load, parse
+from smp_motor_ident.bag.mapping import of
+from smp_motor_ident.errors import BagError
+
+
+@pytest.mark.parametrize(
+    ("text", "signal"),
+    [
+        ("voltage=/pwm.data*12/255", Signal("/pwm", "data", 12 / 255, 0.0, "V")),
+        ("voltage=/a/b_c.d.e[3].f", Signal("/a/b_c", "d.e[3].f", 1.0, 0.0, "V")),
+        ("voltage=/pwm.data*-12/255", Signal("/pwm", "data", -12 / 255, 0.0, "V")),
+        ("voltage=/x.data-127*12/128", Signal("/x", "data", 1.0, -127 * 12 / 128, "V")),
+        ("voltage=/x.data*2e-3 + .5:mV", Signal("/x", "data", 2e-3, 0.5, "mV")),
+        ("voltage=/x.data:%", Signal("/x", "data", 1.0, 0.0, "%")),
+        (
+            "velocity=/joint_states.velocity[left_wheel_joint]:RPM@motor",
+            Signal("/joint_states", "velocity[left_wheel_joint]", 1.0, 0.0, "rpm", "motor"),
+        ),
+        ("velocity=y:deg/s", Signal("", "y", 1.0, 0.0, "deg/s")),
+        ("velocity=Motor_Speed(RPM):rpm", Signal("", "Motor_Speed(RPM)", 1.0, 0.0, "rpm")),
+        ('velocity="left-wheel speed"*2', Signal("", "left-wheel speed", 2.0, 0.0, "rad/s")),
+        ('velocity="a:b*c"', Signal("", "a:b*c", 1.0, 0.0, "rad/s")),
+        ("velocity=/plot/juggler/column", Signal("", "/plot/juggler/column", 1.0, 0.0, "rad/s")),
+        ("count=/enc.ticks:counts", Signal("/enc", "ticks", 1.0, 0.0, "ticks")),
+        ("time=Timestamp(ms):ms", Signal("", "Timestamp(ms)", 1.0, 0.0, "ms")),
+    ],
+)
+def test_a_signal_is_read_from_its_text(text: str, signal: Signal) -> None:
+    name = text.partition("=")[0]
+    mapping = parse([text])
+    signals = mapping.motors["motor"].signals if mapping.motors else mapping.defaults.signals
+    found = signals[name]
+    assert found.scale == pytest.approx(signal.scale, rel=1e-15)
+    assert found.offset == pytest.approx(signal.offset, rel=1e-15)
+    assert (found.topic, found.field, found.unit, found.shaft) == (
+        signal.topic,
+        signal.field,
+        signal.unit,
+        signal.shaft,
+    )
+
+
+def test_the_same_is_written_in_yaml_and_on_the_command_line(tmp_path: Path) -> None:
+    file = tmp_path / "map.yaml"
+    file.write_text(
+        "supply_voltage: 12\n"
+        "held: before\n"
+        "types: [msgs]\n"
+        "motors:\n"
+        "  left:\n"
+        "    voltage: {topic: /pwm, field: data, scale: 12/255, unit: V}\n"
+        "    velocity: /joint_states.velocity[left]:rpm\n"
+        "    gear_ratio: 65.5\n"
+    )
+    loaded = load(file)
+    items = [
+        "supply_voltage=12 held=before",
+        "left.voltage=/pwm.data*12/255",
+        "left.velocity=/joint_states.velocity[left]:rpm",
+        "left.gear_ratio=65.5",
+    ]
+    parsed = parse(items, [str(tmp_path / "msgs")])
+    assert loaded == parsed
+    assert of(str(file)) == of(file) == loaded
+    assert of(parsed) is parsed
+    assert of(items).motors == parsed.motors
+
+
+@pytest.mark.parametrize(
+    ("item", "reason"),
+    [
+        ("voltage", "write KEY=VALUE"),
+        ("voltage=", "write KEY=VALUE"),
+        ("volts=/a.b", "no key of a mapping; use voltage"),
+        ("left.volts=/a.b", "no key of a mapping"),
+        ("voltage=/a.b:furlong", "cannot be in 'furlong'; use one of V"),
+        ("velocity=/a.b*0", "leaves nothing"),
+        ("velocity=/a.b*1/0", "divides by zero"),
+        ("velocity=/a.b@axle", "'axle'; use wheel or motor"),
+        ("velocity=/a.b[c", "field path"),
+        ("gear_ratio=-3", "it must be a positive number"),
+        ("gear_ratio=fast", "must be a number"),
+        ("encoder_bits=65", "from 0 to 64"),
+        ("encoder_bits=1.5", "from 0 to 64"),
+        ("held=never", "use after or before"),
+        ("voltage=/a.b voltage=/c.d", "given twice"),
+        ("left.velocity=/a.b voltage=/c.d", "needs its wheel"),
+    ],
+)
+def test_what_is_wrong_is_named_with_what_it_may_be(item: str, reason: str) -> None:
+    with pytest.raises(BagError) as refused:
+        parse([item])
+    assert reason in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[1, 2]",
+        "motors: 3",
+        "motors: {left: 3}",
+        "motors: {left: {voltage: {topic: /a}}}",
+        "motors: {left: {voltage: {topic: /a, field: b, unti: V}}}",
+        "types: {a: 1}",
+        ":\n  - {",
+        "\tx: 1",
+    ],
+)
+def test_a_file_that_is_no_mapping_is_refused_by_its_name(tmp_path: Path, text: str) -> None:
+    file = tmp_path / "map.yaml"
+    file.write_text(text)
+    with pytest.raises(BagError, match=r"map\.yaml") as refused:
+        load(file)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_mapping_file_that_does_not_exist_is_named(tmp_path: Path) -> None:
+    with pytest.raises(BagError, match=r"nothing\.yaml"):
+        load(tmp_path / "nothing.yaml")

@@ -1,0 +1,413 @@
+"""Time: which clock, order, losses, gaps, wrap-around and held inputs."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+
+from smp_motor_ident.bag import BagWriter, join_records, read_records
+from smp_motor_ident.bag.counter import unwrap
+from smp_motor_ident.bag.timing import fit_clock, mean_held
+from smp_motor_ident.errors import BagError
+
+# Without shrinking, which takes minutes where an example is a whole bag.
+MANY = settings(
+    max_examples=25,
+    deadline=None,
+    suppress_health_check=list(HealthCheck),
+    phases=(Phase.explicit, Phase.reuse, Phase.generate),
+)
+
+
+def read(path: Path, corpus: SimpleNamespace, messages: list[Any], mapping: Any = None) -> Any:
+    path.unlink(missing_ok=True)
+    corpus.write_mcap(path, messages)
+    return next(iter(read_records(path, mapping).values()))
+
+
+def replaced(truth: Any, **changes: Any) -> Any:
+    return dataclasses.replace(truth, **changes)
+
+
+@MANY
+@given(data=st.data())
+def test_any_sequence_of_states_reads_back_as_it_was_written(
+    tmp_path_factory: pytest.TempPathFactory, corpus: SimpleNamespace, data: st.DataObject
+) -> None:
+    n = data.draw(st.integers(2, 60))
+    finite = st.floats(-1e12, 1e12)
+    column = st.lists(finite, min_size=n, max_size=n).map(np.array)
+    # Any intervals between half and one and a half of each other: no gap, no loss.
+    steps = data.draw(st.lists(st.integers(8_000_000, 12_000_000), min_size=n, max_size=n))
+    counts = data.draw(st.lists(st.integers(-(2**62), 2**62), min_size=n, max_size=n))
+    truth = corpus.Motion(
+        "rear_right",
+        corpus.START + np.cumsum(np.array(steps, np.int64)),
+        *(data.draw(column) for _ in range(4)),
+        count=np.array(counts, np.int64),
+    )
+    bag = tmp_path_factory.mktemp("bag") / "bag"
+    with BagWriter(bag) as writer:
+        for sent in truth.messages():
+            writer.write(sent.topic, sent.type, sent.data, sent.stamp)
+    corpus.assert_read(read_records(bag)["rear_right"], truth)
+
+
+@MANY
+@given(order=st.permutations(range(50)), storage=st.sampled_from(["mcap", "db3"]))
+def test_shuffled_samples_are_sorted_and_that_is_told(
+    tmp_path_factory: pytest.TempPathFactory,
+    corpus: SimpleNamespace,
+    order: list[int],
+    storage: str,
+) -> None:
+    truth = corpus.motion(n=50)
+    messages = truth.messages(description=False)
+    description = truth.messages()[:1]
+    path = tmp_path_factory.mktemp("bag") / f"bag.{storage}"
+    write = corpus.write_mcap if storage == "mcap" else corpus.write_sqlite
+    write(path, [*description, *(messages[k] for k in order)])
+    record = read_records(path)["front_left"]
+    corpus.assert_read(record, truth)
+    shuffled = list(order) != sorted(order)
+    assert ("out of order" in " ".join(record.notes)) is shuffled
+
+
+@MANY
+@given(
+    bits=st.sampled_from([8, 12, 16, 24, 31, 32, 48, 63, 64]),
+    seed=st.integers(0, 2**32 - 1),
+    told=st.booleans(),
+)
+def test_a_counter_that_wraps_at_any_width_is_unwrapped(bits: int, seed: int, told: bool) -> None:
+    rng = np.random.default_rng(seed)
+    # A motor's counts change smoothly, by at most a sixteenth of the range from sample to sample.
+    speed = np.sin(np.arange(400) / rng.uniform(20, 60)) * 2.0 ** min(bits - 4, 40)
+    truth = np.cumsum(speed.astype(np.int64)) + rng.integers(0, 2 ** min(bits - 1, 40))
+    half = np.int64(64 - bits)
+    raw = (truth << half) >> half
+    if not told and bits not in (16, 32):
+        return
+    found = unwrap(raw, bits if told else None)
+    np.testing.assert_array_equal(found.count - found.count[0], truth - truth[0])
+    assert found.resets.size == 0
+    wrapped = bool((raw != truth - truth[0] + raw[0]).any())
+    if not told:
+        assert bool(found.notes) == wrapped
+
+
+@pytest.mark.parametrize("bits", [16, 32])
+def test_a_wrapping_counter_in_a_bag_follows_its_description(
+    tmp_path: Path, corpus: SimpleNamespace, bits: int
+) -> None:
+    truth = corpus.motion(n=400, bits=bits)
+    fast = 2 ** (bits - 3)
+    truth = replaced(truth, count=np.arange(400, dtype=np.int64) * fast - 3 * fast)
+    # The measured speed agrees, as a motor's does.
+    rate = fast / 0.01 * 2 * np.pi / corpus.COUNTS / corpus.RATIO
+    truth = replaced(truth, velocity=np.full(400, rate))
+    record = read(tmp_path / "bag.mcap", corpus, truth.messages())
+    np.testing.assert_array_equal(np.diff(record.count), fast)
+    assert record.starts == (0,)
+
+
+def test_a_narrow_counter_faster_than_half_its_range_follows_the_speed(
+    tmp_path: Path, corpus: SimpleNamespace
+) -> None:
+    truth = corpus.motion(n=200, bits=8)
+    count = np.arange(200, dtype=np.int64) * 700  # 2.7 ranges a sample
+    rate = 700 / 0.01 * 2 * np.pi / corpus.COUNTS / corpus.RATIO
+    truth = replaced(truth, count=count, velocity=np.full(200, rate))
+    record = read(tmp_path / "bag.mcap", corpus, truth.messages())
+    np.testing.assert_array_equal(record.count - record.count[0], count)
+
+
+def test_a_reset_counter_begins_a_new_segment(tmp_path: Path, corpus: SimpleNamespace) -> None:
+    truth = corpus.motion(n=300)
+    count = np.arange(300, dtype=np.int64) * 50 + 20_000
+    count[120:] -= count[120]
+    rate = 50 / 0.01 * 2 * np.pi / corpus.COUNTS / corpus.RATIO
+    truth = replaced(truth, count=count, velocity=np.full(300, rate))
+    record = read(tmp_path / "bag.mcap", corpus, truth.messages())
+    assert record.starts == (0, 120)
+    assert np.all(np.diff(record.count)[np.arange(299) != 119] == 50)
+    assert "reset 1 times" in " ".join(record.notes)
+
+
+def test_a_few_lost_samples_are_bridged_and_more_begin_a_segment(
+    tmp_path: Path, corpus: SimpleNamespace
+) -> None:
+    truth = corpus.motion(n=400)
+    ramp = np.linspace(-10, 10, 400)
+    truth = replaced(truth, voltage=ramp)
+    lost = [50, 100, 101, *range(200, 205), *range(300, 350)]
+    kept = np.setdiff1d(np.arange(400), lost)
+    messages = truth.messages()
+    some = [messages[0], *(messages[1 + k] for k in kept)]
+    record = read(tmp_path / "bag.mcap", corpus, some)
+    assert len(record) == kept.size
+    assert [int(kept[s]) for s in record.starts] == [0, 205, 350]
+    notes = " ".join(record.notes)
+    assert "3 samples missing in 2 places" in notes
+    assert "2 gaps of up to 0.51 s (55 samples missing)" in notes
+    # The mean of a ramp over two and three intervals, of which only the last was seen.
+    step = ramp[1] - ramp[0]
+    index = list(kept)
+    assert record.voltage[index.index(51)] == pytest.approx(ramp[51] - step / 2)
+    assert record.voltage[index.index(102)] == pytest.approx(ramp[102] - step)
+    untouched = np.setdiff1d(np.arange(kept.size), [index.index(51), index.index(102)])
+    np.testing.assert_array_equal(record.voltage[untouched], ramp[kept][untouched])
+
+
+def test_late_samples_are_not_taken_for_lost_ones(tmp_path: Path, corpus: SimpleNamespace) -> None:
+    truth = corpus.motion(n=400)
+    time = truth.time.copy()
+    # A stall of four periods, after which the sampler catches up in a burst.
+    for k in (60, 200, 330):
+        time[k : k + 4] = time[k + 3] + np.arange(4) * 100_000
+    truth = replaced(truth, time=time)
+    record = read(tmp_path / "bag.mcap", corpus, truth.messages())
+    corpus.assert_read(record, truth)
+    assert record.starts == (0,)
+    assert "missing" not in " ".join(record.notes)
+
+
+def test_duplicates_are_left_out_and_told(tmp_path: Path, corpus: SimpleNamespace) -> None:
+    truth = corpus.motion(n=100)
+    messages = truth.messages()
+    record = read(tmp_path / "bag.mcap", corpus, [*messages, *messages[40:60]])
+    corpus.assert_read(record, truth)
+    assert "20 samples have the time of another and were left out (duplicates)" in " ".join(
+        record.notes
+    )
+
+
+def test_samples_without_a_voltage_are_left_out_and_told(
+    tmp_path: Path, corpus: SimpleNamespace
+) -> None:
+    truth = corpus.motion(n=100)
+    voltage, current = truth.voltage.copy(), np.full(100, np.nan)
+    voltage[[10, 40]] = np.nan, np.inf
+    velocity = truth.velocity.copy()
+    velocity[70] = np.nan
+    truth = replaced(truth, voltage=voltage, current=current, velocity=velocity)
+    record = read(tmp_path / "bag.mcap", corpus, truth.messages())
+    assert len(record) == 98
+    assert record.current is None
+    assert np.isnan(record.velocity).sum() == 1
+    notes = " ".join(record.notes)
+    assert "2 samples without a finite voltage were left out" in notes
+    assert "velocity: 1 values missing" in notes
+
+
+@pytest.mark.parametrize("days", [0, 3, -3])
+def test_header_stamps_days_away_from_the_log_are_used_and_that_is_told(
+    tmp_path: Path, corpus: SimpleNamespace, days: int
+) -> None:
+    truth = corpus.motion(n=100)
+    record = read(tmp_path / "bag.mcap", corpus, truth.messages(latency=days * 86_400 * 10**9 + 7))
+    corpus.assert_read(record, truth)
+    notes = " ".join(record.notes)
+    assert "time: header stamps" in notes
+    assert (f"{days * 86400:+d}.000000 s from the header's" in notes) is bool(days)
+
+
+def test_stamps_that_are_not_set_are_not_the_time(tmp_path: Path, corpus: SimpleNamespace) -> None:
+    truth = corpus.motion(n=100)
+    unset = replaced(truth, time=np.zeros(100, np.int64))
+    messages = [
+        dataclasses.replace(sent, stamp=int(truth.time[k]))
+        for k, sent in enumerate(unset.messages(description=False))
+    ]
+    record = read(tmp_path / "bag.mcap", corpus, [*truth.messages()[:1], *messages])
+    corpus.assert_read(record, truth)
+    assert "time: log times (the header stamps are not set)" in " ".join(record.notes)
+
+
+def test_a_clock_that_was_set_back_begins_a_new_segment(
+    tmp_path: Path, corpus: SimpleNamespace
+) -> None:
+    truth = corpus.motion(n=200)
+    stamps = truth.time.copy()
+    stamps[100:] -= 3_600 * 10**9
+    messages = [
+        dataclasses.replace(sent, stamp=int(truth.time[k]))
+        for k, sent in enumerate(replaced(truth, time=stamps).messages(description=False))
+    ]
+    record = read(tmp_path / "bag.mcap", corpus, [*truth.messages()[:1], *messages])
+    assert record.starts == (0, 100)
+    np.testing.assert_array_equal(record.voltage, truth.voltage)
+    assert "set back 1 times" in " ".join(record.notes)
+
+
+def floats(corpus: SimpleNamespace, topic: str, times: Any, values: Any) -> list[Any]:
+    kind = "std_msgs/msg/Float64"
+    return [
+        corpus.Sent(topic, kind, int(t), corpus.serialized(kind, data=float(v)))
+        for t, v in zip(times, values)
+    ]
+
+
+def test_a_stamped_output_meets_an_unstamped_input_by_offset_and_drift(
+    tmp_path: Path, corpus: SimpleNamespace
+) -> None:
+    rng = np.random.default_rng(5)
+    n, drift, offset = 3000, 50e-6, 12_345.678
+    sampled = np.arange(n) * 0.01  # the microcontroller's clock
+    on_log = sampled * (1 + drift) + offset
+    latency = 0.0002 + rng.exponential(0.0005, n)
+    messages = []
+    for k in range(n):
+        data = corpus.serialized(
+            "sensor_msgs/msg/JointState",
+            header=corpus.header(corpus.START + round(sampled[k] * 1e9), ""),
+            name=["w"],
+            position=np.zeros(0),
+            velocity=np.array([on_log[k]]),
+            effort=np.zeros(0),
+        )
+        stamp = corpus.START + round((on_log[k] + latency[k]) * 1e9)
+        messages.append(corpus.Sent("/js", "sensor_msgs/msg/JointState", stamp, data))
+    # The input is its own time, so that an error of alignment is an error of voltage.
+    input_times = np.arange(n // 2) * 0.02 + offset
+    stamps = corpus.START + np.rint(input_times * 1e9).astype(np.int64)
+    messages = sorted(messages + floats(corpus, "/u", stamps, input_times), key=lambda s: s.stamp)
+    record = read(
+        tmp_path / "bag.mcap", corpus, messages, "voltage=/u.data velocity=/js.velocity[w]"
+    )
+    notes = " ".join(record.notes)
+    assert "offset and drift" in notes
+    assert "drifting by +50 ppm" in notes
+    # Mean over the interval of what was held: at most one input period old, none in the future.
+    lag = record.velocity - record.voltage
+    assert lag.min() >= 0.0
+    # Half an output period plus up to one input period, plus latency that cannot be known.
+    assert lag.max() < 0.005 + 0.02 + 0.001
+
+
+def test_offset_and_drift_are_found_below_the_latency() -> None:
+    rng = np.random.default_rng(6)
+    stamp = np.arange(60_000, dtype=np.int64) * 1_000_000
+    latency = rng.exponential(2_000_000, stamp.size).astype(np.int64)
+    log = stamp + 5_000_000_000 + (stamp * 100e-6).astype(np.int64) + latency
+    fit = fit_clock(stamp, log)
+    # The fastest of 3000 messages is late by 2 ms / 3000: a microsecond, a little more by chance.
+    assert fit.offset == pytest.approx(5e9, abs=10_000)
+    assert fit.drift == pytest.approx(100e-6, abs=1e-6)
+
+
+@MANY
+@given(data=st.data(), held=st.sampled_from(["after", "before"]))
+def test_a_held_input_is_averaged_over_each_interval(data: st.DataObject, held: str) -> None:
+    increasing = st.sets(st.integers(0, 1000), min_size=2, max_size=30).map(sorted)
+    time = np.array(data.draw(increasing), np.int64) * 1_000_000
+    value = np.array([data.draw(st.floats(-10, 10)) for _ in time])
+    at = np.array(data.draw(increasing), np.int64) * 1_000_000
+    at = at[at >= time[0]]
+    if at.size < 2:
+        return
+    found = mean_held(time, value, held, at)
+    # By brute force, millisecond by millisecond.
+    grid = np.arange(1_000_000, 1_001_000_000, 1_000_000)  # ends of the milliseconds
+    if held == "after":
+        level = value[np.maximum(np.searchsorted(time, grid - 1_000_000, "right") - 1, 0)]
+    else:
+        level = value[np.minimum(np.searchsorted(time, grid, "left"), value.size - 1)]
+    for k in range(1, at.size):
+        inside = (grid > at[k - 1]) & (grid <= at[k])
+        # Rounding of a running integral over at most 10 V s.
+        assert found[k] == pytest.approx(level[inside].mean(), abs=1e-9)
+
+
+def test_samples_before_the_first_command_are_left_out(
+    tmp_path: Path, corpus: SimpleNamespace
+) -> None:
+    times = corpus.START + np.arange(100) * 10_000_000
+    messages = sorted(
+        floats(corpus, "/w", times, np.arange(100)) + floats(corpus, "/u", times[30:], np.ones(70)),
+        key=lambda sent: sent.stamp,
+    )
+    record = read(tmp_path / "bag.mcap", corpus, messages, "voltage=/u.data velocity=/w.data")
+    assert len(record) == 70
+    assert "30 samples before the first voltage were left out" in " ".join(record.notes)
+
+
+def test_an_input_that_stops_ends_the_record_there(tmp_path: Path, corpus: SimpleNamespace) -> None:
+    times = corpus.START + np.arange(200) * 10_000_000
+    on = np.r_[0:60, 140:200]
+    messages = sorted(
+        floats(corpus, "/w", times, np.arange(200)) + floats(corpus, "/u", times[on], np.ones(120)),
+        key=lambda sent: sent.stamp,
+    )
+    record = read(tmp_path / "bag.mcap", corpus, messages, "voltage=/u.data velocity=/w.data")
+    notes = " ".join(record.notes)
+    assert "no voltage came for more than 0.2 s" in notes
+    assert len(record.starts) == 2
+
+
+def test_outputs_of_several_topics_come_onto_one_axis(
+    tmp_path: Path, corpus: SimpleNamespace
+) -> None:
+    fast = corpus.START + np.arange(400) * 5_000_000
+    slow = corpus.START + np.arange(200) * 10_000_000 + 1_000_000
+    messages = sorted(
+        floats(corpus, "/u", slow, np.ones(200))
+        + floats(corpus, "/pos", slow, np.arange(200) * 0.01)
+        + floats(corpus, "/w", fast, np.arange(400) * 0.5),
+        key=lambda sent: sent.stamp,
+    )
+    record = read(
+        tmp_path / "bag.mcap",
+        corpus,
+        messages,
+        "voltage=/u.data position=/pos.data velocity=/w.data",
+    )
+    assert record.sample_time == pytest.approx(0.01)
+    # A straight line is interpolated exactly, but for rounding.
+    np.testing.assert_allclose(record.velocity, (record.time + 0.001) * 100, rtol=1e-9)
+    assert "velocity: interpolated" in " ".join(record.notes)
+
+
+def test_an_angle_that_wraps_at_a_turn_is_unwrapped(
+    tmp_path: Path, corpus: SimpleNamespace
+) -> None:
+    times = corpus.START + np.arange(300) * 10_000_000
+    angle = np.arange(300) * 7.0
+    messages = sorted(
+        floats(corpus, "/u", times, np.ones(300)) + floats(corpus, "/angle", times, angle % 360),
+        key=lambda sent: sent.stamp,
+    )
+    record = read(
+        tmp_path / "bag.mcap", corpus, messages, "voltage=/u.data position=/angle.data:deg"
+    )
+    np.testing.assert_allclose(np.diff(record.position), np.deg2rad(7.0), rtol=1e-9)
+    assert "wraps at one turn" in " ".join(record.notes)
+
+
+def test_recordings_of_different_gearboxes_are_not_joined(
+    tmp_path: Path, corpus: SimpleNamespace
+) -> None:
+    record = read(tmp_path / "bag.mcap", corpus, corpus.motion(n=20).messages())
+    other = dataclasses.replace(
+        record, hardware=dataclasses.replace(record.hardware, gear_ratio=1.0)
+    )
+    with pytest.raises(BagError, match=r"gear_ratio is 65\.5"):
+        join_records([record, other])
+
+
+def test_what_only_some_recordings_have_stays_known_where_it_is(
+    tmp_path: Path, corpus: SimpleNamespace
+) -> None:
+    record = read(tmp_path / "bag.mcap", corpus, corpus.motion(n=20).messages())
+    other = dataclasses.replace(record, current=None)
+    joined = join_records([record, other])
+    np.testing.assert_array_equal(joined.current[:20], record.current)
+    assert np.isnan(joined.current[20:]).all()
+    assert np.all(np.diff(joined.time) > 0)
