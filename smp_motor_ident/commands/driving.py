@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 SMOOTHING = 0.05
 """Length [s] of the parabola whose slope is taken as the speed."""
 
-LEAST_CHANGE = 0.5
+LEAST_CHANGE = 0.8
 """A smaller change of the set-point [rad/s, wheel] is no step to judge."""
 
 
