@@ -40,9 +40,6 @@ class Controller:
     filter_time: float = 0.0
     weight: float = 1.0
     weight_d: float = 0.0
-    velocity: float = 0.0
-    acceleration: float = 0.0
-    static: float = 0.0
     tracking: float = np.inf
 
     def array(self) -> np.ndarray:
@@ -89,10 +86,10 @@ def _advance(i, w, v, R, L, K, J, b, tc, load, h, steps):
 
 @numba.njit(cache=True)
 def _run(
-    motor, controller, T, delay, counts, window, supply, tc, gain, start, reference, rate, load
+    motor, controller, T, delay, counts, window, supply, tc, gain, start, reference, forward, load
 ):
     R, L, K, J, b = motor
-    p, ki, d, tf, weight, weight_d, velocity, lead, static, tracking = controller
+    p, ki, d, tf, weight, weight_d, tracking = controller
     n = reference.size
     speed, volts, measured_speed = np.empty(n), np.empty(n), np.empty(n)
     whole = int(delay / T + 1e-9)
@@ -123,9 +120,7 @@ def _run(
             previous, begun = (weight_d - 1) * y, True
         rate_d = (tf * rate_d + slope - previous) / (tf + T)
         previous = slope
-        forward = velocity * r + lead * rate[k]
-        forward += static if (r > 0 or (r == 0 and rate[k] > 0)) else (-static if r < 0 else 0.0)
-        wanted = p * (weight * r - y) + integral + d * rate_d + forward
+        wanted = p * (weight * r - y) + integral + d * rate_d + forward[k]
         if k == 0 and start != 0.0:
             # Settled at the start: the integral holds whatever the other terms do not.
             integral -= wanted - sent[0]
@@ -154,7 +149,7 @@ def _run(
     return speed, volts, measured_speed
 
 
-def run(motor, controller, conditions, reference, rate=None, load=None):
+def run(motor, controller, conditions, reference, forward=None, load=None):
     """Return true speed [rad/s], voltage [V] and measured speed at the sampling instants.
 
     ``motor`` is R, L, K, J, b; ``load`` a torque [N m] at each sample.
@@ -164,17 +159,34 @@ def run(motor, controller, conditions, reference, rate=None, load=None):
     return _run(
         np.array(motor, dtype=float), controller.array(), c.sample_time, c.delay, c.counts,
         c.window, c.supply, c.coulomb, c.gain, c.start, np.asarray(reference, dtype=float),
-        zero if rate is None else rate, zero if load is None else load,
+        zero if forward is None else forward, zero if load is None else load,
     )  # fmt: skip
 
 
 def minimum_jerk(distance, duration, time):
-    """Return the minimum-jerk change of speed and its rate."""
+    """Return the minimum-jerk change of speed, its rate and its jerk."""
     s = np.clip(time / duration, 0.0, 1.0)
     return (
         distance * (10 * s**3 - 15 * s**4 + 6 * s**5),
         distance / duration * (30 * s**2 - 60 * s**3 + 30 * s**4),
+        distance / duration**2 * (60 * s - 180 * s**2 + 120 * s**3),
     )
+
+
+def as_delivered(design, distance, time, ratio=RATIO):
+    """Return reference and feed-forward of a planned change as the wheel node makes them.
+
+    The wheel node takes the error from the reference ``lag`` ago; gains are per wheel rad/s.
+    """
+    gains, plan, model = design.gains, design.reference, design.motor
+    stretched = 1.875 * abs(distance) / plan.max_acceleration
+    duration = max(plan.transition_time, stretched)
+    speed, rate, jerk = minimum_jerk(distance, duration, time)
+    bend = model["time_constant_product"] / model["time_constant"]
+    forward = gains.feedforward_velocity * speed
+    forward += gains.feedforward_acceleration * (rate + bend * jerk)
+    forward = forward / ratio + gains.feedforward_static * np.sign(rate + speed)
+    return minimum_jerk(distance, duration, np.maximum(time - plan.lag, 0.0))[0], forward
 
 
 def settling(time, speed, final, band=0.02):
@@ -193,8 +205,11 @@ def from_gains(gains, ratio=RATIO):
     """Return the controller of a design's ``PidGains``, which are per wheel rad/s."""
     tracking = gains.tracking_time_constant
     return Controller(
-        gains.p / ratio, gains.i / ratio, gains.d / ratio, gains.derivative_filter_time_constant,
-        gains.setpoint_weight_p, gains.setpoint_weight_d, gains.feedforward_velocity / ratio,
-        gains.feedforward_acceleration / ratio, gains.feedforward_static,
+        gains.p / ratio,
+        gains.i / ratio,
+        gains.d / ratio,
+        gains.derivative_filter_time_constant,
+        gains.setpoint_weight_p,
+        gains.setpoint_weight_d,
         tracking if gains.antiwindup_strategy == "back_calculation" else np.inf,
-    )  # fmt: skip
+    )

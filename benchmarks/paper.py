@@ -20,8 +20,8 @@ from closed_loop import (
     TABLE_2,
     Conditions,
     Controller,
+    as_delivered,
     from_gains,
-    minimum_jerk,
     overshoot,
     run,
     settling,
@@ -259,9 +259,9 @@ def our_step(wheel, design):
     """Return time, speed and voltage of a step as the wheel node makes it."""
     T = design.loop.sample_time
     time = T * np.arange(int(1.0 / T) + 1)
-    reference, rate = minimum_jerk(STEP, design.reference.transition_time, time)
+    reference, forward = as_delivered(design, STEP, time)
     speed, voltage, _ = run(
-        TABLE_1[wheel], from_gains(design.gains), Conditions(T, T), reference, rate
+        TABLE_1[wheel], from_gains(design.gains), Conditions(T, T), reference, forward
     )
     return time, speed, voltage
 

@@ -6,6 +6,7 @@ Set-point and speeds are the wheel's; counts and the model are the motor's.
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
@@ -41,9 +42,14 @@ class LoopSettings:
     difference_window : int
         Samples to difference over.
     model : MotorModel or None
-        Of the motor, for the observer.
+        Of the motor, for the observer, and for the jerk in the feed-forward.
     noise : ObserverNoise
         What the observer expects.
+    reference_delay : float
+        How much later than the feed-forward acts the measured speed can show it [s]: delay,
+        hold and averaging of the loop.  The error is taken from the reference of that long
+        ago, so that a wheel that does what its model says is left alone; 0: from the present
+        one.
 
     Raises
     ------
@@ -58,8 +64,13 @@ class LoopSettings:
     difference_window: int = 4
     model: MotorModel | None = None
     noise: ObserverNoise = field(default_factory=ObserverNoise)
+    reference_delay: float = 0.0
 
     def __post_init__(self) -> None:
+        if not 0.0 <= self.reference_delay < math.inf:
+            raise ParameterError(
+                f"reference_delay is {self.reference_delay!r} s; it must be zero or positive"
+            )
         if not 0.0 <= self.transition_time < math.inf:
             raise ParameterError(
                 f"transition_time is {self.transition_time!r} s; it must be zero or positive"
@@ -137,6 +148,8 @@ class WheelLoop:
         self.pid = Pid(settings.gains)
         self.profile = Profile(settings.limits, settings.transition_time)
         self.reference = Reference(0.0, 0.0, 0.0)
+        self._elapsed = 0.0
+        self._past: deque[tuple[float, float]] = deque([(0.0, 0.0)])
         self.source = "measured"
         self.set_hardware(gearbox, encoder, max_load)
 
@@ -260,6 +273,7 @@ class WheelLoop:
         """
         self.pid.reset()
         self.profile.reset(measurement)
+        self._past = deque([(self._elapsed, measurement)])
 
     def step(self, setpoint: float, measurement: float, dt: float) -> PidOutput:
         """Advance reference and controller by one sample.
@@ -280,4 +294,35 @@ class WheelLoop:
         if setpoint != profile.target:
             profile.set_target(setpoint)
         self.reference = reference = profile.step(dt)
+        if self.settings.reference_delay:
+            return self._step_behind(reference, measurement, dt)
         return self.pid.step(reference.velocity, measurement, dt, reference.acceleration)
+
+    def _step_behind(self, ahead: Reference, measurement: float, dt: float) -> PidOutput:
+        """Feed forward from the reference, compare with the one of some time ago.
+
+        The controller adds ``fv r_d + fa x`` for the delayed reference ``r_d``; with the x below
+        that is ``fv r + fa (r' + r'' a2 / a1)``, what the model needs for the present one.
+        """
+        settings = self.settings
+        gains, model = settings.gains, settings.model
+        delayed = self._reference_ago(settings.reference_delay, ahead.velocity, dt)
+        forward = ahead.acceleration
+        if gains.feedforward_acceleration:
+            share = gains.feedforward_velocity / gains.feedforward_acceleration
+            forward += share * (ahead.velocity - delayed)
+            if model is not None:
+                forward += ahead.jerk * model.time_constant_product / model.time_constant
+        self.reference = ahead._replace(velocity=delayed)
+        return self.pid.step(delayed, measurement, dt, forward)
+
+    def _reference_ago(self, delay: float, velocity: float, dt: float) -> float:
+        """Return the reference's velocity ``delay`` before now, between samples linearly."""
+        self._elapsed += dt
+        past = self._past
+        past.append((self._elapsed, velocity))
+        then = self._elapsed - delay
+        while len(past) > 2 and past[1][0] <= then:
+            past.popleft()
+        (t0, v0), (t1, v1) = past[0], past[1]
+        return v0 + (v1 - v0) * min(max((then - t0) / (t1 - t0), 0.0), 1.0)

@@ -84,6 +84,10 @@ class Settings:
         0.0, "Duration of every change of set-point [s]; 0: as fast as limits allow.",
         minimum=0.0, maximum=60.0,
     )  # fmt: skip
+    reference_delay: float = described(
+        0.0, "Lag of the measured speed behind the feed-forward: delay, hold and averaging [s].",
+        minimum=0.0, maximum=10.0,
+    )  # fmt: skip
     speed_source: str = described("measured", "measured, difference or observer.")
     difference_window: int = described(
         4, "Samples to difference counts over.", minimum=1, maximum=1000
@@ -119,6 +123,7 @@ class Settings:
             gains=self.gains,
             limits=limits,
             transition_time=self.transition_time,
+            reference_delay=self.reference_delay,
             speed_source=self.speed_source,
             difference_window=self.difference_window,
             model=self._motor_model(),

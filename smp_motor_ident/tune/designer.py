@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -22,11 +22,11 @@ from smp_motor_ident.tune.methods import METHODS
 from smp_motor_ident.tune.performance import Performance, measure
 from smp_motor_ident.tune.plant import Plant, draw_motors, motors_of, sample
 from smp_motor_ident.tune.problem import Method, Problem, Promise, ripple
-from smp_motor_ident.tune.reference import Reference, plan_reference, two_degrees
-from smp_motor_ident.tune.response import TwoDegrees
+from smp_motor_ident.tune.reference import Reference, controller_for, plan_reference
+from smp_motor_ident.tune.response import Controller
 from smp_motor_ident.tune.robust import Jury, Robustness, back_off
 
-COMMON = ("max_velocity", "max_acceleration", "transition_time", "samples", "seed", "lag")
+COMMON = ("max_velocity", "max_acceleration", "transition_time", "samples", "seed")
 """Targets that every method understands."""
 
 
@@ -189,13 +189,15 @@ def finish(case: Case, feedback: Feedback, factor: float, robustness: Robustness
     Design
     """
     problem, plant, loop = case.problem, case.problem.plant, case.problem.loop
-    controller, reference = _follow(plant, loop, feedback, problem.targets)
+    controller = controller_for(loop, feedback)
+    usual = sample(plant.motors, replace(loop, delay=loop.expected_delay))
+    reference = _plan(usual, loop, controller, problem.targets)
     margins = loop_margins(plant, feedback)
-    figures = measure(problem, controller, reference, ripple(problem, feedback))
+    figures = measure(problem, usual, controller, reference, ripple(problem, feedback))
     reason, warnings = _explain(case, margins, factor, robustness, figures)
     m = plant.motors
     return Design(
-        gains=wheel_gains(controller, loop, float(m.static_voltage[0])),
+        gains=wheel_gains(controller, plant, loop),
         margins=margins,
         reason=reason,
         method=case.method.name,
@@ -287,23 +289,23 @@ def recommend(results: dict[str, Design | DesignError]) -> tuple[str, str]:
     )
 
 
-def wheel_gains(controller: TwoDegrees, loop: Loop, static_voltage: float) -> PidGains:
+def wheel_gains(controller: Controller, plant: Plant, loop: Loop) -> PidGains:
     """Return the running controller's settings, per wheel rad/s.
 
     Parameters
     ----------
-    controller : TwoDegrees
+    controller : Controller
         At the motor shaft.
+    plant : Plant
+        The motor, for the feed-forward.
     loop : Loop
         Its gear ratio and supply.
-    static_voltage : float
-        What dry friction takes [V].
 
     Returns
     -------
     PidGains
     """
-    ratio, fb = loop.gear_ratio, controller.feedback
+    ratio, fb, m = loop.gear_ratio, controller.feedback, plant.motors
     tracking = controller.tracking
     limit = loop.supply_voltage
     return PidGains(
@@ -317,11 +319,11 @@ def wheel_gains(controller: TwoDegrees, loop: Loop, static_voltage: float) -> Pi
         antiwindup_strategy="back_calculation" if math.isfinite(tracking) else "none",
         tracking_time_constant=tracking if math.isfinite(tracking) else 0.0,
         setpoint_weight_p=controller.weight,
-        setpoint_weight_d=0.0,
+        setpoint_weight_d=controller.weight_d,
         derivative_filter_time_constant=fb.filter_time,
-        feedforward_static=static_voltage,
-        feedforward_velocity=controller.velocity * ratio,
-        feedforward_acceleration=controller.acceleration * ratio,
+        feedforward_static=float(m.static_voltage[0]),
+        feedforward_velocity=float(m.a0[0]) * ratio,
+        feedforward_acceleration=float(m.a1[0]) * ratio,
     )
 
 
@@ -347,22 +349,19 @@ def _promise(method: Method, problem: Problem) -> Promise:
     )
 
 
-def _follow(
-    plant: Plant, loop: Loop, feedback: Feedback, targets: Mapping[str, Any]
-) -> tuple[TwoDegrees, Reference]:
-    controller, lag = two_degrees(plant, loop, feedback, targets.get("lag"))
+def _plan(
+    plant: Plant, loop: Loop, controller: Controller, targets: Mapping[str, Any]
+) -> Reference:
     ratio = loop.gear_ratio
     speed, rate = targets.get("max_velocity"), targets.get("max_acceleration")
-    reference = plan_reference(
+    return plan_reference(
         plant,
         loop,
         controller,
-        lag,
         max_velocity=None if speed is None else speed * ratio,
         max_acceleration=None if rate is None else rate * ratio,
         transition_time=targets.get("transition_time"),
     )
-    return controller, reference
 
 
 def _explain(

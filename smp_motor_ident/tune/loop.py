@@ -9,6 +9,9 @@ from typing import Literal
 from smp_motor_control.errors import ParameterError
 
 SpeedSource = Literal["measured", "difference", "observer"]
+USUAL_DELAY = 1e-3
+"""From a measurement through two nodes of one machine to the voltage [s]."""
+
 SPEED_SOURCES: tuple[SpeedSource, ...] = ("measured", "difference", "observer")
 
 
@@ -25,6 +28,10 @@ class Loop:
         applied: computation and transport, beyond the hold [s].  None takes one sample, which
         every node that answers within its period keeps.  A delay of the motor itself (that of
         the estimate) is added to it.
+    usual_delay : float or None
+        The same as it usually is [s], for the timing of the reference, where ``delay`` is the
+        longest that the margins must bear.  None takes ``delay`` where that was given, else one
+        millisecond: what nodes on one machine need, of which a sample is the limit.
     gear_ratio : float
         Motor revolutions per wheel revolution [-].
     counts_per_revolution : float or None
@@ -55,6 +62,7 @@ class Loop:
 
     sample_time: float = 0.005
     delay: float | None = None
+    usual_delay: float | None = None
     gear_ratio: float = 65.5
     counts_per_revolution: float | None = 500.0
     supply_voltage: float = 12.0
@@ -92,6 +100,13 @@ class Loop:
     def loop_delay(self) -> float:
         """Delay beyond the hold [s]: as given, or one sample."""
         return self.sample_time if self.delay is None else self.delay
+
+    @property
+    def expected_delay(self) -> float:
+        """Delay beyond the hold that is usual [s]."""
+        if self.usual_delay is not None:
+            return self.usual_delay
+        return min(USUAL_DELAY, self.sample_time) if self.delay is None else self.delay
 
     @property
     def noise_limit(self) -> float:

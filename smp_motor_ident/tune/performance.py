@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
+from smp_motor_ident.tune.plant import Plant
 from smp_motor_ident.tune.problem import Problem
-from smp_motor_ident.tune.reference import Reference
+from smp_motor_ident.tune.reference import CHANGE, Reference, planned_change
 from smp_motor_ident.tune.response import (
-    TwoDegrees,
+    Controller,
     load_figures,
-    minimum_jerk,
     simulate,
     step_figures,
 )
@@ -55,7 +54,7 @@ class Performance:
 
 
 def measure(
-    problem: Problem, controller: TwoDegrees, reference: Reference, ripple: float
+    problem: Problem, usual: Plant, controller: Controller, reference: Reference, ripple: float
 ) -> Performance:
     """Simulate set-point and load steps of one design.
 
@@ -63,7 +62,9 @@ def measure(
     ----------
     problem : Problem
         Plant and loop.
-    controller : TwoDegrees
+    usual : Plant
+        The same plant with the delay that is usual, for the set-point step.
+    controller : Controller
         The design.
     reference : Reference
         How set-points change.
@@ -75,16 +76,16 @@ def measure(
     Performance
     """
     T, fb = problem.loop.sample_time, controller.feedback
-    speed = reference.max_velocity
+    change = CHANGE * reference.max_velocity
     horizon = reference.transition_time + 5 * problem.reduced.time_constant
     if fb.i > 0:
         horizon += 4 * (fb.p + 1 / problem.reduced.gain) / fb.i
     time = T * np.arange(min(max(int(horizon / T), 50), 20_000))
-    smooth, rate = minimum_jerk(speed, reference.transition_time, time)
-    run = simulate(problem.plant, controller, smooth, acceleration=rate)
-    planned = step_figures(time, run.speed[0], run.voltage[0], speed)
+    lagging, forward = planned_change(usual, reference.lag, change, reference.transition_time, time)
+    run = simulate(usual, controller, lagging, forward=forward)
+    planned = step_figures(time, run.speed[0], run.voltage[0], change)
     # Small, so that saturation does not hide the loop.
-    alone = TwoDegrees(fb, limit=math.inf)
+    alone = Controller(fb)
     run_step = simulate(problem.plant, alone, np.ones(time.size))
     abrupt = step_figures(time, run_step.speed[0], run_step.voltage[0], 1.0)
     pushed = simulate(problem.plant, alone, np.zeros(time.size), load=np.ones(time.size))

@@ -1,13 +1,10 @@
-r"""Feed-forward, set-point weight and reference: what makes a wheel arrive without overshoot.
+r"""Feed-forward and reference: what makes wheels arrive together and without overshoot.
 
-With ``y = e^{-h s} r`` wanted, hold and delay ``d`` in the forward path and a measurement that
-lags by ``m``, the path from the reference must be
-
-.. math:: F(s) + b p + i / s = (a_2 s^2 + a_1 s + a_0) e^{-(h-d) s} + C(s) e^{-(h+m) s} .
-
-``F = velocity + acceleration s`` and the weight ``b`` match the powers -1, 0 and 1 of s; the lag
-``h`` is the one at which power 2 vanishes as well.  The integral then has nothing to unwind, which
-is what overshoot of a well-damped loop comes from.
+The feed-forward is the motor's own equation, ``a2 r'' + a1 r' + a0 r`` and dry friction, of the
+reference r.  The wheel then follows r, and the measurement shows it later by a lag that is known:
+delay, hold and averaging of the loop.  The error is taken from the reference of that long ago,
+so the feedback, its integral above all, has nothing to do while the model is right, and nothing
+to unwind afterwards, which is what overshoot of a well-damped loop comes from.
 
 References
 ----------
@@ -18,7 +15,7 @@ References
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,14 +23,20 @@ from smp_motor_ident.errors import DesignError
 from smp_motor_ident.tune.arrays import Array
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.loop import Loop
-from smp_motor_ident.tune.plant import Plant
-from smp_motor_ident.tune.response import TwoDegrees, minimum_jerk, simulate, step_figures
+from smp_motor_ident.tune.plant import Plant, sample
+from smp_motor_ident.tune.response import Controller, minimum_jerk, simulate, step_figures
 
 HEADROOM = 0.92
 """Share of the supply that a constant speed may use; the rest is left to the feedback."""
 
-PEAK = 0.97
+PEAK = 0.95
 """Share of the supply that a planned change of speed may use at its peak."""
+
+CHANGE = 0.5
+"""Share of the largest speed that a change may have without taking longer than others."""
+
+DOUBT = 1e-3
+"""By which the usual delay may be longer than it is said to be [s]."""
 
 PEAK_RATE = 1.875
 """Peak acceleration of a minimum-jerk change of unit distance in unit time."""
@@ -50,9 +53,10 @@ class Reference:
     max_acceleration : float
         [rad/s^2].
     transition_time : float
-        Duration of the minimum-jerk change [s].
+        Duration of the minimum-jerk change [s]; larger changes than ``CHANGE`` of the largest
+        speed take longer, by the acceleration limit.
     lag : float
-        By which the wheel follows the reference [s].
+        By which the measured speed follows the reference [s].
     """
 
     max_velocity: float
@@ -61,74 +65,77 @@ class Reference:
     lag: float
 
 
-def two_degrees(
-    plant: Plant, loop: Loop, feedback: Feedback, lag: float | None = None
-) -> tuple[TwoDegrees, float]:
-    """Return the controller whose set-point path is a pure lag to second order, and the lag.
+def controller_for(loop: Loop, feedback: Feedback) -> Controller:
+    """Return the running controller of a loop.
+
+    Parameters
+    ----------
+    loop : Loop
+        Its supply is the clamp.
+    feedback : Feedback
+        The gains.
+
+    Returns
+    -------
+    Controller
+        With the anti-windup that suits the gains: [1], section 3.5.  Proportional and derivative
+        action see the whole reference: it is smooth, and what the wheel shall do.
+    """
+    tracking = math.inf
+    if feedback.i > 0 and feedback.d > 0:
+        tracking = math.sqrt(feedback.d / feedback.i)
+    elif feedback.i > 0 and feedback.p > 0:
+        tracking = feedback.p / feedback.i
+    return Controller(feedback, weight_d=1.0, limit=loop.supply_voltage, tracking=tracking)
+
+
+def measured_lag(plant: Plant, loop: Loop) -> float:
+    """Return how much later than the feed-forward acts the measurement shows it [s].
 
     Parameters
     ----------
     plant : Plant
         A batch of one.
     loop : Loop
-        Delay, hold and supply.
-    feedback : Feedback
-        The gains that act on the measurement.
-    lag : float or None
-        Lag to realise [s], for wheels that shall go together; None takes the shortest natural.
+        Delay and hold.
 
     Returns
     -------
-    controller : TwoDegrees
-    lag : float
-        [s].
+    float
+        Delay of loop and motor, half a sample of hold, half the averaging window.
     """
-    lag = _natural_lag(plant, loop, feedback) if lag is None else lag
-    constant, linear, _ = _powers(plant, loop, feedback, np.array([lag]))
-    a0 = float(plant.motors.a0[0])
-    weight = (float(constant[0]) - a0) / feedback.p if feedback.p > 0 else 1.0
-    controller = TwoDegrees(
-        feedback=feedback,
-        weight=float(np.clip(weight, 0.0, 1.0)),
-        velocity=a0,
-        acceleration=max(float(linear[0]), 0.0),
-        limit=loop.supply_voltage,
-        tracking=tracking_time(feedback),
-    )
-    return controller, lag
+    dead = loop.expected_delay + float(plant.motors.delay[0])
+    return dead + 0.5 * loop.sample_time * (1 + plant.window)
 
 
-def tracking_time(feedback: Feedback) -> float:
-    """Return the time constant of back-calculation: the rule of thumb of [1], section 3.5."""
-    if feedback.i <= 0:
-        return math.inf
-    if feedback.d > 0:
-        return math.sqrt(feedback.d / feedback.i)
-    return feedback.p / feedback.i if feedback.p > 0 else math.inf
+def planned_change(
+    plant: Plant, lag: float, distance: float, duration: float, time: Array
+) -> tuple[Array, Array]:
+    """Return delayed reference and feed-forward of a minimum-jerk change from rest.
 
+    Parameters
+    ----------
+    plant : Plant
+        A batch of one.
+    lag : float
+        From :func:`measured_lag` [s].
+    distance : float
+        Change of speed [rad/s].
+    duration : float
+        [s].
+    time : ndarray, shape (k,), [s]
+        Sampling instants.
 
-def _powers(plant: Plant, loop: Loop, feedback: Feedback, lag: Array) -> tuple[Array, Array, Array]:
-    """Return the coefficients of powers 0, 1 and 2 of s that the reference path must have."""
-    m, T, window = plant.motors, plant.sample_time, plant.window
-    a0, a1, a2 = float(m.a0[0]), float(m.a1[0]), float(m.a2[0])
-    early = lag - (loop.loop_delay + 0.5 * T)  # the hold acts half a sample late
-    late = lag + 0.5 * T * window
-    late_d = late + feedback.filter_time + 0.5 * T
-    p = feedback.p - 0.5 * T * feedback.i  # the forward-Euler sum lags the integral by T / 2
-    i, d = feedback.i, feedback.d
-    constant = a0 + feedback.p - i * late
-    linear = a1 - a0 * early + d - p * late + 0.5 * i * late**2
-    square = a2 - a1 * early + 0.5 * a0 * early**2 - d * late_d + 0.5 * p * late**2
-    return constant, linear, square - i * late**3 / 6
-
-
-def _natural_lag(plant: Plant, loop: Loop, feedback: Feedback) -> float:
+    Returns
+    -------
+    reference : ndarray, shape (k,), [rad/s]
+    forward : ndarray, shape (k,), [V]
+        Without dry friction.
+    """
     m = plant.motors
-    slow = float(m.a1[0] / m.a0[0])
-    lags = np.linspace(0.0, loop.loop_delay + float(m.delay[0]) + slow, 2000)
-    square = _powers(plant, loop, feedback, lags)[2]
-    roots = np.flatnonzero(np.diff(np.sign(square)))
-    return float(lags[roots[0]] if roots.size else lags[np.argmin(np.abs(square))])
+    speed, rate, jerk = minimum_jerk(distance, duration, time)
+    forward = float(m.a0[0]) * speed + float(m.a1[0]) * rate + float(m.a2[0]) * jerk
+    return minimum_jerk(distance, duration, np.maximum(time - lag, 0.0))[0], forward
 
 
 def top_speed(plant: Plant, supply: float) -> float:
@@ -140,8 +147,7 @@ def top_speed(plant: Plant, supply: float) -> float:
 def plan_reference(
     plant: Plant,
     loop: Loop,
-    controller: TwoDegrees,
-    lag: float,
+    controller: Controller,
     *,
     max_velocity: float | None = None,
     max_acceleration: float | None = None,
@@ -152,13 +158,11 @@ def plan_reference(
     Parameters
     ----------
     plant : Plant
-        A batch of one.
+        A batch of one, sampled with the loop's usual delay.
     loop : Loop
         Its supply is the limit.
-    controller : TwoDegrees
-        With feed-forward.
-    lag : float
-        From :func:`two_degrees` [s].
+    controller : Controller
+        The design.
     max_velocity : float or None
         [rad/s, motor]; None takes 90 % of what the headroom reaches.
     max_acceleration : float or None
@@ -175,52 +179,79 @@ def plan_reference(
     DesignError
         When the motor cannot reach the speed or the acceleration that is asked for.
     """
-    top = top_speed(plant, loop.supply_voltage)
+    lag, ratio = measured_lag(plant, loop), loop.gear_ratio
+    speed = _reachable(plant, loop, max_velocity)
+    change = CHANGE * speed
+    shortest = _shortest(plant, loop, controller, lag, speed)
+    limit = PEAK_RATE * change / shortest
+    if max_acceleration is not None and not 0 < max_acceleration <= limit:
+        raise DesignError(
+            f"max_acceleration {max_acceleration / ratio:.4g} rad/s^2 is beyond the motor: within "
+            f"{PEAK:.0%} of {loop.supply_voltage:g} V a change by {change / ratio:.3g} rad/s "
+            f"reaches {limit / ratio:.4g} rad/s^2; ask for that or less"
+        )
+    if transition_time is not None and not transition_time >= shortest - 1e-9:
+        raise DesignError(
+            f"transition_time {transition_time:.4g} s is too short for the motor: a change by "
+            f"{change / ratio:.3g} rad/s takes at least {shortest:.3g} s; ask for that or more"
+        )
+    if max_acceleration is not None:
+        shortest = max(shortest, PEAK_RATE * change / max_acceleration)
+    duration = shortest if transition_time is None else transition_time
+    return Reference(speed, PEAK_RATE * change / duration, duration, lag)
+
+
+def _reachable(plant: Plant, loop: Loop, wished: float | None) -> float:
+    top, ratio = top_speed(plant, loop.supply_voltage), loop.gear_ratio
     if top <= 0:
         raise DesignError(
             f"dry friction takes {plant.motors.static_voltage[0]:.3g} V of the "
             f"{loop.supply_voltage:g} V supply: the motor cannot turn; raise the supply"
         )
-    if max_velocity is not None and max_velocity > top:
+    if wished is not None and not 0 < wished <= top:
         raise DesignError(
-            f"max_velocity {max_velocity / loop.gear_ratio:.4g} rad/s is beyond the motor: "
-            f"{HEADROOM:.0%} of {loop.supply_voltage:g} V reaches {top / loop.gear_ratio:.4g} "
-            "rad/s; ask for that or less"
+            f"max_velocity {wished / ratio:.4g} rad/s is beyond the motor: {HEADROOM:.0%} of "
+            f"{loop.supply_voltage:g} V reaches {top / ratio:.4g} rad/s; ask for that or less"
         )
-    speed = 0.9 * top if max_velocity is None else max_velocity
-    shortest = _shortest(plant, loop, controller, speed)
-    limit = PEAK_RATE * speed / shortest
-    if max_acceleration is not None and max_acceleration > limit:
-        raise DesignError(
-            f"max_acceleration {max_acceleration / loop.gear_ratio:.4g} rad/s^2 is beyond the "
-            f"motor: a change by {speed / loop.gear_ratio:.3g} rad/s within {PEAK:.0%} of "
-            f"{loop.supply_voltage:g} V reaches {limit / loop.gear_ratio:.4g} rad/s^2; ask for "
-            "that or less"
-        )
-    if transition_time is not None and transition_time < shortest - 1e-9:
-        raise DesignError(
-            f"transition_time {transition_time:.4g} s is too short for the motor: a change by "
-            f"{speed / loop.gear_ratio:.3g} rad/s takes at least {shortest:.3g} s; ask for that "
-            "or more"
-        )
-    if max_acceleration is not None:
-        shortest = max(shortest, PEAK_RATE * speed / max_acceleration)
-    duration = shortest if transition_time is None else transition_time
-    return Reference(speed, PEAK_RATE * speed / duration, duration, lag)
+    return 0.9 * top if wished is None else wished
 
 
-def _shortest(plant: Plant, loop: Loop, controller: TwoDegrees, speed: float) -> float:
-    """Return the shortest change from rest to ``speed`` within headroom and overshoot."""
+def _shortest(plant: Plant, loop: Loop, controller: Controller, lag: float, speed: float) -> float:
+    """Return the shortest change by ``CHANGE`` of the speed; the whole takes twice as long.
+
+    Both must keep to the supply, and not overshoot when the loop's delay is as usual, and hardly
+    when it is ``DOUBT`` longer than that.
+    """
     room = PEAK * loop.supply_voltage - float(plant.motors.static_voltage[0])
-    duration = max(4 * loop.sample_time, 0.05)
     slow = float(plant.motors.a1[0] / plant.motors.a0[0])
-    for _ in range(60):
-        steps = int((duration + 4 * slow + 20 * loop.sample_time) / loop.sample_time)
-        time = loop.sample_time * np.arange(steps)
-        reference, rate = minimum_jerk(speed, duration, time)
-        run = simulate(plant, controller, reference, acceleration=rate)
-        figures = step_figures(time, run.speed[0], run.voltage[0], speed)
-        if figures.peak_voltage <= room and figures.overshoot <= 1.0:
-            return math.ceil(duration * 100 - 1e-9) / 100
-        duration *= 1.15
-    return math.ceil(duration * 100) / 100
+    late = replace(loop, delay=loop.expected_delay + min(DOUBT, loop.sample_time))
+    trials = ((plant, 0.5), (sample(plant.motors, late), 1.5))
+    grain = max(0.005, loop.sample_time)
+    grains = math.ceil(0.02 / grain)
+    for _ in range(200):
+        duration = grains * grain
+        changes = [(share * speed, share / CHANGE * duration) for share in (CHANGE, 1.0)]
+        if all(_voltage(plant, *change) <= room for change in changes) and all(
+            _overshoot(one, controller, lag, *change, slow) <= most
+            for one, most in trials
+            for change in changes
+        ):
+            break
+        grains += max(1, grains // 16)
+    return duration
+
+
+def _voltage(plant: Plant, distance: float, duration: float) -> float:
+    """Return the largest voltage of a change, without dry friction."""
+    time = np.linspace(0.0, duration, 200)
+    return float(planned_change(plant, 0.0, distance, duration, time)[1].max())
+
+
+def _overshoot(
+    plant: Plant, controller: Controller, lag: float, distance: float, duration: float, slow: float
+) -> float:
+    T = plant.sample_time
+    time = T * np.arange(int((duration + lag + 3 * slow) / T) + 2)
+    reference, forward = planned_change(plant, lag, distance, duration, time)
+    run = simulate(plant, controller, reference, forward=forward)
+    return step_figures(time, run.speed[0], run.voltage[0], distance).overshoot

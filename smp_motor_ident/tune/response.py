@@ -19,17 +19,15 @@ from smp_motor_ident.tune.plant import Plant
 
 
 @dataclass(frozen=True, eq=False)
-class TwoDegrees:
+class Controller:
     """A complete controller at the motor shaft; every number may be an array of shape (n,).
 
     Attributes
     ----------
     feedback : Feedback
         Gains that act on the measurement.
-    weight : float
-        Set-point weight of the proportional action [-].
-    velocity, acceleration : float
-        Feed-forward [V s/rad], [V s^2/rad].
+    weight, weight_d : float
+        Set-point weights of the proportional and the derivative action [-].
     limit : float
         Clamp of the output [V].
     tracking : float
@@ -38,8 +36,7 @@ class TwoDegrees:
 
     feedback: Feedback
     weight: float = 1.0
-    velocity: float = 0.0
-    acceleration: float = 0.0
+    weight_d: float = 0.0
     limit: float = math.inf
     tracking: float = math.inf
 
@@ -64,10 +61,10 @@ class Response:
 
 def simulate(
     plant: Plant,
-    controller: TwoDegrees,
+    controller: Controller,
     reference: Array,
     *,
-    acceleration: Array | None = None,
+    forward: Array | None = None,
     load: Array | None = None,
     count_angle: float = 0.0,
 ) -> Response:
@@ -77,12 +74,12 @@ def simulate(
     ----------
     plant : Plant
         A batch of ``n`` motors.
-    controller : TwoDegrees
+    controller : Controller
         With numbers, or arrays of shape (n,).
     reference : ndarray, shape (k,), [rad/s]
-        After the limits, at the sampling instants.
-    acceleration : ndarray, shape (k,), [rad/s^2], or None
-        Of the reference, for the feed-forward.
+        What the error is taken from, at the sampling instants.
+    forward : ndarray, shape (k,), [V], or None
+        Feed-forward.
     load : ndarray, shape (k,), [V], or None
         Load as the voltage that it takes from the motor.
     count_angle : float
@@ -99,8 +96,7 @@ def simulate(
         fb.d,
         fb.filter_time,
         controller.weight,
-        controller.velocity,
-        controller.acceleration,
+        controller.weight_d,
         controller.limit,
         1.0 / np.asarray(controller.tracking),
     )
@@ -113,7 +109,7 @@ def simulate(
         plant.window,
         np.stack([np.broadcast_to(np.asarray(x, dtype=np.float64), n) for x in numbers], axis=1),
         np.asarray(reference, dtype=np.float64),
-        np.zeros(steps) if acceleration is None else acceleration,
+        np.zeros(steps) if forward is None else forward,
         np.zeros(steps) if load is None else load,
         count_angle,
     )
@@ -130,7 +126,7 @@ def _run(
     window: int,
     controllers: Array,
     reference: Array,
-    acceleration: Array,
+    forward: Array,
     load: Array,
     count_angle: float,
 ) -> tuple[Array, Array]:
@@ -138,7 +134,7 @@ def _run(
     steps = reference.size
     speed, voltage = np.empty((n, steps)), np.empty((n, steps))
     for j in range(n):
-        p, i, d, filter_time, weight, velocity, lead, limit, back = controllers[j]
+        p, i, d, filter_time, weight, weight_d, limit, back = controllers[j]
         x, following, past = np.zeros(s), np.zeros(s), np.zeros(m)
         angle = np.zeros(window + 1)
         integral = previous = rate = 0.0
@@ -150,10 +146,11 @@ def _run(
                     newest = math.floor(newest / count_angle) * count_angle
                     oldest = math.floor(oldest / count_angle) * count_angle
                 measured = (newest - oldest) / (window * T)
-            rate = (filter_time * rate + previous - measured) / (filter_time + T)
-            previous = measured
+            slope = weight_d * reference[k] - measured
+            rate = (filter_time * rate + slope - previous) / (filter_time + T)
+            previous = slope
             wanted = p * (weight * reference[k] - measured) + integral + d * rate
-            wanted += velocity * reference[k] + lead * acceleration[k]
+            wanted += forward[k]
             given = min(max(wanted, -limit), limit)
             integral += T * (i * (reference[k] - measured) + (given - wanted) * back)
             speed[j, k], voltage[j, k] = x[0], given
@@ -179,8 +176,8 @@ def _run(
     return speed, voltage
 
 
-def minimum_jerk(distance: float, duration: float, time: Array) -> tuple[Array, Array]:
-    """Return the smoothest change of speed over a duration, and its rate.
+def minimum_jerk(distance: float, duration: float, time: Array) -> tuple[Array, Array, Array]:
+    """Return the smoothest change of speed over a duration, its rate and its jerk.
 
     Parameters
     ----------
@@ -195,6 +192,7 @@ def minimum_jerk(distance: float, duration: float, time: Array) -> tuple[Array, 
     -------
     speed : ndarray, shape (k,), [rad/s]
     acceleration : ndarray, shape (k,), [rad/s^2]
+    jerk : ndarray, shape (k,), [rad/s^3]
 
     References
     ----------
@@ -202,7 +200,8 @@ def minimum_jerk(distance: float, duration: float, time: Array) -> tuple[Array, 
     """
     x = np.clip(time / duration, 0.0, 1.0)
     speed = distance * x**3 * (10 - 15 * x + 6 * x**2)
-    return speed, distance / duration * 30 * x**2 * (1 - x) ** 2
+    acceleration = distance / duration * 30 * x**2 * (1 - x) ** 2
+    return speed, acceleration, distance / duration**2 * 60 * x * (1 - x) * (1 - 2 * x)
 
 
 @dataclass(frozen=True)

@@ -36,6 +36,7 @@ def parameters(design: Design) -> dict[str, Any]:
         "max_velocity": float(reference.max_velocity / ratio),
         "max_acceleration": float(reference.max_acceleration / ratio),
         "transition_time": float(reference.transition_time),
+        "reference_delay": float(reference.lag),
         "speed_source": str(design.loop.speed_source),
         "difference_window": int(max(design.loop.difference_window, 1)),
         "model": {name: float(value) for name, value in design.motor.items()},

@@ -24,7 +24,7 @@ from smp_motor_ident.tune.feedback import Feedback, spectral_radius
 from smp_motor_ident.tune.methods.simc import SIMC
 from smp_motor_ident.tune.plant import Plant
 from smp_motor_ident.tune.problem import Method, Problem, Promise, noise_filter
-from smp_motor_ident.tune.response import TwoDegrees, simulate
+from smp_motor_ident.tune.response import Controller, simulate
 
 POPULATION, ELITE, GENERATIONS = 48, 10, 14
 PROMISE = Promise(phase=45.0, gain=2.0, sensitivity=1.6)
@@ -78,12 +78,12 @@ class _Cost:
         plant = self.plants.setdefault(p.size, self.problem.plant.repeated(p.size))
         gains = Feedback(cast(Any, p), cast(Any, i), cast(Any, d), filter_time)
         with np.errstate(over="ignore", invalid="ignore"):
-            limited = TwoDegrees(
+            limited = Controller(
                 gains, limit=self.problem.loop.supply_voltage, tracking=cast(Any, p / i)
             )
             step = simulate(plant, limited, self.step).speed / self.step
             load = simulate(
-                plant, TwoDegrees(gains), np.zeros(self.time.size), load=np.ones(self.time.size)
+                plant, Controller(gains), np.zeros(self.time.size), load=np.ones(self.time.size)
             ).speed
             errors = np.stack([np.abs(1 - step) @ self.time, np.abs(load) @ self.time])
         over = np.maximum(step.max(axis=1) - 1, 0)

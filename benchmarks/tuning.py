@@ -1,0 +1,289 @@
+"""Do the designed loops keep what they promise?  Every method, 4 + N motors, four rates.
+
+    python benchmarks/tuning.py [--motors 200] [--jobs 2]
+
+Each design is run by ``closed_loop``, which shares no code with the designer: counts, clamp and
+delay included.  A promised margin is confirmed by spending it: at 95 % of gain and delay margin
+the simulated loop must still decay, at 105 % it must not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+from closed_loop import (
+    COUNTS,
+    RATIO,
+    SUPPLY,
+    TABLE_1,
+    Conditions,
+    Controller,
+    as_delivered,
+    from_gains,
+    overshoot,
+    run,
+    settling,
+)
+
+from smp_motor_ident.errors import DesignError
+from smp_motor_ident.result import Estimate, Quantity
+from smp_motor_ident.tune import METHODS, Design, Loop, design
+from smp_motor_ident.tune.feedback import Feedback, spectral_radius
+from smp_motor_ident.tune.margins import batch_margins, grid_for
+from smp_motor_ident.tune.plant import draw_motors, motors_of, sample
+
+RATES = (100.0, 200.0, 500.0, 1000.0)
+SPREAD = 0.01
+"""Relative standard deviation of every combination of the estimate."""
+
+RECOMMENDED = "margin"
+
+
+def random_motors(count: int) -> list[tuple[float, ...]]:
+    """Draw motors of two decades around Table 1: R, L, K, J, b of equal response."""
+    rng = np.random.default_rng(6)
+    motors = []
+    for _ in range(count):
+        a0 = 1 / np.exp(rng.uniform(np.log(12), np.log(60)))
+        tau = np.exp(rng.uniform(np.log(0.02), np.log(0.4)))
+        # Up to 0.25 two real time constants, above a complex pair, as the paper's motors.
+        a1, a2 = tau * a0, rng.uniform(0.005, 0.45) * tau**2 * a0
+        R = rng.uniform(1, 13)
+        motors.append((R, a2 * R / a1, a0, a1 * a0 / R, 0.0))
+    return motors
+
+
+def combinations(motor):
+    """Return a0, a1, a2."""
+    R, L, K, J, b = motor
+    return (R * b + K * K) / K, (R * J + L * b) / K, L * J / K
+
+
+def estimate_of(motor) -> Estimate:
+    """Return what an identification of this motor may have said, without error of its own."""
+    a0, a1, a2 = combinations(motor)
+    values = {"dc_gain": 1 / a0, "time_constant": a1 / a0, "time_constant_product": a2 / a0}
+    return Estimate(
+        wheel="motor",
+        model="second_order",
+        parameters={},
+        combinations={name: Quantity(value) for name, value in values.items()},
+        names=tuple(values),
+        covariance=np.diag([(SPREAD * value) ** 2 for value in values.values()]),
+    )
+
+
+@dataclass
+class Outcome:
+    """What one design of one motor at one rate did."""
+
+    rate: float
+    method: str
+    designed: bool = False
+    stable: bool = False
+    gain_margin: bool = False
+    delay_margin: bool = False
+    promise: bool = False
+    draws_stable: bool = False
+    settling: float = np.nan
+    overshoot: float = np.nan
+    load: float = np.nan
+    faster: dict | None = None
+    seconds: float = 0.0
+    why: str = ""
+
+
+def decays(motor, controller, conditions, crossover) -> bool:
+    """Return whether the linear loop decays: late against early deviation from its step."""
+    seconds = 90 / crossover + 60 * conditions.delay
+    n = int(np.clip(seconds / conditions.sample_time, 600, 60_000))
+    linear = replace(conditions, counts=0.0, supply=np.inf)
+    speed = run(motor, controller, linear, np.ones(n))[0]
+    if not np.all(np.isfinite(speed)):
+        return False
+    off = np.abs(speed - 1)
+    return off[3 * n // 4 :].max() < 0.999 * off[n // 2 : 3 * n // 4].max() or off[-1] < 1e-9
+
+
+def step(motor, controller, conditions, target, planned=None):
+    """Return settling [s] and overshoot [%] of a set-point step with counts and clamp."""
+    a0, a1, _ = combinations(motor)
+    T = conditions.sample_time
+    t = T * np.arange(int((1.0 + 15 * a1 / a0) / T))
+    reference, forward = np.full(t.size, target), np.zeros(t.size)
+    if planned is not None:
+        reference, forward = as_delivered(planned, target, t)
+    speed = run(motor, controller, conditions, reference, forward)[0]
+    return settling(t, speed, target), overshoot(speed, target), speed
+
+
+def load_step(motor, controller, conditions):
+    """Return the integral of the error after a load of 1 V, per volt [rad/V]."""
+    a0, a1, _ = combinations(motor)
+    T = conditions.sample_time
+    t = T * np.arange(int((0.5 + 15 * a1 / a0) / T))
+    torque = np.full(t.size, motor[2] / motor[0])
+    ideal = replace(conditions, counts=0.0)
+    speed = run(motor, controller, ideal, np.zeros(t.size), load=torque)[0]
+    return float(np.trapezoid(np.abs(speed), t))
+
+
+def at_sensitivity(plant, shape: Feedback, peak: float) -> Feedback:
+    """Scale a rule's gains by the largest factor that gives the wanted Ms."""
+    omega = grid_for(plant, 400)
+    base = plant.response(omega) * shape.response(omega, plant.sample_time)
+    low, high = 1e-3, 10.0
+    for _ in range(50):
+        middle = np.sqrt(low * high)
+        fine = batch_margins(middle * base, omega).sensitivity[0] <= peak
+        fine = fine and spectral_radius(plant, shape.scaled(middle))[0] < 1
+        low, high = (middle, high) if fine else (low, middle)
+    return shape.scaled(low)
+
+
+def check(job) -> list[Outcome]:
+    """Design one motor at one rate by every method, and try each."""
+    motor, rate = job
+    T = 1 / rate
+    loop = Loop(sample_time=T, gear_ratio=RATIO, counts_per_revolution=COUNTS,
+                supply_voltage=SUPPLY)  # fmt: skip
+    conditions = Conditions(T, T)
+    estimate = estimate_of(motor)
+    outcomes, designs = [], {}
+    for method in METHODS:
+        outcome = Outcome(rate, method)
+        outcomes.append(outcome)
+        begin = time.perf_counter()
+        try:
+            one = design(estimate, loop, method)
+        except DesignError as error:
+            outcome.why = str(error)
+            continue
+        outcome.seconds = time.perf_counter() - begin
+        outcome.designed, designs[method] = True, one
+        try_design(outcome, motor, one, conditions, estimate)
+    if RECOMMENDED in designs:
+        compare_with_rules(outcomes[0], motor, designs[RECOMMENDED], conditions, estimate, loop)
+    return outcomes
+
+
+def try_design(outcome: Outcome, motor, one: Design, conditions, estimate) -> None:
+    """Fill in what the independent simulation says of one design."""
+    controller, m = from_gains(one.gains), one.margins
+    target = 0.5 * SUPPLY / combinations(motor)[0]
+    outcome.settling, outcome.overshoot, speed = step(motor, controller, conditions, target, one)
+    tail = speed[-speed.size // 5 :]
+    outcome.stable = bool(np.all(np.abs(tail / target - 1) < 0.03))
+    inside = replace(conditions, gain=1 + 0.95 * (m.gain - 1)) if np.isfinite(m.gain) else None
+    outcome.gain_margin = inside is None or (
+        decays(motor, controller, inside, m.crossover)
+        and not decays(motor, controller, replace(conditions, gain=1.05 * m.gain), m.crossover)
+    )
+    if np.isfinite(m.delay):
+        later = [replace(conditions, delay=conditions.delay + f * m.delay) for f in (0.95, 1.05)]
+        outcome.delay_margin = decays(motor, controller, later[0], m.crossover) and not decays(
+            motor, controller, later[1], m.crossover
+        )
+    else:
+        outcome.delay_margin = True
+    promise = METHODS[outcome.method].promise
+    outcome.promise = (
+        m.phase >= 0.99 * promise.phase
+        and m.gain >= 0.99 * promise.gain
+        and m.sensitivity <= 1.01 * promise.sensitivity
+    )
+    outcome.load = load_step(motor, controller, conditions)
+    draws = draw_motors(estimate, 5, np.random.default_rng(1))
+    drawn = [
+        (1.0, draws.a2[k] / draws.a1[k], draws.a0[k], draws.a1[k] * draws.a0[k], 0.0)
+        for k in range(len(draws))
+    ]
+    outcome.draws_stable = one.robustness.stable == 1.0 and all(
+        decays(each, controller, conditions, m.crossover) for each in drawn
+    )
+
+
+def compare_with_rules(outcome: Outcome, motor, one: Design, conditions, estimate, loop) -> None:
+    """Set the recommended design beside SIMC and Ziegler-Nichols at the same Ms."""
+    plant = sample(motors_of(estimate), loop)
+    target = 0.5 * SUPPLY / combinations(motor)[0]
+    outcome.faster = {}
+    for rule in ("simc", "ziegler_nichols"):
+        from smp_motor_ident.tune.problem import Problem
+
+        shape = METHODS[rule].solve(Problem(plant, loop))
+        same = at_sensitivity(plant, shape, one.margins.sensitivity)
+        controller = Controller(same.p, same.i, same.d, same.filter_time, tracking=same.p / same.i)
+        seconds = step(motor, controller, conditions, target)[0]
+        load = load_step(motor, controller, conditions)
+        # One that never settles within the record counts as slower by its length.
+        a0, a1, _ = combinations(motor)
+        seconds = 1.0 + 12 * a1 / a0 if np.isnan(seconds) else seconds
+        outcome.faster[rule] = (seconds / outcome.settling, load / outcome.load)
+
+
+def table(outcomes: list[Outcome]) -> None:
+    """Print what came out."""
+    head = "  ".join(
+        f"{h:>9s}"
+        for h in ("designed", "stable", "gain mgn", "delay mgn", "promise", "draws", "ms/design")
+    )
+    for rate in RATES:
+        print(f"\n{rate:g} Hz{'':12s}{head}")
+        for method in METHODS:
+            of = [o for o in outcomes if o.rate == rate and o.method == method]
+            done = [o for o in of if o.designed]
+            names = ("stable", "gain_margin", "delay_margin", "promise", "draws_stable")
+            cells = [f"{len(done)}/{len(of)}"]
+            cells += [f"{sum(getattr(o, n) for o in done)}" for n in names]
+            cells.append(f"{1e3 * np.median([o.seconds for o in done]):.0f}" if done else "-")
+            print(f"  {method:16s}" + "  ".join(f"{c:>9s}" for c in cells))
+    print(f"\nrecommended ({RECOMMENDED}) against rules at the same Ms, as delivered, 2 % settling")
+    print(
+        "rate     rule              faster by: median, 10 %, worst    load rejected: median, worst"
+    )
+    for rate in RATES:
+        for rule in ("simc", "ziegler_nichols"):
+            pairs = [o.faster[rule] for o in outcomes if o.rate == rate and o.faster]
+            fast, load = np.array(pairs).T
+            print(
+                f"{rate:6g}   {rule:16s}  {np.median(fast):8.2f} {np.quantile(fast, 0.1):8.2f} "
+                f"{fast.min():8.2f}  ({np.mean(fast >= 1.3):.0%} above 1.3)   "
+                f"{np.median(load):8.2f} {load.min():8.2f}  ({np.mean(load >= 1):.0%} above 1)"
+            )
+
+
+def main() -> int:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--motors", type=int, default=200, help="random ones beside the paper's")
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--rates", type=float, nargs="*", default=RATES)
+    arguments = parser.parse_args()
+    motors = [*TABLE_1.values(), *random_motors(arguments.motors)]
+    jobs = [(motor, rate) for rate in arguments.rates for motor in motors]
+    outcomes: list[Outcome] = []
+    begin = time.perf_counter()
+    with ProcessPoolExecutor(arguments.jobs) as pool:
+        for k, found in enumerate(pool.map(check, jobs, chunksize=4)):
+            outcomes += found
+            if k % 20 == 0:
+                print(f"\r{k}/{len(jobs)} ", end="", file=sys.stderr, flush=True)
+    print(f"{len(jobs)} motors and rates, {time.perf_counter() - begin:.0f} s", file=sys.stderr)
+    table(outcomes)
+    for o in outcomes:
+        held = o.stable and o.gain_margin and o.delay_margin and o.promise and o.draws_stable
+        if o.designed and not held:
+            print(f"not held: {o}")
+        elif not o.designed:
+            print(f"no design at {o.rate:g} Hz by {o.method}: {o.why}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,87 @@
+"""Designed gains on the loop that runs: the wheel's own controller on the simulated hardware."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from smp_motor_control.motor_file import load_motors
+from smp_motor_control.motor_model import MotorModel
+from smp_motor_control.plant import DriveSettings
+from smp_motor_control.profile import ProfileLimits
+from smp_motor_control.simulation import Timing, simulate_closed_loop
+from smp_motor_control.wheel_loop import LoopSettings, WheelLoop
+from smp_motor_ident.commands.tune import read_estimates
+from smp_motor_ident.tune import Loop, design, design_wheels
+from smp_motor_ident.tune.plant import motors_of, sample
+from smp_motor_ident.tune.reference import planned_change
+
+MOTORS = Path(__file__).resolve().parents[2] / "config" / "motors_paper.yaml"
+STEP = 1.2
+"""Set-point [rad/s, wheel]: about half of what the slowest motor reaches."""
+
+
+def settings_of(one) -> LoopSettings:
+    ratio, plan = one.loop.gear_ratio, one.reference
+    return LoopSettings(
+        gains=one.gains,
+        limits=ProfileLimits(
+            velocity=plan.max_velocity / ratio, acceleration=plan.max_acceleration / ratio
+        ),
+        transition_time=plan.transition_time,
+        reference_delay=plan.lag,
+        model=MotorModel(**one.motor),
+    )
+
+
+@pytest.fixture(scope="module")
+def estimates():
+    return read_estimates(MOTORS)
+
+
+def test_wheel_loop_feeds_forward_what_the_design_planned(estimates):
+    T = 0.005
+    one = design(estimates["front_left"], Loop(sample_time=T))
+    loop = WheelLoop(settings_of(one))
+    loop.start(0.0)
+    target = 0.5 * one.reference.max_velocity
+    ratio = one.loop.gear_ratio
+    outs, references = [], []
+    for _ in range(80):
+        outs.append(loop.step(target / ratio, loop.reference.velocity, T).feedforward)
+        references.append(loop.reference.velocity * ratio)
+    time = T * np.arange(1, 81)
+    plant = sample(motors_of(estimates["front_left"]), one.loop)
+    duration = one.reference.transition_time
+    delayed, forward = planned_change(plant, one.reference.lag, target, duration, time)
+    forward = forward + one.gains.feedforward_static
+    # The node interpolates the delayed reference linearly between samples: its curvature times
+    # T^2 / 8 is 0.2 % of the step here.
+    np.testing.assert_allclose(references, delayed, atol=3e-3 * target)
+    np.testing.assert_allclose(outs, forward, atol=1e-9 * 12)
+
+
+@pytest.mark.parametrize("rate", [100.0, 200.0, 1000.0])
+def test_four_wheels_arrive_together_without_overshoot(estimates, rate):
+    T = 1 / rate
+    loops = {wheel: Loop(sample_time=T) for wheel in estimates}
+    wheels = design_wheels(estimates, loops)
+    entries = load_motors(MOTORS)
+    times = []
+    for wheel, one in wheels.designs.items():
+        run = simulate_closed_loop(
+            entries[wheel],
+            settings_of(one),
+            lambda time: STEP,
+            0.8,
+            timing=Timing(sample_time=T, delay=one.loop.expected_delay),
+            drive=DriveSettings(command_timeout=np.inf, pwm_steps=1000),
+        )
+        speed = run.velocity
+        assert speed.max() < 1.02 * STEP
+        outside = np.flatnonzero(np.abs(speed - STEP) > 0.02 * STEP)
+        times.append(run.time[outside[-1] + 1])
+    # One control period, 5 ms at 1 kHz: what the wheels together are held to.
+    assert max(times) - min(times) <= max(T, 0.005) + 1e-9
