@@ -1,0 +1,258 @@
+"""teleop_wheels as its own process in a terminal of its own."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import pty
+import select
+import signal
+import subprocess
+import sys
+import termios
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import rclpy
+from geometry_msgs.msg import TwistStamped
+from rclpy.executors import SingleThreadedExecutor
+from sensor_msgs.msg import JointState
+
+LFLAG = 3
+
+
+class Terminal:
+    """A pseudo-terminal with a process in its foreground."""
+
+    def __init__(self, command: list[str]) -> None:
+        self.master, self.slave = pty.openpty()
+        self.usual = termios.tcgetattr(self.slave)
+        self.shown = ""
+
+        def adopt() -> None:
+            os.setsid()
+            fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+
+        self.process = subprocess.Popen(
+            command,
+            stdin=self.slave,
+            stdout=self.slave,
+            stderr=self.slave,
+            preexec_fn=adopt,
+        )
+
+    def type(self, keys: str) -> None:
+        os.write(self.master, keys.encode())
+
+    def look(self) -> str:
+        """Return all that was ever shown."""
+        while select.select([self.master], [], [], 0.0)[0]:
+            self.shown += os.read(self.master, 65536).decode(errors="replace")
+        return self.shown
+
+    def is_usual(self) -> bool:
+        return termios.tcgetattr(self.slave) == self.usual
+
+    def echoes(self) -> bool:
+        return bool(termios.tcgetattr(self.slave)[LFLAG] & termios.ECHO)
+
+    def state(self) -> str:
+        return Path(f"/proc/{self.process.pid}/stat").read_text().rpartition(")")[2].split()[0]
+
+    def close(self) -> None:
+        if self.process.poll() is None:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(self.process.pid, signal.SIGKILL)
+        self.process.wait()
+        for fd in (self.master, self.slave):
+            with contextlib.suppress(OSError):
+                os.close(fd)
+
+
+@pytest.fixture
+def terminal(ros_domain: int) -> Iterator:
+    started = []
+
+    def start(*command: str) -> Terminal:
+        started.append(Terminal(list(command) or ["teleop_wheels"]))
+        return started[-1]
+
+    yield start
+    for one in started:
+        one.close()
+
+
+class Listener:
+    """What the robot would be told."""
+
+    def __init__(self, domain: int) -> None:
+        self.context = rclpy.Context()
+        rclpy.init(args=[], context=self.context, domain_id=domain)
+        self.node = rclpy.create_node("robot", context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        self.twists: list[TwistStamped] = []
+        self.setpoints: list[JointState] = []
+        self.node.create_subscription(TwistStamped, "cmd_vel", self.twists.append, 100)
+        self.node.create_subscription(JointState, "wheel_setpoints", self.setpoints.append, 100)
+
+    def spin(self) -> None:
+        self.executor.spin_once(timeout_sec=0.005)
+
+    def spin_for(self, seconds: float) -> None:
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            self.spin()
+
+    def linear(self) -> float | None:
+        return self.twists[-1].twist.linear.x if self.twists else None
+
+    def heard(self) -> bool:
+        publishers = self.node.count_publishers
+        return bool(publishers("cmd_vel") and publishers("wheel_setpoints"))
+
+
+@pytest.fixture
+def robot(ros_domain: int) -> Iterator[Listener]:
+    listener = Listener(ros_domain)
+    yield listener
+    listener.executor.shutdown()
+    listener.node.destroy_node()
+    rclpy.shutdown(context=listener.context)
+
+
+@pytest.fixture
+def ready(terminal, robot, eventually):
+    """Start it, and wait until the robot hears it and it reads keys."""
+
+    def run(*command: str) -> Terminal:
+        started = terminal(*command)
+        eventually(
+            lambda: robot.heard() and "hold a key" in started.look() and not started.echoes(),
+            deadline=20.0,
+            step=robot.spin,
+        )
+        return started
+
+    return run
+
+
+def hold(key: str, shell: Terminal, robot: Listener, condition, eventually) -> None:
+    def press() -> None:
+        shell.type(key)
+        robot.spin_for(0.05)
+
+    eventually(condition, deadline=5.0, step=press)
+
+
+def test_held_key_drives_and_its_release_stops_then_is_silent(ready, robot, eventually) -> None:
+    shell = ready()
+    robot.spin_for(0.3)
+    assert robot.twists == []
+    assert robot.setpoints == []
+    hold("w", shell, robot, lambda: robot.linear() == 0.2, eventually)
+    released = time.monotonic()
+    eventually(lambda: robot.linear() == 0.0, deadline=3.0, step=robot.spin)
+    assert time.monotonic() - released >= 0.5  # key_timeout is 0.6 s from the last repeat
+    assert robot.twists[-1].header.frame_id == "base_link"
+    assert robot.twists[-1].header.stamp.sec > 0
+    # Zeros for 1 s after the last key; then nobody is disturbed.
+    robot.spin_for(1.5)
+    count = len(robot.twists)
+    robot.spin_for(0.3)
+    assert len(robot.twists) == count
+    assert "stopped" in shell.look()
+
+
+def test_wheel_mode_turns_the_selected_wheel_and_space_stops_it(ready, robot, eventually) -> None:
+    shell = ready()
+    shell.type("m2++")
+    hold(
+        "\x1b[A",
+        shell,
+        robot,
+        lambda: robot.setpoints and max(robot.setpoints[-1].velocity) > 0.0,
+        eventually,
+    )
+    speeds = dict(zip(robot.setpoints[-1].name, robot.setpoints[-1].velocity, strict=True))
+    assert speeds.pop("front_right_wheel_joint") == pytest.approx(1.5 * 1.1**2)
+    assert set(speeds.values()) == {0.0}
+    shell.type(" ")
+    eventually(lambda: not any(robot.setpoints[-1].velocity), deadline=2.0, step=robot.spin)
+    assert robot.twists == []
+
+
+@pytest.mark.parametrize(
+    "leave",
+    [
+        "x",
+        "\x03",
+        "\x1c",
+        signal.SIGTERM,
+        signal.SIGHUP,
+    ],
+    ids=["x", "Ctrl-C", "Ctrl-backslash", "SIGTERM", "SIGHUP"],
+)
+def test_leaving_stops_the_robot_and_restores_the_terminal(
+    ready, robot, eventually, leave: str | int
+) -> None:
+    shell = ready()
+    hold("w", shell, robot, lambda: robot.linear() == 0.2, eventually)
+    if isinstance(leave, str):
+        shell.type(leave)
+    else:
+        os.kill(shell.process.pid, leave)
+    eventually(lambda: robot.linear() == 0.0, deadline=2.0, step=robot.spin)
+    eventually(lambda: shell.process.poll() is not None, deadline=3.0, step=robot.spin)
+    assert shell.process.returncode == 0
+    assert shell.is_usual()
+    assert "\x1b[?25h" in shell.look()  # the cursor is back
+    assert "Traceback" not in shell.shown
+
+
+def test_suspending_stops_and_restores_and_continuing_takes_the_keys_again(
+    ready, robot, eventually
+) -> None:
+    shell = ready()
+    hold("w", shell, robot, lambda: robot.linear() == 0.2, eventually)
+    shell.type("\x1a")
+    eventually(lambda: shell.state() == "T", deadline=3.0, step=robot.spin)
+    assert shell.is_usual()
+    eventually(lambda: robot.linear() == 0.0, deadline=1.0, step=robot.spin)
+    os.kill(shell.process.pid, signal.SIGCONT)
+    eventually(lambda: not shell.echoes(), deadline=3.0, step=robot.spin)
+    robot.twists.clear()
+    hold("s", shell, robot, lambda: robot.linear() == -0.2, eventually)
+    assert shell.process.poll() is None
+
+
+def test_exception_in_the_node_restores_the_terminal(terminal, eventually) -> None:
+    script = (
+        "import smp_motor_control.nodes.teleop_wheels as t, sys\n"
+        "def fail(self, *_): raise RuntimeError('broken')\n"
+        "t.TeleopWheels._show = fail\n"
+        "sys.exit(t.main([]))\n"
+    )
+    shell = terminal(sys.executable, "-c", script)
+    eventually(lambda: shell.process.poll() is not None, deadline=20.0)
+    assert shell.process.returncode == 1
+    assert shell.is_usual()
+    assert "broken" in shell.look()
+
+
+def test_without_a_terminal_it_says_so_in_one_line(process) -> None:
+    started = process("teleop_wheels")
+    assert started.wait(15.0) == 2
+    assert started.output.count("\n") == 1
+    assert "not a terminal" in started.output
+
+
+def test_impossible_speed_is_refused_and_the_terminal_left_alone(terminal, eventually) -> None:
+    shell = terminal("teleop_wheels", "--ros-args", "-p", "linear_speed:=-1.0")
+    eventually(lambda: shell.process.poll() is not None, deadline=20.0)
+    assert shell.process.returncode == 2
+    assert shell.is_usual()
+    assert "linear" in shell.look()
