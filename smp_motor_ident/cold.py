@@ -102,7 +102,7 @@ def candidates(data: Experiments, structure: Structure) -> list[Array]:
             found.append(z)
     for z in found:
         if structure.window:
-            z[models.WINDOW] = 2 * data.step
+            z[models.WINDOW] = 1.02 * data.step
     return found
 
 

@@ -11,7 +11,7 @@ from smp_motor_ident import ladder, models, validate
 from smp_motor_ident import recursion as rc
 from smp_motor_ident.advice import advise, doubts
 from smp_motor_ident.answer import Answer, answer
-from smp_motor_ident.cold import Options, refine
+from smp_motor_ident.cold import Options, cold_fit, grow, refine
 from smp_motor_ident.errors import InsufficientExcitationError, ParameterError, SignalError
 from smp_motor_ident.experiments import Experiments, prepare
 from smp_motor_ident.fit import Fit, Prior
@@ -27,6 +27,8 @@ Array = NDArray[np.float64]
 LOSSES = {"linear": np.inf, "huber": 2.0}
 FIXABLE = (*PHYSICAL, "delay", "averaging_window")
 WORST_FIT = 30.0
+LARGEST_OFFSET = 0.1
+MANY = 400_000
 
 
 def estimate(
@@ -88,12 +90,13 @@ def estimate(
     warnings = screen(group)
     warnings += [note for r in group for note in r.notes]
     use_current = _has_current(group) and model in ("auto", "electromechanical")
-    data = prepare(group, use_current)
     base = _structure(model, use_current, known, group)
+    hold, first = _hold(group, base, LOSSES[loss], say)
+    data = prepare(group, use_current, hold=hold)
     if base.window or "window" in base.held:
         data = data.as_mean_speed()
     options = Options(huber=LOSSES[loss])
-    rungs = ladder.explore(data, base, options, model == "auto", say)
+    rungs = ladder.explore(data, base, options, model == "auto", say, first)
     if not rungs:
         raise InsufficientExcitationError(
             f"{_where(group)}: no motor model explains these data; record 20 s or more of a "
@@ -105,8 +108,9 @@ def estimate(
     result = answer(chosen, known)
     fitted = validate.speed_fit(group, final, chosen)
     _refuse(group, chosen, result, fitted)
+    _refuse_offset(group, chosen)
     say("validating")
-    held = _validation(group, validation, chosen, options, use_current)
+    held = _validation(group, validation, chosen, options, hold)
     tests = validate.residual_tests(final, chosen)
     return Estimate(
         wheel=group[0].wheel,
@@ -191,6 +195,30 @@ def _structure(
     return Structure(rung, order, friction, shape=order == 2, load=asymmetric, held=held)
 
 
+def _hold(
+    group: Sequence[Record], base: Structure, huber: float, say: Callable[[str], None]
+) -> tuple[str, Fit | None]:
+    """Choose how the command ran inside the intervals, by what explains the outputs best."""
+    if base.order != 2 or "window" in base.held or sum(len(r) for r in group) > MANY:
+        return "held", None
+    plain = prepare(group, base.current)
+    others = {h: prepare(group, base.current, hold=h) for h in ("switched", "middle")}
+    others = {h: d for h, d in others.items() if d.section_end.size > plain.section_end.size}
+    if plain.kind != rc.ANGLE or not others:
+        return "held", None
+    say("how the command was held between samples")
+    options = Options(huber=huber)
+    best = cold_fit(plain, base if base.current else base.with_(shape=False), options)
+    if best is None:
+        return "held", None
+    hold = "held"
+    for other, data in others.items():
+        fitted = grow(data, best.structure, best, options)
+        if fitted.deviance < best.deviance - 30:
+            hold, best = other, fitted
+    return hold, best
+
+
 def _for_final(data: Experiments, fit: Fit) -> Experiments:
     return data.as_mean_speed() if fit.kind == rc.MEAN_SPEED else data
 
@@ -256,24 +284,36 @@ def _refuse(group: Sequence[Record], fit: Fit, result: Answer, fitted: float) ->
         )
 
 
+def _refuse_offset(group: Sequence[Record], fit: Fit) -> None:
+    offset = abs(fit.z[models.OFFSET])
+    if not fit.structure.offset or not fit.structure.current:
+        return
+    largest = max(float(np.nanmax(np.abs(r.current))) for r in group if r.current is not None)
+    if offset > LARGEST_OFFSET * max(largest - offset, 1e-12):
+        raise SignalError(
+            f"{_where(group)}: current has an offset of {fit.z[models.OFFSET]:.3g} A where it "
+            f"reaches {largest:.3g} A; zero the current sensor at rest and record again"
+        )
+
+
 def _validation(
     group: Sequence[Record],
     validation: Sequence[Record] | None,
     fit: Fit,
     options: Options,
-    use_current: bool,
+    hold: str,
 ) -> float | None:
     if validation is not None:
-        value = validate.held_out(list(validation), fit)
+        value = validate.held_out(list(validation), fit, hold)
     else:
         fitted, kept = validate.split(group)
         if not kept:
             return None
-        data = _for_final(prepare(fitted, use_current), fit)
+        data = _for_final(prepare(fitted, fit.structure.current, hold=hold), fit)
         if np.ptp(data.section_value) == 0:
             return None
         start = Fit(**{**vars(fit), "initial": data.initial})
-        value = validate.held_out(kept, refine(data, fit.structure, start, fit.z, options))
+        value = validate.held_out(kept, refine(data, fit.structure, start, fit.z, options), hold)
     return value if np.isfinite(value) else None
 
 

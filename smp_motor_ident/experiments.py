@@ -165,7 +165,9 @@ def speed_quantum(velocity: Array) -> float:
     return quantum if regular > 0.95 and 2e-3 * span < quantum < 0.2 * span else 0.0
 
 
-def prepare(records: Sequence[Record], use_current: bool, kind: str = "auto") -> Experiments:
+def prepare(
+    records: Sequence[Record], use_current: bool, kind: str = "auto", hold: str = "held"
+) -> Experiments:
     """Put records one after the other; segments keep their own state.
 
     Parameters
@@ -176,6 +178,9 @@ def prepare(records: Sequence[Record], use_current: bool, kind: str = "auto") ->
         Whether current is an output.
     kind : {'auto', 'speed', 'angle'}
         Which mechanical output.
+    hold : {'held', 'switched', 'middle'}
+        How the command ran inside the intervals of which the voltage is the mean: constant;
+        switching where two-level jumps nearby did; switching half-way.
 
     Returns
     -------
@@ -188,7 +193,7 @@ def prepare(records: Sequence[Record], use_current: bool, kind: str = "auto") ->
     starts, ends, values, section_start = [], [], [], []
     offset = sections = 0
     for record in records:
-        end, value, index = _sections(record)
+        end, value, index = _sections(record, hold)
         starts += [offset + s for s in record.starts]
         section_start += [sections + int(index[s]) for s in record.starts]
         ends.append(end)
@@ -225,7 +230,7 @@ def _join(arrays: Sequence[Array]) -> Array:
     return np.ascontiguousarray(arrays[0]) if len(arrays) == 1 else np.concatenate(arrays)
 
 
-def _sections(record: Record) -> tuple[Array, Array, Integers]:
+def _sections(record: Record, hold: str) -> tuple[Array, Array, Integers]:
     """Return the input as it was held, as far as the mean voltages tell.
 
     ``voltage[k]`` is a mean.  Where the intervals before and after are steady and differ, a
@@ -235,13 +240,14 @@ def _sections(record: Record) -> tuple[Array, Array, Integers]:
     """
     v, t = record.voltage, record.time
     index = np.arange(len(v), dtype=np.int64)
-    k, before = _jumps(record)
-    if k.size == 0:
+    if hold == "held":
         return t, v, index
+    k, before = _jumps(record)
     first, second = v.copy(), v.copy()
-    share = np.zeros(len(v))
+    share = np.full(len(v), 0.5 if hold == "middle" else 0.0)
     if k.size >= 4:
         share = np.interp(index, k, before)
+    if k.size >= 4 or hold == "middle":
         step = _trend(v)
         step[[0, *record.starts]] = 0.0
         first -= step * (1 - share)
@@ -269,7 +275,7 @@ def _jumps(record: Record) -> tuple[Integers, Array]:
     jump = v[3:-1] - v[1:-3]
     inside = (v[2:-2] - v[1:-3]) * (v[3:-1] - v[2:-2]) > 0
     steady = np.maximum(np.abs(v[1:-3] - v[:-4]), np.abs(v[4:] - v[3:-1])) < 0.1 * np.abs(jump)
-    k = np.flatnonzero(inside & steady) + 2
+    k = np.flatnonzero(inside & steady & (np.abs(jump) > 0.2 * np.ptp(v))) + 2
     starts = np.array(record.starts)
     k = k[~np.isin(k, starts) & ~np.isin(k - 1, starts) & ~np.isin(k + 1, starts)]
     return (k, (v[k + 1] - v[k]) / (v[k + 1] - v[k - 1])) if k.size else none

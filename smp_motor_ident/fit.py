@@ -19,6 +19,8 @@ from smp_motor_ident.models import Structure, to_internal
 
 Array = NDArray[np.float64]
 
+PLAUSIBLE = np.array([1e-2, 1e-2, 1e-2, 0.25, 1e-4, 1e-4, 1e-4, 1e-2, 1e-4, 1e-2, 1e-2])
+"""Inverse squares of how far each coordinate z could be from any value at all."""
 BLOCKS = 60  # runs of samples whose scores are summed, for the covariance of coloured residuals
 
 
@@ -100,10 +102,13 @@ class Fit:
         The inverse information, widened coordinate by coordinate where the scores of
         whole runs of samples scatter more than white residuals would let them.
         """
-        information = self.information
-        scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
-        inverse = np.linalg.pinv(information / np.outer(scale, scale), rcond=1e-13, hermitian=True)
-        cov: Array = inverse / np.outer(scale, scale)
+        # Every coordinate lies within some e-folds or volts of any motor's: without that a
+        # direction that the data leave open would count as known.
+        information = self.information + np.diag(PLAUSIBLE[list(self.structure.free())])
+        scale = np.sqrt(np.diag(information))
+        values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
+        vectors = vectors / scale[:, None]
+        cov: Array = (vectors / np.maximum(values, 1e-15)) @ vectors.T
         n = len(self.scores)
         if n > 2 * cov.shape[0]:
             moved = (self.scores - self.scores.mean(axis=0)) @ cov
@@ -622,6 +627,27 @@ def simulate(data: Experiments, fit: Fit, gain: bool = False) -> Array:
         free=False,
     )
     return predicted
+
+
+def information(data: Experiments, fit: Fit) -> Array:
+    """Return the Fisher information that experiments would give about a fit's coordinates.
+
+    Parameters
+    ----------
+    data : Experiments
+        Their times and voltages; outputs may be zero.
+    fit : Fit
+        Coordinates and noise.
+
+    Returns
+    -------
+    ndarray, shape (f, f)
+        Initial states eliminated.
+    """
+    here = _pass(
+        data, fit.structure, fit.z, fit.initial, fit.initial, fit.gain, fit.noise, np.inf, ()
+    )
+    return here.normal
 
 
 def one_step(data: Experiments, fit: Fit) -> Array:

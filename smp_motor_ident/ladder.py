@@ -163,7 +163,12 @@ Say = Callable[[str], None]
 
 
 def explore(
-    data: Experiments, base: Structure, options: Options, auto: bool, say: Say
+    data: Experiments,
+    base: Structure,
+    options: Options,
+    auto: bool,
+    say: Say,
+    first: Fit | None = None,
 ) -> list[Rung]:
     """Fit the rungs that come into question; the last one is the choice.
 
@@ -179,6 +184,8 @@ def explore(
         Whether the order may be chosen.
     say : callable
         Told what is being done.
+    first : Fit, optional
+        Of ``base``, where it is known already.
 
     Returns
     -------
@@ -187,11 +194,14 @@ def explore(
     """
     rungs: list[Rung] = []
     if base.current or not auto:
-        first = _cold(data, base, options, say)
+        if first is None or first.structure != base:
+            first = _cold(data, base, options, say)
         if first is None:
             return []
         best = first
         rungs.append(Rung(first, "asked for" if not auto else "current is measured"))
+        if auto and data.kind == rc.SPEED:
+            best = _try_average(data, best, options, rungs, say)
     else:
         found = _orders(data, base, options, say, rungs)
         if found is None:
@@ -257,7 +267,7 @@ def _ladder(base: Structure, speed: bool, coarse: bool) -> list[Structure]:
 def _one(data: Experiments, structure: Structure, options: Options, known: list[Fit]) -> Fit | None:
     """Fit one rung, started from what the rungs below it found."""
     if structure.window:
-        late = replace(structure, name="first_order", order=1, delay=True)
+        late = replace(structure, name="first_order", order=1, shape=False, delay=True)
         twin = _find(known, late) or _find(known, late.with_(window=False))
         if twin is None or structure.order == 1:
             twin = _find(known, structure.with_(window=False, delay=True))
@@ -346,13 +356,35 @@ def _variations(data: Experiments, best: Fit, options: Options, rungs: list[Rung
     if s.friction == "symmetric" and "vc_plus" not in s.held:
         cov = best.covariance()
         i = s.free().index(models.VC_PLUS)
-        if best.z[models.VC_PLUS] < 3 * np.sqrt(cov[i, i]):
+        std = float(np.sqrt(cov[i, i]))
+        # Friction that the data do not tell stays: leaving it out would make the gain certain.
+        small = best.z[models.VC_PLUS] + 2 * std < 0.02 * np.abs(data.section_value).max()
+        if small and best.z[models.VC_PLUS] < 3 * std:
             plain = cold.refine(data, s.with_(friction="none", shape=False), best, best.z, options)
             keep, reason = needed(plain, best)
             if not keep:
                 rungs.append(Rung(plain, "no Coulomb friction shows"))
                 best = plain
     return best
+
+
+def _try_average(
+    data: Experiments, best: Fit, options: Options, rungs: list[Rung], say: Say
+) -> Fit:
+    """Try a speed averaged over a window of a sample or more, current being measured."""
+    structure = best.structure.with_(window=True)
+    say(f"trying {label(structure)}")
+    starts = []
+    for width in (1.02, 2.0, 4.0):
+        z = best.z.copy()
+        z[models.WINDOW] = width * data.step
+        starts.append(z)
+    fitted = cold.cold_fit(data.as_mean_speed(), structure, options, starts, keep=3, own=False)
+    if fitted is None:
+        return best
+    verdict, reason = needed(best, fitted)
+    rungs.append(Rung(fitted, reason))
+    return fitted if verdict else best
 
 
 def _averaged(
@@ -379,5 +411,6 @@ def _averaged(
             z[models.TE] = z[models.A2] - z[models.A1]
         starts.append(z)
     mean = data.as_mean_speed()
-    fitted = cold.cold_fit(mean, structure, options, starts, keep=3, own=False)
+    own = structure.order == 2 and not structure.delay
+    fitted = cold.cold_fit(mean, structure, options, starts, keep=3, own=own)
     return _snap(mean, fitted, options) if structure.delay else fitted

@@ -44,8 +44,9 @@ def screen(records: Sequence[Record]) -> list[str]:
         warnings += _lost(record)
     _excitation(records, where)
     for record in records:
+        _saturation(record)
         _ratio(record)
-        warnings += _saturation(record)
+        _frozen(record)
     _motion(records, where)
     _signs(records, where)
     return list(dict.fromkeys(warnings))
@@ -169,7 +170,8 @@ def _ratio(record: Record) -> None:
         )
 
 
-def _saturation(record: Record) -> list[str]:
+def _saturation(record: Record) -> None:
+    """Refuse a speed or current that rests at its limit while the voltage moves."""
     where = _where([record])
     for name, unit in (("velocity", "rad/s"), ("current", "A")):
         values = getattr(record, name)
@@ -181,20 +183,42 @@ def _saturation(record: Record) -> list[str]:
             continue
         for limit in (x.max(), x.min()):
             at = x == limit
-            share = float(at.mean())
-            inner = x[1:-1][(x[1:-1] != x.max()) & (x[1:-1] != x.min())]
-            repeats = float(np.mean(np.diff(inner) == 0)) if inner.size > 10 else 1.0
-            runs = at[1:] & at[:-1]
-            if share < 0.01 or repeats > 0.3 or runs.sum() < 0.5 * at.sum() or limit == 0.0:
+            if limit == 0.0:
                 continue
-            if np.ptp(v[at]) < 0.02 * np.ptp(v):
+            share = float(at.mean())
+            levels, times = np.unique(x, return_counts=True)
+            next_times = times[-2] if limit == levels[-1] else times[1]
+            runs = at[1:] & at[:-1]
+            # A resting sensor shows its limit far more often than the level beside it.
+            if share < 0.01 or at.sum() < 5 * next_times or runs.sum() < 0.5 * at.sum():
+                continue
+            low, high = np.percentile(v[at], [5, 95])
+            if high - low < 0.02 * np.ptp(v):
                 continue
             raise SignalError(
                 f"{where}: saturated sensor, {name} rests at {limit:.4g} {unit} in "
                 f"{share:.1%} of the samples while the voltage moves; widen its range or "
                 "lower the excitation"
             )
-    return []
+
+
+def _frozen(record: Record) -> None:
+    """Refuse an encoder that stops counting half-way while the voltage goes on."""
+    if record.count is None or len(record) < 200:
+        return
+    moving = np.flatnonzero(np.diff(record.count)) + 1
+    edges = np.concatenate([[0], moving, [len(record) - 1]])
+    longest = int(np.argmax(np.diff(edges)))
+    a, b = int(edges[longest]), int(edges[longest + 1])
+    if b - a < max(100, 0.1 * len(record)):
+        return
+    still, rest = record.voltage[a:b], np.delete(record.voltage, np.arange(a, b))
+    if np.abs(still).mean() > 0.5 * np.abs(rest).mean():
+        raise SignalError(
+            f"{_where([record])}: dead encoder, the count stays at {record.count[a]} from "
+            f"t = {record.time[a]:.4g} s to {record.time[b]:.4g} s while the voltage reaches "
+            f"{np.abs(still).max():.3g} V; check the encoder's cable, or that nothing blocks the motor"
+        )
 
 
 def _motion(records: Sequence[Record], where: str) -> None:

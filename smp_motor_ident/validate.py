@@ -77,15 +77,17 @@ def _differences(data: Experiments, angle: Array) -> Array:
     return np.asarray(speed)
 
 
-def held_out(records: Sequence[Record], fit: Fit) -> float:
+def held_out(records: Sequence[Record], fit: Fit, hold: str = "held") -> float:
     """Return the fit percent on records that the fit has not seen.
 
     Parameters
     ----------
     records : sequence of Record
-        Only their initial states are fitted.
+        Only their initial states and constant loads are fitted.
     fit : Fit
         The motor.
+    hold : str
+        As in `experiments.prepare`.
 
     Returns
     -------
@@ -93,7 +95,7 @@ def held_out(records: Sequence[Record], fit: Fit) -> float:
         See `speed_fit`.
     """
     kind = "speed" if fit.kind != rc.ANGLE else "auto"
-    data = prepare(records, False, kind)
+    data = prepare(records, False, kind, hold)
     if fit.kind == rc.MEAN_SPEED and data.kind == rc.SPEED:
         data = data.as_mean_speed()
     return speed_fit(records, data, fitting.settle(data, fit))

@@ -1,0 +1,53 @@
+"""Recordings of known motors for the tests of estimation."""
+
+from __future__ import annotations
+
+import independent
+import numpy as np
+
+from smp_motor_ident import models
+from smp_motor_ident.record import Hardware, Record
+
+QUANTUM = 2 * np.pi / 500
+COLUMNS = ("resistance", "inductance", "motor_constant", "inertia", "viscous_friction")
+
+
+def truth(wheel: str, static_voltage: float) -> dict[str, float]:
+    """Return parameters and combinations of a motor of Table 1 with Coulomb friction."""
+    p = independent.TABLE_1[wheel]
+    coulomb = static_voltage * p[2] / p[0]
+    z = models.from_physical(*p, coulomb)
+    return {**models.physical(z)[0], **models.combinations(z, 2)[0]}
+
+
+def record(
+    wheel: str = "rear_left",
+    *,
+    current: bool = True,
+    static_voltage: float = 0.3,
+    kinds: tuple[str, ...] = ("sine", "square", "fourier"),
+    seconds: float = 5.0,
+    rate: float = 200.0,
+    amplitude: float = 10.0,
+    torque_noise: float = 0.0,
+    seed: int = 0,
+    voltage: np.ndarray | None = None,
+) -> Record:
+    """Return counts, differenced speed and noisy current of a motor of Table 1."""
+    rng = np.random.default_rng(seed)
+    n = int(seconds * rate)
+    t = np.arange(n * len(kinds)) / rate
+    if voltage is None:
+        voltage = np.concatenate([independent.excitation(t[:n], k, amplitude) for k in kinds])
+    t = t[: len(voltage)]
+    r, el, k, j, b = independent.TABLE_1[wheel]
+    load = torque_noise * k / r * rng.standard_normal(t.size)
+    out = independent.simulate(
+        t, voltage, r, el, k, j, b, static_voltage * k / r, load, int(max(4, 10_000 / rate))
+    )
+    count = np.floor(out[:, 2] / QUANTUM + rng.uniform()).astype(np.int64)
+    speed = np.zeros(t.size)
+    speed[1:] = np.diff(count) * QUANTUM * rate
+    amps = out[:, 0] + 0.01 * rng.standard_normal(t.size) if current else None
+    hardware = Hardware(65.5, 500.0, 0, 12.0, None)
+    return Record(wheel, t, voltage, amps, speed, None, count, hardware=hardware, source="bag")

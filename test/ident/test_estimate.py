@@ -1,0 +1,157 @@
+"""The estimator recovers known motors, or says that it cannot."""
+
+import json
+from dataclasses import replace
+
+import motors
+import numpy as np
+import pytest
+
+from smp_motor_ident.errors import ParameterError
+from smp_motor_ident.estimate import estimate
+from smp_motor_ident.identifiability import structural, what_next
+from smp_motor_ident.models import PHYSICAL
+
+WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
+# Of some fifty quantities tested one in 2000 passes four standard deviations by chance.
+SIGMAS = 4.0
+
+
+def check(result, truth, names, sigmas=SIGMAS):
+    for name in names:
+        q = result.parameters.get(name) or result.combinations[name]
+        assert q.value is not None and q.std is not None, name
+        assert abs(q.value - truth[name]) < sigmas * q.std + 1e-9 * abs(truth[name]), name
+
+
+@pytest.mark.parametrize("wheel", WHEELS)
+def test_all_parameters_are_recovered_with_current_and_friction(wheel):
+    result = estimate(motors.record(wheel))
+    truth = motors.truth(wheel, 0.3)
+    assert result.model == "electromechanical"
+    assert result.identifiable
+    check(result, truth, PHYSICAL)
+    assert result.value("dc_gain") == pytest.approx(truth["dc_gain"], rel=5e-3)  # the issue's
+    assert result.fit_percent.validation > 95
+    json.dumps(result.to_document(), allow_nan=False)
+
+
+@pytest.mark.parametrize("wheel", WHEELS)
+def test_voltage_and_speed_give_combinations_and_refuse_the_rest(wheel):
+    result = estimate(motors.record(wheel, current=False))
+    truth = motors.truth(wheel, 0.3)
+    assert not result.identifiable
+    assert set(result.unidentifiable) == set(PHYSICAL)
+    assert all(result.parameters[n].value is None for n in PHYSICAL)
+    check(result, truth, ("dc_gain", "time_constant", "time_constant_product", "static_voltage"))
+    assert any("current" in a for a in result.advice)
+
+
+def test_a_linear_motor_is_recovered_without_friction():
+    result = estimate(motors.record("front_left", static_voltage=0.0))
+    check(result, motors.truth("front_left", 0.0), PHYSICAL[:5])
+    q = result.parameters["coulomb_friction"]
+    # Nothing or next to nothing: below a hundredth of what 10 V make.
+    assert q.value < 0.01 * 10 * 0.011 / 12.9
+
+
+def test_torque_disturbance_widens_the_intervals_and_does_not_ruin_the_estimate():
+    quiet = estimate(motors.record("rear_right"))
+    noisy = estimate(motors.record("rear_right", torque_noise=0.5))
+    truth = motors.truth("rear_right", 0.3)
+    check(noisy, truth, PHYSICAL)
+    assert noisy.combinations["dc_gain"].std > 3 * quiet.combinations["dc_gain"].std
+    # 0.5 V of torque noise a sample against 10 V: half a percent is what the data still give.
+    assert noisy.value("dc_gain") == pytest.approx(truth["dc_gain"], rel=5e-3)
+
+
+def test_a_command_that_switches_between_samples_is_put_where_it_switched():
+    fine = motors.record("front_left", rate=1000.0, seconds=5.0)
+    late = np.roll(fine.voltage.reshape(-1, 5).mean(axis=1).repeat(5), 2)
+    late[:2] = late[2]
+    fine = motors.record("front_left", rate=1000.0, seconds=5.0, voltage=late)
+    keep = slice(0, None, 5)
+    mean = np.concatenate(
+        [[late[0]], late[1:].reshape(-1)[: 5 * (len(late) // 5 - 1)].reshape(-1, 5).mean(axis=1)]
+    )
+    coarse = replace(fine, time=fine.time[keep], voltage=mean, current=fine.current[keep],
+                     velocity=None, count=fine.count[keep])  # fmt: skip
+    check(estimate(coarse), motors.truth("front_left", 0.3), PHYSICAL)
+
+
+def test_fixed_resistance_is_reported_as_fixed_and_still_separates_nothing_without_current():
+    result = estimate(motors.record("rear_left", current=False), fixed={"resistance": 3.2843})
+    assert result.parameters["resistance"].status == "fixed"
+    assert result.parameters["resistance"].value == 3.2843
+    assert set(result.unidentifiable) == set(PHYSICAL) - {"resistance"}
+
+
+def test_resistance_and_friction_fixed_separate_the_rest_without_current():
+    truth = motors.truth("rear_left", 0.0)
+    recording = motors.record("rear_left", current=False, static_voltage=0.0)
+    known = {n: truth[n] for n in ("resistance", "viscous_friction")}
+    result = estimate(recording, fixed=known)
+    for name in ("motor_constant", "inertia", "inductance"):
+        q = result.parameters[name]
+        assert abs(q.value - truth[name]) < SIGMAS * q.std, name
+
+
+def test_fixed_resistance_with_current_is_kept():
+    truth = motors.truth("rear_left", 0.3)
+    result = estimate(motors.record("rear_left"), fixed={"resistance": truth["resistance"]})
+    check(result, truth, PHYSICAL[1:])
+    assert result.parameters["resistance"].status == "fixed"
+
+
+def test_several_records_have_their_own_beginnings():
+    parts = [
+        motors.record("rear_left", kinds=(k,), seed=n) for n, k in enumerate(("sine", "square"))
+    ]
+    result = estimate([parts[0], parts[1].slice(100, 1000)])
+    check(result, motors.truth("rear_left", 0.3), PHYSICAL)
+    assert result.samples == 1900
+
+
+def test_a_speed_differenced_over_a_sample_is_recognised_as_a_mean():
+    recording = replace(motors.record("rear_left", current=False), count=None)
+    result = estimate(recording)
+    truth = motors.truth("rear_left", 0.3)
+    # The window is one sample of 5 ms; a tenth of it is what quantised speed tells.
+    assert result.value("averaging_window") == pytest.approx(5e-3, abs=5e-4)
+    assert result.value("dc_gain") == pytest.approx(truth["dc_gain"], rel=2e-3)
+    assert result.value("delay") < 5e-4
+
+
+def test_outliers_do_not_move_a_robust_fit():
+    recording = motors.record("rear_left")
+    rng = np.random.default_rng(1)
+    amps = recording.current.copy()
+    amps[rng.integers(0, len(amps), 60)] += 5.0
+    result = estimate(replace(recording, current=amps), loss="huber")
+    assert result.value("resistance") == pytest.approx(3.2843, rel=0.01)
+
+
+def test_what_next_asks_for_current_where_there_was_none():
+    result = estimate(motors.record("rear_left", current=False))
+    proposal = what_next(result, accuracy=0.01)
+    assert proposal.measure_current
+    assert 0 < proposal.amplitude <= 12
+    assert max(proposal.relative_std.values()) <= 0.0101
+
+
+def test_rank_of_the_sensitivities_is_what_theory_says():
+    p = {n: motors.truth("front_left", 0.0)[n] for n in PHYSICAL[:5]}
+    assert structural(p, current=False).rank == 3
+    assert structural(p, current=False, fixed=("resistance",)).rank == 3
+    assert len(structural(p, current=False, fixed=("resistance",)).blind) == 1
+    assert structural(p, current=True).rank == 5
+
+
+def test_unknown_names_are_refused_by_name():
+    recording = motors.record(seconds=1.0)
+    with pytest.raises(ParameterError, match="third_order"):
+        estimate(recording, model="third_order")
+    with pytest.raises(ParameterError, match="mass"):
+        estimate(recording, fixed={"mass": 1.0})
+    with pytest.raises(ParameterError, match="resistance = -1"):
+        estimate(recording, fixed={"resistance": -1.0})

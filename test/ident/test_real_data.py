@@ -1,0 +1,47 @@
+"""Real motors' recordings, as published (see their README for source and licence)."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from smp_motor_ident.estimate import estimate
+from smp_motor_ident.record import Record
+
+DATA = Path(__file__).parents[3] / "shared" / "data"
+pytestmark = pytest.mark.skipif(not DATA.exists(), reason="recordings are not at hand")
+
+
+def prbs(day: str) -> Record:
+    table = np.genfromtxt(DATA / f"prbs_gearmotor/prbs_{day}.csv", delimiter=",", names=True)
+    return Record("motor", table["t"], table["u"], velocity=np.radians(table["y"]), source=day)
+
+
+def step(path: Path) -> Record:
+    table = np.genfromtxt(path, delimiter=",", skip_header=1)
+    volts = table[:, 2] / 5319 * 12.0
+    speed = table[:, 1] * 2 * np.pi / 60
+    return Record("motor", table[:, 0] * 1e-3, volts, velocity=speed, source=path.name)
+
+
+@pytest.mark.parametrize(
+    ("fitted", "kept"), [("2026-08-14", "2026-08-18"), ("2026-08-18", "2026-08-14")]
+)
+def test_prbs_of_one_day_explains_the_other_day(fitted, kept):
+    result = estimate(prbs(fitted), validation=[prbs(kept)])
+    # The owner's static curve; 3 % and the range of tau are what the data's README knows.
+    assert np.degrees(result.value("dc_gain")) == pytest.approx(159.9, rel=0.03)
+    assert 0.030 < result.value("time_constant") < 0.042
+    assert result.fit_percent.validation > 94
+    # Speed in steps of a count per sample: the filter is one sample long.
+    assert result.value("averaging_window") == pytest.approx(0.020, abs=0.002)
+
+
+def test_ten_steps_in_one_fit_tell_the_speed_filter_from_a_delay():
+    result = estimate([step(p) for p in sorted((DATA / "step_gearmotor").glob("*.csv"))])
+    assert result.fit_percent.estimation > 93
+    assert result.fit_percent.validation > 93
+    # The log's speed is a position difference over 32 samples of 1 ms.
+    assert result.value("averaging_window") == pytest.approx(0.032, abs=0.004)
+    assert result.value("delay") < 0.004
+    assert any("averaged" in w for w in result.warnings)

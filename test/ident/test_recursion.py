@@ -1,0 +1,113 @@
+"""The compiled recursion: events inside the step, delay and window, against other means."""
+
+from dataclasses import replace
+
+import independent
+import motors
+import numpy as np
+import pytest
+
+from smp_motor_ident import fit, models
+from smp_motor_ident import recursion as rc
+from smp_motor_ident.experiments import prepare
+from smp_motor_ident.models import Structure
+
+NO_GAIN = np.zeros((3, 2))
+
+
+def predict(data, structure, z, gain=NO_GAIN):
+    out = np.zeros((data.size, 3))
+    fit._run(data, structure, z, data.initial, gain, np.eye(2), np.inf, out, (), False)
+    return out
+
+
+def exact(wheel="front_left", static_voltage=0.5, kind="fourier", seconds=4.0):
+    recording = motors.record(wheel, kinds=(kind,), seconds=seconds, static_voltage=static_voltage)
+    data = prepare([recording], True)
+    data = replace(data, initial=np.zeros((1, 4)))
+    p = independent.TABLE_1[wheel]
+    z = models.from_physical(*p, static_voltage * p[2] / p[0])
+    return recording, data, z
+
+
+@pytest.mark.parametrize("kind", ["sine", "square", "fourier"])
+def test_sticking_and_reversal_inside_the_step_match_a_simulation_in_small_steps(kind):
+    recording, data, z = exact(kind=kind)
+    structure = Structure("electromechanical", current=True)
+    r, el, k, j, b = independent.TABLE_1["front_left"]
+    small = independent.simulate(
+        recording.time, recording.voltage, r, el, k, j, b, 0.5 * k / r,
+        np.zeros(len(recording)), 400,
+    )  # fmt: skip
+    out = predict(data, structure, z)
+    # The small steps (12.5 us) start from rest up to one step late: 1e-4 of the speed's range.
+    np.testing.assert_allclose(out[:, 0], small[:, 1], atol=0.05)
+    np.testing.assert_allclose(out[:, 1], small[:, 2], atol=2e-3)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.0033, 0.0121])
+@pytest.mark.parametrize("with_gain", [False, True])
+def test_gradient_is_that_of_finite_differences_through_all_events(delay, with_gain):
+    _, data, z = exact(seconds=3.0)
+    structure = Structure(
+        "electromechanical", current=True, delay=delay > 0, offset=True, load=True
+    )
+    z = structure.complete(z) + 0.0
+    z[models.DELAY] = delay
+    matrix = structure.matrix()
+    z = z + matrix @ np.full(matrix.shape[1], 1e-3)
+    gain = NO_GAIN.copy()
+    if with_gain:
+        gain, _ = fit.kalman_gain(z, 2, rc.ANGLE, data.step, 1e7, 0.5)
+
+    def run(at):
+        return fit._run(data, structure, at, data.initial, gain, np.diag([1e-4, 1e-4]), np.inf)
+
+    _, gradient, _, *_ = run(z)
+    for j in range(matrix.shape[1]):
+        step = 1e-6 if structure.free()[j] < models.VC_PLUS else 1e-7
+        up, down = run(z + step * matrix[:, j])[2], run(z - step * matrix[:, j])[2]
+        numeric = -0.5 * (up[0] - down[0]) / (2 * step)
+        scale = np.abs(gradient[0]).max()
+        # A whole delay of samples and the sticking have kinks; elsewhere 1e-3 is rounding.
+        assert gradient[0, j] == pytest.approx(numeric, rel=2e-3, abs=1e-6 * scale)
+
+
+def test_delay_of_whole_samples_equals_a_shifted_input():
+    recording, data, z = exact(static_voltage=0.3)
+    structure = Structure("second_order", delay=True)
+    z = structure.complete(z)
+    late = z.copy()
+    late[models.DELAY] = 2 * data.step
+    v = recording.voltage
+    shifted = replace(recording, voltage=np.concatenate([[v[0], v[0]], v[:-2]]), current=None)
+    plain = replace(prepare([shifted], False), initial=np.zeros((1, 4)))
+    a = predict(replace(data, current=np.zeros(0)), structure, late)
+    b = predict(plain, structure, z)
+    np.testing.assert_allclose(a[:, 0], b[:, 0], atol=1e-8)
+
+
+def test_mean_speed_over_a_window_is_the_difference_of_angles():
+    _, data, z = exact(static_voltage=0.0)
+    structure = Structure("second_order", friction="none", window=True)
+    z = structure.complete(z)
+    z[models.WINDOW] = 4 * data.step
+    data = replace(data, current=np.zeros(0))
+    angle = predict(replace(data, kind=rc.ANGLE), structure, z)[:, 1]
+    mean = predict(replace(data, kind=rc.MEAN_SPEED), structure, z)[:, 1]
+    np.testing.assert_allclose(mean[4:], (angle[4:] - angle[:-4]) / (4 * data.step), rtol=1e-9)
+
+
+def test_irregular_stamps_are_taken_as_they_are():
+    rng = np.random.default_rng(3)
+    t = np.cumsum(0.005 + 0.002 * rng.uniform(-1, 1, 800))
+    v = independent.excitation(t, "square")
+    p = independent.TABLE_1["rear_right"]
+    small = independent.simulate(t, v, *p, 0.2 * p[2] / p[0], np.zeros(t.size), 200)
+    recording = replace(motors.record(seconds=2.0), time=t, voltage=v, velocity=None,
+                        current=small[:, 0], count=np.zeros(800, dtype=np.int64))  # fmt: skip
+    recording = replace(recording, count=(small[:, 2] / motors.QUANTUM).astype(np.int64))
+    data = replace(prepare([recording], True), initial=np.zeros((1, 4)))
+    z = models.from_physical(*p, 0.2 * p[2] / p[0])
+    out = predict(data, Structure("electromechanical", current=True), z)
+    np.testing.assert_allclose(out[:, 0], small[:, 1], atol=0.05)  # as above

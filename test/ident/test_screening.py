@@ -1,0 +1,105 @@
+"""Bad data are named for what they are, and never become a number."""
+
+from dataclasses import replace
+
+import motors
+import numpy as np
+import pytest
+
+from smp_motor_ident.errors import InsufficientExcitationError, SignalError
+from smp_motor_ident.estimate import estimate
+
+GOOD = motors.record("rear_left", seconds=4.0)
+N = len(GOOD)
+
+
+def still(value):
+    return motors.record("rear_left", seconds=4.0, voltage=np.full(N, value))
+
+
+def alternate(values):
+    return np.where(np.arange(N) % 300 < 180, np.nan, values)
+
+
+BAD = {
+    "no excitation": (still(0.0), InsufficientExcitationError, "no excitation"),
+    "constant input": (still(6.0), InsufficientExcitationError, "constant at 6 V"),
+    "too short": (GOOD.slice(0, 30), InsufficientExcitationError, "too short, 30 samples"),
+    "saturated velocity": (
+        replace(GOOD, count=None, velocity=np.clip(GOOD.velocity, -150, 150)),
+        SignalError,
+        "saturated sensor, velocity",
+    ),
+    "saturated current": (
+        replace(GOOD, current=np.clip(GOOD.current, -0.8, 0.8)),
+        SignalError,
+        "saturated sensor, current",
+    ),
+    "dead encoder": (replace(GOOD, count=np.zeros(N, int)), SignalError, "dead encoder"),
+    "encoder dies": (
+        replace(GOOD, velocity=None, count=np.minimum(np.arange(N), N // 2) * 0
+                + GOOD.count[np.minimum(np.arange(N), N // 2)]),
+        SignalError,
+        "dead encoder",
+    ),
+    "swapped leads": (
+        replace(GOOD, count=-GOOD.count, velocity=-GOOD.velocity),
+        SignalError,
+        "swapped sign, speed",
+    ),
+    "swapped channels": (replace(GOOD, count=-GOOD.count), SignalError, "swapped sign"),
+    "swapped current": (replace(GOOD, current=-GOOD.current), SignalError, "swapped sign, current"),
+    "wrong gear ratio": (
+        replace(GOOD, velocity=GOOD.velocity * 0.5),
+        SignalError,
+        "wrong gear ratio",
+    ),
+    "offset current": (replace(GOOD, current=GOOD.current + 1.0), SignalError, "offset of 1"),
+    "NaN gaps": (
+        replace(GOOD, count=None, velocity=alternate(GOOD.velocity)),
+        SignalError,
+        "NaN in 60%",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_data_are_named_for_what_they_are(name):
+    recording, error, words = BAD[name]
+    with pytest.raises(error, match=words) as caught:
+        estimate(recording)
+    assert caught.value.exit_code == 1
+    assert "\n" not in str(caught.value)
+
+
+def test_a_speed_that_has_nothing_to_do_with_the_voltage_is_refused():
+    noise = 50 * np.random.default_rng(0).standard_normal(N)
+    with pytest.raises((SignalError, InsufficientExcitationError)):
+        estimate(replace(GOOD, count=None, velocity=noise))
+
+
+def test_a_small_offset_of_the_current_is_removed_and_said():
+    result = estimate(replace(GOOD, current=GOOD.current + 0.05))
+    assert any("offset" in w for w in result.warnings)
+    assert result.value("resistance") == pytest.approx(3.2843, rel=2e-3)  # 5 of its std
+
+
+def test_gaps_of_nan_are_left_out_and_said():
+    amps = np.where(np.arange(N) % 300 < 60, np.nan, GOOD.current)
+    result = estimate(replace(GOOD, current=amps))
+    assert any("NaN" in w for w in result.warnings)
+    assert result.value("resistance") == pytest.approx(3.2843, rel=2e-3)
+
+
+def test_one_step_does_not_pretend_to_separate_gain_from_friction():
+    n = 1000
+    step = motors.record(
+        "rear_left", current=False, voltage=np.where(np.arange(n) < 50, 0.0, 8.0), kinds=("sine",)
+    )
+    try:
+        gain = estimate(step).combinations["dc_gain"]
+    except InsufficientExcitationError as refusal:
+        assert "dc_gain" in str(refusal)
+        return
+    assert gain.std > 0.01 * gain.value
+    assert abs(gain.value - motors.truth("rear_left", 0.3)["dc_gain"]) < 3 * gain.std
