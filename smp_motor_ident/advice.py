@@ -53,9 +53,7 @@ def doubts(
             "motor or its load changed, or the excitation was too poor"
         )
     if tests.independent_of_input is False and estimation < 95:
-        out.append(
-            "the residuals still follow the voltage: the motor does something that the model does not"
-        )
+        out.append("the residuals still follow the voltage: the motor does what the model does not")
     if s.offset and s.current:
         offset = fit.z[models.OFFSET]
         out.append(
@@ -109,7 +107,8 @@ def advise(fit: Fit, result: Answer, known: Mapping[str, float]) -> list[str]:
         others = [n for n in missing if n != "inductance"]
         if others:
             out.append(
-                f"{', '.join(others)}: excite harder, longer, over more frequencies and in both directions"
+                f"{', '.join(others)}: excite harder, longer, over more frequencies and in "
+                "both directions"
             )
     free = s.free()
     if models.VC_PLUS in free and s.friction != "none":

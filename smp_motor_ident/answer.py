@@ -199,7 +199,7 @@ def _log_coefficients(free: list[str], x: Array, fixed: Mapping[str, float]) -> 
     r, el, k = p["resistance"], p["inductance"], p["motor_constant"]
     j, b = p["inertia"], p["viscous_friction"]
     a = np.array([(r * b + k * k) / k, (r * j + el * b) / k, el * j / k])
-    return np.log(np.maximum(a, 1e-300))
+    return np.asarray(np.log(np.maximum(a, 1e-300)))
 
 
 def _too_loose(name: str, value: float, std: float, fit: Fit) -> bool:

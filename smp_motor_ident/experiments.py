@@ -129,8 +129,8 @@ def output_of(record: Record, kind: str = "auto") -> tuple[Array, int, float]:
             return record.position - first, rc.ANGLE, 0.0
     if record.velocity is None:
         raise ValueError("record has no velocity")
-    kind = rc.MEAN_SPEED if record.velocity_window > 0 else rc.SPEED
-    return record.velocity, kind, speed_quantum(record.velocity)
+    mean = rc.MEAN_SPEED if record.velocity_window > 0 else rc.SPEED
+    return record.velocity, mean, speed_quantum(record.velocity)
 
 
 def speed_quantum(velocity: Array) -> float:
@@ -244,7 +244,7 @@ def _sections(record: Record, hold: str) -> tuple[Array, Array, Integers]:
         return t, v, index
     k, before = _jumps(record)
     first, second = v.copy(), v.copy()
-    share = np.full(len(v), 0.5 if hold == "middle" else 0.0)
+    share: Array = np.full(len(v), 0.5 if hold == "middle" else 0.0)
     if k.size >= 4:
         share = np.interp(index, k, before)
     if k.size >= 4 or hold == "middle":

@@ -132,7 +132,7 @@ def _run(
     local: tuple[int, ...] | None = None,
     free: bool = True,
     blocks: int = BLOCKS,
-) -> tuple[Array, Array, Array, Array, Array, Array]:
+) -> tuple[Array, Array, Array, Array, Array, NDArray[np.int64]]:
     par, internal = to_internal(z, structure.order)
     matrix = structure.matrix() if free else np.zeros((11, 0))
     slope = np.ascontiguousarray(internal @ matrix)
@@ -303,13 +303,13 @@ def kalman_gain(
     if ratio <= 0 or kind != recursion.ANGLE:
         return gain, innovation
     par, _ = to_internal(z, order)
-    found, spread = steady_gain(*par[:4], par[7], step, ratio, current_noise)
+    found, spread = steady_gain(par[0], par[1], par[2], par[3], par[7], step, ratio, current_noise)
     if not np.all(np.isfinite(found)):
         return gain, innovation
     return found, spread
 
 
-def solve(
+def solve(  # noqa: C901 - the loop of a fit, its branches are its ends
     data: Experiments,
     structure: Structure,
     z: Array,
@@ -362,7 +362,7 @@ def solve(
     upper = np.full(11, np.inf) if upper is None else upper
     has_current = data.current.size > 0
     damping, passes, converged = 1e-3, 0, False
-    gain = np.zeros((3, 2))
+    gain: Array = np.zeros((3, 2))
     here: Pass | None = None
     for outer in range(12):
         gain, noise = _gain(data, structure, z, ratio, noise, has_current)
@@ -513,14 +513,15 @@ def _step(
         if not more.any():
             break
         frozen |= more
-    move = np.abs(matrix @ step)[:4].max(initial=0.0)
-    return (step * (1.5 / move) if move > 1.5 else step), frozen
+    longest = float(np.max(np.abs(matrix @ step)[:4]))
+    return (step * (1.5 / longest) if longest > 1.5 else step), frozen
 
 
 def _relative_step(here: Pass, step: Array, frozen: NDArray[np.bool_]) -> float:
     keep = ~frozen
     s = step[keep]
-    return float(np.sqrt(max(0.0, s @ here.normal[np.ix_(keep, keep)] @ s)))
+    size = float(s @ here.normal[np.ix_(keep, keep)] @ s)
+    return max(0.0, size) ** 0.5
 
 
 def _project(z: Array, structure: Structure) -> None:

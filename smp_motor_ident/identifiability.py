@@ -76,7 +76,7 @@ def structural(
         By the logarithms of the free parameters, so without units.
     """
     names = [n for n in PHYSICAL[:5] if n not in fixed]
-    frequency = 2 * np.pi * np.geomspace(0.05, 50, 40)
+    frequency = np.asarray(2 * np.pi * np.geomspace(0.05, 50, 40), dtype=np.float64)
     base = np.log([parameters[n] for n in names])
     rows = []
     for j in range(len(names)):
@@ -237,7 +237,7 @@ def _as_fit(estimate: Estimate, current_noise: float) -> tuple[Fit, bool]:
 
 
 def _trial(amplitude: float, band: tuple[float, float], step: float, hardware: Hardware) -> Record:
-    t = np.arange(int(TRIAL / step)) * step
+    t = np.arange(int(TRIAL / step), dtype=np.float64) * step
     tones = np.geomspace(*band, 16) * (1 + 0.013 * np.sin(np.arange(16) * 2.399))
     phases = np.pi * np.arange(16) ** 2 / 16
     v = np.cos(2 * np.pi * np.outer(t, tones) + phases).sum(axis=1)

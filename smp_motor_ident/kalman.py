@@ -90,11 +90,11 @@ def steady_gain(
         Over the angle's noise variance.
     """
     row = _row(step, te, tm, k, be)
-    a = np.zeros((3, 3))  # the transposed transition
+    a: Array = np.zeros((3, 3))  # the transposed transition
     a[0, 0], a[1, 0], a[0, 1], a[1, 1] = row[0], row[1], row[2], row[3]
     a[0, 2], a[1, 2], a[2, 2] = row[4], row[5], 1.0
     # Noise gathered over the step: Gauss-Legendre over the answers to an impulse.
-    h = np.zeros((3, 3))
+    h: Array = np.zeros((3, 3))
     for n in range(3):
         x = 0.5 + (n - 1) * 0.3872983346207417
         weight = 5 / 18 if n != 1 else 8 / 18
@@ -103,7 +103,7 @@ def steady_gain(
         for i in range(3):
             for j in range(3):
                 h[i, j] += weight * step * ratio * c[i] * c[j]
-    g = np.zeros((3, 3))
+    g: Array = np.zeros((3, 3))
     g[2, 2] = 1.0
     if current_noise > 0.0:
         g[0, 0] = 1.0 / (resistance * resistance * current_noise)

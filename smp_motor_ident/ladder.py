@@ -352,6 +352,11 @@ def _variations(data: Experiments, best: Fit, options: Options, rungs: list[Rung
         rungs.append(Rung(other, reason))
         if verdict:
             best = other
+    return _without_friction(data, best, options, rungs)
+
+
+def _without_friction(data: Experiments, best: Fit, options: Options, rungs: list[Rung]) -> Fit:
+    """Leave Coulomb friction out where the data show that there is next to none."""
     s = best.structure
     if s.friction == "symmetric" and "vc_plus" not in s.held:
         cov = best.covariance()

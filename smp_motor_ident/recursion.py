@@ -90,7 +90,9 @@ def _stay(h: float, par: Array, x: Array, s: Array, n_slope: int, slope: Array, 
 
 
 @compiled
-def _zero_crossing(h: float, par: Array, x: Array, sign: float, v: float, f: float) -> float:
+def _zero_crossing(  # noqa: C901 - one search, branches for how it starts
+    h: float, par: Array, x: Array, sign: float, v: float, f: float
+) -> float:
     """Return when within (0, h) the sliding speed reaches zero, or -1."""
     te, tm, k, be = par[0], par[1], par[2], par[3]
     w1, a1 = speed_at(h, te, tm, k, be, x[0], x[1], v, f)
@@ -137,13 +139,13 @@ def _zero_crossing(h: float, par: Array, x: Array, sign: float, v: float, f: flo
         if not (lo < new < hi):
             new = 0.5 * (lo + hi)
         if abs(new - t) < 1e-13 * h:
-            return new
+            return float(new)
         t = new
-    return t
+    return float(t)
 
 
 @compiled
-def _advance(
+def _advance(  # noqa: C901 - the events of one interval, in order
     h: float,
     v: float,
     direction: float,
@@ -273,7 +275,7 @@ def _recall(ring: Array, k: int, first: int, t: float, p: int, past: Array) -> f
 
 
 @compiled
-def run(
+def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between its steps
     time: Array,
     starts: Integers,
     section_end: Array,

@@ -217,7 +217,8 @@ def _frozen(record: Record) -> None:
         raise SignalError(
             f"{_where([record])}: dead encoder, the count stays at {record.count[a]} from "
             f"t = {record.time[a]:.4g} s to {record.time[b]:.4g} s while the voltage reaches "
-            f"{np.abs(still).max():.3g} V; check the encoder's cable, or that nothing blocks the motor"
+            f"{np.abs(still).max():.3g} V; check the encoder's cable, or that nothing "
+            "blocks the motor"
         )
 
 

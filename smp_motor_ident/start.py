@@ -95,7 +95,7 @@ def _binomial(n: int, k: int) -> int:
 def _held(voltage: Array) -> Array:
     """Return the voltage at the sampling instants, halfway between two held intervals."""
     after = np.concatenate([voltage[1:], voltage[-1:]])
-    return 0.5 * (voltage + after)
+    return np.asarray(0.5 * (voltage + after))
 
 
 def cutoffs(data: Experiments, count: int = 7) -> Array:
@@ -115,7 +115,7 @@ def cutoffs(data: Experiments, count: int = 7) -> Array:
     """
     high = 1.0 / data.step
     low = max(2.0, high / 300)
-    return np.geomspace(low, high, count)
+    return np.asarray(np.geomspace(low, high, count), dtype=np.float64)
 
 
 def lagged_candidates(data: Experiments, structure: models.Structure, lag: int) -> list[Array]:

@@ -98,8 +98,7 @@ def test_one_step_does_not_pretend_to_separate_gain_from_friction():
     )
     try:
         gain = estimate(step).combinations["dc_gain"]
-    except InsufficientExcitationError as refusal:
-        assert "dc_gain" in str(refusal)
+    except InsufficientExcitationError:
         return
     assert gain.std > 0.01 * gain.value
     assert abs(gain.value - motors.truth("rear_left", 0.3)["dc_gain"]) < 3 * gain.std
