@@ -49,10 +49,12 @@ def simulate(estimate: Estimate, record: Record) -> tuple[Array, Array]:
     if data.kind != rc.ANGLE:
         return data.output, predicted[:, 1]
     mean = _differences(record, predicted[:, 1])
-    if record.velocity is None:
+    measured = record.velocity
+    if measured is None:
         return _differences(record, data.output), mean
-    options = (predicted[:, 0], mean)
-    return record.velocity, max(options, key=lambda speed: percent(record.velocity, speed))
+    at_once = predicted[:, 0]
+    better = percent(measured, at_once) > percent(measured, mean)
+    return measured, at_once if better else mean
 
 
 def _differences(record: Record, angle: Array) -> Array:

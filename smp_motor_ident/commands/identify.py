@@ -16,8 +16,10 @@ from pathlib import Path
 from smp_motor_ident import bag
 from smp_motor_ident.commands.frame import Parser, progress, run
 from smp_motor_ident.commands.tables import console, estimate_table
+from smp_motor_ident.commands.topics import list_topics
 from smp_motor_ident.errors import BagError, ParameterError, SmpError
 from smp_motor_ident.estimate import estimate
+from smp_motor_ident.identifiability import what_next
 from smp_motor_ident.record import Record
 from smp_motor_ident.report.document import (
     check_free,
@@ -93,8 +95,17 @@ def parser() -> argparse.ArgumentParser:
     add("--msg", action="append", default=[], metavar="FILE", help=".msg file of an unknown type")
     add("--topics", action="store_true", help="list what the bag offers, suggest a mapping")
     add("--what-next", action="store_true", help="propose the next recording")
+    add("--accuracy", type=_share, default=0.01, help="wanted by --what-next; default 0.01")
     add("--quiet", "-q", action="store_true", help="print errors only")
     return made
+
+
+def _share(text: str) -> float:
+    """Return a relative accuracy; argparse turns the error into its own."""
+    value = float(text)
+    if not 0 < value < 1:
+        raise argparse.ArgumentTypeError(f"{text} is not between 0 and 1")
+    return value
 
 
 def fixed_parameters(items: Sequence[str]) -> dict[str, float]:
@@ -164,7 +175,7 @@ def work(command: str, arguments: argparse.Namespace) -> int:
     """
     mapping = signal_map(arguments)
     if arguments.topics:
-        return _list_topics(arguments, mapping)
+        return list_topics(arguments.bags, arguments.msg, NAME)
     if not arguments.output:
         raise ParameterError("--output DIR is missing: where shall the results go?")
     fixed = fixed_parameters(arguments.fix)
@@ -250,7 +261,8 @@ def _identify(
     notes = [note for record in (*records, *kept) for note in record.notes]
     results.notes[wheel] = list(dict.fromkeys(notes))
     fitted, held = (records, kept) if kept else split(records)
-    curves = [(r, "estimation") for r in fitted] + [(r, "validation") for r in held]
+    curves: list[tuple[Record, Role]] = [(record, "estimation") for record in fitted]
+    curves += [(record, "validation") for record in held]
     results.comparisons[wheel] = [_compare(found, record, role) for record, role in curves]
 
 
@@ -293,9 +305,19 @@ def _tell(results: Results, paths: Sequence[Path], arguments: argparse.Namespace
             out.print(estimate_table(estimate))
             notes = results.notes[estimate.wheel]
             for text in estimate.warnings:
-                out.print(f"{'note' if text in notes else 'warning'}: {text}", soft_wrap=True)
+                out.print(
+                    f"{'note' if text in notes else 'warning'}: {text}",
+                    soft_wrap=True,
+                    markup=False,
+                )
             for text in estimate.advice:
                 out.print(f"advice: {text}", soft_wrap=True)
+            if arguments.what_next:
+                out.print(
+                    f"next: {what_next(estimate, arguments.accuracy).words}",
+                    soft_wrap=True,
+                    markup=False,
+                )
             out.print()
         if results.estimates:
             out.print(f"written: {', '.join(str(path) for path in paths)}", soft_wrap=True)

@@ -24,7 +24,7 @@ def console() -> Console:
     Console
         Without colours outside a terminal.
     """
-    return Console(width=None if sys.stdout.isatty() else 110, highlight=False, soft_wrap=False)
+    return Console(width=None if sys.stdout.isatty() else 110, highlight=False, markup=False)
 
 
 def table(title: str, *columns: str, left: int = 1) -> Table:
