@@ -1,0 +1,58 @@
+"""excite as its own process, on a simulated motor."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+
+import pytest
+from wheel_robot import WheelRobot
+
+
+@pytest.fixture
+def robot(ros_domain: int) -> Iterator[WheelRobot]:
+    robot = WheelRobot(ros_domain)
+    yield robot
+    robot.close()
+
+
+def test_excite_is_bounded_ends_by_itself_and_ends_at_zero(process, robot, eventually):
+    process("motor_plant", "--ros-args", "-p", "rate:=100.0")
+    eventually(lambda: robot.states["front_left"], 20.0, robot.spin)
+    excite = process(
+        "excite", "--ros-args", "-p", "signal:=fourier", "-p", "amplitude:=5.0",
+        "-p", "duration:=1.5", "-p", "rate:=100.0", "-p", "wheels:=[front_left, rear_right]",
+    )  # fmt: skip
+    eventually(lambda: excite.returncode is not None, 20.0, robot.spin, excite.output)
+    assert excite.wait(1.0) == 0
+    robot.spin_for(0.1)
+    one, two = ([m.voltage for m in robot.commands[w]] for w in ("front_left", "rear_right"))
+    assert len(one) > 75 and max(map(abs, one)) <= 5.0 and max(map(abs, one)) > 2.0
+    assert one[-1] == two[-1] == 0.0
+    assert one[20:60] != two[20:60]
+    assert not robot.commands["front_right"]
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        robot.commands["front_left"].clear()
+        excite = process("excite", "--ros-args", "-p", "signal:=square", "-p", "duration:=60.0")
+        eventually(lambda: len(robot.commands["front_left"]) > 20, 20.0, robot.spin)
+        excite.send_signal(number)
+        assert excite.wait(2.0) == 0
+        last = robot.commands["front_left"]
+        eventually(lambda c=last: c[-1].voltage == 0.0, 2.0, robot.spin, "no zero command")
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ("amplitude:=20.0", "must not exceed max_voltage"),
+        ("signal:=noise", "known are sine"),
+        ("wheels:=[left]", "wheels has 'left'"),
+        ("duration:=-1.0", "duration is -1.0"),
+        ("wait:=0.2", "nobody listens on /front_left/motor_command"),
+    ],
+)
+def test_excite_refuses_in_one_line(process, given, words):
+    excite = process("excite", "--ros-args", "-p", given)
+    assert excite.wait(15.0) == 2
+    assert words in excite.output and len(excite.output.strip().splitlines()) == 1

@@ -1,0 +1,100 @@
+"""motor_plant as its own process."""
+
+from __future__ import annotations
+
+import math
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from wheel_robot import WheelRobot
+
+from smp_interfaces.msg import MotorCommand, MotorDescription
+
+PAPER = Path(__file__).parents[2] / "config" / "motors_paper.yaml"
+
+
+@pytest.fixture
+def robot(ros_domain: int) -> Iterator[WheelRobot]:
+    robot = WheelRobot(ros_domain)
+    yield robot
+    robot.close()
+
+
+def test_plant_turns_on_commands_stops_without_and_describes_itself(process, robot, eventually):
+    plant = process("motor_plant", "--ros-args", "-p", "rate:=100.0")
+    front, idle = robot.states["front_left"], robot.states["rear_right"]
+    eventually(lambda: len(front) > 20, 20.0, robot.spin, "no feedback")
+    assert all(m.voltage == 0.0 and m.encoder_count == 0 for m in front)
+
+    described: list[MotorDescription] = []
+    late = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    robot.node.create_subscription(
+        MotorDescription, "/front_left/motor_description", described.append, late
+    )
+    eventually(lambda: described, 10.0, robot.spin, "no description for the late")
+    assert described[0].gear_ratio == 65.5 and described[0].resistance == 12.919
+    assert described[0].joint_name == front[-1].header.frame_id == "front_left_wheel_joint"
+
+    send = robot.node.create_publisher(MotorCommand, "/front_left/motor_command", 10)
+    eventually(lambda: send.get_subscription_count(), 10.0, robot.spin)
+
+    def command(voltage: float, seconds: float) -> None:
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            send.publish(MotorCommand(voltage=voltage))
+            robot.spin()
+
+    command(6.0, 1.0)
+    # Steady state of Table 1 with 0.45 V of friction: 2.17 rad/s; one count of speed is 0.02.
+    assert robot.velocity("front_left") == pytest.approx(2.165, abs=0.05)
+    assert front[-1].voltage == pytest.approx(6.0, abs=0.013)  # half a step of the PWM
+    assert front[-1].position == pytest.approx(
+        front[-1].encoder_count * 2 * math.pi / 500 / 65.5, abs=1e-9
+    )
+    assert idle[-1].encoder_count == 0
+
+    command(math.nan, 0.5)
+    assert front[-1].voltage == 0.0
+    eventually(lambda: robot.named("motor_plant", "no numbers"), 3.0, robot.spin)
+    command(6.0, 0.5)
+    before = time.monotonic()
+    eventually(lambda: front[-1].voltage == 0.0, 2.0, robot.spin, "no time-out")
+    assert time.monotonic() - before < 0.5  # 0.2 s of time-out, and a busy machine
+
+    accepted, reason = robot.set("motor_plant", command_timeout=-1.0)
+    assert not accepted and "command_timeout" in reason
+    plant.send_signal(signal.SIGTERM)
+    assert plant.wait(2.0) == 0
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (("inertia: 1.13e-06", "inertia: -1.13e-06"), "inertia is -1.13e-06"),
+        (("inertia: 1.13e-06", "mass: 1.0"), "unknown key 'mass'"),
+    ],
+)
+@pytest.mark.parametrize("way", ["motors_file", "params-file"])
+def test_bad_motor_file_ends_the_plant_with_one_line(process, tmp_path, change, words, way):
+    path = tmp_path / "bad.yaml"
+    path.write_text(PAPER.read_text().replace(*change))
+    given = ["-p", f"motors_file:={path}"] if way == "motors_file" else ["--params-file", path]
+    plant = process("motor_plant", "--ros-args", *given)
+    assert plant.wait(15.0) == 2
+    assert words in plant.output and len(plant.output.strip().splitlines()) == 1
+
+
+def test_unknown_parameter_and_unreadable_file_end_the_plant_with_one_line(process):
+    for given, words in (
+        (["-p", "speed:=1.0"], "unknown parameter 'speed'"),
+        (["-p", "rate:=fast"], "rate is 'fast'"),
+        (["-p", "motors_file:=/nowhere.yaml"], "/nowhere.yaml: cannot be read"),
+        (["--params-file", "/nowhere.yaml"], "/nowhere.yaml"),
+    ):
+        plant = process("motor_plant", "--ros-args", *given)
+        assert plant.wait(15.0) == 2
+        assert words in plant.output and len(plant.output.strip().splitlines()) == 1

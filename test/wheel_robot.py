@@ -1,0 +1,204 @@
+"""The rest of a robot for tests of nodes: sends set-points and feedback, keeps what comes back."""
+
+from __future__ import annotations
+
+import copy
+import math
+import time
+from collections.abc import Callable, Sequence
+
+import pytest
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from rcl_interfaces.srv import SetParametersAtomically
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64
+
+from smp_interfaces.msg import MotorCommand, MotorState, PidState
+from smp_motor_control import WHEELS
+
+STREAM = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
+PERIOD = 0.02
+
+
+class Relay:
+    """Passes one wheel's feedback on, as it is or with a fault."""
+
+    def __init__(self, robot: WheelRobot, wheel: str) -> None:
+        self.robot = robot
+        self.fault: Callable[[MotorState], Sequence[MotorState]] = lambda message: [message]
+        self.delayed: list[tuple[float, MotorState]] = []
+        self.publisher = robot.node.create_publisher(MotorState, f"/{wheel}/motor_state", 10)
+        robot.node.create_subscription(MotorState, f"/{wheel}/raw_state", self.take, STREAM)
+
+    def take(self, message: MotorState) -> None:
+        self.robot.states["raw"].append(message)
+        for one in self.fault(message):
+            self.publisher.publish(one)
+
+    def passes(self) -> None:
+        self.fault = lambda message: [message]
+
+    def changes(self, **fields: object) -> None:
+        """Overwrite fields; a callable computes the new value from the old."""
+
+        def change(message: MotorState) -> list[MotorState]:
+            changed = copy.deepcopy(message)
+            for name, value in fields.items():
+                old = getattr(message, name)
+                setattr(changed, name, value(old) if callable(value) else value)
+            return [changed]
+
+        self.fault = change
+
+    def freezes(self) -> None:
+        """Repeat count, position and velocity of the first sample under new stamps."""
+        first: list[MotorState] = []
+
+        def frozen(message: MotorState) -> list[MotorState]:
+            first.append(message) if not first else None
+            same = copy.deepcopy(first[0])
+            same.header.stamp = message.header.stamp
+            same.velocity, same.current = 0.0, message.current
+            return [same]
+
+        self.fault = frozen
+
+    def delays(self, seconds: float) -> None:
+        queue: list[tuple[float, MotorState]] = []
+
+        def late(message: MotorState) -> list[MotorState]:
+            now = time.monotonic()
+            queue.append((now + seconds, message))
+            ripe = [m for due, m in queue if due <= now]
+            del queue[: len(ripe)]
+            return ripe
+
+        self.fault = late
+
+    def shifts_stamps(self, seconds: float) -> None:
+        def shifted(message: MotorState) -> list[MotorState]:
+            moved = copy.deepcopy(message)
+            total = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+            total += round(seconds * 1e9)
+            moved.header.stamp.sec, moved.header.stamp.nanosec = divmod(total, 10**9)
+            return [moved]
+
+        self.fault = shifted
+
+
+class WheelRobot:
+    """Publishes set-points while spinning and remembers what the wheels do."""
+
+    def __init__(self, domain: int) -> None:
+        self.context = rclpy.Context()
+        rclpy.init(args=[], context=self.context, domain_id=domain)
+        self.node = rclpy.create_node("robot", context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        self.states: dict[str, list[MotorState]] = {w: [] for w in (*WHEELS, "raw")}
+        self.commands: dict[str, list[MotorCommand]] = {w: [] for w in WHEELS}
+        self.pid_states: list[PidState] = []
+        self.diagnoses: list[tuple[float, str, bytes, str]] = []
+        self.setpoint: float | None = None
+        self._sent = 0.0
+        node = self.node
+        for wheel in WHEELS:
+            kept = self.states[wheel].append
+            node.create_subscription(MotorState, f"/{wheel}/motor_state", kept, STREAM)
+            sent = self.commands[wheel].append
+            node.create_subscription(MotorCommand, f"/{wheel}/motor_command", sent, STREAM)
+        node.create_subscription(PidState, "/front_left/pid_state", self.pid_states.append, STREAM)
+        node.create_subscription(DiagnosticArray, "/diagnostics", self._diagnosed, 100)
+        self.setpoints = node.create_publisher(JointState, "/wheel_setpoints", 10)
+        self.feedback = {}
+        self.load = node.create_publisher(Float64, "/front_left/load_torque", 10)
+
+    def _diagnosed(self, array: DiagnosticArray) -> None:
+        now = time.monotonic()
+        self.diagnoses += [(now, s.name, s.level, s.message) for s in array.status]
+
+    def spin(self) -> None:
+        now = time.monotonic()
+        if self.setpoint is not None and now - self._sent > PERIOD:
+            self._sent = now
+            self.send_setpoint(self.setpoint)
+        self.executor.spin_once(timeout_sec=0.005)
+
+    def spin_for(self, seconds: float) -> None:
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            self.spin()
+
+    def send_setpoint(self, velocity: float, wheels: Sequence[str] = WHEELS) -> None:
+        message = JointState(
+            name=[f"{w}_wheel_joint" for w in wheels], velocity=[float(velocity)] * len(wheels)
+        )
+        message.header.stamp = self.node.get_clock().now().to_msg()
+        self.setpoints.publish(message)
+
+    def feed(self, wheel: str, stamp: int, **fields: object) -> None:
+        """Publish feedback of one wheel stamped ``stamp`` [ns]."""
+        if wheel not in self.feedback:
+            self.feedback[wheel] = self.node.create_publisher(
+                MotorState, f"/{wheel}/motor_state", 10
+            )
+        message = MotorState(**{"current": math.nan, **fields})
+        message.header.frame_id = f"{wheel}_wheel_joint"
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
+        self.feedback[wheel].publish(message)
+
+    def velocity(self, wheel: str, samples: int = 20) -> float:
+        """Mean speed over the last samples, by position; NaN before there are some."""
+        last = self.states[wheel][-samples:]
+        if len(last) < samples:
+            return math.nan
+        stamps = [m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec for m in last]
+        return (last[-1].position - last[0].position) / (stamps[-1] - stamps[0])
+
+    def named(self, node: str, text: str, since: float = 0.0) -> bool:
+        """Tell whether a node has said something on /diagnostics since an instant."""
+        return any(t >= since and n == node and text in m for t, n, _, m in self.diagnoses)
+
+    def last_diagnosis(self, node: str) -> str:
+        return next((m for _, n, _, m in reversed(self.diagnoses) if n == node), "")
+
+    def set(self, node: str, **values: object) -> tuple[bool, str]:
+        """Set parameters as one; names have __ for a dot."""
+        client = self.node.create_client(
+            SetParametersAtomically, f"/{node}/set_parameters_atomically"
+        )
+        assert client.wait_for_service(10.0)
+        parameters = [
+            Parameter(name.replace("__", "."), value=value).to_parameter_msg()
+            for name, value in values.items()
+        ]
+        result = self._call(client, SetParametersAtomically.Request(parameters=parameters)).result
+        return result.successful, result.reason
+
+    def transition(self, node: str, name: str) -> bool:
+        client = self.node.create_client(ChangeState, f"/{node}/change_state")
+        assert client.wait_for_service(10.0)
+        number = getattr(Transition, f"TRANSITION_{name.upper()}")
+        request = ChangeState.Request(transition=Transition(id=number))
+        return bool(self._call(client, request).success)
+
+    def _call(self, client: object, request: object) -> object:
+        future = client.call_async(request)
+        end = time.monotonic() + 10.0
+        while not future.done() and time.monotonic() < end:
+            self.spin()
+        self.node.destroy_client(client)
+        if not future.done():
+            pytest.fail(f"{client.srv_name} does not answer")
+        return future.result()
+
+    def close(self) -> None:
+        self.executor.shutdown()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self.context)
