@@ -13,7 +13,7 @@ from smp_motor_ident.tune.feedback import Feedback, closed_loop, spectral_radius
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.margins import batch_margins, grid_for, loop_margins
 from smp_motor_ident.tune.plant import Motors, sample
-from smp_motor_ident.tune.response import TwoDegrees, minimum_jerk, simulate
+from smp_motor_ident.tune.response import Controller, minimum_jerk, simulate
 
 # Motor 1 of the paper's Table 1, and a first-order motor.
 MOTOR_1 = (0.039142, 0.0019981, 3.1755e-5)
@@ -59,7 +59,7 @@ def test_sampled_motor_with_any_delay_and_window_is_exact(coefficients, delay, w
         motors(*coefficients), Loop(sample_time=T, delay=delay, difference_window=window)
     )
     # A controller that is nothing but feed-forward plays the inputs into the loop.
-    run = simulate(plant, TwoDegrees(Feedback(0.0, 0.0), velocity=1.0), inputs)
+    run = simulate(plant, Controller(Feedback(0.0, 0.0)), np.zeros(25), forward=inputs)
     # 1e-7 of the largest speed: the ODE solver's own tolerance, accumulated.
     np.testing.assert_allclose(run.speed[0], speed[:-1], atol=1e-7 * np.abs(speed).max())
     measured = speed.copy()
@@ -86,7 +86,7 @@ def test_closed_loop_matrix_and_simulation_agree_on_the_decay(window):
     plant = sample(motors(*MOTOR_1), Loop(sample_time=0.005, delay=0.008, difference_window=window))
     feedback = Feedback(0.03, 0.9, 0.0008, 0.004)
     eigenvalues = np.linalg.eigvals(closed_loop(plant, feedback)[0])
-    run = simulate(plant, TwoDegrees(feedback), np.ones(400))
+    run = simulate(plant, Controller(feedback), np.ones(400))
     left = np.abs(run.speed[0] - 1)
     # The slowest mode alone is left after 100 samples; 3 % for what the others still add.
     slope = (left[360:].max() / left[100:140].max()) ** (1 / 260)
@@ -98,15 +98,16 @@ def test_simulated_controller_is_the_running_one():
     T, limit = 0.005, 4.5
     plant = sample(motors(*MOTOR_1), Loop(sample_time=T, delay=T))
     feedback = Feedback(0.05, 1.2, 0.0009, 0.003)
-    controller = TwoDegrees(feedback, 0.6, 0.03, 0.001, limit, 0.05)
+    controller = Controller(feedback, 0.6, 0.9, limit, 0.05)
     time = T * np.arange(300)
-    reference, rate = minimum_jerk(100.0, 0.1, time)
-    run = simulate(plant, controller, reference, acceleration=rate)
+    reference, rate, _ = minimum_jerk(100.0, 0.1, time)
+    forward = 0.03 * reference + 0.001 * rate
+    run = simulate(plant, controller, reference, forward=forward)
     pid = Pid(
         PidGains(
             p=0.05, i=1.2, d=0.0009, u_clamp_min=-limit, u_clamp_max=limit,
             antiwindup_strategy="back_calculation", tracking_time_constant=0.05,
-            setpoint_weight_p=0.6, derivative_filter_time_constant=0.003,
+            setpoint_weight_p=0.6, setpoint_weight_d=0.9, derivative_filter_time_constant=0.003,
             feedforward_velocity=0.03, feedforward_acceleration=0.001,
         )
     )  # fmt: skip

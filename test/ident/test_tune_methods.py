@@ -1,0 +1,179 @@
+"""Every tuning method: its published numbers, and what it promises on the sampled loop."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from smp_motor_ident.errors import DesignError
+from smp_motor_ident.tune.feedback import Feedback, closed_loop
+from smp_motor_ident.tune.loop import Loop
+from smp_motor_ident.tune.margins import loop_margins
+from smp_motor_ident.tune.methods import METHODS
+from smp_motor_ident.tune.methods.pole_placement import place
+from smp_motor_ident.tune.methods.relay import oscillate, read_oscillation
+from smp_motor_ident.tune.methods.ziegler_nichols import from_ultimate
+from smp_motor_ident.tune.plant import Motors, sample
+from smp_motor_ident.tune.problem import FirstOrderDelay, Problem, ripple
+
+# The paper's Table 1 as a0, a1, a2 [V s/rad and its powers].
+PAPER = (
+    (0.039142, 0.0019981, 3.1755e-5),
+    (0.059399, 0.0025612, 2.5313e-5),
+    (0.036147, 0.0016439, 2.9671e-5),
+    (0.040251, 0.0017646, 2.5002e-5),
+)
+
+
+def problem(coefficients=PAPER[0], sample_time=0.005, **targets) -> Problem:
+    motors = Motors(*(np.array([x]) for x in (*coefficients, 0.0, 0.0)))
+    loop = Loop(sample_time=sample_time)
+    return Problem(sample(motors, loop), loop, targets)
+
+
+class Reduced(Problem):
+    """A problem whose reduction is given, for numbers from the literature."""
+
+    def __init__(self, model: FirstOrderDelay, **targets) -> None:
+        base = problem()
+        super().__init__(base.plant, base.loop, targets)
+        object.__setattr__(self, "reduced", model)
+
+
+def test_ziegler_nichols_and_tyreus_luyben_give_their_published_shares():
+    one, full = problem(), problem(structure="pid")
+    assert from_ultimate(one, "ziegler_nichols", 2.0, 1.2) == Feedback(0.9, 0.9)
+    pid = from_ultimate(full, "ziegler_nichols", 2.0, 1.0)
+    assert (pid.p, pid.p / pid.i, pid.d / pid.p) == pytest.approx((1.2, 0.5, 0.125))
+    pi = from_ultimate(one, "tyreus_luyben", 3.2, 1.0)
+    assert (pi.p, pi.p / pi.i) == pytest.approx((1.0, 2.2))
+    pid = from_ultimate(full, "tyreus_luyben", 2.2, 6.3)
+    assert (pid.p, pid.p / pid.i, pid.d / pid.p) == pytest.approx((1.0, 2.2 * 6.3, 1.0))
+
+
+def test_simc_solves_skogestads_example():
+    # Process E1 of the SIMC paper, 1/((s+1)(0.2s+1)): half rule tau 1.1, theta 0.1, and with
+    # tau_c = theta a PI controller of Kc 5.5 and tau_I 0.8.
+    feedback = METHODS["simc"].solve(Reduced(FirstOrderDelay(1.0, 1.1, 0.1)))
+    assert feedback.p == pytest.approx(5.5)
+    assert feedback.p / feedback.i == pytest.approx(0.8)
+
+
+def test_half_rule_keeps_the_sum_of_time_constants_and_delays():
+    one = problem(PAPER[1], sample_time=0.001)
+    a0, a1, _ = PAPER[1]
+    # Delay of one sample, half a sample of hold and half of the difference: 2 ms.
+    assert one.reduced.time_constant + one.reduced.delay == pytest.approx(a1 / a0 + 0.002)
+
+
+def test_amigo_gives_its_published_formula():
+    # Equal lag and delay of 1 s and a gain of 1: K = 0.15 + 0.35 - 1/4, Ti = 0.35 + 13/20.
+    feedback = METHODS["amigo"].solve(Reduced(FirstOrderDelay(1.0, 1.0, 1.0)))
+    assert feedback.p == pytest.approx(0.25)
+    assert feedback.p / feedback.i == pytest.approx(1.0)
+
+
+def test_lambda_cancels_the_pole_and_closes_the_loop_as_asked():
+    feedback = METHODS["lambda"].solve(
+        Reduced(FirstOrderDelay(2.0, 0.5, 0.1), closed_loop_time_constant=0.4)
+    )
+    assert feedback.p == pytest.approx(0.5 / (2.0 * 0.5))
+    assert feedback.p / feedback.i == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("sample_time", [0.01, 0.001])
+def test_placed_poles_are_poles_of_the_sampled_loop(sample_time):
+    one = problem(PAPER[1], sample_time)
+    feedback = place(one, 20.0, 0.8)
+    wanted = np.exp(sample_time * 20.0 * (-0.8 + 0.6j))
+    poles = np.linalg.eigvals(closed_loop(one.plant, feedback)[0])
+    assert np.abs(poles - wanted).min() < 1e-6  # rounding of the eigenvalue solver
+
+
+def test_ultimate_gain_is_where_proportional_control_turns_unstable():
+    one = problem()
+    gain, period = one.ultimate
+    for share, stable in ((0.99, True), (1.01, False)):
+        poles = np.abs(np.linalg.eigvals(closed_loop(one.plant, Feedback(share * gain, 0.0))[0]))
+        # The idle integrator stays at 1.
+        assert (np.sort(poles)[-2] < 1) == stable or (np.sort(poles)[-1] <= 1 + 1e-9) == stable
+    assert period > 4 * one.loop.sample_time
+
+
+@pytest.mark.parametrize("coefficients", PAPER)
+def test_relay_feedback_finds_the_ultimate_point_without_a_model(coefficients):
+    one = problem(coefficients)
+    quantum = one.loop.count_angle / one.loop.sample_time
+    voltage, speed = oscillate(one, 3.0, quantum, 4.0)
+    gain, period = read_oscillation(voltage, speed, one.loop.sample_time)
+    # The relay's hysteresis of one count and its switching at samples only make it find a point
+    # a little below the ultimate one: 35 % in gain is the literature's own figure for it.
+    assert gain == pytest.approx(one.ultimate[0], rel=0.35)
+    assert period == pytest.approx(one.ultimate[1], rel=0.35)
+    assert np.abs(voltage).max() == 3.0
+
+
+def test_relay_that_does_not_oscillate_is_told():
+    with pytest.raises(DesignError, match="steady cycles"):
+        read_oscillation(np.ones(100), np.ones(100), 0.005)
+
+
+@pytest.mark.parametrize("coefficients", PAPER)
+@pytest.mark.parametrize("sample_time", [0.01, 0.005, 0.001])
+def test_margin_method_keeps_margin_sensitivity_and_ripple(coefficients, sample_time):
+    one = problem(coefficients, sample_time)
+    feedback = METHODS["margin"].solve(one)
+    margins = loop_margins(one.plant, feedback)
+    assert margins.stable
+    # Search grid of 160 frequencies: half a percent.
+    assert margins.phase >= 0.995 * 60
+    assert margins.sensitivity <= 1.005 * 1.4
+    assert ripple(one, feedback) <= 1.005 * one.loop.noise_limit
+
+
+def test_margin_method_rejects_a_load_better_than_a_grid_of_pi_gains():
+    """No PI controller of a dense grid that keeps the same limits has more integral gain."""
+    one = problem(structure="pi")
+    best = METHODS["margin"].solve(one)
+    for p in best.p * np.linspace(0.3, 1.7, 15):
+        feedback = Feedback(float(p), 1.03 * best.i)
+        m = loop_margins(one.plant, feedback)
+        loop = one.response * feedback.response(one.omega, 0.005)
+        hump = np.abs(loop / (1 + loop)).max()
+        assert m.phase < 60 or m.sensitivity > 1.4 or hump > 1.25 or not m.stable
+
+
+def test_bandwidth_is_met_where_it_can_be():
+    one = problem(bandwidth=15.0)
+    margins = loop_margins(one.plant, METHODS["margin"].solve(one))
+    assert margins.crossover == pytest.approx(15.0, rel=1e-3)
+
+
+@pytest.mark.parametrize("wished", [150.0, 5000.0])
+def test_bandwidth_beyond_the_delay_is_refused_with_the_nearest(wished):
+    with pytest.raises(DesignError, match="the nearest that holds is") as refusal:
+        METHODS["margin"].solve(problem(bandwidth=wished))
+    words = str(refusal.value).split()
+    nearest = float(words[words.index("is") + 1])
+    again = problem(bandwidth=0.999 * nearest)
+    assert loop_margins(again.plant, METHODS["margin"].solve(again)).phase >= 59.5
+
+
+def test_natural_frequency_beyond_the_loop_is_refused_with_the_nearest():
+    with pytest.raises(DesignError, match="the nearest design that holds"):
+        METHODS["pole_placement"].solve(problem(natural_frequency=300.0))
+
+
+def test_focus_trades_load_rejection_for_a_flat_response():
+    gains = {
+        focus: METHODS["margin"].solve(problem(focus=focus))
+        for focus in ("load", "balanced", "tracking")
+    }
+    assert gains["load"].i >= gains["balanced"].i >= gains["tracking"].i
+
+
+@pytest.mark.parametrize("name", list(METHODS))
+def test_every_method_names_its_source(name):
+    method = METHODS[name]
+    assert any(character.isdigit() for character in method.source)
+    assert method.title
