@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -37,6 +38,13 @@ class Robustness:
     phase: float
     gain: float
     sensitivity: float
+
+
+class Judge(Protocol):
+    """Whoever can say what gains do over some motors."""
+
+    def judge(self, feedback: Feedback) -> Robustness:
+        """Return what the gains do; see :meth:`Jury.judge`."""
 
 
 class Jury:
@@ -86,7 +94,7 @@ class Jury:
         )
 
 
-def back_off(jury: Jury, feedback: Feedback) -> tuple[Feedback, float, Robustness]:
+def back_off(jury: Judge, feedback: Feedback) -> tuple[Feedback, float, Robustness]:
     """Scale gains down until 99 % of the motors keep the promise.
 
     Proportional and derivative action shrink with the factor, integral action with its square,
@@ -94,7 +102,7 @@ def back_off(jury: Jury, feedback: Feedback) -> tuple[Feedback, float, Robustnes
 
     Parameters
     ----------
-    jury : Jury
+    jury : Judge
         The motors and the promise.
     feedback : Feedback
         What the rule gave.

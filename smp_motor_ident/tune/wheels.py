@@ -11,7 +11,7 @@ from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune.designer import Case, Design, design, finish, prepare
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.loop import Loop
-from smp_motor_ident.tune.robust import SHARE
+from smp_motor_ident.tune.robust import Robustness, back_off
 
 Sets = Literal["auto", "one", "each"]
 
@@ -100,29 +100,43 @@ def _finish(case: Case, own: Design, shared: Feedback | None) -> Design:
     return finish(case, mine, 1.0, case.jury.judge(mine))
 
 
+class _Panel:
+    """All wheels' juries as one: gains, per wheel rad/s, are as good as on the worst wheel."""
+
+    def __init__(self, cases: Mapping[str, Case]) -> None:
+        self.cases = cases
+
+    def judge(self, feedback: Feedback) -> Robustness:
+        verdicts = [
+            case.jury.judge(feedback.scaled(1 / case.problem.loop.gear_ratio))
+            for case in self.cases.values()
+        ]
+        return min(verdicts, key=lambda verdict: verdict.holds)
+
+
 def _choose(
     cases: Mapping[str, Case], own: Mapping[str, Design], sets: Sets
 ) -> tuple[Feedback | None, str]:
     """Return the feedback for all, per wheel rad/s, or None, and why."""
     if sets == "each" or len(own) == 1:
         return None, "one set of gains each"
+    panel = _Panel(cases)
     best: tuple[float, Feedback] | None = None
     for wheel, one in own.items():
         candidate = one.feedback.scaled(cases[wheel].problem.loop.gear_ratio)
-        loss = max(other.feedback.i * other.loop.gear_ratio / candidate.i for other in own.values())
-        holds = all(
-            case.jury.judge(candidate.scaled(1 / case.problem.loop.gear_ratio)).holds >= SHARE
-            for case in cases.values()
-        )
-        if holds and (best is None or loss < best[0]):
-            best = loss, candidate
+        shared, factor, _ = back_off(panel, candidate)
+        if factor == 0.0:
+            continue
+        loss = max(other.feedback.i * other.loop.gear_ratio / shared.i for other in own.values())
+        if best is None or loss < best[0]:
+            best = loss, shared
     if best is None:
         if sets == "one":
             raise DesignError(
-                "no wheel's gains keep the promised margins on all wheels: the motors differ too "
-                "much for one set; ask for one each, or for smaller margins"
+                "no set of gains keeps the promised margins on all wheels: the motors differ too "
+                "much; ask for one set each, or for smaller margins"
             )
-        return None, "one set of gains each: no wheel's gains keep the margins on all wheels"
+        return None, "one set of gains each: no set keeps the margins on all wheels"
     if sets == "auto" and best[0] > WORTH:
         return None, (
             f"one set of gains each: a set that holds for all would let a load pull a wheel down "

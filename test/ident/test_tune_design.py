@@ -1,0 +1,219 @@
+"""design, compare and the wheels together: units, robustness, refusals."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from smp_motor_ident.errors import DesignError
+from smp_motor_ident.result import Estimate, Quantity
+from smp_motor_ident.tune import METHODS, Loop, compare, design, design_wheels, recommend
+
+# The paper's Table 1: R, L, K, J, b.
+TABLE_1 = (
+    (12.919, 0.30994, 0.011029, 1.13e-6, 2.40e-5),
+    (4.5516, 0.06754, 0.001761, 6.60e-7, 2.23e-5),
+    (3.2843, 0.06383, 0.030117, 1.40e-5, 5.53e-5),
+    (2.7031, 0.03995, 0.035314, 2.21e-5, 6.45e-5),
+)
+PHYSICAL = ("resistance", "inductance", "motor_constant", "inertia", "viscous_friction")
+
+
+def combinations(row):
+    R, L, K, J, b = row
+    a0, a1, a2 = (R * b + K * K) / K, (R * J + L * b) / K, L * J / K
+    return {"dc_gain": 1 / a0, "time_constant": a1 / a0, "time_constant_product": a2 / a0}
+
+
+def estimate(k=0, std=0.0, **more) -> Estimate:
+    values = {**combinations(TABLE_1[k]), **more}
+    covariance = np.diag([(std * x) ** 2 for x in values.values()])
+    told = {name: Quantity(value) for name, value in values.items()}
+    return Estimate("front_left", "second_order", {}, told, tuple(values), covariance)
+
+
+def of_parameters(row) -> Estimate:
+    told = {name: Quantity(value) for name, value in zip(PHYSICAL, row, strict=True)}
+    return Estimate("front_left", "electromechanical", told, {})
+
+
+@pytest.mark.parametrize("k", range(4))
+@pytest.mark.parametrize("method", ["margin", "simc", "relay"])
+def test_combinations_alone_give_the_gains_of_the_true_parameters(k, method):
+    loop = Loop()
+    known = design(estimate(k), loop, method).gains
+    true = design(of_parameters(TABLE_1[k]), loop, method).gains
+    for name in ("p", "i", "d", "feedforward_velocity", "feedforward_acceleration"):
+        assert getattr(known, name) == pytest.approx(getattr(true, name), rel=1e-6, abs=1e-12)
+
+
+def test_identified_combinations_give_the_gains_of_the_true_ones_within_two_percent():
+    rng = np.random.default_rng(3)
+    loop = Loop()
+    true = design(estimate(), loop).gains
+    for _ in range(5):
+        # A tenth of a percent is what 30 s of a Fourier voltage leave, and more.
+        wrong = {n: v * (1 + 1e-3 * rng.normal()) for n, v in combinations(TABLE_1[0]).items()}
+        gains = design(estimate(0, std=1e-3, **wrong), loop).gains
+        for name in ("p", "i", "d"):
+            assert getattr(gains, name) == pytest.approx(getattr(true, name), rel=0.02)
+
+
+def test_gains_are_volts_per_wheel_speed():
+    direct = design(estimate(), Loop(gear_ratio=1.0)).gains
+    geared = design(estimate(), Loop(gear_ratio=65.5)).gains
+    for name in ("p", "i", "d", "feedforward_velocity", "feedforward_acceleration"):
+        assert getattr(geared, name) == pytest.approx(65.5 * getattr(direct, name))
+    assert geared.tracking_time_constant == pytest.approx(direct.tracking_time_constant)
+    assert geared.u_clamp_max == 12.0
+
+
+def test_feed_forward_is_the_motors_own_equation():
+    one = combinations(TABLE_1[2])
+    gains = design(estimate(2, static_voltage=0.35), Loop(gear_ratio=10.0)).gains
+    assert gains.feedforward_velocity == pytest.approx(10.0 / one["dc_gain"])
+    assert gains.feedforward_acceleration == pytest.approx(
+        10.0 * one["time_constant"] / one["dc_gain"]
+    )
+    assert gains.feedforward_static == 0.35
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_gains_hold_for_99_percent_of_an_uncertain_motor(method):
+    one = design(estimate(1, std=0.05), Loop(), method)
+    assert one.robustness.samples == 1000
+    assert one.robustness.stable == 1.0
+    assert one.robustness.holds >= 0.99
+
+
+def test_uncertainty_makes_the_design_back_off_and_say_so():
+    sure, unsure = design(estimate(1), Loop()), design(estimate(1, std=0.15), Loop())
+    assert unsure.gains.i < sure.gains.i
+    assert "backed off to" in unsure.reason
+    assert "backed off" not in sure.reason
+    assert any("no uncertainty" in warning for warning in sure.warnings)
+
+
+def test_robustness_is_judged_on_fresh_draws_as_well():
+    """Gains chosen on one sample of the distribution hold on another, with another seed."""
+    one = design(estimate(1, std=0.05), Loop(), seed=1)
+    from smp_motor_ident.tune.plant import draw_motors, sample
+    from smp_motor_ident.tune.robust import Jury
+
+    fresh = sample(draw_motors(estimate(1, std=0.05), 4000, np.random.default_rng(99)), Loop())
+    verdict = Jury(fresh, METHODS["margin"].promise).judge(one.feedback)
+    # 99 % of 1000 draws: the binomial spread of a fresh sample is 0.3 %, three of them.
+    assert verdict.holds >= 0.98
+    assert verdict.stable == 1.0
+
+
+def test_longer_delay_and_slower_rate_cost_bandwidth():
+    fast = design(estimate(), Loop(sample_time=0.005, delay=0.001))
+    late = design(estimate(), Loop(sample_time=0.005, delay=0.015))
+    slow = design(estimate(), Loop(sample_time=0.02))
+    assert fast.margins.crossover > late.margins.crossover > 0
+    assert fast.margins.crossover > slow.margins.crossover
+
+
+def test_delay_of_the_estimate_counts_like_delay_of_the_loop():
+    inside = design(estimate(delay=0.004), Loop(delay=0.003))
+    outside = design(estimate(), Loop(delay=0.007))
+    assert inside.gains.p == pytest.approx(outside.gains.p, rel=1e-9)
+    assert inside.reference.lag == pytest.approx(outside.reference.lag)
+
+
+@pytest.mark.parametrize(
+    ("targets", "words"),
+    [
+        ({"max_velocity": 6.0}, "max_velocity 6 rad/s is beyond the motor"),
+        ({"max_acceleration": 1e5}, "max_acceleration 1e\\+05 rad/s\\^2 is beyond the motor"),
+        ({"transition_time": 0.01}, "transition_time 0.01 s is too short"),
+        ({"bandwidth": 400.0}, "the nearest that holds is"),
+        ({"phase_margin": -5.0}, "phase_margin is -5"),
+        ({"phase_margin": math.nan}, "phase_margin is nan"),
+        ({"maximum_sensitivity": 0.9}, "maximum_sensitivity is 0.9"),
+        ({"focus": "sport"}, "focus is 'sport'"),
+        ({"gain": 1.0}, "knows no target 'gain'"),
+    ],
+)
+def test_impossible_demand_is_refused_with_the_limit(targets, words):
+    with pytest.raises(DesignError, match=words):
+        design(estimate(), Loop(), **targets)
+
+
+def test_nearest_acceleration_that_the_refusal_tells_is_accepted():
+    with pytest.raises(DesignError) as refusal:
+        design(estimate(), Loop(), max_acceleration=1e5)
+    words = str(refusal.value).split()
+    limit = float(words[words.index("reaches") + 1])
+    one = design(estimate(), Loop(), max_acceleration=0.999 * limit)
+    assert one.reference.max_acceleration / 65.5 <= limit
+
+
+def test_motor_that_friction_holds_is_refused():
+    with pytest.raises(DesignError, match="cannot turn"):
+        design(estimate(static_voltage=11.5), Loop())
+
+
+def test_estimate_without_dynamics_is_refused():
+    bare = Estimate("rear_left", "static_gain", {}, {"dc_gain": Quantity(25.0)})
+    with pytest.raises(DesignError, match="rear_left: the estimate holds neither"):
+        design(bare, Loop())
+
+
+def test_comparison_recommends_a_sound_design_for_a_reason():
+    results = compare(estimate(0, std=0.01), Loop())
+    assert set(results) == set(METHODS)
+    name, reason = recommend(results)
+    chosen = results[name]
+    assert chosen.margins.sensitivity <= 1.6
+    assert "load" in reason
+    for other in results.values():
+        sound = other.margins.sensitivity <= 1.6
+        if sound and other.performance.ripple <= other.loop.noise_limit:
+            assert chosen.performance.load_integral <= other.performance.load_integral
+
+
+def test_comparison_keeps_the_refusals_apart():
+    results = compare(estimate(), Loop(), ("margin", "simc"), bandwidth=1000.0)
+    assert isinstance(results["margin"], DesignError)
+    assert not isinstance(results["simc"], DesignError)
+
+
+def four(spread: float) -> dict[str, Estimate]:
+    rng = np.random.default_rng(5)
+    found = {}
+    for wheel in ("front_left", "front_right", "rear_left", "rear_right"):
+        values = {n: v * (1 + spread * rng.normal()) for n, v in combinations(TABLE_1[3]).items()}
+        found[wheel] = replace(estimate(3, std=0.002, **values), wheel=wheel)
+    return found
+
+
+def test_alike_motors_share_one_set_of_gains():
+    found = four(0.005)
+    wheels = design_wheels(found, dict.fromkeys(found, Loop()))
+    assert wheels.one_set
+    assert len({(d.gains.p, d.gains.i, d.gains.d) for d in wheels.designs.values()}) == 1
+    for one in wheels.designs.values():
+        assert one.robustness.holds >= 0.99
+
+
+def test_motors_that_differ_get_gains_of_their_own_and_one_reference():
+    found = {f"wheel_{k}": replace(estimate(k), wheel=f"wheel_{k}") for k in range(4)}
+    wheels = design_wheels(found, dict.fromkeys(found, Loop()))
+    assert not wheels.one_set
+    assert len({d.gains.p for d in wheels.designs.values()}) == 4
+    plans = [d.reference for d in wheels.designs.values()]
+    for name in ("transition_time", "max_velocity", "max_acceleration"):
+        assert len({round(getattr(plan, name), 9) for plan in plans}) == 1
+
+
+def test_one_set_for_motors_that_differ_holds_for_all_of_them():
+    found = {f"wheel_{k}": replace(estimate(k, 0.01), wheel=f"wheel_{k}") for k in range(4)}
+    wheels = design_wheels(found, dict.fromkeys(found, Loop()), sets="one")
+    assert wheels.one_set
+    for one in wheels.designs.values():
+        assert one.robustness.holds >= 0.99
