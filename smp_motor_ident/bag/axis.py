@@ -88,7 +88,12 @@ def on_one_axis(
     if keep.sum() < 2:
         raise BagError(f"{source}: {wheel}: fewer than 2 samples have a voltage and an output")
     axis = axis[keep]
-    values = mean_held(voltage.time, voltage.value, held, axis)
+    if alike:  # each interval has one voltage
+        values = voltage.value.copy()
+        if held == "after":
+            values[1:] = voltage.value[:-1]
+    else:
+        values = mean_held(voltage.time, voltage.value, held, axis)
     starts = _count_starts(series, plan, hardware, keep, axis_name, notes)
     starts |= _gaps(axis, plan, alike, held, voltage, values, notes)
     columns: dict[str, Any] = {"voltage": values}

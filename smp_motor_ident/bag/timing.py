@@ -66,11 +66,12 @@ def fit_clock(stamp: Integers, log: Integers) -> ClockFit:
     span = float(since.max())
     if span < 10 * _SECOND or stamp.size < 200:
         return ClockFit(float(base), 0.0, origin)
-    part = np.minimum((since / span * 20).astype(np.int64), 19)
+    part = np.minimum((since * (20 / span)).astype(np.int8), 19)
     parts = [inside for k in range(20) if (inside := np.flatnonzero(part == k)).size]
     drift = offset = 0.0
     for _ in range(3):  # the fastest message of a part is judged without the drift inside it
-        best = np.array([inside[np.argmin((late - drift * since)[inside])] for inside in parts])
+        rest = late - drift * since
+        best = np.array([inside[np.argmin(rest[inside])] for inside in parts])
         drift, offset = np.polyfit(since[best], late[best], 1).tolist()
     return ClockFit(base + offset, drift, origin)
 
