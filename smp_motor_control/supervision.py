@@ -112,9 +112,9 @@ class FeedbackClock:
 class Fault(Enum):
     """What can be wrong with a motor that is being driven."""
 
-    STALL = "stall: current flows and the wheel does not turn"
-    DEAD_ENCODER = "dead encoder: the motor takes its voltage and no counts come"
-    NO_MOTION = "no motion: stalled wheel or dead encoder (no current is measured to tell)"
+    STALL = "stall (or dead encoder): no counts under voltage, current as at standstill"
+    DEAD_ENCODER = "dead encoder (or stall): no counts under voltage, current as of a turning motor"
+    NO_MOTION = "stall or dead encoder: no counts under voltage, and no current is measured to tell"
     RUNAWAY = "runaway: the wheel turns against its voltage (wrong sign of motor or encoder?)"
     OVER_CURRENT = "over-current"
 
@@ -229,16 +229,21 @@ class FaultDetector:
     def _no_motion(self, voltage: float, current: float) -> Fault:
         if math.isnan(current) or math.isnan(self.resistance):
             return Fault.NO_MOTION
-        # At standstill all voltage drives current; a turning motor takes but little of it.
-        if abs(current) * self.resistance > 0.6 * abs(voltage):
+        # At standstill all voltage drives current, R i = v.  A turning motor takes less, but one
+        # whose friction eats all of its torque not much less: the name tells the other cause too.
+        if abs(current) * self.resistance > 0.85 * abs(voltage):
             return Fault.STALL
         return Fault.DEAD_ENCODER
+
+
+_SILENT = (Fault.STALL, Fault.DEAD_ENCODER, Fault.NO_MOTION)
 
 
 class Latch:
     """Holds a fault until the wheel may be tried again.
 
-    That is when the set-point is zero, or after a pause that doubles every time.
+    That is when the set-point is zero, when a wheel that gave no counts is seen to turn, or
+    after a pause that doubles every time.
 
     Parameters
     ----------
@@ -274,13 +279,15 @@ class Latch:
         self._pause = longer if again else self.first_pause
         self.fault, self._since = fault, now
 
-    def may_release(self, setpoint: float, now: float) -> bool:
+    def may_release(self, setpoint: float, now: float, turns: bool = False) -> bool:
         """Tell whether the wheel may be tried again, and let go of it if so.
 
         Parameters
         ----------
         setpoint : float
             Present one [rad/s].
+        turns : bool
+            Whether feedback shows the wheel turning.
         now : float
             [s].
 
@@ -290,7 +297,12 @@ class Latch:
             Whether it has let go.
         """
         waited = now - self._since
-        if (setpoint == 0.0 and waited > 0.5) or (self._pause > 0.0 and waited > self._pause):
+        alive = turns and self.fault in _SILENT
+        if (
+            alive
+            or (setpoint == 0.0 and waited > 0.5)
+            or (self._pause > 0.0 and waited > self._pause)
+        ):
             self.fault = None
             self._released = now
             return True

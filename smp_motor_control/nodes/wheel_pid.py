@@ -85,6 +85,7 @@ class WheelPid(LifecycleNode):
         self._setpoint_at = self._feedback_at = -math.inf
         self._expired = False
         self._resume = True
+        self._cautious = False
         self._output = 0.0
         self._index = 0
         self._clock_of_feedback.reset()
@@ -269,8 +270,7 @@ class WheelPid(LifecycleNode):
 
     def _answer(self, message: MotorState, measurement: float, dt: float, steady: float) -> None:
         setpoint = self._present_setpoint(measurement, steady)
-        latch = self._latch
-        if latch.fault is not None and not latch.may_release(setpoint or 0.0, steady):
+        if self._latch.fault is not None and not self._released(setpoint, measurement, steady):
             self._send_zero()
             return
         if setpoint is None:
@@ -291,7 +291,10 @@ class WheelPid(LifecycleNode):
             self._refuse("output that is not a number")
             self._send_zero()
             return
-        self._send(out.output, message)
+        voltage = out.output
+        if self._cautious:
+            voltage = self._with_caution(voltage, measurement)
+        self._send(voltage, message)
         self._steps += 1
         self._enter(TIMED_OUT if self._expired else DRIVING)
         if self._watched:
@@ -312,6 +315,23 @@ class WheelPid(LifecycleNode):
             self._setpoint = None
             return None
         return 0.0
+
+    def _released(self, setpoint: float | None, measurement: float, steady: float) -> bool:
+        """Tell whether a wheel at fault may be tried again, and then do so with caution."""
+        turns = abs(measurement) > self._settings.faults.stall_velocity
+        if not self._latch.may_release(setpoint or 0.0, steady, turns):
+            return False
+        self._cautious = True
+        return True
+
+    def _with_caution(self, voltage: float, measurement: float) -> float:
+        """Limit the voltage of a wheel after a fault until it turns the way it is driven."""
+        faults = self._settings.faults
+        if voltage * measurement > 0.0 and abs(measurement) > faults.stall_velocity:
+            self._cautious = False
+            return voltage
+        limit = 1.05 * faults.stall_voltage
+        return min(max(voltage, -limit), limit)
 
     def _trip(self, fault: Fault, steady: float) -> None:
         self._latch.set(fault, steady)

@@ -101,8 +101,8 @@ def run(detector: FaultDetector, duration: float, voltage, velocity, current) ->
 
 
 def test_stall_and_dead_encoder_are_told_apart_by_the_current():
-    # 6 V over 3 ohm: 2 A at standstill, a tenth of that when it really turns.
-    for current, fault in ((2.0, Fault.STALL), (0.2, Fault.DEAD_ENCODER)):
+    # 6 V over 3 ohm: 2 A at standstill, less when it really turns.
+    for current, fault in ((1.95, Fault.STALL), (1.4, Fault.DEAD_ENCODER)):
         detector = FaultDetector(LIMITS, resistance=3.0)
         assert run(detector, 2.0, 6.0, 0.0, current) == pytest.approx(0.5, abs=0.006)
         assert detector.found is fault
@@ -150,6 +150,13 @@ def test_fault_is_released_by_a_zero_set_point_or_after_a_pause_that_doubles():
             now += 0.01
         pauses.append(now - begin)
     assert pauses == pytest.approx([2.0, 4.0, 8.0, 16.0, 30.0, 30.0], abs=0.02)
+
+
+def test_wheel_that_gave_no_counts_is_released_by_counts():
+    for fault, released in ((Fault.DEAD_ENCODER, True), (Fault.RUNAWAY, False)):
+        latch = Latch(first_pause=0.0)
+        latch.set(fault, 0.0)
+        assert latch.may_release(1.0, 0.1, turns=True) is released
 
 
 def test_without_a_pause_only_a_zero_set_point_releases():

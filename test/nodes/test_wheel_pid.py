@@ -208,20 +208,22 @@ def test_stall_runaway_and_over_current_switch_the_motor_off(start, robot, event
     feed = Feed(robot, eventually)
     settle(robot, feed)
     for words, velocity, current in (
-        ("no motion", 0.0, math.nan),
+        ("no counts under voltage", 0.0, math.nan),
         ("runaway", -0.5, math.nan),
         ("over-current", 0.4, 3.0),
     ):
         robot.setpoint = 1.0
         begin = time.monotonic()
-        eventually(lambda v=velocity: feed.sample(v) > 1.0, 3.0)
+        eventually(lambda v=velocity: feed.sample(v) > 1.0, 3.0, message=f"before {words}")
         eventually(lambda v=velocity, i=current: feed.sample(v, current=i) == 0.0, 1.0)
         eventually(lambda w=words, t=begin: robot.named(NODE, w, t), 1.0, robot.spin)
         assert feed.sample(velocity) == 0.0
         robot.setpoint = 0.0
-        end = time.monotonic() + 0.8
-        while time.monotonic() < end:
-            feed.sample(0.0)
+        eventually(
+            lambda: feed.sample(0.0) == 0.0 and robot.last_diagnosis(NODE).startswith("driving"),
+            5.0,
+            message="not released by a zero set-point",
+        )
 
 
 def test_wheel_without_a_name_and_unknown_parameters_are_refused(process):

@@ -101,7 +101,7 @@ def test_feedback_faults_stop_the_wheel_are_named_and_driving_resumes(process, r
     relay = campaign.relay
     stopping: list[tuple[str, Callable[[], None], str]] = [
         ("lost", lambda: setattr(relay, "fault", lambda m: []), "no feedback"),
-        ("frozen", relay.freezes, "dead encoder"),
+        ("frozen", relay.freezes, "no counts under voltage"),
         ("delayed 500 ms", lambda: relay.delays(0.5), "late"),
         ("not a number", lambda: relay.changes(velocity=math.nan), "not a number"),
         ("infinite", lambda: relay.changes(velocity=math.inf), "not a number"),
