@@ -59,7 +59,9 @@ class Experiments:
         return replace(self, kind=rc.MEAN_SPEED)
 
     def head(self, duration: float) -> Experiments:
-        """Return the first ``duration`` seconds (of all segments together, in order).
+        """Return all up to ``duration`` seconds after the first voltage, of all segments together.
+
+        A standstill before the first voltage teaches nothing, so it does not count.
 
         Parameters
         ----------
@@ -71,7 +73,7 @@ class Experiments:
         Experiments
             Views of the same arrays.
         """
-        left = duration
+        left = duration + self._lead()
         for g in range(len(self.starts) - 1):
             a, b = int(self.starts[g]), int(self.starts[g + 1])
             span = self.time[b - 1] - self.time[a]
@@ -81,6 +83,18 @@ class Experiments:
                 return self._cut(g + 1, end)
             left -= span
         return self
+
+    def _lead(self) -> float:
+        """Return how long [s] it takes until a twentieth of the largest voltage is exceeded."""
+        level = np.abs(self.section_value)
+        first = int(np.argmax(level > 0.05 * level.max()))
+        before = 0.0
+        for g in range(len(self.starts) - 1):
+            begin, last = self.time[self.starts[g]], self.time[self.starts[g + 1] - 1]
+            if g + 2 == len(self.starts) or first < self.section_start[g + 1]:
+                return before + max(float(self.section_end[first] - begin), 0.0)
+            before += float(last - begin)
+        return before
 
     def _cut(self, segments: int, end: int) -> Experiments:
         starts = self.starts[: segments + 1].copy()
