@@ -5,6 +5,7 @@ Derivation: docs/derivations.md, sections 6 to 9.
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -521,7 +522,7 @@ def _relative_step(here: Pass, step: Array, frozen: NDArray[np.bool_]) -> float:
     keep = ~frozen
     s = step[keep]
     size = float(s @ here.normal[np.ix_(keep, keep)] @ s)
-    return max(0.0, size) ** 0.5
+    return math.sqrt(max(0.0, size))
 
 
 def _project(z: Array, structure: Structure) -> None:

@@ -14,7 +14,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident._compile import compiled
+from smp_motor_ident._compile import compiled, inlined
 from smp_motor_ident.propagator import ROW, WIDTH, first_order, second_order, speed_at
 
 Array = NDArray[np.float64]
@@ -35,33 +35,53 @@ def _fill(row: Array, h: float, par: Array) -> None:
         second_order(row, h, par[0], par[1], par[2], par[3])
 
 
-@compiled
+@inlined
 def _slide(
-    row: Array, x: Array, s: Array, n_slope: int, slope: Array, v: float, f: float, df: Array
+    rows: Array,
+    n: int,
+    x: Array,
+    s: Array,
+    n_slope: int,
+    slope: Array,
+    v: float,
+    f: float,
+    df: Array,
+    which: int,
 ) -> None:
-    """Advance state x and sensitivities s over one interval with constant v and F = f."""
+    """Advance state x and sensitivities s over one interval with constant v and F = f.
+
+    The propagator is row ``n`` of ``rows``; no view of it is made, that would cost more than
+    the step itself.
+    """
     q, w = x[0], x[1]
     c00 = c01 = c02 = c10 = c11 = c12 = c20 = c21 = c22 = c30 = c31 = c32 = 0.0
     o = ROW
-    c00 = row[o] * q + row[o + 1] * w + row[o + 6] * v - row[o + 9] * f
-    c01 = row[o + 2] * q + row[o + 3] * w + row[o + 7] * v - row[o + 10] * f
-    c02 = row[o + 4] * q + row[o + 5] * w + row[o + 8] * v - row[o + 11] * f
+    c00 = rows[n, o] * q + rows[n, o + 1] * w + rows[n, o + 6] * v - rows[n, o + 9] * f
+    c01 = rows[n, o + 2] * q + rows[n, o + 3] * w + rows[n, o + 7] * v - rows[n, o + 10] * f
+    c02 = rows[n, o + 4] * q + rows[n, o + 5] * w + rows[n, o + 8] * v - rows[n, o + 11] * f
     o = 2 * ROW
-    c10 = row[o] * q + row[o + 1] * w + row[o + 6] * v - row[o + 9] * f
-    c11 = row[o + 2] * q + row[o + 3] * w + row[o + 7] * v - row[o + 10] * f
-    c12 = row[o + 4] * q + row[o + 5] * w + row[o + 8] * v - row[o + 11] * f
+    c10 = rows[n, o] * q + rows[n, o + 1] * w + rows[n, o + 6] * v - rows[n, o + 9] * f
+    c11 = rows[n, o + 2] * q + rows[n, o + 3] * w + rows[n, o + 7] * v - rows[n, o + 10] * f
+    c12 = rows[n, o + 4] * q + rows[n, o + 5] * w + rows[n, o + 8] * v - rows[n, o + 11] * f
     o = 3 * ROW
-    c20 = row[o] * q + row[o + 1] * w + row[o + 6] * v - row[o + 9] * f
-    c21 = row[o + 2] * q + row[o + 3] * w + row[o + 7] * v - row[o + 10] * f
-    c22 = row[o + 4] * q + row[o + 5] * w + row[o + 8] * v - row[o + 11] * f
+    c20 = rows[n, o] * q + rows[n, o + 1] * w + rows[n, o + 6] * v - rows[n, o + 9] * f
+    c21 = rows[n, o + 2] * q + rows[n, o + 3] * w + rows[n, o + 7] * v - rows[n, o + 10] * f
+    c22 = rows[n, o + 4] * q + rows[n, o + 5] * w + rows[n, o + 8] * v - rows[n, o + 11] * f
     o = 4 * ROW
-    c30 = row[o] * q + row[o + 1] * w + row[o + 6] * v - row[o + 9] * f
-    c31 = row[o + 2] * q + row[o + 3] * w + row[o + 7] * v - row[o + 10] * f
-    c32 = row[o + 4] * q + row[o + 5] * w + row[o + 8] * v - row[o + 11] * f
-    e00, e01, e10, e11, h0, h1 = row[0], row[1], row[2], row[3], row[4], row[5]
-    g0, g1, g2 = row[9], row[10], row[11]
+    c30 = rows[n, o] * q + rows[n, o + 1] * w + rows[n, o + 6] * v - rows[n, o + 9] * f
+    c31 = rows[n, o + 2] * q + rows[n, o + 3] * w + rows[n, o + 7] * v - rows[n, o + 10] * f
+    c32 = rows[n, o + 4] * q + rows[n, o + 5] * w + rows[n, o + 8] * v - rows[n, o + 11] * f
+    e00, e01, e10, e11, h0, h1 = (
+        rows[n, 0],
+        rows[n, 1],
+        rows[n, 2],
+        rows[n, 3],
+        rows[n, 4],
+        rows[n, 5],
+    )
+    g0, g1, g2 = rows[n, 9], rows[n, 10], rows[n, 11]
     for j in range(s.shape[1]):
-        sq, sw, fj = s[0, j], s[1, j], df[j]
+        sq, sw, fj = s[0, j], s[1, j], df[which, j]
         s[0, j] = e00 * sq + e01 * sw - g0 * fj
         s[1, j] = e10 * sq + e11 * sw - g1 * fj
         s[2, j] += h0 * sq + h1 * sw - g2 * fj
@@ -70,9 +90,9 @@ def _slide(
         s[0, j] += c00 * t0 + c10 * t1 + c20 * t2 + c30 * t3
         s[1, j] += c01 * t0 + c11 * t1 + c21 * t2 + c31 * t3
         s[2, j] += c02 * t0 + c12 * t1 + c22 * t2 + c32 * t3
-    x[0] = e00 * q + e01 * w + row[6] * v - g0 * f
-    x[1] = e10 * q + e11 * w + row[7] * v - g1 * f
-    x[2] += h0 * q + h1 * w + row[8] * v - g2 * f
+    x[0] = e00 * q + e01 * w + rows[n, 6] * v - g0 * f
+    x[1] = e10 * q + e11 * w + rows[n, 7] * v - g1 * f
+    x[2] += h0 * q + h1 * w + rows[n, 8] * v - g2 * f
 
 
 @compiled
@@ -144,7 +164,7 @@ def _zero_crossing(  # noqa: C901 - one search, branches for how it starts
     return float(t)
 
 
-@compiled
+@inlined
 def _advance(  # noqa: C901 - the events of one interval, in order
     h: float,
     v: float,
@@ -195,7 +215,7 @@ def _advance(  # noqa: C901 - the events of one interval, in order
             t = _zero_crossing(left, par, x, direction, v, f)
             if t >= 0.0:
                 _fill(cache[4], t, par)
-                _slide(cache[4], x, s, n_slope, slope, v, f, df[which])
+                _slide(cache, 4, x, s, n_slope, slope, v, f, df, which)
                 x[1] = 0.0
                 net = (x[0] if par[0] > 0.0 else v) - load
                 before = net - (f - load)
@@ -229,7 +249,7 @@ def _advance(  # noqa: C901 - the events of one interval, in order
                 _fill(cache[slot], h, par)
         else:
             _fill(cache[4], left, par)
-        _slide(cache[slot], x, s, n_slope, slope, v, f, df[which])
+        _slide(cache, slot, x, s, n_slope, slope, v, f, df, which)
         return direction
     return direction
 
