@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import gc
+import math
 import os
 import signal
 import statistics
@@ -84,10 +85,10 @@ class Feeder:
 
     def __init__(self, wheels: list[str]) -> None:
         import rclpy
-        from rclpy.executors import SingleThreadedExecutor
         from sensor_msgs.msg import JointState
 
         from smp_interfaces.msg import MotorCommand, MotorState
+        from smp_motor_control.nodes.executor import LeanExecutor
         from smp_motor_control.nodes.runtime import STREAM_PUBLISHER, STREAM_SUBSCRIBER
 
         rclpy.init(args=[])
@@ -112,7 +113,7 @@ class Feeder:
         self.setpoint = JointState(
             name=[f"{w}_wheel_joint" for w in wheels], velocity=[1.0] * len(wheels)
         )
-        self.executor = SingleThreadedExecutor()
+        self.executor = LeanExecutor()
         self.executor.add_node(self.node)
 
     def answered(self, wheel: str, message: object) -> None:
@@ -124,29 +125,35 @@ class Feeder:
 
     def feed(self, rate: float, duration: float) -> None:
         """Publish at a rate; answers are taken in between."""
-        from builtin_interfaces.msg import Time
+        from smp_motor_control.nodes.runtime import steady_timer
 
-        period = 1.0 / rate
-        begin = time.perf_counter()
-        count = round(duration * rate)
-        for k in range(count):
-            due = begin + k * period
-            while (left := due - time.perf_counter()) > 0:
-                self.executor.spin_once(timeout_sec=left)
-            now = time.time_ns()
-            stamp = Time(sec=now // 1_000_000_000, nanosec=now % 1_000_000_000)
-            if k % max(1, round(rate / 20)) == 0:
-                self.setpoints.publish(self.setpoint)
-            for wheel in self.wheels:
-                message = self.messages[wheel]
-                message.header.stamp = stamp
-                message.velocity = 0.9 + 0.1 * np.sin(k * 0.01)
-                message.encoder_count = k
-                self.sent[wheel][(stamp.sec, stamp.nanosec)] = time.perf_counter()
-                self.states[wheel].publish(message)
+        self.tick, self.left = 0, round(duration * rate)
+        timer = steady_timer(self.node, 1.0 / rate, lambda: self.publish(rate))
+        while self.left > 0:
+            self.executor.spin_once()
+        self.node.destroy_timer(timer)
+        rest = steady_timer(self.node, 0.05, lambda: None)
         end = time.perf_counter() + 0.2
         while time.perf_counter() < end:
-            self.executor.spin_once(timeout_sec=0.05)
+            self.executor.spin_once()
+        self.node.destroy_timer(rest)
+
+    def publish(self, rate: float) -> None:
+        """Publish one sample of every wheel, and the set-point 20 times a second."""
+        if self.left <= 0:
+            return
+        self.left -= 1
+        self.tick += 1
+        seconds, nanoseconds = divmod(time.time_ns(), 1_000_000_000)
+        if self.tick % max(1, round(rate / 20)) == 0:
+            self.setpoints.publish(self.setpoint)
+        for wheel in self.wheels:
+            message = self.messages[wheel]
+            message.header.stamp.sec, message.header.stamp.nanosec = seconds, nanoseconds
+            message.velocity = 0.9 + 0.1 * math.sin(self.tick * 0.01)
+            message.encoder_count = self.tick
+            self.sent[wheel][(seconds, nanoseconds)] = time.perf_counter()
+            self.states[wheel].publish(message)
 
     def ready(self, rate: float) -> None:
         """Feed until every wheel answers, and a second longer."""
