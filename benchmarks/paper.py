@@ -249,7 +249,9 @@ def table_2_step(wheel, reading, rate, seconds=1.0):
 def ours(found, rate, together):
     """Return designs for the identified motors, apart or together."""
     estimates = {wheel: found[wheel, "Fourier", False] for wheel in TABLE_1}
-    loops = {w: Loop(sample_time=1 / rate, supply_voltage=SUPPLY) for w in estimates}
+    loops = {
+        w: Loop(sample_time=1 / rate, delay=1 / rate, supply_voltage=SUPPLY) for w in estimates
+    }
     if together:
         return dict(design_wheels(estimates, loops).designs)
     return {w: design_wheels({w: e}, {w: loops[w]}).designs[w] for w, e in estimates.items()}

@@ -150,8 +150,9 @@ def check(job) -> list[Outcome]:
     """Design one motor at one rate by every method, and try each."""
     motor, rate = job
     T = 1 / rate
-    loop = Loop(sample_time=T, gear_ratio=RATIO, counts_per_revolution=COUNTS,
-                supply_voltage=SUPPLY)  # fmt: skip
+    # The simulated delay is one sample exactly: nothing to doubt.
+    loop = Loop(sample_time=T, delay=T, delay_doubt=0.0, gear_ratio=RATIO,
+                counts_per_revolution=COUNTS, supply_voltage=SUPPLY)  # fmt: skip
     conditions = Conditions(T, T)
     estimate = estimate_of(motor)
     outcomes, designs = [], {}

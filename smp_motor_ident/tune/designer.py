@@ -101,16 +101,7 @@ def design(estimate: Estimate, loop: Loop, method: str = "margin", **targets: An
         When the demand cannot be met; the message tells the limit and the nearest design.
     """
     case = prepare(estimate, loop, method, targets)
-    ruled = case.method.solve(case.problem)
-    feedback, factor, robustness = back_off(case.jury, ruled)
-    if factor == 0.0:
-        raise DesignError(
-            f"{estimate.wheel}: no gains of this kind keep a phase margin of "
-            f"{case.promise.phase:g} deg and Ms {case.promise.sensitivity:g} over the motors that "
-            f"the data allow (only {robustness.holds:.0%} do); record more, or ask for smaller "
-            "margins"
-        )
-    return finish(case, feedback, factor, robustness)
+    return finish(case, *solve(case))
 
 
 @dataclass(frozen=True)
@@ -170,6 +161,38 @@ def prepare(estimate: Estimate, loop: Loop, method: str, targets: dict[str, Any]
     return Case(estimate.wheel, chosen, problem, promise, jury, motors is not None)
 
 
+def solve(case: Case) -> tuple[Feedback, float, Robustness]:
+    """Find the feedback gains, backed off as far as the uncertainty asks for it.
+
+    Parameters
+    ----------
+    case : Case
+        From :func:`prepare`.
+
+    Returns
+    -------
+    feedback : Feedback
+        At the motor shaft.
+    factor : float
+        By which the rule's gains were backed off; 1 where they were not.
+    robustness : Robustness
+
+    Raises
+    ------
+    DesignError
+        When the demand cannot be met.
+    """
+    feedback, factor, robustness = back_off(case.jury, case.method.solve(case.problem))
+    if factor == 0.0:
+        raise DesignError(
+            f"{case.wheel}: no gains of this kind keep a phase margin of "
+            f"{case.promise.phase:g} deg and Ms {case.promise.sensitivity:g} over the motors that "
+            f"the data allow (only {robustness.holds:.0%} do); record more, or ask for smaller "
+            "margins"
+        )
+    return feedback, factor, robustness
+
+
 def finish(case: Case, feedback: Feedback, factor: float, robustness: Robustness) -> Design:
     """Add feed-forward, reference, figures and words to feedback gains.
 
@@ -190,7 +213,7 @@ def finish(case: Case, feedback: Feedback, factor: float, robustness: Robustness
     """
     problem, plant, loop = case.problem, case.problem.plant, case.problem.loop
     controller = controller_for(loop, feedback)
-    usual = sample(plant.motors, replace(loop, delay=loop.expected_delay))
+    usual = _usual(case)
     reference = _plan(usual, loop, controller, problem.targets)
     margins = loop_margins(plant, feedback)
     figures = measure(problem, usual, controller, reference, ripple(problem, feedback))
@@ -216,6 +239,33 @@ def finish(case: Case, feedback: Feedback, factor: float, robustness: Robustness
         warnings=warnings,
         feedback=feedback,
     )
+
+
+def with_reference(case: Case, one: Design, reference: Reference) -> Design:
+    """Return a design with another reference, and the figures that go with it.
+
+    Parameters
+    ----------
+    case : Case
+        That it was made from.
+    one : Design
+        The design.
+    reference : Reference
+        Within what its own was.
+
+    Returns
+    -------
+    Design
+    """
+    controller = controller_for(one.loop, one.feedback)
+    figures = measure(case.problem, _usual(case), controller, reference, one.performance.ripple)
+    return replace(one, reference=reference, performance=figures)
+
+
+def _usual(case: Case) -> Plant:
+    """Return the nominal motor sampled with the loop's usual delay."""
+    loop = case.problem.loop
+    return sample(case.problem.plant.motors, replace(loop, delay=loop.expected_delay))
 
 
 def compare(

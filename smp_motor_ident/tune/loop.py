@@ -9,7 +9,7 @@ from typing import Literal
 from smp_motor_control.errors import ParameterError
 
 SpeedSource = Literal["measured", "difference", "observer"]
-USUAL_DELAY = 1e-3
+USUAL_DELAY = 2e-3
 """From a measurement through two nodes of one machine to the voltage [s]."""
 
 SPEED_SOURCES: tuple[SpeedSource, ...] = ("measured", "difference", "observer")
@@ -30,8 +30,10 @@ class Loop:
         the estimate) is added to it.
     usual_delay : float or None
         The same as it usually is [s], for the timing of the reference, where ``delay`` is the
-        longest that the margins must bear.  None takes ``delay`` where that was given, else one
-        millisecond: what nodes on one machine need, of which a sample is the limit.
+        longest that the margins must bear.  None takes ``delay`` where that was given, else two
+        milliseconds, or one sample where that is shorter: what nodes on one machine need.
+    delay_doubt : float
+        By which the delay may be longer than usual without overshoot that matters [s].
     gear_ratio : float
         Motor revolutions per wheel revolution [-].
     counts_per_revolution : float or None
@@ -63,6 +65,7 @@ class Loop:
     sample_time: float = 0.005
     delay: float | None = None
     usual_delay: float | None = None
+    delay_doubt: float = 2e-3
     gear_ratio: float = 65.5
     counts_per_revolution: float | None = 500.0
     supply_voltage: float = 12.0

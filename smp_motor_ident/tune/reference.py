@@ -33,10 +33,7 @@ PEAK = 0.95
 """Share of the supply that a planned change of speed may use at its peak."""
 
 CHANGE = 0.5
-"""Share of the largest speed that a change may have without taking longer than others."""
-
-DOUBT = 1e-3
-"""By which the usual delay may be longer than it is said to be [s]."""
+"""Share of the largest speed that the figures of a design are about."""
 
 PEAK_RATE = 1.875
 """Peak acceleration of a minimum-jerk change of unit distance in unit time."""
@@ -53,8 +50,7 @@ class Reference:
     max_acceleration : float
         [rad/s^2].
     transition_time : float
-        Duration of the minimum-jerk change [s]; larger changes than ``CHANGE`` of the largest
-        speed take longer, by the acceleration limit.
+        Duration of every minimum-jerk change [s]; the acceleration limit stretches large ones.
     lag : float
         By which the measured speed follows the reference [s].
     """
@@ -106,6 +102,24 @@ def measured_lag(plant: Plant, loop: Loop) -> float:
     """
     dead = loop.expected_delay + float(plant.motors.delay[0])
     return dead + 0.5 * loop.sample_time * (1 + plant.window)
+
+
+def duration_of(reference: Reference, distance: float) -> float:
+    """Return how long a change takes: the transition time, stretched by the acceleration [s].
+
+    Parameters
+    ----------
+    reference : Reference
+        With its limits.
+    distance : float
+        Change of speed [rad/s].
+
+    Returns
+    -------
+    float
+    """
+    stretched = PEAK_RATE * abs(distance) / reference.max_acceleration
+    return max(reference.transition_time, stretched)
 
 
 def planned_change(
@@ -181,24 +195,25 @@ def plan_reference(
     """
     lag, ratio = measured_lag(plant, loop), loop.gear_ratio
     speed = _reachable(plant, loop, max_velocity)
-    change = CHANGE * speed
-    shortest = _shortest(plant, loop, controller, lag, speed)
-    limit = PEAK_RATE * change / shortest
-    if max_acceleration is not None and not 0 < max_acceleration <= limit:
+    quickest = _quickest(plant, loop, controller, lag)
+    steepest = _steepest(plant, loop, speed, quickest)
+    if max_acceleration is not None and not 0 < max_acceleration <= steepest:
         raise DesignError(
-            f"max_acceleration {max_acceleration / ratio:.4g} rad/s^2 is beyond the motor: within "
-            f"{PEAK:.0%} of {loop.supply_voltage:g} V a change by {change / ratio:.3g} rad/s "
-            f"reaches {limit / ratio:.4g} rad/s^2; ask for that or less"
+            f"max_acceleration {max_acceleration / ratio:.4g} rad/s^2 is beyond the motor: a "
+            f"change by {speed / ratio:.3g} rad/s within {PEAK:.0%} of {loop.supply_voltage:g} V "
+            f"reaches {steepest / ratio:.4g} rad/s^2; ask for that or less"
         )
-    if transition_time is not None and not transition_time >= shortest - 1e-9:
+    if transition_time is not None and not transition_time >= quickest - 1e-9:
         raise DesignError(
-            f"transition_time {transition_time:.4g} s is too short for the motor: a change by "
-            f"{change / ratio:.3g} rad/s takes at least {shortest:.3g} s; ask for that or more"
+            f"transition_time {transition_time:.4g} s is too short for the loop: without overshoot "
+            f"a change takes at least {quickest:.3g} s; ask for that or more"
         )
-    if max_acceleration is not None:
-        shortest = max(shortest, PEAK_RATE * change / max_acceleration)
-    duration = shortest if transition_time is None else transition_time
-    return Reference(speed, PEAK_RATE * change / duration, duration, lag)
+    return Reference(
+        max_velocity=speed,
+        max_acceleration=steepest if max_acceleration is None else max_acceleration,
+        transition_time=quickest if transition_time is None else transition_time,
+        lag=lag,
+    )
 
 
 def _reachable(plant: Plant, loop: Loop, wished: float | None) -> float:
@@ -216,42 +231,51 @@ def _reachable(plant: Plant, loop: Loop, wished: float | None) -> float:
     return 0.9 * top if wished is None else wished
 
 
-def _shortest(plant: Plant, loop: Loop, controller: Controller, lag: float, speed: float) -> float:
-    """Return the shortest change by ``CHANGE`` of the speed; the whole takes twice as long.
+def _quickest(plant: Plant, loop: Loop, controller: Controller, lag: float) -> float:
+    """Return the shortest change of speed, however small, that does not overshoot [s].
 
-    Both must keep to the supply, and not overshoot when the loop's delay is as usual, and hardly
-    when it is ``DOUBT`` longer than that.
+    By half a percent when the loop's delay is as usual, by one and a half when it is longer by
+    the loop's doubt.
     """
-    room = PEAK * loop.supply_voltage - float(plant.motors.static_voltage[0])
     slow = float(plant.motors.a1[0] / plant.motors.a0[0])
-    late = replace(loop, delay=loop.expected_delay + min(DOUBT, loop.sample_time))
+    late = replace(loop, delay=loop.expected_delay + loop.delay_doubt)
     trials = ((plant, 0.5), (sample(plant.motors, late), 1.5))
+    linear = replace(controller, limit=math.inf, tracking=math.inf)
     grain = max(0.005, loop.sample_time)
     grains = math.ceil(0.02 / grain)
     for _ in range(200):
         duration = grains * grain
-        changes = [(share * speed, share / CHANGE * duration) for share in (CHANGE, 1.0)]
-        if all(_voltage(plant, *change) <= room for change in changes) and all(
-            _overshoot(one, controller, lag, *change, slow) <= most
-            for one, most in trials
-            for change in changes
-        ):
+        if all(_overshoot(one, linear, lag, duration, slow) <= most for one, most in trials):
             break
         grains += max(1, grains // 16)
     return duration
 
 
-def _voltage(plant: Plant, distance: float, duration: float) -> float:
-    """Return the largest voltage of a change, without dry friction."""
-    time = np.linspace(0.0, duration, 200)
-    return float(planned_change(plant, 0.0, distance, duration, time)[1].max())
-
-
 def _overshoot(
-    plant: Plant, controller: Controller, lag: float, distance: float, duration: float, slow: float
+    plant: Plant, controller: Controller, lag: float, duration: float, slow: float
 ) -> float:
+    """Return the overshoot of a change by 1 rad/s [%]."""
     T = plant.sample_time
     time = T * np.arange(int((duration + lag + 3 * slow) / T) + 2)
-    reference, forward = planned_change(plant, lag, distance, duration, time)
+    reference, forward = planned_change(plant, lag, 1.0, duration, time)
     run = simulate(plant, controller, reference, forward=forward)
-    return step_figures(time, run.speed[0], run.voltage[0], distance).overshoot
+    return step_figures(time, run.speed[0], run.voltage[0], 1.0).overshoot
+
+
+def _steepest(plant: Plant, loop: Loop, speed: float, quickest: float) -> float:
+    """Return the largest acceleration that no change up to ``speed`` takes beyond the supply."""
+    room = PEAK * loop.supply_voltage - float(plant.motors.static_voltage[0])
+    highest = PEAK_RATE * speed / quickest
+    rates = highest * np.geomspace(1.0, 0.01, 200)
+    for rate in rates:
+        # A change that just takes the shortest time has the most jerk for its acceleration.
+        changes = np.geomspace(rate * quickest / PEAK_RATE, speed, 4)
+        if all(_voltage(plant, c, PEAK_RATE * c / rate) <= room for c in changes):
+            return float(rate)
+    return float(rates[-1])
+
+
+def _voltage(plant: Plant, distance: float, duration: float) -> float:
+    """Return the largest voltage of a change, without dry friction."""
+    time = np.linspace(0.0, duration, 100)
+    return float(planned_change(plant, 0.0, distance, duration, time)[1].max())

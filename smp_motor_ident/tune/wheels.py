@@ -8,7 +8,14 @@ from typing import Any, Literal
 
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.result import Estimate
-from smp_motor_ident.tune.designer import Case, Design, design, finish, prepare
+from smp_motor_ident.tune.designer import (
+    Case,
+    Design,
+    finish,
+    prepare,
+    solve,
+    with_reference,
+)
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.robust import Robustness, back_off
@@ -72,32 +79,50 @@ def design_wheels(
     """
     if not estimates:
         raise DesignError("no motor was identified; identify a bag that holds one")
-    own = {w: design(e, loops[w], method, **targets) for w, e in estimates.items()}
-    pace = max(own, key=lambda w: own[w].reference.transition_time)
-    slow = min(own, key=lambda w: own[w].reference.max_velocity / loops[w].gear_ratio)
-    common = {
-        **targets,
-        "transition_time": own[pace].reference.transition_time,
-        "max_velocity": own[slow].reference.max_velocity / loops[slow].gear_ratio,
-    }
-    cases = {w: prepare(e, loops[w], method, common) for w, e in estimates.items()}
+    cases = {w: prepare(e, loops[w], method, targets) for w, e in estimates.items()}
+    own = {wheel: finish(case, *solve(case)) for wheel, case in cases.items()}
     shared, reason = _choose(cases, own, sets)
-    together = {wheel: _finish(case, own[wheel], shared) for wheel, case in cases.items()}
-    if len(own) > 1:
-        reason += (
-            f"; {pace} needs {own[pace].reference.transition_time:g} s for a change of speed and "
-            f"{slow} is the slowest: all take that time, up to {common['max_velocity']:.3g} rad/s"
-        )
-    return WheelSet(together, shared is not None, reason)
+    if shared is not None:
+        own = {wheel: _with(case, shared) for wheel, case in cases.items()}
+    if len(own) == 1:
+        return WheelSet(own, False, reason)
+    together, pace = _together(cases, own)
+    return WheelSet(together, shared is not None, f"{reason}; {pace}")
 
 
-def _finish(case: Case, own: Design, shared: Feedback | None) -> Design:
-    """Finish a design for the common reference, with its own or the shared gains."""
-    if shared is None:
-        done = finish(case, own.feedback, 1.0, own.robustness)
-        return replace(done, reason=own.reason)
+def _with(case: Case, shared: Feedback) -> Design:
+    """Finish a design with gains that are per wheel rad/s."""
     mine = shared.scaled(1 / case.problem.loop.gear_ratio)
     return finish(case, mine, 1.0, case.jury.judge(mine))
+
+
+def _together(
+    cases: Mapping[str, Case], own: Mapping[str, Design]
+) -> tuple[dict[str, Design], str]:
+    """Give all wheels the one reference that the weakest of them can follow."""
+
+    def at_wheel(wheel: str, name: str) -> float:
+        return float(getattr(own[wheel].reference, name)) / own[wheel].loop.gear_ratio
+
+    late = max(own, key=lambda w: own[w].reference.transition_time)
+    slow = min(own, key=lambda w: at_wheel(w, "max_velocity"))
+    weak = min(own, key=lambda w: at_wheel(w, "max_acceleration"))
+    duration = own[late].reference.transition_time
+    speed, rate = at_wheel(slow, "max_velocity"), at_wheel(weak, "max_acceleration")
+    together = {}
+    for wheel, one in own.items():
+        ratio = one.loop.gear_ratio
+        common = replace(
+            one.reference,
+            transition_time=duration,
+            max_velocity=speed * ratio,
+            max_acceleration=rate * ratio,
+        )
+        together[wheel] = with_reference(cases[wheel], one, common)
+    return together, (
+        f"one reference for all: {1e3 * duration:.0f} ms as {late} needs, up to {speed:.3g} rad/s "
+        f"as {slow} reaches, at most {rate:.3g} rad/s^2 as {weak} can"
+    )
 
 
 class _Panel:
