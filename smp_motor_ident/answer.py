@@ -144,27 +144,23 @@ def _from_combinations(
     """Solve ``a(R, L, K, J, b) = a`` for what the user has not fixed, where that is unique."""
     free = [n for n in PHYSICAL[:5] if n not in fixed]
     rows = np.eye(11)[[models.A0, models.A1, models.A2]] @ matrix
-    if len(free) > 3:
+    if len(free) > 3 or not free:
         return {}
-    weight = np.linalg.pinv(rows @ cov @ rows.T, hermitian=True)
+    weight = np.asarray(np.linalg.pinv(rows @ cov @ rows.T, hermitian=True), dtype=np.float64)
     target = fit.z[[models.A0, models.A1, models.A2]]
-    x = np.log(_first_guess(fit, fixed, free)) if free else np.zeros(0)
-    jacobian = np.zeros((3, len(free)))
-    for _ in range(200):
-        have = _log_coefficients(free, x, fixed)
-        for j in range(len(free)):
-            step = np.zeros(len(free))
-            step[j] = 1e-6
-            jacobian[:, j] = (_log_coefficients(free, x + step, fixed) - have) / 1e-6
-        normal = jacobian.T @ weight @ jacobian
-        move = np.linalg.pinv(normal, rcond=1e-12) @ jacobian.T @ weight @ (target - have)
-        x = x + np.clip(move, -1, 1)
-        if np.abs(move).max(initial=0.0) < 1e-10:
-            break
-    scaled = np.linalg.svd(jacobian, compute_uv=False) if free else np.ones(1)
-    if scaled.min() < 1e-6 * scaled.max() or not np.all(np.isfinite(x)):
+    # The equations are quadratic: with R and b known, say, two motors answer the same.
+    found: list[tuple[Array, Array]] = []
+    for guess in _guesses(fit, fixed, free):
+        x, jacobian, miss = _newton(guess, target, weight, free, fixed)
+        if miss > max(0.02, 5 * float(np.sqrt(np.trace(rows @ cov @ rows.T)))):
+            continue
+        if not any(np.abs(x - other).max() < 1e-3 for other, _ in found):
+            found.append((x, jacobian))
+    if len(found) != 1:
         return {}
-    if np.abs(_log_coefficients(free, x, fixed) - target).max() > 0.2:
+    x, jacobian = found[0]
+    scaled = np.linalg.svd(jacobian, compute_uv=False)
+    if scaled.min() < 1e-6 * scaled.max():
         return {}
     back = np.linalg.pinv(jacobian.T @ weight @ jacobian) @ jacobian.T @ weight @ rows
     out = {n: (float(np.exp(x[j])), float(np.exp(x[j])) * back[j]) for j, n in enumerate(free)}
@@ -180,18 +176,42 @@ def _from_combinations(
     return out
 
 
-def _first_guess(fit: Fit, fixed: Mapping[str, float], free: list[str]) -> Array:
+def _newton(
+    x: Array, target: Array, weight: Array, free: list[str], fixed: Mapping[str, float]
+) -> tuple[Array, Array, float]:
+    """Return the logarithms that come nearest, the Jacobian there, and the largest miss."""
+    jacobian = np.zeros((3, len(free)))
+    for _ in range(60):
+        have = _log_coefficients(free, x, fixed)
+        for j in range(len(free)):
+            step = np.zeros(len(free))
+            step[j] = 1e-6
+            jacobian[:, j] = (_log_coefficients(free, x + step, fixed) - have) / 1e-6
+        normal = jacobian.T @ weight @ jacobian
+        move = np.linalg.pinv(normal, rcond=1e-12) @ jacobian.T @ weight @ (target - have)
+        x = x + np.clip(move, -1, 1)
+        if np.abs(move).max() < 1e-10:
+            break
+    miss = np.abs(_log_coefficients(free, x, fixed) - target).max()
+    return x, jacobian, float(miss) if np.isfinite(miss) else np.inf
+
+
+def _guesses(fit: Fit, fixed: Mapping[str, float], free: list[str]) -> list[Array]:
     a0, a1, a2 = np.exp(fit.z[:3])
-    k = fixed.get("motor_constant", 0.7 * a0)
     r = fixed.get("resistance", 1.0)
-    guess = {
-        "resistance": r,
-        "inductance": a2 * r / a1,
-        "motor_constant": k,
-        "inertia": a1 * k / r,
-        "viscous_friction": max(a0 - k, 0.1 * a0) * k / r,
-    }
-    return np.array([guess[n] for n in free])
+    out = []
+    for share in (0.03, 0.3, 0.7, 0.97):
+        for part in (1.0, 0.2):
+            k = fixed.get("motor_constant", share * a0)
+            guess = {
+                "resistance": r,
+                "inductance": a2 * r / a1 / part,
+                "motor_constant": k,
+                "inertia": part * a1 * k / r,
+                "viscous_friction": max(a0 - k, 0.03 * a0) * k / r,
+            }
+            out.append(np.log(np.array([guess[n] for n in free], dtype=np.float64)))
+    return out
 
 
 def _log_coefficients(free: list[str], x: Array, fixed: Mapping[str, float]) -> Array:

@@ -86,14 +86,23 @@ def test_fixed_resistance_is_reported_as_fixed_and_still_separates_nothing_witho
     assert set(result.unidentifiable) == set(PHYSICAL) - {"resistance"}
 
 
-def test_resistance_and_friction_fixed_separate_the_rest_without_current():
+def test_resistance_and_inductance_fixed_separate_the_rest_without_current():
     truth = motors.truth("rear_left", 0.0)
     recording = motors.record("rear_left", current=False, static_voltage=0.0)
-    known = {n: truth[n] for n in ("resistance", "viscous_friction")}
-    result = estimate(recording, fixed=known)
-    for name in ("motor_constant", "inertia", "inductance"):
+    known = {n: truth[n] for n in ("resistance", "inductance")}
+    result = estimate(recording, model="second_order", fixed=known)
+    for name in ("motor_constant", "inertia", "viscous_friction"):
         q = result.parameters[name]
         assert abs(q.value - truth[name]) < SIGMAS * q.std, name
+
+
+def test_resistance_and_friction_fixed_leave_two_motors_and_are_refused():
+    truth = motors.truth("front_left", 0.0)
+    recording = motors.record("front_left", current=False, static_voltage=0.0)
+    known = {n: truth[n] for n in ("resistance", "viscous_friction")}
+    result = estimate(recording, model="second_order", fixed=known)
+    # K^2 - a0 K + R b = 0 has two positive solutions, each with its own J and L.
+    assert set(result.unidentifiable) >= {"motor_constant", "inertia", "inductance"}
 
 
 def test_fixed_resistance_with_current_is_kept():

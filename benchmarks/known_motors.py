@@ -1,0 +1,91 @@
+"""Recordings of known motors for the benchmarks of identification.
+
+The simulator (test/ident/independent.py) integrates in small fixed steps and shares nothing
+with the estimator.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "test" / "ident")]
+
+import independent  # noqa: E402
+
+from smp_motor_ident import models  # noqa: E402
+from smp_motor_ident.record import Hardware, Record  # noqa: E402
+
+QUANTUM = 2 * np.pi / 500
+CURRENT_NOISE = 0.01
+TABLE_1 = independent.TABLE_1
+
+
+def voltage(t: np.ndarray, kind: str, amplitude: float, rng: np.random.Generator) -> np.ndarray:
+    """Return an excitation that never repeats in step with the sampling: slowly detuned."""
+    s = np.concatenate([[t[0]], t[:-1]])
+    slow = 1 + 0.07 * np.sin(0.61 * s + rng.uniform(0, 6))
+    phase = 2 * np.pi * np.cumsum(slow) * (s[2] - s[1])
+    if kind == "sine":
+        return amplitude * slow * np.sin(1.037 * phase + rng.uniform(0, 6))
+    if kind == "square":
+        return amplitude * np.sign(np.sin(0.917 * phase + rng.uniform(0, 6)))
+    f = np.geomspace(0.1, 20, 24) * (1 + 0.01 * rng.standard_normal(24))
+    x = np.cos(2 * np.pi * np.outer(s, f) + rng.uniform(0, 2 * np.pi, 24)).sum(axis=1)
+    return amplitude * x / np.abs(x).max()
+
+
+def recording(
+    parameters: tuple[float, ...],
+    kind: str = "fourier",
+    *,
+    current: bool = True,
+    static_voltage: float = 0.0,
+    torque_noise: float = 0.0,
+    seconds: float = 10.0,
+    rate: float = 200.0,
+    amplitude: float = 12.0,
+    seed: int = 0,
+    counts: bool = True,
+    substeps: int = 0,
+) -> tuple[Record, np.ndarray]:
+    """Return a recording of a motor (R, L, K, J, b) and its true coordinates z."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(int(seconds * rate)) / rate
+    if kind == "all":
+        n = len(t) // 3
+        parts = [voltage(t[:n], k, amplitude, rng) for k in ("sine", "square")]
+        v = np.concatenate([*parts, voltage(t[: len(t) - 2 * n], "fourier", amplitude, rng)])
+    else:
+        v = voltage(t, kind, amplitude, rng)
+    r, el, k, j, b = parameters
+    load = torque_noise * k / r * rng.standard_normal(t.size)
+    te, tm = el / r, r * j / (k + r * b / k)
+    fastest = min(te, tm / k if k else te)
+    steps = substeps or int(np.clip(20 / rate / max(fastest, 1e-6), 20, 2000))
+    out = independent.simulate(t, v, r, el, k, j, b, static_voltage * k / r, load, steps)
+    count = np.floor(out[:, 2] / QUANTUM + rng.uniform()).astype(np.int64)
+    amps = out[:, 0] + CURRENT_NOISE * rng.standard_normal(t.size) if current else None
+    hardware = Hardware(1.0, 500.0 if counts else None, 0, amplitude, None)
+    made = Record(
+        "motor",
+        t,
+        v,
+        amps,
+        None if counts else out[:, 1],
+        None,
+        count if counts else None,
+        hardware=hardware,
+        source="simulated",
+    )
+    return made, models.from_physical(r, el, k, j, b, static_voltage * k / r)
+
+
+def table(head: tuple[str, ...], rows: list[tuple[object, ...]]) -> str:
+    """Return a Markdown table."""
+    lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
+    lines += ["| " + " | ".join(str(x) for x in row) + " |" for row in rows]
+    return "\n".join(lines)
