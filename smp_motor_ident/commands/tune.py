@@ -12,8 +12,10 @@ from typing import Any
 from smp_motor_ident.commands import applying, frame
 from smp_motor_ident.errors import DesignError, ParameterError
 from smp_motor_ident.report.document import check_free, read_identification, write_together
+from smp_motor_ident.report.tuning_figures import tuning_svg
 from smp_motor_ident.result import Estimate, Quantity
 from smp_motor_ident.tune import METHODS, Design, Loop, WheelSet, compare, design_wheels, recommend
+from smp_motor_ident.tune.curves import curves
 from smp_motor_ident.tune.loop import SPEED_SOURCES
 from smp_motor_ident.tune.writing import gains_document, gains_yaml, to_json
 
@@ -44,7 +46,9 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "source", type=Path, nargs="?", help="identification.json, its folder, or motors.yaml"
     )
-    p.add_argument("--output", type=Path, help="parameter file to write; gains.json goes beside it")
+    p.add_argument(
+        "--output", type=Path, help="parameter file to write; gains.json and a figure go beside it"
+    )
     p.add_argument("--method", default="margin", help=", ".join(METHODS))
     p.add_argument("--compare", action="store_true", help="show every method; take the recommended")
     loop = p.add_argument_group("the loop that will run")
@@ -129,8 +133,10 @@ def _work(arguments: argparse.Namespace) -> int:
         sources = sorted({s for e in estimates.values() for s in e.sources})
         told = {"date": now, "input": str(arguments.source), "sources": sources}
         document = to_json(gains_document(wheels.designs, told, wheels.reason))
-        write_together(dict(zip(files, (text, document), strict=True)), arguments.force)
-        print(f"written: {files[0]} and {files[1].name}")
+        drawn = {w: curves(estimates[w], one) for w, one in wheels.designs.items()}
+        figure = tuning_svg(drawn, METHODS[method].promise.sensitivity)
+        write_together(dict(zip(files, (text, document, figure), strict=True)), arguments.force)
+        print(f"written: {files[0]}, beside it {files[1].name} and {files[2].name}")
     if arguments.apply:
         return 0 if applying.apply(applying.from_designs(wheels.designs), arguments.watch) else 1
     return 0
@@ -149,7 +155,7 @@ def _files(arguments: argparse.Namespace) -> list[Path]:
         return []
     if output.suffix not in (".yaml", ".yml"):
         raise ParameterError(f"--output {output}: must end in .yaml, as ROS parameter files do")
-    return [output, output.with_suffix(".json")]
+    return [output, output.with_suffix(".json"), output.with_suffix(".svg")]
 
 
 def read_estimates(source: Path) -> dict[str, Estimate]:

@@ -1,0 +1,98 @@
+"""A design as curves: responses and frequency responses with the band of the estimate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from smp_motor_ident.result import Estimate
+from smp_motor_ident.tune.arrays import Array
+from smp_motor_ident.tune.designer import Design
+from smp_motor_ident.tune.margins import frequencies
+from smp_motor_ident.tune.plant import draw_motors, motors_of, sample
+from smp_motor_ident.tune.reference import CHANGE, controller_for, duration_of, planned_change
+from smp_motor_ident.tune.response import Controller, simulate
+
+DRAWS = 200
+QUANTILES = (0.01, 0.5, 0.99)
+
+
+@dataclass(frozen=True, eq=False)
+class Curves:
+    """What to draw of one design; bands are rows for 1 %, 50 % and 99 % of the motors.
+
+    Attributes
+    ----------
+    time : ndarray, shape (k,), [s]
+    reference : ndarray, shape (k,), [rad/s, wheel]
+    step : ndarray, shape (3, k), [rad/s, wheel]
+        Answer to a planned change of the set-point.
+    load : ndarray, shape (3, k), [rad/s, wheel]
+        Answer to a load that takes 1 V.
+    omega : ndarray, shape (f,), [rad/s]
+    gain : ndarray, shape (3, f)
+        Magnitude of the loop gain [-].
+    phase : ndarray, shape (3, f), [deg]
+        Of the loop gain.
+    sensitivity : ndarray, shape (3, f)
+        Magnitude of the sensitivity [-].
+    """
+
+    time: Array
+    reference: Array
+    step: Array
+    load: Array
+    omega: Array
+    gain: Array
+    phase: Array
+    sensitivity: Array
+
+
+def curves(estimate: Estimate, design: Design) -> Curves:
+    """Compute the curves of a design over the distribution of its estimate.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        That the design was made from.
+    design : Design
+        The design.
+
+    Returns
+    -------
+    Curves
+    """
+    loop, ratio = design.loop, design.loop.gear_ratio
+    nominal = motors_of(estimate)
+    drawn = draw_motors(estimate, DRAWS, np.random.default_rng(0))
+    plant = sample(nominal if drawn is None else drawn, loop)
+    controller = controller_for(loop, design.feedback)
+    change = CHANGE * design.reference.max_velocity
+    duration = duration_of(design.reference, change)
+    slow = float(nominal.a1[0] / nominal.a0[0])
+    T = loop.sample_time
+    time = T * np.arange(int((duration + 6 * slow) / T) + 2)
+    lagging, forward = planned_change(sample(nominal, loop), design.reference.lag, change,
+                                      duration, time)  # fmt: skip
+    step = simulate(plant, controller, lagging, forward=forward).speed
+    pushed = simulate(
+        plant, Controller(design.feedback), np.zeros(time.size), load=np.ones(time.size)
+    )
+    omega = frequencies(T, 1 / slow, 250)
+    loop_gain = plant.response(omega) * design.feedback.response(omega, T)
+    return Curves(
+        time=time,
+        reference=lagging / ratio,
+        step=_band(step) / ratio,
+        load=_band(pushed.speed) / ratio,
+        omega=omega,
+        gain=_band(np.abs(loop_gain)),
+        phase=_band(np.rad2deg(np.unwrap(np.angle(loop_gain), axis=1))),
+        sensitivity=_band(np.abs(1 / (1 + loop_gain))),
+    )
+
+
+def _band(values: Array) -> Array:
+    band: Array = np.quantile(values, QUANTILES, axis=0)
+    return band
