@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import fcntl
 import os
 import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
+from typing import IO
 
 from smp_motor_control.errors import SmpError
 
@@ -27,18 +30,19 @@ class ProcessError(SmpError):
     exit_code = 1
 
 
-def free_domain(first: int = 30, last: int = 100) -> int:
-    """Return a ROS domain that nobody on this machine uses.
+def free_domain(first: int = 215, last: int = 232) -> int:
+    """Claim a ROS domain that nobody on this machine uses, for as long as this process lives.
 
     Parameters
     ----------
     first, last : int
-        Range to choose from.
+        Range to choose from.  These lie above the ports that Linux hands out to others, and
+        above the domains that people choose.
 
     Returns
     -------
     int
-        Whose first participant's port is free.
+        Whose first participant's port is free, and which no other call holds.
 
     Raises
     ------
@@ -52,13 +56,34 @@ def free_domain(first: int = 30, last: int = 100) -> int:
     count = last - first + 1
     for k in range(count):
         domain = first + (os.getpid() + k) % count
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            try:
-                probe.bind(("", 7400 + 250 * domain + 10))
-            except OSError:
-                continue
+        if _claim(domain) and _port_is_free(7400 + 250 * domain + 10):
             return domain
     raise ProcessError(f"all ROS domains from {first} to {last} are in use; end one of their users")
+
+
+_CLAIMS: list[IO[str]] = []
+
+
+def _claim(domain: int) -> bool:
+    """Lock the domain's file; the lock ends with this process."""
+    path = Path(tempfile.gettempdir()) / f"smp_domain_{domain}_{os.getuid()}.lock"
+    claim = path.open("w")
+    try:
+        fcntl.flock(claim, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        claim.close()
+        return False
+    _CLAIMS.append(claim)
+    return True
+
+
+def _port_is_free(port: int) -> bool:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.bind(("", port))
+        except OSError:
+            return False
+    return True
 
 
 def stop_when_orphaned() -> None:
