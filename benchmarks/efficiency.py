@@ -23,7 +23,7 @@ COMBINATIONS = ("dc_gain", "time_constant", "time_constant_product")
 
 def bound(record, z, current: bool, torque: float) -> dict[str, float]:
     """Return the Cramer-Rao variance of every quantity, sensitivities taken at the truth."""
-    structure = Structure("bound", friction="none", current=current)
+    structure = Structure("bound", current=current, shape=not current)
     data = prepare([record], current)
     step = data.step
     noise = np.diag([QUANTUM**2 / 12, CURRENT_NOISE**2])
@@ -64,7 +64,7 @@ def main() -> None:
                 for seed in range(args.realisations):
                     record, z = recording(
                         p, kind, current=current, seed=seed, seconds=args.seconds,
-                        torque_noise=args.torque,
+                        torque_noise=args.torque, static_voltage=0.3,
                     )  # fmt: skip
                     limits = bound(record, z, current, args.torque)
                     model = "electromechanical" if current else "second_order"

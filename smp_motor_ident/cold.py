@@ -21,6 +21,7 @@ from smp_motor_ident.models import Structure
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]
 
+FLOOR = 1.3  # residual variance over that of quantisation, below which there is no more
 PRICE = 12.0  # deviance that torque noise must explain before it is believed
 HEAD = 12_000  # samples on which candidates and noise levels are compared
 
@@ -329,6 +330,11 @@ def _find_ratio(part: Experiments, structure: Structure, first: Fit, options: Op
             _solve(part, structure, first.z, _initial(part, first), first.noise, 0.0, options, 30),
             options,
         )
+    # Residuals no larger than the counter's own resolution leave nothing for torque noise.
+    at_once = _at_rest(part, structure, _solve(part, structure, first.z, _initial(part, first),
+                       first.noise, 0.0, options, 30), options)  # fmt: skip
+    if at_once.converged and at_once.noise[0, 0] < FLOOR * part.quantum**2 / 12:
+        return at_once
     band = _bandwidth(first.z, part)
     path: list[tuple[float, Fit]] = []
     here = first
@@ -346,7 +352,9 @@ def _find_ratio(part: Experiments, structure: Structure, first: Fit, options: Op
             break
     factor, best = min(path, key=lambda item: item[1].deviance)
     free_run = path[-1][1]
-    if factor == 0.0 or (free_run.ratio == 0 and free_run.deviance < best.deviance + PRICE):
+    if at_once.deviance < free_run.deviance or free_run.ratio > 0:
+        free_run = at_once
+    if factor == 0.0 or free_run.deviance < best.deviance + PRICE:
         return free_run
     for finer in (1.8, 1 / 1.8):
         while True:

@@ -358,18 +358,23 @@ def _variations(data: Experiments, best: Fit, options: Options, rungs: list[Rung
 def _without_friction(data: Experiments, best: Fit, options: Options, rungs: list[Rung]) -> Fit:
     """Leave Coulomb friction out where the data show that there is next to none."""
     s = best.structure
-    if s.friction == "symmetric" and "vc_plus" not in s.held:
-        cov = best.covariance()
-        i = s.free().index(models.VC_PLUS)
-        std = float(np.sqrt(cov[i, i]))
-        # Friction that the data do not tell stays: leaving it out would make the gain certain.
-        small = best.z[models.VC_PLUS] + 2 * std < 0.02 * np.abs(data.section_value).max()
-        if small and best.z[models.VC_PLUS] < 3 * std:
-            plain = cold.refine(data, s.with_(friction="none", shape=False), best, best.z, options)
-            keep, reason = needed(plain, best)
-            if not keep:
-                rungs.append(Rung(plain, "no Coulomb friction shows"))
-                best = plain
+    if s.friction != "symmetric" or "vc_plus" in s.held:
+        return best
+    plain = cold.refine(data, s.with_(friction="none", shape=False), best, best.z, options)
+    if plain.deviance < best.deviance:  # then friction has led astray
+        z = plain.z.copy()
+        z[models.VC_PLUS] = 1e-3 * np.abs(data.section_value).max()
+        again = cold.refine(data, s, plain, s.complete(z), options)
+        best = min(best, again, key=lambda f: f.deviance)
+    cov = best.covariance()
+    i = s.free().index(models.VC_PLUS)
+    most = best.z[models.VC_PLUS] + 2 * float(np.sqrt(cov[i, i]))
+    # Friction that the data do not tell stays: leaving it out would make the gain certain.
+    if most < 0.02 * np.abs(data.section_value).max() or plain.deviance < best.deviance:
+        keep, _ = needed(plain, best)
+        if not keep:
+            rungs.append(Rung(plain, "no Coulomb friction shows"))
+            return plain
     return best
 
 
