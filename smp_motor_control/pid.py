@@ -156,7 +156,8 @@ class Pid:
         acceleration : float
             Rate of the reference [rad/s^2], for the feed-forward alone.
         error_rate : float, optional
-            Rate of ``c r - y`` [rad/s^2] where a sensor tells it; replaces differencing.
+            Rate of ``c r - y`` [rad/s^2] where a sensor or an observer tells it; replaces
+            differencing, not the filter.
 
         Returns
         -------
@@ -181,7 +182,7 @@ class Pid:
             raise ParameterError(f"dt is {dt} s: must be finite and not negative")
         error = reference - measurement
         weighted = self._weight_d * reference - measurement
-        rate = self._differentiate(weighted, measurement, dt) if error_rate is None else error_rate
+        rate = self._filtered_rate(weighted, measurement, dt, error_rate)
         i_term = self.i_term
         p_term = self._p * (self._weight_p * reference - measurement)
         d_term = self._d * rate
@@ -198,9 +199,8 @@ class Pid:
         if error > self._deadband or error < -self._deadband:
             i_term = self._integrate(error, dt, output, unsaturated)
             self.i_term = i_term
-        if error_rate is None:
-            self._previous = weighted
-            self._rate = rate if -_INF < rate < _INF else 0.0
+        self._previous = weighted
+        self._rate = rate if -_INF < rate < _INF else 0.0
         self._seen = (reference, measurement, acceleration)
         last = PidOutput(
             output, unsaturated, p_term, i_term, d_term, feedforward, output != unsaturated
@@ -208,12 +208,20 @@ class Pid:
         self._last = last
         return last
 
-    def _differentiate(self, weighted: float, measurement: float, dt: float) -> float:
+    def _filtered_rate(
+        self, weighted: float, measurement: float, dt: float, given: float | None
+    ) -> float:
         """Return the rate of ``c r - y``: backward Euler of ``s / (1 + T s)``."""
-        previous = self._previous
-        if previous is None:
-            previous = self._weight_d * measurement - measurement
-        return (self._filter * self._rate + (weighted - previous)) / (self._filter + dt)
+        if given is None:
+            previous = self._previous
+            if previous is None:
+                previous = self._weight_d * measurement - measurement
+            change = weighted - previous
+        elif self._filter == 0.0:
+            return given
+        else:
+            change = given * dt
+        return (self._filter * self._rate + change) / (self._filter + dt)
 
     def _feedforward(self, reference: float, acceleration: float) -> float:
         """Return the voltage that the model says the reference needs.
