@@ -286,10 +286,10 @@ class Latch:
         ----------
         setpoint : float
             Present one [rad/s].
-        turns : bool
-            Whether feedback shows the wheel turning.
         now : float
             [s].
+        turns : bool
+            Whether feedback shows the wheel turning.
 
         Returns
         -------
