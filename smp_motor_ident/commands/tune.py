@@ -56,6 +56,9 @@ def parser() -> argparse.ArgumentParser:
     loop.add_argument(
         "--delay", type=float, help="measurement to voltage, beyond the hold [s]; else one sample"
     )
+    loop.add_argument(
+        "--usual-delay", type=float, help="what it usually is [s]; else --delay, or 2 ms"
+    )
     loop.add_argument("--speed-source", choices=SPEED_SOURCES, default="measured")
     loop.add_argument("--difference-window", type=int, default=1, help="[samples]")
     loop.add_argument("--gear-ratio", type=float, help="else as identified")
@@ -226,7 +229,7 @@ def loop_for(estimate: Estimate, arguments: argparse.Namespace) -> Loop:
         When a value is impossible, or the supply is neither known nor given.
     """
     hardware = estimate.hardware
-    supply = arguments.supply or hardware.supply_voltage
+    supply = _first(arguments.supply, hardware.supply_voltage)
     if supply is None:
         raise ParameterError(
             f"{arguments.source}: {estimate.wheel}: the supply voltage is not known; give --supply"
@@ -240,12 +243,19 @@ def loop_for(estimate: Estimate, arguments: argparse.Namespace) -> Loop:
     return Loop(
         sample_time=sample_time,
         delay=arguments.delay,
-        gear_ratio=arguments.gear_ratio or hardware.gear_ratio,
-        counts_per_revolution=arguments.counts_per_revolution or hardware.counts_per_revolution,
+        usual_delay=arguments.usual_delay,
+        gear_ratio=_first(arguments.gear_ratio, hardware.gear_ratio) or 0.0,
+        counts_per_revolution=_first(
+            arguments.counts_per_revolution, hardware.counts_per_revolution
+        ),
         supply_voltage=supply,
         speed_source=arguments.speed_source,
         difference_window=arguments.difference_window,
     )
+
+
+def _first(given: float | None, identified: float | None) -> float | None:
+    return identified if given is None else given
 
 
 def _known(method: str) -> tuple[str, ...]:

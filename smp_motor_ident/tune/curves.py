@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -73,9 +73,11 @@ def curves(estimate: Estimate, design: Design) -> Curves:
     slow = float(nominal.a1[0] / nominal.a0[0])
     T = loop.sample_time
     time = T * np.arange(int((duration + 6 * slow) / T) + 2)
-    lagging, forward = planned_change(sample(nominal, loop), design.reference.lag, change,
-                                      duration, time)  # fmt: skip
-    step = simulate(plant, controller, lagging, forward=forward).speed
+    usual = replace(loop, delay=loop.expected_delay)
+    plan = sample(nominal, usual)
+    lagging, forward = planned_change(plan, design.reference.lag, change, duration, time)
+    as_usual = sample(plant.motors, usual)
+    step = simulate(as_usual, controller, lagging, forward=forward).speed
     pushed = simulate(
         plant, Controller(design.feedback), np.zeros(time.size), load=np.ones(time.size)
     )

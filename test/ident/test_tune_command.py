@@ -1,0 +1,142 @@
+"""The command ``tune``: files, exit codes, one-line refusals."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from smp_motor_control import WHEELS
+from smp_motor_control.pid import PidGains
+from smp_motor_ident.commands.tune import main
+from smp_motor_ident.record import Hardware
+from smp_motor_ident.report.document import identification_document
+from smp_motor_ident.result import Estimate, Quantity
+
+MOTORS = Path(__file__).resolve().parents[2] / "config" / "motors_paper.yaml"
+
+
+@pytest.fixture
+def identified(tmp_path) -> Path:
+    values = {"dc_gain": 25.5, "time_constant": 0.051, "time_constant_product": 8.1e-4}
+    one = Estimate(
+        wheel="",
+        model="second_order",
+        parameters={"inertia": Quantity(None, status="unidentifiable")},
+        combinations={n: Quantity(v, 0.001 * v) for n, v in values.items()},
+        names=tuple(values),
+        covariance=np.diag([(0.001 * v) ** 2 for v in values.values()]),
+        sample_time=0.005,
+        sources=("drive_3.mcap",),
+        hardware=Hardware(65.5, 500.0, 16, 12.0),
+    )
+    path = tmp_path / "identification.json"
+    document = identification_document({wheel: replace(one, wheel=wheel) for wheel in WHEELS})
+    path.write_text(json.dumps(document))
+    return tmp_path
+
+
+def test_parameter_file_holds_what_the_four_nodes_take(identified, capsys):
+    output = identified / "gains.yaml"
+    assert main([str(identified), "--output", str(output)]) == 0
+    tree = yaml.safe_load(output.read_text())
+    assert list(tree) == [f"/{wheel}/wheel_pid" for wheel in WHEELS]
+    for node in tree.values():
+        parameters = node["ros__parameters"]
+        names = set(PidGains.__dataclass_fields__)
+        PidGains(**{n: v for n, v in parameters.items() if n in names})
+        # An integer in YAML for a double parameter is an error in ROS.
+        whole = [n for n, v in parameters.items() if type(v) is int]
+        assert whole == ["difference_window"]
+        assert all(type(v) is float for v in parameters["model"].values())
+    head = output.read_text().split("/front_left")[0]
+    for word in ("drive_3.mcap", "second_order", "phase margin", "UTC"):
+        assert word in head
+    document = json.loads((identified / "gains.json").read_text())
+    assert document["wheels"]["rear_left"]["margins"]["phase"] > 59
+    assert document["wheels"]["rear_left"]["loop"]["sample_time"] == 0.005
+    assert (identified / "gains.svg").read_text().startswith("<?xml")
+    assert "one set of gains for all" in capsys.readouterr().out
+
+
+def test_motor_file_of_identify_is_taken_as_it_is(tmp_path, capsys):
+    output = tmp_path / "gains.yaml"
+    assert main([str(MOTORS), "--output", str(output), "--rate", "100", "--method", "simc"]) == 0
+    assert "SIMC" in output.read_text()
+    assert "no uncertainty" in capsys.readouterr().out
+
+
+def test_comparison_lists_every_method_and_recommends_one(identified, capsys):
+    assert main([str(identified), "--compare"]) == 0
+    told = capsys.readouterr().out
+    for method in ("margin", "optimise", "simc", "amigo", "relay"):
+        assert f" {method} " in told
+    assert "* recommended: " in told
+
+
+def test_nothing_is_overwritten_without_force(identified, capsys):
+    output = identified / "gains.yaml"
+    output.write_text("mine")
+    assert main([str(identified), "--output", str(output)]) == 2
+    assert output.read_text() == "mine"
+    assert "--force" in capsys.readouterr().err
+    assert main([str(identified), "--output", str(output), "--force"]) == 0
+    assert output.read_text() != "mine"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (["--bandwidth", "900"], 1, "the nearest that holds is"),
+        (["--max-acceleration", "1e6"], 1, "is beyond the motor"),
+        (["--phase-margin", "nan"], 1, "phase_margin is nan"),
+        (["--method", "guess"], 2, "--method is 'guess'"),
+        (["--rate", "0"], 2, "--rate is 0"),
+        (["--rate", "nan"], 2, "--rate is nan"),
+        (["--delay", "-1"], 2, "delay is -1"),
+        (["--supply", "-12"], 2, "supply_voltage is -12"),
+        (["--gear-ratio", "0"], 2, "gear_ratio is 0"),
+        (["--output", "gains.txt"], 2, "must end in .yaml"),
+        (["--colour", "red"], 2, "unrecognized arguments"),
+        (["--gains", "x.yaml"], 2, "--gains goes with --apply alone"),
+    ],
+)
+def test_refusal_is_one_line_with_its_exit_code(identified, capsys, arguments, code, words):
+    assert main([str(identified), *arguments]) == code
+    told = capsys.readouterr().err.strip().splitlines()
+    assert words in told[-1]
+    assert not any("Traceback" in line for line in told)
+    assert sorted(p.name for p in identified.iterdir()) == ["identification.json"]
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [(None, "cannot be read"), ("{", "is not JSON"), ('{"schema": 7}', "schema")],
+)
+def test_unreadable_identification_is_named(tmp_path, capsys, content, words):
+    path = tmp_path / "identification.json"
+    if content is not None:
+        path.write_text(content)
+    assert main([str(path)]) == 2
+    told = capsys.readouterr().err
+    assert words in told
+    assert "identification.json" in told
+
+
+def test_nothing_to_tune_is_told(capsys):
+    assert main([]) == 2
+    assert "nothing to tune" in capsys.readouterr().err
+
+
+def test_unknown_supply_is_asked_for(identified, capsys):
+    path = identified / "identification.json"
+    document = json.loads(path.read_text())
+    document["motors"]["rear_left"]["hardware"]["supply_voltage"] = None
+    path.write_text(json.dumps(document))
+    assert main([str(identified)]) == 2
+    assert "give --supply" in capsys.readouterr().err
+    assert main([str(identified), "--supply", "12"]) == 0
