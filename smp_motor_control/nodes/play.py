@@ -26,7 +26,10 @@ from smp_motor_ident.bag.storage import Channel
 DEPTH = 1000
 FIND_EACH_OTHER = 1.0
 """Shortest wait [s] before the first message, so that subscribers find the publishers."""
+FIND_ANYBODY = 3.0
+"""Longest wait [s] for a first subscriber, where nobody listens yet."""
 FIND_AT_MOST = 5.0
+"""Longest wait [s] until everybody whom the graph shows is connected."""
 
 
 @dataclass(frozen=True)
@@ -113,15 +116,16 @@ class Player(Node):
         runtime.finish(code)
 
     def _wait_for_subscribers(self) -> None:
-        """Wait until everybody whom the graph shows is connected, within a limit."""
+        """Wait until there is somebody, and everybody is connected, within limits."""
         begin = time.monotonic()
         while not self._ended.wait(0.02):
             waited = time.monotonic() - begin
-            linked = all(
-                p.get_subscription_count() >= self.count_subscribers(p.topic_name)
-                for _, p in self._outputs.values()
-            )
-            if waited >= FIND_AT_MOST or (linked and waited >= self._options.wait):
+            linked = [p.get_subscription_count() for _, p in self._outputs.values()]
+            known = [self.count_subscribers(p.topic_name) for _, p in self._outputs.values()]
+            enough = FIND_ANYBODY if not any(known) else 0.0
+            if any(link < count for link, count in zip(linked, known)):
+                enough = FIND_AT_MOST
+            if waited >= max(enough, self._options.wait):
                 return
 
     def _play_once(self) -> bool:
