@@ -67,7 +67,18 @@ def ratio_of(bandwidth: float, step: float, kind: int) -> float:
 
 
 def first_noise(data: Experiments) -> Array:
-    """Return a first guess of the residuals' covariance, from resolution and scatter."""
+    """Return a first guess of the residuals' covariance, from resolution and scatter.
+
+    Parameters
+    ----------
+    data : Experiments
+        Prepared records.
+
+    Returns
+    -------
+    ndarray, shape (2, 2)
+        Diagonal: variances of output and current.
+    """
     y = data.output[:HEAD]
     rough = np.nanvar(np.diff(y, n=4)) / 70 if y.size > 8 else np.nanvar(y)
     v0 = max(data.quantum**2 / 12, 1e-12 * np.nanvar(y), 1e-4 * rough, 1e-18)
@@ -95,7 +106,8 @@ def candidates(data: Experiments, structure: Structure) -> list[Array]:
     """
     found = start.current_candidates(data) if structure.current else []
     if not found:
-        found = start.speed_candidates(data, structure.order)
+        frictions = (False,) if structure.friction == "none" else (True, False)
+        found = start.speed_candidates(data, structure.order, frictions=frictions)
     if not found and structure.order == 2:
         for z in start.speed_candidates(data, 1):
             z[models.A2] = 2 * z[models.A1] - z[models.A0] - np.log(20)
@@ -160,8 +172,11 @@ def cold_fit(
         tried.append(z)
         ratio = ratio_of(_bandwidth(z, head), head.step, head.kind)
         one = _solve(head, structure, z, head.initial, first_noise(head), ratio, options, 25)
+        again = best is not None and abs(one.deviance - best.deviance) < 0.1
         if best is None or one.deviance < best.deviance:
             best = one
+        if (again or structure.friction == "none") and one.converged:
+            break  # two starts agree, or the surface is smooth
         if len(tried) == keep:
             break
     assert best is not None
@@ -300,7 +315,7 @@ def grow(data: Experiments, structure: Structure, first: Fit, options: Options) 
     best = _find_ratio(part, structure, first, options)
     if part.size == data.size:
         return best
-    horizon = part.size * 4
+    horizon = part.size * 4 if structure.friction != "none" else data.size
     while horizon < data.size and best.ratio == 0:
         longer = data.head(horizon * data.step)
         best = _solve(

@@ -320,7 +320,7 @@ def solve(  # noqa: C901 - the loop of a fit, its branches are its ends
     huber: float = np.inf,
     priors: Sequence[Prior] = (),
     iterations: int = 40,
-    tolerance: float = 1e-4,
+    tolerance: float = 1e-2,
     lower: Array | None = None,
     upper: Array | None = None,
 ) -> Fit:

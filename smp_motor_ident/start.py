@@ -29,7 +29,7 @@ class Uniform:
     current: Array | None
 
 
-def resample(data: Experiments, g: int, most: int = 12_000) -> Uniform | None:
+def resample(data: Experiments, g: int, most: int = 8_000) -> Uniform | None:
     """Put segment ``g`` on an even grid (for the start only).
 
     Parameters
@@ -138,7 +138,9 @@ def lagged_candidates(data: Experiments, structure: models.Structure, lag: int) 
     return speed_candidates(data, structure.order, lag)
 
 
-def speed_candidates(data: Experiments, order: int, lag: int = 0) -> list[Array]:
+def speed_candidates(
+    data: Experiments, order: int, lag: int = 0, frictions: tuple[bool, ...] = (True, False)
+) -> list[Array]:
     """Return candidate coordinates from voltage and the mechanical output.
 
     Least squares on ``v = a2 w'' + a1 w' + a0 w + Vc sign(w)`` after filtering, for several
@@ -152,6 +154,8 @@ def speed_candidates(data: Experiments, order: int, lag: int = 0) -> list[Array]
         1 or 2.
     lag : int
         Samples by which the input comes late.
+    frictions : tuple of bool
+        With or without Coulomb friction.
 
     Returns
     -------
@@ -164,7 +168,7 @@ def speed_candidates(data: Experiments, order: int, lag: int = 0) -> list[Array]
     if not grids:
         return out
     for cutoff in cutoffs(data, 7 if lag == 0 else 4):
-        for friction in (True, False):
+        for friction in frictions:
             rows, rhs = [], []
             for u in grids:
                 x, y = _regression(u, cutoff, data.kind, order, friction)
