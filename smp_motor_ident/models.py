@@ -152,7 +152,18 @@ class Structure:
         return z
 
     def with_(self, **changes: object) -> Structure:
-        """Return a copy with some attributes changed."""
+        """Return a copy with some attributes changed.
+
+        Parameters
+        ----------
+        **changes : object
+            Attributes by name, with their new values.
+
+        Returns
+        -------
+        Structure
+            The same in all else.
+        """
         return replace(self, **changes)  # type: ignore[arg-type]
 
 

@@ -7,6 +7,7 @@ start of the record.  Records know no files, no topics and no ROS.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -152,7 +153,7 @@ class Record:
         Record
             Time starts again at 0; segments that begin inside are kept.
         """
-        arrays = {
+        arrays: dict[str, Any] = {
             name: None if (values := getattr(self, name)) is None else values[begin:end]
             for name in ("voltage", "current", "velocity", "position", "count")
         }

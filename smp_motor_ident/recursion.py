@@ -327,15 +327,16 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
 
     Parameters
     ----------
-    time, output, current : ndarray, shape (n,)
-        Sampling instants [s], mechanical output (NaN where lost), current [A] (shape (0,)
-        where it is not used).
+    time : ndarray, shape (n,)
+        Sampling instants [s].
     starts : ndarray of int, shape (g + 1,)
         First sample of each segment, and n.
     section_end, section_value : ndarray, shape (m,)
         Instants [s] until which the input was held at the values [V].
     section_start : ndarray of int, shape (g,)
         First section of each segment; it also holds what came before.
+    output, current : ndarray, shape (n,)
+        Mechanical output (NaN where lost); current [A], shape (0,) where it is not used.
     kind : int
         SPEED, ANGLE or MEAN_SPEED (over the trailing window).
     friction : bool
@@ -343,7 +344,8 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
     par, slope : ndarray, shapes (11,) and (11, c)
         Internal parameters (see the constants of this module; te and tm not as logarithms)
         and their derivatives by the c common columns (those of te and tm logarithmic).
-        Only the first ``n_slope`` columns touch te, tm, K, be.
+    n_slope : int
+        Only the first of the common columns, this many, touch te, tm, K, be.
     initial : ndarray, shape (g, 4)
         q, w, th and load of each segment.
     local : ndarray of int, shape (l,)

@@ -16,13 +16,13 @@ from functools import partial
 
 from builtin_interfaces.msg import Time
 from rclpy.node import Node
-from smp_motor_ident.estimate import estimate
 
 from smp_interfaces.msg import MotorDescription, MotorParameters, MotorState
 from smp_motor_control import WHEELS
 from smp_motor_control.errors import ParameterError, SmpError
 from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.settings import Parameters, described, nested
+from smp_motor_ident.estimate import estimate
 from smp_motor_ident.live import Demands, Window, missing
 from smp_motor_ident.record import Hardware, Record
 from smp_motor_ident.result import Estimate

@@ -36,7 +36,18 @@ class Series:
     bits: int | None = None
 
     def take(self, which: NDArray[Any]) -> Series:
-        """Return some of the samples."""
+        """Return some of the samples.
+
+        Parameters
+        ----------
+        which : ndarray
+            Their indices, or a mask.
+
+        Returns
+        -------
+        Series
+            With the same width of the counter.
+        """
         number = None if self.number is None else self.number[which]
         return Series(self.time[which], self.value[which], number, self.bits)
 
@@ -54,8 +65,8 @@ def on_one_axis(
 
     Parameters
     ----------
-    wheel, source : str
-        Names of motor and recording.
+    wheel : str
+        Name of the motor.
     plan : MotorMap
         Its options ``held`` and ``gap``.
     hardware : Hardware
@@ -64,6 +75,8 @@ def on_one_axis(
         Voltage and at least the output ``axis_name``.
     axis_name : {'count', 'position', 'velocity'}
         The output whose instants become the record's.
+    source : str
+        Name of the recording.
     notes : list of str
         What was found so far.
 

@@ -311,7 +311,18 @@ class Layout:
     numbers: tuple[Number | None, ...]
 
     def matches(self, batch: Batch) -> NDArray[np.bool_]:
-        """Return which messages have this layout."""
+        """Return which messages have this layout.
+
+        Parameters
+        ----------
+        batch : Batch
+            Messages of the type.
+
+        Returns
+        -------
+        ndarray of bool
+            One per message.
+        """
         same: NDArray[np.bool_] = np.equal(batch.length, self.length)
         for offset, word in self.checks:
             if not same.any():
@@ -436,7 +447,22 @@ class Decoded:
         parts: list[list[NDArray[Any] | None]],
         width: int,
     ) -> Decoded:
-        """Return what several layouts gave as one, in the order of the messages."""
+        """Return what several layouts gave as one, in the order of the messages.
+
+        Parameters
+        ----------
+        rows : list of ndarray of int64
+            Indices of the messages of each layout.
+        parts : list of list of ndarray or None
+            The columns that each layout gave; None: a column that it does not have.
+        width : int
+            Number of columns.
+
+        Returns
+        -------
+        Decoded
+            All of them, sorted by message.
+        """
         if not rows:
             return cls(np.zeros(0, np.int64), [None] * width, [None] * width)
         if len(rows) == 1:

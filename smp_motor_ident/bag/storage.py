@@ -113,7 +113,18 @@ class Storage(Protocol):
         ...
 
     def batches(self, wanted: Callable[[Channel], bool]) -> Iterator[tuple[float, Batch]]:
-        """Yield the fraction of the file that is read, and a batch."""
+        """Yield the fraction of the file that is read, and a batch.
+
+        Parameters
+        ----------
+        wanted : callable
+            Whether a channel's messages are to be read.
+
+        Yields
+        ------
+        tuple of float and Batch
+            Fraction 0 to 1, and the messages that follow those before.
+        """
         ...
 
 
@@ -143,7 +154,18 @@ def gather(data: Bytes, at: Integers, dtype: str) -> NDArray[Any]:
 
 
 def message_type(name: str) -> str:
-    """Return a type name with its ``/msg/``, which the oldest bags leave out."""
+    """Return a type name with its ``/msg/``, which the oldest bags leave out.
+
+    Parameters
+    ----------
+    name : str
+        Such as ``std_msgs/Header``.
+
+    Returns
+    -------
+    str
+        Such as ``std_msgs/msg/Header``.
+    """
     return re.sub(r"^(\w+)/(\w+)$", r"\1/msg/\2", name)
 
 

@@ -36,7 +36,18 @@ class ClockFit:
     origin: int
 
     def to_log(self, stamp: Integers) -> Integers:
-        """Return stamps on the recorder's clock [ns]."""
+        """Return stamps on the recorder's clock.
+
+        Parameters
+        ----------
+        stamp : ndarray of int64, [ns]
+            Header stamps.
+
+        Returns
+        -------
+        ndarray of int64, [ns]
+            Log times that they stand for.
+        """
         since = (stamp - self.origin).astype(np.float64)
         shift = np.rint(self.offset + self.drift * since).astype(np.int64)
         result: Integers = stamp + shift
@@ -154,6 +165,16 @@ class Rhythm:
 
         A late sample after which the others catch up is late, not preceded by a loss: the
         beat must stay behind by whole intervals.
+
+        Parameters
+        ----------
+        time : ndarray of int64, [ns]
+            Instants of the samples, increasing.
+
+        Returns
+        -------
+        ndarray of int64, shape (n - 1,)
+            Zeros where the signal has no rhythm.
         """
         steps = np.diff(time)
         number: Integers = np.zeros(steps.size, np.int64)

@@ -104,7 +104,7 @@ def wheel_speed(state: Columns, hardware: Hardware) -> tuple[Array, Array]:
     time = np.arange(state.time[0], state.time[-1], step)
     even = np.interp(time, state.time, angle)
     window = max(2 * round(SMOOTHING / step / 2) + 1, 5)
-    speed: Array = savgol_filter(even, window, 2, deriv=1, delta=step)
+    speed = np.asarray(savgol_filter(even, window, 2, deriv=1, delta=step), dtype=np.float64)
     return time, speed
 
 

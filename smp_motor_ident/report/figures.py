@@ -261,7 +261,9 @@ def correlation_matrix(estimate: Estimate) -> str:
             axes.text(column, row, f"{value:+.2f}", ha="center", va="center", fontsize=9)
         elif row != column:
             color = COLOR["measured" if value > 0 else "simulated"]
-            axes.scatter(column, row, s=1700 / known.size * abs(value), color=color, alpha=0.85, lw=0)
+            axes.scatter(
+                column, row, s=1700 / known.size * abs(value), color=color, alpha=0.85, lw=0
+            )
         else:
             axes.scatter(column, row, s=8, color=COLOR["muted"], lw=0)
     axes.set(xlim=(-0.5, known.size - 0.5), ylim=(known.size - 0.5, -0.5))

@@ -36,7 +36,18 @@ class Feedback:
     filter_time: float = 0.0
 
     def scaled(self, factor: float) -> Feedback:
-        """Return the same controller with every gain multiplied by ``factor``."""
+        """Return the same controller with every gain multiplied by ``factor``.
+
+        Parameters
+        ----------
+        factor : float
+            Of the loop gain.
+
+        Returns
+        -------
+        Feedback
+            With the same filter.
+        """
         return replace(self, p=self.p * factor, i=self.i * factor, d=self.d * factor)
 
     def response(self, omega: Array, sample_time: float) -> Complex:

@@ -75,7 +75,20 @@ def frequencies(sample_time: float, slowest: float, count: int = 500) -> Array:
 
 
 def grid_for(plant: Plant, count: int = 500) -> Array:
-    """Return the frequency grid that suits a batch of plants; see :func:`frequencies`."""
+    """Return the frequency grid that suits a batch of plants; see :func:`frequencies`.
+
+    Parameters
+    ----------
+    plant : Plant
+        The slowest of its motors sets the lowest frequency.
+    count : int
+        Number of frequencies.
+
+    Returns
+    -------
+    ndarray, shape (count,), [rad/s]
+        Up to the Nyquist frequency.
+    """
     motors = plant.motors
     return frequencies(plant.sample_time, float(np.min(motors.a0 / motors.a1)), count)
 

@@ -161,7 +161,18 @@ class Plant:
         return int(self.phi.shape[0])
 
     def repeated(self, n: int) -> Plant:
-        """Return a batch of ``n`` copies of a batch of one, for ``n`` controllers."""
+        """Return a batch of ``n`` copies of a batch of one, for ``n`` controllers.
+
+        Parameters
+        ----------
+        n : int
+            Number of copies.
+
+        Returns
+        -------
+        Plant
+            A batch of ``n``.
+        """
         arrays = (self.phi, self.taps, self.phi_angle, self.taps_angle)
         phi, taps, phi_angle, taps_angle = (np.repeat(x, n, axis=0) for x in arrays)
         return Plant(phi, taps, phi_angle, taps_angle, self.sample_time, self.window, self.motors)
@@ -183,7 +194,20 @@ class Plant:
         return self.transfer(np.exp(1j * np.asarray(omega) * self.sample_time), window=window)
 
     def transfer(self, z: Complex, *, window: int | None = None) -> Complex:
-        """Return the transfer function at points of the z plane; see :meth:`response`."""
+        """Return the transfer function at points of the z plane; see :meth:`response`.
+
+        Parameters
+        ----------
+        z : ndarray of complex, shape (f,)
+            Points other than poles.
+        window : int or None
+            Averaging window in samples; None takes the plant's own.
+
+        Returns
+        -------
+        ndarray of complex, shape (n, f), [rad/s/V]
+            One row per motor of the batch.
+        """
         window = self.window if window is None else window
         z = np.asarray(z, dtype=np.complex128)
         delays = z[None, :] ** -np.arange(self.taps.shape[1])[:, None]

@@ -111,7 +111,18 @@ class Problem:
         return 1 / float(np.abs(self.plant.response(np.array([w]))[0, 0])), 2 * math.pi / w
 
     def filter_time(self, natural: float) -> float:
-        """Return the derivative filter: the loop's if it names one, else ``natural`` [s]."""
+        """Return the derivative filter: the loop's if it names one, else ``natural``.
+
+        Parameters
+        ----------
+        natural : float
+            What the method would take [s].
+
+        Returns
+        -------
+        float
+            Time constant [s], half a sample at least where it is the method's.
+        """
         given = self.loop.derivative_filter_time_constant
         return max(natural, 0.5 * self.loop.sample_time) if given is None else given
 

@@ -153,7 +153,20 @@ def planned_change(
 
 
 def top_speed(plant: Plant, supply: float) -> float:
-    """Return the speed that a motor reaches at the headroom of the supply [rad/s]."""
+    """Return the speed that a motor reaches at the headroom of the supply.
+
+    Parameters
+    ----------
+    plant : Plant
+        A batch of one.
+    supply : float
+        [V].
+
+    Returns
+    -------
+    float
+        At the motor shaft [rad/s].
+    """
     m = plant.motors
     return float((HEADROOM * supply - m.static_voltage[0]) / m.a0[0])
 
@@ -234,15 +247,15 @@ def _reachable(plant: Plant, loop: Loop, wished: float | None) -> float:
 def _quickest(plant: Plant, loop: Loop, controller: Controller, lag: float) -> float:
     """Return the shortest change of speed, however small, that does not overshoot [s].
 
-    By half a percent when the loop's delay is as usual, by one and a half when it is longer by
-    the loop's doubt.
+    By more than one percent when the loop's delay is as usual, or one and a half when it is longer
+    by the loop's doubt.
     """
     slow = float(plant.motors.a1[0] / plant.motors.a0[0])
     late = replace(loop, delay=loop.expected_delay + loop.delay_doubt)
-    trials = ((plant, 0.5), (sample(plant.motors, late), 1.5))
+    trials = ((plant, 1.0), (sample(plant.motors, late), 1.5))
     linear = replace(controller, limit=math.inf, tracking=math.inf)
-    grain = max(0.005, loop.sample_time)
-    grains = math.ceil(0.02 / grain)
+    grain = max(0.002, loop.sample_time)
+    grains = math.ceil(0.01 / grain)
     for _ in range(200):
         duration = grains * grain
         if all(_overshoot(one, linear, lag, duration, slow) <= most for one, most in trials):

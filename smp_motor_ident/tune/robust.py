@@ -44,7 +44,18 @@ class Judge(Protocol):
     """Whoever can say what gains do over some motors."""
 
     def judge(self, feedback: Feedback) -> Robustness:
-        """Return what the gains do; see :meth:`Jury.judge`."""
+        """Return what the gains do; see :meth:`Jury.judge`.
+
+        Parameters
+        ----------
+        feedback : Feedback
+            The gains.
+
+        Returns
+        -------
+        Robustness
+            Over the motors that the judge knows.
+        """
 
 
 class Jury:
