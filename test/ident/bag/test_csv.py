@@ -1,0 +1,130 @@
+"""CSV files by the same mapping, whatever wrote them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from smp_motor_ident.bag import list_topics, read_experiments, read_records
+from smp_motor_ident.errors import BagError
+
+DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
+U = np.array([1.0, -2.0, 3.0, 4.5, 0.0])
+Y = np.array([0.0, 90.0, 180.0, -90.0, 45.0])
+MAP = ["voltage=u velocity=y:deg/s time=t"]
+
+
+def table(
+    separator: str = ",", decimal: str = ".", head: str = "t,u,y", newline: str = "\n"
+) -> str:
+    rows = [head.replace(",", separator)]
+    rows += [
+        separator.join(f"{x:.6f}".replace(".", decimal) for x in row)
+        for row in zip(np.arange(5) * 0.02, U, Y)
+    ]
+    return newline.join(rows) + newline
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        table(),
+        table(newline="\r\n"),
+        table(";", ","),
+        table("\t"),
+        table(" "),
+        table(", "),
+        "\ufeff" + table(),
+        "# made by a scope\n#\n" + table() + "\n# the end\n",
+        table(head='"t","u","y"'),
+    ],
+)
+def test_every_usual_kind_of_csv_is_read(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "log.csv"
+    path.write_bytes(text.encode())
+    record = read_records(path, MAP)["motor"]
+    np.testing.assert_allclose(record.time, np.arange(5) * 0.02, atol=1e-9)
+    np.testing.assert_allclose(record.velocity, np.deg2rad(Y))
+    # Applied from its row on: the mean over the interval that ends at a row is the one before.
+    np.testing.assert_allclose(record.voltage[1:], U[:-1])
+
+
+def test_a_voltage_may_have_been_held_up_to_its_row(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text(table())
+    record = read_records(tmp_path / "log.csv", [*MAP, "held=before"])["motor"]
+    np.testing.assert_allclose(record.voltage, U)
+
+
+def test_empty_cells_are_missing_values(tmp_path: Path) -> None:
+    text = "t,u,y,i\n" + "".join(f"{k * 0.01},{k},{k if k % 10 else ''},nan\n" for k in range(100))
+    (tmp_path / "log.csv").write_text(text)
+    record = read_records(tmp_path / "log.csv", ["voltage=u velocity=y current=i time=t"])["motor"]
+    assert np.isnan(record.velocity).sum() == 10
+    assert record.current is None
+    assert "velocity: 10 values missing" in " ".join(record.notes)
+
+
+def test_a_file_without_time_has_a_sample_time(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text(table())
+    record = read_records(tmp_path / "log.csv", ["voltage=u velocity=y sample_time=0.5"])["motor"]
+    np.testing.assert_allclose(record.time, np.arange(5) * 0.5)
+
+
+def test_several_files_are_several_experiments_of_several_motors(tmp_path: Path) -> None:
+    for name in ("a.csv", "b.csv"):
+        (tmp_path / name).write_text(table())
+    mapping = ["time=t left.voltage=u left.velocity=y:deg/s right.voltage=y right.velocity=u"]
+    found = read_experiments(tmp_path, mapping)
+    assert {wheel: len(records) for wheel, records in found.items()} == {"left": 2, "right": 2}
+
+
+@pytest.mark.parametrize(
+    ("text", "mapping", "reason"),
+    [
+        ("", MAP, "is empty"),
+        ("0.0,1.0,2.0\n0.1,1.0,2.0\n", MAP, "names of its columns"),
+        ("t,u,y\n", MAP, "no rows"),
+        ("t,u,y\n0,1,2\n1,1,abc\n", MAP, "line 3, column 'y': 'abc' is no number"),
+        (table(), ["voltage=u velocity=speed time=t"], "no column 'speed'; it has t, u, y"),
+        (table(), ["voltage=u velocity=y"], "which column is the time"),
+        (table(), None, "needs a mapping, such as"),
+        ("t,u,y\n0,1,2\n", MAP, "fewer than 2"),
+        ("\x00\xff\xfe", MAP, "log.csv"),
+    ],
+)
+def test_what_cannot_be_read_is_refused_with_file_and_reason(
+    tmp_path: Path, text: str, mapping: list[str] | None, reason: str
+) -> None:
+    path = tmp_path / "log.csv"
+    path.write_bytes(text.encode("latin-1"))
+    with pytest.raises(BagError) as refused:
+        read_records(path, mapping)
+    assert reason in str(refused.value)
+    assert "log.csv" in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.skipif(not DATA.exists(), reason="needs the recordings beside the repository")
+def test_the_recordings_of_real_motors_are_read() -> None:
+    path = DATA / "prbs_gearmotor" / "prbs_2026-08-14.csv"
+    record = read_records(path, MAP)["motor"]
+    assert len(record) == 4093
+    assert record.sample_time == pytest.approx(0.02)
+    assert record.starts == (0,)
+    assert list_topics(path)[0].suggestion == ["voltage=u", "velocity=y", "time=t"]
+    steps = DATA / "step_gearmotor"
+    mapping = [
+        "voltage=Commanded_PWM*12/5319-12/5319",
+        "velocity=Motor_Speed(RPM)-1.24:rpm",
+        "time=Timestamp(ms):ms",
+        "velocity_window=0.032",
+    ]
+    records = read_experiments(steps, mapping)["motor"]
+    assert len(records) == 10
+    # Duty cycles of about 30 to 75 % of 12 V, in ticks that are no round numbers.
+    highest = sorted(np.abs(record.voltage).max() / 12 for record in records)
+    assert highest[0] == pytest.approx(0.3, abs=0.03)
+    assert highest[-1] == pytest.approx(0.75, abs=0.03)
+    assert records[0].velocity_window == 0.032
