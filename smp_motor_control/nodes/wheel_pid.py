@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from sensor_msgs.msg import JointState
@@ -20,6 +20,14 @@ from smp_motor_control.errors import ParameterError
 from smp_motor_control.motor import Gearbox
 from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.settings import Parameters
+from smp_motor_control.nodes.wheel_report import (
+    DRIVING,
+    INACTIVE,
+    LATE_FEEDBACK,
+    TIMED_OUT,
+    WAITING,
+    WheelReport,
+)
 from smp_motor_control.nodes.wheel_settings import Settings
 from smp_motor_control.pid import PidOutput
 from smp_motor_control.supervision import Fault, FaultDetector, FeedbackClock, Latch, Verdict
@@ -29,24 +37,6 @@ _LARGEST_SETPOINT = 1e4
 _FRESH, _FIRST, _LATE = Verdict.FRESH, Verdict.FIRST, Verdict.LATE
 _AT_REST = 0.05
 _WATCH_PERIOD = 0.02
-
-WAITING = "waiting for a set-point"
-DRIVING = "driving"
-TIMED_OUT = "set-point timed out: braked, then 0 V"
-NO_FEEDBACK = "no feedback: 0 V"
-LATE_FEEDBACK = "feedback is late: 0 V"
-BAD_FEEDBACK = "feedback is not a number or implausible: left out"
-INACTIVE = "not active"
-
-_LEVELS = {
-    WAITING: runtime.OK,
-    DRIVING: runtime.OK,
-    INACTIVE: runtime.OK,
-    TIMED_OUT: runtime.WARN,
-    NO_FEEDBACK: runtime.ERROR,
-    LATE_FEEDBACK: runtime.ERROR,
-    BAD_FEEDBACK: runtime.ERROR,
-}
 
 
 class WheelPid(LifecycleNode):
@@ -64,19 +54,14 @@ class WheelPid(LifecycleNode):
             )
         self._active = False
         self._configured = False
-        self._state = INACTIVE
         self._supply = math.inf
         self._loop = WheelLoop(settings.loop)
         self._detector = FaultDetector(settings.faults)
         self._latch = Latch(settings.fault_retry)
-        self._clock_of_feedback = FeedbackClock(
-            settings.feedback_timeout, settings.feedback_timeout
-        )
+        self._feedback = FeedbackClock(settings.feedback_timeout, settings.feedback_timeout)
         self._forget()
-        self._refused: dict[str, int] = {}
-        self._steps = self._answered = 0
-        self._reported: dict[str, int] = {}
-        self._timekeeping: list[str] = []
+        self._report = WheelReport(self._feedback, self._latch, self._values)
+        self._steps = 0
         self._now: Callable[[], int] = time.time_ns
 
     def _forget(self) -> None:
@@ -88,7 +73,7 @@ class WheelPid(LifecycleNode):
         self._cautious = False
         self._output = 0.0
         self._index = 0
-        self._clock_of_feedback.reset()
+        self._feedback.reset()
         self._loop.reset_speed()
 
     # Lifecycle -----------------------------------------------------------------------------
@@ -115,20 +100,22 @@ class WheelPid(LifecycleNode):
             ),
         ]
         self._timer = runtime.steady_timer(self, _WATCH_PERIOD, self._watch)
-        self._diagnostics = runtime.Diagnostics(self, self._assess, self._joint)
+        self._report.open(self, self._joint)
         self._configured = True
         return TransitionCallbackReturn.SUCCESS
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Answer feedback from now on; the wheel waits for its first set-point."""
         self._forget()
-        self._latch = Latch(self._settings.fault_retry)
+        self._latch.fault = None
         self._detector.reset()
         affinity = tuple(cpu for cpu in self._settings.cpu_affinity if cpu >= 0)
-        self._timekeeping = runtime.keep_time(self, self._settings.scheduling_priority, affinity)
+        self._report.timekeeping = runtime.keep_time(
+            self, self._settings.scheduling_priority, affinity
+        )
         self._active = True
         self._feedback_at = time.monotonic()
-        self._enter(WAITING)
+        self._report.enter(WAITING)
         return super().on_activate(state)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -163,14 +150,14 @@ class WheelPid(LifecycleNode):
             self._output = self._command.voltage = 0.0
             self._command.header.stamp = self.get_clock().now().to_msg()
             runtime.send_last(self._publisher, self._command)
-            self._enter(INACTIVE)
+            self._report.enter(INACTIVE)
 
     def _destroy(self) -> None:
         if self._configured:
             self._configured = False
             for topic in self._topics:
                 self.destroy_subscription(topic)
-            self._diagnostics.destroy()
+            self._report.close()
             self.destroy_timer(self._timer)
             self.destroy_publisher(self._publisher)
             self.destroy_publisher(self._state_publisher)
@@ -182,7 +169,7 @@ class WheelPid(LifecycleNode):
         self._loop.configure(settings.loop.within(self._supply))
         self._detector.limits = settings.faults
         self._latch.first_pause = settings.fault_retry
-        clock = self._clock_of_feedback
+        clock = self._feedback
         clock.max_age = clock.max_gap = settings.feedback_timeout
 
     def _on_description(self, message: MotorDescription) -> None:
@@ -195,7 +182,7 @@ class WheelPid(LifecycleNode):
             self._loop.configure(self._settings.loop.within(supply))
             self._supply = supply
         except ParameterError as error:
-            self._refuse(f"motor_description: {error}")
+            self._report.refuse(f"motor_description: {error}")
             return
         self._loop.set_hardware(gearbox, encoder, 1.5 * supply)
         self._detector.resistance = message.resistance
@@ -209,30 +196,27 @@ class WheelPid(LifecycleNode):
                 return
             self._index = index = names.index(self._joint)
         if index >= len(message.velocity):
-            self._refuse("set-point without a velocity")
+            self._report.refuse("set-point without a velocity")
             return
         value = message.velocity[index]
         if not -_LARGEST_SETPOINT <= value <= _LARGEST_SETPOINT:
-            self._refuse("set-point that is not a number or absurd")
+            self._report.refuse("set-point that is not a number or absurd")
             return
         stamp = message.header.stamp
         if stamp.sec or stamp.nanosec:
             age = self._now() * 1e-9 - stamp.sec - stamp.nanosec * 1e-9
             if age > self._settings.setpoint_timeout:
-                self._refuse("set-point that is out of date by its stamp")
+                self._report.refuse("set-point that is out of date by its stamp")
                 return
         self._setpoint = value
         self._setpoint_at = time.monotonic()
-
-    def _refuse(self, what: str) -> None:
-        self._refused[what] = self._refused.get(what, 0) + 1
 
     # Feedback ------------------------------------------------------------------------------
 
     def _on_state(self, message: MotorState) -> None:
         stamp = message.header.stamp
         now = self._now()
-        clock = self._clock_of_feedback
+        clock = self._feedback
         verdict = clock.accept(stamp.sec * 1_000_000_000 + stamp.nanosec, now)
         if verdict is not _FRESH:
             self._not_fresh(verdict)
@@ -242,14 +226,14 @@ class WheelPid(LifecycleNode):
         dt = clock.dt
         voltage = message.voltage
         if not -limit <= velocity <= limit:
-            self._refuse("feedback velocity that is not a number or implausible")
+            self._report.refuse("feedback velocity that is not a number or implausible")
             return
         if voltage - voltage != 0.0:
             voltage = self._output
         measurement = self._loop.speed(dt, velocity, message.encoder_count, voltage)
         if not -limit <= measurement <= limit:
             if measurement == measurement:
-                self._refuse("feedback count that jumps")
+                self._report.refuse("feedback count that jumps")
                 self._loop.reset_speed()
             return
         steady = time.monotonic()
@@ -266,7 +250,7 @@ class WheelPid(LifecycleNode):
             self._resume = True
             if self._active:
                 self._send_zero()
-                self._enter(LATE_FEEDBACK)
+                self._report.enter(LATE_FEEDBACK)
 
     def _answer(self, message: MotorState, measurement: float, dt: float, steady: float) -> None:
         setpoint = self._present_setpoint(measurement, steady)
@@ -276,7 +260,7 @@ class WheelPid(LifecycleNode):
         if setpoint is None:
             self._resume = True
             self._send_zero()
-            self._enter(WAITING if self._setpoint_at == -math.inf else TIMED_OUT)
+            self._report.enter(WAITING if self._setpoint_at == -math.inf else TIMED_OUT)
             return
         if self._resume:
             self._resume = False
@@ -288,7 +272,7 @@ class WheelPid(LifecycleNode):
             return
         out = self._loop.step(setpoint, measurement, dt)
         if out.output - out.output != 0.0:
-            self._refuse("output that is not a number")
+            self._report.refuse("output that is not a number")
             self._send_zero()
             return
         voltage = out.output
@@ -296,7 +280,7 @@ class WheelPid(LifecycleNode):
             voltage = self._with_caution(voltage, measurement)
         self._send(voltage, message)
         self._steps += 1
-        self._enter(TIMED_OUT if self._expired else DRIVING)
+        self._report.enter(TIMED_OUT if self._expired else DRIVING)
         if self._watched:
             self._tell(message, setpoint, measurement, dt, out)
 
@@ -337,7 +321,7 @@ class WheelPid(LifecycleNode):
         self._latch.set(fault, steady)
         self._resume = True
         self._send_zero()
-        self._enter(fault.value)
+        self._report.enter(fault.value)
         self.get_logger().error(f"{fault.value}; 0 V")
 
     def _send(self, voltage: float, message: MotorState) -> None:
@@ -369,7 +353,7 @@ class WheelPid(LifecycleNode):
         state.p_term, state.i_term, state.d_term = out.p_term, out.i_term, out.d_term
         state.feedforward, state.saturated = out.feedforward, out.saturated
         state.dt = dt
-        state.age = self._clock_of_feedback.age
+        state.age = self._feedback.age
         self._state_publisher.publish(state)
 
     # Watching ------------------------------------------------------------------------------
@@ -384,50 +368,14 @@ class WheelPid(LifecycleNode):
         if time.monotonic() - self._feedback_at > self._settings.feedback_timeout:
             self._resume = True
             self._send_zero()
-            if self._state != LATE_FEEDBACK or not self._counted(_LATE):
-                self._enter(BAD_FEEDBACK if self._counted_bad() else NO_FEEDBACK)
+            self._report.enter_silence()
 
     def _simulated_now(self) -> int:
         return int(self.get_clock().now().nanoseconds)
 
-    def _counted(self, verdict: Verdict) -> bool:
-        return self._recent().get(verdict.value, 0) > 0
-
-    def _counted_bad(self) -> bool:
-        return any(key.startswith("feedback") and n > 0 for key, n in self._recent().items())
-
-    def _enter(self, state: str) -> None:
-        if state is not self._state:
-            self._state = state
-            self._diagnostics.publish()
-
-    def _totals(self) -> dict[str, int]:
-        """Return how often each thing out of the ordinary has happened since the start."""
-        counts = self._clock_of_feedback.counts
-        totals = {v.value: n for v, n in counts.items() if v not in (_FRESH, _FIRST)}
-        totals["clock jumps"] = self._clock_of_feedback.jumps
-        return {**totals, **self._refused}
-
-    def _recent(self) -> dict[str, int]:
-        """Return the same since the last second's diagnostics."""
-        return {key: n - self._reported.get(key, 0) for key, n in self._totals().items()}
-
-    def _assess(self) -> tuple[bytes, str, Mapping[str, object]]:
-        state = self._latch.fault.value if self._latch.fault else self._state
-        level = _LEVELS.get(state, runtime.ERROR)
-        recent = {key: n for key, n in self._recent().items() if n}
-        message = state
-        if recent:
-            told = ", ".join(f"{n} x {key}" for key, n in recent.items())
-            message = f"{state}; in the last second: {told}"
-            level = max(level, runtime.WARN)
-        if self._timekeeping and level == runtime.OK:
-            message = f"{message}; {self._timekeeping[0]}"
-        if self._diagnostics.due:
-            self._reported = self._totals()
-            runtime.collect_garbage()
-        clock = self._clock_of_feedback
-        values: dict[str, object] = {
+    def _values(self) -> dict[str, object]:
+        clock = self._feedback
+        return {
             "steps": self._steps,
             "set-point [rad/s]": "none" if self._setpoint is None else self._setpoint,
             "output [V]": self._output,
@@ -435,9 +383,7 @@ class WheelPid(LifecycleNode):
             "feedback dt [s]": clock.dt,
             "feedback age [s]": clock.age,
             "offset of the feedback's clock [s]": clock.offset,
-            **self._totals(),
         }
-        return level, message, values
 
 
 def _make() -> WheelPid:

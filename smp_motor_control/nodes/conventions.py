@@ -1,0 +1,133 @@
+"""What all nodes do alike: QoS, timers that nothing stops, names, stamps, files."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.timer import Timer
+
+from smp_motor_control.errors import SmpError
+
+# REP-2003: streams are published reliably and taken best effort, so that both a stock
+# reliable subscriber and a stock best-effort publisher find a partner in our nodes.
+STREAM_PUBLISHER = QoSProfile(depth=5, reliability=ReliabilityPolicy.RELIABLE)
+"""Commands, states, set-points: what is outdated by the next message."""
+
+STREAM_SUBSCRIBER = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""The other end of :data:`STREAM_PUBLISHER`, and of any stock publisher."""
+
+LATCHED = QoSProfile(
+    depth=1,
+    history=HistoryPolicy.KEEP_LAST,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+"""Descriptions: the last one is kept for whoever comes late."""
+
+
+def send_last(publisher: Publisher, message: Any, timeout: float = 0.3) -> None:
+    """Publish a last message and wait until those who take it reliably have it.
+
+    Parameters
+    ----------
+    publisher : rclpy.publisher.Publisher
+        Of the topic.
+    message : object
+        Such as a zero command.
+    timeout : float
+        Longest wait [s].
+    """
+    publisher.publish(message)
+    publisher.wait_for_all_acked(Duration(seconds=timeout))
+    # Best-effort readers acknowledge nothing: give the datagram time to leave the process.
+    time.sleep(0.02)
+
+
+def steady_timer(node: Node, period: float, callback: Callable[[], None]) -> Timer:
+    """Return a timer that neither simulated nor corrected time can stop.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+        Owner.
+    period : float
+        [s].
+    callback : callable
+        Called every period.
+
+    Returns
+    -------
+    rclpy.timer.Timer
+        Running.
+    """
+    return node.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+
+def wheel_of(node: Node) -> str:
+    """Return the wheel whose namespace a node lives in.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+        Such as ``/front_left/wheel_pid``, also below a robot's namespace.
+
+    Returns
+    -------
+    str
+        Such as ``front_left``; empty in the root namespace.
+    """
+    return str(node.get_namespace().rsplit("/", 1)[-1])
+
+
+def share(path: str) -> Path:
+    """Return a file of this package, installed or in its source tree.
+
+    Parameters
+    ----------
+    path : str
+        Such as ``config/motors_paper.yaml``.
+
+    Returns
+    -------
+    Path
+        Where it is.
+
+    Raises
+    ------
+    SmpError
+        When it is nowhere.
+    """
+    places = [Path(__file__).resolve().parents[2]]
+    with contextlib.suppress(PackageNotFoundError):
+        places.insert(0, Path(get_package_share_directory("smp_motor_control")))
+    for place in places:
+        if (place / path).exists():
+            return place / path
+    raise SmpError(f"{path} of smp_motor_control is not installed; build the package again")
+
+
+def seconds(stamp: Any) -> float:
+    """Return a ``builtin_interfaces/Time`` as seconds.
+
+    Parameters
+    ----------
+    stamp : builtin_interfaces.msg.Time
+        The stamp.
+
+    Returns
+    -------
+    float
+        [s]; good to some 0.1 us since 1970.
+    """
+    return float(stamp.sec + 1e-9 * stamp.nanosec)

@@ -1,0 +1,81 @@
+"""A node's health on ``/diagnostics``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.node import Node
+
+from smp_motor_control.nodes.conventions import steady_timer
+
+OK, WARN, ERROR, STALE = (
+    DiagnosticStatus.OK,
+    DiagnosticStatus.WARN,
+    DiagnosticStatus.ERROR,
+    DiagnosticStatus.STALE,
+)
+
+
+class Diagnostics:
+    """Publishes a node's health on ``/diagnostics``, every second and at once on a change.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+        Its full name is the status' name.
+    assess : callable
+        Returns ``(level, message, values)``: one of :data:`OK`, :data:`WARN`, :data:`ERROR`,
+        :data:`STALE`, a line for people, and a mapping of names to values.
+    hardware_id : str
+        Such as the joint's name.
+
+    Attributes
+    ----------
+    due : bool
+        Whether ``assess`` is asked for the report of the second, and not for one between.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        assess: Callable[[], tuple[bytes, str, Mapping[str, object]]],
+        hardware_id: str = "",
+    ) -> None:
+        self._node = node
+        self._assess = assess
+        self._name = node.get_fully_qualified_name().lstrip("/")
+        self._hardware_id = hardware_id
+        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._timer = steady_timer(node, 1.0, self._tick)
+        self.due = False
+
+    def _tick(self) -> None:
+        self.due = True
+        self.publish()
+        self.due = False
+
+    def destroy(self) -> None:
+        """Fall silent and give the topic back."""
+        self._node.destroy_timer(self._timer)
+        self._node.destroy_publisher(self._publisher)
+
+    def publish(self) -> None:
+        """Publish the present health now."""
+        level, message, values = self._assess()
+        array = DiagnosticArray()
+        array.header.stamp = self._node.get_clock().now().to_msg()
+        array.status = [
+            DiagnosticStatus(
+                level=level,
+                name=self._name,
+                message=message,
+                hardware_id=self._hardware_id,
+                values=[KeyValue(key=key, value=_text(value)) for key, value in values.items()],
+            )
+        ]
+        self._publisher.publish(array)
+
+
+def _text(value: object) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,52 @@
+"""What a control loop asks of the system and of Python so that it keeps time."""
+
+from __future__ import annotations
+
+import gc
+import os
+
+from rclpy.node import Node
+
+
+def keep_time(node: Node, priority: int, affinity: tuple[int, ...]) -> list[str]:
+    """Ask the system for what a control loop wants, and do without where it says no.
+
+    Freezes what is allocated so far out of the garbage collector's sight and turns the
+    collector off; :func:`collect_garbage` is then to be called where it does no harm.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+        For its log.
+    priority : int
+        SCHED_FIFO priority, 1 to 99; 0 leaves the scheduler alone.
+    affinity : tuple of int
+        Processors to run on; empty for all.
+
+    Returns
+    -------
+    list of str
+        What was refused, a line each.
+    """
+    refused = []
+    if priority > 0:
+        try:
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+        except (OSError, AttributeError) as error:
+            refused.append(f"scheduling_priority {priority} not granted: {error}")
+    if affinity:
+        try:
+            os.sched_setaffinity(0, affinity)
+        except (OSError, ValueError, OverflowError) as error:
+            refused.append(f"cpu_affinity {list(affinity)} not granted: {error}")
+    for line in refused:
+        node.get_logger().warning(f"{line}; running without it")
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    return refused
+
+
+def collect_garbage() -> None:
+    """Collect the few objects made since :func:`keep_time`, while the loop has time."""
+    gc.collect()
