@@ -225,8 +225,9 @@ class Recorder(Node):
         """Take what has come, close the bag and tell what is in it."""
         try:
             self._take_all()
-        finally:
             self._writer.close()
+        except SmpError as error:  # the disk is full: what is there is whole
+            print(f"record: {error}", file=sys.stderr, flush=True)
         for name, count in sorted(self._writer.counts.items()):
             lost = self._topics[name].lost
             print(f"{count:9d}  {name}" + (f"  ({lost} lost)" if lost else ""), flush=True)

@@ -56,19 +56,34 @@ def read_experiments(
     Raises
     ------
     BagError
-        When a path cannot be read, or holds no motor; the message says which.
+        When a path cannot be read, or holds no motor; the message says which.  Of a folder
+        with several recordings those that cannot be read become notes of the others.
     """
     asked = mappings.of(mapping)
     types = Types(asked.msg_files)
     found: dict[str, list[Record]] = {}
+    failures: list[BagError] = []
     every = recordings(paths)
     total, before = max(sum(r.size() for r in every), 1), 0
     for recording in every:
         part = recording.size() / total
         report = None if progress is None else _scaled(progress, before / total, part)
-        for record in _read(recording, asked, types, report):
-            found.setdefault(record.wheel, []).append(record)
+        try:
+            for record in _read(recording, asked, types, report):
+                found.setdefault(record.wheel, []).append(record)
+        except BagError as error:
+            if not recording.one_of_many:
+                raise
+            failures.append(error)
         before += recording.size()
+    if failures and not found:
+        raise failures[0]
+    if failures:
+        notes = tuple(f"not read: {error}" for error in failures)
+        found = {
+            wheel: [replace(record, notes=(*record.notes, *notes)) for record in records]
+            for wheel, records in found.items()
+        }
     if progress is not None:
         progress(1.0, every[-1].name)
     return found

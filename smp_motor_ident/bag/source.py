@@ -39,6 +39,8 @@ class Recording:
         ROS distribution that wrote it, where known.
     notes : list of str
         What was found amiss, grows while the files are read.
+    one_of_many : bool
+        Whether it was found in a folder with others, so that nobody asked for it by name.
     """
 
     name: str
@@ -46,6 +48,7 @@ class Recording:
     promised: dict[str, int] | None = None
     distribution: str = ""
     notes: list[str] = field(default_factory=list)
+    one_of_many: bool = False
     _storages: dict[Path, Storage | None] = field(default_factory=dict, repr=False)
     _folder: tempfile.TemporaryDirectory[str] | None = field(default=None, repr=False)
 
@@ -240,7 +243,12 @@ def recordings(paths: Any) -> list[Recording]:
     for path in map(Path, paths):
         if not path.exists():
             raise BagError(f"{path}: does not exist")
-        inside = _of_folder(path) if path.is_dir() else [Recording(path.name, [path])]
+        try:
+            inside = _of_folder(path) if path.is_dir() else [Recording(path.name, [path])]
+        except OSError as error:
+            raise BagError(f"{path}: cannot be read ({error.strerror})") from None
+        for recording in inside:
+            recording.one_of_many = len(inside) > 1
         if not inside:
             raise BagError(f"{path}: holds no bag (.mcap, .db3) and no CSV file")
         found += inside

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -346,6 +347,43 @@ def test_a_topic_without_messages_is_refused_by_its_name(
         database.execute("DELETE FROM messages WHERE topic_id = 2")
     with pytest.raises(BagError, match="/front_left/motor_state has no messages"):
         read_records(path)
+
+
+def test_a_folder_of_bags_tells_which_of_them_could_not_be_read(
+    tmp_path: Path, corpus: SimpleNamespace
+) -> None:
+    for name in ("good", "bad"):
+        (tmp_path / name).mkdir()
+        corpus.write_mcap(tmp_path / name / "x_0.mcap", corpus.motion(n=20).messages())
+    (tmp_path / "bad" / "x_0.mcap").write_bytes(b"")
+    records = read_experiments(tmp_path)["front_left"]
+    assert [len(record) for record in records] == [20]
+    assert "not read:" in " ".join(records[0].notes)
+    assert "is empty" in " ".join(records[0].notes)
+    with pytest.raises(BagError, match="is empty"):
+        read_experiments([tmp_path / "good", tmp_path / "bad"])
+
+
+def test_types_defined_as_idl_are_understood(tmp_path: Path, corpus: SimpleNamespace) -> None:
+    text = (
+        "module odd_msgs {\n module msg {\n  struct Speed {\n   string label;\n"
+        '   sequence<double> values;\n   @unit(value="V")\n   float volts;\n  };\n };\n};\n'
+    )
+    path = tmp_path / "bag.mcap"
+    with path.open("wb") as file:
+        writer = mcap.writer.Writer(file)
+        writer.start("ros2")
+        line = "=" * 80 + "\nIDL: odd_msgs/msg/Speed\n"
+        schema = writer.register_schema("odd_msgs/msg/Speed", "ros2idl", (line + text).encode())
+        channel = writer.register_channel("/odd", "cdr", schema)
+        for k in range(20):
+            # Label "a", two values, four volts: aligned as CDR asks.
+            data = struct.pack("<4sI2s2xI4xddf", b"\0\1\0\0", 2, b"a\0", 2, 0.5, float(k), 4.0)
+            writer.add_message(channel, k * 10_000_000, data, 0)
+        writer.finish()
+    record = read_records(path, "voltage=/odd.volts velocity=/odd.values[1]")["motor"]
+    assert record.velocity.tolist() == list(range(20))
+    assert set(record.voltage) == {4.0}
 
 
 @pytest.mark.parametrize("text", ["", ":\n - {", "a: 1", "rosbag2_bagfile_information: 7"])
