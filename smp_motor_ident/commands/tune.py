@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from smp_motor_ident.commands import applying, frame
+from smp_motor_ident.commands import applying, frame, relaying
 from smp_motor_ident.errors import DesignError, ParameterError
 from smp_motor_ident.report.document import check_free, read_identification, write_together
 from smp_motor_ident.report.tuning_figures import tuning_svg
@@ -28,6 +28,8 @@ TARGETS = (
     "closed_loop_time_constant",
     "natural_frequency",
     "damping",
+    "relay_amplitude",
+    "rule",
     "max_velocity",
     "max_acceleration",
     "transition_time",
@@ -57,7 +59,7 @@ def parser() -> argparse.ArgumentParser:
         "--delay", type=float, help="measurement to voltage, beyond the hold [s]; else one sample"
     )
     loop.add_argument(
-        "--usual-delay", type=float, help="what it usually is [s]; else --delay, or 2 ms"
+        "--usual-delay", type=float, help="what it usually is [s]; else --delay"
     )
     loop.add_argument("--speed-source", choices=SPEED_SOURCES, default="measured")
     loop.add_argument("--difference-window", type=int, default=1, help="[samples]")
@@ -87,6 +89,12 @@ def parser() -> argparse.ArgumentParser:
         "--gains", type=Path, help="with --apply and without a source: gains of this file"
     )
     p.add_argument("--watch", type=float, default=3.0, help="trial after --apply [s]")
+    relay = p.add_argument_group("relay feedback on a running wheel, without a model")
+    relay.add_argument("--relay", metavar="WHEEL", help="make it oscillate, and tune from that")
+    relay.add_argument("--relay-amplitude", type=float, help="[V]; a quarter of the supply")
+    relay.add_argument("--relay-hysteresis", type=float, default=0.05, help="[rad/s, wheel]")
+    relay.add_argument("--relay-seconds", type=float, default=4.0)
+    relay.add_argument("--rule", choices=("tyreus_luyben", "ziegler_nichols"))
     p.add_argument("--force", action="store_true", help="replace files that exist")
     return p
 
@@ -108,6 +116,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _work(arguments: argparse.Namespace) -> int:
+    if arguments.relay is not None:
+        return relaying.tune_by_relay(arguments, _files(arguments)[:1])
     if arguments.gains is not None:
         return _apply_file(arguments)
     if arguments.source is None:

@@ -431,6 +431,11 @@ def _explain(
         )
     else:
         warnings.append("the estimate tells no uncertainty: the margins are those of one motor")
+    if loop.speed_source == "observer":
+        warnings.append(
+            "margins and ripple are those with counts differenced over one sample; the observer "
+            "has less lag and noise while its model is right"
+        )
     if factor < 1:
         words.append(f"gains backed off to {factor:.0%} of the rule's so that 99 % hold")
     if figures.ripple > 1.05 * loop.noise_limit:

@@ -9,9 +9,6 @@ from typing import Literal
 from smp_motor_control.errors import ParameterError
 
 SpeedSource = Literal["measured", "difference", "observer"]
-USUAL_DELAY = 2e-3
-"""From a measurement through two nodes of one machine to the voltage [s]."""
-
 SPEED_SOURCES: tuple[SpeedSource, ...] = ("measured", "difference", "observer")
 
 
@@ -30,8 +27,8 @@ class Loop:
         the estimate) is added to it.
     usual_delay : float or None
         The same as it usually is [s], for the timing of the reference, where ``delay`` is the
-        longest that the margins must bear.  None takes ``delay`` where that was given, else two
-        milliseconds, or one sample where that is shorter: what nodes on one machine need.
+        longest that the margins must bear.  None takes ``delay``: a driver whose loop has a
+        fixed rate applies at its next sample whatever came in between.
     delay_doubt : float
         By which the delay may be longer than usual without overshoot that matters [s].
     gear_ratio : float
@@ -107,9 +104,7 @@ class Loop:
     @property
     def expected_delay(self) -> float:
         """Delay beyond the hold that is usual [s]."""
-        if self.usual_delay is not None:
-            return self.usual_delay
-        return min(USUAL_DELAY, self.sample_time) if self.delay is None else self.delay
+        return self.loop_delay if self.usual_delay is None else self.usual_delay
 
     @property
     def noise_limit(self) -> float:

@@ -231,7 +231,8 @@ def sample(motors: Motors, loop: Loop, *, window: int | None = None) -> Plant:
     loop : Loop
         Sample time, delay, and how speed is measured.
     window : int or None
-        Averaging window [samples]; None takes that of the loop (0 under an observer).
+        Averaging window [samples]; None takes that of the loop.  An observer is taken as one
+        sample: it has less lag and less noise than that.
 
     Returns
     -------
@@ -240,7 +241,7 @@ def sample(motors: Motors, loop: Loop, *, window: int | None = None) -> Plant:
     """
     T = loop.sample_time
     if window is None:
-        window = 0 if loop.speed_source == "observer" else int(loop.difference_window)
+        window = 1 if loop.speed_source == "observer" else int(loop.difference_window)
     total = loop.loop_delay + motors.delay
     whole = np.floor(total / T + 1e-9).astype(int)
     late = np.clip(total - whole * T, 0.0, T)

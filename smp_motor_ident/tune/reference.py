@@ -101,7 +101,8 @@ def measured_lag(plant: Plant, loop: Loop) -> float:
         Delay of loop and motor, half a sample of hold, half the averaging window.
     """
     dead = loop.expected_delay + float(plant.motors.delay[0])
-    return dead + 0.5 * loop.sample_time * (1 + plant.window)
+    window = 0 if loop.speed_source == "observer" else plant.window
+    return dead + 0.5 * loop.sample_time * (1 + window)
 
 
 def duration_of(reference: Reference, distance: float) -> float:
@@ -261,7 +262,7 @@ def _quickest(plant: Plant, loop: Loop, controller: Controller, lag: float) -> f
         if all(_overshoot(one, linear, lag, duration, slow) <= most for one, most in trials):
             break
         grains += max(1, grains // 16)
-    return duration
+    return round(duration, 9)
 
 
 def _overshoot(

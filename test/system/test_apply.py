@@ -144,3 +144,18 @@ def test_apply_without_running_wheels_says_so(process, ros_domain):
     assert tune.wait(60.0) == 1
     assert "is wheel_pid running?" in tune.output
     assert "Traceback" not in tune.output
+
+
+def test_relay_on_a_running_wheel_gives_gains_without_a_model(process, robot, eventually, tmp_path):
+    output = tmp_path / "relay.yaml"
+    code, told = run_tune(
+        process, robot, "--relay", "rear_right", "--supply", "12", "--output", output
+    )
+    assert code == 0, told
+    gains = yaml.safe_load(output.read_text())["/rear_right/wheel_pid"]["ros__parameters"]
+    # Ultimate point of the model at 200 Hz: Ku 25 V s/rad of the wheel without delay, 12 with 5 ms
+    # and 4 with 20 ms, which a busy machine may add; Tyreus-Luyben takes a third.
+    assert 0.8 < gains["p"] < 9.0
+    assert 0.0 < gains["i"] < 20 * gains["p"]
+    # The controller has the wheel again.
+    eventually(robot.at_speed, deadline=15.0, step=robot.spin, message="did not drive on")

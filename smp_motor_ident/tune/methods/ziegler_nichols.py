@@ -13,6 +13,8 @@ References
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.problem import Method, Problem, Promise
 
@@ -43,9 +45,34 @@ def from_ultimate(problem: Problem, rule: str, gain: float, period: float) -> Fe
     -------
     Feedback
     """
-    share, integral, derivative = RULES[rule, str(problem.targets.get("structure") or "pi")]
+    ruled = by_rule(rule, str(problem.targets.get("structure") or "pi"), gain, period)
+    if not ruled.d:
+        return ruled
+    return replace(ruled, filter_time=problem.filter_time(ruled.filter_time))
+
+
+def by_rule(rule: str, structure: str, gain: float, period: float) -> Feedback:
+    """Apply a rule to an ultimate point without a model.
+
+    Parameters
+    ----------
+    rule : str
+        ``ziegler_nichols`` or ``tyreus_luyben``.
+    structure : str
+        ``pi`` or ``pid``.
+    gain : float
+        Ultimate gain, of the shaft that the controller shall be of [V s/rad].
+    period : float
+        Ultimate period [s].
+
+    Returns
+    -------
+    Feedback
+        Of the same shaft.
+    """
+    share, integral, derivative = RULES[rule, structure]
     p, td = share * gain, derivative * period
-    return Feedback(p, p / (integral * period), p * td, problem.filter_time(td / 10) if td else 0.0)
+    return Feedback(p, p / (integral * period), p * td, td / 10)
 
 
 def _solve(rule: str, problem: Problem) -> Feedback:

@@ -1,0 +1,102 @@
+"""tune --relay: gains of one running wheel from a bounded oscillation, without a model."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from smp_motor_ident.commands.processes import ProcessError, Processes
+from smp_motor_ident.errors import ParameterError
+from smp_motor_ident.report.document import check_free, write_together
+from smp_motor_ident.tune.methods.relay import read_oscillation
+from smp_motor_ident.tune.methods.ziegler_nichols import by_rule
+
+BIAS = 0.4
+"""Share of the supply around which the relay switches, so that friction is not crossed."""
+
+
+def tune_by_relay(arguments: argparse.Namespace, files: Sequence[Path]) -> int:
+    """Make a wheel oscillate and write the gains that follow.
+
+    Parameters
+    ----------
+    arguments : argparse.Namespace
+        Of ``tune``.
+    files : sequence of Path
+        The parameter file to write, or nothing.
+
+    Returns
+    -------
+    int
+        Exit code.
+
+    Raises
+    ------
+    ProcessError
+        When the wheel does not answer.
+    DesignError
+        When it does not oscillate.
+    ParameterError
+        When a value is impossible.
+    """
+    supply, wheel = arguments.supply, arguments.relay
+    if supply is None or not 0 < supply < math.inf:
+        raise ParameterError("--relay needs the supply voltage; give --supply")
+    amplitude = 0.25 * supply if arguments.relay_amplitude is None else arguments.relay_amplitude
+    bias = BIAS * supply
+    if not 0 < amplitude <= supply - bias:
+        raise ParameterError(
+            f"--relay-amplitude is {amplitude:g} V; it must be within {supply - bias:g} V around "
+            f"a bias of {bias:g} V"
+        )
+    check_free(files, arguments.force)
+    values = {
+        "bias": bias,
+        "amplitude": amplitude,
+        "hysteresis": arguments.relay_hysteresis,
+        "seconds": arguments.relay_seconds,
+    }
+    print(f"{wheel} turns at {bias:g} V, then switches by {amplitude:g} V around it")
+    options = [text for name, value in values.items() for text in (f"--{name}", str(value))]
+    with tempfile.TemporaryDirectory() as logs, Processes(Path(logs)) as processes:
+        test = processes.start("relay_test", "relay_test", wheel, *options, pipes=True)
+        assert test.stdout is not None
+        line = test.stdout.readline()
+        if not line:
+            raise ProcessError(f"relay_test ended: {processes.last_words('relay_test')}")
+        answer = json.loads(line)
+        processes.wait("relay_test", 20.0)
+    if "error" in answer:
+        raise ProcessError(answer["error"])
+    gain, period = read_oscillation(
+        np.array(answer["voltage"]), np.array(answer["speed"]), answer["sample_time"]
+    )
+    rule, structure = arguments.rule or "tyreus_luyben", arguments.structure or "pi"
+    ruled = by_rule(rule, structure, gain, period)
+    told = (
+        f"{wheel}: ultimate gain {gain:.4g} V s/rad (wheel), period {1e3 * period:.3g} ms; {rule}: "
+        f"p {ruled.p:.4g}, i {ruled.i:.4g}, d {ruled.d:.4g}"
+    )
+    print(told)
+    if files:
+        parameters = {
+            "p": ruled.p,
+            "i": ruled.i,
+            "d": ruled.d,
+            "derivative_filter_time_constant": ruled.filter_time,
+            "u_clamp_min": -float(supply),
+            "u_clamp_max": float(supply),
+            "antiwindup_strategy": "back_calculation",
+        }
+        tree = {f"/{wheel}/wheel_pid": {"ros__parameters": parameters}}
+        text = f"# Tuned by relay feedback. {told}\n" + yaml.safe_dump(tree, sort_keys=False)
+        write_together({files[0]: text}, arguments.force)
+        print(f"written: {files[0]}")
+    return 0
