@@ -58,9 +58,7 @@ def parser() -> argparse.ArgumentParser:
     loop.add_argument(
         "--delay", type=float, help="measurement to voltage, beyond the hold [s]; else one sample"
     )
-    loop.add_argument(
-        "--usual-delay", type=float, help="what it usually is [s]; else --delay"
-    )
+    loop.add_argument("--usual-delay", type=float, help="what it usually is [s]; else --delay")
     loop.add_argument("--speed-source", choices=SPEED_SOURCES, default="measured")
     loop.add_argument("--difference-window", type=int, default=1, help="[samples]")
     loop.add_argument("--gear-ratio", type=float, help="else as identified")
