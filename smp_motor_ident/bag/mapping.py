@@ -16,7 +16,7 @@ from typing import Any
 
 import yaml
 
-from smp_motor_ident.bag.layout import parse_path
+from smp_motor_ident.bag.template import parse_path
 from smp_motor_ident.bag.units import check_unit
 from smp_motor_ident.errors import BagError
 

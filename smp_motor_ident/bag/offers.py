@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 
 from smp_motor_ident.bag.csv_file import CsvFile
-from smp_motor_ident.bag.layout import (
+from smp_motor_ident.bag.source import Recording, recordings
+from smp_motor_ident.bag.storage import decompress_messages
+from smp_motor_ident.bag.table import Progress
+from smp_motor_ident.bag.template import (
     DecodeError,
     Number,
     Template,
     names_beside,
     take_apart,
 )
-from smp_motor_ident.bag.source import Recording, recordings
-from smp_motor_ident.bag.storage import decompress_messages
-from smp_motor_ident.bag.table import Progress
 from smp_motor_ident.bag.types import Types
 from smp_motor_ident.errors import BagError
 

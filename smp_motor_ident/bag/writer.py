@@ -11,7 +11,6 @@ import contextlib
 import json
 import os
 import struct
-import textwrap
 import threading
 import time
 import zlib
@@ -26,50 +25,14 @@ from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 
 from smp_motor_ident.bag.mcap_file import MAGIC, NUMBERED
+from smp_motor_ident.bag.metadata import DEFAULT_QOS, document, topic_entry
 from smp_motor_ident.bag.types import definition
 from smp_motor_ident.errors import BagError
 
 _MESSAGE = struct.Struct("<BQHIQQ")
 _INDEX_ENTRY = struct.Struct("<QQ")
-_METADATA = """\
-rosbag2_bagfile_information:
-  version: 9
-  storage_identifier: mcap
-  duration:
-    nanoseconds: {duration}
-  starting_time:
-    nanoseconds_since_epoch: {start}
-  message_count: {total}
-  topics_with_message_count:
-{topics}  compression_format: ""
-  compression_mode: ""
-  relative_file_paths:
-    - {name}
-  files:
-    - path: {name}
-      starting_time:
-        nanoseconds_since_epoch: {start}
-      duration:
-        nanoseconds: {duration}
-      message_count: {total}
-  custom_data: ~
-  ros_distro: {distribution}
-"""
 CHUNK_SIZE = 1 << 20
 FLUSH_PERIOD = 0.5
-_FOREVER = {"sec": 9223372036, "nsec": 854775807}
-DEFAULT_QOS: dict[str, Any] = {
-    "history": "keep_last",
-    "depth": 10,
-    "reliability": "reliable",
-    "durability": "volatile",
-    "deadline": dict(_FOREVER),
-    "lifespan": dict(_FOREVER),
-    "liveliness": "automatic",
-    "liveliness_lease_duration": dict(_FOREVER),
-    "avoid_ros_namespace_conventions": False,
-}
-"""QoS of a topic as metadata of version 9 write it."""
 
 
 @dataclass
@@ -186,14 +149,7 @@ class BagWriter:
                 metadata=metadata,
                 schema_id=schema.id,
             )
-            entry = {
-                "name": topic,
-                "type": type_name,
-                "serialization_format": "cdr",
-                "offered_qos_profiles": profiles,
-                "type_description_hash": type_hash,
-            }
-            text = textwrap.indent(yaml.safe_dump(entry, sort_keys=False), " " * 8)
+            text = topic_entry(topic, type_name, profiles, type_hash)
             self._topics[topic] = _Topic(channel, text)
             self._add_record(channel)
             return bool(schema.data)
@@ -397,20 +353,10 @@ class BagWriter:
 
     def _write_metadata(self) -> None:
         """Write metadata.yaml beside, then put it in place at once."""
-        first, last = self._range
         total = sum(self.counts.values())
-        text = _METADATA.format(
-            name=self._file_name,
-            duration=last - first if total else 0,
-            start=first if total else 0,
-            total=total,
-            distribution=self._distribution,
-            topics="".join(
-                f"    - topic_metadata:\n{topic.text}      message_count: {topic.count}\n"
-                for topic in self._topics.values()
-            )
-            or "    []\n",
-        )
+        first, last = self._range if total else (0, 0)
+        topics = [(topic.text, topic.count) for topic in self._topics.values()]
+        text = document(self._file_name, self._distribution, first, last, topics)
         target = self.path / "metadata.yaml"
         draft = target.with_suffix(".yaml.new")
         draft.write_text(text)

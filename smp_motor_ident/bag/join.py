@@ -1,0 +1,71 @@
+"""Several recordings of one motor as one record."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from smp_motor_ident.errors import BagError
+from smp_motor_ident.record import Record
+
+BETWEEN = 1.0
+"""Time [s] that a joined record leaves between two recordings."""
+
+
+def join_records(records: list[Record]) -> Record:
+    """Join recordings of one motor; each begins a new segment, one second behind the last.
+
+    Parameters
+    ----------
+    records : list of Record
+        At least one, all of the same motor.
+
+    Returns
+    -------
+    Record
+        A signal that only some recordings have is left out, or NaN where it may be.
+
+    Raises
+    ------
+    BagError
+        When their gearboxes or encoders differ.
+    """
+    if len(records) == 1:
+        return records[0]
+    first = records[0]
+    for other in records[1:]:
+        for name in ("gear_ratio", "counts_per_revolution"):
+            here, there = getattr(first.hardware, name), getattr(other.hardware, name)
+            if here != there:
+                raise BagError(
+                    f"{first.wheel}: {name} is {here} in {first.source} and {there} in "
+                    f"{other.source}; identify them apart"
+                )
+    offsets = np.cumsum([0.0, *(r.duration + BETWEEN for r in records)])[:-1]
+    lengths = np.cumsum([0, *(len(r) for r in records)])[:-1].tolist()
+    notes = [f"{r.source}: {note}" for r in records for note in r.notes]
+    columns: dict[str, Any] = {}
+    for name in ("voltage", "current", "velocity", "position", "count"):
+        parts = [getattr(r, name) for r in records]
+        if all(part is None for part in parts):
+            continue
+        if any(part is None for part in parts):
+            if name == "count":
+                notes.append("count: not in all recordings, left out")
+                continue
+            parts = [np.full(len(r), np.nan) if p is None else p for r, p in zip(records, parts)]
+        columns[name] = np.concatenate(parts)
+    return replace(
+        first,
+        time=np.concatenate([r.time + offset for r, offset in zip(records, offsets)]),
+        current=columns.pop("current", None),
+        velocity=columns.pop("velocity", None),
+        position=columns.pop("position", None),
+        count=columns.pop("count", None),
+        starts=tuple(s + n for r, n in zip(records, lengths) for s in r.starts),
+        source=", ".join(dict.fromkeys(r.source for r in records)),
+        notes=tuple(dict.fromkeys(notes)),
+        **columns,
+    )

@@ -1,0 +1,298 @@
+"""One message taken apart: where its numbers, strings and lengths stand.
+
+CDR puts a field behind everything that precedes it, aligned to its size from the byte
+after the four of the encapsulation.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from rosbags.interfaces import Nodetype
+
+from smp_motor_ident.bag.types import Definitions
+from smp_motor_ident.errors import BagError
+
+_KINDS = {
+    "bool": "u1",
+    "byte": "u1",
+    "char": "u1",
+    "octet": "u1",
+    "int8": "i1",
+    "uint8": "u1",
+    "int16": "i2",
+    "uint16": "u2",
+    "int32": "i4",
+    "uint32": "u4",
+    "int64": "i8",
+    "uint64": "u8",
+    "float32": "f4",
+    "float64": "f8",
+}
+_STEP = re.compile(r"(\w+)((?:\[[^\]]*\])*)")
+
+
+class DecodeError(Exception):
+    """The bytes are not a message of the type."""
+
+
+@dataclass(frozen=True)
+class Number:
+    """A number, or ``count`` of them side by side, at a byte of the message."""
+
+    offset: int
+    kind: str
+    count: int | None = None
+
+
+@dataclass(frozen=True)
+class Text:
+    """A string and the bytes where it stands."""
+
+    value: str
+    begin: int
+    end: int
+
+
+@dataclass
+class Template:
+    """One message taken apart: positions instead of values.
+
+    ``lengths`` are the positions of all lengths of strings and sequences.
+    """
+
+    root: dict[str, Any]
+    lengths: list[int] = field(default_factory=list)
+    order: str = "<"
+
+
+def parse_path(path: str) -> list[str | int]:
+    """Split a field path such as ``velocity[left_wheel_joint]`` or ``a.b[2].c``.
+
+    Parameters
+    ----------
+    path : str
+        Fields joined by dots; an index or a name in brackets.
+
+    Returns
+    -------
+    list of str or int
+        Steps; a name in brackets keeps its opening bracket.
+
+    Raises
+    ------
+    BagError
+        When it is no such path.
+    """
+    steps: list[str | int] = []
+    position = 0
+    while position < len(path):
+        match = _STEP.match(path, position)
+        if match is None:
+            break
+        steps.append(match[1])
+        for key in re.findall(r"\[([^\]]*)\]", match[2]):
+            key = key.rpartition("=")[2].strip().strip("'\"")
+            steps.append(int(key) if re.fullmatch(r"\d+", key) else "[" + key)
+        position = match.end()
+        if position == len(path):
+            return steps
+        if path[position] != ".":
+            break
+        position += 1
+    raise BagError(f"field path {path!r}: write fields with dots and [index] or [name]")
+
+
+class _Parser:
+    """Takes one message apart."""
+
+    def __init__(self, data: bytes, definitions: Definitions) -> None:
+        if len(data) < 4 or data[0] != 0 or data[1] > 1:
+            raise DecodeError(f"its first bytes are {data[:4].hex()}, not those of CDR")
+        self.data, self.definitions, self.position = data, definitions, 4
+        self.order = "<" if data[1] else ">"
+        self.lengths: list[int] = []
+
+    def parse(self, name: str) -> Template:
+        root = self.message(name)
+        rest = len(self.data) - self.position
+        if not 0 <= rest <= 3:  # writers may pad to a multiple of four
+            raise DecodeError(f"{rest} bytes are left behind its last field")
+        return Template(root, self.lengths, self.order)
+
+    def message(self, name: str) -> dict[str, Any]:
+        fields = self.definitions[name]
+        if not fields:  # ROS gives an empty message one byte
+            self.take(1, 1)
+        return {key: self.value(description) for key, description in fields}
+
+    def value(self, description: Any) -> Any:
+        kind, detail = description
+        if kind == Nodetype.BASE:
+            return self.text() if detail[0] == "string" else self.numbers(detail[0], None)
+        if kind == Nodetype.NAME:
+            return self.message(detail)
+        element, count = detail
+        if kind == Nodetype.SEQUENCE:
+            count = self.length()
+        if element[0] == Nodetype.BASE and element[1][0] != "string":
+            return self.numbers(element[1][0], count)
+        if count > len(self.data):
+            raise DecodeError(f"a sequence of {count} is longer than the message")
+        return [self.value(element) for _ in range(count)]
+
+    def take(self, size: int, alignment: int) -> int:
+        """Return where the next bytes begin, and go behind them."""
+        begin = self.position + (-(self.position - 4)) % alignment
+        if begin + size > len(self.data):
+            raise DecodeError(f"it ends at byte {len(self.data)}, inside a field")
+        self.position = begin + size
+        return begin
+
+    def length(self) -> int:
+        begin = self.take(4, 4)
+        self.lengths.append(begin)
+        return int.from_bytes(
+            self.data[begin : begin + 4], "little" if self.order == "<" else "big"
+        )
+
+    def text(self) -> Text:
+        begin = self.position + (-(self.position - 4)) % 4
+        size = self.length()
+        at = self.take(size, 1)
+        value = self.data[at : at + max(size - 1, 0)].decode("utf-8", "replace")
+        return Text(value, begin, at + size)
+
+    def numbers(self, name: str, count: int | None) -> Number:
+        if name not in _KINDS:
+            raise DecodeError(f"a field of type {name} cannot be read")
+        kind = np.dtype(_KINDS[name])
+        if count == 0:
+            return Number(self.position, kind.str, 0)
+        begin = self.take(kind.itemsize * (1 if count is None else count), kind.itemsize)
+        return Number(begin, self.order + _KINDS[name], count)
+
+
+def take_apart(data: bytes, name: str, definitions: Definitions) -> Template:
+    """Return where everything in a message stands.
+
+    Parameters
+    ----------
+    data : bytes
+        The serialized message.
+    name : str
+        Its type.
+    definitions : Definitions
+        Of that type and all in it.
+
+    Returns
+    -------
+    Template
+        Positions instead of values.
+
+    Raises
+    ------
+    DecodeError
+        When the bytes are no such message.
+    """
+    return _Parser(data, definitions).parse(name)
+
+
+def names_beside(parent: Mapping[str, Any]) -> dict[str, list[Text]]:
+    """Return the lists of strings of a message, those called a name first.
+
+    Parameters
+    ----------
+    parent : mapping
+        A message of a template.
+
+    Returns
+    -------
+    dict of str to list of Text
+        By field.
+    """
+    lists = {
+        key: value
+        for key, value in parent.items()
+        if isinstance(value, list) and value and all(isinstance(v, Text) for v in value)
+    }
+    return dict(sorted(lists.items(), key=lambda item: "name" not in item[0]))
+
+
+def locate(template: Template, path: Sequence[str | int]) -> tuple[Number | None, list[Text]]:
+    """Find a number in a template.
+
+    Parameters
+    ----------
+    template : Template
+        Of one message.
+    path : sequence of str or int
+        From `parse_path`.
+
+    Returns
+    -------
+    number : Number or None
+        None where the message lacks the name or the index that is asked for.
+    names : list of Text
+        Names on which the place depends.
+
+    Raises
+    ------
+    BagError
+        When no message of the type can have it.
+    """
+    here: Any = template.root
+    parent: Mapping[str, Any] = template.root
+    names: list[Text] = []
+    for step in path:
+        if isinstance(step, str) and not step.startswith("["):
+            if not isinstance(here, dict):
+                raise BagError(f"has no field {step!r} there")
+            if step not in here:
+                raise BagError(f"has no field {step!r}; it has {', '.join(here)}")
+            parent, here = here, here[step]
+            continue
+        index = step if isinstance(step, int) else _index_of(step[1:], parent, here, names)
+        here = None if index is None else _element(here, index)
+        if here is None:
+            return None, names
+    if not isinstance(here, Number):
+        raise BagError("is no number")
+    if here.count is not None:
+        raise BagError("is an array; say which element, such as [0] or [name]")
+    return here, names
+
+
+def _element(here: Any, index: int) -> Any:
+    """Return an array's element, or None where the array is too short."""
+    if isinstance(here, list):
+        return here[index] if index < len(here) else None
+    if not isinstance(here, Number) or here.count is None:
+        raise BagError("is no array where an index is given")
+    if index >= here.count:
+        return None
+    return Number(here.offset + index * np.dtype(here.kind).itemsize, here.kind)
+
+
+def _index_of(name: str, parent: Mapping[str, Any], here: Any, used: list[Text]) -> int | None:
+    """Return the index of a name in the strings beside an array, or inside its elements."""
+    beside = names_beside(parent)
+    for texts in beside.values():
+        if name in (values := [text.value for text in texts]):
+            used.extend(texts)
+            return values.index(name)
+    if isinstance(here, list) and here and isinstance(here[0], dict):
+        for k, element in enumerate(here):
+            texts = [value for value in element.values() if isinstance(value, Text)][:1]
+            used.extend(texts)
+            if texts and texts[0].value == name:
+                return k
+        return None
+    if not beside and not any(isinstance(v, list) for v in parent.values()):
+        raise BagError(f"has no names beside it, so that [{name}] says nothing; use [0]")
+    used.extend(text for texts in beside.values() for text in texts)
+    return None
