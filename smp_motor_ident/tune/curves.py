@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -81,13 +82,14 @@ def curves(estimate: Estimate, design: Design) -> Curves:
     pushed = simulate(
         plant, Controller(design.feedback), np.zeros(time.size), load=np.ones(time.size)
     )
-    omega = frequencies(T, 1 / slow, 250)
+    omega = frequencies(T, 1 / slow, 120)
+    shown = slice(None, None, math.ceil(time.size / 200))
     loop_gain = plant.response(omega) * design.feedback.response(omega, T)
     return Curves(
-        time=time,
-        reference=lagging / ratio,
-        step=_band(step) / ratio,
-        load=_band(pushed.speed) / ratio,
+        time=time[shown],
+        reference=lagging[shown] / ratio,
+        step=_band(step[:, shown]) / ratio,
+        load=_band(pushed.speed[:, shown]) / ratio,
         omega=omega,
         gain=_band(np.abs(loop_gain)),
         phase=_band(np.rad2deg(np.unwrap(np.angle(loop_gain), axis=1))),
