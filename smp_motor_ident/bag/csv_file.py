@@ -32,10 +32,7 @@ class CsvFile:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        try:
-            text = path.read_text("utf-8-sig")
-        except (OSError, UnicodeDecodeError) as error:
-            raise BagError(f"{path}: cannot be read as text ({error})") from None
+        text = _text(path)
         lines = text.splitlines()
         self._first = next((k for k, s in enumerate(lines) if s.strip() and s[0] != "#"), -1)
         if self._first < 0:
@@ -113,6 +110,21 @@ class CsvFile:
             raise BagError(
                 f"{self.path}: line {line}, column {self.names[column]!r}: {text!r} is no number"
             ) from None
+
+
+def _text(path: Path) -> str:
+    """Return a file's text in whatever spreadsheets and scopes write."""
+    try:
+        data = path.read_bytes()
+        if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
+            return data.decode("utf-16")
+        return data.decode("utf-8-sig")
+    except OSError as error:
+        raise BagError(f"{path}: cannot be read ({error.strerror})") from None
+    except UnicodeDecodeError:
+        if b"\0" in data:
+            raise BagError(f"{path}: is no text") from None
+        return data.decode("latin-1")  # a degree sign in an old code page
 
 
 def _is_number(text: str) -> bool:

@@ -253,7 +253,7 @@ def locate(template: Template, path: Sequence[str | int]) -> tuple[Number | None
             if not isinstance(here, dict):
                 raise BagError(f"has no field {step!r} there")
             if step not in here:
-                raise BagError(f"has no field {step!r}; it has {', '.join(here)}")
+                raise BagError(f"does not exist: no {step!r} among {', '.join(here)}")
             parent, here = here, here[step]
             continue
         index = step if isinstance(step, int) else _index_of(step[1:], parent, here, names)

@@ -27,6 +27,14 @@ def table(
     return newline.join(rows) + newline
 
 
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16", "latin-1"])
+def test_text_of_old_and_wide_encodings_is_read(tmp_path: Path, encoding: str) -> None:
+    path = tmp_path / "log.csv"
+    path.write_bytes(table(head="t,u,y [°/s]").encode(encoding))
+    record = read_records(path, ["voltage=u", 'velocity="y [°/s]":deg/s', "time=t"])["motor"]
+    np.testing.assert_allclose(record.velocity, np.deg2rad(Y))
+
+
 @pytest.mark.parametrize(
     "text",
     [

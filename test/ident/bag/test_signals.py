@@ -275,7 +275,7 @@ def test_units_scales_and_shafts_come_out_in_si_at_the_motor(
     ("mapping", "reason"),
     [
         ("voltage=/nope.data velocity=/w.data", "has no /nope; it has /u, /w"),
-        ("voltage=/u.nope velocity=/w.data", "field 'nope' has no field 'nope'; it has data"),
+        ("voltage=/u.nope velocity=/w.data", "field 'nope' does not exist: no 'nope' among data"),
         ("voltage=/u.data[0] velocity=/w.data", "is no array"),
         ("voltage=/u.data", "gives no velocity, position or count"),
         ("velocity=/w.data", "gives no voltage"),
