@@ -197,6 +197,12 @@ def measure(feeder: Feeder, kind: str, rate: float, duration: float) -> Result:
         took = np.concatenate([feeder.took[wheel] for wheel in feeder.wheels])
         count = round(duration * rate) * len(feeder.wheels)
         in_time = float(np.count_nonzero(took < 1.0 / rate))
+        late = np.sort(took[took >= 1.0 / rate])
+        if late.size:
+            print(
+                f"  {late.size} late, median {1e3 * np.median(late):.1f} ms, longest "
+                f"{1e3 * late[-1]:.1f} ms; {count - took.size} not answered"
+            )
         return Result(
             cpu=sum(used) / duration / len(used),
             p50=float(np.percentile(took, 50)),
@@ -240,6 +246,8 @@ def wheels(rate: float, duration: float) -> bool:
     from smp_motor_control import WHEELS
 
     feeder = Feeder(list(WHEELS))
+    gc.freeze()
+    gc.disable()  # of the feeder, which would otherwise count its own pauses
     result = measure(feeder, "wheel_pid", rate, duration)
     print(
         f"four wheels at {rate:g} Hz for {duration:g} s: {100 * result.answered:.3f} % answered "

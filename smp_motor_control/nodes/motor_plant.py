@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 from std_msgs.msg import Float64
 
@@ -26,6 +27,7 @@ from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.settings import Parameters, described, given_parameters, nested
 from smp_motor_control.plant import DrivenMotor, DriveSettings, Supply
 
+_FIXED = ParameterDescriptor(description="As in a motor file.", read_only=True)
 _DRIVE = {
     "pwm_steps": "Steps of the duty cycle from 0 to 1; 0 for a continuous one.",
     "command_timeout": "Time after the last command at which the voltage goes to zero [s].",
@@ -158,7 +160,7 @@ class MotorPlant(Node):
             raise ParameterError("give either motors_file or motors.<wheel>.<key>, not both")
         if motors:
             for key, value in motors.items():
-                self.declare_parameter(f"motors.{key}", value, ignore_override=True)
+                self.declare_parameter(f"motors.{key}", value, _FIXED, ignore_override=True)
             return parse_motors(nest(motors), "parameters")
         path = settings.motors_file or str(runtime.share("config/motors_paper.yaml"))
         return load_motors(Path(path))

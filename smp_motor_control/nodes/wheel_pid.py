@@ -37,6 +37,7 @@ _LARGEST_SETPOINT = 1e4
 _FRESH, _FIRST, _LATE = Verdict.FRESH, Verdict.FIRST, Verdict.LATE
 _AT_REST = 0.05
 _WATCH_PERIOD = 0.02
+_SELDOM = 10
 
 
 class WheelPid(LifecycleNode):
@@ -91,6 +92,7 @@ class WheelPid(LifecycleNode):
             PidState, "pid_state", runtime.STREAM_PUBLISHER
         )
         self._watched = False
+        self._watches = 0
         stream = runtime.STREAM_SUBSCRIBER
         self._topics = [
             self.create_subscription(MotorState, "motor_state", self._on_state, stream),
@@ -349,9 +351,9 @@ class WheelPid(LifecycleNode):
         state.reference = reference
         state.measurement = measurement
         state.error = reference - measurement
-        state.output, state.unsaturated = out.output, out.unsaturated
+        state.output, state.unsaturated = self._output, out.unsaturated
         state.p_term, state.i_term, state.d_term = out.p_term, out.i_term, out.d_term
-        state.feedforward, state.saturated = out.feedforward, out.saturated
+        state.feedforward, state.saturated = out.feedforward, self._output != out.unsaturated
         state.dt = dt
         state.age = self._feedback.age
         self._state_publisher.publish(state)
@@ -359,10 +361,12 @@ class WheelPid(LifecycleNode):
     # Watching ------------------------------------------------------------------------------
 
     def _watch(self) -> None:
-        """Look for lost feedback, and for what need not be looked for at every step."""
-        self._watched = self._state_publisher.get_subscription_count() > 0
-        simulated = self.get_clock().ros_time_is_active
-        self._now = self._simulated_now if simulated else time.time_ns
+        """Look for lost feedback, and now and then for what changes seldom."""
+        self._watches += 1
+        if self._watches % _SELDOM == 0:
+            self._watched = self._state_publisher.get_subscription_count() > 0
+            simulated = self.get_clock().ros_time_is_active
+            self._now = self._simulated_now if simulated else time.time_ns
         if not self._active:
             return
         if time.monotonic() - self._feedback_at > self._settings.feedback_timeout:

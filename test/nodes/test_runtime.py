@@ -1,0 +1,180 @@
+"""What nodes share: the lean executor, settings, and how a process starts and ends."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import pytest
+import rclpy
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from std_msgs.msg import Float64, String
+from std_srvs.srv import Trigger
+
+from smp_motor_control.errors import ParameterError
+from smp_motor_control.nodes.executor import LeanExecutor
+from smp_motor_control.nodes.runtime import STREAM_PUBLISHER, STREAM_SUBSCRIBER, steady_timer
+from smp_motor_control.nodes.settings import Parameters, described
+
+PROGRAM = """
+import sys
+from rclpy.node import Node
+from std_msgs.msg import String
+from smp_motor_control.nodes import runtime
+
+class Busy(Node):
+    def __init__(self):
+        super().__init__("busy")
+        self.last = self.create_publisher(String, "last", 10)
+        runtime.steady_timer(self, 0.05, self.work)
+        print("ready", flush=True)
+    def work(self):
+        {work}
+    def on_stop(self):
+        print("stopped", flush=True)
+        runtime.send_last(self.last, String(data="zero"))
+
+sys.exit(runtime.run("busy", Busy, []))
+"""
+
+
+@pytest.fixture
+def context(ros_domain: int) -> Iterator[rclpy.Context]:
+    context = rclpy.Context()
+    rclpy.init(args=[], context=context, domain_id=ros_domain)
+    yield context
+    rclpy.shutdown(context=context)
+
+
+@pytest.fixture
+def executor(context) -> Iterator[LeanExecutor]:
+    executor = LeanExecutor(context=context)
+    yield executor
+    executor.shutdown()
+
+
+def spin_until(executor: LeanExecutor, node: Node, condition, seconds: float = 10.0) -> None:
+    ticking = steady_timer(node, 0.01, lambda: None)
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "not in time"
+        executor.spin_once()
+    node.destroy_timer(ticking)
+
+
+def test_lean_executor_serves_topics_timers_services_clients_and_coroutines(context, executor):
+    node = rclpy.create_node("all_kinds", context=context)
+    executor.add_node(node)
+    heard: list[float] = []
+    awaited: list[float] = []
+
+    async def coroutine(message: Float64) -> None:
+        awaited.append(message.data)
+
+    node.create_subscription(Float64, "x", lambda m: heard.append(m.data), STREAM_SUBSCRIBER)
+    node.create_subscription(Float64, "x", coroutine, STREAM_SUBSCRIBER)
+    node.create_service(Trigger, "ask", lambda _, r: Trigger.Response(success=True, message="yes"))
+    client = node.create_client(Trigger, "ask")
+    publisher = node.create_publisher(Float64, "x", STREAM_PUBLISHER)
+    sent = iter(range(10_000))
+    timer = steady_timer(node, 0.005, lambda: publisher.publish(Float64(data=float(next(sent)))))
+    spin_until(executor, node, lambda: len(heard) > 20 and len(awaited) > 20)
+    assert heard == sorted(heard)
+    spin_until(executor, node, client.service_is_ready)
+    future = client.call_async(Trigger.Request())
+    spin_until(executor, node, future.done)
+    assert future.result().message == "yes"
+    node.destroy_timer(timer)
+
+
+def test_lean_executor_lives_through_entities_made_and_destroyed_in_callbacks(context, executor):
+    node = rclpy.create_node("coming_and_going", context=context)
+    executor.add_node(node)
+    publisher = node.create_publisher(String, "y", STREAM_PUBLISHER)
+    heard: list[str] = []
+    made: list[object] = []
+
+    def renew() -> None:
+        if made:
+            node.destroy_subscription(made.pop())
+            node.destroy_publisher(made.pop())
+        made.append(node.create_publisher(String, "z", STREAM_PUBLISHER))
+        made.append(
+            node.create_subscription(String, "y", lambda m: heard.append(m.data), STREAM_SUBSCRIBER)
+        )
+
+    renewing = steady_timer(node, 0.05, renew)
+    steady_timer(node, 0.005, lambda: publisher.publish(String(data="here")))
+    spin_until(executor, node, lambda: len(heard) > 50)
+    node.destroy_timer(renewing)
+    before = len(heard)
+    spin_until(executor, node, lambda: len(heard) > before + 10)
+
+
+def test_exception_in_a_callback_comes_out_of_the_spin(context, executor):
+    node = rclpy.create_node("raising", context=context)
+    executor.add_node(node)
+    steady_timer(node, 0.01, lambda: [][0])
+    with pytest.raises(IndexError):
+        spin_until(executor, node, lambda: False, 5.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    low: float = described(1.0, "Lower.", minimum=0.0)
+    high: float = described(2.0, "Upper.")
+    fixed: str = described("a", "Set at the start.", read_only=True)
+    names: tuple[str, ...] = described(("x",), "Names.")
+
+    def __post_init__(self) -> None:
+        if self.low >= self.high:
+            raise ParameterError(f"low is {self.low}; it must be below high, {self.high}")
+
+
+def test_settings_change_as_a_whole_or_not_at_all(context):
+    node = rclpy.create_node("settled", context=context)
+    changes: list[Settings] = []
+    parameters = Parameters(node, Settings, changes.append)
+    first = parameters.settings
+
+    def set_both(**values: object) -> tuple[bool, str]:
+        given = [Parameter(name, value=value) for name, value in values.items()]
+        result = node.set_parameters_atomically(given)
+        return result.successful, result.reason
+
+    for refused, words in (
+        (dict(low=3.0), "below high"),
+        (dict(low=3.0, high=2.5), "below high"),
+        (dict(low=-1.0), "low"),
+        (dict(low="much"), "must be a number"),
+        (dict(low=float("nan")), "nan"),
+        (dict(fixed="b"), "read-only"),
+        (dict(names="x"), "must be a list"),
+    ):
+        accepted, reason = set_both(**refused)
+        assert not accepted and words in reason
+    assert parameters.settings is first and not changes
+    assert set_both(low=3, high=4.0) == (True, "")
+    assert (parameters.settings.low, parameters.settings.high) == (3.0, 4.0)
+    assert changes == [parameters.settings]
+    node.destroy_node()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signal_ends_a_node_cleanly_within_two_seconds(process, eventually, number):
+    node = process(sys.executable, "-c", PROGRAM.format(work="pass"))
+    eventually(lambda: "ready" in node.output, 20.0)
+    node.send_signal(number)
+    assert node.wait(2.0) == 0
+    assert "stopped" in node.output
+
+
+def test_node_that_raises_still_stops_its_motors_and_says_why(process):
+    node = process(sys.executable, "-c", PROGRAM.format(work="raise ValueError('too bad')"))
+    assert node.wait(20.0) == 1
+    assert "stopped" in node.output
+    assert "busy: stopped by ValueError: too bad" in node.output
