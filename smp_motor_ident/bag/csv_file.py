@@ -74,6 +74,8 @@ class CsvFile:
                 )
         use = [self.names.index(name) for name in names]
         body = self._lines[self._first + 1 :]
+        if not any(line.strip() for line in body):
+            raise BagError(f"{self.path}: has no rows below the names of its columns")
         try:
             values = np.loadtxt(
                 io.StringIO("\n".join(body)),

@@ -184,27 +184,29 @@ def _read_bag(
             if signal.field not in fields:
                 fields.append(signal.field)
     descriptions = [c.topic for c in channels if c.type == DESCRIPTION]
-    described = (
-        "gear_ratio",
-        "counts_per_revolution",
-        "encoder_bits",
-        "supply_voltage",
-        "resistance",
-    )
-    wanted.update({topic: list(described) for topic in descriptions})
+    wanted.update({topic: list(mappings.HARDWARE) for topic in descriptions})
     tables = collect(recording, wanted, types, progress)
-    records = []
+    records: list[Record] = []
+    failures: list[BagError] = []
     for wheel in list(plans):
         plan = plans.pop(wheel)
-        notes = list(recording.notes)
+        notes: list[str] = []
         description = _description(wheel, plan, descriptions, tables, notes)
         plan = replace(plan, hardware={**description, **plan.hardware})
-        record = assemble(wheel, plan, _hardware(plan.hardware), tables, recording.name)
-        records.append(replace(record, notes=(*notes, *record.notes)))
+        try:
+            record = assemble(wheel, plan, _hardware(plan.hardware), tables, recording.name)
+            records.append(replace(record, notes=(*notes, *record.notes)))
+        except BagError as error:
+            if not plan.own:
+                raise
+            failures.append(error)
         used = {s.topic for other in plans.values() for s in other.signals.values()}
         for topic in {s.topic for s in plan.signals.values()} - used:
             del tables[topic]  # its memory is needed for the next
-    return records
+    if failures and not records:
+        raise failures[0]
+    shared = (*recording.notes, *(f"not read: {error}" for error in failures))
+    return [replace(record, notes=(*shared, *record.notes)) for record in records]
 
 
 def _plans(recording: Recording, asked: SignalMap, channels: list[Channel]) -> dict[str, MotorMap]:

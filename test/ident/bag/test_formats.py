@@ -386,6 +386,19 @@ def test_types_defined_as_idl_are_understood(tmp_path: Path, corpus: SimpleNames
     assert set(record.voltage) == {4.0}
 
 
+def test_a_wheel_that_never_spoke_does_not_hide_the_others(
+    tmp_path: Path, corpus: SimpleNamespace
+) -> None:
+    silent = corpus.motion(n=20, wheel="rear_left").messages()
+    spoken = corpus.motion(n=20).messages()
+    path = corpus.write_sqlite(tmp_path / "bag.db3", spoken + silent)
+    with sqlite3.connect(path) as database:
+        database.execute("DELETE FROM messages WHERE topic_id = 4")
+    records = read_records(path)
+    assert set(records) == {"front_left"}
+    assert "not read: bag.db3: rear_left" in " ".join(records["front_left"].notes)
+
+
 @pytest.mark.parametrize("text", ["", ":\n - {", "a: 1", "rosbag2_bagfile_information: 7"])
 def test_damaged_metadata_do_not_hide_the_files(
     tmp_path: Path, corpus: SimpleNamespace, text: str
