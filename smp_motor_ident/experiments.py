@@ -13,6 +13,8 @@ from smp_motor_ident.record import Record
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
+REST = 10
+"""Samples after which an unchanged count is a standstill."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +139,9 @@ def output_of(record: Record, kind: str = "auto") -> tuple[Array, int, float]:
     if kind != "speed":
         if record.count is not None and per_turn:
             quantum = 2 * np.pi / per_turn
-            return (record.count - record.count[0]) * quantum, rc.ANGLE, quantum
+            angle = (record.count - record.count[0]) * quantum
+            angle[_repeats(record.count, record.starts)] = np.nan
+            return angle, rc.ANGLE, quantum
         if record.position is not None and np.isfinite(record.position).sum() > 2:
             first = record.position[np.isfinite(record.position)][0]
             return record.position - first, rc.ANGLE, 0.0
@@ -145,6 +149,22 @@ def output_of(record: Record, kind: str = "auto") -> tuple[Array, int, float]:
         raise ValueError("record has no velocity")
     mean = rc.MEAN_SPEED if record.velocity_window > 0 else rc.SPEED
     return record.velocity, mean, speed_quantum(record.velocity)
+
+
+def _repeats(count: Integers, starts: Sequence[int]) -> NDArray[np.bool_]:
+    """Mark what a standing encoder only says again: its error is the same every time.
+
+    Taken for so many independent readings, a standstill would fix the angle far better than
+    to the fraction of a count that is unknown.  Of a long run the sample in the middle stays,
+    which is late in neither direction, and of one that begins a segment the first.
+    """
+    turned = np.flatnonzero(np.diff(count)) + 1
+    begin = np.unique(np.concatenate(([0], turned, np.asarray(starts, dtype=np.int64))))
+    length = np.diff(np.append(begin, count.size))
+    repeats = np.repeat(length >= REST, length)
+    stays = begin + np.where(np.isin(begin, starts), 0, length // 2)
+    repeats[stays] = False
+    return repeats
 
 
 def speed_quantum(velocity: Array) -> float:
@@ -260,7 +280,8 @@ def _sections(record: Record, hold: str) -> tuple[Array, Array, Integers]:
     first, second = v.copy(), v.copy()
     share: Array = np.full(len(v), 0.5 if hold == "middle" else 0.0)
     if k.size >= 4:
-        share = np.interp(index, k, before)
+        # Two clocks drift past each other: the part runs through 1 to 0, not back.
+        share = np.interp(index, k, np.unwrap(before, period=1.0)) % 1.0
     if k.size >= 4 or hold == "middle":
         step = _trend(v)
         step[[0, *record.starts]] = 0.0
@@ -278,6 +299,22 @@ def _sections(record: Record, hold: str) -> tuple[Array, Array, Integers]:
     shift = np.zeros(len(v), dtype=np.int64)
     shift[split] = 1
     return end, value, index + np.cumsum(shift)
+
+
+def between_samples(record: Record) -> bool:
+    """Tell whether the command switched between samples, on a clock of its own.
+
+    Parameters
+    ----------
+    record : Record
+        One motor's signals.
+
+    Returns
+    -------
+    bool
+        True where at least four two-level switches show it.
+    """
+    return bool(_jumps(record)[0].size >= 4)
 
 
 def _jumps(record: Record) -> tuple[Integers, Array]:
