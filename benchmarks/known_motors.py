@@ -34,7 +34,9 @@ def voltage(t: np.ndarray, kind: str, amplitude: float, rng: np.random.Generator
     if kind == "square":
         return amplitude * np.sign(np.sin(0.917 * phase + rng.uniform(0, 6)))
     f = np.geomspace(0.1, 20, 24) * (1 + 0.01 * rng.standard_normal(24))
-    x = np.cos(2 * np.pi * np.outer(s, f) + rng.uniform(0, 2 * np.pi, 24)).sum(axis=1)
+    x = np.zeros(t.size)  # tone by tone: ten million samples must fit
+    for tone, phase0 in zip(f, rng.uniform(0, 2 * np.pi, 24)):
+        x += np.cos(2 * np.pi * tone * s + phase0)
     return amplitude * x / np.abs(x).max()
 
 

@@ -66,7 +66,10 @@ def doubts(
             "looks like a delay is that filter, not the motor"
         )
     if fit.ratio > 0 and data.kind == rc.ANGLE:
-        out.append("the load torque fluctuates; the estimate allows for it (innovations form)")
+        out.append(
+            "the motion scatters beyond the counter's resolution (a load that fluctuates, or a "
+            "command that switches between samples); the estimate allows for it"
+        )
     return out
 
 

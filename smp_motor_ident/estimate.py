@@ -13,11 +13,11 @@ from smp_motor_ident.advice import advise, doubts
 from smp_motor_ident.answer import Answer, answer
 from smp_motor_ident.cold import Options, cold_fit, grow, refine
 from smp_motor_ident.errors import InsufficientExcitationError, ParameterError, SignalError
-from smp_motor_ident.experiments import Experiments, prepare
+from smp_motor_ident.experiments import Experiments, between_samples, prepare
 from smp_motor_ident.fit import Fit, Prior
 from smp_motor_ident.ladder import Rung
 from smp_motor_ident.models import MODELS, PHYSICAL, Structure
-from smp_motor_ident.quantisation import widened
+from smp_motor_ident.quantisation import blurred, widened
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import Candidate, Estimate, FitPercent
 from smp_motor_ident.screening import screen
@@ -28,6 +28,7 @@ LOSSES = {"linear": np.inf, "huber": 2.0}
 FIXABLE = (*PHYSICAL, "delay", "averaging_window")
 WORST_FIT = 30.0
 LARGEST_OFFSET = 0.1
+INSTANT = 0.01
 MANY = 400_000
 
 
@@ -104,7 +105,7 @@ def estimate(
         )
     chosen = _constrain(_for_final(data, rungs[-1].fit), rungs[-1].fit, options, known, bounds)
     final = _for_final(data, chosen)
-    chosen = widened(final, chosen)
+    chosen = blurred(final, widened(final, chosen), _instants(group, hold))
     result = answer(chosen, known)
     fitted = validate.speed_fit(group, final, chosen)
     _refuse(group, chosen, result, fitted)
@@ -217,6 +218,18 @@ def _hold(
         if fitted.deviance < best.deviance - 30:
             hold, best = other, fitted
     return hold, best
+
+
+def _instants(group: Sequence[Record], hold: str) -> float:
+    """Return how well the input's instants are known [s].
+
+    A command on a clock of its own, or jittered stamps, leave a hundredth of an interval open.
+    """
+    steps = np.concatenate([np.diff(r.time[:MANY]) for r in group])
+    step = float(np.median(steps))
+    jitter = float(np.median(np.abs(steps - step)))
+    loose = hold != "held" or jitter > 1e-3 * step or any(between_samples(r) for r in group)
+    return INSTANT * step if loose else 0.0
 
 
 def _for_final(data: Experiments, fit: Fit) -> Experiments:

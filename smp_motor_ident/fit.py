@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 
 PLAUSIBLE = np.array([1e-2, 1e-2, 1e-2, 0.25, 1e-4, 1e-4, 1e-4, 1e-2, 1e-4, 1e-2, 1e-2])
 """Inverse squares of how far each coordinate z could be from any value at all."""
+FREE = 0.1  # damping (relative to the diagonal) below which a step counts as undamped
 BLOCKS = 60  # runs of samples whose scores are summed, for the covariance of coloured residuals
 
 
@@ -79,6 +80,8 @@ class Fit:
         Of the data.
     widen : ndarray, shape (f,), optional
         Factors on the standard deviations, see `quantisation.widened`.
+    blur : ndarray, shape (f, f), optional
+        Covariance from instants that are not known exactly, see `quantisation.blurred`.
     """
 
     structure: Structure
@@ -96,6 +99,7 @@ class Fit:
     samples: int
     kind: int
     widen: Array | None = None
+    blur: Array | None = None
 
     def covariance(self) -> Array:
         """Return the covariance of the free coordinates, shape (f, f).
@@ -118,6 +122,8 @@ class Fit:
             cov = cov * np.outer(widen, widen)
         if self.widen is not None:
             cov = cov * np.outer(self.widen, self.widen)
+        if self.blur is not None:
+            cov = cov + self.blur
         return cov
 
 
@@ -393,12 +399,14 @@ def solve(  # noqa: C901 - the loop of a fit, its branches are its ends
                 _linearise(priors, trial, matrix),
             )
             passes += 1
+            # A step may be small because it is damped: only a nearly free one tells the end.
             small = step.size > 0 and _relative_step(here, step, frozen) < tolerance
+            small = small and damping < FREE
             if new.objective <= here.objective * (1 + 1e-12):
                 gained = here.objective - new.objective
                 z, initial, here = trial, moved, new
                 damping = max(damping * 0.1, 1e-9)
-                if small or gained < 1e-9 * here.objective:
+                if small or (gained < 1e-9 * here.objective and damping < FREE):
                     converged = True
                     break
                 if outer == 0 and gained < 1e-3 * here.objective and not small:
@@ -408,7 +416,9 @@ def solve(  # noqa: C901 - the loop of a fit, its branches are its ends
                     converged = True
                     break
                 damping = max(damping, 1e-6) * 8
-                if damping > 1e8:
+                if damping > 1e6:  # a kink: no step leads down, small or large
+                    free_step, frozen = _step(here, 1e-9, matrix, z, lower, upper)
+                    converged = _relative_step(here, free_step, frozen) < 0.5
                     break
         fresh = _noise(here.spread, noise, has_current)
         same = np.abs(np.log(np.diag(fresh) / np.diag(noise))).max() < 2e-2

@@ -347,6 +347,8 @@ def _variations(data: Experiments, best: Fit, options: Options, rungs: list[Rung
             z[models.DELAY] = 0.3 * data.step
         other = cold.refine(data, richer, best, z, options)
         verdict, reason = needed(best, other)
+        if verdict and "delay" in change and other.z[models.DELAY] < 0.03 * data.step:
+            verdict, reason = False, "a delay of hundredths of a sample is how the input was held"
         if verdict and other.ratio > 0:  # what looked like torque noise may have been this
             other = cold.grow(data, richer, other, options)
         rungs.append(Rung(other, reason))
