@@ -1,13 +1,9 @@
-"""skid_steer: velocity commands of the body to set-points of four wheels, and odometry back.
-
-Parameters are named as those of diff_drive_controller where they mean the same.
-"""
+"""skid_steer: velocity commands of the body to set-points of four wheels, and odometry back."""
 
 from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass, fields
 from functools import partial
 
 from geometry_msgs.msg import Twist, TwistStamped
@@ -15,19 +11,16 @@ from rclpy.node import Node
 from sensor_msgs.msg import Imu, JointState
 
 from smp_interfaces.msg import MotorState
-from smp_motor_control.errors import ParameterError
 from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.odometry_output import OdometryOutput
-from smp_motor_control.nodes.settings import Parameters, described, nested
+from smp_motor_control.nodes.settings import Parameters
+from smp_motor_control.nodes.skid_steer_settings import Settings
 from smp_motor_control.odometry import LEAST_STEP
 from smp_motor_control.skid_steer import (
     LEFT,
     RIGHT,
     BodyCommand,
-    HeadingHold,
     Odometry,
-    SkidSteer,
-    SpeedLimiter,
     Verdict,
 )
 from smp_motor_control.wheel_feedback import WheelFeedback, WheelSample
@@ -36,120 +29,6 @@ IMPLAUSIBLE = 4.0
 """Wheels that seem to turn this many times faster than they can have had their counter reset."""
 FASTEST = 250.0
 """What is plausible without a limit [rad/s]."""
-
-_LIMITS = {
-    "min_velocity": "Lowest velocity; NaN takes the negative of max_velocity.",
-    "max_velocity": "Highest velocity [m/s] or [rad/s]; NaN for no limit.",
-    "max_acceleration_reverse": "Speeding up in reverse, not positive; NaN as forward.",
-    "max_acceleration": "Speeding up forward [m/s^2] or [rad/s^2]; NaN for no limit.",
-    "max_deceleration": "Slowing down from forward, not positive; NaN as speeding up.",
-    "max_deceleration_reverse": "Slowing down from reverse, not negative; NaN as speeding up.",
-    "min_jerk": "Lowest jerk; NaN takes the negative of max_jerk.",
-    "max_jerk": "Highest jerk [m/s^3] or [rad/s^3]; NaN for no limit.",
-}
-
-
-@dataclass(frozen=True, kw_only=True)
-class AxisLimits:
-    """Limits of one component of the body's velocity; NaN for none."""
-
-    min_velocity: float = math.nan
-    max_velocity: float = math.nan
-    max_acceleration_reverse: float = math.nan
-    max_acceleration: float = math.nan
-    max_deceleration: float = math.nan
-    max_deceleration_reverse: float = math.nan
-    min_jerk: float = math.nan
-    max_jerk: float = math.nan
-
-    def limiter(self) -> SpeedLimiter:
-        """Return the limiter with these limits."""
-        return SpeedLimiter(**{item.name: getattr(self, item.name) for item in fields(self)})
-
-
-@dataclass(frozen=True, kw_only=True)
-class Settings:
-    """Parameters of the node, validated together."""
-
-    wheel_separation: float = described(0.4, "Between left and right wheels [m].")
-    wheel_radius: float = described(0.1, "Radius of the wheels [m].")
-    wheel_separation_multiplier: float = described(
-        1.0, "Above 1 for a body that turns less than its wheels would roll it."
-    )
-    left_wheel_radius_multiplier: float = described(1.0, "Correction of the left radius.")
-    right_wheel_radius_multiplier: float = described(1.0, "Correction of the right radius.")
-    max_wheel_velocity: float = described(
-        2.9, "What every wheel reaches [rad/s]; commands beyond are scaled. 0: no limit.", minimum=0
-    )
-    publish_rate: float = described(
-        50.0,
-        "Set-points and odometry per second [Hz].",
-        minimum=1.0,
-        maximum=1000.0,
-        read_only=True,
-    )
-    cmd_vel_timeout: float = described(
-        0.5, "Age of a command at which the body brakes [s]; 0: never.", minimum=0.0
-    )
-    use_stamped_vel: bool = described(
-        True, "Commands are TwistStamped (true) or Twist (false).", read_only=True
-    )
-    feedback_timeout: float = described(
-        0.5, "Silence of a wheel that is reported [s].", minimum=0.01
-    )
-    open_loop: bool = described(False, "Odometry from commands instead of wheels.")
-    velocity_rolling_window_size: int = described(
-        10, "Steps that the reported velocity is averaged over.", minimum=1, read_only=True
-    )
-    odom_frame_id: str = described("odom", "Frame of the odometry.", read_only=True)
-    base_frame_id: str = described("base_link", "Frame of the body.", read_only=True)
-    tf_frame_prefix_enable: bool = described(
-        True, "Prefix the frames with tf_frame_prefix, or else the namespace.", read_only=True
-    )
-    tf_frame_prefix: str = described("", "Prefix of the frames.", read_only=True)
-    enable_odom_tf: bool = described(True, "Publish odom to base on /tf.", read_only=True)
-    travel_noise: float = described(
-        1e-4, "Variance that one metre of a side's travel adds [m^2/m].", minimum=0.0
-    )
-    turn_noise: float = described(
-        1e-2, "Variance of the heading that one radian of turning adds [rad^2/rad].", minimum=0.0
-    )
-    heading_hold: bool = described(False, "Correct the heading by the yaw of the topic imu.")
-    heading_p: float = described(2.0, "Proportional gain of the heading [1/s].", minimum=0.0)
-    heading_i: float = described(0.5, "Integral gain of the heading [1/s^2].", minimum=0.0)
-    heading_max_correction: float = described(0.5, "Largest yaw rate that is added [rad/s].")
-    heading_max_error: float = described(
-        0.7, "Beyond this the present heading is taken for the wanted one [rad]."
-    )
-    imu_timeout: float = described(0.2, "Age at which a yaw is not used [s].", minimum=0.01)
-    linear: AxisLimits = nested(AxisLimits(), _LIMITS, prefix="linear.x.")  # noqa: RUF009
-    angular: AxisLimits = nested(AxisLimits(), _LIMITS, prefix="angular.z.")  # noqa: RUF009
-
-    def __post_init__(self) -> None:
-        self.robot()
-        self.hold()
-        for name, axis in (("linear.x", self.linear), ("angular.z", self.angular)):
-            try:
-                axis.limiter()
-            except ParameterError as error:
-                raise ParameterError(f"{name}: {error}") from None
-
-    def robot(self) -> SkidSteer:
-        """Return the geometry."""
-        return SkidSteer(
-            wheel_separation=self.wheel_separation,
-            wheel_radius=self.wheel_radius,
-            wheel_separation_multiplier=self.wheel_separation_multiplier,
-            left_wheel_radius_multiplier=self.left_wheel_radius_multiplier,
-            right_wheel_radius_multiplier=self.right_wheel_radius_multiplier,
-            max_wheel_speed=self.max_wheel_velocity or math.inf,
-        )
-
-    def hold(self) -> HeadingHold:
-        """Return a heading controller."""
-        return HeadingHold(
-            self.heading_p, self.heading_i, self.heading_max_correction, self.heading_max_error
-        )
 
 
 class SkidSteerNode(Node):

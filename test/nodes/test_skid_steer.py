@@ -265,8 +265,8 @@ def test_odometry_follows_the_wheels_from_any_first_position(start, peer, eventu
     # travel_noise of 1e-4 m^2/m on two sides, 0.1 m: (1e-4 * 0.2) / 4.
     assert last.pose.covariance[0] == pytest.approx(5e-6, rel=0.02)
     assert all(math.isfinite(x) for x in (*last.pose.covariance, *last.twist.covariance))
+    eventually(lambda: peer.joints[-1].position[0] == 1001.0, deadline=2.0, step=peer.spin)
     assert peer.joints[-1].name == JOINTS
-    assert peer.joints[-1].position[0] == pytest.approx(1001.0)
 
 
 def test_lost_or_nan_feedback_is_named_and_never_reaches_the_odometry(
