@@ -10,6 +10,7 @@ request ``do``        with                                           answer
 ``wait_for_nodes``    ``nodes`` (full names), ``timeout`` [s]        nothing
 ``wait_for_listener`` ``node`` (name), ``topics``, ``timeout``       nothing
 ``change_state``      ``node``, ``transition`` (``activate``, ...)   nothing
+``get_state``         ``node``, ``timeout`` [s]                      ``state``, empty if none
 ``set_parameters``    ``node``, ``parameters``                       nothing; all or none set
 ``get_parameters``    ``node``, ``names``                            ``parameters``
 ``drive``             ``segments`` of ``[name, m/s, rad/s, s]``      ``segments`` of ``[name,
@@ -33,7 +34,7 @@ from typing import Any
 import rclpy
 from geometry_msgs.msg import TwistStamped
 from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState
+from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.msg import ParameterType
 from rcl_interfaces.srv import GetParameters, SetParametersAtomically
 from rclpy.executors import SingleThreadedExecutor
@@ -142,6 +143,14 @@ class Conductor(Node):
         request = ChangeState.Request(transition=Transition(id=_TRANSITIONS[transition]))
         if not self._call(ChangeState, f"{node}/change_state", request).success:
             raise RequestError(f"{node} refused to {transition}")
+
+    def do_get_state(self, node: str, timeout: float) -> dict[str, Any]:
+        """Return a lifecycle node's state; empty where there is no such node."""
+        client = self._client(GetState, f"{node}/get_state")
+        if not self._until(client.service_is_ready, timeout):
+            return {"state": ""}
+        answer = self._call(GetState, f"{node}/get_state", GetState.Request())
+        return {"state": answer.current_state.label}
 
     def do_set_parameters(self, node: str, parameters: dict[str, Any]) -> None:
         """Set all parameters at once, or none."""

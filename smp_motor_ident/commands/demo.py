@@ -13,7 +13,7 @@ from smp_motor_control import WHEELS
 from smp_motor_control.motor_file import load_motors
 from smp_motor_ident.commands import steps
 from smp_motor_ident.commands.conductor import Conductor
-from smp_motor_ident.commands.driving import read_answers
+from smp_motor_ident.commands.driving import longest_gap, read_answers
 from smp_motor_ident.commands.frame import Parser, run
 from smp_motor_ident.commands.processes import Processes, free_domain, stop_when_orphaned
 from smp_motor_ident.commands.verdict import check, show
@@ -36,6 +36,11 @@ DRIVE = (
     ("stop", 0.0, 0.0, 2.0),
 )
 """Manoeuvres: name, m/s, rad/s, s."""
+
+STALL = 0.03
+"""A simulated robot that was not computed for so long [s] is no robot: the drive is repeated."""
+
+ATTEMPTS = 3
 
 
 def parser() -> argparse.ArgumentParser:
@@ -102,9 +107,9 @@ def work(arguments: argparse.Namespace) -> int:
         robot = start(processes, folder, motors, arguments.rate)
         say(f"running: motor_plant, {len(WHEELS)} wheel_pid, skid_steer (ROS domain {domain})")
         estimates, gains = learn(robot, say)
-        segments = drive(robot, gains, say)
+        bag, segments = drive(robot, gains, say)
     hardware = {wheel: estimates[wheel].hardware for wheel in WHEELS}
-    answers = read_answers(folder / "drive", segments, hardware)
+    answers = read_answers(bag, segments, hardware)
     show(truth, estimates, gains, answers)
     checks = check(truth, estimates, answers)
     for one in checks:
@@ -189,7 +194,7 @@ def learn(robot: steps.Robot, say: Any) -> tuple[dict[str, Estimate], dict[str, 
 
 def drive(
     robot: steps.Robot, gains: Mapping[str, Mapping[str, Any]], say: Any
-) -> list[tuple[str, float, float]]:
+) -> tuple[Path, list[tuple[str, float, float]]]:
     """Set the gains, switch the controllers on, and drive through :data:`DRIVE`.
 
     Parameters
@@ -203,17 +208,24 @@ def drive(
 
     Returns
     -------
-    list of tuple of str, float, float
+    bag : Path
+        The recording.
+    segments : list of tuple of str, float, float
         Name, begin and end of each segment [s].
     """
     steps.set_gains(robot, gains)
     robot.switch("activate")
     say("gains set in the running controllers; driving")
-    steps.record(robot, "drive")
-    answer = robot.conductor.ask("drive", segments=DRIVE, patience=60.0)
-    robot.processes.stop("record")
+    for attempt in range(1, ATTEMPTS + 1):
+        bag = steps.record(robot, "drive" if attempt == 1 else f"drive_{attempt}")
+        answer = robot.conductor.ask("drive", segments=DRIVE, patience=60.0)
+        robot.processes.stop("record")
+        stall = longest_gap(bag, robot.wheels)
+        if stall <= STALL:
+            break
+        say(f"this machine stood still for {1e3 * stall:.0f} ms meanwhile; driving again")
     robot.switch("deactivate")
-    return [(name, begin, end) for name, begin, end in answer["segments"]]
+    return bag, [(name, begin, end) for name, begin, end in answer["segments"]]
 
 
 if __name__ == "__main__":

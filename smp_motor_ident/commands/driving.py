@@ -80,6 +80,25 @@ def read_answers(
     return answers
 
 
+def longest_gap(bag: Path, wheels: Sequence[str]) -> float:
+    """Return the longest interval without a state of some wheel.
+
+    Parameters
+    ----------
+    bag : Path
+        With ``motor_state`` of every wheel.
+    wheels : sequence of str
+        The wheels.
+
+    Returns
+    -------
+    float
+        [s].
+    """
+    read = read_columns(bag, {f"/{wheel}/motor_state": ["encoder_count"] for wheel in wheels})
+    return max(float(np.max(np.diff(columns.time))) for columns in read.values())
+
+
 def wheel_speed(state: Columns, hardware: Hardware) -> tuple[Array, Array]:
     """Return the wheel's speed as its encoder saw it.
 

@@ -324,3 +324,7 @@ def _tell(results: Results, paths: Sequence[Path], arguments: argparse.Namespace
     for error in results.failures.values():
         print(f"{NAME}: {error}", file=sys.stderr)
     return max((error.exit_code for error in results.failures.values()), default=0)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
