@@ -63,7 +63,7 @@ def test_plant_turns_on_commands_stops_without_and_describes_itself(process, rob
     command(6.0, 0.5)
     before = time.monotonic()
     eventually(lambda: front[-1].voltage == 0.0, 2.0, robot.spin, "no time-out")
-    assert time.monotonic() - before < 0.5  # 0.2 s of time-out, and a busy machine
+    assert time.monotonic() - before < 1.0  # 0.2 s of time-out, and a busy machine
 
     accepted, reason = robot.set("motor_plant", command_timeout=-1.0)
     assert not accepted and "command_timeout" in reason
