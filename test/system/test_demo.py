@@ -1,0 +1,100 @@
+"""The demo as its user runs it: once to the end, and ended half-way in three ways."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import time
+import uuid
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from smp_motor_control import WHEELS
+from smp_motor_control.motor_file import load_motors
+from smp_motor_ident.bag import read_records
+from smp_motor_ident.commands.steps import read_parameters
+
+LIMIT = 150.0
+"""What the demo may take [s] on two cores that are its own."""
+
+
+def alive(mark: str) -> list[int]:
+    """Processes of the demo that carries the mark in its environment."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if not entry.name.isdigit():
+            continue
+        try:
+            environment = (entry / "environ").read_bytes()
+            state = (entry / "stat").read_text().rpartition(")")[2].split()[0]
+        except OSError:
+            continue
+        if mark.encode() in environment and state != "Z":
+            found.append(int(entry.name))
+    return found
+
+
+@pytest.fixture
+def mark() -> Iterator[str]:
+    name = f"smp-demo-{uuid.uuid4()}"
+    yield name
+    for pid in alive(name):  # only where a test has failed
+        os.kill(pid, signal.SIGKILL)
+
+
+@pytest.mark.slow
+def test_the_demo_shows_everything_and_leaves_nothing_running(
+    process: Callable[..., Any], mark: str, tmp_path: Path
+) -> None:
+    idle = os.getloadavg()[0] < 1.0
+    begun = time.monotonic()
+    demo = process("demo", "--output", "result", env={"SMP_MARK": mark})
+    code = demo.wait(4 * LIMIT)
+    took = time.monotonic() - begun
+    assert code == 0, demo.output
+    assert alive(mark) == []
+    assert took < LIMIT or not idle
+    result = tmp_path / "result"
+    assert (result / "identification" / "report.html").stat().st_size > 100_000
+    assert set(load_motors(result / "identification" / "motors.yaml")) == set(WHEELS)
+    assert set(read_records([str(result / "excitation")])) == set(WHEELS)
+    gains = read_parameters(result / "gains.yaml")
+    assert set(gains) == {f"/{wheel}/wheel_pid" for wheel in WHEELS}
+    motors = json.loads((result / "identification" / "identification.json").read_text())["motors"]
+    assert all(motors[wheel]["identifiable"] for wheel in WHEELS)
+    for wheel in WHEELS:
+        assert wheel.replace("_", " ").capitalize() in demo.output
+    assert re.search(r"^report: .*report\.html$", demo.output, re.MULTILINE)
+    assert "FAIL" not in demo.output
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_an_interrupted_demo_leaves_nothing_running(
+    process: Callable[..., Any], eventually: Callable[..., None], mark: str, number: signal.Signals
+) -> None:
+    demo = process("demo", "--output", "result", env={"SMP_MARK": mark})
+    eventually(lambda: "exciting" in demo.output, 90.0, message=demo.output)
+    assert len(alive(mark)) > 2 + len(WHEELS)
+    demo.send_signal(number)
+    code = demo.wait(20.0)
+    # A killed demo cannot end its processes: the kernel asks them to, and they need a moment.
+    eventually(lambda: alive(mark) == [], 10.0)
+    if number != signal.SIGKILL:
+        assert code == 130
+        assert "Traceback" not in demo.output
+
+
+def test_an_earlier_folder_of_another_kind_is_left_alone(
+    process: Callable[..., Any], tmp_path: Path
+) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.tex").write_text("years of work")
+    demo = process("demo", "--output", "mine")
+    assert demo.wait(30.0) == 2
+    assert "mine" in demo.output
+    assert (tmp_path / "mine" / "thesis.tex").read_text() == "years of work"
