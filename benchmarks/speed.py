@@ -127,8 +127,16 @@ def growth() -> None:
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         spent, x = best_of(ours, record, 1)
         after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        rows.append((n, f"{spent:.2f} s", f"{1e9 * spent / n:.0f} ns", f"{size:.0f} MiB",
-                     f"{max(0.0, after - before):.0f} MiB", f"{np.abs(x - z[:3]).max():.1e}"))  # noqa: E501
+        rows.append(
+            (
+                n,
+                f"{spent:.2f} s",
+                f"{1e9 * spent / n:.0f} ns",
+                f"{size:.0f} MiB",
+                f"{max(0.0, after - before):.0f} MiB",
+                f"{np.abs(x - z[:3]).max():.1e}",
+            )
+        )
         print(rows[-1], flush=True)
     head = ("samples", "cold fit", "per sample", "record", "more at its peak", "error of ln a")
     print("\n" + table(head, rows))
