@@ -25,10 +25,12 @@ def test_excite_is_bounded_ends_by_itself_and_ends_at_zero(process, robot, event
     )  # fmt: skip
     eventually(lambda: excite.returncode is not None, 20.0, robot.spin, excite.output)
     assert excite.wait(1.0) == 0
-    robot.spin_for(0.1)
+    for wheel in ("front_left", "rear_right"):
+        last = robot.commands[wheel]
+        eventually(lambda c=last: c[-1].voltage == 0.0, 3.0, robot.spin, "no zero command")
     one, two = ([m.voltage for m in robot.commands[w]] for w in ("front_left", "rear_right"))
-    assert len(one) > 75 and max(map(abs, one)) <= 5.0 and max(map(abs, one)) > 2.0
-    assert one[-1] == two[-1] == 0.0
+    # 150 are sent; a busy machine skips some.
+    assert len(one) > 60 and max(map(abs, one)) <= 5.0 and max(map(abs, one)) > 2.0
     assert one[20:60] != two[20:60]
     assert not robot.commands["front_right"]
 
@@ -39,7 +41,7 @@ def test_excite_is_bounded_ends_by_itself_and_ends_at_zero(process, robot, event
         excite.send_signal(number)
         assert excite.wait(2.0) == 0
         last = robot.commands["front_left"]
-        eventually(lambda c=last: c[-1].voltage == 0.0, 2.0, robot.spin, "no zero command")
+        eventually(lambda c=last: c[-1].voltage == 0.0, 3.0, robot.spin, "no zero command")
 
 
 @pytest.mark.parametrize(
