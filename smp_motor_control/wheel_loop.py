@@ -23,6 +23,9 @@ SPEED_SOURCES = ("measured", "difference", "observer")
 _LEARNING = 20
 """Samples from which the observer learns the usual interval."""
 
+_HALF_WAY = math.log(2.0)
+"""Time constants after which a first-order lag has gone half of its way."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class LoopSettings:
@@ -312,9 +315,26 @@ class WheelLoop:
             share = gains.feedforward_velocity / gains.feedforward_acceleration
             forward += share * (ahead.velocity - delayed)
             if model is not None:
-                forward += ahead.jerk * model.time_constant_product / model.time_constant
+                electrical = model.time_constant_product / model.time_constant
+                forward += ahead.jerk * electrical
+                if self._friction_turns(ahead, delayed, electrical):
+                    turn = math.copysign(2 * gains.feedforward_static, self.profile.target)
+                    forward += turn / gains.feedforward_acceleration
         self.reference = ahead._replace(velocity=delayed)
         return self.pid.step(delayed, measurement, dt, forward)
+
+    def _friction_turns(self, ahead: Reference, delayed: float, electrical: float) -> bool:
+        """Return whether, on the way through zero, the friction's voltage has to turn by now.
+
+        The wheel passes zero when the reference ahead does, later than the delayed one.  The
+        current follows a turn of the voltage with the electrical time constant: half of it is
+        there after ln 2 of that, so the voltage turns so much earlier.
+        """
+        target = self.profile.target
+        if delayed * target >= 0.0:
+            return False
+        soon = ahead.velocity + _HALF_WAY * electrical * ahead.acceleration
+        return soon * target > 0.0
 
     def _reference_ago(self, delay: float, velocity: float, dt: float) -> float:
         """Return the reference's velocity ``delay`` before now, between samples linearly."""

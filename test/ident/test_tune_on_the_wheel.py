@@ -85,3 +85,20 @@ def test_four_wheels_arrive_together_without_overshoot(estimates, rate):
         times.append(run.time[outside[-1] + 1])
     # One control period, 5 ms at 1 kHz: what the wheels together are held to.
     assert max(times) - min(times) <= max(T, 0.005) + 1e-9
+
+
+def test_a_reversal_turns_the_friction_voltage_in_time(estimates):
+    T = 0.005
+    designs = design_wheels(estimates, {wheel: Loop(sample_time=T) for wheel in estimates}).designs
+    entries = load_motors(MOTORS)
+    for wheel, one in designs.items():
+        run = simulate_closed_loop(
+            entries[wheel],
+            settings_of(one),
+            lambda time: 1.0 if time < 1.0 else -2.0,
+            2.0,
+            timing=Timing(sample_time=T, delay=one.loop.expected_delay),
+            drive=DriveSettings(command_timeout=np.inf, pwm_steps=1000),
+        )
+        # 0.9 % of the change for the slowest winding; turned with the delayed reference, 2.2 %.
+        assert run.velocity.min() > -2.0 - 0.013 * 3.0
