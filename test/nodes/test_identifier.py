@@ -1,0 +1,63 @@
+"""identifier as its own process, on a plant that others excite."""
+
+from __future__ import annotations
+
+import math
+import signal
+from collections.abc import Iterator
+
+import pytest
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from wheel_robot import WheelRobot
+
+from smp_interfaces.msg import MotorParameters
+
+TRUE_GAIN = 25.548
+"""Of motor 1, K / (R b + K^2) of Table 1 [rad/s/V]."""
+
+
+@pytest.fixture
+def robot(ros_domain: int) -> Iterator[WheelRobot]:
+    robot = WheelRobot(ros_domain)
+    yield robot
+    robot.close()
+
+
+def test_it_demands_motion_before_it_names_a_number_and_then_names_the_right_one(
+    process, robot, eventually
+):
+    told: list[MotorParameters] = []
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    robot.node.create_subscription(
+        MotorParameters, "/front_left/motor_parameters", told.append, latched
+    )
+    process("motor_plant")
+    settings = ["-p", "period:=1.0", "-p", "window:=12.0", "-p", "wheels:=[front_left]"]
+    identifier = process("identifier", "--ros-args", *settings)
+    eventually(lambda: told, 30.0, robot.spin, "nothing heard")
+    # At rest: the status says what is missing, and there is no number.
+    eventually(lambda: "turned for 0.0" in told[-1].status, 10.0, robot.spin, "no reason")
+    assert all(not m.names and m.status.startswith("collecting") for m in told)
+    assert math.isnan(told[-1].fit_percent)
+
+    excite = ["-p", "wheels:=[front_left]", "-p", "duration:=15.0", "-p", "amplitude:=9.0"]
+    process("excite", "--ros-args", *excite)
+    eventually(lambda: told[-1].names, 60.0, robot.spin, "no estimate")
+    found = told[-1]
+    assert found.status.split(":")[0] in ("valid", "doubtful")
+    assert found.joint_name == "front_left_wheel_joint"
+    k = found.names.index("dc_gain")
+    error = abs(found.values[k] - TRUE_GAIN)
+    # Five standard deviations, or 0.5 % on a machine that is too busy to keep the plant's time.
+    assert error < max(5 * found.std_devs[k], 0.005 * TRUE_GAIN)
+    assert found.fit_percent > 80.0
+
+    identifier.send_signal(signal.SIGINT)
+    assert identifier.wait(5.0) == 0
+
+
+def test_a_window_that_cannot_meet_its_demands_is_refused_in_one_line(process):
+    node = process("identifier", "--ros-args", "-p", "window:=3.0")
+    assert node.wait(30.0) == 2
+    (line,) = node.output.strip().splitlines()
+    assert "demands.duration" in line
