@@ -6,6 +6,7 @@ The wheels' controllers should be inactive meanwhile: two senders of commands di
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -19,6 +20,9 @@ from smp_motor_control.errors import ParameterError
 from smp_motor_control.excitation import SIGNALS, Bounded, Excitation
 from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.settings import Parameters, described
+
+_OTHERS = 0.5
+"""Time [s] that other listeners than the driver are given to connect."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,6 +125,7 @@ class Excite(Node):
             signal(0.0)  # Prepared now, not in the first period.
             self._outputs.append((publisher, signal, message))
         self._begin: float | None = None
+        self._all_heard = math.inf
         self._created = time.monotonic()
         self._diagnostics = runtime.Diagnostics(self, self._assess)
         self._timer = runtime.steady_timer(self, 1.0 / settings.rate, self._tick)
@@ -149,7 +154,17 @@ class Excite(Node):
             raise ParameterError(
                 f"nobody listens on {', '.join(silent)}; is the driver or motor_plant running?"
             )
-        return not silent
+        if silent:
+            self._all_heard = math.inf
+            return False
+        # Recorders that are known but not connected yet are waited for, a little.
+        self._all_heard = min(self._all_heard, now)
+        waited = now - self._all_heard
+        known = all(
+            p.get_subscription_count() >= self.count_subscribers(p.topic_name)
+            for p, *_ in self._outputs
+        )
+        return waited > _OTHERS and (known or waited > 4 * _OTHERS)
 
     def _announce(self) -> None:
         settings = self._settings
