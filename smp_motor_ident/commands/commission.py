@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shutil
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -74,6 +75,19 @@ def work(arguments: argparse.Namespace) -> int:
         Exit code.
     """
     folder, wheels, plan = _checked(arguments)
+    try:
+        return _commission(arguments, folder, wheels, plan)
+    finally:
+        if folder.is_dir() and not (folder / "excitation").exists():
+            shutil.rmtree(folder)  # nothing but logs of what did not begin
+
+
+def _commission(
+    arguments: argparse.Namespace,
+    folder: Path,
+    wheels: tuple[str, ...],
+    plan: Sequence[steps.Excitation],
+) -> int:
     with Processes(folder / "logs") as processes:
         robot = steps.Robot(processes, Conductor(processes), wheels, folder)
         rates = robot.conductor.ask("wait_for_wheels", wheels=list(wheels), timeout=10.0)["rates"]

@@ -1,0 +1,64 @@
+"""commission on a robot that runs, as its user runs it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from wheel_robot import WheelRobot
+
+from smp_motor_control import WHEELS
+from smp_motor_ident.report.document import read_identification
+
+Process = Callable[..., Any]
+
+
+@pytest.fixture
+def robot(ros_domain: int) -> Iterator[WheelRobot]:
+    robot = WheelRobot(ros_domain)
+    yield robot
+    robot.close()
+
+
+def test_it_identifies_tunes_and_sets_the_gains_of_the_running_robot(
+    process: Process, robot: WheelRobot, eventually: Callable[..., None], tmp_path: Path
+) -> None:
+    process("motor_plant")
+    for wheel in WHEELS:
+        process("wheel_pid", "--ros-args", "-r", f"__ns:=/{wheel}")
+    eventually(lambda: all(robot.states[w] for w in WHEELS), 30.0, robot.spin, "no robot")
+    tool = process("commission", "--output", "r", "--duration", "4", "--yes", "--apply")
+    assert tool.wait(240.0) == 0, tool.output
+    estimates = read_identification(tmp_path / "r" / "identification")
+    assert set(estimates) == set(WHEELS)
+    # Motor 1 of Table 1; short signals on a busy machine still tell it to a percent.
+    assert estimates["front_left"].value("dc_gain") == pytest.approx(25.548, rel=0.01)
+    assert (tmp_path / "r" / "gains.yaml").is_file()
+    # The controllers, switched off meanwhile, run again with the new gains.
+    for _ in range(100):
+        robot.send_setpoint(1.0)
+        robot.spin_for(0.02)
+    assert robot.velocity("front_left") == pytest.approx(1.0, abs=0.1)
+
+
+def test_nothing_moves_without_a_word(
+    process: Process, robot: WheelRobot, eventually: Callable[..., None], tmp_path: Path
+) -> None:
+    process("motor_plant")
+    eventually(lambda: all(robot.states[w] for w in WHEELS), 30.0, robot.spin, "no robot")
+    tool = process("commission", "--output", "r")
+    assert tool.wait(60.0) == 2
+    assert "--yes" in tool.output
+    robot.spin_for(0.2)
+    assert all(robot.states[w][-1].encoder_count == 0 for w in WHEELS)
+    assert not (tmp_path / "r").exists()
+
+
+def test_a_robot_that_is_not_there_is_named(process: Process, tmp_path: Path) -> None:
+    tool = process("commission", "--output", "r", "--yes", "--wheel", "rear_left")
+    assert tool.wait(60.0) == 1
+    assert "/rear_left/motor_state" in tool.output
+    assert "Traceback" not in tool.output
+    assert not (tmp_path / "r").exists()
