@@ -576,7 +576,10 @@ def deviance(spread: Array) -> float:
     if spread[4] < 1:
         return float(spread[3] * np.log(max(v0, 1e-300)))
     v1 = spread[1] / spread[4]
-    c = spread[2] / max(spread[5], 1)
+    # The three are means over different samples where outputs were lost, and need not belong
+    # to one covariance.
+    limit = 0.95 * np.sqrt(v0 * v1)
+    c = np.clip(spread[2] / max(spread[5], 1), -limit, limit)
     together = np.log(max(v0 * v1 - c * c, 1e-300))
     return float(
         spread[5] * together
