@@ -80,23 +80,27 @@ def read_answers(
     return answers
 
 
-def longest_gap(bag: Path, wheels: Sequence[str]) -> float:
-    """Return the longest interval without a state of some wheel.
+def longest_stall(bag: Path, wheels: Sequence[str]) -> float:
+    """Return how long the machine that simulates stood still at worst.
 
     Parameters
     ----------
     bag : Path
-        With ``motor_state`` of every wheel.
+        With ``motor_state`` and ``pid_state`` of every wheel.
     wheels : sequence of str
         The wheels.
 
     Returns
     -------
     float
-        [s].
+        Longest interval between two states, or age of a state when it was answered [s].
     """
-    read = read_columns(bag, {f"/{wheel}/motor_state": ["encoder_count"] for wheel in wheels})
-    return max(float(np.max(np.diff(columns.time))) for columns in read.values())
+    wanted = {f"/{wheel}/motor_state": ["encoder_count"] for wheel in wheels}
+    wanted |= {f"/{wheel}/pid_state": ["age"] for wheel in wheels}
+    read = read_columns(bag, wanted)
+    gaps = (np.diff(c.time) for c in read.values() if "age" not in c.fields)
+    ages = (c.fields["age"] for c in read.values() if "age" in c.fields)
+    return max(float(np.max(found)) for found in (*gaps, *ages))
 
 
 def wheel_speed(state: Columns, hardware: Hardware) -> tuple[Array, Array]:
