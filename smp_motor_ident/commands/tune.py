@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from smp_motor_ident.bag.transport import TransportDelay, measure_delay
 from smp_motor_ident.commands import applying, frame, relaying
 from smp_motor_ident.errors import DesignError, ParameterError
 from smp_motor_ident.report.document import check_free, read_identification, write_together
@@ -58,6 +59,10 @@ def parser() -> argparse.ArgumentParser:
     loop.add_argument(
         "--delay", type=float, help="measurement to voltage, beyond the hold [s]; else one sample"
     )
+    loop.add_argument(
+        "--bag", type=Path, help="measure both delays: a bag with motor_state and motor_command "
+        "of the driving wheels",
+    )  # fmt: skip
     loop.add_argument("--usual-delay", type=float, help="what it usually is [s]; else --delay")
     loop.add_argument("--speed-source", choices=SPEED_SOURCES, default="measured")
     loop.add_argument("--difference-window", type=int, default=1, help="[samples]")
@@ -127,7 +132,10 @@ def _work(arguments: argparse.Namespace) -> int:
     files = _files(arguments)
     check_free(files, arguments.force)
     estimates = read_estimates(arguments.source)
-    loops = {wheel: loop_for(estimate, arguments) for wheel, estimate in estimates.items()}
+    measured = {} if arguments.bag is None else measure_delay(arguments.bag)
+    loops = {w: loop_for(one, arguments, measured.get(w)) for w, one in estimates.items()}
+    told_delays = _tell_delays(loops, measured, arguments)
+    print("".join(f"{line}\n" for line in told_delays), end="")
     targets = {n: getattr(arguments, n) for n in TARGETS if getattr(arguments, n) is not None}
     method = arguments.method
     with frame.progress("tune") as say:
@@ -140,9 +148,16 @@ def _work(arguments: argparse.Namespace) -> int:
     _show(wheels)
     if files:
         now = datetime.datetime.now(datetime.timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
-        text = gains_yaml(wheels.designs, _provenance(wheels, arguments, estimates, now))
+        text = gains_yaml(
+            wheels.designs, [*_provenance(wheels, arguments, estimates, now), *told_delays]
+        )
         sources = sorted({s for e in estimates.values() for s in e.sources})
-        told = {"date": now, "input": str(arguments.source), "sources": sources}
+        told = {
+            "date": now,
+            "input": str(arguments.source),
+            "sources": sources,
+            "delays": told_delays,
+        }
         document = to_json(gains_document(wheels.designs, told, wheels.reason))
         drawn = {w: curves(estimates[w], one) for w, one in wheels.designs.items()}
         figure = tuning_svg(drawn, METHODS[method].promise.sensitivity)
@@ -217,7 +232,9 @@ def read_estimates(source: Path) -> dict[str, Estimate]:
     return estimates
 
 
-def loop_for(estimate: Estimate, arguments: argparse.Namespace) -> Loop:
+def loop_for(
+    estimate: Estimate, arguments: argparse.Namespace, measured: TransportDelay | None = None
+) -> Loop:
     """Return the loop of one wheel: what the user says, else what the bag knew.
 
     Parameters
@@ -226,6 +243,8 @@ def loop_for(estimate: Estimate, arguments: argparse.Namespace) -> Loop:
         Its hardware and sample time are the defaults.
     arguments : argparse.Namespace
         Of the tool.
+    measured : TransportDelay or None
+        The loop's delay as a bag told it; what the user says goes before.
 
     Returns
     -------
@@ -248,10 +267,13 @@ def loop_for(estimate: Estimate, arguments: argparse.Namespace) -> Loop:
         sample_time = 1.0 / arguments.rate
     else:
         sample_time = estimate.sample_time or 1.0 / DEFAULT_RATE
+    usual, longest = (None, None) if measured is None else measured.until_applied(sample_time)
+    if arguments.delay is not None:
+        usual = None  # it is the longest, which nothing measured may pass
     return Loop(
         sample_time=sample_time,
-        delay=arguments.delay,
-        usual_delay=arguments.usual_delay,
+        delay=_first(arguments.delay, longest),
+        usual_delay=_first(arguments.usual_delay, usual),
         gear_ratio=_first(arguments.gear_ratio, hardware.gear_ratio) or 0.0,
         counts_per_revolution=_first(
             arguments.counts_per_revolution, hardware.counts_per_revolution
@@ -260,6 +282,27 @@ def loop_for(estimate: Estimate, arguments: argparse.Namespace) -> Loop:
         speed_source=arguments.speed_source,
         difference_window=arguments.difference_window,
     )
+
+
+def _tell_delays(
+    loops: Mapping[str, Loop],
+    measured: Mapping[str, TransportDelay],
+    arguments: argparse.Namespace,
+) -> list[str]:
+    """Return where the delays come from, in a line for each wheel, if a bag was to tell them."""
+    lines = []
+    for wheel, loop in loops.items() if arguments.bag is not None else ():
+        if wheel not in measured:
+            lines.append(f"{wheel}: {arguments.bag} tells no delay: taken as one sample")
+            continue
+        one = measured[wheel]
+        lines.append(
+            f"{wheel}: delay usually {1e3 * loop.expected_delay:.3g} ms, at most "
+            f"{1e3 * loop.loop_delay:.3g} ms, from {one.answers} commands of {arguments.bag} that "
+            f"arrived after {1e3 * one.usual:.3g} ms, 95 % within {1e3 * one.longest:.3g} ms"
+            + (", and wait for the driver's next sample" if one.latched else "")
+        )
+    return lines
 
 
 def _first(given: float | None, identified: float | None) -> float | None:

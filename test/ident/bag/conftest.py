@@ -26,7 +26,7 @@ RATIO, COUNTS = 65.5, 500.0
 def types() -> Typestore:
     """Return a type store with our messages, read from their source."""
     store = get_typestore(Stores.ROS2_JAZZY)
-    for name in (STATE, DESCRIPTION):
+    for name in (STATE, DESCRIPTION, "smp_interfaces/msg/MotorCommand"):
         text = (ROOT / "smp_interfaces" / "msg" / f"{name.rpartition('/')[2]}.msg").read_text()
         store.register(get_types_from_msg(text, name))
     return store

@@ -1,0 +1,168 @@
+"""How long a loop takes to answer: from the stamp of a sample to the voltage that answers it.
+
+Commands of ``wheel_pid`` carry the stamp of the sample that they answer, so a bag that was
+recorded while it drove tells for every command when it arrived.  Where the hardware reports the
+voltage that it applied, the delay that explains it best tells whether the driver applies a
+command on arrival or keeps it until its next sample.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smp_motor_ident.bag.source import Recording, recordings
+from smp_motor_ident.bag.table import Table, collect
+from smp_motor_ident.bag.timing import SAME_CLOCK, fit_clock, mean_held
+from smp_motor_ident.bag.types import Types
+from smp_motor_ident.errors import BagError
+
+STATE, COMMAND = "smp_interfaces/msg/MotorState", "smp_interfaces/msg/MotorCommand"
+
+LEAST_ANSWERS = 50
+"""Commands below which quantiles of their delay mean nothing."""
+
+SHARE = 0.95
+"""Share of the commands that the longest delay covers: margins are about a delay that stays,
+a single late command is a disturbance."""
+
+EXPLAINED = 0.3
+"""A delay explains the applied voltage when what is left is below this share of its steps."""
+
+
+@dataclass(frozen=True)
+class TransportDelay:
+    """From the stamp of a sample to the arrival of the command that answers it.
+
+    Attributes
+    ----------
+    usual : float
+        Median [s].
+    longest : float
+        That 95 % of the commands keep [s].
+    latched : bool
+        Whether the driver keeps a command until its next sample.
+    answers : int
+        Commands that this was measured from.
+    """
+
+    usual: float
+    longest: float
+    latched: bool
+    answers: int
+
+    def until_applied(self, sample_time: float) -> tuple[float, float]:
+        """Return usual and longest delay until the voltage is applied.
+
+        Parameters
+        ----------
+        sample_time : float
+            Of the loop that will run [s].
+
+        Returns
+        -------
+        usual, longest : float
+            [s]; whole samples where the driver waits for its next one.
+        """
+        if not self.latched:
+            return self.usual, self.longest
+        usual, longest = (
+            max(math.ceil(arrival / sample_time), 1) * sample_time
+            for arrival in (self.usual, self.longest)
+        )
+        return usual, longest
+
+
+def measure_delay(path: Path) -> dict[str, TransportDelay]:
+    """Measure the delay of every wheel's loop from a bag with its commands.
+
+    Parameters
+    ----------
+    path : Path
+        A bag with ``motor_state`` and ``motor_command`` of running wheels.
+
+    Returns
+    -------
+    dict of str to TransportDelay
+        By wheel; wheels without enough commands that answer a sample are left out.
+
+    Raises
+    ------
+    BagError
+        When the bag cannot be read, or holds no such wheel.
+    """
+    found: dict[str, TransportDelay] = {}
+    for recording in recordings([path]):
+        found.update(_of_recording(recording))
+    if not found:
+        raise BagError(
+            f"{path}: no wheel with {LEAST_ANSWERS} motor_command that answer a motor_state; "
+            "record both topics while wheel_pid drives, or give --delay"
+        )
+    return found
+
+
+def _of_recording(recording: Recording) -> dict[str, TransportDelay]:
+    if recording.is_table:
+        return {}
+    kinds = {channel.topic: channel.type for channel in recording.channels()}
+    pairs = {}
+    for topic, kind in kinds.items():
+        place = topic.rpartition("/")[0]
+        if kind == STATE and kinds.get(f"{place}/motor_command") == COMMAND:
+            pairs[place.rpartition("/")[2]] = topic, f"{place}/motor_command"
+    wanted = {topic: ["voltage"] for pair in pairs.values() for topic in pair}
+    tables = collect(recording, wanted, Types(()), None)
+    delays = {
+        wheel: _delay(tables[state], tables[command]) for wheel, (state, command) in pairs.items()
+    }
+    return {wheel: delay for wheel, delay in delays.items() if delay is not None}
+
+
+def _delay(state: Table, command: Table) -> TransportDelay | None:
+    if state.stamp is None or command.stamp is None or state.stamp.size < LEAST_ANSWERS:
+        return None
+    answers = np.isin(command.stamp, state.stamp)
+    if np.count_nonzero(answers) < LEAST_ANSWERS:
+        return None
+    stamp, log = command.stamp[answers], command.log[answers]
+    offset = fit_clock(state.stamp, state.log)
+    # On another clock the fastest state stands for no latency at all.
+    one_clock = abs(offset.offset) < SAME_CLOCK
+    arrival = 1e-9 * (log - (stamp if one_clock else offset.to_log(stamp)))
+    usual, longest = (float(q) for q in np.quantile(arrival, (0.5, SHARE)))
+    period = 1e-9 * float(np.median(np.diff(np.sort(state.stamp))))
+    applied = _until_applied(state, stamp, command.columns["voltage"][answers], period)
+    latched = applied is not None and applied > usual + 0.25 * period
+    if applied is not None and not latched:
+        usual, longest = applied, max(longest, applied)
+    return TransportDelay(max(usual, 0.0), max(longest, 0.0), latched, int(stamp.size))
+
+
+def _until_applied(
+    state: Table, stamp: NDArray[np.int64], voltage: NDArray[np.float64], period: float
+) -> float | None:
+    """Return the delay that explains the voltages that the hardware reports, or None."""
+    assert state.stamp is not None
+    order = np.argsort(stamp, kind="stable")
+    stamp, voltage = stamp[order], voltage[order]
+    time, which = np.unique(state.stamp, return_index=True)
+    # Delays of up to three samples, in twentieths of one; what these could reach back to.
+    inside = (time > stamp[0] + 4e9 * period) & (time < stamp[-1])
+    time, acted = time[inside], state.columns["voltage"][which][inside]
+    if time.size < LEAST_ANSWERS or not np.all(np.isfinite(acted)):
+        return None
+    steps = math.sqrt(float(np.mean(np.diff(acted) ** 2)))
+    trials = period * np.arange(0, 61) / 20
+    left = []
+    for trial in trials:
+        shifted = stamp + round(1e9 * trial)
+        off = (acted - mean_held(shifted, voltage, "after", time))[1:]
+        # The middle of the errors: a command that was late or lost says nothing of the others.
+        left.append(math.sqrt(float(np.mean(np.sort(off**2)[: int(0.9 * off.size)]))))
+    best = int(np.argmin(left))
+    return float(trials[best]) if left[best] < EXPLAINED * steps else None

@@ -1,0 +1,105 @@
+"""The delay of a loop, measured from bags of loops whose delay is known."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from smp_motor_ident.bag.transport import measure_delay
+from smp_motor_ident.commands.tune import main as tune
+from smp_motor_ident.errors import BagError
+
+MOTORS = Path(__file__).resolve().parents[3] / "config" / "motors_paper.yaml"
+COMMAND = "smp_interfaces/msg/MotorCommand"
+PERIOD = 5_000_000
+"""[ns]"""
+FINE = 10_000
+"""Grid on which the applied voltage is put together [ns]."""
+
+
+def driven_bag(
+    corpus, path: Path, arrival: np.ndarray, *, latch: bool, answering: bool = True
+) -> Path:
+    """Write the bag of a loop whose command ``k`` arrives ``arrival[k]`` ns after sample ``k``."""
+    rng = np.random.default_rng(7)
+    one = corpus.motion(arrival.size, step=PERIOD)
+    wanted = rng.uniform(-6, 6, arrival.size)
+    begin = one.time[0]
+    acts = np.arange(arrival.size) * PERIOD + arrival
+    if latch:  # the driver's next sample takes what has come
+        acts = np.ceil(acts / PERIOD).astype(np.int64) * PERIOD
+    volts = np.zeros(arrival.size * PERIOD // FINE)
+    for k in np.argsort(acts, kind="stable"):
+        volts[acts[k] // FINE :] = wanted[k]
+    applied = np.roll(volts.reshape(arrival.size, -1).mean(axis=1), 1)
+    sent = corpus.merged(replace(one, voltage=applied), latency=150_000)
+    for k, late in enumerate(arrival):
+        stamp = one.time[k] if answering else one.time[k] + 1_234_567
+        data = corpus.serialized(COMMAND, header=corpus.header(stamp), voltage=float(wanted[k]))
+        sent.append(
+            corpus.Sent("/front_left/motor_command", COMMAND, int(begin + k * PERIOD + late), data)
+        )
+    return corpus.write_mcap(path, sorted(sent, key=lambda s: s.stamp))
+
+
+def arrivals(n: int = 600) -> np.ndarray:
+    """Return 1.2 ms and an exponential tail of 0.3 ms, on the fine grid."""
+    late = 1.2e6 + np.random.default_rng(3).exponential(0.3e6, n)
+    return (late / FINE).astype(np.int64) * FINE
+
+
+def test_driver_that_applies_on_arrival_tells_its_delay(tmp_path, corpus):
+    arrival = arrivals()
+    found = measure_delay(driven_bag(corpus, tmp_path / "a.mcap", arrival, latch=False))[
+        "front_left"
+    ]
+    assert not found.latched
+    assert found.answers == 600
+    # One delay stands for all: within the spread of the tail, one trial step (0.25 ms) beside.
+    assert found.usual == pytest.approx(1e-9 * np.median(arrival), abs=0.3e-3)
+    assert found.longest == pytest.approx(1e-9 * np.quantile(arrival, 0.95), abs=1e-6)
+    assert found.until_applied(0.002) == (found.usual, found.longest)
+
+
+def test_driver_that_waits_for_its_next_sample_is_recognised(tmp_path, corpus):
+    found = measure_delay(driven_bag(corpus, tmp_path / "a.mcap", arrivals(), latch=True))[
+        "front_left"
+    ]
+    assert found.latched
+    assert found.until_applied(0.005) == (0.005, 0.005)
+    # At a rate at which the tail misses the next sample it is two.
+    assert found.until_applied(0.0018) == (0.0018, 0.0036)
+
+
+def test_few_late_commands_do_not_set_the_delay(tmp_path, corpus):
+    arrival = arrivals()
+    arrival[200:220] += 200_000_000  # the machine stood still for a tenth of a second
+    found = measure_delay(driven_bag(corpus, tmp_path / "a.mcap", arrival, latch=False))[
+        "front_left"
+    ]
+    assert found.longest < 0.005
+
+
+def test_bag_whose_commands_answer_nothing_is_refused(tmp_path, corpus):
+    bag = driven_bag(corpus, tmp_path / "a.mcap", arrivals(), latch=False, answering=False)
+    with pytest.raises(BagError, match="no wheel with 50 motor_command that answer"):
+        measure_delay(bag)
+
+
+def test_tune_designs_for_the_delay_of_a_bag_and_says_so(tmp_path, corpus, capsys):
+    bag = driven_bag(corpus, tmp_path / "a.mcap", arrivals() + 6_000_000, latch=False)
+    output = tmp_path / "gains.yaml"
+    assert tune([str(MOTORS), "--bag", str(bag), "--output", str(output)]) == 0
+    loops = json.loads((tmp_path / "gains.json").read_text())["wheels"]
+    found = measure_delay(bag)["front_left"]
+    assert loops["front_left"]["loop"]["delay"] == pytest.approx(found.longest)
+    assert loops["front_left"]["loop"]["usual_delay"] == pytest.approx(found.usual)
+    # The bag holds one wheel; the others have what every loop has without a bag.
+    assert loops["rear_left"]["loop"]["delay"] == 0.005
+    for told in (capsys.readouterr().out, output.read_text()):
+        assert "600 commands of" in told
+        assert "rear_left" in told and "tells no delay: taken as one sample" in told
