@@ -114,7 +114,7 @@ def _motor(estimate: Estimate, parts: Sequence[Comparison]) -> dict[str, object]
         "estimate": estimate,
         "verdict": _verdict(estimate),
         "headline": [
-            _row(name, words.scaled(estimate.combinations[name]))
+            _headline(name, words.scaled(estimate.combinations[name]))
             for name in ("dc_gain", "time_constant", "static_voltage", "delay")
             if name in estimate.combinations
         ],
@@ -148,6 +148,14 @@ def _row(name: str, quantity: Quantity) -> Row:
         status=words.status(quantity),
         kind=quantity.status,
     )
+
+
+def _headline(name: str, quantity: Quantity) -> tuple[str, str, str, str]:
+    """Return name, value, unit and relative deviation, short enough for a card."""
+    share = ""
+    if quantity.value and quantity.std:
+        share = f"± {100 * quantity.std / abs(quantity.value):.2g} %"
+    return words.label(name), words.number(quantity.value), quantity.unit, share
 
 
 def _alike(estimate: Estimate) -> list[tuple[str, str, str]]:
