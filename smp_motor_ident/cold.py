@@ -46,6 +46,23 @@ class Options:
     upper: Array | None = None
 
 
+def head(data: Experiments) -> Experiments:
+    """Return the part on which models are compared, or all where that is little more.
+
+    Parameters
+    ----------
+    data : Experiments
+        Prepared records.
+
+    Returns
+    -------
+    Experiments
+        Of `HEAD` samples or so; ``data`` itself where it has less than three times as many.
+    """
+    part = data.head(HEAD * data.step)
+    return part if data.size > 3 * part.size else data
+
+
 def ratio_of(bandwidth: float, step: float, kind: int) -> float:
     """Return the torque-noise ratio at which the innovations follow with a bandwidth.
 
@@ -171,7 +188,7 @@ def cold_fit(
             continue
         tried.append(z)
         ratio = ratio_of(_bandwidth(z, head), head.step, head.kind)
-        one = _solve(head, structure, z, head.initial, first_noise(head), ratio, options, 25)
+        one = _solve(head, structure, z, head.initial, first_noise(head), ratio, options, 25, 0.1)
         again = best is not None and abs(one.deviance - best.deviance) < 0.1
         if best is None or one.deviance < best.deviance:
             best = one
@@ -230,7 +247,7 @@ def refine(data: Experiments, structure: Structure, near: Fit, z: Array, options
     Fit
         With the noise ratio of ``near``.
     """
-    return _solve(data, structure, z, _initial(data, near), near.noise, near.ratio, options, 30)
+    return _solve(data, structure, z, initial_of(data, near), near.noise, near.ratio, options, 30)
 
 
 def restate(data: Experiments, structure: Structure, fit: Fit, options: Options) -> Fit:
@@ -276,6 +293,7 @@ def _solve(
     ratio: float,
     options: Options,
     iterations: int,
+    tolerance: float = 1e-2,
 ) -> Fit:
     return solve(
         data,
@@ -287,6 +305,7 @@ def _solve(
         options.huber,
         options.priors,
         iterations,
+        tolerance,
         lower=options.lower,
         upper=options.upper,
     )
@@ -314,17 +333,40 @@ def grow(data: Experiments, structure: Structure, first: Fit, options: Options) 
     part = data.head(min(HEAD * data.step, 60.0))
     best = _find_ratio(part, structure, first, options)
     best = _along_friction(part, structure, best, options)
-    if part.size == data.size:
+    return extend(data, structure, best, options)
+
+
+def extend(data: Experiments, structure: Structure, best: Fit, options: Options) -> Fit:
+    """Carry a fit of the head on to all data, on a growing horizon.
+
+    Parameters
+    ----------
+    data : Experiments
+        Prepared records.
+    structure : Structure
+        What is free.
+    best : Fit
+        On the head of the data.
+    options : Options
+        Loss and prior knowledge.
+
+    Returns
+    -------
+    Fit
+        On all data.
+    """
+    part = data.head(min(HEAD * data.step, 60.0))
+    if best.samples == data.size:
         return best
     horizon = part.size * 4 if structure.friction != "none" else data.size
     while horizon < data.size and best.ratio == 0:
         longer = data.head(horizon * data.step)
         best = _solve(
-            longer, structure, best.z, _initial(longer, best), best.noise, best.ratio, options, 8
+            longer, structure, best.z, initial_of(longer, best), best.noise, best.ratio, options, 8
         )
         horizon *= 6
     return _solve(
-        data, structure, best.z, _initial(data, best), best.noise, best.ratio, options, 25
+        data, structure, best.z, initial_of(data, best), best.noise, best.ratio, options, 25
     )
 
 
@@ -350,7 +392,21 @@ def _along_friction(part: Experiments, structure: Structure, best: Fit, options:
     return best
 
 
-def _initial(data: Experiments, fit: Fit) -> Array:
+def initial_of(data: Experiments, fit: Fit) -> Array:
+    """Return a fit's initial states for more data; those it lacks from the measurements.
+
+    Parameters
+    ----------
+    data : Experiments
+        With as many segments as the fit has, or more.
+    fit : Fit
+        Of a part of them.
+
+    Returns
+    -------
+    ndarray, shape (g, 4)
+        As in `fit.Fit`.
+    """
     initial = data.initial.copy()
     n = min(len(initial), len(fit.initial))
     initial[:n] = fit.initial[:n]
@@ -365,11 +421,13 @@ def _find_ratio(part: Experiments, structure: Structure, first: Fit, options: Op
         return _at_rest(
             part,
             structure,
-            _solve(part, structure, first.z, _initial(part, first), first.noise, 0.0, options, 30),
+            _solve(
+                part, structure, first.z, initial_of(part, first), first.noise, 0.0, options, 30
+            ),
             options,
         )
     # Residuals no larger than the counter's own resolution leave nothing for torque noise.
-    at_once = _at_rest(part, structure, _solve(part, structure, first.z, _initial(part, first),
+    at_once = _at_rest(part, structure, _solve(part, structure, first.z, initial_of(part, first),
                        first.noise, 0.0, options, 30), options)  # fmt: skip
     if at_once.converged and at_once.noise[0, 0] < FLOOR * part.quantum**2 / 12:
         return at_once
@@ -381,7 +439,7 @@ def _find_ratio(part: Experiments, structure: Structure, first: Fit, options: Op
         here = _at_rest(
             part,
             structure,
-            _solve(part, structure, here.z, _initial(part, here), here.noise, ratio, options, 20),
+            _solve(part, structure, here.z, initial_of(part, here), here.noise, ratio, options, 20),
             options,
         )
         path.append((factor, here))

@@ -7,11 +7,11 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident import ladder, models, validate
+from smp_motor_ident import cold, ladder, models, validate
 from smp_motor_ident import recursion as rc
 from smp_motor_ident.advice import advise, doubts
 from smp_motor_ident.answer import Answer, answer
-from smp_motor_ident.cold import Options, cold_fit, grow, refine
+from smp_motor_ident.cold import Options, cold_fit, extend, grow, refine
 from smp_motor_ident.errors import InsufficientExcitationError, ParameterError, SignalError
 from smp_motor_ident.experiments import Experiments, between_samples, prepare
 from smp_motor_ident.fit import Fit, Prior
@@ -30,6 +30,7 @@ WORST_FIT = 30.0
 LARGEST_OFFSET = 0.1
 INSTANT = 0.01
 MANY = 400_000
+FAR = 100.0  # deviance on the head by which a way of holding the command is out
 
 
 def estimate(
@@ -58,7 +59,7 @@ def estimate(
         Parameters that the user knows, by the names of `models.PHYSICAL` or ``delay``,
         ``averaging_window``; SI, at the motor shaft.
     bounds : mapping of str to (float, float), optional
-        Limits of parameters or combinations.
+        Limits of physical parameters, where current is measured.
     loss : {'linear', 'huber'}
         Least squares, or a robust loss where there are outliers.
     validation : sequence of Record, optional
@@ -88,6 +89,7 @@ def estimate(
     group = [records] if isinstance(records, Record) else list(records)
     say = progress or (lambda _: None)
     known = _checked(model, fixed, loss, group)
+    _check_bounds(bounds or {}, model, group)
     warnings = screen(group)
     warnings += [note for r in group for note in r.notes]
     use_current = _has_current(group) and model in ("auto", "electromechanical")
@@ -165,6 +167,21 @@ def _checked(
     return known
 
 
+def _check_bounds(
+    bounds: Mapping[str, tuple[float, float]], model: str, group: Sequence[Record]
+) -> None:
+    for name, limits in bounds.items():
+        if name not in PHYSICAL:
+            raise ParameterError(f"bounds of {name!r}: not one of {', '.join(PHYSICAL)}")
+        if len(limits) != 2 or not limits[0] <= limits[1]:
+            raise ParameterError(f"bounds of {name} = {limits}: two numbers, the lower one first")
+        if model not in ("auto", "electromechanical") or not _has_current(group):
+            raise ParameterError(
+                f"bounds of {name}: voltage and speed alone do not tell it; record the current "
+                "too, or leave the bounds out"
+            )
+
+
 def _has_current(group: Sequence[Record]) -> bool:
     there = [r.current for r in group if r.current is not None]
     finite = sum(int(np.isfinite(c).sum()) for c in there)
@@ -213,8 +230,13 @@ def _hold(
     if best is None:
         return "held", None
     hold = "held"
+    part = cold.head(plain)
+    near = refine(part, best.structure, best, best.z, options) if part is not plain else best
     for other, data in others.items():
-        fitted = grow(data, best.structure, best, options)
+        fitted = grow(cold.head(data), best.structure, near, options)
+        if fitted.deviance > near.deviance + FAR and fitted.converged:
+            continue
+        fitted = extend(data, best.structure, fitted, options)
         if fitted.deviance < best.deviance - 30:
             hold, best = other, fitted
     return hold, best
@@ -260,8 +282,6 @@ def _constrain(
         and not (n == "resistance" or (n == "inductance" and "ln_te" in fit.structure.held))
     ]
     for name, (low, high) in (bounds or {}).items():
-        if name not in values:
-            raise ParameterError(f"bounds of {name!r}: not a parameter of this model")
         if not low <= values[name] <= high:
             priors.append(Prior(name, float(np.clip(values[name], low, high)), 1e-4 * scale[name]))
     if values["viscous_friction"] < 0 and "viscous_friction" not in known:

@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 
 PLAUSIBLE = np.array([1e-2, 1e-2, 1e-2, 0.25, 1e-4, 1e-4, 1e-4, 1e-2, 1e-4, 1e-2, 1e-2])
 """Inverse squares of how far each coordinate z could be from any value at all."""
+STALL = 4, 0.02  # passes that together gain less deviance than this end a descent
 FREE = 0.1  # damping (relative to the diagonal) below which a step counts as undamped
 BLOCKS = 60  # runs of samples whose scores are summed, for the covariance of coloured residuals
 
@@ -369,6 +370,7 @@ def solve(  # noqa: C901 - the loop of a fit, its branches are its ends
     upper = np.full(11, np.inf) if upper is None else upper
     has_current = data.current.size > 0
     damping, passes, converged = 1e-3, 0, False
+    recent: list[float] = []
     gain: Array = np.zeros((3, 2))
     here: Pass | None = None
     for outer in range(12):
@@ -377,6 +379,7 @@ def solve(  # noqa: C901 - the loop of a fit, its branches are its ends
         here = _pass(data, structure, z, initial, start, gain, noise, huber, prior)
         passes += 1
         converged = False
+        recent.clear()
         if not np.isfinite(here.objective):
             break
         while passes < iterations:
@@ -402,8 +405,13 @@ def solve(  # noqa: C901 - the loop of a fit, its branches are its ends
             # A step may be small because it is damped: only a nearly free one tells the end.
             small = step.size > 0 and _relative_step(here, step, frozen) < tolerance
             small = small and damping < FREE
+            gained = max(here.objective - new.objective, 0.0) if new.objective < np.inf else 0.0
+            if new.objective <= here.objective:
+                recent.append(gained * data.size / max(here.objective, 1e-300))
+            if len(recent) >= STALL[0] and sum(recent[-STALL[0] :]) < STALL[1]:
+                converged = _undamped(here, matrix, z, lower, upper)
+                break
             if new.objective <= here.objective * (1 + 1e-12):
-                gained = here.objective - new.objective
                 z, initial, here = trial, moved, new
                 damping = max(damping * 0.1, 1e-9)
                 if small or (gained < 1e-9 * here.objective and damping < FREE):
@@ -417,8 +425,7 @@ def solve(  # noqa: C901 - the loop of a fit, its branches are its ends
                     break
                 damping = max(damping, 1e-6) * 8
                 if damping > 1e6:  # a kink: no step leads down, small or large
-                    free_step, frozen = _step(here, 1e-9, matrix, z, lower, upper)
-                    converged = _relative_step(here, free_step, frozen) < 0.5
+                    converged = _undamped(here, matrix, z, lower, upper)
                     break
         fresh = _noise(here.spread, noise, has_current)
         same = np.abs(np.log(np.diag(fresh) / np.diag(noise))).max() < 2e-2
@@ -526,6 +533,12 @@ def _step(
         frozen |= more
     longest = float(np.max(np.abs(matrix @ step)[:4]))
     return (step * (1.5 / longest) if longest > 1.5 else step), frozen
+
+
+def _undamped(here: Pass, matrix: Array, z: Array, lower: Array, upper: Array) -> bool:
+    """Tell whether an undamped step would stay within half a standard deviation."""
+    step, frozen = _step(here, 1e-9, matrix, z, lower, upper)
+    return _relative_step(here, step, frozen) < 0.5
 
 
 def _relative_step(here: Pass, step: Array, frozen: NDArray[np.bool_]) -> float:
@@ -687,6 +700,36 @@ def one_step(data: Experiments, fit: Fit) -> Array:
     scaled = here.normal / np.outer(scale, scale)
     step = np.linalg.pinv(scaled, rcond=1e-13, hermitian=True) @ (here.gradient / scale) / scale
     return np.asarray(step)
+
+
+def promise(data: Experiments, fit: Fit, richer: Structure) -> tuple[float, Array, Array]:
+    """Return what freeing more would gain, by the score: one pass in place of a fit.
+
+    Parameters
+    ----------
+    data : Experiments
+        What was fitted.
+    fit : Fit
+        Converged.
+    richer : Structure
+        In which more is free.
+
+    Returns
+    -------
+    gain : float
+        Deviance, to second order.
+    step : ndarray, shape (f,)
+        Undamped step of the free coordinates.
+    covariance : ndarray, shape (f, f)
+        Of white residuals.
+    """
+    z = richer.complete(fit.z)
+    here = _pass(data, richer, z, fit.initial, fit.initial, fit.gain, fit.noise, np.inf, ())
+    scale = np.sqrt(np.maximum(np.diag(here.normal), 1e-300))
+    inverse = np.linalg.pinv(here.normal / np.outer(scale, scale), rcond=1e-13, hermitian=True)
+    covariance = inverse / np.outer(scale, scale)
+    step = covariance @ here.gradient
+    return float(here.gradient @ step), step, covariance
 
 
 def settle(data: Experiments, fit: Fit, iterations: int = 12) -> Fit:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident import cold, models, start
+from smp_motor_ident import fit as fitting
 from smp_motor_ident import recursion as rc
 from smp_motor_ident.cold import Options
 from smp_motor_ident.experiments import Experiments
@@ -16,6 +17,9 @@ from smp_motor_ident.fit import Fit
 from smp_motor_ident.models import Structure
 
 Array = NDArray[np.float64]
+
+HOPELESS = 40.0  # deviance on the head of the data by which a rung is out for good
+LITTLE = 0.02  # of the largest voltage: friction below it may be left out
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,6 +196,9 @@ def explore(
     list of Rung
         In the order of trial, the chosen one at the end.
     """
+    smooth = _frictionless(data, base, options, auto, say)
+    if smooth:
+        return smooth
     rungs: list[Rung] = []
     if base.current or not auto:
         if first is None or first.structure != base:
@@ -219,19 +226,69 @@ def _cold(data: Experiments, s: Structure, options: Options, say: Say) -> Fit | 
     return cold.cold_fit(data, s, options)
 
 
+def _frictionless(
+    data: Experiments, base: Structure, options: Options, auto: bool, say: Say
+) -> list[Rung]:
+    """Climb without friction where the score of a linear motor asks for none.
+
+    Where there is none, a descent with friction has no bottom to find: L/R beside the
+    response's own coefficients is told by friction alone.
+    """
+    if base.current or base.friction != "symmetric" or options.priors or data.quantum > 0:
+        return []
+    plain = base.with_(friction="none", shape=False)
+    head = cold.head(data)
+    quick = cold.cold_fit(head, plain, options)
+    if quick is None or not quick.converged or _friction_shows(head, quick, False):
+        return []
+    rungs = explore(data, plain, options, auto, say, quick if head is data else None)
+    if not rungs or _friction_shows(_of_kind(data, rungs[-1].fit), rungs[-1].fit, True):
+        return []
+    reason = f"{rungs[-1].reason}; no Coulomb friction shows"
+    return [*rungs[:-1], Rung(rungs[-1].fit, reason)]
+
+
+def _friction_shows(data: Experiments, fit: Fit, surely_small: bool) -> bool:
+    """Tell by the score whether Coulomb friction is there, or may be and is not little."""
+    structure = fit.structure.with_(friction="symmetric")
+    _, step, cov = fitting.promise(data, fit, structure)
+    i = structure.free().index(models.VC_PLUS)
+    std = float(np.sqrt(max(cov[i, i], 1e-300)) * np.sqrt(inflation(fit)))
+    found = max(float(step[i]), 0.0)
+    if not np.isfinite(found) or (found / std) ** 2 > 0.5 * np.log(fit.samples):
+        return True
+    return surely_small and found + 2 * std > LITTLE * float(np.abs(data.section_value).max())
+
+
+def _of_kind(data: Experiments, fit: Fit) -> Experiments:
+    return data.as_mean_speed() if fit.kind == rc.MEAN_SPEED else data
+
+
 def _orders(
     data: Experiments, base: Structure, options: Options, say: Say, rungs: list[Rung]
 ) -> Fit | None:
-    """Climb, by the number of parameters, as far as the data ask."""
-    best: Fit | None = None
+    """Climb, by the number of parameters, as far as the data ask.
+
+    Rungs that the head of a long record rejects by far are not fitted to all of it.
+    """
+    part = cold.head(data)
+    tried: list[Fit] = []
     for structure in _ladder(base, data.kind == rc.SPEED, data.quantum > 0):
         say(f"fitting {label(structure)}")
-        fitted = _one(data, structure, options, [r.fit for r in rungs])
-        if fitted is None:
-            continue
+        fitted = _one(part, structure, options, tried)
+        if fitted is not None:
+            tried.append(fitted)
+    least = min((f.deviance for f in tried), default=0.0)
+    best: Fit | None = None
+    for fitted in tried:
+        if part is not data:
+            if fitted.deviance > least + HOPELESS * inflation(fitted):
+                rungs.append(Rung(_projected(data, fitted), f"rejected on {part.size} samples"))
+                continue
+            fitted = cold.extend(_of_kind(data, fitted), fitted.structure, fitted, options)
         if best is None:
             best = fitted
-            rungs.append(Rung(fitted, "the simplest"))
+            rungs.append(Rung(fitted, "the simplest" if len(rungs) == 0 else "the simplest left"))
             continue
         if size(fitted.structure) == size(best.structure):
             verdict = fitted.deviance < best.deviance
@@ -242,6 +299,16 @@ def _orders(
         if verdict:
             best = fitted
     return best
+
+
+def _projected(data: Experiments, fit: Fit) -> Fit:
+    """Return a fit of the head with its deviance projected to all data."""
+    return replace(
+        fit,
+        initial=cold.initial_of(data, fit),
+        deviance=fit.deviance * data.size / fit.samples,
+        samples=data.size,
+    )
 
 
 def _ladder(base: Structure, speed: bool, coarse: bool) -> list[Structure]:
@@ -334,12 +401,13 @@ def _variations(data: Experiments, best: Fit, options: Options, rungs: list[Rung
         trials.append({"offset": True})
         if "delay" not in s.held and not best.structure.delay:
             trials.append({"delay": True})
-    if best.structure.friction == "symmetric":
+    if best.structure.friction != "asymmetric":
         trials.append({"load": True})
+    if best.structure.friction == "symmetric":
         trials.append({"friction": "asymmetric", "load": True})
     for change in trials:
         richer = best.structure.with_(**change)
-        if richer == best.structure:
+        if richer == best.structure or not _promising(data, best, richer):
             continue
         say(f"trying {label(richer)}")
         z = best.z.copy()
@@ -357,12 +425,28 @@ def _variations(data: Experiments, best: Fit, options: Options, rungs: list[Rung
     return _without_friction(data, best, options, rungs)
 
 
+def _promising(data: Experiments, best: Fit, richer: Structure) -> bool:
+    """Tell from the score whether a fit of more is worth its passes."""
+    if not best.converged:
+        return True
+    gain, _, _ = fitting.promise(data, best, richer)
+    price = (size(richer) - size(best.structure)) * float(np.log(best.samples))
+    return not gain < 0.5 * price * inflation(best)
+
+
 def _without_friction(data: Experiments, best: Fit, options: Options, rungs: list[Rung]) -> Fit:
     """Leave Coulomb friction out where the data show that there is next to none."""
     s = best.structure
     if s.friction != "symmetric" or "vc_plus" in s.held:
         return best
-    plain = cold.refine(data, s.with_(friction="none", shape=False), best, best.z, options)
+    smooth = s.with_(friction="none", shape=False)
+    head = _of_kind(cold.head(data), best)
+    if head.size < data.size:
+        with_it = cold.refine(head, s, best, best.z, options)
+        without = cold.refine(head, smooth, with_it, best.z, options)
+        if without.deviance > with_it.deviance + HOPELESS * inflation(with_it):
+            return best
+    plain = cold.refine(data, smooth, best, best.z, options)
     if plain.deviance < best.deviance:  # then friction has led astray
         z = plain.z.copy()
         z[models.VC_PLUS] = 1e-3 * np.abs(data.section_value).max()
@@ -372,7 +456,7 @@ def _without_friction(data: Experiments, best: Fit, options: Options, rungs: lis
     i = s.free().index(models.VC_PLUS)
     most = best.z[models.VC_PLUS] + 2 * float(np.sqrt(cov[i, i]))
     # Friction that the data do not tell stays: leaving it out would make the gain certain.
-    if most < 0.02 * np.abs(data.section_value).max() or plain.deviance < best.deviance:
+    if most < LITTLE * np.abs(data.section_value).max() or plain.deviance < best.deviance:
         keep, _ = needed(plain, best)
         if not keep:
             rungs.append(Rung(plain, "no Coulomb friction shows"))

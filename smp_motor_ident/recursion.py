@@ -28,11 +28,20 @@ STUCK = 0.0
 
 
 @compiled
-def _fill(row: Array, h: float, par: Array) -> None:
+def _fill(row: Array, h: float, par: Array, n_slope: int, slope: Array, derivatives: Array) -> None:
+    """Put the propagator over h into a row, then its derivative by each common column."""
     if par[0] == 0.0:
-        first_order(row, h, par[1], par[2], par[3])
+        first_order(derivatives, h, par[1], par[2], par[3])
     else:
-        second_order(row, h, par[0], par[1], par[2], par[3])
+        second_order(derivatives, h, par[0], par[1], par[2], par[3])
+    for i in range(ROW):
+        row[i] = derivatives[i]
+    for j in range(n_slope):
+        for i in range(ROW):
+            total = 0.0
+            for m in range(4):
+                total += slope[m, j] * derivatives[ROW * (m + 1) + i]
+            row[ROW * (j + 1) + i] = total
 
 
 @inlined
@@ -42,7 +51,6 @@ def _slide(
     x: Array,
     s: Array,
     n_slope: int,
-    slope: Array,
     v: float,
     f: float,
     df: Array,
@@ -54,23 +62,6 @@ def _slide(
     the step itself.
     """
     q, w = x[0], x[1]
-    c00 = c01 = c02 = c10 = c11 = c12 = c20 = c21 = c22 = c30 = c31 = c32 = 0.0
-    o = ROW
-    c00 = rows[n, o] * q + rows[n, o + 1] * w + rows[n, o + 6] * v - rows[n, o + 9] * f
-    c01 = rows[n, o + 2] * q + rows[n, o + 3] * w + rows[n, o + 7] * v - rows[n, o + 10] * f
-    c02 = rows[n, o + 4] * q + rows[n, o + 5] * w + rows[n, o + 8] * v - rows[n, o + 11] * f
-    o = 2 * ROW
-    c10 = rows[n, o] * q + rows[n, o + 1] * w + rows[n, o + 6] * v - rows[n, o + 9] * f
-    c11 = rows[n, o + 2] * q + rows[n, o + 3] * w + rows[n, o + 7] * v - rows[n, o + 10] * f
-    c12 = rows[n, o + 4] * q + rows[n, o + 5] * w + rows[n, o + 8] * v - rows[n, o + 11] * f
-    o = 3 * ROW
-    c20 = rows[n, o] * q + rows[n, o + 1] * w + rows[n, o + 6] * v - rows[n, o + 9] * f
-    c21 = rows[n, o + 2] * q + rows[n, o + 3] * w + rows[n, o + 7] * v - rows[n, o + 10] * f
-    c22 = rows[n, o + 4] * q + rows[n, o + 5] * w + rows[n, o + 8] * v - rows[n, o + 11] * f
-    o = 4 * ROW
-    c30 = rows[n, o] * q + rows[n, o + 1] * w + rows[n, o + 6] * v - rows[n, o + 9] * f
-    c31 = rows[n, o + 2] * q + rows[n, o + 3] * w + rows[n, o + 7] * v - rows[n, o + 10] * f
-    c32 = rows[n, o + 4] * q + rows[n, o + 5] * w + rows[n, o + 8] * v - rows[n, o + 11] * f
     e00, e01, e10, e11, h0, h1 = (
         rows[n, 0],
         rows[n, 1],
@@ -86,10 +77,14 @@ def _slide(
         s[1, j] = e10 * sq + e11 * sw - g1 * fj
         s[2, j] += h0 * sq + h1 * sw - g2 * fj
     for j in range(n_slope):
-        t0, t1, t2, t3 = slope[0, j], slope[1, j], slope[2, j], slope[3, j]
-        s[0, j] += c00 * t0 + c10 * t1 + c20 * t2 + c30 * t3
-        s[1, j] += c01 * t0 + c11 * t1 + c21 * t2 + c31 * t3
-        s[2, j] += c02 * t0 + c12 * t1 + c22 * t2 + c32 * t3
+        o = ROW * (j + 1)
+        s[0, j] += rows[n, o] * q + rows[n, o + 1] * w + rows[n, o + 6] * v - rows[n, o + 9] * f
+        s[1, j] += (
+            rows[n, o + 2] * q + rows[n, o + 3] * w + rows[n, o + 7] * v - rows[n, o + 10] * f
+        )
+        s[2, j] += (
+            rows[n, o + 4] * q + rows[n, o + 5] * w + rows[n, o + 8] * v - rows[n, o + 11] * f
+        )
     x[0] = e00 * q + e01 * w + rows[n, 6] * v - g0 * f
     x[1] = e10 * q + e11 * w + rows[n, 7] * v - g1 * f
     x[2] += h0 * q + h1 * w + rows[n, 8] * v - g2 * f
@@ -165,6 +160,21 @@ def _zero_crossing(  # noqa: C901 - one search, branches for how it starts
 
 
 @inlined
+def _keeps_turning(
+    rows: Array, n: int, par: Array, x: Array, sign: float, v: float, f: float
+) -> bool:
+    """Tell from the propagator at hand that the speed does not reach zero on the way."""
+    q, w = x[0], x[1]
+    end = rows[n, 2] * q + rows[n, 3] * w + rows[n, 7] * v - rows[n, 10] * f
+    if sign * end < 0.0 or sign * w <= 0.0:
+        return False
+    if par[0] == 0.0:
+        return True
+    drive = rows[n, 0] * q + rows[n, 1] * w + rows[n, 6] * v - rows[n, 9] * f
+    return not (sign * (q - par[3] * w - f) < 0.0 and sign * (drive - par[3] * end - f) > 0.0)
+
+
+@inlined
 def _advance(  # noqa: C901 - the events of one interval, in order
     h: float,
     v: float,
@@ -179,6 +189,7 @@ def _advance(  # noqa: C901 - the events of one interval, in order
     df: Array,
     cache: Array,
     cached: Array,
+    derivatives: Array,
 ) -> float:
     """Advance by h at constant v, through all events; return the direction of motion."""
     left = h
@@ -209,13 +220,26 @@ def _advance(  # noqa: C901 - the events of one interval, in order
             direction = 1.0 if end > 0.0 else -1.0
         f = load
         which = 0
+        slot = 4
+        if whole:
+            for n in range(4):
+                if abs(cached[n] - h) < 1e-9 * h:
+                    slot = n
+                    break
+            if slot == 4:
+                slot = int(cached[4])
+                cached[4] = (slot + 1) % 4
+                cached[slot] = h
+                _fill(cache[slot], h, par, n_slope, slope, derivatives)
         if friction:
             f += par[VC_PLUS] if direction > 0.0 else -par[VC_MINUS]
             which = 0 if direction > 0.0 else 1
-            t = _zero_crossing(left, par, x, direction, v, f)
+            t = -1.0
+            if not (whole and _keeps_turning(cache, slot, par, x, direction, v, f)):
+                t = _zero_crossing(left, par, x, direction, v, f)
             if t >= 0.0:
-                _fill(cache[4], t, par)
-                _slide(cache, 4, x, s, n_slope, slope, v, f, df, which)
+                _fill(cache[4], t, par, n_slope, slope, derivatives)
+                _slide(cache, 4, x, s, n_slope, v, f, df, which)
                 x[1] = 0.0
                 net = (x[0] if par[0] > 0.0 else v) - load
                 before = net - (f - load)
@@ -236,20 +260,9 @@ def _advance(  # noqa: C901 - the events of one interval, in order
                 if left <= 1e-14 * h:
                     return direction
                 continue
-        slot = 4
-        if whole:
-            for n in range(4):
-                if abs(cached[n] - h) < 1e-9 * h:
-                    slot = n
-                    break
-            if slot == 4:
-                slot = int(cached[4])
-                cached[4] = (slot + 1) % 4
-                cached[slot] = h
-                _fill(cache[slot], h, par)
-        else:
-            _fill(cache[4], left, par)
-        _slide(cache, slot, x, s, n_slope, slope, v, f, df, which)
+        if not whole:
+            _fill(cache[4], left, par, n_slope, slope, derivatives)
+        _slide(cache, slot, x, s, n_slope, v, f, df, which)
         return direction
     return direction
 
@@ -380,6 +393,7 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
     s = np.zeros((3, p))
     df = np.zeros((2, p))
     cache = np.zeros((5, WIDTH))
+    derivatives = np.zeros(WIDTH)
     cached = np.full(5, -1.0)
     cached[4] = 0.0
     past = np.zeros(1 + p)
@@ -457,6 +471,7 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
                         df,
                         cache,
                         cached,
+                        derivatives,
                     )
                 now = end
                 if section < limit and change <= target + 1e-9 * (target - time[k - 1]):

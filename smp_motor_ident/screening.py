@@ -271,5 +271,5 @@ def _slow_product(v: Array, y: Array) -> float:
     """Return the largest (by size) inner product of voltage and a later speed."""
     n = len(v)
     lags = np.unique(np.minimum(np.geomspace(1, max(2, n // 50), 12).astype(int), n // 4)) - 1
-    products = [float(v[: n - k] @ y[k:]) for k in lags]
+    products = [float(np.einsum("i,i->", v[: n - k], y[k:])) for k in lags]
     return max(products, key=abs)

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import fftconvolve
 from scipy.stats import norm
 
 from smp_motor_ident import fit as fitting
@@ -37,10 +36,10 @@ def percent(measured: Array, predicted: Array) -> float:
     """
     ok = np.isfinite(measured) & np.isfinite(predicted)
     y, z = measured[ok], predicted[ok]
-    scatter = np.linalg.norm(y - y.mean()) if y.size else 0.0
+    scatter = float(np.sqrt(np.square(y - y.mean()).sum())) if y.size else 0.0
     if scatter == 0.0:
         return float("nan")
-    return float(100 * (1 - np.linalg.norm(y - z) / scatter))
+    return float(100 * (1 - np.sqrt(np.square(y - z).sum()) / scatter))
 
 
 def speed_fit(records: Sequence[Record], data: Experiments, fit: Fit) -> float:
@@ -187,7 +186,7 @@ def residual_tests(data: Experiments, fit: Fit, lags: int = 25) -> ResidualTests
 def _lagged(a: Array, b: Array, lags: int) -> Array:
     """Return the inner products of a and b, b delayed by 0 to ``lags`` samples."""
     n = len(a)
-    return np.asarray(fftconvolve(a[::-1], b)[n - 1 - lags : n][::-1])
+    return np.array([np.einsum("i,i->", a[k:], b[: n - k]) for k in range(lags + 1)])
 
 
 def _input_of(data: Experiments, g: int) -> tuple[Array, Array]:

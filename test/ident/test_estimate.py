@@ -164,3 +164,16 @@ def test_unknown_names_are_refused_by_name():
         estimate(recording, fixed={"mass": 1.0})
     with pytest.raises(ParameterError, match="resistance = -1"):
         estimate(recording, fixed={"resistance": -1.0})
+
+
+@pytest.mark.parametrize(
+    ("bounds", "current"),
+    [
+        ({"inductance": (1e-4, 1e-2)}, False),
+        ({"stiffness": (0.0, 1.0)}, True),
+        ({"inertia": (2.0, 1.0)}, True),
+    ],
+)
+def test_bounds_that_cannot_be_kept_are_refused_by_name(bounds, current):
+    with pytest.raises(ParameterError, match=next(iter(bounds))):
+        estimate(motors.record("rear_left", current=current), bounds=bounds)
