@@ -161,6 +161,28 @@ def _run(
     gradient = np.empty((segments, p))
     cost = np.empty(segments)
     spread = np.empty(6)
+    if predicted is None and _uneventful(data, structure, z, gain, huber):
+        used = recursion.run_linear(
+            data.time,
+            data.starts,
+            data.section_value,
+            data.output,
+            kind == recursion.ANGLE,
+            par,
+            slope,
+            n_slope,
+            initial,
+            kinds,
+            1 / math.sqrt(noise[0, 0]),
+            normal,
+            gradient,
+            cost,
+            spread,
+            length,
+            block_scores,
+            block_segment,
+        )
+        return normal, gradient, cost, spread, block_scores[:used], block_segment[:used]
     used = recursion.run(
         data.time,
         data.starts,
@@ -190,6 +212,22 @@ def _run(
         np.zeros((0, 3)) if predicted is None else predicted,
     )
     return normal, gradient, cost, spread, block_scores[:used], block_segment[:used]
+
+
+def _uneventful(
+    data: Experiments, structure: Structure, z: Array, gain: Array, huber: float
+) -> bool:
+    """Tell whether `recursion.run_linear` does: nothing happens between the samples."""
+    return bool(
+        structure.friction == "none"
+        and not structure.delay
+        and z[models.DELAY] == 0.0
+        and data.kind != recursion.MEAN_SPEED
+        and not data.current.size
+        and not np.isfinite(huber)
+        and not gain.any()
+        and data.section_end.ctypes.data == data.time.ctypes.data
+    )
 
 
 def _shortest(data: Experiments) -> float:

@@ -599,3 +599,134 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
             for i in range(j):
                 normal[g, i, j] = normal[g, j, i]
     return block + 1
+
+
+@compiled
+def run_linear(  # noqa: C901 - the same pass without its events
+    time: Array,
+    starts: Integers,
+    voltage: Array,
+    output: Array,
+    angle: bool,
+    par: Array,
+    slope: Array,
+    n_slope: int,
+    initial: Array,
+    local: Integers,
+    weight: float,
+    normal: Array,
+    gradient: Array,
+    cost: Array,
+    spread: Array,
+    block_length: int,
+    blocks: Array,
+    block_segment: Integers,
+) -> int:
+    """Run as `run` does where nothing happens between the samples.
+
+    Without friction, delay, window, current, robust loss and innovations; the input changes
+    at the samples.
+
+    Parameters
+    ----------
+    time, starts, output, par, slope, n_slope, initial, local
+        As in `run`.
+    voltage : ndarray, shape (n,)
+        Held over the interval that ends at each sample [V].
+    angle : bool
+        Whether the output is the angle.
+    weight : float
+        Inverse standard deviation of the output.
+    normal, gradient, cost, spread, block_length, blocks, block_segment
+        As in `run`.
+
+    Returns
+    -------
+    int
+        Number of rows of ``blocks`` in use.
+    """
+    n_common = slope.shape[1]
+    p = n_common + local.shape[0]
+    row = np.zeros(WIDTH)
+    derivatives = np.zeros(WIDTH)
+    sq, sw, st, d = np.zeros(p), np.zeros(p), np.zeros(p), np.zeros(p)
+    load_slope = np.zeros(p)
+    squares = np.zeros((p, p))
+    step = -1.0
+    spread[:] = 0.0
+    block = -1
+    for j in range(n_common):
+        load_slope[j] = slope[LOAD, j]
+    for j in range(local.shape[0]):
+        if local[j] == 3:
+            load_slope[n_common + j] = 1.0
+    e00 = e01 = e10 = e11 = h0 = h1 = g0 = g1 = g2 = 0.0
+    for g in range(starts.shape[0] - 1):
+        first, last = starts[g], starts[g + 1]
+        q, w, th = initial[g, 0], initial[g, 1], initial[g, 2]
+        f = par[LOAD] + initial[g, 3]
+        sq[:] = 0.0
+        sw[:] = 0.0
+        st[:] = 0.0
+        squares[:] = 0.0
+        gradient[g] = 0.0
+        for j in range(local.shape[0]):
+            sq[n_common + j] = 1.0 if local[j] == 0 else 0.0
+            sw[n_common + j] = 1.0 if local[j] == 1 else 0.0
+            st[n_common + j] = 1.0 if local[j] == 2 else 0.0
+        total = count = 0.0
+        filled = block_length
+        for k in range(first, last):
+            if k > first:
+                h = time[k] - time[k - 1]
+                if abs(h - step) > 1e-9 * h:
+                    step = h
+                    _fill(row, h, par, n_slope, slope, derivatives)
+                    e00, e01, e10, e11, h0, h1 = row[0], row[1], row[2], row[3], row[4], row[5]
+                    g0, g1, g2 = row[9], row[10], row[11]
+                v = voltage[k]
+                for j in range(p):
+                    a, b, c = sq[j], sw[j], load_slope[j]
+                    sq[j] = e00 * a + e01 * b - g0 * c
+                    sw[j] = e10 * a + e11 * b - g1 * c
+                    if angle:
+                        st[j] += h0 * a + h1 * b - g2 * c
+                for j in range(n_slope):
+                    o = ROW * (j + 1)
+                    sq[j] += row[o] * q + row[o + 1] * w + row[o + 6] * v - row[o + 9] * f
+                    sw[j] += row[o + 2] * q + row[o + 3] * w + row[o + 7] * v - row[o + 10] * f
+                    if angle:
+                        st[j] += row[o + 4] * q + row[o + 5] * w + row[o + 8] * v - row[o + 11] * f
+                th += h0 * q + h1 * w + row[8] * v - g2 * f
+                old = q
+                q = e00 * q + e01 * w + row[6] * v - g0 * f
+                w = e10 * old + e11 * w + row[7] * v - g1 * f
+            if filled == block_length:
+                block += 1
+                block_segment[block] = g
+                blocks[block] = 0.0
+                filled = 0
+            filled += 1
+            e = output[k] - (th if angle else w)
+            if e != e:
+                continue
+            total += e * e
+            count += 1.0
+            d = st if angle else sw
+            for j in range(p):
+                dj = d[j]
+                blocks[block, j] += dj * e
+                for i in range(j + 1):
+                    squares[j, i] += dj * d[i]
+        spread[0] += total
+        spread[3] += count
+        cost[g] = weight * weight * total
+        for j in range(p):
+            for i in range(j + 1):
+                normal[g, j, i] = weight * weight * squares[j, i]
+                normal[g, i, j] = normal[g, j, i]
+    for b in range(block + 1):
+        for j in range(p):
+            blocks[b, j] *= weight * weight
+            gradient[block_segment[b], j] += blocks[b, j]
+    return block + 1
