@@ -394,6 +394,9 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
     df = np.zeros((2, p))
     cache = np.zeros((5, WIDTH))
     derivatives = np.zeros(WIDTH)
+    row_fast = np.zeros(WIDTH)  # of the interval that comes again and again
+    whole = np.zeros(ROW)
+    fast = last_h = -1.0
     cached = np.full(5, -1.0)
     cached[4] = 0.0
     past = np.zeros(1 + p)
@@ -456,23 +459,65 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
                 if switches:
                     end = change
                 v = section_value[section]
-                if end > now:
-                    direction = _advance(
-                        end - now,
-                        v,
-                        direction,
-                        load,
-                        friction,
-                        par,
-                        x,
-                        s,
-                        n_slope,
-                        slope,
-                        df,
-                        cache,
-                        cached,
-                        derivatives,
-                    )
+                h = end - now
+                if h > 0.0:
+                    if abs(h - fast) > 1e-9 * h and abs(h - last_h) <= 1e-9 * h:
+                        fast = h
+                        _fill(row_fast, h, par, n_slope, slope, derivatives)
+                        for n in range(ROW):
+                            whole[n] = row_fast[n]
+                    last_h = h
+                    slides = abs(h - fast) <= 1e-9 * h
+                    f = load
+                    which = 0
+                    q, w = x[0], x[1]
+                    if slides and friction:
+                        if direction > 0.0:
+                            f += par[VC_PLUS]
+                        else:
+                            f -= par[VC_MINUS]
+                            which = 1
+                    new_q = whole[0] * q + whole[1] * w + whole[6] * v - whole[9] * f
+                    new_w = whole[2] * q + whole[3] * w + whole[7] * v - whole[10] * f
+                    if slides and friction:  # does it keep turning all the way?
+                        slides = direction * w > 0.0 and direction * new_w >= 0.0
+                        if slides and par[0] > 0.0:
+                            begins = direction * (q - par[BE] * w - f)
+                            ends = direction * (new_q - par[BE] * new_w - f)
+                            slides = not (begins < 0.0 and ends > 0.0)
+                    if slides:
+                        e00, e01, e10, e11 = whole[0], whole[1], whole[2], whole[3]
+                        h0, h1, g0, g1, g2 = whole[4], whole[5], whole[9], whole[10], whole[11]
+                        for j in range(p):
+                            a, b, c = s[0, j], s[1, j], df[which, j]
+                            s[0, j] = e00 * a + e01 * b - g0 * c
+                            s[1, j] = e10 * a + e11 * b - g1 * c
+                            s[2, j] += h0 * a + h1 * b - g2 * c
+                        for j in range(n_slope):
+                            o = ROW * (j + 1)
+                            r = row_fast[o : o + ROW]
+                            s[0, j] += r[0] * q + r[1] * w + r[6] * v - r[9] * f
+                            s[1, j] += r[2] * q + r[3] * w + r[7] * v - r[10] * f
+                            s[2, j] += r[4] * q + r[5] * w + r[8] * v - r[11] * f
+                        x[2] += h0 * q + h1 * w + whole[8] * v - g2 * f
+                        x[0], x[1] = new_q, new_w
+                    else:
+                        direction = _advance(
+                            h,
+                            v,
+                            direction,
+                            load,
+                            friction,
+                            par,
+                            x,
+                            s,
+                            n_slope,
+                            slope,
+                            df,
+                            cache,
+                            cached,
+                            derivatives,
+                        )
                 now = end
                 if section < limit and change <= target + 1e-9 * (target - time[k - 1]):
                     section += 1
