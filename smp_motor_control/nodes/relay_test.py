@@ -3,14 +3,14 @@
 The tool ``tune --relay`` starts it as a process of its own.  The wheel's controller is
 deactivated for the time of the test and activated again.  First a constant voltage shows the
 speed to oscillate around, then the relay switches around it.  One line of JSON at the end:
-``sample_time`` [s], ``voltage`` [V] and ``speed`` [rad/s, wheel], both around their rest; or
-``error``.  Whatever ends it, the last command is zero.
+``time`` [s] from the stamps, ``voltage`` [V] that was asked for after each sample, ``applied``
+[V, mean over the interval before the sample, None where the hardware does not tell] and ``speed``
+[rad/s, wheel], all around their rest; or ``error``.  Whatever ends it, the last command is zero.
 """
 
 from __future__ import annotations
 
 import argparse
-import itertools
 import json
 import math
 import signal
@@ -20,12 +20,15 @@ from collections.abc import Callable
 from typing import Any
 
 import rclpy
-from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState
+from lifecycle_msgs.msg import State, Transition
+from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.node import Node
 
 from smp_interfaces.msg import MotorCommand, MotorState
 from smp_motor_control.nodes import runtime
+
+PATIENCE = 8.0
+"""Longest wait for the wheel and its controller; on a busy machine discovery takes seconds [s]."""
 
 SETTLE = 1.5
 """How long the constant voltage acts; its last half second tells the speed [s]."""
@@ -54,6 +57,9 @@ class RelayTest(Node):
         self.stamps: list[float] = []
         self.speeds: list[float] = []
         self.voltages: list[float] = []
+        self.applied: list[float] = []
+        self.heard = self.paused = False
+        self.known: dict[str, Any] = {}
         self.command = self.create_publisher(
             MotorCommand, f"/{wheel}/motor_command", runtime.STREAM_PUBLISHER
         )
@@ -63,6 +69,7 @@ class RelayTest(Node):
 
     def _answer(self, message: MotorState) -> None:
         speed = message.velocity
+        self.heard = True
         if self.begun is None or not math.isfinite(speed):
             return
         if self.centre is None:
@@ -74,6 +81,7 @@ class RelayTest(Node):
         self.stamps.append(runtime.seconds(message.header.stamp))
         self.speeds.append(speed)
         self.voltages.append(self.output)
+        self.applied.append(message.voltage)
         self.send(self.output)
 
     def send(self, voltage: float) -> None:
@@ -94,10 +102,11 @@ class RelayTest(Node):
         first = len(self.speeds)
         self.output = self.bias + self.amplitude
         self.spin(lambda: False, seconds)
-        steps = sorted(b - a for a, b in itertools.pairwise(self.stamps))
+        applied = [v - self.bias for v in self.applied[first:]]
         return {
-            "sample_time": steps[len(steps) // 2],
+            "time": [t - self.stamps[first] for t in self.stamps[first:]],
             "voltage": [v - self.bias for v in self.voltages[first:]],
+            "applied": applied if all(map(math.isfinite, applied)) else None,
             "speed": [v - self.centre for v in self.speeds[first:]],
         }
 
@@ -111,17 +120,65 @@ class RelayTest(Node):
             rclpy.spin_once(self, timeout_sec=min(left, 0.05))
         return True
 
+    def take_over(self) -> str:
+        """Wait for the wheel and pause its controller; return what is in the way, or nothing."""
+        state = f"/{self.wheel}/motor_state"
+        if not self.spin(lambda: self.heard, PATIENCE):
+            return f"{state}: nothing within {PATIENCE:g} s; does the hardware's driver run?"
+        # Who is discovered together with the wheel is not so at the same instant.
+        self.spin(self.has_rival, 1.0)
+        if not self.has_rival():
+            return ""
+        before = self.state()
+        self.paused = before == State.PRIMARY_STATE_ACTIVE
+        if before is None or (self.paused and not self.switch(Transition.TRANSITION_DEACTIVATE)):
+            return (
+                f"/{self.wheel}/motor_command: someone else commands the wheel, and is no "
+                "wheel_pid that can be paused; end it first"
+            )
+        return ""
+
+    def has_rival(self) -> bool:
+        """Return whether someone else commands the wheel."""
+        return self.count_publishers(self.command.topic_name) > 1
+
+    def state(self) -> int | None:
+        """Return the state of the wheel's controller; None when it does not tell."""
+        end = time.monotonic() + PATIENCE
+        while time.monotonic() < end:
+            answer = self.ask(GetState, "get_state", GetState.Request())
+            if answer is not None:
+                return int(answer.current_state.id)
+        return None
+
     def switch(self, transition: int) -> bool:
-        """Ask the wheel's controller for a transition; return whether it is there and did it."""
-        client = self.create_client(ChangeState, f"/{self.wheel}/wheel_pid/change_state")
-        if not self.spin(client.service_is_ready, 2.0):
-            return False
-        for _ in range(6):
+        """Ask the wheel's controller for a transition; return whether it is in its state then.
+
+        Where an answer was lost it is there already and tells the next request as a failure, so
+        the state decides.
+        """
+        wanted = {
+            Transition.TRANSITION_DEACTIVATE: State.PRIMARY_STATE_INACTIVE,
+            Transition.TRANSITION_ACTIVATE: State.PRIMARY_STATE_ACTIVE,
+        }[transition]
+        end = time.monotonic() + PATIENCE
+        while time.monotonic() < end:
             request = ChangeState.Request(transition=Transition(id=transition))
-            future = client.call_async(request)
-            if self.spin(future.done, 1.0):
-                return bool(future.result().success)
+            self.ask(ChangeState, "change_state", request)
+            if self.state() == wanted:
+                return True
         return False
+
+    def ask(self, kind: Any, service: str, request: Any) -> Any:
+        """Ask the wheel's controller once; return its answer, or None."""
+        if service not in self.known:
+            name = f"/{self.wheel}/wheel_pid/{service}"
+            self.known[service] = self.create_client(kind, name)
+        client = self.known[service]
+        if not self.spin(client.service_is_ready, 0.5):
+            return None
+        future = client.call_async(request)
+        return future.result() if self.spin(future.done, 0.5) else None
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -145,16 +202,17 @@ def main(argv: list[str] | None = None) -> int:
     rclpy.init(signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     node = RelayTest(arguments.wheel, arguments.bias, arguments.amplitude, arguments.hysteresis)
-    paused = False
     try:
-        paused = node.switch(Transition.TRANSITION_DEACTIVATE)
-        print(json.dumps(node.run(arguments.seconds)), flush=True)
+        trouble = node.take_over()
+        answer = {"error": trouble} if trouble else node.run(arguments.seconds)
+        print(json.dumps(answer), flush=True)
     except KeyboardInterrupt:
         return 130
     finally:
-        node.begun = None
-        runtime.send_last(node.command, MotorCommand(voltage=0.0))
-        if paused:
+        if node.begun is not None:
+            node.begun = None
+            runtime.send_last(node.command, MotorCommand(voltage=0.0))
+        if node.paused:
             node.switch(Transition.TRANSITION_ACTIVATE)
         node.destroy_node()
         rclpy.try_shutdown()

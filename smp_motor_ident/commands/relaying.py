@@ -6,15 +6,17 @@ import argparse
 import json
 import math
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
 
 from smp_motor_ident.commands.processes import ProcessError, Processes
-from smp_motor_ident.errors import ParameterError
+from smp_motor_ident.errors import DesignError, ParameterError
 from smp_motor_ident.report.document import check_free, write_together
+from smp_motor_ident.tune.arrays import Array
 from smp_motor_ident.tune.methods.relay import read_oscillation
 from smp_motor_ident.tune.methods.ziegler_nichols import by_rule
 
@@ -72,12 +74,10 @@ def tune_by_relay(arguments: argparse.Namespace, files: Sequence[Path]) -> int:
         if not line:
             raise ProcessError(f"relay_test ended: {processes.last_words('relay_test')}")
         answer = json.loads(line)
-        processes.wait("relay_test", 20.0)
+        processes.wait("relay_test", 30.0)
     if "error" in answer:
         raise ProcessError(answer["error"])
-    gain, period = read_oscillation(
-        np.array(answer["voltage"]), np.array(answer["speed"]), answer["sample_time"]
-    )
+    gain, period = read_oscillation(*evenly(answer))
     rule, structure = arguments.rule or "tyreus_luyben", arguments.structure or "pi"
     ruled = by_rule(rule, structure, gain, period)
     told = (
@@ -100,3 +100,34 @@ def tune_by_relay(arguments: argparse.Namespace, files: Sequence[Path]) -> int:
         write_together({files[0]: text}, arguments.force)
         print(f"written: {files[0]}")
     return 0
+
+
+def evenly(answer: Mapping[str, Any]) -> tuple[Array, Array, float]:
+    """Return a recorded oscillation on an even grid, whatever samples were lost.
+
+    Parameters
+    ----------
+    answer : mapping
+        Of the node ``relay_test``: ``time``, ``voltage``, ``applied``, ``speed``.
+
+    Returns
+    -------
+    voltage : ndarray, shape (k,), [V]
+        That acted, where the hardware tells it: what was asked for acts later, at an instant
+        that wanders on a busy machine, and the motor answers what acted.
+    speed : ndarray, shape (k,), [rad/s]
+    sample_time : float
+        The usual interval [s].
+
+    Raises
+    ------
+    DesignError
+        When fewer than 20 samples came.
+    """
+    time, speed = np.array(answer["time"]), np.array(answer["speed"])
+    if time.size < 20:
+        raise DesignError(f"only {time.size} samples came while the relay switched")
+    step = float(np.median(np.diff(time)))
+    acted = answer["voltage"] if answer["applied"] is None else answer["applied"]
+    grid = np.arange(time[0], time[-1], step)
+    return np.interp(grid, time, acted), np.interp(grid, time, speed), step

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from smp_motor_ident.commands.relaying import evenly
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.tune.feedback import Feedback, closed_loop
 from smp_motor_ident.tune.loop import Loop
@@ -111,6 +112,32 @@ def test_relay_feedback_finds_the_ultimate_point_without_a_model(coefficients):
     assert gain == pytest.approx(one.ultimate[0], rel=0.35)
     assert period == pytest.approx(one.ultimate[1], rel=0.35)
     assert np.abs(voltage).max() == 3.0
+
+
+def test_relay_feedback_bears_lost_samples():
+    one = problem(PAPER[3])
+    voltage, speed = oscillate(one, 3.0, one.loop.count_angle / 0.005, 4.0)
+    time = 0.005 * np.arange(voltage.size)
+    acted = np.roll(voltage, 2)  # what the hardware reports: a sample of delay, one of holding
+    kept = np.random.default_rng(4).uniform(size=time.size) > 0.05
+    answer = {
+        "time": time[kept].tolist(),
+        "voltage": voltage[kept].tolist(),
+        "applied": acted[kept].tolist(),
+        "speed": speed[kept].tolist(),
+    }
+    gain, period = read_oscillation(*evenly(answer))
+    whole = read_oscillation(voltage, speed, 0.005)
+    # One sample of twenty is a straight line between its neighbours, a twelfth of a period apart.
+    assert (gain, period) == pytest.approx(whole, rel=0.05)
+    # Without the voltage that acted, the one that was asked for tells nearly the same.
+    asked = read_oscillation(*evenly({**answer, "applied": None}))
+    assert asked == pytest.approx(whole, rel=0.05)
+
+
+def test_relay_without_samples_is_told():
+    with pytest.raises(DesignError, match="only 1 samples"):
+        evenly({"time": [0.0], "voltage": [0.0], "applied": None, "speed": [0.0]})
 
 
 def test_relay_that_does_not_oscillate_is_told():
