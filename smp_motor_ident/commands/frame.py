@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import argparse
 import os
-import signal
 import sys
 import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from types import FrameType
 from typing import NoReturn
 
 from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from smp_motor_control.errors import SmpError
+from smp_motor_ident.commands.interruption import interruptible
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
@@ -62,9 +61,8 @@ def run(
         arguments = parser.parse_args(argv)
     except SystemExit as end:
         return int(end.code or 0)
-    previous = {s: signal.signal(s, _interrupt) for s in (signal.SIGTERM, signal.SIGHUP)}
     try:
-        with warnings.catch_warnings():
+        with interruptible(), warnings.catch_warnings():
             # Numerics that fail are dealt with where they occur; standard error is for the user.
             warnings.simplefilter("ignore", RuntimeWarning)
             code = work(arguments) or 0
@@ -83,13 +81,6 @@ def run(
             raise
         told = f"{type(error).__name__}: {error}".replace("\n", " ")
         return _fail(parser.prog, f"a defect of this tool: {told} (SMP_DEBUG=1 shows where)", 2)
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
-
-
-def _interrupt(number: int, frame: FrameType | None) -> None:
-    raise KeyboardInterrupt
 
 
 def _fail(program: str, message: str, code: int) -> int:

@@ -19,6 +19,7 @@ from types import TracebackType
 from typing import IO
 
 from smp_motor_control.errors import SmpError
+from smp_motor_ident.commands import interruption
 
 _PR_SET_PDEATHSIG = 1
 _LIBC = ctypes.CDLL(None, use_errno=True)
@@ -162,8 +163,8 @@ class Processes:
         """
         self._logs.mkdir(parents=True, exist_ok=True)
         parent = os.getpid()
-        with (self._logs / f"{name}.log").open("wb") as log:
-            process = subprocess.Popen(
+        with (self._logs / f"{name}.log").open("wb") as log, interruption.held():
+            process = self._running[name] = subprocess.Popen(
                 [*_command(node), *arguments],
                 stdin=subprocess.PIPE if pipes else subprocess.DEVNULL,
                 stdout=subprocess.PIPE if pipes else log,
@@ -172,7 +173,6 @@ class Processes:
                 start_new_session=True,
                 preexec_fn=lambda: _prepare(parent, priority),
             )
-        self._running[name] = process
         return process
 
     def check(self, but: str = "") -> None:
@@ -187,7 +187,10 @@ class Processes:
         ------
         ProcessError
             When one has ended; the message has the last line of its log.
+        KeyboardInterrupt
+            When a signal asked for it.
         """
+        interruption.check()
         for name, process in self._running.items():
             if name != but and process.poll() is not None:
                 raise ProcessError(

@@ -1,0 +1,67 @@
+"""Ctrl-C reaches a tool even when Python drops the exception."""
+
+from __future__ import annotations
+
+import os
+import signal
+import weakref
+
+import pytest
+
+from smp_motor_ident.commands import interruption
+
+
+class Thing:
+    """Something that can be weakly referred to."""
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_inside_a_callback_that_cannot_raise_is_raised_at_the_next_look(number):
+    def in_callback(_: object) -> None:
+        os.kill(os.getpid(), number)
+        for _ in range(1000):
+            pass  # the handler runs between two of these
+
+    with interruption.interruptible():
+        thing = Thing()
+        reference = weakref.ref(thing, in_callback)
+        del thing  # the exception that the callback raises is dropped here
+        assert reference() is None
+        with pytest.raises(KeyboardInterrupt):
+            interruption.check()
+
+
+def test_what_was_asked_for_is_forgotten_after_the_block():
+    with pytest.raises(KeyboardInterrupt), interruption.interruptible():
+        os.kill(os.getpid(), signal.SIGINT)
+    with interruption.interruptible():
+        interruption.check()
+
+
+def test_an_inner_block_does_not_make_the_outer_forget():
+    with interruption.interruptible():
+        with pytest.raises(KeyboardInterrupt), interruption.interruptible():
+            os.kill(os.getpid(), signal.SIGINT)
+        with pytest.raises(KeyboardInterrupt):
+            interruption.check()
+
+
+def test_earlier_handlers_are_restored():
+    before = signal.getsignal(signal.SIGTERM)
+    with interruption.interruptible():
+        assert signal.getsignal(signal.SIGTERM) is not before
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_what_must_not_be_left_half_done_is_done_before_the_interruption():
+    done: list[str] = []
+
+    def work() -> None:
+        with interruption.held():
+            os.kill(os.getpid(), signal.SIGTERM)
+            done.append("all of it")
+
+    with interruption.interruptible(), pytest.raises(KeyboardInterrupt):
+        work()
+    assert done
