@@ -24,6 +24,8 @@ from smp_motor_ident.tune.methods.ziegler_nichols import from_ultimate
 from smp_motor_ident.tune.problem import Method, Problem, Promise
 
 LEAST_CYCLES = 4
+ALIKE = 0.25
+"""Share by which the length of a cycle may differ from the usual one and still count."""
 
 
 def oscillate(
@@ -107,15 +109,26 @@ def read_oscillation(voltage: Array, speed: Array, sample_time: float) -> tuple[
             f"the relay switched over only {max(switches.size - 1, 0)} steady cycles, it needs "
             f"{LEAST_CYCLES}; run it longer or with a larger amplitude"
         )
-    first, last = int(switches[0]), int(switches[-1])
-    cycles = switches.size - 1
-    period = (last - first) / cycles * sample_time
-    turn = np.exp(-2j * math.pi * cycles * np.arange(last - first) / (last - first))
-    sent = abs(np.sum(turn * voltage[first:last]))
-    answered = abs(np.sum(turn * speed[first:last]))
+    lengths = np.diff(switches)
+    # A cycle during which the machine stood still, or counts made it switch twice, is none.
+    alike = np.flatnonzero(np.abs(lengths - np.median(lengths)) <= ALIKE * np.median(lengths))
+    if alike.size < LEAST_CYCLES:
+        raise DesignError(
+            f"only {alike.size} of {lengths.size} cycles are alike, it needs {LEAST_CYCLES}: the "
+            "delay wanders; run it on a machine that is less busy"
+        )
+    powers = np.array([_fundamental(voltage, speed, switches[k], lengths[k]) for k in alike])
+    sent, answered = np.sqrt(powers.sum(axis=0))
     if not answered > 0:
         raise DesignError("the wheel did not move under the relay; use a larger amplitude")
-    return float(sent / answered), period
+    return float(sent / answered), float(lengths[alike].mean() * sample_time)
+
+
+def _fundamental(voltage: Array, speed: Array, first: int, length: int) -> tuple[float, float]:
+    """Return the squared fundamentals of one cycle."""
+    turn = np.exp(-2j * math.pi * np.arange(length) / length)
+    cycle = slice(first, first + length)
+    return abs(np.sum(turn * voltage[cycle])) ** 2, abs(np.sum(turn * speed[cycle])) ** 2
 
 
 def _solve(problem: Problem) -> Feedback:
