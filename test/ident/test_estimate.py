@@ -177,3 +177,14 @@ def test_unknown_names_are_refused_by_name():
 def test_bounds_that_cannot_be_kept_are_refused_by_name(bounds, current):
     with pytest.raises(ParameterError, match=next(iter(bounds))):
         estimate(motors.record("rear_left", current=current), bounds=bounds)
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_a_square_wave_without_current_does_not_lead_friction_astray(seed):
+    # Stopping and starting makes kinks; another valley would be some 15 deviations away.
+    result = estimate(
+        motors.record("front_right", current=False, kinds=("square",), seed=seed),
+        model="second_order",
+    )
+    truth = motors.truth("front_right", 0.3)
+    check(result, truth, ("dc_gain", "time_constant", "static_voltage"))
