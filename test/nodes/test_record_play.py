@@ -282,6 +282,7 @@ def test_play_goes_faster_from_an_offset_with_a_clock_and_chosen_topics(
 ) -> None:
     written = write_bag(tmp_path / "bag")
     arguments = ("--rate", "0.5", "--start-offset", "0.5", "--clock", "100", "--topics", "number")
+    arguments += ("--delay", "3")  # on a busy machine discovery takes that long
     player = process("play", tmp_path / "bag", *arguments)
     assert player.wait(30.0) == 0
     assert listener.data["/number"] == written["/number"][50:]
@@ -299,7 +300,7 @@ def test_play_loops_until_it_is_interrupted(
     tmp_path: Path,
 ) -> None:
     written = write_bag(tmp_path / "bag", count=10)
-    player = process("play", tmp_path / "bag", "--loop", "--rate", "2")
+    player = process("play", tmp_path / "bag", "--loop", "--rate", "2", "--delay", "3")
     eventually(lambda: len(listener.data["/number"]) >= 25, deadline=20.0)
     player.interrupt()
     assert player.wait(3.0) == 0
