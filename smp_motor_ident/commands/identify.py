@@ -13,11 +13,18 @@ from functools import partial
 from importlib import metadata
 from pathlib import Path
 
+import numpy as np
+
 from smp_motor_ident import bag
 from smp_motor_ident.commands.frame import Parser, progress, run
 from smp_motor_ident.commands.tables import console, estimate_table
 from smp_motor_ident.commands.topics import list_topics
-from smp_motor_ident.errors import BagError, ParameterError, SmpError
+from smp_motor_ident.errors import (
+    BagError,
+    InsufficientExcitationError,
+    ParameterError,
+    SmpError,
+)
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.identifiability import what_next
 from smp_motor_ident.record import Record
@@ -256,6 +263,13 @@ def _identify(
         raise
     except SmpError as error:
         results.failures[wheel] = error
+        return
+    except np.linalg.LinAlgError as error:
+        # One wheel's numerics must not take the others' results with them.
+        results.failures[wheel] = InsufficientExcitationError(
+            f"{records[0].source}: {wheel}: the estimate broke down ({error}); record a longer "
+            "excitation with several frequencies, in both directions"
+        )
         return
     results.estimates[wheel] = found
     notes = [note for record in (*records, *kept) for note in record.notes]
