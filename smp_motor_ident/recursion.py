@@ -674,12 +674,16 @@ def run_linear(  # noqa: C901 - the same pass without its events
 
     Parameters
     ----------
-    time, starts, output, par, slope, n_slope, initial, local
+    time, starts
         As in `run`.
     voltage : ndarray, shape (n,)
         Held over the interval that ends at each sample [V].
+    output
+        As in `run`.
     angle : bool
-        Whether the output is the angle.
+        Whether it is the angle.
+    par, slope, n_slope, initial, local
+        As in `run`.
     weight : float
         Inverse standard deviation of the output.
     normal, gradient, cost, spread, block_length, blocks, block_segment
