@@ -26,6 +26,8 @@ from smp_interfaces.msg import MotorDescription, MotorState  # noqa: E402
 from smp_motor_ident.bag import BagWriter, read_records  # noqa: E402
 
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
+# Where the first word of a DDS participant is lost, its next follows after 3 s.
+UNHURRIED = ("--delay", "5")
 RELIABLE = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 BEST_EFFORT = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
 LATCHED = QoSProfile(
@@ -285,7 +287,7 @@ def test_play_goes_faster_from_an_offset_with_a_clock_and_chosen_topics(
 ) -> None:
     written = write_bag(tmp_path / "bag")
     arguments = ("--rate", "0.5", "--start-offset", "0.5", "--clock", "100", "--topics", "number")
-    arguments += ("--delay", "3")  # on a busy machine discovery takes that long
+    arguments += UNHURRIED
     player = process("play", tmp_path / "bag", *arguments)
     assert player.wait(30.0) == 0
     assert listener.data["/number"] == written["/number"][50:]
@@ -303,7 +305,7 @@ def test_play_loops_until_it_is_interrupted(
     tmp_path: Path,
 ) -> None:
     written = write_bag(tmp_path / "bag", count=10)
-    player = process("play", tmp_path / "bag", "--loop", "--rate", "2", "--delay", "3")
+    player = process("play", tmp_path / "bag", "--loop", "--rate", "2", *UNHURRIED)
     eventually(lambda: len(listener.data["/number"]) >= 25, deadline=20.0)
     player.interrupt()
     assert player.wait(3.0) == 0
@@ -316,7 +318,7 @@ def test_what_is_recorded_while_playing_is_the_same_bag(
     written = write_bag(tmp_path / "bag")
     recorder = process("record", "-o", tmp_path / "again", "--regex", "/number|/text")
     eventually(lambda: "recording to" in recorder.output, deadline=20.0)
-    player = process("play", tmp_path / "bag", "--delay", "3")
+    player = process("play", tmp_path / "bag", *UNHURRIED)
     assert player.wait(30.0) == 0
     eventually(lambda: sum(map(len, so_far(tmp_path / "again").values())) >= 200)
     recorder.interrupt()
