@@ -63,6 +63,11 @@ class Settings:
     seed: int = described(1, "Of all noise.", read_only=True)
 
 
+SHORTEST_INTERVAL = 0.5
+"""Of two samples, in periods: a timer that was late makes up for it, a microcontroller does not.
+A speed that is differenced over a sliver of a period would be all quantisation."""
+
+
 class Wheel:
     """One motor and its topics."""
 
@@ -173,6 +178,8 @@ class MotorPlant(Node):
     def _tick(self) -> None:
         stamp = self.get_clock().now().to_msg()
         now = time.monotonic()
+        if now - self._last < SHORTEST_INTERVAL * self._period:
+            return
         self._late += now - self._last > 1.5 * self._period
         self._last = now
         self._samples += 1
