@@ -12,7 +12,8 @@ import numpy as np
 from known_motors import TABLE_1, recording, table
 
 from smp_motor_ident import fit
-from smp_motor_ident.cold import Options, cold_fit
+from smp_motor_ident.cold import cold_fit
+from smp_motor_ident.descent import Options
 from smp_motor_ident.errors import SmpError
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.experiments import prepare

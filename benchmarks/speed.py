@@ -17,7 +17,8 @@ from known_motors import TABLE_1, recording, table
 from scipy.optimize import least_squares
 from scipy.signal import cont2discrete, lfilter
 
-from smp_motor_ident.cold import Options, cold_fit
+from smp_motor_ident.cold import cold_fit
+from smp_motor_ident.descent import Options
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.experiments import prepare
 from smp_motor_ident.models import Structure

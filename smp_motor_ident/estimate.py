@@ -7,15 +7,17 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident import cold, ladder, models, validate
+from smp_motor_ident import ladder, models, validate
 from smp_motor_ident import recursion as rc
 from smp_motor_ident.advice import advise, doubts
 from smp_motor_ident.answer import Answer, answer
-from smp_motor_ident.cold import Options, cold_fit, extend, grow, refine
+from smp_motor_ident.choice import Rung
+from smp_motor_ident.cold import cold_fit
+from smp_motor_ident.descent import Options, head, refine
 from smp_motor_ident.errors import InsufficientExcitationError, ParameterError, SignalError
 from smp_motor_ident.experiments import Experiments, between_samples, prepare
 from smp_motor_ident.fit import Fit, Prior
-from smp_motor_ident.ladder import Rung
+from smp_motor_ident.horizon import extend, grow
 from smp_motor_ident.models import MODELS, PHYSICAL, Structure
 from smp_motor_ident.quantisation import blurred, widened
 from smp_motor_ident.record import Record
@@ -230,10 +232,10 @@ def _hold(
     if best is None:
         return "held", None
     hold = "held"
-    part = cold.head(plain)
+    part = head(plain)
     near = refine(part, best.structure, best, best.z, options) if part is not plain else best
     for other, data in others.items():
-        fitted = grow(cold.head(data), best.structure, near, options)
+        fitted = grow(head(data), best.structure, near, options)
         if fitted.deviance > near.deviance + FAR and fitted.converged:
             continue
         fitted = extend(data, best.structure, fitted, options)

@@ -3,165 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from smp_motor_ident import cold, models, start
+from smp_motor_ident import descent, horizon, models
 from smp_motor_ident import fit as fitting
 from smp_motor_ident import recursion as rc
-from smp_motor_ident.cold import Options
+from smp_motor_ident.choice import Rung, inflation, label, needed, size
+from smp_motor_ident.cold import cold_fit
+from smp_motor_ident.descent import Options
 from smp_motor_ident.experiments import Experiments
 from smp_motor_ident.fit import Fit
+from smp_motor_ident.lateness import averaged, with_delay
 from smp_motor_ident.models import Structure
-
-Array = NDArray[np.float64]
 
 HOPELESS = 40.0  # deviance on the head of the data by which a rung is out for good
 LITTLE = 0.02  # of the largest voltage: friction below it may be left out
-
-
-@dataclass(frozen=True, eq=False)
-class Rung:
-    """A fitted structure and what was decided about it."""
-
-    fit: Fit
-    reason: str = ""
-
-    @property
-    def label(self) -> str:
-        """Name of the structure with what was added to it."""
-        return label(self.fit.structure)
-
-    @property
-    def bic(self) -> float:
-        """Bayesian information criterion."""
-        return bic(self.fit)
-
-
-def label(structure: Structure) -> str:
-    """Return a structure's name in words.
-
-    Parameters
-    ----------
-    structure : Structure
-        Any.
-
-    Returns
-    -------
-    str
-        Such as ``first_order with delay``.
-    """
-    added = [
-        word
-        for flag, word in (
-            (structure.friction == "none", "no friction"),
-            (structure.friction == "asymmetric", "asymmetric friction"),
-            (structure.load, "load"),
-            (structure.delay, "delay"),
-            (structure.window, "averaged speed"),
-            (structure.offset, "current offset"),
-        )
-        if flag
-    ]
-    return structure.name + (" with " + ", ".join(added) if added else "")
-
-
-def bic(fit: Fit) -> float:
-    """Return the Bayesian information criterion of a fit.
-
-    Parameters
-    ----------
-    fit : Fit
-        Any.
-
-    Returns
-    -------
-    float
-        Deviance + parameters x ln(samples).
-    """
-    return fit.deviance + size(fit.structure) * float(np.log(fit.samples))
-
-
-def size(structure: Structure) -> int:
-    """Return the number of parameters that a structure is charged for.
-
-    Parameters
-    ----------
-    structure : Structure
-        Any.
-
-    Returns
-    -------
-    int
-        L/R beside the response's own coefficients is not charged: leaving it free is honest
-        about what is not known, it claims nothing.
-    """
-    free = structure.free()
-    return len(free) - (models.TE in free and not structure.current)
-
-
-def inflation(fit: Fit) -> float:
-    """Return by how much the scores scatter more than white residuals would let them.
-
-    Parameters
-    ----------
-    fit : Fit
-        Any.
-
-    Returns
-    -------
-    float
-        At least 1; deviances are divided by it before they are compared.
-    """
-    white = np.diag(np.linalg.pinv(fit.information, hermitian=True))
-    return float(max(1.0, np.median(np.diag(fit.covariance()) / np.maximum(white, 1e-300))))
-
-
-def needed(simple: Fit, rich: Fit) -> tuple[bool, str]:
-    """Decide whether the data reject the simpler of two models.
-
-    Parameters
-    ----------
-    simple, rich : Fit
-        On the same data.
-
-    Returns
-    -------
-    verdict : bool
-        Whether ``rich`` is needed.
-    reason : str
-        In words.
-    """
-    more = size(rich.structure) - size(simple.structure)
-    gained = (simple.deviance - rich.deviance) / inflation(rich)
-    price = more * float(np.log(simple.samples))
-    if not rich.converged and gained < 10 * price:
-        return False, "did not converge"
-    if gained <= price:
-        return (
-            False,
-            f"no better than {label(simple.structure)} (gain {gained:.0f}, price {price:.0f})",
-        )
-    loose = _loose(simple, rich)
-    if loose:
-        return False, f"its {loose} cannot be told from these data"
-    return True, f"{label(simple.structure)} is rejected (gain {gained:.0f}, price {price:.0f})"
-
-
-def _loose(simple: Fit, rich: Fit) -> str:
-    cov = rich.covariance()
-    free = rich.structure.free()
-    for i in set(free) - set(simple.structure.free()):
-        name = models.Z_NAMES[i]
-        std = float(np.sqrt(cov[free.index(i), free.index(i)]))
-        if name in ("delay", "window") and std > 0.4 * rich.z[i]:
-            return name
-        if name == "ln_a2" and std > 0.4:
-            return "second time constant"
-    return ""
-
 
 Say = Callable[[str], None]
 
@@ -222,8 +80,8 @@ def explore(
 def _cold(data: Experiments, s: Structure, options: Options, say: Say) -> Fit | None:
     say(f"fitting {label(s)}")
     if s.delay:
-        return _with_delay(data, s, options, None)
-    return cold.cold_fit(data, s, options)
+        return with_delay(data, s, options, None)
+    return cold_fit(data, s, options)
 
 
 def _frictionless(
@@ -237,8 +95,8 @@ def _frictionless(
     if base.current or base.friction != "symmetric" or options.priors or data.quantum > 0:
         return []
     plain = base.with_(friction="none", shape=False)
-    head = cold.head(data)
-    quick = cold.cold_fit(head, plain, options)
+    head = descent.head(data)
+    quick = cold_fit(head, plain, options)
     if quick is None or not quick.converged or _friction_shows(head, quick, False):
         return []
     rungs = explore(data, plain, options, auto, say, quick if head is data else None)
@@ -271,7 +129,7 @@ def _orders(
 
     Rungs that the head of a long record rejects by far are not fitted to all of it.
     """
-    part = cold.head(data)
+    part = descent.head(data)
     tried: list[Fit] = []
     for structure in _ladder(base, data.kind == rc.SPEED, data.quantum > 0):
         say(f"fitting {label(structure)}")
@@ -285,7 +143,7 @@ def _orders(
             if fitted.deviance > least + HOPELESS * inflation(fitted):
                 rungs.append(Rung(_projected(data, fitted), f"rejected on {part.size} samples"))
                 continue
-            fitted = cold.extend(_of_kind(data, fitted), fitted.structure, fitted, options)
+            fitted = horizon.extend(_of_kind(data, fitted), fitted.structure, fitted, options)
         if best is None:
             best = fitted
             rungs.append(Rung(fitted, "the simplest" if len(rungs) == 0 else "the simplest left"))
@@ -305,7 +163,7 @@ def _projected(data: Experiments, fit: Fit) -> Fit:
     """Return a fit of the head with its deviance projected to all data."""
     return replace(
         fit,
-        initial=cold.initial_of(data, fit),
+        initial=descent.initial_of(data, fit),
         deviance=fit.deviance * data.size / fit.samples,
         samples=data.size,
     )
@@ -338,9 +196,9 @@ def _one(data: Experiments, structure: Structure, options: Options, known: list[
         twin = _find(known, late) or _find(known, late.with_(window=False))
         if twin is None or structure.order == 1:
             twin = _find(known, structure.with_(window=False, delay=True))
-        return _averaged(data, structure, options, twin)
+        return averaged(data, structure, options, twin)
     if structure.delay:
-        return _with_delay(data, structure, options, _find(known, structure.with_(delay=False)))
+        return with_delay(data, structure, options, _find(known, structure.with_(delay=False)))
     extra = []
     if structure.order == 2 and known:
         z = min(known, key=lambda f: f.deviance).z.copy()
@@ -349,46 +207,11 @@ def _one(data: Experiments, structure: Structure, options: Options, known: list[
         z[models.TE] = z[models.A2] - z[models.A1]
         z[models.DELAY] = 0.0
         extra = [z]
-    return cold.cold_fit(data, structure, options, extra)
+    return cold_fit(data, structure, options, extra)
 
 
 def _find(known: list[Fit], structure: Structure) -> Fit | None:
     return next((f for f in known if f.structure == structure), None)
-
-
-def _with_delay(
-    data: Experiments, delayed: Structure, options: Options, plain: Fit | None
-) -> Fit | None:
-    """Fit with a delay, started from several: the surface has a valley for each sample."""
-    structure = delayed.with_(delay=False)
-    starts = []
-    if plain is not None:
-        z = plain.z.copy()
-        z[models.DELAY] = 0.2 * data.step
-        starts.append(z)
-    for lag in (0, 1, 2, 4, 8, 16, 32):
-        # The regressions of a lagged input are those of a delayed motor.
-        for z in start.lagged_candidates(data, structure, lag):
-            z[models.DELAY] = max(lag - 0.5, 0.1) * data.step
-            starts.append(z)
-    return _snap(data, cold.cold_fit(data, delayed, options, starts, keep=4, own=False), options)
-
-
-def _snap(data: Experiments, fit: Fit | None, options: Options) -> Fit | None:
-    """Try a whole number of samples of delay: the surface has a kink there.
-
-    A switch of the input that falls on a sampling instant makes the derivative by the delay
-    jump; a descent that comes near such a point stays short of it.
-    """
-    if fit is None:
-        return None
-    best = fit
-    for n in {int(fit.z[models.DELAY] / data.step), int(fit.z[models.DELAY] / data.step) + 1}:
-        whole = fit.structure.with_(held={**fit.structure.held, "delay": n * data.step})
-        other = cold.refine(data, whole, fit, fit.z, options)
-        if other.deviance < best.deviance - 1:
-            best = cold.restate(data, fit.structure, other, options)
-    return best
 
 
 def _variations(data: Experiments, best: Fit, options: Options, rungs: list[Rung], say: Say) -> Fit:
@@ -413,12 +236,12 @@ def _variations(data: Experiments, best: Fit, options: Options, rungs: list[Rung
         z = best.z.copy()
         if "delay" in change:
             z[models.DELAY] = 0.3 * data.step
-        other = cold.refine(data, richer, best, z, options)
+        other = descent.refine(data, richer, best, z, options)
         verdict, reason = needed(best, other)
         if verdict and "delay" in change and other.z[models.DELAY] < 0.03 * data.step:
             verdict, reason = False, "a delay of hundredths of a sample is how the input was held"
         if verdict and other.ratio > 0:  # what looked like torque noise may have been this
-            other = cold.grow(data, richer, other, options)
+            other = horizon.grow(data, richer, other, options)
         rungs.append(Rung(other, reason))
         if verdict:
             best = other
@@ -440,17 +263,17 @@ def _without_friction(data: Experiments, best: Fit, options: Options, rungs: lis
     if s.friction != "symmetric" or "vc_plus" in s.held:
         return best
     smooth = s.with_(friction="none", shape=False)
-    head = _of_kind(cold.head(data), best)
+    head = _of_kind(descent.head(data), best)
     if head.size < data.size:
-        with_it = cold.refine(head, s, best, best.z, options)
-        without = cold.refine(head, smooth, with_it, best.z, options)
+        with_it = descent.refine(head, s, best, best.z, options)
+        without = descent.refine(head, smooth, with_it, best.z, options)
         if without.deviance > with_it.deviance + HOPELESS * inflation(with_it):
             return best
-    plain = cold.refine(data, smooth, best, best.z, options)
+    plain = descent.refine(data, smooth, best, best.z, options)
     if plain.deviance < best.deviance:  # then friction has led astray
         z = plain.z.copy()
         z[models.VC_PLUS] = 1e-3 * np.abs(data.section_value).max()
-        again = cold.refine(data, s, plain, s.complete(z), options)
+        again = descent.refine(data, s, plain, s.complete(z), options)
         best = min(best, again, key=lambda f: f.deviance)
     cov = best.covariance()
     i = s.free().index(models.VC_PLUS)
@@ -476,38 +299,9 @@ def _try_average(
         z = best.z.copy()
         z[models.WINDOW] = width * data.step
         starts.append(z)
-    fitted = cold.cold_fit(data.as_mean_speed(), structure, options, starts, keep=3, own=False)
+    fitted = cold_fit(data.as_mean_speed(), structure, options, starts, keep=3, own=False)
     if fitted is None:
         return best
     verdict, reason = needed(best, fitted)
     rungs.append(Rung(fitted, reason))
     return fitted if verdict else best
-
-
-def _averaged(
-    data: Experiments, structure: Structure, options: Options, twin: Fit | None
-) -> Fit | None:
-    """Fit a speed averaged over a window, started from what looked like a delay."""
-    if twin is None:
-        return None
-    lag = max(twin.z[models.DELAY] + 0.5 * twin.z[models.WINDOW], 0.5 * data.step)
-    starts = []
-    if twin.structure.window:
-        z = twin.z.copy()
-        z[models.A2] = z[models.A1] + np.log(0.1 * lag)
-        z[models.TE] = z[models.A2] - z[models.A1]
-        starts.append(z)
-    for width in (0.5, 1.0, 1.6) if structure.delay else (1.0, 2.0, 3.0):
-        z = twin.z.copy()
-        z[models.WINDOW] = max(width * lag, 1.01 * data.step)
-        z[models.DELAY] = max(lag - 0.5 * z[models.WINDOW], 0.1 * data.step)
-        if not structure.delay:
-            z[models.DELAY] = 0.0
-        if structure.order == 2 and twin.structure.order == 1:
-            z[models.A2] = z[models.A1] + np.log(0.3 * lag)
-            z[models.TE] = z[models.A2] - z[models.A1]
-        starts.append(z)
-    mean = data.as_mean_speed()
-    own = structure.order == 2 and not structure.delay
-    fitted = cold.cold_fit(mean, structure, options, starts, keep=3, own=own)
-    return _snap(mean, fitted, options) if structure.delay else fitted

@@ -1,0 +1,90 @@
+"""The valley along which friction and gain trade where the current is not measured.
+
+Derivation: docs/derivations.md, section 10.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from smp_motor_ident import models
+from smp_motor_ident.descent import Options, descend
+from smp_motor_ident.experiments import Experiments
+from smp_motor_ident.fit import Fit
+from smp_motor_ident.models import Structure
+
+
+def along_friction(part: Experiments, structure: Structure, best: Fit, options: Options) -> Fit:
+    """Try other shares of friction and gain that turn the motor as fast at full voltage.
+
+    Without current the two trade against each other along a long curved valley.
+
+    Parameters
+    ----------
+    part : Experiments
+        What ``best`` was fitted to.
+    structure : Structure
+        What is free.
+    best : Fit
+        So far.
+    options : Options
+        Loss and prior knowledge.
+
+    Returns
+    -------
+    Fit
+        The likeliest.
+    """
+    if structure.current or models.VC_PLUS not in structure.free():
+        return best
+    full = float(np.abs(part.section_value).max())
+    for share in (0.01, 0.025, 0.06):
+        z = best.z.copy()
+        z[models.VC_PLUS] = share * full
+        z[models.A0] += np.log((full - share * full) / max(full - best.z[models.VC_PLUS], 1e-9))
+        other = descend(part, structure, structure.complete(z), best.initial, best.noise,
+                       best.ratio, options, 30)  # fmt: skip
+        if other.deviance < best.deviance - 1:
+            best = other
+    if best.converged or structure.friction != "symmetric":
+        return best
+    return _scan_friction(part, structure, best, options, full)
+
+
+def _scan_friction(
+    part: Experiments, structure: Structure, best: Fit, options: Options, full: float
+) -> Fit:
+    """Search friction by the profile of the deviance: the others are fitted at each value.
+
+    Where the motor sticks often, the joint surface has a kink at every start and stop, and a
+    descent along the valley ends at one of them; across the valley it does not.
+    """
+    profile: dict[float, Fit] = {}
+
+    def at(level: float) -> Fit:
+        if level not in profile:
+            near = min(profile.values(), key=lambda f: abs(_level(f) - level), default=best)
+            z = near.z.copy()
+            z[models.A0] += np.log((full - level) / max(full - _level(near), 1e-9))
+            fixed = structure.with_(held={**structure.held, "vc_plus": level})
+            profile[level] = descend(part, fixed, fixed.complete(z), near.initial, near.noise,
+                                    best.ratio, options, 12, 0.1)  # fmt: skip
+        return profile[level]
+
+    grid = sorted({_level(best), *(full * np.array([0.003, 0.008, 0.016, 0.025, 0.04, 0.08]))})
+    for level in grid:
+        at(level)
+    for _ in range(8):
+        levels = sorted(profile)
+        i = levels.index(min(levels, key=lambda x: profile[x].deviance))
+        low, high = levels[max(i - 1, 0)], levels[min(i + 1, len(levels) - 1)]
+        at(0.5 * (low + levels[i]) if levels[i] - low > high - levels[i] else
+           0.5 * (high + levels[i]))  # fmt: skip
+    least = min(profile.values(), key=lambda f: f.deviance)
+    if least.deviance >= best.deviance - 1:
+        return best
+    return descend(part, structure, least.z, least.initial, least.noise, best.ratio, options, 30)
+
+
+def _level(fit: Fit) -> float:
+    return float(fit.z[models.VC_PLUS])
