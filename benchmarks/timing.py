@@ -4,6 +4,7 @@
     python benchmarks/timing.py --only echo     # ratios against the bare node
     python benchmarks/timing.py --only wheels   # four wheels at 500 Hz for 60 s
     python benchmarks/timing.py --only core     # one PID step
+    python benchmarks/timing.py --only wheels --priority 50   # with SCHED_FIFO, where granted
 
 The feeder publishes ``motor_state`` at a fixed rate and takes the time until the command that
 answers it arrives.  Echo and controller run in turn, several times; medians are reported.
@@ -168,12 +169,13 @@ class Feeder:
             self.took[wheel].clear()
 
 
-def start(kind: str, wheel: str) -> subprocess.Popen[bytes]:
+def start(kind: str, wheel: str, priority: int = 0) -> subprocess.Popen[bytes]:
     """Start the echo or the controller of one wheel."""
     if kind == "echo":
         command = [sys.executable, str(Path(__file__).resolve()), "--echo", "--ros-args"]
     else:
         given = [f"{name}:={value}" for name, value in GAINS.items()]
+        given.append(f"scheduling_priority:={priority}")
         command = ["wheel_pid", "--ros-args", *(a for g in given for a in ("-p", g))]
     return subprocess.Popen([*command, "-r", f"__ns:=/{wheel}"])
 
@@ -184,9 +186,9 @@ def cpu_seconds(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def measure(feeder: Feeder, kind: str, rate: float, duration: float) -> Result:
+def measure(feeder: Feeder, kind: str, rate: float, duration: float, priority: int = 0) -> Result:
     """Run one kind of node under the feed."""
-    processes = [start(kind, wheel) for wheel in feeder.wheels]
+    processes = [start(kind, wheel, priority) for wheel in feeder.wheels]
     try:
         for wheel in feeder.wheels:
             feeder.took[wheel].clear()
@@ -241,14 +243,14 @@ def compare(rate: float, duration: float, repeats: int) -> bool:
     return held
 
 
-def wheels(rate: float, duration: float) -> bool:
-    """Measure four wheels at once."""
+def wheels(rate: float, duration: float, priority: int) -> bool:
+    """Measure four wheels at once; the feeder keeps time as they do."""
     from smp_motor_control import WHEELS
+    from smp_motor_control.nodes.keeping_time import keep_time
 
     feeder = Feeder(list(WHEELS))
-    gc.freeze()
-    gc.disable()  # of the feeder, which would otherwise count its own pauses
-    result = measure(feeder, "wheel_pid", rate, duration)
+    keep_time(feeder.node, priority, ())
+    result = measure(feeder, "wheel_pid", rate, duration, priority)
     print(
         f"four wheels at {rate:g} Hz for {duration:g} s: {100 * result.answered:.3f} % answered "
         f"before the next sample, limit {100 * ANSWERED_LIMIT} % "
@@ -283,6 +285,7 @@ def main() -> int:
     parser.add_argument("--duration", type=float, default=10.0, help="of each run [s]")
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--wheels-duration", type=float, default=60.0)
+    parser.add_argument("--priority", type=int, default=0, help="SCHED_FIFO, of the four wheels")
     arguments = parser.parse_args()
     os.environ.setdefault("ROS_DOMAIN_ID", "98")
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
@@ -296,7 +299,7 @@ def main() -> int:
     held = {
         "core": core,
         "echo": lambda: compare(arguments.rate, arguments.duration, arguments.repeats),
-        "wheels": lambda: wheels(500.0, arguments.wheels_duration),
+        "wheels": lambda: wheels(500.0, arguments.wheels_duration, arguments.priority),
     }[arguments.only]()
     return 0 if held else 1
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import os
 
@@ -19,7 +20,7 @@ def keep_time(node: Node, priority: int, affinity: tuple[int, ...]) -> list[str]
     node : rclpy.node.Node
         For its log.
     priority : int
-        SCHED_FIFO priority, 1 to 99; 0 leaves the scheduler alone.
+        SCHED_FIFO priority of all threads of the process, 1 to 99; 0 leaves the scheduler alone.
     affinity : tuple of int
         Processors to run on; empty for all.
 
@@ -31,13 +32,17 @@ def keep_time(node: Node, priority: int, affinity: tuple[int, ...]) -> list[str]
     refused = []
     if priority > 0:
         try:
-            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+            for thread in _threads():
+                with contextlib.suppress(ProcessLookupError):
+                    os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority))
         except (OSError, AttributeError) as error:
             refused.append(f"scheduling_priority {priority} not granted: {error}")
     if affinity:
         try:
-            os.sched_setaffinity(0, affinity)
-        except (OSError, ValueError, OverflowError) as error:
+            for thread in _threads():
+                with contextlib.suppress(ProcessLookupError):
+                    os.sched_setaffinity(thread, affinity)
+        except (OSError, ValueError, OverflowError, AttributeError) as error:
             refused.append(f"cpu_affinity {list(affinity)} not granted: {error}")
     for line in refused:
         node.get_logger().warning(f"{line}; running without it")
@@ -45,6 +50,14 @@ def keep_time(node: Node, priority: int, affinity: tuple[int, ...]) -> list[str]
     gc.freeze()
     gc.disable()
     return refused
+
+
+def _threads() -> list[int]:
+    """Return all threads of this process: a sample comes through those of the middleware."""
+    try:
+        return [int(name) for name in os.listdir("/proc/self/task")]
+    except OSError:
+        return [0]
 
 
 def collect_garbage() -> None:

@@ -126,8 +126,7 @@ class WheelReport:
             told = ", ".join(f"{n} x {key}" for key, n in recent.items())
             message = f"{message}; in the last second: {told}"
             level = max(level, runtime.WARN)
-        elif self.timekeeping and level == runtime.OK:
-            message = f"{message}; {self.timekeeping[0]}"
+        message = "; ".join([message, *self.timekeeping])
         totals = self._totals()
         if self._diagnostics is not None and self._diagnostics.due:
             self._reported = totals

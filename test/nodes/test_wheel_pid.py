@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import os
+import resource
 import signal
 import time
 from collections.abc import Iterator
@@ -235,3 +237,24 @@ def test_wheel_without_a_name_and_unknown_parameters_are_refused(process):
         node = process("wheel_pid", "--ros-args", *given)
         assert node.wait(15.0) == 2
         assert words in node.output and len(node.output.strip().splitlines()) == 1
+
+
+def test_priority_and_processor_hold_for_all_threads_or_their_refusal_is_told(
+    start, robot, eventually
+):
+    processor = min(os.sched_getaffinity(0))
+    node = start("scheduling_priority:=10", f"cpu_affinity:=[{processor}]")
+    settle(robot, Feed(robot, eventually))
+    threads = [int(name) for name in os.listdir(f"/proc/{node.pid}/task")]
+    assert len(threads) > 1, "the middleware has threads of its own"
+    assert {tuple(os.sched_getaffinity(thread)) for thread in threads} == {(processor,)}
+    if os.geteuid() == 0 or resource.getrlimit(resource.RLIMIT_RTPRIO)[1] >= 10:
+        assert {os.sched_getscheduler(thread) for thread in threads} == {os.SCHED_FIFO}
+    else:
+        eventually(lambda: robot.named(NODE, "scheduling_priority 10 not granted"), 3.0, robot.spin)
+
+
+def test_processor_that_is_not_there_is_told_and_done_without(start, robot, eventually):
+    start("cpu_affinity:=[4000]")
+    settle(robot, Feed(robot, eventually))
+    eventually(lambda: robot.named(NODE, "cpu_affinity [4000] not granted"), 3.0, robot.spin)
