@@ -16,12 +16,14 @@ from pathlib import Path
 import numpy as np
 from known_motors import CURRENT_NOISE, QUANTUM, TABLE_1, recording, table
 
-from smp_motor_ident import fit, models
+from smp_motor_ident import models
 from smp_motor_ident import recursion as rc
 from smp_motor_ident.errors import SmpError
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.experiments import prepare
 from smp_motor_ident.models import PHYSICAL, Structure
+from smp_motor_ident.noise import kalman_gain
+from smp_motor_ident.passes import evaluate
 
 COMBINATIONS = ("dc_gain", "time_constant", "time_constant_product")
 KINDS = ("sine", "square", "fourier")
@@ -40,11 +42,11 @@ def bound(record, z, current: bool, torque: float) -> dict[str, tuple[float, flo
         par, _ = models.to_internal(z, 2)
         ratio = (torque / par[1]) ** 2 * step / noise[0, 0]
         relative = noise[1, 1] / noise[0, 0] if current else 0.0
-        gain, scale = fit.kalman_gain(z, 2, rc.ANGLE, step, ratio, relative)
+        gain, scale = kalman_gain(z, 2, rc.ANGLE, step, ratio, relative)
         noise = scale * noise[0, 0] if current else np.diag([scale[0, 0] * noise[0, 0], 1.0])
     z = structure.complete(z)
     start = np.zeros((1, 4))
-    here = fit._pass(data, structure, z, start, start, gain, noise, np.inf, ())
+    here = evaluate(data, structure, z, start, start, gain, noise)
     cov = np.linalg.inv(here.normal)
     m = structure.matrix()
     values, gradients = models.combinations(z, 2)

@@ -10,13 +10,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident import fit as fitting
-from smp_motor_ident import models, start
+from smp_motor_ident import models, replay, start
 from smp_motor_ident.descent import HEAD, Options, bandwidth, descend, first_noise, ratio_of
 from smp_motor_ident.experiments import Experiments
 from smp_motor_ident.fit import Fit
 from smp_motor_ident.horizon import grow
 from smp_motor_ident.models import Structure
+from smp_motor_ident.noise import deviance, kalman_gain
 
 Array = NDArray[np.float64]
 
@@ -142,7 +142,7 @@ def _score(head: Experiments, structure: Structure, z: Array) -> float:
     ratio = ratio_of(bandwidth(z, head), head.step, head.kind)
     noise = first_noise(head)
     relative = noise[1, 1] / noise[0, 0] if head.current.size else 0.0
-    gain, _ = fitting.kalman_gain(z, structure.order, head.kind, head.step, ratio, relative)
-    spread = fitting.run_spread(head, structure, z, gain, noise)
-    value = fitting.deviance(spread)
+    gain, _ = kalman_gain(z, structure.order, head.kind, head.step, ratio, relative)
+    spread = replay.run_spread(head, structure, z, gain, noise)
+    value = deviance(spread)
     return value if np.isfinite(value) else np.inf

@@ -14,8 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident import fit as fitting
-from smp_motor_ident import models
+from smp_motor_ident import models, replay
 from smp_motor_ident import recursion as rc
 from smp_motor_ident.experiments import prepare
 from smp_motor_ident.fit import Fit
@@ -26,6 +25,8 @@ from smp_motor_ident.result import Estimate
 Array = NDArray[np.float64]
 
 AMPLITUDES = (0.4, 0.7, 1.0)
+SHARES = (0.97, 0.7, 0.3, 0.03)  # of a0 that K may be, where the current was not measured
+LARGEST_RESISTANCE = 15.0  # [ohm] allowed for where it is not known either
 SPREADS = (0.5, 2.0, 6.0)
 TRIAL = 10.0
 
@@ -149,6 +150,8 @@ def what_next(
 
     Several amplitudes and bands are simulated with the estimated motor; the Fisher
     information of each, which grows in proportion to the length, tells how long it must be.
+    Where the current was not measured a family of motors answers the same: the promise holds
+    for the least favourable of them whose back-EMF is at least 3 % of what limits the speed.
 
     Parameters
     ----------
@@ -169,7 +172,7 @@ def what_next(
         The shortest one that suffices, or the best one of length ``longest``.
     """
     limit = supply or estimate.hardware.supply_voltage or 12.0
-    fit, needs_current = _as_fit(estimate, current_noise)
+    family, needs_current = _family(estimate, current_noise)
     step = estimate.sample_time or 0.005
     corner = 1 / (2 * np.pi * max(estimate.value("time_constant"), 4 * step))
     best: Proposal | None = None
@@ -177,9 +180,7 @@ def what_next(
         for spread in SPREADS:
             band = (max(0.05, 0.1 * corner), min(corner * spread, 0.4 / step))
             record = _trial(share * limit, band, step, estimate.hardware)
-            relative = _relative_std(record, fit, current_noise)
-            if not relative:
-                continue
+            relative = _least_certain(record, family)
             length = TRIAL * (max(relative.values()) / accuracy) ** 2
             duration = float(np.clip(length, 5.0, longest))
             after = {n: v * float(np.sqrt(TRIAL / duration)) for n, v in relative.items()}
@@ -195,45 +196,48 @@ def _cost(p: Proposal, accuracy: float) -> tuple[float, float, float]:
     return (max(0.0, max(p.relative_std.values()) / accuracy - 1.0), p.duration, p.amplitude)
 
 
-def _as_fit(estimate: Estimate, current_noise: float) -> tuple[Fit, bool]:
-    """Return the estimate as coordinates with current measured, and whether it was not."""
-    had = estimate.model.startswith("electromechanical")
+def _family(estimate: Estimate, current_noise: float) -> tuple[list[Fit], bool]:
+    """Return the motors that answer as the estimated one does, and whether current is lacking."""
     known = {n: q.value for n, q in estimate.parameters.items() if n in PHYSICAL}
-    r = known.get("resistance") or estimate.hardware.resistance or 3.0
+    told = known.get("resistance") or estimate.hardware.resistance
+    r = told or LARGEST_RESISTANCE
     z = np.zeros(11)
     gain, tau = estimate.value("dc_gain"), estimate.value("time_constant")
     product = estimate.value("time_constant_product") or 0.02 * tau**2
     z[models.A0] = -np.log(gain)
     z[models.A1] = np.log(tau / gain)
     z[models.A2] = np.log(product / gain)
-    z[models.TE] = z[models.A2] - z[models.A1] + 0.1
     z[models.LN_R] = np.log(r)
     z[models.VC_PLUS] = z[models.VC_MINUS] = estimate.value("static_voltage")
-    if had and known.get("inductance") and known.get("resistance"):
-        z[models.TE] = np.log(float(known["inductance"] or 0.0) / r)
     friction = "symmetric" if z[models.VC_PLUS] > 0 else "none"
     structure = Structure("electromechanical", 2, friction, current=True)
     turn = estimate.hardware.counts_per_revolution
     noise = np.diag([(2 * np.pi / turn) ** 2 / 12 if turn else 1e-4, current_noise**2])
-    zeros = np.zeros((3, 2))
-    empty = np.zeros((0, len(structure.free())))
-    fit = Fit(
-        structure,
-        z,
-        np.zeros((1, 4)),
-        noise,
-        0.0,
-        zeros,
-        0.0,
-        0.0,
-        np.eye(len(structure.free())),
-        empty,
-        0,
-        True,
-        0,
-        rc.ANGLE,
-    )
-    return fit, not had
+    f = len(structure.free())
+    fits = []
+    for te in _electric(estimate, z):
+        z = z.copy()
+        z[models.TE] = np.log(te)
+        fits.append(
+            Fit(structure, z, np.zeros((1, 4)), noise, 0.0, np.zeros((3, 2)), 0.0, 0.0, np.eye(f),
+                np.zeros((0, f)), 0, True, 0, rc.ANGLE)
+        )  # fmt: skip
+    return fits, not estimate.model.startswith("electromechanical")
+
+
+def _electric(estimate: Estimate, z: Array) -> list[float]:
+    """Return L/R, or the values of it that the response leaves open: be = a1/te - a2/te^2."""
+    inductance, r = estimate.value("inductance"), estimate.value("resistance")
+    if inductance > 0 and r > 0:
+        return [inductance / r]
+    a0, a1, a2 = np.exp(z[:3])
+    out = []
+    for share in SHARES:
+        be = (1 - share) * a0
+        roots = np.roots([be, -a1, a2])
+        real = roots[np.abs(roots.imag) < 1e-9 * np.abs(roots)].real
+        out += [float(te) for te in real if te > 0]
+    return out or [float(1.1 * a2 / a1)]
 
 
 def _trial(amplitude: float, band: tuple[float, float], step: float, hardware: Hardware) -> Record:
@@ -245,9 +249,15 @@ def _trial(amplitude: float, band: tuple[float, float], step: float, hardware: H
     return Record("trial", t, v, np.zeros(len(t)), None, np.zeros(len(t)), hardware=hardware)
 
 
-def _relative_std(record: Record, fit: Fit, current_noise: float) -> dict[str, float]:
+def _least_certain(record: Record, family: Sequence[Fit]) -> dict[str, float]:
+    """Return the largest relative standard deviation of each parameter over a family."""
+    each = [_relative_std(record, fit) for fit in family]
+    return {n: max(one[n] for one in each) for n in each[0]}
+
+
+def _relative_std(record: Record, fit: Fit) -> dict[str, float]:
     data = replace(prepare([record], True), kind=rc.ANGLE)
-    information = fitting.information(data, fit)
+    information = replay.information(data, fit)
     cov = replace(fit, information=information).covariance()
     values, gradients = models.physical(fit.z)
     matrix = fit.structure.matrix()

@@ -7,8 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from smp_motor_ident import descent, horizon, models
-from smp_motor_ident import fit as fitting
+from smp_motor_ident import descent, horizon, models, replay
 from smp_motor_ident import recursion as rc
 from smp_motor_ident.choice import Rung, inflation, label, needed, size
 from smp_motor_ident.cold import cold_fit
@@ -109,7 +108,7 @@ def _frictionless(
 def _friction_shows(data: Experiments, fit: Fit, surely_small: bool) -> bool:
     """Tell by the score whether Coulomb friction is there, or may be and is not little."""
     structure = fit.structure.with_(friction="symmetric")
-    _, step, cov = fitting.promise(data, fit, structure)
+    _, step, cov = replay.promise(data, fit, structure)
     i = structure.free().index(models.VC_PLUS)
     std = float(np.sqrt(max(cov[i, i], 1e-300)) * np.sqrt(inflation(fit)))
     found = max(float(step[i]), 0.0)
@@ -252,7 +251,7 @@ def _promising(data: Experiments, best: Fit, richer: Structure) -> bool:
     """Tell from the score whether a fit of more is worth its passes."""
     if not best.converged:
         return True
-    gain, _, _ = fitting.promise(data, best, richer)
+    gain, _, _ = replay.promise(data, best, richer)
     price = (size(richer) - size(best.structure)) * float(np.log(best.samples))
     return not gain < 0.5 * price * inflation(best)
 

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from smp_motor_ident import fit as fitting
-from smp_motor_ident import models
+from smp_motor_ident import models, replay
 from smp_motor_ident import recursion as rc
 from smp_motor_ident.experiments import Experiments
 from smp_motor_ident.fit import Fit
@@ -48,7 +47,7 @@ def widened(data: Experiments, fit: Fit, seed: int = 0) -> Fit:
     if fit.noise[0, 0] > 3 * own or not fit.structure.free():
         return fit
     rng = np.random.default_rng(seed)
-    predicted = fitting.simulate(data, fit)
+    predicted = replay.simulate(data, fit)
     noise = np.sqrt(max(fit.noise[0, 0] - own, 0.0))
     cov = fit.covariance()
     replays = 24 if data.size < MANY else 8
@@ -63,8 +62,8 @@ def widened(data: Experiments, fit: Fit, seed: int = 0) -> Fit:
         counts = np.floor(angle / data.quantum) * data.quantum
         counts -= (counts - predicted[:, 1]).mean()
         counts[np.isnan(data.output)] = np.nan
-        replay = replace(data, output=counts, current=current)
-        errors.append(fitting.one_step(replay, fit))
+        again = replace(data, output=counts, current=current)
+        errors.append(replay.one_step(again, fit))
     second = np.mean(np.square(errors), axis=0)
     excess = second / np.maximum(np.diag(cov), 1e-300)
     # Below the 95 % point the replays do not contradict the covariance.
@@ -93,7 +92,7 @@ def blurred(data: Experiments, fit: Fit, instant: float) -> Fit:
     structure = fit.structure
     if instant <= 0 or structure.delay or "delay" in structure.held or not structure.free():
         return fit
-    both = fitting.information(data, replace(fit, structure=structure.with_(delay=True)))
+    both = replay.information(data, replace(fit, structure=structure.with_(delay=True)))
     keep = [i for i, c in enumerate(structure.with_(delay=True).free()) if c != models.DELAY]
     late = structure.with_(delay=True).free().index(models.DELAY)
     own = both[np.ix_(keep, keep)]

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident import fit as fitting
-from smp_motor_ident import models
+from smp_motor_ident import models, replay
 from smp_motor_ident import recursion as rc
 from smp_motor_ident.experiments import prepare
 from smp_motor_ident.fit import Fit
@@ -44,8 +43,8 @@ def simulate(estimate: Estimate, record: Record) -> tuple[Array, Array]:
     fit = _motor(estimate)
     if fit.structure.held["window"] > 0 and data.kind == rc.SPEED:
         data = data.as_mean_speed()
-    settled = fitting.settle(data, fit)
-    predicted = fitting.simulate(data, settled)
+    settled = replay.settle(data, fit)
+    predicted = replay.simulate(data, settled)
     if data.kind != rc.ANGLE:
         return data.output, predicted[:, 1]
     mean = _differences(record, predicted[:, 1])

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from smp_motor_ident import fit as fitting
 from smp_motor_ident import recursion as rc
+from smp_motor_ident import replay
 from smp_motor_ident.experiments import Experiments, prepare
 from smp_motor_ident.fit import Fit
 from smp_motor_ident.record import Record
@@ -60,7 +60,7 @@ def speed_fit(records: Sequence[Record], data: Experiments, fit: Fit) -> float:
         Against the recorded velocity; where there is none, against counts or angles
         differenced over one sample, with the model's mean speed over the same interval.
     """
-    predicted = fitting.simulate(data, fit)
+    predicted = replay.simulate(data, fit)
     at_once = predicted[:, 1] if data.kind != rc.ANGLE else predicted[:, 0]
     if data.kind != rc.ANGLE:
         return percent(data.output, at_once)
@@ -100,7 +100,7 @@ def held_out(records: Sequence[Record], fit: Fit, hold: str = "held") -> float:
     data = prepare(records, False, kind, hold)
     if fit.kind == rc.MEAN_SPEED and data.kind == rc.SPEED:
         data = data.as_mean_speed()
-    return speed_fit(records, data, fitting.settle(data, fit))
+    return speed_fit(records, data, replay.settle(data, fit))
 
 
 def split(records: Sequence[Record], share: float = 0.7) -> tuple[list[Record], list[Record]]:
@@ -156,7 +156,7 @@ def residual_tests(data: Experiments, fit: Fit, lags: int = 25) -> ResidualTests
     ResidualTests
         Of the mechanical output.
     """
-    residual = data.output - fitting.simulate(data, fit, gain=True)[:, 1]
+    residual = data.output - replay.simulate(data, fit, gain=True)[:, 1]
     voltage = np.interp(data.time, data.section_end, data.section_value)
     if len(data.starts) > 2:
         voltage = np.concatenate(

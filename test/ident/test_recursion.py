@@ -7,17 +7,19 @@ import motors
 import numpy as np
 import pytest
 
-from smp_motor_ident import fit, models
+from smp_motor_ident import models
 from smp_motor_ident import recursion as rc
 from smp_motor_ident.experiments import prepare
 from smp_motor_ident.models import Structure
+from smp_motor_ident.noise import kalman_gain
+from smp_motor_ident.passes import gather
 
 NO_GAIN = np.zeros((3, 2))
 
 
 def predict(data, structure, z, gain=NO_GAIN):
     out = np.zeros((data.size, 3))
-    fit._run(data, structure, z, data.initial, gain, np.eye(2), np.inf, out, (), False)
+    gather(data, structure, z, data.initial, gain, predicted=out, differentiate=False)
     return out
 
 
@@ -58,15 +60,15 @@ def test_gradient_is_that_of_finite_differences_through_all_events(delay, with_g
     z = z + matrix @ np.full(matrix.shape[1], 1e-3)
     gain = NO_GAIN.copy()
     if with_gain:
-        gain, _ = fit.kalman_gain(z, 2, rc.ANGLE, data.step, 1e7, 0.5)
+        gain, _ = kalman_gain(z, 2, rc.ANGLE, data.step, 1e7, 0.5)
 
     def run(at):
-        return fit._run(data, structure, at, data.initial, gain, np.diag([1e-4, 1e-4]), np.inf)
+        return gather(data, structure, at, data.initial, gain, np.diag([1e-4, 1e-4]))
 
-    _, gradient, _, *_ = run(z)
+    gradient = run(z).gradient
     for j in range(matrix.shape[1]):
         step = 1e-6 if structure.free()[j] < models.VC_PLUS else 1e-7
-        up, down = run(z + step * matrix[:, j])[2], run(z - step * matrix[:, j])[2]
+        up, down = run(z + step * matrix[:, j]).cost, run(z - step * matrix[:, j]).cost
         numeric = -0.5 * (up[0] - down[0]) / (2 * step)
         scale = np.abs(gradient[0]).max()
         # A whole delay of samples and the sticking have kinks; elsewhere 1e-3 is rounding.
