@@ -1,17 +1,21 @@
 """Random motors over two decades around Table 1, from an independent simulator, from cold.
 
-Usage: python benchmarks/cold_start.py [--motors 200] [--seconds 6] [--rate 1000]
+Each motor is one line of a file, so that a long run may be stopped and taken up again:
+
+    python benchmarks/cold_start.py [--motors 200] [--seconds 6] [--rate 1000] [--lines FILE.jsonl]
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import time
+from pathlib import Path
 
 import numpy as np
 from known_motors import TABLE_1, recording, table
 
-from smp_motor_ident import fit
+from smp_motor_ident import fit, models
 from smp_motor_ident.cold import cold_fit
 from smp_motor_ident.descent import Options
 from smp_motor_ident.errors import SmpError
@@ -19,13 +23,14 @@ from smp_motor_ident.estimate import estimate
 from smp_motor_ident.experiments import prepare
 from smp_motor_ident.models import Structure
 
-CASES = (
-    ("linear, voltage only", False, False, 0.0),
-    ("linear, with current", True, False, 0.0),
-    ("friction, with current", True, True, 0.0),
-    ("friction and torque noise, with current", True, True, 0.2),
-    ("friction, voltage only", False, True, 0.0),
-)
+CASES = {
+    "linear, voltage only": (False, False, 0.0),
+    "linear, with current": (True, False, 0.0),
+    "friction, with current": (True, True, 0.0),
+    "friction and torque noise, with current": (True, True, 0.2),
+    "friction, voltage only": (False, True, 0.0),
+}
+FAR = 5.0  # standard deviations beyond which an answer is wrong: none in 3 million by chance
 
 
 def motor(rng: np.random.Generator) -> tuple[float, ...]:
@@ -34,56 +39,96 @@ def motor(rng: np.random.Generator) -> tuple[float, ...]:
     return tuple(base * 10 ** rng.uniform(-1, 1, 5))
 
 
+def minimum(record, z, current: bool, friction: bool) -> dict:
+    """Return whether the descent from cold ends as low as one from the truth, and its time."""
+    structure = Structure(
+        "trial", friction="symmetric" if friction else "none", current=current,
+        shape=friction and not current,
+    )  # fmt: skip
+    data = prepare([record], current)
+    begun = time.perf_counter()
+    found = cold_fit(data, structure, Options())
+    spent = time.perf_counter() - begun
+    if found is None:
+        return {"right": False, "seconds": spent}
+    near = fit.solve(
+        data, structure, structure.complete(z), np.zeros((1, 4)), found.noise, found.ratio
+    )
+    # At or below the deviance that a start from the truth reaches; 0.1 % of noise.
+    above = found.deviance - near.deviance
+    return {"right": bool(above <= max(10.0, 1e-3 * data.size)), "above": above, "seconds": spent}
+
+
+def answer(record, z) -> dict:
+    """Return what the tool says of the record, and the worst error of what it claims."""
+    begun = time.perf_counter()
+    try:
+        e = estimate(record)
+    except SmpError as refusal:
+        return {"says": "refused", "words": str(refusal), "spent": time.perf_counter() - begun}
+    values = {**models.physical(z)[0], **models.combinations(z, 2)[0]}
+    claims = {n: q for n, q in {**e.combinations, **e.parameters}.items()
+              if q.status == "estimated" and q.std and n in values}  # fmt: skip
+    errors = {n: abs(q.value - values[n]) / q.std for n, q in claims.items()}
+    worst = max(errors, key=lambda n: errors[n])
+    words = [w for w in e.warnings if "doubtful" in w]
+    off = abs(claims[worst].value / values[worst] - 1) if values[worst] else 0.0
+    return {"says": "doubtful" if words else "sure", "words": "; ".join(words), "model": e.model,
+            "worst": worst, "sigmas": errors[worst], "off": off,
+            "spent": time.perf_counter() - begun}  # fmt: skip
+
+
+def run(args) -> list[dict]:
+    """Return all lines, those of the file first, those still to do appended to it."""
+    path = Path(args.lines) if args.lines else None
+    lines = [json.loads(x) for x in path.read_text().splitlines()] if path and path.exists() else []
+    done = {(x["case"], x["n"]) for x in lines}
+    for name, (current, friction, torque) in CASES.items():
+        rng = np.random.default_rng(7)
+        for n in range(args.motors):
+            p = motor(rng)
+            volts = rng.uniform(0.1, 2.0) if friction else 0.0
+            if (name, n) in done:
+                continue
+            record, z = recording(
+                p, "all", current=current, static_voltage=volts, torque_noise=torque,
+                seconds=args.seconds, rate=args.rate, seed=n,
+            )  # fmt: skip
+            line = {"case": name, "n": n, "motor": p, "static": volts,
+                    **minimum(record, z, current, friction), **answer(record, z)}  # fmt: skip
+            lines.append(line)
+            if path:
+                with path.open("a") as file:
+                    file.write(json.dumps(line) + "\n")
+            print(f"\r{name}: {n + 1} of {args.motors}  ", end="", flush=True)
+        print()
+    return [x for x in lines if x["n"] < args.motors]
+
+
 def main() -> None:
     """Run all cases and print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--motors", type=int, default=200)
     parser.add_argument("--seconds", type=float, default=6.0)
     parser.add_argument("--rate", type=float, default=1000.0)
+    parser.add_argument("--lines", help="file of motors, appended to")
     args = parser.parse_args()
+    lines = run(args)
     rows = []
-    for name, current, friction, torque in CASES:
-        right = doubtful = silent = unclear = 0
-        spent = []
-        rng = np.random.default_rng(7)
-        for n in range(args.motors):
-            p = motor(rng)
-            volts = rng.uniform(0.1, 2.0) if friction else 0.0
-            record, z = recording(
-                p, "all", current=current, static_voltage=volts, torque_noise=torque,
-                seconds=args.seconds, rate=args.rate, seed=n,
-            )  # fmt: skip
-            structure = Structure(
-                "trial", friction="symmetric" if friction else "none", current=current,
-                shape=friction and not current,
-            )  # fmt: skip
-            data = prepare([record], current)
-            begun = time.perf_counter()
-            found = cold_fit(data, structure, Options())
-            spent.append(time.perf_counter() - begun)
-            if found is None:
-                unclear += 1
-                continue
-            near = fit.solve(
-                data, structure, structure.complete(z), np.zeros((1, 4)), found.noise, found.ratio
-            )
-            # At or below the deviance that a start from the truth reaches; 0.1 % of noise.
-            if found.deviance <= near.deviance + max(10.0, 1e-3 * data.size):
-                right += 1
-                continue
-            try:
-                e = estimate(record)
-                flagged = any("doubtful" in w for w in e.warnings)
-            except SmpError:
-                flagged = True
-            doubtful += flagged
-            silent += not flagged
+    for name in CASES:
+        here = [x for x in lines if x["case"] == name]
+        right = sum(x["right"] for x in here)
+        told = sum(not x["right"] and x["says"] != "sure" for x in here)
+        wrong = [x for x in here if x["says"] == "sure" and x["sigmas"] > FAR]
         rows.append(
-            (name, f"{right} of {args.motors}", doubtful + unclear, silent,
-             f"{1e3 * np.median(spent):.0f} ms")
+            (name, f"{right} of {len(here)} ({100 * right / len(here):.1f} %)", told,
+             len(here) - right - told,
+             sum(x["says"] == "sure" for x in here), sum(x["says"] == "doubtful" for x in here),
+             sum(x["says"] == "refused" for x in here), len(wrong),
+             f"{1e3 * np.median([x['seconds'] for x in here]):.0f} ms")
         )  # fmt: skip
-        print(rows[-1], flush=True)
-    head = ("case", "right minimum", "said to be doubtful", "neither", "median time")
+    head = ("case", "right minimum", "else told", "else silent", "tool: sure", "doubtful",
+            "refused", f"sure, yet off by > {FAR:g} std", "median time")  # fmt: skip
     print("\n" + table(head, rows))
 
 
