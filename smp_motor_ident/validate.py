@@ -18,6 +18,7 @@ from smp_motor_ident.result import Estimate, ResidualTests
 
 Array = NDArray[np.float64]
 
+COARSE = 0.02  # of the speed's scatter: what a counter's resolution may add to it
 MOST = 200_000  # samples beyond which the tests of residuals learn nothing new
 
 
@@ -57,26 +58,43 @@ def speed_fit(records: Sequence[Record], data: Experiments, fit: Fit) -> float:
     Returns
     -------
     float
-        Against the recorded velocity; where there is none, against counts or angles
-        differenced over one sample, with the model's mean speed over the same interval.
+        Against the recorded speed; against counts or angles as mean speeds over so many
+        samples that their resolution is 2 % of the speed's scatter (one where it is fine).
     """
     predicted = replay.simulate(data, fit)
     at_once = predicted[:, 1] if data.kind != rc.ANGLE else predicted[:, 0]
     if data.kind != rc.ANGLE:
         return percent(data.output, at_once)
-    mean = _differences(data, predicted[:, 1])
+    lag = _lag(data, predicted[:, 1])
+    best = percent(_means(data, data.output, lag), _means(data, predicted[:, 1], lag))
     given = [r.velocity for r in records]
     if all(v is not None for v in given):
         velocity = np.concatenate([v for v in given if v is not None])
-        return max(percent(velocity, at_once), percent(velocity, mean))
-    return percent(_differences(data, data.output), mean)
+        told = percent(velocity, at_once), percent(velocity, _means(data, predicted[:, 1], 1))
+        best = max(best, *(x for x in told if np.isfinite(x)))
+    return best
 
 
-def _differences(data: Experiments, angle: Array) -> Array:
-    with np.errstate(divide="ignore", invalid="ignore"):
-        speed = np.diff(angle, prepend=np.nan) / np.diff(data.time, prepend=np.nan)
-    speed[data.starts[:-1]] = np.nan
-    return np.asarray(speed)
+def _lag(data: Experiments, angle: Array) -> int:
+    """Return over how many samples angles tell a speed, and not mostly their resolution."""
+    y = data.output[np.isfinite(data.output)]
+    rough = np.diff(y, n=4).var() / 70 if y.size > 8 else 0.0  # fourth differences: 1 4 6 4 1
+    noise = np.sqrt(2 * max(rough, data.quantum**2 / 12))
+    first = float(np.nanstd(_means(data, angle, 1)))
+    lag = 1
+    while noise / (lag * data.step) > COARSE * first and 8 * lag < data.size:
+        if np.nanstd(_means(data, angle, 2 * lag)) < 0.7 * first:
+            break  # longer, and the motion itself would be averaged away
+        lag *= 2
+    return lag
+
+
+def _means(data: Experiments, angle: Array, lag: int) -> Array:
+    speed = np.full(data.size, np.nan)
+    speed[lag:] = (angle[lag:] - angle[:-lag]) / (data.time[lag:] - data.time[:-lag])
+    for first in data.starts[:-1]:
+        speed[first : first + lag] = np.nan
+    return speed
 
 
 def held_out(records: Sequence[Record], fit: Fit, hold: str = "held") -> float:
