@@ -52,6 +52,11 @@ class Experiments:
     initial: Array
 
     @property
+    def plain(self) -> bool:
+        """Whether the input changes at the samples, one value for each."""
+        return bool(self.section_end.ctypes.data == self.time.ctypes.data)
+
+    @property
     def size(self) -> int:
         """Number of samples."""
         return int(self.time.size)

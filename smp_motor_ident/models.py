@@ -15,11 +15,15 @@ docs/derivations.md, section 1.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+
+from smp_motor_ident._compile import compiled
 
 Array = NDArray[np.float64]
 
@@ -91,6 +95,10 @@ class Structure:
 
     def free(self) -> tuple[int, ...]:
         """Return the indices of the free coordinates."""
+        return self._free
+
+    @cached_property
+    def _free(self) -> tuple[int, ...]:
         wanted = [A0] if self.name.startswith("static_gain") else [A0, A1]
         if self.order == 2:
             wanted += [A2] + ([TE] if self.shape or self.current else [])
@@ -108,7 +116,11 @@ class Structure:
         return tuple(i for i in wanted if Z_NAMES[i] not in self.held)
 
     def matrix(self) -> Array:
-        """Return dz/dfree, shape (11, free): the ties between the coordinates."""
+        """Return dz/dfree, shape (11, free), read-only: the ties between the coordinates."""
+        return self._matrix
+
+    @cached_property
+    def _matrix(self) -> Array:
         free = self.free()
         m = np.zeros((len(Z_NAMES), len(free)))
         for j, i in enumerate(free):
@@ -117,6 +129,7 @@ class Structure:
             m[VC_MINUS] = m[VC_PLUS]
         if self.order == 2 and TE not in free and "ln_te" not in self.held:
             m[TE] = m[A2] - m[A1]
+        m.flags.writeable = False
         return m
 
     def complete(self, z: Array) -> Array:
@@ -186,26 +199,32 @@ def to_internal(z: Array, order: int) -> tuple[Array, Array]:
     slope : ndarray, shape (11, 11)
         Its derivative by z; rows of te, tm and R are of their logarithms.
     """
-    par = z.copy()
-    slope = np.eye(len(Z_NAMES))
-    slope[:4] = 0.0
-    a0, a1 = np.exp(z[A0]), np.exp(z[A1])
-    par[7] = np.exp(z[LN_R])
+    par = np.array(z, dtype=np.float64)
+    slope = np.zeros((len(Z_NAMES), len(Z_NAMES)))
+    _fill_internal(par, slope, order)
+    return par, slope
+
+
+@compiled
+def _fill_internal(par: Array, slope: Array, order: int) -> None:
+    """Turn z in par into internal parameters; what overflows becomes infinite."""
+    for i in range(4, par.shape[0]):
+        slope[i, i] = 1.0
+    a0, a1 = math.exp(par[A0]), math.exp(par[A1])
+    a2, te = math.exp(par[A2]), math.exp(par[TE])
+    par[LN_R] = math.exp(par[LN_R])
+    slope[2, A0] = a0
     if order == 1:
-        par[:4] = 0.0, a1, a0, 0.0
+        par[0], par[1], par[2], par[3] = 0.0, a1, a0, 0.0
         slope[1, A1] = 1.0
-        slope[2, A0] = a0
-        return par, slope
-    a2, te = np.exp(z[A2]), np.exp(z[TE])
-    be = a1 / te - a2 / te**2
-    par[:4] = te, a2 / te, a0 - be, be
-    slope[0, TE] = 1.0
-    slope[1, A2], slope[1, TE] = 1.0, -1.0
+        return
+    be = (a1 - a2 / te) / te
+    par[0], par[1], par[2], par[3] = te, a2 / te, a0 - be, be
+    slope[0, TE] = slope[1, A2] = 1.0
+    slope[1, TE] = -1.0
     slope[3, A1], slope[3, A2] = a1 / te, -a2 / te**2
     slope[3, TE] = -a1 / te + 2 * a2 / te**2
-    slope[2] = -slope[3]
-    slope[2, A0] = a0
-    return par, slope
+    slope[2, A1], slope[2, A2], slope[2, TE] = -slope[3, A1], -slope[3, A2], -slope[3, TE]
 
 
 def combinations(z: Array, order: int) -> tuple[dict[str, float], dict[str, Array]]:

@@ -196,7 +196,7 @@ def _slides(data: Experiments, structure: Structure, z: Array, gain: Array, hube
         and not data.current.size
         and huber == math.inf
         and not gain.any()
-        and data.section_end.ctypes.data == data.time.ctypes.data
+        and data.plain
     )
 
 
