@@ -88,7 +88,8 @@ def cold_fit(
     starts = [z for z in starts if np.all(np.isfinite(z))]
     if not starts:
         return None
-    ranked = sorted(starts, key=lambda z: _score(head, structure, z))
+    noise = first_noise(head)
+    ranked = sorted(starts, key=lambda z: _score(head, structure, z, noise))
     best: Fit | None = None
     tried: list[Array] = []
     if models.TE in structure.free() and not structure.current:
@@ -99,7 +100,7 @@ def cold_fit(
             continue
         tried.append(z)
         ratio = ratio_of(bandwidth(z, head), head.step, head.kind)
-        one = descend(head, structure, z, head.initial, first_noise(head), ratio, options, 25, 0.1)
+        one = descend(head, structure, z, head.initial, noise, ratio, options, 25, 0.1)
         again = best is not None and abs(one.deviance - best.deviance) < 0.1
         if best is None or one.deviance < best.deviance:
             best = one
@@ -137,10 +138,9 @@ def _alike(z: Array, other: Array, step: float) -> bool:
     return bool(d[:5].max() < 0.05 and late < 0.5)
 
 
-def _score(head: Experiments, structure: Structure, z: Array) -> float:
+def _score(head: Experiments, structure: Structure, z: Array, noise: Array) -> float:
     """Return the deviance of a candidate on the innovations (robust against drift)."""
     ratio = ratio_of(bandwidth(z, head), head.step, head.kind)
-    noise = first_noise(head)
     relative = noise[1, 1] / noise[0, 0] if head.current.size else 0.0
     gain, _ = kalman_gain(z, structure.order, head.kind, head.step, ratio, relative)
     spread = replay.run_spread(head, structure, z, gain, noise)

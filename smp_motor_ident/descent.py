@@ -107,13 +107,21 @@ def first_noise(data: Experiments) -> Array:
         Diagonal: variances of output and current.
     """
     y = data.output[:HEAD]
-    rough = np.nanvar(np.diff(y, n=4)) / 70 if y.size > 8 else np.nanvar(y)
-    v0 = max(data.quantum**2 / 12, 1e-12 * np.nanvar(y), 1e-4 * rough, 1e-18)
+    v0 = max(data.quantum**2 / 12, 1e-12 * _variance(y, 0), 1e-4 * _variance(y, 4) / 70, 1e-18)
     v1 = 1.0
     if data.current.size:
         i = data.current[:HEAD]
-        v1 = max(np.nanvar(np.diff(i, n=2)) / 6 * 0.1, 1e-8 * np.nanvar(i), 1e-12)
-    return np.diag([float(v0), float(v1)])
+        v1 = max(_variance(i, 2) / 6 * 0.1, 1e-8 * _variance(i, 0), 1e-12)
+    return np.diag([v0, v1])
+
+
+def _variance(x: Array, order: int) -> float:
+    """Return the variance of differences; across lost samples where there are no others."""
+    d = np.diff(x, n=order)
+    there = d[np.isfinite(d)]
+    if there.size < 8:
+        there = np.diff(x[np.isfinite(x)], n=order)
+    return float(np.var(there)) if there.size else 0.0
 
 
 def initial_of(data: Experiments, fit: Fit) -> Array:

@@ -62,6 +62,8 @@ def eliminate(  # noqa: C901 - plain loops
     score: Array,
     local_step: Array,
     local_gain: Array,
+    scores: Array,
+    owner: Integers,
 ) -> float:
     """Eliminate each segment's own columns from the normal equations.
 
@@ -80,6 +82,8 @@ def eliminate(  # noqa: C901 - plain loops
         Added to: normal matrix and gradient of the common columns.
     local_step, local_gain : ndarray, shapes (g, l) and (g, l, f)
         Filled: step of the own columns, and by how much it is less per common step.
+    scores, owner : ndarray, shapes (blocks, p) and (blocks,)
+        Scores of runs of samples and their segments; the first f columns are updated.
 
     Returns
     -------
@@ -124,6 +128,10 @@ def eliminate(  # noqa: C901 - plain loops
                 score[i] -= cross * local_step[g, j]
                 for k in range(f):
                     common[i, k] -= cross * local_gain[g, j, k]
+    for b in range(owner.shape[0]):
+        for j in range(own):
+            for i in range(f):
+                scores[b, i] -= scores[b, f + j] * local_gain[owner[b], j, i]
     for i in range(f):
         if common[i, i] <= LOST * before[i]:  # nothing but rounding is left
             common[i, :] = 0.0

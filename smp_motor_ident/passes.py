@@ -240,9 +240,9 @@ def evaluate(
         score += row * miss
         total += miss * miss
     away = (initial - start)[:, list(own)]
-    total += eliminate(sums.normal, sums.gradient, away, data.size, common, score, step, local_gain)
+    total += eliminate(sums.normal, sums.gradient, away, data.size, common, score, step, local_gain,
+                       sums.scores, sums.owner)  # fmt: skip
     if not math.isfinite(total + float(common.sum()) + float(score.sum()) + float(step.sum())):
         return Pass(math.inf, np.zeros((f, f)), np.zeros(f), np.zeros_like(step),
                     np.zeros_like(local_gain), np.full(6, np.nan), np.zeros((0, f)))  # fmt: skip
-    moved = np.einsum("bi,bik->bk", sums.scores[:, f:], local_gain[sums.owner])
-    return Pass(total, common, score, step, local_gain, sums.spread, sums.scores[:, :f] - moved)
+    return Pass(total, common, score, step, local_gain, sums.spread, sums.scores[:, :f])

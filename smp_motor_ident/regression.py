@@ -18,7 +18,6 @@ from smp_motor_ident.propagator import WIDTH, first_order, second_order
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-BINOMIAL = np.array([[1.0, 0, 0, 0], [1, 1, 0, 0], [1, 2, 1, 0], [1, 3, 3, 1]])
 LITTLE = 1e-10  # of a scaled pivot, below which a column is left out
 KNEE = 0.02  # of the largest speed, below which friction counts in part
 
@@ -36,7 +35,7 @@ def filtered(x: Array, cutoff: float, step: float, order: int) -> Array:
     step : float
         Sampling interval [s].
     order : int
-        n, at most 3.
+        n, 1 to 3.
 
     Returns
     -------
@@ -46,26 +45,22 @@ def filtered(x: Array, cutoff: float, step: float, order: int) -> Array:
     c = math.tan(min(cutoff * step / 2, 1.2)) * 2 / step
     g = c * step / 2
     b, a = g / (1 + g), (1 - g) / (1 + g)
-    size = x.shape[0]
-    powers = np.empty((4, size))
+    out = np.empty((order + 1, x.shape[0]))
     last0 = last1 = last2 = f1 = f2 = f3 = 0.0
-    for i in range(size):
+    for i in range(x.shape[0]):
         now = x[i]
         f1 = a * f1 + b * (now + last0)
         f2 = a * f2 + b * (f1 + last1)
         f3 = a * f3 + b * (f2 + last2)
         last0, last1, last2 = now, f1, f2
-        powers[0, i], powers[1, i], powers[2, i], powers[3, i] = now, f1, f2, f3
-    out = np.zeros((order + 1, size))
-    scale = 1.0
-    for k in range(order + 1):
-        for j in range(k + 1):
-            factor = scale * BINOMIAL[k, j] * (1.0 if j % 2 == 0 else -1.0)
-            power = powers[order - k + j]
-            row = out[k]
-            for i in range(size):
-                row[i] += factor * power[i]
-        scale *= c
+        if order == 1:
+            out[0, i], out[1, i] = f1, c * (now - f1)
+        elif order == 2:
+            out[0, i], out[1, i], out[2, i] = f2, c * (f1 - f2), c * c * (now - 2 * f1 + f2)
+        else:
+            out[0, i], out[1, i] = f3, c * (f2 - f3)
+            out[2, i] = c * c * (f1 - 2 * f2 + f3)
+            out[3, i] = c * c * c * (now - 3 * f1 + 3 * f2 - f3)
     return out
 
 
