@@ -6,8 +6,9 @@
     python benchmarks/timing.py --only core     # one PID step
     python benchmarks/timing.py --only wheels --priority 50   # with SCHED_FIFO, where granted
 
-The feeder publishes ``motor_state`` at a fixed rate and takes the time until the command that
-answers it arrives.  Echo and controller run in turn, several times; medians are reported.
+The feeder publishes ``motor_state`` at a fixed rate and takes the time until the middleware has
+received the command that answers it.  An answer is late when the next sample was sent before.
+Echo and controller run in turn, several times; medians are reported.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from stillness import Witness, touched
 
 CPU_LIMIT, LATENCY_LIMIT, ANSWERED_LIMIT, STEP_LIMIT = 1.4, 1.3, 0.999, 3e-6
 GAINS = {
@@ -82,7 +84,7 @@ class Result:
 
 
 class Feeder:
-    """Publishes feedback and set-points of some wheels and waits for the answers."""
+    """Publishes feedback and set-points of some wheels and notes when the answers come in."""
 
     def __init__(self, wheels: list[str]) -> None:
         import rclpy
@@ -95,19 +97,23 @@ class Feeder:
         rclpy.init(args=[])
         self.node = rclpy.create_node("feeder")
         self.wheels = wheels
-        self.states, self.messages, self.sent, self.took = {}, {}, {}, {}
+        self.states, self.messages = {}, {}
+        self.sent: dict[str, list[int]] = {wheel: [] for wheel in wheels}
+        self.received: dict[str, dict[int, int]] = {wheel: {} for wheel in wheels}
         for wheel in wheels:
             self.states[wheel] = self.node.create_publisher(
                 MotorState, f"/{wheel}/motor_state", STREAM_PUBLISHER
             )
             self.messages[wheel] = MotorState()
-            self.sent[wheel], self.took[wheel] = {}, []
             self.node.create_subscription(
                 MotorCommand,
                 f"/{wheel}/motor_command",
-                lambda message, wheel=wheel: self.answered(wheel, message),
+                lambda message, info, received=self.received[wheel]: self.answered(
+                    message, info, received
+                ),
                 STREAM_SUBSCRIBER,
             )
+        self.published = -math.inf
         self.setpoints = self.node.create_publisher(
             JointState, "/wheel_setpoints", STREAM_PUBLISHER
         )
@@ -117,12 +123,10 @@ class Feeder:
         self.executor = LeanExecutor()
         self.executor.add_node(self.node)
 
-    def answered(self, wheel: str, message: object) -> None:
-        """Take the time of an answer by the stamp that it carries."""
+    def answered(self, message: object, info: dict[str, int], received: dict[int, int]) -> None:
+        """Note when the middleware received the answer to the stamp that it carries."""
         stamp = message.header.stamp
-        begun = self.sent[wheel].pop((stamp.sec, stamp.nanosec), None)
-        if begun is not None:
-            self.took[wheel].append(time.perf_counter() - begun)
+        received[stamp.sec * 1_000_000_000 + stamp.nanosec] = info["received_timestamp"]
 
     def feed(self, rate: float, duration: float) -> None:
         """Publish at a rate; answers are taken in between."""
@@ -141,32 +145,48 @@ class Feeder:
 
     def publish(self, rate: float) -> None:
         """Publish one sample of every wheel, and the set-point 20 times a second."""
-        if self.left <= 0:
-            return
+        now = time.perf_counter()
+        if self.left <= 0 or now - self.published < 0.5 / rate:
+            return  # the timer keeps its phase: a late tick is soon followed by another
+        self.published = now
         self.left -= 1
         self.tick += 1
-        seconds, nanoseconds = divmod(time.time_ns(), 1_000_000_000)
         if self.tick % max(1, round(rate / 20)) == 0:
             self.setpoints.publish(self.setpoint)
         for wheel in self.wheels:
             message = self.messages[wheel]
-            message.header.stamp.sec, message.header.stamp.nanosec = seconds, nanoseconds
             message.velocity = 0.9 + 0.1 * math.sin(self.tick * 0.01)
             message.encoder_count = self.tick
-            self.sent[wheel][(seconds, nanoseconds)] = time.perf_counter()
+            now = time.time_ns()
+            stamp = message.header.stamp
+            stamp.sec, stamp.nanosec = divmod(now, 1_000_000_000)
+            self.sent[wheel].append(now)
             self.states[wheel].publish(message)
 
     def ready(self, rate: float) -> None:
         """Feed until every wheel answers, and a second longer."""
         deadline = time.perf_counter() + 30.0
-        while not all(self.took[wheel] for wheel in self.wheels):
+        while not all(self.received[wheel] for wheel in self.wheels):
             if time.perf_counter() > deadline:
                 raise SystemExit("a controller does not answer")
             self.feed(rate, 0.5)
         self.feed(rate, 1.0)
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin anew."""
         for wheel in self.wheels:
             self.sent[wheel].clear()
-            self.took[wheel].clear()
+            self.received[wheel].clear()
+
+    def times(self, wheel: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return when samples were sent and the ones after them [ns], and the answers' time [s].
+
+        NaN where no answer came.  The first sample, which follows a pause, is left out.
+        """
+        sent, received = self.sent[wheel][1:], self.received[wheel]
+        took = [1e-9 * (received.get(at, math.nan) - at) for at in sent[:-1]]
+        return np.array(sent[:-1]), np.array(sent[1:]), np.array(took)
 
 
 def start(kind: str, wheel: str, priority: int = 0) -> subprocess.Popen[bytes]:
@@ -188,34 +208,34 @@ def cpu_seconds(pid: int) -> float:
 
 def measure(feeder: Feeder, kind: str, rate: float, duration: float, priority: int = 0) -> Result:
     """Run one kind of node under the feed."""
+    witness = Witness() if priority else None
     processes = [start(kind, wheel, priority) for wheel in feeder.wheels]
     try:
-        for wheel in feeder.wheels:
-            feeder.took[wheel].clear()
+        feeder.forget()
         feeder.ready(rate)
         before = [cpu_seconds(p.pid) for p in processes]
         feeder.feed(rate, duration)
         used = [cpu_seconds(p.pid) - b for p, b in zip(processes, before)]
-        took = np.concatenate([feeder.took[wheel] for wheel in feeder.wheels])
-        count = round(duration * rate) * len(feeder.wheels)
-        in_time = float(np.count_nonzero(took < 1.0 / rate))
-        late = np.sort(took[took >= 1.0 / rate])
-        if late.size:
-            print(
-                f"  {late.size} late, median {1e3 * np.median(late):.1f} ms, longest "
-                f"{1e3 * late[-1]:.1f} ms; {count - took.size} not answered"
-            )
-        return Result(
-            cpu=sum(used) / duration / len(used),
-            p50=float(np.percentile(took, 50)),
-            p99=float(np.percentile(took, 99)),
-            answered=in_time / count,
-        )
     finally:
         for process in processes:
             process.send_signal(signal.SIGKILL if kind == "echo" else signal.SIGINT)
         for process in processes:
             process.wait(10)
+    sent, after, took = (np.concatenate(part) for part in zip(*map(feeder.times, feeder.wheels)))
+    answered = sent + 1e9 * took < after
+    if priority and not answered.all():
+        still = touched(sent, after, witness.stop())
+        print(
+            f"  {np.count_nonzero(~answered)} of {took.size} not in time, longest "
+            f"{1e3 * np.nanmax(took):.1f} ms; {np.count_nonzero(~answered & still)} of them while "
+            f"the machine stood still; in time otherwise {100 * answered[~still].mean():.3f} %"
+        )
+    return Result(
+        cpu=sum(used) / duration / len(used),
+        p50=float(np.nanpercentile(took, 50)),
+        p99=float(np.nanpercentile(took, 99)),
+        answered=answered.mean(),
+    )
 
 
 def compare(rate: float, duration: float, repeats: int) -> bool:
