@@ -10,6 +10,8 @@ from smp_motor_ident import models
 from smp_motor_ident.fit import Fit
 from smp_motor_ident.models import Structure
 
+SURELY = 3.0  # times the price: a gain that rejects the simpler model whatever is left loose
+
 
 @dataclass(frozen=True, eq=False)
 class Rung:
@@ -75,21 +77,29 @@ def size(structure: Structure) -> int:
     return len(free) - (models.TE in free and not structure.current)
 
 
-def inflation(fit: Fit) -> float:
+def inflation(fit: Fit, beside: Structure | None = None) -> float:
     """Return by how much the scores scatter more than white residuals would let them.
+
+    Under coloured residuals the deviance that a needless coordinate gains is chi-square times
+    the ratio of its variance to that of white residuals.
 
     Parameters
     ----------
     fit : Fit
         Any.
+    beside : Structure, optional
+        A simpler one: the coordinates that it lacks count, else the middle one of all.
 
     Returns
     -------
     float
         At least 1; deviances are divided by it before they are compared.
     """
-    white = np.diag(np.linalg.pinv(fit.information, hermitian=True))
-    return float(max(1.0, np.median(np.diag(fit.covariance()) / np.maximum(white, 1e-300))))
+    colour = fit.colour()
+    free = fit.structure.free()
+    added = [] if beside is None else [i for i in free if i not in beside.free()]
+    most = max((colour[free.index(i)] for i in added), default=1.0)
+    return float(max(most, np.median(colour)))
 
 
 def needed(simple: Fit, rich: Fit) -> tuple[bool, str]:
@@ -108,7 +118,7 @@ def needed(simple: Fit, rich: Fit) -> tuple[bool, str]:
         In words.
     """
     more = size(rich.structure) - size(simple.structure)
-    gained = (simple.deviance - rich.deviance) / inflation(rich)
+    gained = (simple.deviance - rich.deviance) / inflation(rich, simple.structure)
     price = more * float(np.log(simple.samples))
     if not rich.converged and gained < 10 * price:
         return False, "did not converge"
@@ -118,7 +128,7 @@ def needed(simple: Fit, rich: Fit) -> tuple[bool, str]:
             f"no better than {label(simple.structure)} (gain {gained:.0f}, price {price:.0f})",
         )
     loose = _loose(simple, rich)
-    if loose:
+    if loose and gained < SURELY * price:
         return False, f"its {loose} cannot be told from these data"
     return True, f"{label(simple.structure)} is rejected (gain {gained:.0f}, price {price:.0f})"
 

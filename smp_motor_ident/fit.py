@@ -98,6 +98,26 @@ class Fit:
         The inverse information, widened coordinate by coordinate where the scores of
         whole runs of samples scatter more than white residuals would let them.
         """
+        cov = self._white()
+        widen = np.sqrt(self.colour())
+        cov = cov * np.outer(widen, widen)
+        if self.widen is not None:
+            cov = cov * np.outer(self.widen, self.widen)
+        if self.blur is not None:
+            cov = cov + self.blur
+        return cov
+
+    def colour(self) -> Array:
+        """Return by how much each variance is larger than of white residuals, shape (f,)."""
+        cov = self._white()
+        n = len(self.scores)
+        if n <= 2 * cov.shape[0]:
+            return np.ones(cov.shape[0])
+        moved = (self.scores - self.scores.mean(axis=0)) @ cov
+        sandwich = np.square(moved).sum(axis=0) * (n / (n - 1))
+        return np.asarray(np.maximum(1.0, sandwich / np.maximum(np.diag(cov), 1e-300)))
+
+    def _white(self) -> Array:
         # Every coordinate lies within some e-folds or volts of any motor's: without that a
         # direction that the data leave open would count as known.
         information = self.information + np.diag(PLAUSIBLE[list(self.structure.free())])
@@ -105,16 +125,6 @@ class Fit:
         values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
         vectors = vectors / scale[:, None]
         cov: Array = (vectors / np.maximum(values, 1e-15)) @ vectors.T
-        n = len(self.scores)
-        if n > 2 * cov.shape[0]:
-            moved = (self.scores - self.scores.mean(axis=0)) @ cov
-            sandwich = moved.T @ moved * (n / (n - 1))
-            widen = np.sqrt(np.maximum(1.0, np.diag(sandwich) / np.maximum(np.diag(cov), 1e-300)))
-            cov = cov * np.outer(widen, widen)
-        if self.widen is not None:
-            cov = cov * np.outer(self.widen, self.widen)
-        if self.blur is not None:
-            cov = cov + self.blur
         return cov
 
 

@@ -5,6 +5,8 @@ Derivation: docs/derivations.md, sections 7 and 10.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,6 +21,9 @@ from smp_motor_ident.valley import along_friction
 Array = NDArray[np.float64]
 
 FLOOR = 1.3  # residual variance over that of quantisation, below which there is no more
+WALK = 0.6  # step of the logarithm of the bandwidth while its best is not bracketed
+CLOSE = 0.15  # spacing of the same at which the best is known well enough
+MOST = 5.0  # farthest from the motor's own bandwidth
 PRICE = 12.0  # deviance that torque noise must explain before it is believed
 
 
@@ -83,55 +88,59 @@ def extend(data: Experiments, structure: Structure, best: Fit, options: Options)
 
 def _find_ratio(part: Experiments, structure: Structure, first: Fit, options: Options) -> Fit:
     """Walk from following to free run; keep the likeliest ratio of torque noise."""
+
+    def fitted(near: Fit, ratio: float, passes: int) -> Fit:
+        initial = initial_of(part, near)
+        one = descend(part, structure, near.z, initial, near.noise, ratio, options, passes)
+        return _at_rest(part, structure, one, options)
+
     # A speed output survives torque noise in free run, and free run has no bias where the
     # model is not the motor; the innovations form is for angles, which drift.
+    free_run = fitted(first, 0.0, 30)
     if part.kind != rc.ANGLE:
-        return _at_rest(
-            part,
-            structure,
-            descend(
-                part, structure, first.z, initial_of(part, first), first.noise, 0.0, options, 30
-            ),
-            options,
-        )
-    # Residuals no larger than the counter's own resolution leave nothing for torque noise.
-    at_once = _at_rest(part, structure, descend(part, structure, first.z, initial_of(part, first),
-                       first.noise, 0.0, options, 30), options)  # fmt: skip
-    if at_once.converged and at_once.noise[0, 0] < FLOOR * part.quantum**2 / 12:
-        return at_once
-    band = bandwidth(first.z, part)
-    path: list[tuple[float, Fit]] = []
-    here = first
-    for factor in (1.0, 0.3, 0.1, 0.03, 0.01, 0.0):
-        ratio = ratio_of(band * factor, part.step, part.kind)
-        here = _at_rest(
-            part,
-            structure,
-            descend(
-                part, structure, here.z, initial_of(part, here), here.noise, ratio, options, 20
-            ),
-            options,
-        )
-        path.append((factor, here))
-        worst = here.deviance - min(f.deviance for _, f in path)
-        if factor > 0 and worst > (60 if here.converged else 2000):
-            break
-    factor, best = min(path, key=lambda item: item[1].deviance)
-    free_run = path[-1][1]
-    if at_once.deviance < free_run.deviance or free_run.ratio > 0:
-        free_run = at_once
-    if factor == 0.0 or free_run.deviance < best.deviance + PRICE:
         return free_run
-    for finer in (1.8, 1 / 1.8):
-        while True:
-            ratio = ratio_of(band * factor * finer, part.step, part.kind)
-            here = descend(part, structure, best.z, best.initial, best.noise, ratio, options, 12)
-            if here.deviance >= best.deviance - 0.5:
+    # Residuals no larger than the counter's own resolution leave nothing for torque noise.
+    if free_run.converged and free_run.noise[0, 0] < FLOOR * part.quantum**2 / 12:
+        return free_run
+    band = bandwidth(first.z, part)
+    path: dict[float, Fit] = {}
+    here = first
+    for factor in (1.0, 0.3, 0.1, 0.03, 0.01):
+        here = fitted(here, ratio_of(band * factor, part.step, part.kind), 20)
+        path[float(np.log(factor))] = here
+        worst = here.deviance - min(f.deviance for f in path.values())
+        if worst > (60 if here.converged else 2000):
+            break
+    else:
+        free_run = min(free_run, fitted(here, 0.0, 20), key=lambda f: f.deviance)
+    if free_run.deviance < min(f.deviance for f in path.values()) + PRICE:
+        return free_run
+    return _likeliest(path, lambda near, x: fitted(
+        near, ratio_of(band * float(np.exp(x)), part.step, part.kind), 15))  # fmt: skip
+
+
+def _likeliest(path: dict[float, Fit], fitted: Callable[[Fit, float], Fit]) -> Fit:
+    """Refine the logarithm of a bandwidth by parabolas through the deviance."""
+    for _ in range(14):
+        xs = sorted(path)
+        i = xs.index(min(xs, key=lambda x: path[x].deviance))
+        best = path[xs[i]]
+        if i in (0, len(xs) - 1):  # not bracketed yet
+            x = xs[i] + (WALK if i else -WALK)
+            if abs(x) > MOST:
                 break
-            best, factor = here, factor * finer
-            if factor > 30:
+        else:
+            (a, b, c), y = xs[i - 1 : i + 2], [path[x].deviance for x in xs[i - 1 : i + 2]]
+            rise, fall = (y[2] - y[1]) / (c - b), (y[1] - y[0]) / (b - a)
+            if (c - a) * (rise - fall) < 0.2:  # flat to a tenth of a deviance
                 break
-    return best
+            x = 0.5 * (a + b) - 0.5 * fall * (c - a) / (rise - fall)
+            if c - a > 2.5 * WALK or abs(x - b) < 0.02 * (c - a):
+                x = 0.5 * (a + b) if b - a > c - b else 0.5 * (b + c)
+            if max(c - b, b - a) < CLOSE:
+                break
+        path[x] = fitted(best, x)
+    return min(path.values(), key=lambda f: f.deviance)
 
 
 def _at_rest(data: Experiments, structure: Structure, fit: Fit, options: Options) -> Fit:

@@ -134,7 +134,7 @@ def _orders(
         say(f"fitting {label(structure)}")
         fitted = _one(part, structure, options, tried)
         if fitted is not None:
-            tried.append(fitted)
+            tried.append(_no_worse(_of_kind(part, fitted), fitted, tried, options))
     least = min((f.deviance for f in tried), default=0.0)
     best: Fit | None = None
     for fitted in tried:
@@ -156,6 +156,23 @@ def _orders(
         if verdict:
             best = fitted
     return best
+
+
+def _no_worse(data: Experiments, fit: Fit, known: list[Fit], options: Options) -> Fit:
+    """Hold a fit against those that it contains: their answers are starts as good as any."""
+    free = set(fit.structure.free())
+    inner = [f for f in known if f.kind == fit.kind and set(f.structure.free()) < free]
+    least = min(inner, key=lambda f: f.deviance, default=fit)
+    if least.deviance >= fit.deviance:
+        return fit
+    z = least.z.copy()
+    if fit.structure.order > least.structure.order:
+        z[models.A2] = 2 * z[models.A1] - z[models.A0] + np.log(0.02)
+        z[models.TE] = z[models.A2] - z[models.A1]
+    if fit.structure.delay and not least.structure.delay:
+        z[models.DELAY] = 0.1 * data.step
+    again = descent.refine(data, fit.structure, least, fit.structure.complete(z), options)
+    return min(fit, again, key=lambda f: f.deviance)
 
 
 def _projected(data: Experiments, fit: Fit) -> Fit:

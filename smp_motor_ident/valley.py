@@ -13,6 +13,8 @@ from smp_motor_ident.experiments import Experiments
 from smp_motor_ident.fit import Fit
 from smp_motor_ident.models import Structure
 
+OPEN = 0.3  # standard deviation of ln a2 above which other starts are tried
+
 
 def along_friction(part: Experiments, structure: Structure, best: Fit, options: Options) -> Fit:
     """Try other shares of friction and gain that turn the motor as fast at full voltage.
@@ -46,9 +48,29 @@ def along_friction(part: Experiments, structure: Structure, best: Fit, options: 
                        best.ratio, options, 30)  # fmt: skip
         if other.deviance < best.deviance - 1:
             best = other
+    best = _along_lag(part, structure, best, options)
     if best.converged or structure.friction != "symmetric":
         return best
     return _scan_friction(part, structure, best, options, full)
+
+
+def _along_lag(part: Experiments, structure: Structure, best: Fit, options: Options) -> Fit:
+    """Try other second time constants where the fit leaves it open."""
+    free = structure.free()
+    if models.A2 not in free or models.TE not in free:
+        return best
+    i = free.index(models.A2)
+    if best.converged and best.covariance()[i, i] < OPEN**2:
+        return best
+    for share in (0.05, 0.2, 0.6):
+        z = best.z.copy()
+        z[models.A2] = 2 * z[models.A1] - z[models.A0] + np.log(share)
+        z[models.TE] = z[models.A2] - z[models.A1] + 0.02
+        other = descend(part, structure, structure.complete(z), best.initial, best.noise,
+                        best.ratio, options, 30)  # fmt: skip
+        if other.deviance < best.deviance - 1:
+            best = other
+    return best
 
 
 def _scan_friction(
