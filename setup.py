@@ -5,7 +5,7 @@ from glob import glob
 from setuptools import find_packages, setup
 
 NAME = "smp_motor_control"
-NODES = (
+EXECUTABLES = (
     "wheel_pid",
     "motor_plant",
     "skid_steer",
@@ -14,8 +14,11 @@ NODES = (
     "record",
     "play",
     "identifier",
+    "identify",
+    "tune",
+    "commission",
+    "demo",
 )
-TOOLS = ("identify", "tune", "commission", "demo")
 
 setup(
     name=NAME,
@@ -36,9 +39,6 @@ setup(
     install_requires=["setuptools"],
     zip_safe=False,
     entry_points={
-        "console_scripts": [
-            *(f"{node} = {NAME}.nodes.{node}:main" for node in NODES),
-            *(f"{tool} = smp_motor_ident.commands.{tool}:main" for tool in TOOLS),
-        ],
+        "console_scripts": [f"{name} = {NAME}.entry:{name}" for name in EXECUTABLES],
     },
 )

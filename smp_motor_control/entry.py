@@ -1,0 +1,40 @@
+"""The executables: each imports its program while it already listens to Ctrl-C."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+
+
+def _program(module: str, interrupted: int) -> Callable[[], int]:
+    """Return what runs ``main`` of a module, and its exit code where Ctrl-C came before that."""
+
+    def run() -> int:
+        try:
+            return importlib.import_module(module).main() or 0
+        except KeyboardInterrupt:
+            return interrupted
+
+    return run
+
+
+def _node(name: str) -> Callable[[], int]:
+    return _program(f"smp_motor_control.nodes.{name}", 0)
+
+
+def _tool(name: str) -> Callable[[], int]:
+    return _program(f"smp_motor_ident.commands.{name}", 130)
+
+
+wheel_pid = _node("wheel_pid")
+motor_plant = _node("motor_plant")
+skid_steer = _node("skid_steer")
+teleop_wheels = _node("teleop_wheels")
+excite = _node("excite")
+record = _node("record")
+play = _node("play")
+identifier = _node("identifier")
+identify = _tool("identify")
+tune = _tool("tune")
+commission = _tool("commission")
+demo = _tool("demo")
