@@ -269,6 +269,28 @@ def test_odometry_follows_the_wheels_from_any_first_position(start, peer, eventu
     assert peer.joints[-1].name == JOINTS
 
 
+def test_odometry_is_also_on_tf_where_tf2_msgs_is_installed(start, peer, eventually) -> None:
+    tf2_msgs = pytest.importorskip("tf2_msgs.msg", reason="tf2_msgs is not among the wheels")
+    seen: list = []
+    peer.node.create_subscription(
+        tf2_msgs.TFMessage, "/tf", lambda message: seen.extend(message.transforms), 100
+    )
+    start()
+    travel = iter(0.01 * k for k in range(100_000))
+    repeatedly(
+        peer,
+        lambda: peer.feed_all(*(2 * [next(travel)])),
+        lambda: seen and seen[-1].transform.translation.x > 0.01,
+        eventually,
+    )
+    assert (seen[-1].header.frame_id, seen[-1].child_frame_id) == ("odom", "base_link")
+    last = seen[-1].header.stamp
+    same = [o for o in peer.odometry if o.header.stamp == last]
+    assert same, "each transform has an odometry of the same stamp"
+    assert same[0].pose.pose.position.x == seen[-1].transform.translation.x
+    assert same[0].pose.pose.orientation == seen[-1].transform.rotation
+
+
 def test_lost_or_nan_feedback_is_named_and_never_reaches_the_odometry(
     start, peer, eventually
 ) -> None:
