@@ -86,11 +86,11 @@ def _advance(i, w, v, R, L, K, J, b, tc, load, h, steps):
 
 @numba.njit(cache=True)
 def _run(
-    motor, controller, T, delay, counts, window, supply, tc, gain, start, reference, forward, load
+    motor, controller, T, delay, counts, window, supply, tc, gain, start, low, high, forward, load
 ):
     R, L, K, J, b = motor
     p, ki, d, tf, weight, weight_d, tracking = controller
-    n = reference.size
+    n = low.size
     speed, volts, measured_speed = np.empty(n), np.empty(n), np.empty(n)
     whole = int(delay / T + 1e-9)
     late = max(delay - whole * T, 0.0)
@@ -114,7 +114,7 @@ def _run(
             y = (new - old) / (window * T)
         else:
             y = w
-        r = reference[k]
+        r = min(max(y, low[k]), high[k])
         slope = weight_d * r - y
         if not begun:
             previous, begun = (weight_d - 1) * y, True
@@ -149,16 +149,18 @@ def _run(
     return speed, volts, measured_speed
 
 
-def run(motor, controller, conditions, reference, forward=None, load=None):
+def run(motor, controller, conditions, reference, forward=None, load=None, high=None):
     """Return true speed [rad/s], voltage [V] and measured speed at the sampling instants.
 
-    ``motor`` is R, L, K, J, b; ``load`` a torque [N m] at each sample.
+    ``motor`` is R, L, K, J, b; ``load`` a torque [N m] at each sample.  With ``high`` there is no
+    error while the measurement is between ``reference`` and that.
     """
     c = conditions
     zero = np.zeros(reference.size)
     return _run(
         np.array(motor, dtype=float), controller.array(), c.sample_time, c.delay, c.counts,
         c.window, c.supply, c.coulomb, c.gain, c.start, np.asarray(reference, dtype=float),
+        np.asarray(reference if high is None else high, dtype=float),
         zero if forward is None else forward, zero if load is None else load,
     )  # fmt: skip
 
@@ -174,19 +176,24 @@ def minimum_jerk(distance, duration, time):
 
 
 def as_delivered(design, distance, time, ratio=RATIO):
-    """Return reference and feed-forward of a planned change as the wheel node makes them.
+    """Return reference, feed-forward and upper reference of a change as the wheel node makes them.
 
-    The wheel node takes the error from the reference ``lag`` ago; gains are per wheel rad/s.
+    The path is that of the running node; gains are per wheel rad/s.
     """
     gains, plan, model = design.gains, design.reference, design.motor
-    stretched = 1.875 * abs(distance) / plan.max_acceleration
-    duration = max(plan.transition_time, stretched)
-    speed, rate, jerk = minimum_jerk(distance, duration, time)
+    T = time[1] - time[0]
+    profile = plan.profile()
+    profile.set_target(distance, T)
+    path = [profile.ahead(k * T) for k in range(time.size + 1)]
+    speed, rate = np.array([(r.velocity, r.acceleration) for r in path]).T
     bend = model["time_constant_product"] / model["time_constant"]
-    forward = gains.feedforward_velocity * speed
-    forward += gains.feedforward_acceleration * (rate + bend * jerk)
-    forward = forward / ratio + gains.feedforward_static * np.sign(rate + speed)
-    return minimum_jerk(distance, duration, np.maximum(time - plan.lag, 0.0))[0], forward
+    mean = (speed[1:] + speed[:-1]) / 2 - T / 12 * np.diff(rate)
+    forward = gains.feedforward_velocity * mean
+    forward += gains.feedforward_acceleration * (np.diff(speed) + bend * np.diff(rate)) / T
+    forward = forward / ratio + gains.feedforward_static * np.sign(mean)
+    late = (plan.lag + plan.doubt, plan.lag, max(plan.lag - plan.doubt, 0.0))
+    seen = [np.interp(time - each, time, speed[:-1]) for each in late]
+    return np.min(seen, axis=0), forward, np.max(seen, axis=0)
 
 
 def settling(time, speed, final, band=0.02):

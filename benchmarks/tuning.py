@@ -119,10 +119,10 @@ def step(motor, controller, conditions, target, planned=None):
     a0, a1, _ = combinations(motor)
     T = conditions.sample_time
     t = T * np.arange(int((1.0 + 15 * a1 / a0) / T))
-    reference, forward = np.full(t.size, target), np.zeros(t.size)
+    reference, forward, high = np.full(t.size, target), np.zeros(t.size), None
     if planned is not None:
-        reference, forward = as_delivered(planned, target, t)
-    speed = run(motor, controller, conditions, reference, forward)[0]
+        reference, forward, high = as_delivered(planned, target, t)
+    speed = run(motor, controller, conditions, reference, forward, high=high)[0]
     return settling(t, speed, target), overshoot(speed, target), speed
 
 

@@ -6,7 +6,6 @@ Set-point and speeds are the wheel's; counts and the model are the motor's.
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
@@ -16,15 +15,13 @@ from smp_motor_control.motor import Gearbox
 from smp_motor_control.motor_model import MotorModel
 from smp_motor_control.observer import ObserverNoise, SpeedObserver
 from smp_motor_control.pid import Pid, PidGains, PidOutput
-from smp_motor_control.profile import Profile, ProfileLimits, Reference
+from smp_motor_control.profile import Drive, Profile, ProfileLimits, Reference
+from smp_motor_control.reference_path import ReferencePath
 
 SPEED_SOURCES = ("measured", "difference", "observer")
 
 _LEARNING = 20
 """Samples from which the observer learns the usual interval."""
-
-_HALF_WAY = math.log(2.0)
-"""Time constants after which a first-order lag has gone half of its way."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,10 +46,15 @@ class LoopSettings:
     noise : ObserverNoise
         What the observer expects.
     reference_delay : float
-        How much later than the feed-forward acts the measured speed can show it [s]: delay,
-        hold and averaging of the loop.  The error is taken from the reference of that long
-        ago, so that a wheel that does what its model says is left alone; 0: from the present
-        one.
+        How much later than the reference the measured speed can show it [s]: delay and
+        averaging of the loop.  The error is taken from the reference of that long ago, so that
+        a wheel that does what its model says is left alone; 0: from the present one.
+    reference_doubt : float
+        By which that delay may be wrong [s]: there is no error while the measurement is what
+        the reference was within so much of it.
+    drive : Drive or None
+        Motor and voltage that changes of set-point keep to, in wheel rad/s; see
+        :class:`~smp_motor_control.profile.Profile`.
 
     Raises
     ------
@@ -68,16 +70,14 @@ class LoopSettings:
     model: MotorModel | None = None
     noise: ObserverNoise = field(default_factory=ObserverNoise)
     reference_delay: float = 0.0
+    reference_doubt: float = 0.0
+    drive: Drive | None = None
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.reference_delay < math.inf:
-            raise ParameterError(
-                f"reference_delay is {self.reference_delay!r} s; it must be zero or positive"
-            )
-        if not 0.0 <= self.transition_time < math.inf:
-            raise ParameterError(
-                f"transition_time is {self.transition_time!r} s; it must be zero or positive"
-            )
+        for name in ("reference_delay", "reference_doubt", "transition_time"):
+            value = getattr(self, name)
+            if not 0.0 <= value < math.inf:
+                raise ParameterError(f"{name} is {value!r} s; it must be zero or positive")
         if self.speed_source not in SPEED_SOURCES:
             known = ", ".join(SPEED_SOURCES)
             raise ParameterError(f"speed_source is {self.speed_source!r}; known are {known}")
@@ -149,10 +149,9 @@ class WheelLoop:
     ) -> None:
         self.settings = settings
         self.pid = Pid(settings.gains)
-        self.profile = Profile(settings.limits, settings.transition_time)
+        self.profile = Profile(settings.limits, settings.transition_time, settings.drive)
         self.reference = Reference(0.0, 0.0, 0.0)
-        self._elapsed = 0.0
-        self._past: deque[tuple[float, float]] = deque([(0.0, 0.0)])
+        self._path = ReferencePath(self.profile)
         self.source = "measured"
         self.set_hardware(gearbox, encoder, max_load)
 
@@ -183,7 +182,7 @@ class WheelLoop:
         """
         old, self.settings = self.settings, settings
         self.pid.set_gains(settings.gains)
-        self.profile.configure(settings.limits, settings.transition_time)
+        self.profile.configure(settings.limits, settings.transition_time, settings.drive)
         shaped = ("speed_source", "difference_window", "model", "noise")
         if any(getattr(old, name) != getattr(settings, name) for name in shaped):
             self._renew_speed()
@@ -275,8 +274,7 @@ class WheelLoop:
             [rad/s, wheel].
         """
         self.pid.reset()
-        self.profile.reset(measurement)
-        self._past = deque([(self._elapsed, measurement)])
+        self._path.start(measurement)
 
     def step(self, setpoint: float, measurement: float, dt: float) -> PidOutput:
         """Advance reference and controller by one sample.
@@ -293,56 +291,16 @@ class WheelLoop:
         PidOutput
             Volts and their parts.
         """
-        profile = self.profile
+        settings, profile = self.settings, self.profile
+        if settings.reference_delay:
+            path = self._path
+            now = path.step(setpoint, dt)
+            delay, doubt = settings.reference_delay, settings.reference_doubt
+            nominal, compared = path.ago(delay, doubt, measurement)
+            forward = path.forward(compared, settings.gains, settings.model)
+            self.reference = now._replace(velocity=nominal)
+            return self.pid.step(compared, measurement, dt, forward)
         if setpoint != profile.target:
-            profile.set_target(setpoint)
+            profile.set_target(setpoint, dt)
         self.reference = reference = profile.step(dt)
-        if self.settings.reference_delay:
-            return self._step_behind(reference, measurement, dt)
         return self.pid.step(reference.velocity, measurement, dt, reference.acceleration)
-
-    def _step_behind(self, ahead: Reference, measurement: float, dt: float) -> PidOutput:
-        """Feed forward from the reference, compare with the one of some time ago.
-
-        The controller adds ``fv r_d + fa x`` for the delayed reference ``r_d``; with the x below
-        that is ``fv r + fa (r' + r'' a2 / a1)``, what the model needs for the present one.
-        """
-        settings = self.settings
-        gains, model = settings.gains, settings.model
-        delayed = self._reference_ago(settings.reference_delay, ahead.velocity, dt)
-        forward = ahead.acceleration
-        if gains.feedforward_acceleration:
-            share = gains.feedforward_velocity / gains.feedforward_acceleration
-            forward += share * (ahead.velocity - delayed)
-            if model is not None:
-                electrical = model.time_constant_product / model.time_constant
-                forward += ahead.jerk * electrical
-                if self._friction_turns(ahead, delayed, electrical):
-                    turn = math.copysign(2 * gains.feedforward_static, self.profile.target)
-                    forward += turn / gains.feedforward_acceleration
-        self.reference = ahead._replace(velocity=delayed)
-        return self.pid.step(delayed, measurement, dt, forward)
-
-    def _friction_turns(self, ahead: Reference, delayed: float, electrical: float) -> bool:
-        """Return whether, on the way through zero, the friction's voltage has to turn by now.
-
-        The wheel passes zero when the reference ahead does, later than the delayed one.  The
-        current follows a turn of the voltage with the electrical time constant: half of it is
-        there after ln 2 of that, so the voltage turns so much earlier.
-        """
-        target = self.profile.target
-        if delayed * target >= 0.0:
-            return False
-        soon = ahead.velocity + _HALF_WAY * electrical * ahead.acceleration
-        return soon * target > 0.0
-
-    def _reference_ago(self, delay: float, velocity: float, dt: float) -> float:
-        """Return the reference's velocity ``delay`` before now, between samples linearly."""
-        self._elapsed += dt
-        past = self._past
-        past.append((self._elapsed, velocity))
-        then = self._elapsed - delay
-        while len(past) > 2 and past[1][0] <= then:
-            past.popleft()
-        (t0, v0), (t1, v1) = past[0], past[1]
-        return v0 + (v1 - v0) * min(max((then - t0) / (t1 - t0), 0.0), 1.0)

@@ -9,7 +9,7 @@ from smp_motor_control.motor_model import MotorModel
 from smp_motor_control.nodes.settings import described, nested
 from smp_motor_control.observer import ObserverNoise
 from smp_motor_control.pid import PidGains
-from smp_motor_control.profile import ProfileLimits
+from smp_motor_control.profile import Drive, ProfileLimits
 from smp_motor_control.supervision import FaultLimits
 from smp_motor_control.wheel_loop import LoopSettings
 
@@ -52,6 +52,11 @@ def _model(name: str, description: str) -> float:
     return default
 
 
+def _drive(name: str, description: str) -> float:
+    default: float = described(0.0, description, minimum=0.0, name=f"drive.{name}")
+    return default
+
+
 @dataclass(frozen=True, kw_only=True)
 class Settings:
     """Parameters of the node.
@@ -85,9 +90,19 @@ class Settings:
         minimum=0.0, maximum=60.0,
     )  # fmt: skip
     reference_delay: float = described(
-        0.0, "Lag of the measured speed behind the feed-forward: delay, hold and averaging [s].",
+        0.0, "Lag of the measured speed behind the reference: delay and averaging [s].",
         minimum=0.0, maximum=10.0,
     )  # fmt: skip
+    reference_doubt: float = described(
+        0.0, "By which that lag may be wrong [s].", minimum=0.0, maximum=1.0
+    )
+    drive_top_speed: float = _drive(
+        "top_speed", "Speed at which the voltage for changes is used up [rad/s]; 0: no limit."
+    )
+    drive_time_constant: float = _drive(
+        "time_constant", "Sum of the time constants that changes are made for [s]."
+    )
+    drive_time_constant_product: float = _drive("time_constant_product", "Their product [s^2].")
     speed_source: str = described("measured", "measured, difference or observer.")
     difference_window: int = described(
         4, "Samples to difference counts over.", minimum=1, maximum=1000
@@ -124,12 +139,23 @@ class Settings:
             limits=limits,
             transition_time=self.transition_time,
             reference_delay=self.reference_delay,
+            reference_doubt=self.reference_doubt,
+            drive=self._drive(),
             speed_source=self.speed_source,
             difference_window=self.difference_window,
             model=self._motor_model(),
             noise=self.observer,
         )
         object.__setattr__(self, "loop", loop)
+
+    def _drive(self) -> Drive | None:
+        if self.drive_top_speed == 0.0:
+            return None
+        return Drive(
+            top_speed=self.drive_top_speed,
+            time_constant=self.drive_time_constant,
+            time_constant_product=self.drive_time_constant_product,
+        )
 
     def _motor_model(self) -> MotorModel | None:
         given = (self.model_dc_gain, self.model_time_constant)

@@ -12,7 +12,7 @@ from smp_motor_ident.tune.arrays import Array
 from smp_motor_ident.tune.designer import Design
 from smp_motor_ident.tune.margins import frequencies
 from smp_motor_ident.tune.plant import draw_motors, motors_of, sample
-from smp_motor_ident.tune.reference import CHANGE, controller_for, duration_of, planned_change
+from smp_motor_ident.tune.reference import CHANGE, controller_for, planned_change
 from smp_motor_ident.tune.response import Controller, simulate
 
 DRAWS = 200
@@ -70,15 +70,16 @@ def curves(estimate: Estimate, design: Design) -> Curves:
     plant = sample(nominal if drawn is None else drawn, loop)
     controller = controller_for(loop, design.feedback)
     change = CHANGE * design.reference.max_velocity
-    duration = duration_of(design.reference, change)
     slow = float(nominal.a1[0] / nominal.a0[0])
     T = loop.sample_time
-    time = T * np.arange(int((duration + 6 * slow) / T) + 2)
+    time = T * np.arange(int((design.reference.transition_time + 8 * slow) / T) + 2)
     usual = replace(loop, delay=loop.expected_delay)
     plan = sample(nominal, usual)
-    lagging, forward = planned_change(plan, design.reference.lag, change, duration, time)
+    planned = planned_change(plan, design.reference, change, time)
     as_usual = sample(plant.motors, usual)
-    step = simulate(as_usual, controller, lagging, forward=forward).speed
+    step = simulate(
+        as_usual, controller, planned.low, high=planned.high, forward=planned.forward
+    ).speed
     pushed = simulate(
         plant, Controller(design.feedback), np.zeros(time.size), load=np.ones(time.size)
     )
@@ -87,7 +88,7 @@ def curves(estimate: Estimate, design: Design) -> Curves:
     loop_gain = plant.response(omega) * design.feedback.response(omega, T)
     return Curves(
         time=time[shown],
-        reference=lagging[shown] / ratio,
+        reference=planned.reference[shown] / ratio,
         step=_band(step[:, shown]) / ratio,
         load=_band(pushed.speed[:, shown]) / ratio,
         omega=omega,

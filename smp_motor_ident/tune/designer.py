@@ -26,7 +26,9 @@ from smp_motor_ident.tune.reference import Reference, controller_for, plan_refer
 from smp_motor_ident.tune.response import Controller
 from smp_motor_ident.tune.robust import Jury, Robustness, back_off
 
-COMMON = ("max_velocity", "max_acceleration", "transition_time", "samples", "seed")
+COMMON = (
+    "max_velocity", "max_acceleration", "transition_time", "together", "samples", "seed",
+)  # fmt: skip
 """Targets that every method understands."""
 
 
@@ -89,7 +91,8 @@ def design(estimate: Estimate, loop: Loop, method: str = "margin", **targets: An
     **targets
         What the method understands, such as ``phase_margin`` [deg] or ``bandwidth`` [rad/s], and
         for all: ``max_velocity`` [rad/s, wheel], ``max_acceleration`` [rad/s^2, wheel],
-        ``transition_time`` [s], ``samples`` (draws of the distribution), ``seed``.
+        ``transition_time`` [s], ``together`` (one of several motors that shall arrive together),
+        ``samples`` (draws of the distribution), ``seed``.
 
     Returns
     -------
@@ -214,8 +217,8 @@ def finish(case: Case, feedback: Feedback, factor: float, robustness: Robustness
     problem, plant, loop = case.problem, case.problem.plant, case.problem.loop
     controller = controller_for(loop, feedback)
     usual = _usual(case)
-    reference = _plan(usual, loop, controller, problem.targets)
     margins = loop_margins(plant, feedback)
+    reference = _plan(usual, loop, controller, margins, problem.targets)
     figures = measure(problem, usual, controller, reference, ripple(problem, feedback))
     reason, warnings = _explain(case, margins, factor, robustness, figures)
     m = plant.motors
@@ -400,7 +403,7 @@ def _promise(method: Method, problem: Problem) -> Promise:
 
 
 def _plan(
-    plant: Plant, loop: Loop, controller: Controller, targets: Mapping[str, Any]
+    plant: Plant, loop: Loop, controller: Controller, margins: Margins, targets: Mapping[str, Any]
 ) -> Reference:
     ratio = loop.gear_ratio
     speed, rate = targets.get("max_velocity"), targets.get("max_acceleration")
@@ -408,9 +411,11 @@ def _plan(
         plant,
         loop,
         controller,
+        least=0.4 / margins.crossover if margins.crossover > 0 else 0.0,
         max_velocity=None if speed is None else speed * ratio,
         max_acceleration=None if rate is None else rate * ratio,
         transition_time=targets.get("transition_time"),
+        together=bool(targets.get("together")),
     )
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from smp_motor_ident.tune.plant import Plant
 from smp_motor_ident.tune.problem import Problem
-from smp_motor_ident.tune.reference import CHANGE, Reference, duration_of, planned_change
+from smp_motor_ident.tune.reference import CHANGE, Reference, planned_change
 from smp_motor_ident.tune.response import (
     Controller,
     load_figures,
@@ -77,13 +77,12 @@ def measure(
     """
     T, fb = problem.loop.sample_time, controller.feedback
     change = CHANGE * reference.max_velocity
-    duration = duration_of(reference, change)
-    horizon = duration + 5 * problem.reduced.time_constant
+    horizon = reference.transition_time + 8 * problem.reduced.time_constant
     if fb.i > 0:
         horizon += 4 * (fb.p + 1 / problem.reduced.gain) / fb.i
     time = T * np.arange(min(max(int(horizon / T), 50), 20_000))
-    lagging, forward = planned_change(usual, reference.lag, change, duration, time)
-    run = simulate(usual, controller, lagging, forward=forward)
+    plan = planned_change(usual, reference, change, time)
+    run = simulate(usual, controller, plan.low, high=plan.high, forward=plan.forward)
     planned = step_figures(time, run.speed[0], run.voltage[0], change)
     # Small, so that saturation does not hide the loop.
     alone = Controller(fb)

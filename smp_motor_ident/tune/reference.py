@@ -2,7 +2,7 @@ r"""Feed-forward and reference: what makes wheels arrive together and without ov
 
 The feed-forward is the motor's own equation, ``a2 r'' + a1 r' + a0 r`` and dry friction, of the
 reference r.  The wheel then follows r, and the measurement shows it later by a lag that is known:
-delay, hold and averaging of the loop.  The error is taken from the reference of that long ago,
+delay and averaging of the loop.  The error is taken from the reference of that long ago,
 so the feedback, its integral above all, has nothing to do while the model is right, and nothing
 to unwind afterwards, which is what overshoot of a well-damped loop comes from.
 
@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from smp_motor_control.profile import Drive, Profile, ProfileLimits
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.tune.arrays import Array
 from smp_motor_ident.tune.feedback import Feedback
@@ -48,17 +49,33 @@ class Reference:
     max_velocity : float
         [rad/s].
     max_acceleration : float
-        [rad/s^2].
+        [rad/s^2]; infinite where voltage alone limits.
     transition_time : float
-        Duration of every minimum-jerk change [s]; the acceleration limit stretches large ones.
+        Duration of every minimum-jerk change [s]; larger ones are made as fast as limits allow.
     lag : float
         By which the measured speed follows the reference [s].
+    doubt : float
+        By which that may be wrong without the feedback taking it for an error [s].
+    drive : Drive
+        Motor and voltage that large changes keep to.
     """
 
     max_velocity: float
     max_acceleration: float
     transition_time: float
     lag: float
+    doubt: float
+    drive: Drive
+
+    def profile(self) -> Profile:
+        """Return the reference as the running loop leads it, at rest at zero.
+
+        Returns
+        -------
+        Profile
+        """
+        limits = ProfileLimits(acceleration=self.max_acceleration)
+        return Profile(limits, self.transition_time, self.drive)
 
 
 def controller_for(loop: Loop, feedback: Feedback) -> Controller:
@@ -86,7 +103,7 @@ def controller_for(loop: Loop, feedback: Feedback) -> Controller:
 
 
 def measured_lag(plant: Plant, loop: Loop) -> float:
-    """Return how much later than the feed-forward acts the measurement shows it [s].
+    """Return how much later than the reference the measurement shows it [s].
 
     Parameters
     ----------
@@ -98,59 +115,66 @@ def measured_lag(plant: Plant, loop: Loop) -> float:
     Returns
     -------
     float
-        Delay of loop and motor, half a sample of hold, half the averaging window.
+        Delay of loop and motor, and half the averaging window.
     """
     dead = loop.expected_delay + float(plant.motors.delay[0])
     window = 0 if loop.speed_source == "observer" else plant.window
-    return dead + 0.5 * loop.sample_time * (1 + window)
+    return dead + 0.5 * loop.sample_time * window
 
 
-def duration_of(reference: Reference, distance: float) -> float:
-    """Return how long a change takes: the transition time, stretched by the acceleration [s].
+@dataclass(frozen=True, eq=False)
+class Change:
+    """A planned change of set-point from rest, at the sampling instants; each of shape (k,).
 
-    Parameters
+    Attributes
     ----------
-    reference : Reference
-        With its limits.
-    distance : float
-        Change of speed [rad/s].
-
-    Returns
-    -------
-    float
+    low, reference, high : ndarray, [rad/s]
+        What the measurement is compared with, and between what it is left alone.
+    forward : ndarray, [V]
+        Feed-forward without dry friction.
+    duration : float
+        [s].
     """
-    stretched = PEAK_RATE * abs(distance) / reference.max_acceleration
-    return max(reference.transition_time, stretched)
+
+    low: Array
+    reference: Array
+    high: Array
+    forward: Array
+    duration: float
 
 
-def planned_change(
-    plant: Plant, lag: float, distance: float, duration: float, time: Array
-) -> tuple[Array, Array]:
-    """Return delayed reference and feed-forward of a minimum-jerk change from rest.
+def planned_change(plant: Plant, plan: Reference, distance: float, time: Array) -> Change:
+    """Return what the running loop makes of a change of set-point from rest.
 
     Parameters
     ----------
     plant : Plant
-        A batch of one.
-    lag : float
-        From :func:`measured_lag` [s].
+        A batch of one; the feed-forward is that of its motor.
+    plan : Reference
+        The plan.
     distance : float
         Change of speed [rad/s].
-    duration : float
-        [s].
     time : ndarray, shape (k,), [s]
-        Sampling instants.
+        Sampling instants from the change on.
 
     Returns
     -------
-    reference : ndarray, shape (k,), [rad/s]
-    forward : ndarray, shape (k,), [V]
-        Without dry friction.
+    Change
     """
-    m = plant.motors
-    speed, rate, jerk = minimum_jerk(distance, duration, time)
-    forward = float(m.a0[0]) * speed + float(m.a1[0]) * rate + float(m.a2[0]) * jerk
-    return minimum_jerk(distance, duration, np.maximum(time - lag, 0.0))[0], forward
+    m, T = plant.motors, plant.sample_time
+    profile = plan.profile()
+    profile.set_target(distance, T)
+    rows = [profile.ahead(k * T) for k in range(time.size + 1)]
+    speed, rate = np.array([(r.velocity, r.acceleration) for r in rows]).T
+    gained, turned = np.diff(speed), np.diff(rate)
+    forward = float(m.a0[0]) * (0.5 * (speed[1:] + speed[:-1]) - T / 12 * turned)
+    forward = forward + (float(m.a1[0]) * gained + float(m.a2[0]) * turned) / T
+    around = [
+        np.interp(time - plan.lag - late, time, speed[:-1])
+        for late in (plan.doubt, 0.0, -min(plan.doubt, plan.lag))
+    ]
+    low, high = np.min(around, axis=0), np.max(around, axis=0)
+    return Change(low, around[1], high, forward, profile.duration)
 
 
 def top_speed(plant: Plant, supply: float) -> float:
@@ -177,9 +201,11 @@ def plan_reference(
     loop: Loop,
     controller: Controller,
     *,
+    least: float = 0.0,
     max_velocity: float | None = None,
     max_acceleration: float | None = None,
     transition_time: float | None = None,
+    together: bool = False,
 ) -> Reference:
     """Return the fastest reference that the motor can follow without overshoot.
 
@@ -191,12 +217,19 @@ def plan_reference(
         Its supply is the limit.
     controller : Controller
         The design.
+    least : float
+        Duration that a change takes in any case [s], such as the time in which the feedback can
+        answer: a shorter one gains little, and hammers the motor with every small change.
     max_velocity : float or None
         [rad/s, motor]; None takes 90 % of what the headroom reaches.
     max_acceleration : float or None
         [rad/s^2, motor]; None follows from the others.
     transition_time : float or None
         Of every change of set-point [s]; None takes the shortest.
+    together : bool
+        Whether it is one of several motors that shall arrive together: then the feedback, which
+        takes up what loads them differently, is left nothing undone for doubt about the delay,
+        and the transition is as long as that asks for.
 
     Returns
     -------
@@ -207,26 +240,47 @@ def plan_reference(
     DesignError
         When the motor cannot reach the speed or the acceleration that is asked for.
     """
-    lag, ratio = measured_lag(plant, loop), loop.gear_ratio
+    ratio = loop.gear_ratio
     speed = _reachable(plant, loop, max_velocity)
-    quickest = _quickest(plant, loop, controller, lag)
-    steepest = _steepest(plant, loop, speed, quickest)
-    if max_acceleration is not None and not 0 < max_acceleration <= steepest:
-        raise DesignError(
-            f"max_acceleration {max_acceleration / ratio:.4g} rad/s^2 is beyond the motor: a "
-            f"change by {speed / ratio:.3g} rad/s within {PEAK:.0%} of {loop.supply_voltage:g} V "
-            f"reaches {steepest / ratio:.4g} rad/s^2; ask for that or less"
-        )
-    if transition_time is not None and not transition_time >= quickest - 1e-9:
-        raise DesignError(
-            f"transition_time {transition_time:.4g} s is too short for the loop: without overshoot "
-            f"a change takes at least {quickest:.3g} s; ask for that or more"
-        )
+    plan = _fastest(plant, loop, speed, together)
+    plan = _quickest(plant, loop, controller, plan, least)
+    quickest = plan.transition_time
+    if max_acceleration is not None:
+        steepest = _steepest(plant, loop, speed, quickest)
+        if not 0 < max_acceleration <= steepest:
+            raise DesignError(
+                f"max_acceleration {max_acceleration / ratio:.4g} rad/s^2 is beyond the motor: a "
+                f"change by {speed / ratio:.3g} rad/s within {PEAK:.0%} of "
+                f"{loop.supply_voltage:g} V reaches {steepest / ratio:.4g} rad/s^2; ask for that "
+                "or less"
+            )
+        plan = replace(plan, max_acceleration=max_acceleration)
+    if transition_time is not None:
+        if not quickest - 1e-9 <= transition_time < math.inf:
+            raise DesignError(
+                f"transition_time {transition_time:.4g} s is too short for the loop: without "
+                f"overshoot a change takes at least {quickest:.3g} s; ask for that or more"
+            )
+        plan = replace(plan, transition_time=transition_time)
+    return plan
+
+
+def _fastest(plant: Plant, loop: Loop, speed: float, together: bool) -> Reference:
+    """Return a plan that keeps to the voltage alone."""
+    m = plant.motors
+    lag = measured_lag(plant, loop)
+    drive = Drive(
+        top_speed=(PEAK * loop.supply_voltage - float(m.static_voltage[0])) / float(m.a0[0]),
+        time_constant=float(m.a1[0] / m.a0[0]),
+        time_constant_product=float(m.a2[0] / m.a0[0]),
+    )
     return Reference(
         max_velocity=speed,
-        max_acceleration=steepest if max_acceleration is None else max_acceleration,
-        transition_time=quickest if transition_time is None else transition_time,
+        max_acceleration=math.inf,
+        transition_time=0.0,
         lag=lag,
+        doubt=0.0 if together else loop.delay_doubt,
+        drive=drive,
     )
 
 
@@ -245,34 +299,34 @@ def _reachable(plant: Plant, loop: Loop, wished: float | None) -> float:
     return 0.9 * top if wished is None else wished
 
 
-def _quickest(plant: Plant, loop: Loop, controller: Controller, lag: float) -> float:
-    """Return the shortest change of speed, however small, that does not overshoot [s].
+def _quickest(
+    plant: Plant, loop: Loop, controller: Controller, plan: Reference, least: float
+) -> Reference:
+    """Return the plan with the shortest change of speed, however small, that does not overshoot.
 
     By more than one percent when the loop's delay is as usual, or one and a half when it is longer
     by the loop's doubt.
     """
-    slow = float(plant.motors.a1[0] / plant.motors.a0[0])
     late = replace(loop, delay=loop.expected_delay + loop.delay_doubt)
     trials = ((plant, 1.0), (sample(plant.motors, late), 1.5))
     linear = replace(controller, limit=math.inf, tracking=math.inf)
     grain = max(0.002, loop.sample_time)
-    grains = math.ceil(0.01 / grain)
+    grains = math.ceil(max(0.01, least) / grain)
     for _ in range(200):
-        duration = grains * grain
-        if all(_overshoot(one, linear, lag, duration, slow) <= most for one, most in trials):
+        plan = replace(plan, transition_time=round(grains * grain, 9))
+        if all(_overshoot(one, linear, plan) <= most for one, most in trials):
             break
         grains += max(1, grains // 16)
-    return round(duration, 9)
+    return plan
 
 
-def _overshoot(
-    plant: Plant, controller: Controller, lag: float, duration: float, slow: float
-) -> float:
-    """Return the overshoot of a change by 1 rad/s [%]."""
-    T = plant.sample_time
-    time = T * np.arange(int((duration + lag + 3 * slow) / T) + 2)
-    reference, forward = planned_change(plant, lag, 1.0, duration, time)
-    run = simulate(plant, controller, reference, forward=forward)
+def _overshoot(plant: Plant, controller: Controller, plan: Reference) -> float:
+    """Return the overshoot of a small change [%]."""
+    slow, T = plan.drive.time_constant, plant.sample_time
+    time = T * np.arange(int((plan.transition_time + plan.lag + 3 * slow) / T) + 2)
+    small = replace(plan, drive=replace(plan.drive, top_speed=1e9))
+    change = planned_change(plant, small, 1.0, time)
+    run = simulate(plant, controller, change.low, high=change.high, forward=change.forward)
     return step_figures(time, run.speed[0], run.voltage[0], 1.0).overshoot
 
 
@@ -280,16 +334,15 @@ def _steepest(plant: Plant, loop: Loop, speed: float, quickest: float) -> float:
     """Return the largest acceleration that no change up to ``speed`` takes beyond the supply."""
     room = PEAK * loop.supply_voltage - float(plant.motors.static_voltage[0])
     highest = PEAK_RATE * speed / quickest
-    rates = highest * np.geomspace(1.0, 0.01, 200)
-    for rate in rates:
+    m = plant.motors
+    for rate in highest * np.geomspace(1.0, 0.01, 200):
         # A change that just takes the shortest time has the most jerk for its acceleration.
-        changes = np.geomspace(rate * quickest / PEAK_RATE, speed, 4)
-        if all(_voltage(plant, c, PEAK_RATE * c / rate) <= room for c in changes):
-            return float(rate)
-    return float(rates[-1])
-
-
-def _voltage(plant: Plant, distance: float, duration: float) -> float:
-    """Return the largest voltage of a change, without dry friction."""
-    time = np.linspace(0.0, duration, 100)
-    return float(planned_change(plant, 0.0, distance, duration, time)[1].max())
+        for change in np.geomspace(rate * quickest / PEAK_RATE, speed, 4):
+            duration = PEAK_RATE * change / rate
+            motion = minimum_jerk(change, duration, np.linspace(0.0, duration, 100))
+            needed = sum(float(a[0]) * x for a, x in zip((m.a0, m.a1, m.a2), motion, strict=True))
+            if np.max(needed) > room:
+                break
+        else:
+            break
+    return float(rate)

@@ -64,6 +64,7 @@ def simulate(
     controller: Controller,
     reference: Array,
     *,
+    high: Array | None = None,
     forward: Array | None = None,
     load: Array | None = None,
     count_angle: float = 0.0,
@@ -78,6 +79,8 @@ def simulate(
         With numbers, or arrays of shape (n,).
     reference : ndarray, shape (k,), [rad/s]
         What the error is taken from, at the sampling instants.
+    high : ndarray, shape (k,), [rad/s], or None
+        Where given, there is no error while the measurement is between ``reference`` and this.
     forward : ndarray, shape (k,), [V], or None
         Feed-forward.
     load : ndarray, shape (k,), [V], or None
@@ -109,6 +112,7 @@ def simulate(
         plant.window,
         np.stack([np.broadcast_to(np.asarray(x, dtype=np.float64), n) for x in numbers], axis=1),
         np.asarray(reference, dtype=np.float64),
+        np.asarray(reference if high is None else high, dtype=np.float64),
         np.zeros(steps) if forward is None else forward,
         np.zeros(steps) if load is None else load,
         count_angle,
@@ -125,13 +129,14 @@ def _run(
     T: float,
     window: int,
     controllers: Array,
-    reference: Array,
+    low: Array,
+    high: Array,
     forward: Array,
     load: Array,
     count_angle: float,
 ) -> tuple[Array, Array]:
     n, m, s = taps.shape
-    steps = reference.size
+    steps = low.size
     speed, voltage = np.empty((n, steps)), np.empty((n, steps))
     for j in range(n):
         p, i, d, filter_time, weight, weight_d, limit, back = controllers[j]
@@ -146,13 +151,14 @@ def _run(
                     newest = math.floor(newest / count_angle) * count_angle
                     oldest = math.floor(oldest / count_angle) * count_angle
                 measured = (newest - oldest) / (window * T)
-            slope = weight_d * reference[k] - measured
+            reference = min(max(measured, low[k]), high[k])
+            slope = weight_d * reference - measured
             rate = (filter_time * rate + slope - previous) / (filter_time + T)
             previous = slope
-            wanted = p * (weight * reference[k] - measured) + integral + d * rate
+            wanted = p * (weight * reference - measured) + integral + d * rate
             wanted += forward[k]
             given = min(max(wanted, -limit), limit)
-            integral += T * (i * (reference[k] - measured) + (given - wanted) * back)
+            integral += T * (i * (reference - measured) + (given - wanted) * back)
             speed[j, k], voltage[j, k] = x[0], given
             for q in range(m - 1, 0, -1):
                 past[q] = past[q - 1]

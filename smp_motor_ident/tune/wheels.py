@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+import numpy as np
+
+from smp_motor_control.profile import Drive, Reference
+from smp_motor_control.voltage_limited import VoltageLimited
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune.designer import (
@@ -50,6 +55,7 @@ def design_wheels(
     loops: Mapping[str, Loop],
     method: str = "margin",
     sets: Sets = "auto",
+    together: bool = True,
     **targets: Any,
 ) -> WheelSet:
     """Design for every wheel of a robot.
@@ -65,6 +71,9 @@ def design_wheels(
     sets : {'auto', 'one', 'each'}
         One set of feedback gains for all, one for each, or decided by the spread: one set where
         no wheel loses more than a tenth of its load rejection by it.
+    together : bool
+        Whether all shall arrive together, on the one reference that the weakest can follow;
+        else each is as fast as its own voltage allows.
     **targets
         As for :func:`smp_motor_ident.tune.design`.
 
@@ -79,15 +88,19 @@ def design_wheels(
     """
     if not estimates:
         raise DesignError("no motor was identified; identify a bag that holds one")
+    together = together and len(estimates) > 1
+    targets["together"] = together
     cases = {w: prepare(e, loops[w], method, targets) for w, e in estimates.items()}
     own = {wheel: finish(case, *solve(case)) for wheel, case in cases.items()}
     shared, reason = _choose(cases, own, sets)
     if shared is not None:
         own = {wheel: _with(case, shared) for wheel, case in cases.items()}
-    if len(own) == 1:
-        return WheelSet(own, False, reason)
-    together, pace = _together(cases, own)
-    return WheelSet(together, shared is not None, f"{reason}; {pace}")
+    if not together:
+        return WheelSet(
+            own, shared is not None, f"{reason}; each as fast as its own voltage allows"
+        )
+    common, pace = _together(cases, own)
+    return WheelSet(common, shared is not None, f"{reason}; {pace}")
 
 
 def _with(case: Case, shared: Feedback) -> Design:
@@ -101,14 +114,17 @@ def _together(
 ) -> tuple[dict[str, Design], str]:
     """Give all wheels the one reference that the weakest of them can follow."""
 
-    def at_wheel(wheel: str, name: str) -> float:
-        return float(getattr(own[wheel].reference, name)) / own[wheel].loop.gear_ratio
+    def least(value: Callable[[Design], float]) -> tuple[float, str]:
+        """Return the least of a value that is per wheel, and whose it is."""
+        found = {wheel: value(one) / one.loop.gear_ratio for wheel, one in own.items()}
+        wheel = min(found, key=lambda w: found[w])
+        return found[wheel], wheel
 
     late = max(own, key=lambda w: own[w].reference.transition_time)
-    slow = min(own, key=lambda w: at_wheel(w, "max_velocity"))
-    weak = min(own, key=lambda w: at_wheel(w, "max_acceleration"))
     duration = own[late].reference.transition_time
-    speed, rate = at_wheel(slow, "max_velocity"), at_wheel(weak, "max_acceleration")
+    speed, slow = least(lambda one: one.reference.max_velocity)
+    rate, _ = least(lambda one: one.reference.max_acceleration)
+    drive = common_drive(own)
     together = {}
     for wheel, one in own.items():
         ratio = one.loop.gear_ratio
@@ -117,12 +133,55 @@ def _together(
             transition_time=duration,
             max_velocity=speed * ratio,
             max_acceleration=rate * ratio,
+            drive=replace(drive, top_speed=drive.top_speed * ratio),
         )
         together[wheel] = with_reference(cases[wheel], one, common)
+    limited = "as voltage allows" if math.isinf(rate) else f"at most {rate:.3g} rad/s^2"
     return together, (
         f"one reference for all: {1e3 * duration:.0f} ms as {late} needs, up to {speed:.3g} rad/s "
-        f"as {slow} reaches, at most {rate:.3g} rad/s^2 as {weak} can"
+        f"as {slow} reaches, larger changes as fast {limited}"
     )
+
+
+def common_drive(designs: Mapping[str, Design]) -> Drive:
+    """Return the motor whose fastest changes are within what every one of these can do.
+
+    Parameters
+    ----------
+    designs : mapping of str to Design
+        By wheel.
+
+    Returns
+    -------
+    Drive
+        At the wheels: the largest time constants, and as much of the least top speed as leaves
+        each motor within its own voltage at every instant of changes small and large.
+    """
+    drives = [
+        replace(one.reference.drive, top_speed=one.reference.drive.top_speed / one.loop.gear_ratio)
+        for one in designs.values()
+    ]
+    step = max(one.loop.sample_time for one in designs.values())
+    common = Drive(
+        top_speed=min(d.top_speed for d in drives),
+        time_constant=max(d.time_constant for d in drives),
+        time_constant_product=max(d.time_constant_product for d in drives),
+    )
+    largest = min(one.reference.max_velocity / one.loop.gear_ratio for one in designs.values())
+    for _ in range(100):
+        changes = [
+            VoltageLimited(Reference(begin * largest, 0.0, 0.0), end * largest, common, step)
+            for begin, end in ((0.0, 0.3), (0.0, 1.0), (1.0, 0.0), (-1.0, 1.0))
+        ]
+        if all(
+            abs(drive.needed(change.at(s * change.duration))) <= 1.001 * drive.top_speed
+            for change in changes
+            for s in np.linspace(0.0, 0.999, 60)
+            for drive in drives
+        ):
+            break
+        common = replace(common, top_speed=0.98 * common.top_speed)
+    return common
 
 
 class _Panel:

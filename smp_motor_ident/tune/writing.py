@@ -31,12 +31,19 @@ def parameters(design: Design) -> dict[str, Any]:
     gains = dataclasses.asdict(design.gains)
     gains.pop("error_deadband")
     ratio, reference = design.loop.gear_ratio, design.reference
+    limit = reference.max_acceleration
     return {
         **gains,
         "max_velocity": float(reference.max_velocity / ratio),
-        "max_acceleration": float(reference.max_acceleration / ratio),
+        "max_acceleration": float(limit / ratio) if math.isfinite(limit) else 0.0,
         "transition_time": float(reference.transition_time),
         "reference_delay": float(reference.lag),
+        "reference_doubt": float(reference.doubt),
+        "drive": {
+            "top_speed": float(reference.drive.top_speed / ratio),
+            "time_constant": float(reference.drive.time_constant),
+            "time_constant_product": float(reference.drive.time_constant_product),
+        },
         "speed_source": str(design.loop.speed_source),
         "difference_window": int(max(design.loop.difference_window, 1)),
         "model": {name: float(value) for name, value in design.motor.items()},
@@ -107,6 +114,8 @@ def _entry(design: Design) -> dict[str, Any]:
             "max_acceleration": design.reference.max_acceleration / design.loop.gear_ratio,
             "transition_time": design.reference.transition_time,
             "lag": design.reference.lag,
+            "doubt": design.reference.doubt,
+            "top_speed": design.reference.drive.top_speed / design.loop.gear_ratio,
         },
         "loop": {**dataclasses.asdict(design.loop), "delay": design.loop.loop_delay},
         "motor": dict(design.motor),

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.linalg import expm
+from scipy.optimize import linprog
 
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.motor import MotorParameters
 from smp_motor_control.profile import (
     PEAK_ACCELERATION,
     PEAK_JERK,
+    Drive,
     MinimumJerk,
     Profile,
     ProfileLimits,
@@ -22,6 +26,7 @@ from smp_motor_control.profile import (
     peak_voltage,
     shortest_common_transition,
 )
+from smp_motor_control.voltage_limited import VoltageLimited
 
 # Table 1 of the paper: J, K, L, R, b.
 PAPER = [
@@ -189,3 +194,87 @@ def test_speed_that_a_motor_cannot_hold_is_refused_with_the_motor_named() -> Non
 
 def test_standing_still_takes_no_time() -> None:
     assert shortest_common_transition(MOTORS, [5.0] * 4, [5.0] * 4, 11.0) == 0.0
+
+
+drives = st.builds(
+    Drive,
+    top_speed=st.floats(1.0, 20.0),
+    time_constant=st.floats(0.01, 0.5),
+    time_constant_product=st.just(0.0),
+)
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    drives,
+    st.floats(0.0, 0.6),
+    st.floats(-0.95, 0.95),
+    st.floats(-0.95, 0.95),
+    st.floats(-1.0, 1.0),
+    st.sampled_from([0.001, 0.005, 0.01]),
+)
+def test_a_change_as_fast_as_voltage_allows_ends_at_rest_within_it(
+    drive: Drive, bend: float, begin: float, end: float, push: float, dt: float
+) -> None:
+    if bend > 0.001:
+        drive = replace(drive, time_constant_product=bend * drive.time_constant**2)
+    top, tau = drive.top_speed, drive.time_constant
+    start = Reference(begin * top, push * (1 - abs(begin)) * top / tau, 0.0)
+    change = VoltageLimited(start, end * top, drive, dt)
+    if change.duration == 0.0:
+        return
+    # Of whole samples, so that a voltage that is held over samples can be the one it needs.
+    assert change.duration / dt == pytest.approx(round(change.duration / dt), abs=1e-6)
+    last = change.at(change.duration * (1.0 - 1e-9))
+    assert last.velocity == pytest.approx(end * top, abs=1e-5 * top)
+    if drive.time_constant_product:
+        assert last.acceleration * tau == pytest.approx(0.0, abs=1e-4 * top)
+    seen = [change.at(change.duration * k / 50) for k in range(50)]
+    if drive.time_constant_product:
+        # Rounding of the jerk, a difference of large numbers, is all that may go beyond.
+        assert max(abs(drive.needed(x)) for x in seen) <= top * (1 + 1e-6)
+
+
+def test_a_first_order_motor_gets_the_time_of_the_textbook() -> None:
+    drive = Drive(top_speed=10.0, time_constant=0.1)
+    change = VoltageLimited(REST, 5.0, drive, 1e-4)
+    # w = U (1 - exp(-t / tau)), rounded up to samples.
+    assert 0.1 * math.log(2.0) <= change.duration <= 0.1 * math.log(2.0) + 1e-4
+
+
+def test_no_voltage_within_the_limit_is_faster() -> None:
+    drive = Drive(top_speed=10.0, time_constant=0.05, time_constant_product=0.0008)
+    dt, target = 0.005, 6.0
+    samples = round(VoltageLimited(REST, target, drive, dt).duration / dt)
+    # Every sequence of voltages of one sample less: its reachable states are a zonotope, which
+    # contains the target if and only if a linear programme has a solution.
+    A = np.array([[0.0, 1.0], [-1.0 / 0.0008, -0.05 / 0.0008]])
+    step = expm(A * dt)
+    push = (np.eye(2) - step) @ np.array([1.0, 0.0])
+    for n, possible in ((samples, True), (samples - 1, False)):
+        columns = [np.linalg.matrix_power(step, n - 1 - k) @ push for k in range(n)]
+        found = linprog(
+            np.zeros(n), A_eq=np.array(columns).T, b_eq=[target, 0.0], bounds=[(-10.0, 10.0)] * n
+        )
+        assert found.success == possible
+
+
+def test_a_small_change_takes_the_transition_time_and_a_large_one_what_voltage_allows() -> None:
+    drive = Drive(top_speed=10.0, time_constant=0.05, time_constant_product=0.0008)
+    profile = Profile(transition_time=0.05, drive=drive)
+    durations = []
+    for target in (0.5, 9.0):
+        profile.reset()
+        profile.set_target(target, 0.005)
+        durations.append(profile.duration)
+    assert durations[0] == 0.05
+    assert durations[1] == pytest.approx(0.1)  # 20 samples
+
+
+def test_an_acceleration_limit_holds_beside_the_voltage() -> None:
+    drive = Drive(top_speed=10.0, time_constant=0.05, time_constant_product=0.0008)
+    profile = Profile(ProfileLimits(acceleration=40.0), transition_time=0.05, drive=drive)
+    profile.set_target(8.0, 0.005)
+    seen = [profile.step(0.001) for _ in range(round(profile.duration / 0.001))]
+    assert max(x.acceleration for x in seen) <= 1.001 * 40.0
+    assert max(drive.needed(x) for x in seen) <= 1.001 * 10.0

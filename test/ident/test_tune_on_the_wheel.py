@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,9 @@ import pytest
 from smp_motor_control.motor_file import load_motors
 from smp_motor_control.motor_model import MotorModel
 from smp_motor_control.plant import DriveSettings
-from smp_motor_control.profile import ProfileLimits
+from smp_motor_control.profile import ProfileLimits, Reference
 from smp_motor_control.simulation import Timing, simulate_closed_loop
+from smp_motor_control.voltage_limited import VoltageLimited
 from smp_motor_control.wheel_loop import LoopSettings, WheelLoop
 from smp_motor_ident.commands.tune import read_estimates
 from smp_motor_ident.tune import Loop, design, design_wheels
@@ -32,6 +34,8 @@ def settings_of(one) -> LoopSettings:
         ),
         transition_time=plan.transition_time,
         reference_delay=plan.lag,
+        reference_doubt=plan.doubt,
+        drive=replace(plan.drive, top_speed=plan.drive.top_speed / ratio),
         model=MotorModel(**one.motor),
     )
 
@@ -41,26 +45,51 @@ def estimates():
     return read_estimates(MOTORS)
 
 
-def test_wheel_loop_feeds_forward_what_the_design_planned(estimates):
+@pytest.mark.parametrize("share", [0.05, 0.9])
+def test_wheel_loop_feeds_forward_what_the_design_planned(estimates, share):
     T = 0.005
     one = design(estimates["front_left"], Loop(sample_time=T))
-    loop = WheelLoop(settings_of(one))
+    settings = settings_of(one)
+    loop = WheelLoop(replace(settings, gains=replace(settings.gains, feedforward_static=0.0)))
     loop.start(0.0)
-    target = 0.5 * one.reference.max_velocity
+    target = share * one.reference.max_velocity
     ratio = one.loop.gear_ratio
     outs, references = [], []
     for _ in range(80):
-        outs.append(loop.step(target / ratio, loop.reference.velocity, T).feedforward)
+        out = loop.step(target / ratio, loop.reference.velocity, T)
+        outs.append(out.feedforward)
         references.append(loop.reference.velocity * ratio)
-    time = T * np.arange(1, 81)
+    time = T * np.arange(80)
     plant = sample(motors_of(estimates["front_left"]), one.loop)
-    duration = one.reference.transition_time
-    delayed, forward = planned_change(plant, one.reference.lag, target, duration, time)
-    forward = forward + one.gains.feedforward_static
-    # The node interpolates the delayed reference linearly between samples: its curvature times
-    # T^2 / 8 is 0.2 % of the step here.
-    np.testing.assert_allclose(references, delayed, atol=3e-3 * target)
-    np.testing.assert_allclose(outs, forward, atol=1e-9 * 12)
+    planned = planned_change(plant, one.reference, target, time)
+    # Both interpolate linearly between the same samples.
+    np.testing.assert_allclose(references, planned.reference, atol=1e-9 * target)
+    np.testing.assert_allclose(outs, planned.forward, atol=1e-9 * 12)
+
+
+@pytest.mark.parametrize("rate", [100.0, 200.0, 1000.0])
+@pytest.mark.parametrize("share", [0.3, 0.6])
+def test_a_wheel_alone_is_as_fast_as_its_voltage_allows(estimates, rate, share):
+    T = 1 / rate
+    one = design(estimates["rear_right"], Loop(sample_time=T))
+    drive, ratio = one.reference.drive, one.loop.gear_ratio
+    target = share * drive.top_speed / ratio
+    run = simulate_closed_loop(
+        load_motors(MOTORS)["rear_right"],
+        settings_of(one),
+        lambda time: target,
+        0.6,
+        timing=Timing(sample_time=T, delay=one.loop.expected_delay),
+        drive=DriveSettings(command_timeout=np.inf, pwm_steps=1000),
+    )
+    outside = np.flatnonzero(np.abs(run.velocity - target) > 0.02 * target)
+    arrived = run.time[outside[-1] + 1]
+    quickest = VoltageLimited(
+        Reference(0.0, 0.0, 0.0), target, replace(drive, top_speed=drive.top_speed / ratio), T
+    ).duration
+    # First sample, delay, and what rounding up to samples and the least duration add.
+    assert arrived <= max(quickest, one.reference.transition_time) + one.loop.loop_delay + 2 * T
+    assert run.velocity.max() < 1.02 * target
 
 
 @pytest.mark.parametrize("rate", [100.0, 200.0, 1000.0])
