@@ -77,7 +77,7 @@ def size(structure: Structure) -> int:
     return len(free) - (models.TE in free and not structure.current)
 
 
-def inflation(fit: Fit, beside: Structure | None = None) -> float:
+def inflation(fit: Fit, beside: Fit | None = None) -> float:
     """Return by how much the scores scatter more than white residuals would let them.
 
     Under coloured residuals the deviance that a needless coordinate gains is chi-square times
@@ -87,8 +87,9 @@ def inflation(fit: Fit, beside: Structure | None = None) -> float:
     ----------
     fit : Fit
         Any.
-    beside : Structure, optional
-        A simpler one: the coordinates that it lacks count, else the middle one of all.
+    beside : Fit, optional
+        A simpler one: the coordinates that it lacks count, and its own worst one, for the
+        richer model may hide in a direction that nothing tells.
 
     Returns
     -------
@@ -96,10 +97,12 @@ def inflation(fit: Fit, beside: Structure | None = None) -> float:
         At least 1; deviances are divided by it before they are compared.
     """
     colour = fit.colour()
-    free = fit.structure.free()
-    added = [] if beside is None else [i for i in free if i not in beside.free()]
-    most = max((colour[free.index(i)] for i in added), default=1.0)
-    return float(max(most, np.median(colour)))
+    middle = float(np.median(colour))
+    if beside is None:
+        return max(1.0, middle)
+    free, before = fit.structure.free(), beside.structure.free()
+    added = [colour[free.index(i)] for i in free if i not in before]
+    return float(max([1.0, middle, *added, *beside.colour()]))
 
 
 def needed(simple: Fit, rich: Fit) -> tuple[bool, str]:
@@ -118,7 +121,7 @@ def needed(simple: Fit, rich: Fit) -> tuple[bool, str]:
         In words.
     """
     more = size(rich.structure) - size(simple.structure)
-    gained = (simple.deviance - rich.deviance) / inflation(rich, simple.structure)
+    gained = (simple.deviance - rich.deviance) / inflation(rich, simple)
     price = more * float(np.log(simple.samples))
     if not rich.converged and gained < 10 * price:
         return False, "did not converge"
