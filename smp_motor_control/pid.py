@@ -157,7 +157,8 @@ class Pid:
             Rate of the reference [rad/s^2], for the feed-forward alone.
         error_rate : float, optional
             Rate of ``c r - y`` [rad/s^2] where a sensor or an observer tells it; replaces
-            differencing, not the filter.
+            differencing, not the filter.  Such a step is not what a later one differences
+            from, as in control_toolbox.
 
         Returns
         -------
@@ -199,7 +200,8 @@ class Pid:
         if error > self._deadband or error < -self._deadband:
             i_term = self._integrate(error, dt, output, unsaturated)
             self.i_term = i_term
-        self._previous = weighted
+        if error_rate is None:
+            self._previous = weighted
         self._rate = rate if -_INF < rate < _INF else 0.0
         self._seen = (reference, measurement, acceleration)
         last = PidOutput(
@@ -293,7 +295,7 @@ class Pid:
         """
         before = self._without_integral()
         self._adopt(gains)
-        if self._seen is not None:
+        if self._seen is not None and self._previous is not None:
             self._previous = self._weight_d * self._seen[0] - self._seen[1]
         self._store_integral(self.i_term + before - self._without_integral())
 
