@@ -79,6 +79,13 @@ class Player(Node):
         self._thread.start()
 
     def _offer(self, channel: Channel) -> None:
+        kept, _ = self._outputs.get(channel.topic, (channel.type, None))
+        if kept != channel.type:  # a node cannot offer one topic with two types
+            self.get_logger().warning(
+                f"{channel.topic}: its messages of type {channel.type} are not played, "
+                f"only those of type {kept}"
+            )
+            return
         message = message_class(channel.type)
         if message is None or channel.encoding != "cdr":
             why = f"its type {channel.type} is not installed here"

@@ -39,7 +39,7 @@ class Replay:
         if self._recording.is_table:
             raise BagError(f"{path}: is a table, not a bag")
         channels = self._recording.channels()
-        self.channels = list({channel.topic: channel for channel in channels}.values())
+        self.channels = list({(c.topic, c.type): c for c in channels}.values())
 
     @property
     def notes(self) -> list[str]:

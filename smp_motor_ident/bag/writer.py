@@ -40,6 +40,7 @@ class _Topic:
     """A topic of the bag and what is said about it."""
 
     channel: records.Channel
+    type_name: str
     text: str
     count: int = 0
     entries: bytearray = field(default_factory=bytearray)
@@ -150,7 +151,7 @@ class BagWriter:
                 schema_id=schema.id,
             )
             text = topic_entry(topic, type_name, profiles, type_hash)
-            self._topics[topic] = _Topic(channel, text)
+            self._topics[topic] = _Topic(channel, type_name, text)
             self._add_record(channel)
             return bool(schema.data)
 
@@ -203,7 +204,7 @@ class BagWriter:
         Raises
         ------
         BagError
-            When the bag is closed or the disk does not take it.
+            When the bag is closed, the topic is of another type, or the disk does not take it.
         """
         with self._lock:
             if self._closed:
@@ -212,6 +213,10 @@ class BagWriter:
             if entry is None:
                 self.add_topic(topic, type_name)
                 entry = self._topics[topic]
+            if entry.type_name != type_name:
+                raise BagError(
+                    f"{self.path}: {topic} is of the type {entry.type_name}, not {type_name}"
+                )
             entry.entries += _INDEX_ENTRY.pack(stamp, len(self._chunk))
             self._chunk += _MESSAGE.pack(
                 Opcode.MESSAGE,

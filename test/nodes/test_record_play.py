@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import mcap.writer
 import pytest
 
 rclpy = pytest.importorskip("rclpy")
@@ -25,6 +26,7 @@ from std_msgs.msg import Float64, String  # noqa: E402
 
 from smp_interfaces.msg import MotorDescription, MotorState  # noqa: E402
 from smp_motor_ident.bag import BagWriter, read_records  # noqa: E402
+from smp_motor_ident.errors import BagError  # noqa: E402
 
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 BEGIN = time.time_ns()
@@ -394,3 +396,33 @@ def test_topics_of_unknown_types_are_told_and_the_others_played(
     assert player.wait(20.0) == 0
     assert "/odd is not played: its type strange_msgs/msg/Thing is not installed" in player.output
     eventually(lambda: len(listener.data["/number"]) == 1, deadline=2.0)
+
+
+def test_topic_with_two_types_is_played_with_one_and_the_other_told(
+    process: Callable[..., Any],
+    listener: Listener,
+    eventually: Callable[..., None],
+    tmp_path: Path,
+) -> None:
+    bag = tmp_path / "two.mcap"
+    with bag.open("wb") as file:
+        writer = mcap.writer.Writer(file)
+        writer.start(profile="ros2")
+        for stamp, message in ((1_000, Float64(data=4.0)), (2_000, String(data="four"))):
+            name = f"std_msgs/msg/{type(message).__name__}"
+            schema = writer.register_schema(name, "ros2msg", b"")
+            channel = writer.register_channel("/number", "cdr", schema)
+            writer.add_message(channel, stamp, raw(message), stamp)
+        writer.finish()
+    player = process("play", bag)
+    assert player.wait(20.0) == 0
+    assert "/number: its messages of type std_msgs/msg/String are not played" in player.output
+    eventually(lambda: len(listener.data["/number"]) == 1, deadline=2.0)
+
+
+def test_message_of_another_type_than_its_topic_is_not_written(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.write("/number", "std_msgs/msg/Float64", raw(Float64(data=4.0)), 1_000)
+        with pytest.raises(BagError, match="is of the type std_msgs/msg/Float64, not"):
+            bag.write("/number", "std_msgs/msg/String", raw(String(data="four")), 2_000)
+        assert bag.counts == {"/number": 1}
