@@ -26,7 +26,7 @@ from smp_motor_ident.noise import kalman_gain
 from smp_motor_ident.passes import evaluate
 
 COMBINATIONS = ("dc_gain", "time_constant", "time_constant_product")
-KINDS = ("sine", "square", "fourier")
+KINDS = ("sine", "square", "fourier", "plain square")
 TELLS = 0.3  # a quantity is identifiable where the bound's std is below this part of it
 
 

@@ -25,14 +25,19 @@ TABLE_1 = independent.TABLE_1
 
 
 def voltage(t: np.ndarray, kind: str, amplitude: float, rng: np.random.Generator) -> np.ndarray:
-    """Return an excitation that never repeats in step with the sampling: slowly detuned."""
+    """Return an excitation that never repeats in step with the sampling: slowly detuned.
+
+    Frequency and amplitude wander by 7 %; a ``plain square`` keeps its amplitude, so that the
+    motor turns at two exact speeds and the counter's error repeats.
+    """
     s = np.concatenate([[t[0]], t[:-1]])
     slow = 1 + 0.07 * np.sin(0.61 * s + rng.uniform(0, 6))
     phase = 2 * np.pi * np.cumsum(slow) * (s[2] - s[1])
     if kind == "sine":
         return amplitude * slow * np.sin(1.037 * phase + rng.uniform(0, 6))
-    if kind == "square":
-        return amplitude * np.sign(np.sin(0.917 * phase + rng.uniform(0, 6)))
+    if kind.endswith("square"):
+        level = amplitude if kind == "plain square" else amplitude * slow / 1.07
+        return level * np.sign(np.sin(0.917 * phase + rng.uniform(0, 6)))
     f = np.geomspace(0.1, 20, 24) * (1 + 0.01 * rng.standard_normal(24))
     x = np.zeros(t.size)  # tone by tone: ten million samples must fit
     for tone, phase0 in zip(f, rng.uniform(0, 2 * np.pi, 24)):

@@ -14,6 +14,8 @@ from smp_motor_ident.record import Record
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
+EDGE = 0.02
+"""Part of an interval next to its ends in which a switch counts as one at the sample."""
 REST = 10
 """Samples after which an unchanged count is a standstill."""
 FEW = 2_000
@@ -303,7 +305,7 @@ def _sections(record: Record, hold: str) -> tuple[Array, Array, Integers]:
         second += step * share
     share[k] = before
     first[k], second[k] = v[k - 1], v[k + 1]
-    split = np.flatnonzero((first != second) & (share > 0.02) & (share < 0.98))
+    split = np.flatnonzero((first != second) & (share > EDGE) & (share < 1 - EDGE))
     split = split[split > 0]
     switch = t[split - 1] + share[split] * (t[split] - t[split - 1])
     value = v.copy()
@@ -343,7 +345,10 @@ def _jumps(record: Record) -> tuple[Integers, Array]:
     k = np.flatnonzero(inside & steady & (np.abs(jump) > 0.2 * np.ptp(v))) + 2
     starts = np.array(record.starts)
     k = k[~np.isin(k, starts) & ~np.isin(k - 1, starts) & ~np.isin(k + 1, starts)]
-    return (k, (v[k + 1] - v[k]) / (v[k + 1] - v[k - 1])) if k.size else none
+    before = (v[k + 1] - v[k]) / (v[k + 1] - v[k - 1])
+    # A level that wanders a little before it jumps at a sample has not jumped before.
+    truly = (before > EDGE) & (before < 1 - EDGE)
+    return (k[truly], before[truly]) if truly.any() else none
 
 
 def _trend(v: Array) -> Array:

@@ -12,7 +12,6 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from smp_motor_ident import models, replay
 from smp_motor_ident import recursion as rc
@@ -21,7 +20,9 @@ from smp_motor_ident.fit import Fit
 
 Array = NDArray[np.float64]
 
-MANY = 50_000  # samples above which fewer replays are run
+REPLAYS = 8, 32  # fewest and most
+MOST = 500_000  # samples in all replays
+REACH = 2.0  # standard deviations to which motions near the estimate are replayed
 
 
 def widened(data: Experiments, fit: Fit, seed: int = 0) -> Fit:
@@ -46,29 +47,55 @@ def widened(data: Experiments, fit: Fit, seed: int = 0) -> Fit:
     own = data.quantum**2 / 12
     if fit.noise[0, 0] > 3 * own or not fit.structure.free():
         return fit
+    cov = fit.covariance()
+    counted, metered = (np.diag(share) for share in _shares(data, fit))
+    expected = np.maximum(metered + counted, 1e-300)
     rng = np.random.default_rng(seed)
+    excess = np.ones(len(cov))
+    # How the counter errs hangs on the motion itself, known as well as the estimate tells:
+    # a first round shows how well that is, the second takes it from there.
+    for _ in range(2):
+        spread = REACH**2 * cov * np.sqrt(np.outer(excess, excess))
+        errors = _errors(data, fit, own, spread, rng)
+        # Only what the counter does is replayed; what the current's noise does is known.
+        second = metered + np.mean(np.square(errors), axis=0)
+        excess = np.maximum(second / np.maximum(expected, np.diag(cov)), excess)
+    return replace(fit, widen=np.sqrt(excess))
+
+
+def _shares(data: Experiments, fit: Fit) -> tuple[Array, Array]:
+    """Return the covariances that independent errors of counter and current would make."""
+    whole = replay.information(data, fit)
+    inverse = replay.inverse(whole)
+    if not data.current.size:
+        return inverse, np.zeros_like(inverse)
+    lost = replace(data, current=np.full(data.size, np.nan))
+    counter = replay.information(lost, fit)
+    return inverse @ counter @ inverse, inverse @ (whole - counter) @ inverse
+
+
+def _errors(
+    data: Experiments, fit: Fit, own: float, spread: Array, rng: np.random.Generator
+) -> Array:
+    """Return the estimate's errors where nothing but the counter errs, shape (replays, f)."""
+    matrix = fit.structure.matrix()
     predicted = replay.simulate(data, fit)
     noise = np.sqrt(max(fit.noise[0, 0] - own, 0.0))
-    cov = fit.covariance()
-    replays = 24 if data.size < MANY else 8
+    current = data.current
+    if current.size:
+        current = np.where(np.isnan(current), np.nan, predicted[:, 2])
     errors = []
-    for _ in range(replays):
-        current = data.current
-        if current.size:
-            scatter = np.sqrt(fit.noise[1, 1]) * rng.standard_normal(data.size)
-            current = np.where(np.isnan(current), np.nan, predicted[:, 2] + scatter)
-        angle = predicted[:, 1] + rng.uniform(0, data.quantum)
-        angle += noise * rng.standard_normal(data.size)
-        counts = np.floor(angle / data.quantum) * data.quantum
-        counts -= (counts - predicted[:, 1]).mean()
+    values, vectors = np.linalg.eigh(spread)
+    half = vectors * np.sqrt(np.maximum(values, 0.0))
+    for _ in range(int(np.clip(MOST // data.size, *REPLAYS))):
+        near = fit.structure.complete(fit.z + matrix @ (half @ rng.standard_normal(len(half))))
+        angle = replay.simulate(data, replace(fit, z=near))[:, 1]
+        shown = angle + rng.uniform(0, data.quantum) + noise * rng.standard_normal(data.size)
+        wrong = np.floor(shown / data.quantum) * data.quantum - angle
+        counts = predicted[:, 1] + wrong - wrong.mean()
         counts[np.isnan(data.output)] = np.nan
-        again = replace(data, output=counts, current=current)
-        errors.append(replay.one_step(again, fit))
-    second = np.mean(np.square(errors), axis=0)
-    excess = second / np.maximum(np.diag(cov), 1e-300)
-    # Below the 95 % point the replays do not contradict the covariance.
-    widen = np.where(excess > chi2.ppf(0.95, replays) / replays, np.sqrt(excess), 1.0)
-    return replace(fit, widen=widen)
+        errors.append(replay.one_step(replace(data, output=counts, current=current), fit))
+    return np.array(errors)
 
 
 def blurred(data: Experiments, fit: Fit, instant: float) -> Fit:

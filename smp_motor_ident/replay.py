@@ -69,10 +69,24 @@ def _again(data: Experiments, structure: Structure, fit: Fit) -> Pass:
     return evaluate(data, structure, z, fit.initial, fit.initial, fit.gain, fit.noise)
 
 
-def _inverse(normal: Array, rcond: float = 1e-13) -> Array:
+def inverse(normal: Array, rcond: float = 1e-13) -> Array:
+    """Return the pseudo-inverse of a normal matrix, whatever the units of its coordinates.
+
+    Parameters
+    ----------
+    normal : ndarray, shape (f, f)
+        Symmetric.
+    rcond : float
+        Relative to the largest eigenvalue; below it a direction counts as not told.
+
+    Returns
+    -------
+    ndarray, shape (f, f)
+        Zero along the directions that are not told.
+    """
     scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    inverse = np.linalg.pinv(normal / np.outer(scale, scale), rcond=rcond, hermitian=True)
-    return np.asarray(inverse / np.outer(scale, scale))
+    scaled = np.linalg.pinv(normal / np.outer(scale, scale), rcond=rcond, hermitian=True)
+    return np.asarray(scaled / np.outer(scale, scale))
 
 
 def information(data: Experiments, fit: Fit) -> Array:
@@ -109,7 +123,7 @@ def one_step(data: Experiments, fit: Fit) -> Array:
         Of the free coordinates.
     """
     here = _again(data, fit.structure, fit)
-    return np.asarray(_inverse(here.normal) @ here.gradient)
+    return np.asarray(inverse(here.normal) @ here.gradient)
 
 
 def promise(data: Experiments, fit: Fit, richer: Structure) -> tuple[float, Array, Array]:
@@ -134,7 +148,7 @@ def promise(data: Experiments, fit: Fit, richer: Structure) -> tuple[float, Arra
         Of white residuals.
     """
     here = _again(data, richer, fit)
-    covariance = _inverse(here.normal)
+    covariance = inverse(here.normal)
     step = covariance @ here.gradient
     return float(here.gradient @ step), step, covariance
 
