@@ -8,6 +8,7 @@ Quantisation errors that repeat are a bias; those that do not are noise.
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import overload
@@ -27,7 +28,7 @@ _GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Excitation:
+class Excitation(ABC):
     """Base of all signals: bounded by ``amplitude`` and zero before time zero.
 
     Attributes
@@ -72,8 +73,9 @@ class Excitation:
         values[~begun] = 0.0
         return float(values[0]) if np.ndim(time) == 0 else values
 
+    @abstractmethod
     def _shape(self, time: Array) -> Array:
-        raise NotImplementedError
+        """Return the signal of amplitude 1 at instants from time zero on."""
 
 
 @dataclass(frozen=True, kw_only=True)
