@@ -24,7 +24,11 @@ from smp_motor_ident.tune.plant import Plant, draw_motors, motors_of, sample
 from smp_motor_ident.tune.problem import Method, Problem, Promise, ripple
 from smp_motor_ident.tune.reference import Reference, controller_for, plan_reference
 from smp_motor_ident.tune.response import Controller
-from smp_motor_ident.tune.robust import Jury, Robustness, back_off
+from smp_motor_ident.tune.robust import Jury, Robustness, back_off, softer
+
+CLAMPED = 1 / 6
+"""Largest ripple [share of the supply, rms] of any gains: three times it is half of the supply, and
+a loop whose noise is clamped is none."""
 
 COMMON = (
     "max_velocity", "max_acceleration", "transition_time", "together", "samples", "seed",
@@ -185,7 +189,10 @@ def solve(case: Case) -> tuple[Feedback, float, Robustness]:
     DesignError
         When the demand cannot be met.
     """
-    feedback, factor, robustness = back_off(case.jury, case.method.solve(case.problem))
+    ruled = case.method.solve(case.problem)
+    quiet, calm = _within_clamp(case.problem, ruled)
+    feedback, factor, robustness = back_off(case.jury, quiet)
+    factor *= calm
     if factor == 0.0:
         raise DesignError(
             f"{case.wheel}: no gains of this kind keep a phase margin of "
@@ -194,6 +201,15 @@ def solve(case: Case) -> tuple[Feedback, float, Robustness]:
             "margins"
         )
     return feedback, factor, robustness
+
+
+def _within_clamp(problem: Problem, feedback: Feedback) -> tuple[Feedback, float]:
+    """Soften gains until what quantisation makes at the output leaves room within the clamp."""
+    factor, trial = 1.0, feedback
+    while ripple(problem, trial) > CLAMPED * problem.loop.supply_voltage and factor > 0.01:
+        factor *= 0.95
+        trial = softer(feedback, factor)
+    return trial, factor
 
 
 def finish(case: Case, feedback: Feedback, factor: float, robustness: Robustness) -> Design:
@@ -442,7 +458,10 @@ def _explain(
             "has less lag and noise while its model is right"
         )
     if factor < 1:
-        words.append(f"gains backed off to {factor:.0%} of the rule's so that 99 % hold")
+        words.append(
+            f"gains backed off to {factor:.0%} of the rule's so that 99 % hold and the ripple from "
+            "the encoder stays within the clamp"
+        )
     if figures.ripple > 1.05 * loop.noise_limit:
         warnings.append(
             f"encoder quantisation makes {figures.ripple:.2g} V of ripple, above "

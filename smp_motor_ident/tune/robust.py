@@ -132,7 +132,7 @@ def back_off(jury: Judge, feedback: Feedback) -> tuple[Feedback, float, Robustne
     good, bad = None, 1.0
     factor = 0.97
     while factor > 0.01:
-        trial = _softer(feedback, factor)
+        trial = softer(feedback, factor)
         verdict = jury.judge(trial)
         if verdict.holds >= SHARE:
             good = factor, trial, verdict
@@ -142,7 +142,7 @@ def back_off(jury: Judge, feedback: Feedback) -> tuple[Feedback, float, Robustne
         return feedback, 0.0, jury.judge(feedback)
     for _ in range(6):
         middle = 0.5 * (good[0] + bad)
-        trial = _softer(feedback, middle)
+        trial = softer(feedback, middle)
         verdict = jury.judge(trial)
         if verdict.holds >= SHARE:
             good = middle, trial, verdict
@@ -151,7 +151,20 @@ def back_off(jury: Judge, feedback: Feedback) -> tuple[Feedback, float, Robustne
     return good[1], good[0], good[2]
 
 
-def _softer(feedback: Feedback, factor: float) -> Feedback:
+def softer(feedback: Feedback, factor: float) -> Feedback:
+    """Return gains with a lower crossover and the same shape of the loop.
+
+    Parameters
+    ----------
+    feedback : Feedback
+        The gains.
+    factor : float
+        Of proportional and derivative action; integral action shrinks with its square.
+
+    Returns
+    -------
+    Feedback
+    """
     return Feedback(
         feedback.p * factor,
         feedback.i * factor**2,
