@@ -12,103 +12,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident._compile import compiled, inlined
-from smp_motor_ident.internal import STUCK, VC_MINUS, VC_PLUS
-from smp_motor_ident.propagator import ROW, first_order, second_order, speed_at
+from smp_motor_ident.internal import BE, STUCK, VC_MINUS, VC_PLUS
+from smp_motor_ident.lanes import (
+    LANES,
+    SLOTS,
+    SW,
+    WHOLE,
+    activate,
+    fill,
+    slide_columns,
+    slide_state,
+    stay,
+    turn,
+)
+from smp_motor_ident.propagator import speed_at
 
 Array = NDArray[np.float64]
 
-
-@compiled
-def fill(row: Array, h: float, par: Array, n_slope: int, slope: Array, derivatives: Array) -> None:
-    """Put the propagator over h into a row, then its derivative by each common column.
-
-    Parameters
-    ----------
-    row : ndarray, shape (WIDTH,)
-        Overwritten.
-    h : float
-        Length of the interval [s].
-    par : ndarray, shape (11,)
-        Internal parameters.
-    n_slope : int
-        Number of columns that touch te, tm, K, be.
-    slope : ndarray, shape (11, c)
-        Derivatives of the internal parameters.
-    derivatives : ndarray, shape (WIDTH,)
-        Scratch.
-    """
-    if par[0] == 0.0:
-        first_order(derivatives, h, par[1], par[2], par[3])
-    else:
-        second_order(derivatives, h, par[0], par[1], par[2], par[3])
-    for i in range(ROW):
-        row[i] = derivatives[i]
-    for j in range(n_slope):
-        for i in range(ROW):
-            total = 0.0
-            for m in range(4):
-                total += slope[m, j] * derivatives[ROW * (m + 1) + i]
-            row[ROW * (j + 1) + i] = total
-
-
-@inlined
-def _slide(
-    rows: Array,
-    n: int,
-    x: Array,
-    s: Array,
-    n_slope: int,
-    v: float,
-    f: float,
-    df: Array,
-    which: int,
-) -> None:
-    """Advance state x and sensitivities s over one interval with constant v and F = f.
-
-    The propagator is row ``n`` of ``rows``; no view of it is made, that would cost more than
-    the step itself.
-    """
-    q, w = x[0], x[1]
-    e00, e01, e10, e11, h0, h1 = (
-        rows[n, 0],
-        rows[n, 1],
-        rows[n, 2],
-        rows[n, 3],
-        rows[n, 4],
-        rows[n, 5],
-    )
-    g0, g1, g2 = rows[n, 9], rows[n, 10], rows[n, 11]
-    for j in range(s.shape[1]):
-        sq, sw, fj = s[0, j], s[1, j], df[which, j]
-        s[0, j] = e00 * sq + e01 * sw - g0 * fj
-        s[1, j] = e10 * sq + e11 * sw - g1 * fj
-        s[2, j] += h0 * sq + h1 * sw - g2 * fj
-    for j in range(n_slope):
-        o = ROW * (j + 1)
-        s[0, j] += rows[n, o] * q + rows[n, o + 1] * w + rows[n, o + 6] * v - rows[n, o + 9] * f
-        s[1, j] += (
-            rows[n, o + 2] * q + rows[n, o + 3] * w + rows[n, o + 7] * v - rows[n, o + 10] * f
-        )
-        s[2, j] += (
-            rows[n, o + 4] * q + rows[n, o + 5] * w + rows[n, o + 8] * v - rows[n, o + 11] * f
-        )
-    x[0] = e00 * q + e01 * w + rows[n, 6] * v - g0 * f
-    x[1] = e10 * q + e11 * w + rows[n, 7] * v - g1 * f
-    x[2] += h0 * q + h1 * w + rows[n, 8] * v - g2 * f
-
-
-@compiled
-def _stay(h: float, par: Array, x: Array, s: Array, n_slope: int, slope: Array, v: float) -> None:
-    """Advance the stuck motor: the current relaxes towards v / R, nothing turns."""
-    if par[0] == 0.0:
-        return
-    e = math.exp(-h / par[0])
-    d = (x[0] - v) * e * h / par[0]
-    x[0] = v + (x[0] - v) * e
-    for j in range(s.shape[1]):
-        s[0, j] *= e
-    for j in range(n_slope):
-        s[0, j] += d * slope[0, j]
+EVENTS = 32  # most in one interval
 
 
 @compiled
@@ -167,38 +88,86 @@ def _zero_crossing(  # noqa: C901 - one search, branches for how it starts
 
 
 @inlined
-def _keeps_turning(
-    rows: Array, n: int, par: Array, x: Array, sign: float, v: float, f: float
-) -> bool:
-    """Tell from the propagator at hand that the speed does not reach zero on the way."""
+def keeps_turning(m: Array, par: Array, x: Array, sign: float, v: float, f: float) -> bool:
+    """Tell from the propagator at hand that the speed does not reach zero on the way.
+
+    Parameters
+    ----------
+    m : ndarray, shape (SIZE,)
+        Lanes of `lanes`.
+    par : ndarray, shape (11,)
+        Internal parameters.
+    x : ndarray, shape (3,)
+        State at the beginning.
+    sign : float
+        Direction of motion.
+    v, f : float
+        Voltage, friction and load [V].
+
+    Returns
+    -------
+    bool
+        False where a closer look is needed.
+    """
     q, w = x[0], x[1]
-    end = rows[n, 2] * q + rows[n, 3] * w + rows[n, 7] * v - rows[n, 10] * f
+    end = m[WHOLE + 2] * q + m[WHOLE + 3] * w + m[WHOLE + 7] * v - m[WHOLE + 10] * f
     if sign * end < 0.0 or sign * w <= 0.0:
         return False
     if par[0] == 0.0:
         return True
-    drive = rows[n, 0] * q + rows[n, 1] * w + rows[n, 6] * v - rows[n, 9] * f
-    return not (sign * (q - par[3] * w - f) < 0.0 and sign * (drive - par[3] * end - f) > 0.0)
+    drive = m[WHOLE] * q + m[WHOLE + 1] * w + m[WHOLE + 6] * v - m[WHOLE + 9] * f
+    return not (sign * (q - par[BE] * w - f) < 0.0 and sign * (drive - par[BE] * end - f) > 0.0)
 
 
-@inlined
-def advance(  # noqa: C901 - the events of one interval, in order
+@compiled
+def _breakaway(h: float, v: float, load: float, par: Array, x: Array) -> tuple[float, float]:
+    """Return when within h the stuck motor breaks loose (h: it does not), and which way."""
+    drive = x[0] - load if par[0] > 0.0 else v - load
+    end = v - load
+    if end > par[VC_PLUS]:
+        limit, direction = par[VC_PLUS], 1.0
+    elif end < -par[VC_MINUS]:
+        limit, direction = -par[VC_MINUS], -1.0
+    else:
+        return h, STUCK
+    wait = 0.0
+    if par[0] > 0.0 and (limit - drive) * (end - drive) > 0.0:
+        ratio = (limit - end) / (drive - end)
+        wait = -par[0] * math.log(ratio) if ratio > 0.0 else h
+    return (wait, direction) if wait < h else (h, STUCK)
+
+
+@compiled
+def _stop(load: float, f: float, v: float, par: Array, x: Array, m: Array) -> float:
+    """Put the speed to zero, let the columns jump, and return the direction from there."""
+    x[1] = 0.0
+    net = (x[0] if par[0] > 0.0 else v) - load
+    before = net - (f - load)
+    direction, after = STUCK, 0.0
+    if net > par[VC_PLUS]:
+        direction, after = 1.0, net - par[VC_PLUS]
+    elif net < -par[VC_MINUS]:
+        direction, after = -1.0, net + par[VC_MINUS]
+    ratio = after / before if before != 0.0 else 0.0
+    for j in range(LANES):
+        m[SW + j] *= ratio
+    return direction
+
+
+@compiled
+def advance(
     h: float,
     v: float,
     direction: float,
     load: float,
-    friction: bool,
     par: Array,
     x: Array,
-    s: Array,
-    n_slope: int,
-    slope: Array,
-    df: Array,
+    m: Array,
     cache: Array,
-    cached: Array,
-    derivatives: Array,
+    marks: Array,
+    scratch: Array,
 ) -> float:
-    """Advance by h at constant v, through all events; return the direction of motion.
+    """Advance by h at constant v under friction, through all events; return the direction.
 
     Parameters
     ----------
@@ -208,20 +177,12 @@ def advance(  # noqa: C901 - the events of one interval, in order
         1, -1 or STUCK.
     load : float
         Constant load [V].
-    friction : bool
-        Whether there is Coulomb friction.
     par : ndarray, shape (11,)
         Internal parameters.
-    x, s : ndarray, shapes (3,) and (3, p)
-        State and sensitivities; updated.
-    n_slope, slope
-        As in `fill`.
-    df : ndarray, shape (2, p)
-        Derivative of friction and load in volts, turning forward and backward.
-    cache, cached : ndarray, shapes (5, WIDTH) and (5,)
-        Propagators of the last interval lengths, and these lengths.
-    derivatives : ndarray, shape (WIDTH,)
-        Scratch.
+    x : ndarray, shape (3,)
+        State; updated.
+    m, cache, marks, scratch : ndarray
+        Of `lanes`; updated.
 
     Returns
     -------
@@ -229,75 +190,25 @@ def advance(  # noqa: C901 - the events of one interval, in order
         Direction afterwards.
     """
     left = h
-    whole = True
-    for _ in range(32):
-        if friction and direction == STUCK:
-            drive = x[0] - load if par[0] > 0.0 else v - load
-            end = v - load
-            limit = 0.0
-            if end > par[VC_PLUS]:
-                limit = par[VC_PLUS]
-            elif end < -par[VC_MINUS]:
-                limit = -par[VC_MINUS]
-            else:
-                _stay(left, par, x, s, n_slope, slope, v)
-                return direction
-            wait = 0.0
-            if par[0] > 0.0 and (limit - drive) * (end - drive) > 0.0:
-                ratio = (limit - end) / (drive - end)
-                wait = -par[0] * math.log(ratio) if ratio > 0.0 else left
-            if wait >= left:
-                _stay(left, par, x, s, n_slope, slope, v)
-                return direction
-            if wait > 0.0:
-                _stay(wait, par, x, s, n_slope, slope, v)
-                left -= wait
-                whole = False
-            direction = 1.0 if end > 0.0 else -1.0
-        f = load
-        which = 0
-        slot = 4
-        if whole:
-            for n in range(4):
-                if abs(cached[n] - h) < 1e-9 * h:
-                    slot = n
-                    break
-            if slot == 4:
-                slot = int(cached[4])
-                cached[4] = (slot + 1) % 4
-                cached[slot] = h
-                fill(cache[slot], h, par, n_slope, slope, derivatives)
-        if friction:
-            f += par[VC_PLUS] if direction > 0.0 else -par[VC_MINUS]
-            which = 0 if direction > 0.0 else 1
-            t = -1.0
-            if not (whole and _keeps_turning(cache, slot, par, x, direction, v, f)):
-                t = _zero_crossing(left, par, x, direction, v, f)
-            if t >= 0.0:
-                fill(cache[4], t, par, n_slope, slope, derivatives)
-                _slide(cache, 4, x, s, n_slope, v, f, df, which)
-                x[1] = 0.0
-                net = (x[0] if par[0] > 0.0 else v) - load
-                before = net - (f - load)
-                new = 0.0
-                after = 0.0
-                if net > par[VC_PLUS]:
-                    new = 1.0
-                    after = net - par[VC_PLUS]
-                elif net < -par[VC_MINUS]:
-                    new = -1.0
-                    after = net + par[VC_MINUS]
-                ratio = after / before if before != 0.0 else 0.0
-                for j in range(s.shape[1]):
-                    s[1, j] *= ratio
-                direction = new
-                left -= t
-                whole = False
-                if left <= 1e-14 * h:
-                    return direction
-                continue
-        if not whole:
-            fill(cache[4], left, par, n_slope, slope, derivatives)
-        _slide(cache, slot, x, s, n_slope, v, f, df, which)
-        return direction
+    for _ in range(EVENTS):
+        if direction == STUCK:
+            wait, direction = _breakaway(left, v, load, par, x)
+            stay(wait, par, x, m, v)
+            left -= wait
+            if direction == STUCK:
+                break
+        turn(m, direction)
+        f = load + (par[VC_PLUS] if direction > 0.0 else -par[VC_MINUS])
+        t = _zero_crossing(left, par, x, direction, v, f)
+        span = t if t >= 0.0 else left
+        fill(span, par, m, cache, SLOTS, scratch)
+        activate(m, cache, marks, SLOTS)
+        slide_columns(m, x[0], x[1], v, f)
+        slide_state(m, x, v, f)
+        if t < 0.0:
+            break
+        direction = _stop(load, f, v, par, x, m)
+        left -= t
+        if left <= 1e-14 * h:
+            break
     return direction

@@ -166,11 +166,10 @@ def gather(
                 scores, owner,
             )  # fmt: skip
     else:
-        n_slope = sum(i <= models.TE for i in structure.free()) if differentiate else 0
         used = recursion.run(
             data.time, data.starts, data.section_end, data.section_value, data.section_start,
             data.output, data.current, data.kind, structure.friction != "none", par, slope,
-            n_slope, initial, own, gain, whitening(noise), huber, normal, gradient, cost, spread,
+            initial, own, gain, whitening(noise), huber, normal, gradient, cost, spread,
             length, scores, owner, _ring(data, par, p),
             np.zeros((0, 3)) if predicted is None else predicted,
         )  # fmt: skip

@@ -8,14 +8,15 @@ Derivation: docs/derivations.md, sections 4 to 7.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident._compile import compiled
-from smp_motor_ident.events import advance, fill
+from smp_motor_ident._compile import compiled, inlined
+from smp_motor_ident.events import advance, keeps_turning
 from smp_motor_ident.internal import (
     ANGLE,
-    BE,
     CURRENT_OFFSET,
     DELAY,
     LOAD,
@@ -27,13 +28,164 @@ from smp_motor_ident.internal import (
     WINDOW,
     R,
 )
-from smp_motor_ident.propagator import ROW, WIDTH
+from smp_motor_ident.lanes import (
+    ACTIVE,
+    D0,
+    D1,
+    LANES,
+    SLOPE,
+    SQ,
+    ST,
+    SW,
+    begin,
+    prepare_slide,
+    slide_columns,
+    slide_state,
+    turn,
+)
 from smp_motor_ident.window import recall, remember
 
 __all__ = ["ANGLE", "MEAN_SPEED", "SPEED", "WINDOW", "run"]
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
+
+TILE = 64  # whitened rows that are gathered before they are summed
+ROOM = LANES + 1  # of each: columns and residual
+ON_OFFSET, ON_R = SLOPE + CURRENT_OFFSET * LANES, SLOPE + R * LANES
+ON_DELAY, ON_WINDOW = SLOPE + DELAY * LANES, SLOPE + WINDOW * LANES
+
+
+@compiled
+def _sum_up(
+    rows: Array, count: int, p: int, tile: Array, normal: Array, gradient: Array, scores: Array
+) -> None:
+    """Add the products of the gathered rows, each of the columns and then the residual."""
+    for n in range(count):  # turned, so that the sums below run along memory
+        for j in range(p):
+            tile[j, n] = rows[n * ROOM + j]
+        tile[p, n] = rows[n * ROOM + LANES]
+    tile[: p + 1, count:] = 0.0
+    residual = tile[p]
+    for j in range(p):
+        one = tile[j]
+        for i in range(j + 1):
+            other = tile[i]
+            total = 0.0
+            for n in range(TILE):
+                total += one[n] * other[n]
+            normal[j, i] += total
+        total = 0.0
+        for n in range(TILE):
+            total += one[n] * residual[n]
+        gradient[j] += total
+        scores[j] += total
+
+
+@inlined
+def _move(
+    h: float,
+    slack: float,
+    v: float,
+    direction: float,
+    load: float,
+    friction: bool,
+    par: Array,
+    x: Array,
+    m: Array,
+    cache: Array,
+    marks: Array,
+    scratch: Array,
+    columns: bool,
+) -> float:
+    """Advance by h at constant v; return the direction of motion."""
+    if direction == STUCK:
+        return advance(h, v, direction, load, par, x, m, cache, marks, scratch)
+    if abs(marks[ACTIVE] - h) > slack:
+        prepare_slide(h, slack, par, m, cache, marks, scratch)
+    f = load
+    if friction:
+        f += par[VC_PLUS] if direction > 0.0 else -par[VC_MINUS]
+        if not keeps_turning(m, par, x, direction, v, f):
+            return advance(h, v, direction, load, par, x, m, cache, marks, scratch)
+    if columns:
+        slide_columns(m, x[0], x[1], v, f)
+    slide_state(m, x, v, f)
+    return direction
+
+
+@compiled
+def _switch(
+    v: float, new: float, load: float, direction: float, friction: bool, par: Array, m: Array
+) -> None:
+    """Let the columns feel that a later switch of the input comes later."""
+    dv = v - new
+    if par[0] > 0.0:
+        for j in range(LANES):
+            m[SQ + j] += dv / par[0] * m[ON_DELAY + j]
+        return
+    if friction and direction == STUCK:  # it starts, if at all, just now
+        net = new - load
+        dv = -max(0.0, net - par[VC_PLUS]) - min(0.0, net + par[VC_MINUS])
+    for j in range(LANES):
+        m[SW + j] += dv / par[1] * m[ON_DELAY + j]
+
+
+@inlined
+def _observe(
+    kind: int, k: int, first: int, t: float, par: Array, x: Array, m: Array, ring: Array,
+    past: Array, columns: bool,
+) -> float:  # fmt: skip
+    """Return the mechanical output; put its derivative into D0."""
+    if kind == MEAN_SPEED:
+        remember(ring, k, t, x, m)
+        width = par[WINDOW]
+        p = past.shape[0] - 1
+        speed = recall(ring, k, first, t - width, p, past)
+        y = float((x[2] - past[0]) / width)
+        for j in range(p):
+            m[D0 + j] = (m[ST + j] - past[1 + j] + (speed - y) * m[ON_WINDOW + j]) / width
+        return y
+    if columns:
+        if kind == ANGLE:
+            for j in range(LANES):
+                m[D0 + j] = m[ST + j]
+        else:
+            for j in range(LANES):
+                m[D0 + j] = m[SW + j]
+    return float(x[2] if kind == ANGLE else x[1])
+
+
+@inlined
+def _observe_current(par: Array, x: Array, m: Array) -> float:
+    """Return the current; put its derivative into D1."""
+    amps = x[0] / par[R]
+    for j in range(LANES):
+        m[D1 + j] = m[SQ + j] / par[R] + m[ON_OFFSET + j] - amps * m[ON_R + j]
+    return float(amps + par[CURRENT_OFFSET])
+
+
+@inlined
+def _correct(
+    gain: Array, e0: float, e1: float, ok0: bool, ok1: bool, stuck: bool, x: Array, m: Array
+) -> None:
+    """Let the innovations move the state and its columns."""
+    for n in range(3):
+        if n == 1 and stuck:
+            continue
+        k0 = gain[n, 0] if ok0 else 0.0
+        k1 = gain[n, 1] if ok1 else 0.0
+        x[n] += k0 * e0 + k1 * e1
+        for j in range(LANES):
+            m[n * LANES + j] -= k0 * m[D0 + j] + k1 * m[D1 + j]
+
+
+@inlined
+def _robust(r: float, huber: float) -> tuple[float, float]:
+    """Return a residual's loss, and the root of the weight that it has left."""
+    if abs(r) > huber:
+        return huber * (2 * abs(r) - huber), math.sqrt(huber / abs(r))
+    return r * r, 1.0
 
 
 @compiled
@@ -49,7 +201,6 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
     friction: bool,
     par: Array,
     slope: Array,
-    n_slope: int,
     initial: Array,
     local: Integers,
     gain: Array,
@@ -86,8 +237,6 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
     par, slope : ndarray, shapes (11,) and (11, c)
         Internal parameters (see the constants of this module; te and tm not as logarithms)
         and their derivatives by the c common columns (those of te and tm logarithmic).
-    n_slope : int
-        Only the first of the common columns, this many, touch te, tm, K, be.
     initial : ndarray, shape (g, 4)
         q, w, th and load of each segment.
     local : ndarray of int, shape (l,)
@@ -116,67 +265,39 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
     """
     n_common = slope.shape[1]
     p = n_common + local.shape[0]
+    columns = p > 0
     has_current = current.shape[0] > 0
+    has_gain = bool(np.any(gain != 0.0))
     delay = par[DELAY]
-    x = np.zeros(3)
-    s = np.zeros((3, p))
-    df = np.zeros((2, p))
-    cache = np.zeros((5, WIDTH))
-    derivatives = np.zeros(WIDTH)
-    row_fast = np.zeros(WIDTH)  # of the interval that comes again and again
-    whole = np.zeros(ROW)
-    fast = last_h = -1.0
-    cached = np.full(5, -1.0)
-    cached[4] = 0.0
-    past = np.zeros(1 + p)
-    d0 = np.zeros(p)
-    d1 = np.zeros(p)
+    late = bool(np.any(slope[DELAY] != 0.0))
+    m, cache, marks, scratch = begin(slope, local, friction)
+    x, past, rows = np.zeros(3), np.zeros(1 + p), np.zeros(TILE * ROOM)
+    tile = np.zeros((ROOM, TILE))
     spread[:] = 0.0
     block = -1
-    has_gain = False
-    for n in range(3):
-        for m in range(2):
-            if gain[n, m] != 0.0:
-                has_gain = True
-    for j in range(n_common):
-        df[0, j] = slope[VC_PLUS, j] + slope[LOAD, j]
-        df[1, j] = -slope[VC_MINUS, j] + slope[LOAD, j]
-    if not friction:
-        for j in range(n_common):
-            df[0, j] = slope[LOAD, j]
-    for j in range(local.shape[0]):
-        if local[j] == 3:
-            df[0, n_common + j] = 1.0
-            df[1, n_common + j] = 1.0
     for g in range(starts.shape[0] - 1):
         first, last = starts[g], starts[g + 1]
-        normal[g] = 0.0
-        gradient[g] = 0.0
-        cost[g] = 0.0
-        s[:] = 0.0
-        for n in range(3):
-            x[n] = initial[g, n]
+        normal[g], gradient[g], cost[g] = 0.0, 0.0, 0.0
+        m[: 3 * LANES] = 0.0
+        x[:] = initial[g, :3]
         # A speed of exactly zero under friction is a motor at rest, not a free number: the
         # cost has a kink there.
-        at_rest = friction and initial[g, 1] == 0.0
+        at_rest = friction and x[1] == 0.0
         for j in range(local.shape[0]):
             if local[j] < 3 and not (at_rest and local[j] == 1):
-                s[local[j], n_common + j] = 1.0
+                m[local[j] * LANES + n_common + j] = 1.0
         load = par[LOAD] + initial[g, 3]
         section = section_start[g]
         limit = section_start[g + 1] - 1 if g + 2 < starts.shape[0] else section_end.shape[0] - 1
         now = time[first]
         direction = 1.0
         if friction:
-            direction = 0.0
-            if x[1] > 0.0:
-                direction = 1.0
-            elif x[1] < 0.0:
-                direction = -1.0
+            direction = STUCK if at_rest else (1.0 if x[1] > 0.0 else -1.0)
+        turn(m, direction)
         block += 1
         block_segment[block] = g
         blocks[block] = 0.0
-        filled = 0
+        filled = count = 0
         while section < limit and section_end[section] + delay <= now:
             section += 1
         for k in range(first, last):
@@ -184,191 +305,75 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
             while now < target:
                 end = target
                 change = section_end[section] + delay
-                switches = section < limit and change < target - 1e-9 * (target - now)
-                if switches:
+                if section < limit and change < target - 1e-9 * (target - now):
                     end = change
                 v = section_value[section]
                 h = end - now
                 if h > 0.0:
-                    if abs(h - fast) > 1e-9 * h and abs(h - last_h) <= 1e-9 * h:
-                        fast = h
-                        fill(row_fast, h, par, n_slope, slope, derivatives)
-                        for n in range(ROW):
-                            whole[n] = row_fast[n]
-                    last_h = h
-                    slides = abs(h - fast) <= 1e-9 * h
-                    f = load
-                    which = 0
-                    q, w = x[0], x[1]
-                    if slides and friction:
-                        if direction > 0.0:
-                            f += par[VC_PLUS]
-                        else:
-                            f -= par[VC_MINUS]
-                            which = 1
-                    new_q = whole[0] * q + whole[1] * w + whole[6] * v - whole[9] * f
-                    new_w = whole[2] * q + whole[3] * w + whole[7] * v - whole[10] * f
-                    if slides and friction:  # does it keep turning all the way?
-                        slides = direction * w > 0.0 and direction * new_w >= 0.0
-                        if slides and par[0] > 0.0:
-                            begins = direction * (q - par[BE] * w - f)
-                            ends = direction * (new_q - par[BE] * new_w - f)
-                            slides = not (begins < 0.0 and ends > 0.0)
-                    if slides:
-                        e00, e01, e10, e11 = whole[0], whole[1], whole[2], whole[3]
-                        h0, h1, g0, g1, g2 = whole[4], whole[5], whole[9], whole[10], whole[11]
-                        for j in range(p):
-                            a, b, c = s[0, j], s[1, j], df[which, j]
-                            s[0, j] = e00 * a + e01 * b - g0 * c
-                            s[1, j] = e10 * a + e11 * b - g1 * c
-                            s[2, j] += h0 * a + h1 * b - g2 * c
-                        for j in range(n_slope):
-                            o = ROW * (j + 1)
-                            r = row_fast[o : o + ROW]
-                            s[0, j] += r[0] * q + r[1] * w + r[6] * v - r[9] * f
-                            s[1, j] += r[2] * q + r[3] * w + r[7] * v - r[10] * f
-                            s[2, j] += r[4] * q + r[5] * w + r[8] * v - r[11] * f
-                        x[2] += h0 * q + h1 * w + whole[8] * v - g2 * f
-                        x[0], x[1] = new_q, new_w
-                    else:
-                        direction = advance(
-                            h,
-                            v,
-                            direction,
-                            load,
-                            friction,
-                            par,
-                            x,
-                            s,
-                            n_slope,
-                            slope,
-                            df,
-                            cache,
-                            cached,
-                            derivatives,
-                        )
+                    slack = 1e-9 * h + 1e-15 * abs(target)
+                    direction = _move(
+                        h, slack, v, direction, load, friction, par, x, m, cache, marks, scratch,
+                        columns,
+                    )  # fmt: skip
                 now = end
                 if section < limit and change <= target + 1e-9 * (target - time[k - 1]):
                     section += 1
-                    dv = v - section_value[section]
-                    if par[0] > 0.0:
-                        dv /= par[0]
-                        for j in range(n_common):
-                            s[0, j] += dv * slope[DELAY, j]
-                    else:
-                        if friction and direction == STUCK:  # it starts, if at all, just now
-                            net = section_value[section] - load
-                            dv = -max(0.0, net - par[VC_PLUS]) - min(0.0, net + par[VC_MINUS])
-                        for j in range(n_common):
-                            s[1, j] += dv / par[1] * slope[DELAY, j]
-            # Outputs.
-            y0 = x[1]
-            row = 1
-            if kind == ANGLE:
-                y0 = x[2]
-                row = 2
-            if kind == MEAN_SPEED:
-                remember(ring, k, target, x, s)
-                width = par[WINDOW]
-                w_past = recall(ring, k, first, target - width, p, past)
-                y0 = (x[2] - past[0]) / width
-                for j in range(p):
-                    d0[j] = (s[2, j] - past[1 + j]) / width
-                for j in range(n_common):
-                    d0[j] += (w_past - y0) / width * slope[WINDOW, j]
-            else:
-                for j in range(p):
-                    d0[j] = s[row, j]
-            y1 = 0.0
-            if has_current:
-                y1 = x[0] / par[R] + par[CURRENT_OFFSET]
-                for j in range(p):
-                    d1[j] = s[0, j] / par[R]
-                for j in range(n_common):
-                    d1[j] += slope[CURRENT_OFFSET, j] - x[0] / par[R] * slope[R, j]
+                    if late:
+                        _switch(v, section_value[section], load, direction, friction, par, m)
+            y0 = _observe(kind, k, first, target, par, x, m, ring, past, columns)
+            y1 = _observe_current(par, x, m) if has_current else 0.0
             if predicted.shape[0] > 0:
-                predicted[k, 0] = x[1]
-                predicted[k, 1] = y0
-                predicted[k, 2] = y1
+                predicted[k, 0], predicted[k, 1], predicted[k, 2] = x[1], y0, y1
             # Residuals, whitened.
             e0 = output[k] - y0
-            ok0 = e0 == e0
-            e1 = 0.0
-            ok1 = False
-            if has_current:
-                e1 = current[k] - y1
-                ok1 = e1 == e1
-            r0 = r1 = 0.0
+            e1 = current[k] - y1 if has_current else 0.0
+            ok0, ok1 = e0 == e0, has_current and e1 == e1
             w00 = w10 = w11 = 0.0
             if ok0:
                 w00 = weight[0, 0]
                 spread[0] += e0 * e0
                 spread[3] += 1.0
+            else:
+                e0 = 0.0
             if ok1:
+                w11 = weight[1, 2]
                 spread[1] += e1 * e1
                 spread[4] += 1.0
-                w11 = weight[1, 2]
                 if ok0:
-                    w10 = weight[1, 0]
-                    w11 = weight[1, 1]
+                    w10, w11 = weight[1, 0], weight[1, 1]
                     spread[2] += e0 * e1
                     spread[5] += 1.0
-            if not ok0:
-                e0 = 0.0
-            if not ok1:
+            else:
                 e1 = 0.0
-            r0 = w00 * e0
-            r1 = w10 * e0 + w11 * e1
-            u0 = u1 = 1.0
-            if abs(r0) > huber:
-                u0 = huber / abs(r0)
-                cost[g] += huber * (2 * abs(r0) - huber)
-            else:
-                cost[g] += r0 * r0
-            if abs(r1) > huber:
-                u1 = huber / abs(r1)
-                cost[g] += huber * (2 * abs(r1) - huber)
-            else:
-                cost[g] += r1 * r1
+            loss0, u0 = _robust(w00 * e0, huber)
+            loss1, u1 = _robust(w10 * e0 + w11 * e1, huber)
+            cost[g] += loss0 + loss1
+            if filled >= block_length or count > TILE - 2:
+                _sum_up(rows, count, p, tile, normal[g], gradient[g], blocks[block])
+                count = 0
             if filled >= block_length:
                 block += 1
                 block_segment[block] = g
                 blocks[block] = 0.0
                 filled = 0
             filled += 1
-            if ok1:
-                for j in range(p):
-                    a0 = w00 * d0[j]
-                    a1 = w10 * d0[j] + w11 * d1[j]
-                    score = u0 * a0 * r0 + u1 * a1 * r1
-                    gradient[g, j] += score
-                    blocks[block, j] += score
-                    a0 *= u0
-                    a1 *= u1
-                    b0 = a0 * w00 + a1 * w10
-                    b1 = a1 * w11
-                    for i in range(j + 1):
-                        normal[g, j, i] += b0 * d0[i] + b1 * d1[i]
-            elif ok0:
-                for j in range(p):
-                    b0 = u0 * w00 * w00 * d0[j]
-                    score = b0 * e0
-                    gradient[g, j] += score
-                    blocks[block, j] += score
-                    for i in range(j + 1):
-                        normal[g, j, i] += b0 * d0[i]
-            # Innovations.
+            if ok0 and columns:
+                for j in range(LANES):
+                    rows[count * ROOM + j] = u0 * w00 * m[D0 + j]
+                rows[count * ROOM + LANES] = u0 * w00 * e0
+                count += 1
+            if ok1 and columns:
+                for j in range(LANES):
+                    rows[count * ROOM + j] = u1 * (w10 * m[D0 + j] + w11 * m[D1 + j])
+                rows[count * ROOM + LANES] = u1 * (w10 * e0 + w11 * e1)
+                count += 1
             if has_gain:
-                for n in range(3):
-                    if n == 1 and friction and direction == STUCK:
-                        continue
-                    k0 = gain[n, 0] if ok0 else 0.0
-                    k1 = gain[n, 1] if ok1 else 0.0
-                    x[n] += k0 * e0 + k1 * e1
-                    for j in range(p):
-                        s[n, j] -= k0 * d0[j] + k1 * d1[j]
-                if friction and direction != STUCK and x[1] * direction < 0.0:
+                stuck = direction == STUCK
+                _correct(gain, e0, e1, ok0, ok1, stuck, x, m)
+                if friction and not stuck and x[1] * direction < 0.0:
                     direction = -direction
+                    turn(m, direction)
+        _sum_up(rows, count, p, tile, normal[g], gradient[g], blocks[block])
         for j in range(p):
             for i in range(j):
                 normal[g, i, j] = normal[g, j, i]

@@ -9,12 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident._compile import compiled
+from smp_motor_ident.lanes import ST, SW
 
 Array = NDArray[np.float64]
 
 
 @compiled
-def remember(ring: Array, k: int, t: float, x: Array, s: Array) -> None:
+def remember(ring: Array, k: int, t: float, x: Array, m: Array) -> None:
     """Keep time, angle, speed and the sensitivities of both.
 
     Parameters
@@ -25,17 +26,17 @@ def remember(ring: Array, k: int, t: float, x: Array, s: Array) -> None:
         Sample.
     t : float
         Its time [s].
-    x, s : ndarray, shapes (3,) and (3, p)
-        State and sensitivities.
+    x, m : ndarray, shapes (3,) and (SIZE,)
+        State, and lanes of `lanes`.
     """
     row = ring[k % ring.shape[0]]
-    p = s.shape[1]
+    p = (ring.shape[1] - 3) // 2
     row[0] = t
     row[1] = x[2]
     row[2] = x[1]
     for j in range(p):
-        row[3 + j] = s[2, j]
-        row[3 + p + j] = s[1, j]
+        row[3 + j] = m[ST + j]
+        row[3 + p + j] = m[SW + j]
 
 
 @compiled
