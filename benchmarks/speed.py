@@ -1,195 +1,186 @@
-"""Cold estimation of one linear motor against what people write today, on the same data.
+"""Cold estimation of one motor against what people write today, on the same data in one run.
 
-Usage: python benchmarks/speed.py [--samples 60000] [--peers lsq,control,sippy,casadi] [--growth]
+Every program starts from the same guess, a motor of no particular size (`GUESS`); this
+project takes none.  Wall and processor time, one thread.
+
+Usage: python benchmarks/speed.py [--samples 60000] [--peers lsq,control,casadi,...] [--friction]
+       python benchmarks/speed.py --growth
 Peers are optional: pip install -r benchmarks/requirements-peers.txt
 """
 
 from __future__ import annotations
 
-import argparse
-import importlib.util
-import resource
-import time
-from collections.abc import Callable
+import os
 
-import numpy as np
-from known_motors import TABLE_1, recording, table
-from scipy.optimize import least_squares
-from scipy.signal import cont2discrete, lfilter
+for _library in ("OPENBLAS", "OMP", "MKL"):
+    os.environ.setdefault(f"{_library}_NUM_THREADS", "1")
 
-from smp_motor_ident.cold import cold_fit
-from smp_motor_ident.descent import Options
-from smp_motor_ident.estimate import estimate
-from smp_motor_ident.experiments import prepare
-from smp_motor_ident.models import Structure
+import argparse  # noqa: E402
+import importlib.util  # noqa: E402
+import tempfile  # noqa: E402
+import time  # noqa: E402
+from collections.abc import Callable  # noqa: E402
+from dataclasses import dataclass  # noqa: E402
+
+import numpy as np  # noqa: E402
+import peers  # noqa: E402
+from growth import growth  # noqa: E402
+from known_motors import TABLE_1, recording, table  # noqa: E402
+
+from smp_motor_ident.cold import cold_fit  # noqa: E402
+from smp_motor_ident.descent import Options  # noqa: E402
+from smp_motor_ident.estimate import estimate  # noqa: E402
+from smp_motor_ident.experiments import prepare  # noqa: E402
+from smp_motor_ident.models import Structure  # noqa: E402
+from smp_motor_ident.record import Record  # noqa: E402
+
+NOISE = 2.0  # rad/s
+STATIC = 0.3  # V, where there is friction
 
 
-def ours(record) -> np.ndarray:
-    """Return ln a0, ln a1, ln a2 from cold: the fit alone."""
-    fit = cold_fit(prepare([record], False), Structure("speed", friction="none"), Options())
-    return fit.z[:3]
+@dataclass(frozen=True)
+class Run:
+    """What one program took and found."""
+
+    title: str
+    wall: float
+    processor: float
+    built: float
+    error: float
+    cost: float
 
 
-def whole(record) -> np.ndarray:
+def ours(record: Record, friction: bool) -> np.ndarray:
+    """Return the coordinates from cold: the fit alone."""
+    kind = "symmetric" if friction else "none"
+    fit = cold_fit(prepare([record], False), Structure("speed", friction=kind), Options())
+    return fit.z[[0, 1, 2, 4]] if friction else fit.z[:3]
+
+
+def whole(record: Record, friction: bool, model: str = "second_order") -> np.ndarray:
     """Return the same from `estimate`: screening, choice, intervals, validation included."""
-    e = estimate(record, "second_order")
+    e = estimate(record, model)
     gain, tau, product = (e.value(n) for n in ("dc_gain", "time_constant", "time_constant_product"))
-    return np.log([1 / gain, tau / gain, product / gain])
+    z = np.log([1 / gain, tau / gain, product / gain])
+    return np.append(z, e.value("static_voltage")) if friction else z
 
 
-def any_model(record) -> np.ndarray:
-    """Return the same, the order of the model being chosen too."""
-    e = estimate(record)
-    gain, tau, product = (e.value(n) for n in ("dc_gain", "time_constant", "time_constant_product"))
-    return np.log([1 / gain, tau / gain, product / gain])
-
-
-def with_lfilter(record) -> np.ndarray:
-    """Return an expert's ten lines: exact discretisation, lfilter, finite differences."""
-    h, v, y = record.sample_time, record.voltage, record.velocity
-    v = np.concatenate([v[1:], v[-1:]])
-
-    def residual(x: np.ndarray) -> np.ndarray:
-        a0, a1, a2 = np.exp(x)
-        num, den, _ = cont2discrete(([1.0], [a2, a1, a0]), h)
-        return lfilter(num.ravel(), den, v) - y
-
-    return least_squares(residual, np.log([0.03, 1e-3, 1e-5]), x_scale="jac").x
-
-
-def with_control(record) -> np.ndarray:
-    """Return python-control's simulation under least_squares."""
-    import control
-
-    t, y = record.time, record.velocity
-    v = np.concatenate([record.voltage[1:], record.voltage[-1:]])
-
-    def residual(x: np.ndarray) -> np.ndarray:
-        a0, a1, a2 = np.exp(x)
-        system = control.c2d(control.ss(control.tf([1.0], [a2, a1, a0])), record.sample_time)
-        return control.forced_response(system, t, v).outputs - y
-
-    return least_squares(residual, np.log([0.03, 1e-3, 1e-5]), x_scale="jac").x
-
-
-def with_casadi(record) -> np.ndarray:
-    """Return CasADi's Gauss-Newton on a Runge-Kutta simulation."""
-    import casadi as ca
-
-    h, n = record.sample_time, len(record)
-    x, u, p = ca.SX.sym("x", 2), ca.SX.sym("u"), ca.SX.sym("p", 3)
-    a = ca.exp(p)
-    rate = ca.Function("f", [x, u, p], [ca.vertcat(x[1], (u - a[0] * x[0] - a[1] * x[1]) / a[2])])
-    k1 = rate(x, u, p)
-    k2 = rate(x + h / 2 * k1, u, p)
-    k3 = rate(x + h / 2 * k2, u, p)
-    k4 = rate(x + h * k3, u, p)
-    step = ca.Function("F", [x, u, p], [x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)])
-    q = ca.MX.sym("q", 3)
-    path = step.mapaccum(n - 1)(ca.DM.zeros(2), ca.DM(record.voltage[1:]).T, q)
-    error = path[0, :].T - ca.DM(record.velocity[1:])
-    both = ca.Function("r", [q], [error, ca.jacobian(error, q)])
-    z = np.log([0.04, 1.5e-3, 2.5e-5])
-    for _ in range(8):
-        e, jac = (np.array(m) for m in both(z))
-        z = z - np.linalg.lstsq(jac, e, rcond=None)[0].ravel()
-    return z
-
-
-def with_sippy(record) -> np.ndarray:
-    """Return SIPPY's output-error model (its discrete coefficients; no a0..a2)."""
-    from sippy_unipi import system_identification
-
-    system_identification(
-        record.velocity, record.voltage, "OE", OE_orders=[2, 2, 1], tsample=record.sample_time
-    )
-    return np.full(3, np.nan)
-
-
-PEERS: dict[str, tuple[str, Callable]] = {
-    "lsq": ("scipy", with_lfilter),
-    "control": ("control", with_control),
-    "casadi": ("casadi", with_casadi),
-    "sippy": ("sippy_unipi", with_sippy),
-}
-
-
-def best_of(call: Callable, record, repeats: int) -> tuple[float, np.ndarray]:
-    """Return the shortest processor time (of all threads) and the answer."""
-    spent = []
+def measured(call: Callable[[], np.ndarray], repeats: int) -> tuple[float, float, np.ndarray]:
+    """Return the shortest wall and processor times (of all threads), and the answer."""
+    wall, processor = [], []
     for _ in range(repeats):
-        begun = time.process_time()
-        answer = call(record)
-        spent.append(time.process_time() - begun)
-    return min(spent), answer
+        built = tuple(peers.set_up)
+        begun, spent = time.perf_counter(), time.process_time()
+        answer = call()
+        wall.append(time.perf_counter() - begun - (peers.set_up[0] - built[0]))
+        processor.append(time.process_time() - spent - (peers.set_up[1] - built[1]))
+    return min(wall), min(processor), answer
 
 
-def growth() -> None:
-    """Print time and memory against the number of samples."""
+def noisy(samples: int, friction: bool) -> tuple[Record, np.ndarray]:
+    """Return voltage and noisy speed of Table 1's fourth motor at 1 kHz, and the truth."""
+    made, z = recording(
+        TABLE_1["rear_right"],
+        current=False,
+        seconds=samples / 1000,
+        rate=1000.0,
+        counts=False,
+        static_voltage=STATIC if friction else 0.0,
+    )
+    speed = made.velocity + NOISE * np.random.default_rng(0).standard_normal(len(made))
+    truth = z[[0, 1, 2, 4]] if friction else z[:3]
+    return Record("motor", made.time, made.voltage, velocity=speed), truth
+
+
+def compare(samples: int, wanted: list[str], friction: bool, repeats: int) -> None:
+    """Run everybody and print the table."""
+    record, truth = noisy(samples, friction)
+    begun = time.perf_counter()
+    ours(record, friction)
+    first = time.perf_counter() - begun
+    runs: list[Run] = []
+
+    def add(title: str, call: Callable[[], np.ndarray], times: int) -> None:
+        before = peers.set_up[0]
+        wall, processor, x = measured(call, times)
+        built = peers.set_up[0] - before
+        error = float(np.abs(x[:3] - truth[:3]).max()) if np.all(np.isfinite(x)) else np.nan
+        runs.append(Run(title, wall, processor, built, error, peers.cost(record, x)))
+        r = runs[-1]
+        print(f"{title}: {r.wall:.4f} s, {r.processor:.4f} s of processor", flush=True)
+
+    add("this project: the fit", lambda: ours(record, friction), repeats)
+    whole(record, friction)
+    add("this project: estimate(), second_order", lambda: whole(record, friction), 3)
+    whole(record, friction, "auto")
+    add("this project: estimate(), auto", lambda: whole(record, friction, "auto"), 3)
+    for name in wanted:
+        peer = peers.PEERS[name]
+        if peer.friction != friction:
+            continue
+        if importlib.util.find_spec(peer.module) is None:
+            print(f"{peer.title}: {peer.module} is not installed, left out")
+            continue
+        add(peer.title, lambda peer=peer: peer.fit(record), 3 if peer.quick else 1)
+    report(runs, samples, first, friction)
+
+
+def report(runs: list[Run], samples: int, first: float, friction: bool) -> None:
+    """Print the table and the goals."""
+    base, best = runs[0], min(r.cost for r in runs if np.isfinite(r.cost))
     rows = []
-    for n in (10_000, 100_000, 1_000_000, 10_000_000):
-        record, z = recording(
-            TABLE_1["rear_right"], current=False, seconds=n / 1000, rate=1000.0, substeps=4
-        )
-        size = sum(a.nbytes for a in (record.time, record.voltage, record.count)) / 2**20
-        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        spent, x = best_of(ours, record, 1)
-        after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    for r in runs:
+        excess = r.cost / best - 1  # in variances of the noise: times the samples
+        reached = "yes" if excess * samples < 1 else f"no ({100 * excess:.2g} % above)"
+        reached = "no" if not np.isfinite(r.cost) else reached
         rows.append(
             (
-                n,
-                f"{spent:.2f} s",
-                f"{1e9 * spent / n:.0f} ns",
-                f"{size:.0f} MiB",
-                f"{max(0.0, after - before):.0f} MiB",
-                f"{np.abs(x - z[:3]).max():.1e}",
+                r.title,
+                f"{r.wall:.4f}",
+                f"{r.processor:.4f}",
+                f"{r.built:.1f}" if r.built else "",
+                f"{r.wall / base.wall:.0f}",
+                f"{r.processor / base.processor:.0f}",
+                "-" if np.isnan(r.error) else f"{r.error:.1e}",
+                reached,
             )
         )
-        print(rows[-1], flush=True)
-    head = ("samples", "cold fit", "per sample", "record", "more at its peak", "error of ln a")
-    print("\n" + table(head, rows))
+    head = ("program", "wall s", "processor s", "building s", "times ours (wall)", "(processor)",
+            "error of ln a", "least squares reached")  # fmt: skip
+    print("\n" + table(head, rows) + "\n")
+    goals = {p.title: p.goal for p in peers.PEERS.values() if p.goal and p.friction == friction}
+    for r in runs:
+        if r.title in goals:
+            ratio, goal = r.wall / base.wall, goals[r.title]
+            verdict = "reached" if ratio >= goal else "NOT reached"
+            print(f"{r.title}: {ratio:.0f} times, goal {goal}: {verdict}")
+    what = f"with {STATIC} V of Coulomb friction" if friction else "linear"
+    print(
+        f"\n{samples} samples, {what}; peers start from a0, a1, a2 = {peers.GUESS}; first call of "
+        f"this project {first:.2f} s with compilation or its cache"
+    )
 
 
 def main() -> None:
-    """Run the comparison and print the table."""
+    """Run the comparison, or the growth."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--samples", type=int, default=60_000)
-    parser.add_argument("--peers", default="lsq,control,casadi,sippy")
-    parser.add_argument("--growth", action="store_true")
+    parser.add_argument("--peers", default=",".join(peers.PEERS))
+    parser.add_argument("--friction", action="store_true", help="only the motor with friction")
+    parser.add_argument("--linear", action="store_true", help="only the linear motor")
+    parser.add_argument("--repeats", type=int, default=9, help="of this project's fit")
+    parser.add_argument("--growth", action="store_true", help="time and memory to 10 million")
+    parser.add_argument("--most", type=int, default=10_000_000, help="samples of the growth")
     args = parser.parse_args()
     if args.growth:
-        growth()
+        growth(args.most)
         return
-    seconds = args.samples / 1000
-    record, z = recording(
-        TABLE_1["rear_right"], current=False, seconds=seconds, rate=1000.0, counts=False
-    )
-    rng = np.random.default_rng(0)
-    noisy = record.velocity + 2.0 * rng.standard_normal(len(record))
-    record = type(record)("motor", record.time, record.voltage, velocity=noisy)
-    begun = time.perf_counter()
-    ours(record)
-    first = time.perf_counter() - begun
-    base, x = best_of(ours, record, 5)
-    rows = [("this project, the fit", f"{base:.4f}", "1", f"{np.abs(x - z[:3]).max():.1e}")]
-    title = {"lsq": "lfilter + least_squares", "control": "python-control + least_squares",
-             "casadi": "CasADi Gauss-Newton", "sippy": "SIPPY OE"}  # fmt: skip
-    for what, call in (("estimate(), second_order", whole), ("estimate(), auto", any_model)):
-        call(record)
-        spent, x = best_of(call, record, 3)
-        rows.append((f"this project, {what}", f"{spent:.3f}", f"{spent / base:.0f}",
-                     f"{np.abs(x - z[:3]).max():.1e}"))  # fmt: skip
-    for name in args.peers.split(","):
-        module, call = PEERS[name]
-        if importlib.util.find_spec(module) is None:
-            print(f"{name}: not installed, left out")
-            continue
-        spent, x = best_of(call, record, 1)
-        rows.append((title[name], f"{spent:.3f}",
-                     f"{spent / base:.0f}", f"{np.abs(x - z[:3]).max():.1e}"))  # fmt: skip
-        print(rows[-1], flush=True)
-    print("\n" + table(("program", "processor seconds", "times ours", "error of ln a"), rows))
-    print(f"\n{args.samples} samples; first call {first:.1f} s with compilation or its cache")
+    for friction in (False, True):
+        if (friction and not args.linear) or (not friction and not args.friction):
+            with tempfile.TemporaryDirectory() as folder:
+                os.chdir(folder)  # CasADi leaves the code that it compiles where it is
+                compare(args.samples, args.peers.split(","), friction, args.repeats)
+                os.chdir("/")
 
 
 if __name__ == "__main__":

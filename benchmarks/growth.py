@@ -1,0 +1,129 @@
+"""Time and memory of a cold fit against the number of samples, each in a process of its own."""
+
+from __future__ import annotations
+
+import gc
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from known_motors import TABLE_1, recording, table
+
+from smp_motor_ident.cold import cold_fit
+from smp_motor_ident.descent import Options
+from smp_motor_ident.experiments import prepare
+from smp_motor_ident.models import Structure
+from smp_motor_ident.record import Hardware, Record
+
+CASES = (
+    # what is measured, Coulomb friction [V]
+    ("speed", 0.0),
+    ("speed", 0.3),
+    ("counts", 0.0),
+    ("counts", 0.3),
+)
+
+
+def _peak() -> float:
+    """Return the most memory that this process has had resident [MiB] since the mark."""
+    text = Path("/proc/self/status").read_text()
+    return int(text.split("VmHWM:")[1].split()[0]) / 1024
+
+
+def _resident() -> float:
+    text = Path("/proc/self/status").read_text()
+    return int(text.split("VmRSS:")[1].split()[0]) / 1024
+
+
+def _mark() -> None:
+    Path("/proc/self/clear_refs").write_text("5")
+
+
+def _load(folder: Path, counts: bool) -> Record:
+    arrays = {p.stem: np.load(p) for p in folder.glob("*.npy")}
+    hardware = Hardware(1.0, 500.0 if counts else None, 0, 12.0, None)
+    return Record("motor", arrays["time"], arrays["voltage"], None, arrays.get("velocity"),
+                  None, arrays.get("count"), hardware=hardware)  # fmt: skip
+
+
+def child(folder: str, counts: bool, friction: bool) -> None:
+    """Fit what lies in a folder and print time and memory as JSON."""
+    record = _load(Path(folder), counts)
+    structure = Structure("speed", friction="symmetric" if friction else "none")
+    short = record.slice(0, min(len(record), 8_000))
+    cold_fit(prepare([short], False), structure, Options())  # compiled code into memory
+    del short
+    gc.collect()
+    before = _resident()
+    _mark()
+    begun, spent = time.perf_counter(), time.process_time()
+    fit = cold_fit(prepare([record], False), structure, Options())
+    wall, processor = time.perf_counter() - begun, time.process_time() - spent
+    print(json.dumps({"wall": wall, "processor": processor, "more": _peak() - before,
+                      "z": list(fit.z), "passes": fit.passes}))  # fmt: skip
+
+
+def growth(most: int) -> None:
+    """Print time and memory against the number of samples.
+
+    Parameters
+    ----------
+    most : int
+        Samples of the longest record.
+    """
+    sizes = [n for n in (10_000, 100_000, 1_000_000, 10_000_000) if n <= most]
+    rows, exponents = [], []
+    for kind, friction in CASES:
+        times = []
+        for n in sizes:
+            row, processor = _one(kind, friction, n)
+            rows.append(row)
+            times.append(processor)
+            print(row, flush=True)
+        if len(sizes) > 2:
+            slope = np.polyfit(np.log(sizes[1:]), np.log(times[1:]), 1)[0]
+            exponents.append(f"{kind}, {friction} V: {slope:.2f}")
+    head = ("output", "friction", "samples", "wall s", "processor s", "per sample", "record",
+            "more at its peak", "times the record", "error of ln a")  # fmt: skip
+    print("\n" + table(head, rows))
+    print(f"\nexponent of the growth from 100,000 samples on: {'; '.join(exponents)}")
+
+
+def _one(kind: str, friction: float, n: int) -> tuple[tuple[object, ...], float]:
+    counts = kind == "counts"
+    made, z = recording(TABLE_1["rear_right"], current=False, seconds=n / 1000, rate=1000.0,
+                        substeps=4, counts=counts, static_voltage=friction)  # fmt: skip
+    with tempfile.TemporaryDirectory() as folder:
+        arrays = {"time": made.time, "voltage": made.voltage}
+        if counts:
+            arrays["count"] = made.count
+        else:
+            noise = 2.0 * np.random.default_rng(0).standard_normal(n)
+            arrays["velocity"] = made.velocity + noise
+        for name, values in arrays.items():
+            np.save(Path(folder) / f"{name}.npy", values)
+        size = sum(a.nbytes for a in arrays.values()) / 2**20
+        del made, arrays
+        command = [sys.executable, __file__, folder, str(int(counts)), str(int(friction > 0))]
+        told = json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
+    row = (
+        kind,
+        f"{friction} V",
+        n,
+        f"{told['wall']:.3f}",
+        f"{told['processor']:.3f}",
+        f"{1e9 * told['processor'] / n:.0f} ns",
+        f"{size:.1f} MiB",
+        f"{told['more']:.1f} MiB",
+        f"{told['more'] / size:.1f}",
+        f"{np.abs(np.array(told['z'])[:3] - z[:3]).max():.1e}",
+    )
+    return row, told["processor"]
+
+
+if __name__ == "__main__":
+    child(sys.argv[1], sys.argv[2] == "1", sys.argv[3] == "1")
