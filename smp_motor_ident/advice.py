@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from smp_motor_ident import models
+from smp_motor_ident import models, replay
 from smp_motor_ident import recursion as rc
 from smp_motor_ident.answer import Answer
 from smp_motor_ident.experiments import Experiments
@@ -43,7 +43,7 @@ def doubts(
     """
     out = []
     s = fit.structure
-    if not fit.converged:
+    if not fit.converged and _unsettled(data, fit):
         out.append("doubtful: the fit did not settle; record a longer or stronger excitation")
     if estimation < 70:
         out.append(f"doubtful: the model explains only {estimation:.0f} % of the speed")
@@ -71,6 +71,17 @@ def doubts(
             "command that switches between samples); the estimate allows for it"
         )
     return out
+
+
+def _unsettled(data: Experiments, fit: Fit) -> bool:
+    """Tell whether a further step would still move what is reported by half its uncertainty.
+
+    A descent may end at a kink, or along L/R beside the response, which nothing reports.
+    """
+    _, step, _ = replay.promise(data, fit, fit.structure)
+    free = np.array(fit.structure.free())
+    told = (free != models.TE) | fit.structure.current
+    return bool(np.any(np.abs(step) > 0.5 * np.sqrt(np.diag(fit.covariance())), where=told))
 
 
 def advise(fit: Fit, result: Answer, known: Mapping[str, float]) -> list[str]:

@@ -10,6 +10,7 @@ from smp_motor_ident import models
 from smp_motor_ident.fit import Fit
 from smp_motor_ident.models import Structure
 
+SCEPSIS = 4.0  # deviance of prior odds of e^2 to 1 against any addition: many are tried
 SURELY = 3.0  # times the price: a gain that rejects the simpler model whatever is left loose
 
 
@@ -122,7 +123,7 @@ def needed(simple: Fit, rich: Fit) -> tuple[bool, str]:
     """
     more = size(rich.structure) - size(simple.structure)
     gained = (simple.deviance - rich.deviance) / inflation(rich, simple)
-    price = more * float(np.log(simple.samples))
+    price = more * (float(np.log(simple.samples)) + SCEPSIS)
     if not rich.converged and gained < 10 * price:
         return False, "did not converge"
     if gained <= price:

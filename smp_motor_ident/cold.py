@@ -58,6 +58,7 @@ def cold_fit(
     extra: Sequence[Array] = (),
     keep: int = 3,
     own: bool = True,
+    near: Fit | None = None,
 ) -> Fit | None:
     """Fit a structure without any guess.
 
@@ -75,6 +76,8 @@ def cold_fit(
         How many of the ranked candidates are refined.
     own : bool
         Whether the regressions' candidates join ``extra``.
+    near : Fit, optional
+        Of another structure on the same data: its torque noise is a good first guess.
 
     Returns
     -------
@@ -109,7 +112,7 @@ def cold_fit(
         if len(tried) == keep:
             break
     assert best is not None
-    return grow(data, structure, best, options)
+    return grow(data, structure, best, options, near)
 
 
 def _distinct(ranked: Sequence[Array], step: float, keep: int) -> list[Array]:

@@ -23,6 +23,7 @@ from smp_motor_ident.quantisation import blurred, widened
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import Candidate, Estimate, FitPercent
 from smp_motor_ident.screening import screen
+from smp_motor_ident.thinning import thinned
 
 Array = NDArray[np.float64]
 
@@ -222,6 +223,8 @@ def _hold(
     if base.order != 2 or "window" in base.held or sum(len(r) for r in group) > MANY:
         return "held", None
     plain = prepare(group, base.current)
+    if thinned(plain) is not plain:
+        return "held", None  # how the command ran within so short an interval does not show
     others = {h: prepare(group, base.current, hold=h) for h in ("switched", "middle")}
     others = {h: d for h, d in others.items() if d.section_end.size > plain.section_end.size}
     if plain.kind != rc.ANGLE or not others:

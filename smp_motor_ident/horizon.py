@@ -27,7 +27,13 @@ MOST = 5.0  # farthest from the motor's own bandwidth
 PRICE = 12.0  # deviance that torque noise must explain before it is believed
 
 
-def grow(data: Experiments, structure: Structure, first: Fit, options: Options) -> Fit:
+def grow(
+    data: Experiments,
+    structure: Structure,
+    first: Fit,
+    options: Options,
+    near: Fit | None = None,
+) -> Fit:
     """Find the noise ratio on a growing horizon, then fit all data.
 
     Parameters
@@ -40,6 +46,8 @@ def grow(data: Experiments, structure: Structure, first: Fit, options: Options) 
         On the head of the data, with a high ratio.
     options : Options
         Loss and prior knowledge.
+    near : Fit, optional
+        Of another structure, whose ratio is a good first guess.
 
     Returns
     -------
@@ -47,7 +55,7 @@ def grow(data: Experiments, structure: Structure, first: Fit, options: Options) 
         On all data.
     """
     part = data.head(min(HEAD * data.step, 60.0))
-    best = _find_ratio(part, structure, first, options)
+    best = _find_ratio(part, structure, first, options, near)
     best = along_friction(part, structure, best, options)
     return extend(data, structure, best, options)
 
@@ -72,7 +80,7 @@ def extend(data: Experiments, structure: Structure, best: Fit, options: Options)
         On all data.
     """
     part = data.head(min(HEAD * data.step, 60.0))
-    if best.samples == data.size:
+    if best.samples == data.size and best.converged:
         return best
     horizon = part.size * 4 if structure.friction != "none" else data.size
     while horizon < data.size and best.ratio == 0:
@@ -86,7 +94,9 @@ def extend(data: Experiments, structure: Structure, best: Fit, options: Options)
     )
 
 
-def _find_ratio(part: Experiments, structure: Structure, first: Fit, options: Options) -> Fit:
+def _find_ratio(
+    part: Experiments, structure: Structure, first: Fit, options: Options, near: Fit | None
+) -> Fit:
     """Walk from following to free run; keep the likeliest ratio of torque noise."""
 
     def fitted(near: Fit, ratio: float, passes: int) -> Fit:
@@ -100,11 +110,21 @@ def _find_ratio(part: Experiments, structure: Structure, first: Fit, options: Op
     if part.kind != rc.ANGLE:
         return free_run
     # Residuals no larger than the counter's own resolution leave nothing for torque noise.
-    if free_run.converged and free_run.noise[0, 0] < FLOOR * part.quantum**2 / 12:
+    quiet = free_run.noise[0, 0] < FLOOR * part.quantum**2 / 12
+    if free_run.converged and (quiet or (near is not None and near.ratio == 0)):
         return free_run
     band = bandwidth(first.z, part)
     path: dict[float, Fit] = {}
     here = first
+
+    def walked(near: Fit, x: float) -> Fit:
+        return fitted(near, ratio_of(band * float(np.exp(x)), part.step, part.kind), 15)
+
+    if near is not None and near.ratio > 0:
+        x = float(np.log((near.ratio / part.step) ** 0.25 / band))
+        path[x] = fitted(first, near.ratio, 20)
+        best = _likeliest(path, walked)
+        return min(free_run, best, key=lambda f: f.deviance + PRICE * (f.ratio > 0))
     for factor in (1.0, 0.3, 0.1, 0.03, 0.01):
         here = fitted(here, ratio_of(band * factor, part.step, part.kind), 20)
         path[float(np.log(factor))] = here
@@ -115,8 +135,7 @@ def _find_ratio(part: Experiments, structure: Structure, first: Fit, options: Op
         free_run = min(free_run, fitted(here, 0.0, 20), key=lambda f: f.deviance)
     if free_run.deviance < min(f.deviance for f in path.values()) + PRICE:
         return free_run
-    return _likeliest(path, lambda near, x: fitted(
-        near, ratio_of(band * float(np.exp(x)), part.step, part.kind), 15))  # fmt: skip
+    return _likeliest(path, walked)
 
 
 def _likeliest(path: dict[float, Fit], fitted: Callable[[Fit, float], Fit]) -> Fit:
@@ -126,7 +145,7 @@ def _likeliest(path: dict[float, Fit], fitted: Callable[[Fit, float], Fit]) -> F
         i = xs.index(min(xs, key=lambda x: path[x].deviance))
         best = path[xs[i]]
         if i in (0, len(xs) - 1):  # not bracketed yet
-            x = xs[i] + (WALK if i else -WALK)
+            x = xs[i] + (WALK if i or len(xs) == 1 else -WALK)
             if abs(x) > MOST:
                 break
         else:

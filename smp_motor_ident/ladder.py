@@ -16,6 +16,7 @@ from smp_motor_ident.experiments import Experiments
 from smp_motor_ident.fit import Fit
 from smp_motor_ident.lateness import averaged, with_delay
 from smp_motor_ident.models import Structure
+from smp_motor_ident.thinning import thinned
 
 HOPELESS = 40.0  # deviance on the head of the data by which a rung is out for good
 LITTLE = 0.02  # of the largest voltage: friction below it may be left out
@@ -128,13 +129,14 @@ def _orders(
 
     Rungs that the head of a long record rejects by far are not fitted to all of it.
     """
-    part = descent.head(data)
+    part = descent.head(thinned(data))
     tried: list[Fit] = []
     for structure in _ladder(base, data.kind == rc.SPEED, data.quantum > 0):
         say(f"fitting {label(structure)}")
         fitted = _one(part, structure, options, tried)
         if fitted is not None:
             tried.append(_no_worse(_of_kind(part, fitted), fitted, tried, options))
+    tried = _from_richer(part, tried, options)
     least = min((f.deviance for f in tried), default=0.0)
     best: Fit | None = None
     for fitted in tried:
@@ -173,6 +175,24 @@ def _no_worse(data: Experiments, fit: Fit, known: list[Fit], options: Options) -
         z[models.DELAY] = 0.1 * data.step
     again = descent.refine(data, fit.structure, least, fit.structure.complete(z), options)
     return min(fit, again, key=lambda f: f.deviance)
+
+
+def _from_richer(data: Experiments, tried: list[Fit], options: Options) -> list[Fit]:
+    """Start the simpler rungs from the likeliest one as well: its torque noise may be theirs."""
+    best = min(tried, key=lambda f: f.deviance, default=None)
+    out = []
+    for fit in tried:
+        free, more = set(fit.structure.free()), set(best.structure.free()) if best else set()
+        if best is not None and free < more and fit.kind == best.kind:
+            z = best.z.copy()
+            late = z[models.DELAY] * (models.DELAY not in free)
+            if fit.structure.order == 2 and late > 0:
+                z[models.A2] = np.logaddexp(z[models.A2], z[models.A1] + np.log(late))
+            part = _of_kind(data, fit)
+            again = descent.refine(part, fit.structure, best, fit.structure.complete(z), options)
+            fit = min(fit, again, key=lambda f: f.deviance)
+        out.append(fit)
+    return out
 
 
 def _projected(data: Experiments, fit: Fit) -> Fit:
@@ -223,7 +243,8 @@ def _one(data: Experiments, structure: Structure, options: Options, known: list[
         z[models.TE] = z[models.A2] - z[models.A1]
         z[models.DELAY] = 0.0
         extra = [z]
-    return cold_fit(data, structure, options, extra)
+    near = min(known, key=lambda f: f.deviance, default=None)
+    return cold_fit(data, structure, options, extra, near=near)
 
 
 def _find(known: list[Fit], structure: Structure) -> Fit | None:

@@ -47,7 +47,8 @@ def with_delay(
         for z in start.lagged_candidates(data, structure, lag):
             z[models.DELAY] = max(lag - 0.5, 0.1) * data.step
             starts.append(z)
-    return _snap(data, cold_fit(data, delayed, options, starts, keep=4, own=False), options)
+    fit = cold_fit(data, delayed, options, starts, keep=4, own=False, near=plain)
+    return _snap(data, fit, options)
 
 
 def _snap(data: Experiments, fit: Fit | None, options: Options) -> Fit | None:
