@@ -14,15 +14,30 @@ from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import (
+    DurabilityPolicy,
+    HistoryPolicy,
+    LivelinessPolicy,
+    QoSProfile,
+    ReliabilityPolicy,
+)
 from rclpy.timer import Timer
 
 from smp_motor_control.errors import SmpError
 
 # REP-2003: streams are published reliably and taken best effort, so that both a stock
 # reliable subscriber and a stock best-effort publisher find a partner in our nodes.
-STREAM_PUBLISHER = QoSProfile(depth=5, reliability=ReliabilityPolicy.RELIABLE)
-"""Commands, states, set-points: what is outdated by the next message."""
+# Only offered, never asked for: who asks for more than is offered gets no link, and no word of it.
+STREAM_PUBLISHER = QoSProfile(
+    depth=5,
+    reliability=ReliabilityPolicy.RELIABLE,
+    liveliness=LivelinessPolicy.AUTOMATIC,
+    liveliness_lease_duration=Duration(seconds=1.0),
+)
+"""Commands, states, set-points: what is outdated by the next message.
+
+Who asks for a lease of a second or more is told within it that the process has died.
+"""
 
 STREAM_SUBSCRIBER = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 """The other end of :data:`STREAM_PUBLISHER`, and of any stock publisher."""
