@@ -64,7 +64,7 @@ def eliminate(  # noqa: C901 - plain loops
     local_gain: Array,
     scores: Array,
     owner: Integers,
-) -> float:
+) -> tuple[float, float]:
     """Eliminate each segment's own columns from the normal equations.
 
     A wide prior on them keeps a motor at rest, whose speed the data do not touch, solvable;
@@ -87,11 +87,11 @@ def eliminate(  # noqa: C901 - plain loops
 
     Returns
     -------
-    float
-        Sum of squares of the prior.
+    prior, promise : float
+        Sum of squares of the prior; by how much the own steps alone lower the objective.
     """
     f, own = score.shape[0], away.shape[1]
-    total = 0.0
+    total = promise = 0.0
     small = np.empty((own, own))
     right = np.empty((own, f + 1))
     scale = np.empty(own)
@@ -121,6 +121,7 @@ def eliminate(  # noqa: C901 - plain loops
         cholesky_solve(small, right)
         for j in range(own):
             local_step[g, j] = right[j, f] / scale[j]
+            promise += gradient[g, f + j] * local_step[g, j]
             for i in range(f):
                 local_gain[g, j, i] = right[j, i] / scale[j]
             for i in range(f):
@@ -137,7 +138,7 @@ def eliminate(  # noqa: C901 - plain loops
             common[i, :] = 0.0
             common[:, i] = 0.0
             score[i] = 0.0
-    return total
+    return total, promise
 
 
 @compiled

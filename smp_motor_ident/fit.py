@@ -151,6 +151,7 @@ class _Descent:
         self.own = own_columns(data, structure)
         self.current = data.current.size > 0
         self.z, self.start, self.initial = structure.complete(z), initial.copy(), initial.copy()
+        self.smooth = structure.friction == "none" and not structure.delay
         self.only_scale = not self.current and huber == math.inf and ratio == 0
         self.damping, self.passes, self.converged = 1e-3, 0, False
         self.look(proper(noise))
@@ -190,6 +191,11 @@ class _Descent:
         moved[:, list(self.own)] += here.local_step - here.local_gain @ step
         return z, moved, size
 
+    def within(self, tolerance: float, size: float) -> bool:
+        """Tell whether a step is so small that another pass would not tell more."""
+        own = self.here.local_promise
+        return self.matrix.shape[1] > 0 and size < tolerance and 0 <= own < tolerance**2
+
     def settled(self) -> bool:
         """Tell whether an undamped step would stay within half a standard deviation."""
         here = self.here
@@ -207,6 +213,9 @@ class _Descent:
         while self.passes < iterations:
             before = self.here.objective
             z, initial, size = self.step()
+            if self.smooth and self.damping < FREE and self.within(tolerance, size):
+                self.z, self.initial, self.converged = z, initial, True
+                return
             new = self._pass(z, initial)
             # A step may be small because it is damped: only a nearly free one tells the end.
             small = z.size > 0 and size < tolerance and self.damping < FREE

@@ -49,13 +49,30 @@ class Sums:
 
 @dataclass(frozen=True, eq=False)
 class Pass:
-    """What one run over the data gave, the initial states eliminated."""
+    """What one run over the data gave, the initial states eliminated.
+
+    Attributes
+    ----------
+    objective : float
+        Weighted sum of squares.
+    normal, gradient : ndarray, shapes (f, f) and (f,)
+        Of the common columns.
+    local_step, local_gain : ndarray, shapes (g, l) and (g, l, f)
+        Step of the own columns, and by how much it is less per common step.
+    local_promise : float
+        By how much the own steps alone lower the objective.
+    spread : ndarray, shape (6,)
+        As in `Sums`.
+    scores : ndarray, shape (blocks, f)
+        Scores summed over runs of samples.
+    """
 
     objective: float
     normal: Array
     gradient: Array
     local_step: Array
     local_gain: Array
+    local_promise: float
     spread: Array
     scores: Array
 
@@ -75,6 +92,7 @@ class Pass:
         return replace(
             self,
             objective=self.objective * factor,
+            local_promise=self.local_promise * factor,
             normal=self.normal * factor,
             gradient=self.gradient * factor,
             scores=self.scores * factor,
@@ -239,9 +257,11 @@ def evaluate(
         score += row * miss
         total += miss * miss
     away = (initial - start)[:, list(own)]
-    total += eliminate(sums.normal, sums.gradient, away, data.size, common, score, step, local_gain,
-                       sums.scores, sums.owner)  # fmt: skip
+    prior, promise = eliminate(sums.normal, sums.gradient, away, data.size, common, score, step,
+                               local_gain, sums.scores, sums.owner)  # fmt: skip
+    total += prior
     if not math.isfinite(total + float(common.sum()) + float(score.sum()) + float(step.sum())):
         return Pass(math.inf, np.zeros((f, f)), np.zeros(f), np.zeros_like(step),
-                    np.zeros_like(local_gain), np.full(6, np.nan), np.zeros((0, f)))  # fmt: skip
-    return Pass(total, common, score, step, local_gain, sums.spread, sums.scores[:, :f])
+                    np.zeros_like(local_gain), 0.0, np.full(6, np.nan),
+                    np.zeros((0, f)))  # fmt: skip
+    return Pass(total, common, score, step, local_gain, promise, sums.spread, sums.scores[:, :f])
