@@ -34,7 +34,8 @@ from smp_motor_ident.record import Hardware, Record
 from smp_motor_ident.tune import Loop, design_wheels
 from smp_motor_ident.tune.feedback import Feedback, spectral_radius
 from smp_motor_ident.tune.margins import loop_margins
-from smp_motor_ident.tune.plant import Motors, sample
+from smp_motor_ident.tune.motors import Motors
+from smp_motor_ident.tune.plant import sample
 
 ROOT = Path(__file__).resolve().parent.parent
 STEP = 100.0

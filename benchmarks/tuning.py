@@ -40,7 +40,8 @@ from smp_motor_ident.result import Estimate, Quantity
 from smp_motor_ident.tune import METHODS, Design, Loop, design
 from smp_motor_ident.tune.feedback import Feedback, spectral_radius
 from smp_motor_ident.tune.margins import batch_margins, grid_for
-from smp_motor_ident.tune.plant import draw_motors, motors_of, sample
+from smp_motor_ident.tune.motors import draw_motors, motors_of
+from smp_motor_ident.tune.plant import sample
 from smp_motor_ident.tune.problem import Problem
 
 RATES = (100.0, 200.0, 500.0, 1000.0)

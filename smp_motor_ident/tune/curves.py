@@ -11,7 +11,8 @@ from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune.arrays import Array
 from smp_motor_ident.tune.designer import Design
 from smp_motor_ident.tune.margins import frequencies
-from smp_motor_ident.tune.plant import draw_motors, motors_of, sample
+from smp_motor_ident.tune.motors import draw_motors, motors_of
+from smp_motor_ident.tune.plant import sample
 from smp_motor_ident.tune.reference import CHANGE, controller_for, planned_change
 from smp_motor_ident.tune.response import Controller, simulate
 
@@ -67,7 +68,7 @@ def curves(estimate: Estimate, design: Design) -> Curves:
     loop, ratio = design.loop, design.loop.gear_ratio
     nominal = motors_of(estimate)
     drawn = draw_motors(estimate, DRAWS, np.random.default_rng(0))
-    plant = sample(nominal if drawn is None else drawn, loop)
+    plant = sample(nominal if drawn is None else drawn, loop, believed=nominal)
     controller = controller_for(loop, design.feedback)
     change = CHANGE * design.reference.max_velocity
     slow = float(nominal.a1[0] / nominal.a0[0])
@@ -76,7 +77,7 @@ def curves(estimate: Estimate, design: Design) -> Curves:
     usual = replace(loop, delay=loop.expected_delay)
     plan = sample(nominal, usual)
     planned = planned_change(plan, design.reference, change, time)
-    as_usual = sample(plant.motors, usual)
+    as_usual = sample(plant.motors, usual, believed=nominal)
     step = simulate(
         as_usual, controller, planned.low, high=planned.high, forward=planned.forward
     ).speed

@@ -6,34 +6,22 @@ Methods work at the motor shaft; the gains that come out are per wheel rad/s.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import numpy as np
-
 from smp_motor_control.pid import PidGains
-from smp_motor_ident.errors import DesignError
 from smp_motor_ident.result import Estimate
+from smp_motor_ident.tune.case import Case, prepare, solve
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.margins import Margins, loop_margins
-from smp_motor_ident.tune.methods import METHODS
 from smp_motor_ident.tune.performance import Performance, measure
-from smp_motor_ident.tune.plant import Plant, draw_motors, motors_of, sample
-from smp_motor_ident.tune.problem import Method, Problem, Promise, ripple
+from smp_motor_ident.tune.plant import Plant, sample
+from smp_motor_ident.tune.problem import ripple
 from smp_motor_ident.tune.reference import Reference, controller_for, plan_reference
 from smp_motor_ident.tune.response import Controller
-from smp_motor_ident.tune.robust import Jury, Robustness, back_off, softer
-
-CLAMPED = 1 / 6
-"""Largest ripple [share of the supply, rms] of any gains: three times it is half of the supply, and
-a loop whose noise is clamped is none."""
-
-COMMON = (
-    "max_velocity", "max_acceleration", "transition_time", "together", "samples", "seed",
-)  # fmt: skip
-"""Targets that every method understands."""
+from smp_motor_ident.tune.robust import Robustness
 
 
 @dataclass(frozen=True)
@@ -111,107 +99,6 @@ def design(estimate: Estimate, loop: Loop, method: str = "margin", **targets: An
     return finish(case, *solve(case))
 
 
-@dataclass(frozen=True)
-class Case:
-    """One motor, one loop, one method: what is needed to judge and to finish a design.
-
-    Attributes
-    ----------
-    wheel : str
-        Whose motor.
-    method : Method
-        The method that was asked for.
-    problem : Problem
-        The nominal motor and the targets.
-    promise : Promise
-        What the gains must keep.
-    jury : Jury
-        The motors that the data allow.
-    drawn : bool
-        Whether these were drawn; else the jury is the nominal motor alone.
-    """
-
-    wheel: str
-    method: Method
-    problem: Problem
-    promise: Promise
-    jury: Jury
-    drawn: bool
-
-
-def prepare(estimate: Estimate, loop: Loop, method: str, targets: dict[str, Any]) -> Case:
-    """Sample the motor and the draws of its distribution; see :func:`design`.
-
-    Parameters
-    ----------
-    estimate, loop, method
-        As for :func:`design`.
-    targets : dict
-        Its keywords.
-
-    Returns
-    -------
-    Case
-
-    Raises
-    ------
-    DesignError
-        When method or targets are unknown.
-    """
-    chosen = _method(method, targets)
-    plant = sample(motors_of(estimate), loop)
-    problem = Problem(plant, loop, targets)
-    promise = _promise(chosen, problem)
-    n = int(targets.get("samples") or 1000)
-    motors = draw_motors(estimate, n, np.random.default_rng(int(targets.get("seed") or 0)))
-    jury = Jury(plant if motors is None else sample(motors, loop), promise)
-    return Case(estimate.wheel, chosen, problem, promise, jury, motors is not None)
-
-
-def solve(case: Case) -> tuple[Feedback, float, Robustness]:
-    """Find the feedback gains, backed off as far as the uncertainty asks for it.
-
-    Parameters
-    ----------
-    case : Case
-        From :func:`prepare`.
-
-    Returns
-    -------
-    feedback : Feedback
-        At the motor shaft.
-    factor : float
-        By which the rule's gains were backed off; 1 where they were not.
-    robustness : Robustness
-
-    Raises
-    ------
-    DesignError
-        When the demand cannot be met.
-    """
-    ruled = case.method.solve(case.problem)
-    quiet, calm = _within_clamp(case.problem, ruled)
-    feedback, factor, robustness = back_off(case.jury, quiet)
-    factor *= calm
-    if factor == 0.0:
-        raise DesignError(
-            f"{case.wheel}: no gains of this kind keep a phase margin of "
-            f"{case.promise.phase:g} deg and Ms {case.promise.sensitivity:g} over the motors that "
-            f"the data allow (only {robustness.holds:.0%} do); record more, or ask for smaller "
-            "margins"
-        )
-    return feedback, factor, robustness
-
-
-def _within_clamp(problem: Problem, feedback: Feedback) -> tuple[Feedback, float]:
-    """Soften gains until what quantisation makes at the output leaves room within the clamp."""
-    factor, trial = 1.0, feedback
-    while ripple(problem, trial) > CLAMPED * problem.loop.supply_voltage and factor > 0.01:
-        factor *= 0.95
-        trial = softer(feedback, factor)
-    return trial, factor
-
-
 def finish(case: Case, feedback: Feedback, factor: float, robustness: Robustness) -> Design:
     """Add feed-forward, reference, figures and words to feedback gains.
 
@@ -287,77 +174,6 @@ def _usual(case: Case) -> Plant:
     return sample(case.problem.plant.motors, replace(loop, delay=loop.expected_delay))
 
 
-def compare(
-    estimate: Estimate, loop: Loop, methods: Sequence[str] | None = None, **targets: Any
-) -> dict[str, Design | DesignError]:
-    """Design by every method, for one table.
-
-    Parameters
-    ----------
-    estimate, loop
-        As for :func:`design`.
-    methods : sequence of str or None
-        Names; None takes all.
-    **targets
-        Each method is given those that it understands.
-
-    Returns
-    -------
-    dict of str to Design or DesignError
-        A method that cannot meet the demand is told by its error.
-    """
-    results: dict[str, Design | DesignError] = {}
-    for name in METHODS if methods is None else methods:
-        known = (*COMMON, *METHODS[name].targets)
-        own = {key: value for key, value in targets.items() if key in known}
-        try:
-            results[name] = design(estimate, loop, name, **own)
-        except DesignError as error:
-            results[name] = error
-    return results
-
-
-def recommend(results: dict[str, Design | DesignError]) -> tuple[str, str]:
-    """Choose among compared designs.
-
-    Parameters
-    ----------
-    results : dict
-        From :func:`compare`.
-
-    Returns
-    -------
-    name : str
-    reason : str
-        One sentence.
-
-    Raises
-    ------
-    DesignError
-        When no method met the demand.
-    """
-    sound = {
-        name: r
-        for name, r in results.items()
-        if isinstance(r, Design)
-        and r.margins.stable
-        and r.margins.sensitivity <= 1.6
-        and r.performance.ripple <= 1.05 * r.loop.noise_limit
-        and math.isfinite(r.performance.settling)
-    }
-    if not sound:
-        raise DesignError("no method keeps Ms below 1.6 within the ripple that the loop allows")
-    name = min(sound, key=lambda n: sound[n].performance.load_integral)
-    others = sorted(r.performance.load_integral for n, r in sound.items() if n != name)
-    best = sound[name]
-    better = f", {others[0] / best.performance.load_integral:.2f} times the next" if others else ""
-    return name, (
-        f"{METHODS[name].title}: of the methods that keep Ms below 1.6 and the ripple below "
-        f"{best.loop.noise_limit:.2g} V it rejects a load best{better}, with a phase margin of "
-        f"{best.margins.phase:.0f} deg"
-    )
-
-
 def wheel_gains(controller: Controller, plant: Plant, loop: Loop) -> PidGains:
     """Return the running controller's settings, per wheel rad/s.
 
@@ -396,28 +212,6 @@ def wheel_gains(controller: Controller, plant: Plant, loop: Loop) -> PidGains:
     )
 
 
-def _method(name: str, targets: dict[str, Any]) -> Method:
-    if name not in METHODS:
-        raise DesignError(f"method is {name!r}; it must be one of {', '.join(METHODS)}")
-    known = (*METHODS[name].targets, *COMMON)
-    unknown = [key for key in targets if key not in known]
-    if unknown:
-        raise DesignError(
-            f"the method {name!r} knows no target {unknown[0]!r}; it knows {', '.join(known)}"
-        )
-    return METHODS[name]
-
-
-def _promise(method: Method, problem: Problem) -> Promise:
-    """Return what the method promises, as far as the caller's targets leave it."""
-    promise = method.promise
-    return Promise(
-        phase=problem.target("phase_margin", promise.phase),
-        gain=promise.gain,
-        sensitivity=problem.target("maximum_sensitivity", promise.sensitivity, least=1.0),
-    )
-
-
 def _plan(
     plant: Plant, loop: Loop, controller: Controller, margins: Margins, targets: Mapping[str, Any]
 ) -> Reference:
@@ -452,11 +246,6 @@ def _explain(
         )
     else:
         warnings.append("the estimate tells no uncertainty: the margins are those of one motor")
-    if loop.speed_source == "observer":
-        warnings.append(
-            "margins and ripple are those with counts differenced over one sample; the observer "
-            "has less lag and noise while its model is right"
-        )
     if factor < 1:
         words.append(
             f"gains backed off to {factor:.0%} of the rule's so that 99 % hold and the ripple from "

@@ -12,6 +12,7 @@ import numpy as np
 
 from smp_motor_ident.tune.arrays import Array, Complex
 from smp_motor_ident.tune.plant import Plant
+from smp_motor_ident.tune.seen import SPEED
 
 
 @dataclass(frozen=True)
@@ -89,8 +90,8 @@ def terms(omega: Array, sample_time: float, filter_time: float) -> tuple[Complex
 def closed_loop(plant: Plant, feedback: Feedback) -> Array:
     """Return the state matrices of the closed loop of every plant of a batch.
 
-    The state is: motor, the angles run through in the last ``window`` steps, the voltages still
-    under way, integral, and derivative filter.
+    The state is: motor, the angles run through in the last ``window`` steps or the observer, the
+    voltages still under way, integral, and derivative filter.
 
     Parameters
     ----------
@@ -105,12 +106,15 @@ def closed_loop(plant: Plant, feedback: Feedback) -> Array:
         Stable where every eigenvalue lies inside the unit circle.
     """
     n, m, s = plant.taps.shape
-    T, window = plant.sample_time, plant.window
-    angles, volts, integral = s, s + window, s + window + m - 1
+    T, window, seen = plant.sample_time, plant.window, plant.seen
+    memory = window if seen is None else seen.by_angle.size
+    volts, integral = s + memory, s + memory + m - 1
     size = integral + 2
     speed = np.zeros((n, size))
-    if window:
-        speed[:, angles:volts] = 1 / (window * T)
+    if seen is not None:
+        speed[:, s + SPEED] = 1.0
+    elif window:
+        speed[:, s:volts] = 1 / (window * T)
     else:
         speed[:, 0] = 1.0
     keep = feedback.filter_time / (feedback.filter_time + T)
@@ -123,11 +127,19 @@ def closed_loop(plant: Plant, feedback: Feedback) -> Array:
     A[:, :s, :s] = plant.phi
     A[:, :s] += plant.taps[:, 0, :, None] * output[:, None, :]
     A[:, :s, volts:integral] += np.swapaxes(plant.taps[:, 1:], 1, 2)
-    if window:
-        A[:, angles, :s] = plant.phi_angle
-        A[:, angles] += plant.taps_angle[:, :1] * output
-        A[:, angles, volts:integral] += plant.taps_angle[:, 1:]
-        A[:, angles + 1 : volts] = unit[angles : volts - 1]
+    swept = np.zeros((n, size))
+    swept[:, :s] = plant.phi_angle
+    swept += plant.taps_angle[:, :1] * output
+    swept[:, volts:integral] += plant.taps_angle[:, 1:]
+    if seen is not None:
+        told = seen.taps[0] * output
+        told[:, volts : volts + seen.taps.size - 1] += seen.taps[1:]
+        A[:, s:volts, s:volts] = seen.advance
+        A[:, s:volts] += seen.by_angle[:, None] * swept[:, None, :]
+        A[:, s:volts] += seen.by_voltage[:, None] * told[:, None, :]
+    elif window:
+        A[:, s] = swept
+        A[:, s + 1 : volts] = unit[s : volts - 1]
     if m > 1:
         A[:, volts] = output
         A[:, volts + 1 : integral] = unit[volts : integral - 1]

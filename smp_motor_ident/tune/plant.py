@@ -16,113 +16,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from smp_motor_ident.errors import DesignError
-from smp_motor_ident.result import Estimate
+from smp_motor_control.motor_model import MotorModel
+from smp_motor_control.observer import ObserverNoise
 from smp_motor_ident.tune.arrays import Array, Complex
 from smp_motor_ident.tune.loop import Loop
-
-PHYSICAL = ("resistance", "inductance", "motor_constant", "inertia", "viscous_friction")
-
-
-@dataclass(frozen=True, eq=False)
-class Motors:
-    """Combinations that fix the response from voltage to speed, for a batch of motors.
-
-    Attributes
-    ----------
-    a0, a1, a2 : ndarray, shape (n,)
-        Coefficients [V s/rad], [V s^2/rad], [V s^3/rad] of ``a2 s^2 + a1 s + a0``.
-    delay : ndarray, shape (n,), [s]
-        The motor's own delay, from applied voltage to reported speed.
-    static_voltage : ndarray, shape (n,), [V]
-        What Coulomb friction takes.
-    """
-
-    a0: Array
-    a1: Array
-    a2: Array
-    delay: Array
-    static_voltage: Array
-
-    def __len__(self) -> int:
-        """Return the number of motors."""
-        return int(self.a0.size)
-
-
-def motors_of(estimate: Estimate) -> Motors:
-    """Return the motor of an estimate, from whatever combinations or parameters it holds.
-
-    Parameters
-    ----------
-    estimate : Estimate
-        With ``dc_gain`` and ``time_constant``, or with all physical parameters.
-
-    Returns
-    -------
-    Motors
-        A batch of one.
-
-    Raises
-    ------
-    DesignError
-        When the estimate holds neither, or one of them is not positive.
-    """
-    return _motors(estimate, {name: np.array([estimate.value(name)]) for name in _names(estimate)})
-
-
-def draw_motors(estimate: Estimate, n: int, rng: np.random.Generator) -> Motors | None:
-    """Draw motors from the distribution of the estimation error.
-
-    Parameters
-    ----------
-    estimate : Estimate
-        As for :func:`motors_of`.
-    n : int
-        Number of draws.
-    rng : numpy.random.Generator
-        Source of randomness.
-
-    Returns
-    -------
-    Motors or None
-        A batch of ``n``, or None where the estimate tells no uncertainty of its response.
-    """
-    names = _names(estimate)
-    known = [name for name in names if name in estimate.names]
-    if not known or not np.any(np.diag(estimate.covariance) > 0):
-        return None
-    draws = estimate.samples_of(names, n, rng)
-    return _motors(estimate, dict(zip(names, draws.T, strict=True)))
-
-
-def _names(estimate: Estimate) -> tuple[str, ...]:
-    tail = ("static_voltage", "delay")
-    if estimate.value("dc_gain") and estimate.value("time_constant"):
-        return ("dc_gain", "time_constant", "time_constant_product", *tail)
-    if all(estimate.value(n) for n in ("resistance", "motor_constant", "inertia")):
-        return (*PHYSICAL, "coulomb_friction", "delay")
-    raise DesignError(
-        f"{estimate.wheel}: the estimate holds neither dc_gain and time_constant nor all physical "
-        "parameters; identify the motor again"
-    )
-
-
-def _motors(estimate: Estimate, value: dict[str, Array]) -> Motors:
-    if "dc_gain" in value:
-        a0 = 1 / value["dc_gain"]
-        a1 = value["time_constant"] * a0
-        a2 = value["time_constant_product"] * a0
-        static = value["static_voltage"]
-    else:
-        R, L, K, J, b = (value[name] for name in PHYSICAL)
-        a0, a1, a2 = (R * b + K * K) / K, (R * J + L * b) / K, L * J / K
-        static = R * value["coulomb_friction"] / K
-    if not (np.all(a0 > 0) and np.all(a1 > 0) and np.all(a2 >= 0) and np.all(np.isfinite(a0))):
-        raise DesignError(
-            f"{estimate.wheel}: dc_gain and time_constant must be positive, they are "
-            f"{1 / a0[0]:.4g} rad/s/V and {a1[0] / a0[0]:.4g} s"
-        )
-    return Motors(a0, a1, a2, np.maximum(value["delay"], 0.0), np.abs(static))
+from smp_motor_ident.tune.motors import Motors
+from smp_motor_ident.tune.seen import Seen, seen_by_observer
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,6 +45,8 @@ class Plant:
         Samples over which the measured speed is averaged; 0 measures it instantaneously.
     motors : Motors
         What was sampled.
+    seen : Seen or None
+        The observer through which the speed is seen, where it is fed back; then ``window`` is 0.
     """
 
     phi: Array
@@ -155,6 +56,7 @@ class Plant:
     sample_time: float
     window: int
     motors: Motors
+    seen: Seen | None = None
 
     def __len__(self) -> int:
         """Return the number of motors."""
@@ -175,7 +77,8 @@ class Plant:
         """
         arrays = (self.phi, self.taps, self.phi_angle, self.taps_angle)
         phi, taps, phi_angle, taps_angle = (np.repeat(x, n, axis=0) for x in arrays)
-        return Plant(phi, taps, phi_angle, taps_angle, self.sample_time, self.window, self.motors)
+        made = (phi, taps, phi_angle, taps_angle, self.sample_time, self.window, self.motors)
+        return Plant(*made, self.seen)
 
     def response(self, omega: Array, *, window: int | None = None) -> Complex:
         """Return the frequency response from controller output to measured speed.
@@ -213,15 +116,44 @@ class Plant:
         delays = z[None, :] ** -np.arange(self.taps.shape[1])[:, None]
         drive = np.einsum("nms,mf->nsf", self.taps, delays)
         state = _resolvent(self.phi, z, drive)
-        if window == 0:
+        if window == 0 and self.seen is None:
             return state[:, 0]
         angle = np.einsum("ns,nsf->nf", self.phi_angle, state) + self.taps_angle @ delays
+        if self.seen is not None:
+            from_angle, from_voltage = self.seen.transfer(z)
+            told = self.seen.taps @ z[None, :] ** -np.arange(self.seen.taps.size)[:, None]
+            seen: Complex = from_angle * angle + from_voltage * told
+            return seen
         sweep = np.sum(z[None, :] ** -(1.0 + np.arange(window))[:, None], axis=0)
         response: Complex = angle * sweep / (window * self.sample_time)
         return response
 
+    def angle_noise(self, omega: Array) -> Array:
+        """Return how an error of the counted angle shows in the speed.
 
-def sample(motors: Motors, loop: Loop, *, window: int | None = None) -> Plant:
+        Parameters
+        ----------
+        omega : ndarray, shape (f,), [rad/s]
+
+        Returns
+        -------
+        ndarray, shape (f,), [1/s^2]
+            Squared magnitude.
+        """
+        T = self.sample_time
+        if self.seen is not None:
+            z = np.exp(1j * np.asarray(omega) * T)
+            squared: Array = np.abs(self.seen.transfer(z)[0] * (z - 1)) ** 2
+            return squared
+        if not self.window:
+            return np.zeros(np.shape(omega))
+        difference: Array = 2 * np.sin(0.5 * omega * self.window * T) / (self.window * T)
+        return difference**2
+
+
+def sample(
+    motors: Motors, loop: Loop, *, window: int | None = None, believed: Motors | None = None
+) -> Plant:
     """Sample a batch of motors exactly, with the loop's and the motor's delay.
 
     Parameters
@@ -231,8 +163,9 @@ def sample(motors: Motors, loop: Loop, *, window: int | None = None) -> Plant:
     loop : Loop
         Sample time, delay, and how speed is measured.
     window : int or None
-        Averaging window [samples]; None takes that of the loop.  An observer is taken as one
-        sample: it has less lag and less noise than that.
+        Averaging window [samples]; None takes that of the loop.
+    believed : Motors or None
+        The motor that an observer in the loop takes them all for; None takes the first of them.
 
     Returns
     -------
@@ -240,8 +173,11 @@ def sample(motors: Motors, loop: Loop, *, window: int | None = None) -> Plant:
         The sampled batch.
     """
     T = loop.sample_time
+    seen = None
     if window is None:
-        window = 1 if loop.speed_source == "observer" else int(loop.difference_window)
+        window = int(loop.difference_window)
+        if loop.speed_source == "observer" and loop.count_angle:
+            window, seen = 0, _seen(motors if believed is None else believed, loop)
     total = loop.loop_delay + motors.delay
     whole = np.floor(total / T + 1e-9).astype(int)
     late = np.clip(total - whole * T, 0.0, T)
@@ -249,7 +185,8 @@ def sample(motors: Motors, loop: Loop, *, window: int | None = None) -> Plant:
     n, s = B.shape
     phi, gamma, zeta = _integrals(A, B, np.full(n, T))
     _, recent, recent_angle = _integrals(A, B, T - late)
-    taps = np.zeros((n, int(whole.max()) + 2, s))
+    longest = max(int(whole.max()) + 2, 0 if seen is None else seen.taps.size)
+    taps = np.zeros((n, longest, s))
     taps_angle = np.zeros(taps.shape[:2])
     row = np.arange(n)
     taps[row, whole] = recent
@@ -258,8 +195,24 @@ def sample(motors: Motors, loop: Loop, *, window: int | None = None) -> Plant:
     taps_angle[row, whole + 1] = zeta - recent_angle
     used = np.any(taps != 0, axis=(0, 2))
     m = int(np.flatnonzero(used)[-1]) + 1
+    if seen is not None:
+        m = max(m, seen.taps.size)
     ones, _ = _mean_integral(A, np.full(n, T))
-    return Plant(phi, taps[:, :m], ones[:, 0, :], taps_angle[:, :m], T, window, motors)
+    return Plant(phi, taps[:, :m], ones[:, 0, :], taps_angle[:, :m], T, window, motors, seen)
+
+
+def _seen(believed: Motors, loop: Loop) -> Seen:
+    """Return the observer that runs with the first of some motors as its model."""
+    a0, a1, a2 = (float(a[0]) for a in (believed.a0, believed.a1, believed.a2))
+    model = MotorModel(
+        dc_gain=1 / a0,
+        time_constant=a1 / a0,
+        time_constant_product=a2 / a0,
+        delay=float(believed.delay[0]),
+    )
+    return seen_by_observer(
+        model, loop.sample_time, loop.count_angle, ObserverNoise(), loop.loop_delay
+    )
 
 
 def _continuous(motors: Motors) -> tuple[Array, Array]:

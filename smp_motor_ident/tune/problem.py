@@ -182,7 +182,8 @@ class Method:
 def noise_filter(problem: Problem, omega: Array) -> Array:
     """Return the noise density of the measured speed.
 
-    Quantisation of the count is taken as white and uniform over one count, then differenced.
+    Quantisation of the count is taken as white and uniform over one count, then differenced or
+    observed.
 
     Parameters
     ----------
@@ -195,13 +196,9 @@ def noise_filter(problem: Problem, omega: Array) -> Array:
     ndarray, shape (f,), [rad^2/s^2]
         Variance per share of the band up to Nyquist.
     """
-    loop, window = problem.loop, problem.plant.window
-    density = np.full(omega.shape, loop.speed_noise**2)
-    if window and loop.count_angle:
-        T = loop.sample_time
-        difference = 2 * np.sin(0.5 * omega * window * T) / (window * T)
-        density = density + difference**2 * loop.count_angle**2 / 12
-    return density
+    loop = problem.loop
+    density: Array = problem.plant.angle_noise(omega) * loop.count_angle**2 / 12
+    return density + loop.speed_noise**2
 
 
 def ripple(problem: Problem, feedback: Feedback) -> float:

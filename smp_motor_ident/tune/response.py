@@ -16,6 +16,7 @@ from smp_motor_ident._compile import compiled
 from smp_motor_ident.tune.arrays import Array
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.plant import Plant
+from smp_motor_ident.tune.seen import SPEED
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +104,8 @@ def simulate(
         controller.limit,
         1.0 / np.asarray(controller.tracking),
     )
+    seen = plant.seen
+    none = np.zeros((0, 0))
     speed, voltage = _run(
         plant.phi,
         plant.taps,
@@ -110,6 +113,10 @@ def simulate(
         plant.taps_angle,
         plant.sample_time,
         plant.window,
+        none if seen is None else seen.advance,
+        none.ravel() if seen is None else seen.by_angle,
+        none.ravel() if seen is None else seen.by_voltage,
+        none.ravel() if seen is None else seen.taps,
         np.stack([np.broadcast_to(np.asarray(x, dtype=np.float64), n) for x in numbers], axis=1),
         np.asarray(reference, dtype=np.float64),
         np.asarray(reference if high is None else high, dtype=np.float64),
@@ -121,6 +128,35 @@ def simulate(
 
 
 @compiled
+def _turned(newest: float, oldest: float, count_angle: float) -> float:
+    """Return the angle between two instants, in whole counts where there are counts."""
+    if count_angle > 0.0:
+        counts = math.floor(newest / count_angle) - math.floor(oldest / count_angle)
+        return float(counts * count_angle)
+    return newest - oldest
+
+
+@compiled
+def _weighted(weights: Array, values: Array) -> float:
+    total = 0.0
+    for k in range(weights.size):
+        total += weights[k] * values[k]
+    return total
+
+
+@compiled
+def _observed(
+    advance: Array, by_angle: Array, by_voltage: Array, state: Array, swept: float, told: float
+) -> Array:
+    """Return the observer's state after a sample."""
+    following = by_angle * swept + by_voltage * told
+    for a in range(state.size):
+        for b in range(state.size):
+            following[a] += advance[a, b] * state[b]
+    return following
+
+
+@compiled
 def _run(
     phi: Array,
     taps: Array,
@@ -128,6 +164,10 @@ def _run(
     taps_angle: Array,
     T: float,
     window: int,
+    advance: Array,
+    by_angle: Array,
+    by_voltage: Array,
+    told_taps: Array,
     controllers: Array,
     low: Array,
     high: Array,
@@ -142,15 +182,12 @@ def _run(
         p, i, d, filter_time, weight, weight_d, limit, back = controllers[j]
         x, following, past = np.zeros(s), np.zeros(s), np.zeros(m)
         angle = np.zeros(window + 1)
+        observer = np.zeros(by_angle.size)
         integral = previous = rate = 0.0
         for k in range(steps):
-            measured = x[0]
+            measured = observer[SPEED] if observer.size else x[0]
             if window > 0:
-                newest, oldest = angle[0], angle[window]
-                if count_angle > 0.0:
-                    newest = math.floor(newest / count_angle) * count_angle
-                    oldest = math.floor(oldest / count_angle) * count_angle
-                measured = (newest - oldest) / (window * T)
+                measured = _turned(angle[0], angle[window], count_angle) / (window * T)
             reference = min(max(measured, low[k]), high[k])
             slope = weight_d * reference - measured
             rate = (filter_time * rate + slope - previous) / (filter_time + T)
@@ -177,7 +214,12 @@ def _run(
                     following[a] += taps[j, q, a] * volts
             for q in range(window, 0, -1):
                 angle[q] = angle[q - 1]
+            before = angle[0]
             angle[0] += swept
+            if observer.size:
+                swept = _turned(angle[0], before, count_angle)
+                told = _weighted(told_taps, past)
+                observer[:] = _observed(advance, by_angle, by_voltage, observer, swept, told)
             x[:] = following
     return speed, voltage
 

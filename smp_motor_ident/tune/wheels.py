@@ -13,14 +13,8 @@ from smp_motor_control.profile import Drive, Reference
 from smp_motor_control.voltage_limited import VoltageLimited
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.result import Estimate
-from smp_motor_ident.tune.designer import (
-    Case,
-    Design,
-    finish,
-    prepare,
-    solve,
-    with_reference,
-)
+from smp_motor_ident.tune.case import Case, prepare, solve
+from smp_motor_ident.tune.designer import Design, finish, with_reference
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.robust import Robustness, back_off

@@ -100,7 +100,8 @@ def test_uncertainty_makes_the_design_back_off_and_say_so():
 def test_robustness_is_judged_on_fresh_draws_as_well():
     """Gains chosen on one sample of the distribution hold on another, with another seed."""
     one = design(estimate(1, std=0.05), Loop(), seed=1)
-    from smp_motor_ident.tune.plant import draw_motors, sample
+    from smp_motor_ident.tune.motors import draw_motors
+    from smp_motor_ident.tune.plant import sample
     from smp_motor_ident.tune.robust import Jury
 
     fresh = sample(draw_motors(estimate(1, std=0.05), 4000, np.random.default_rng(99)), Loop())

@@ -14,7 +14,8 @@ from smp_motor_ident.tune.methods import METHODS
 from smp_motor_ident.tune.methods.pole_placement import place
 from smp_motor_ident.tune.methods.relay import oscillate, read_oscillation
 from smp_motor_ident.tune.methods.ziegler_nichols import from_ultimate
-from smp_motor_ident.tune.plant import Motors, sample
+from smp_motor_ident.tune.motors import Motors
+from smp_motor_ident.tune.plant import sample
 from smp_motor_ident.tune.problem import FirstOrderDelay, Problem, ripple
 
 # The paper's Table 1 as a0, a1, a2 [V s/rad and its powers].

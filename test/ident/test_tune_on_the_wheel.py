@@ -17,7 +17,8 @@ from smp_motor_control.voltage_limited import VoltageLimited
 from smp_motor_control.wheel_loop import LoopSettings, WheelLoop
 from smp_motor_ident.commands.tune import read_estimates
 from smp_motor_ident.tune import Loop, design, design_wheels
-from smp_motor_ident.tune.plant import motors_of, sample
+from smp_motor_ident.tune.motors import motors_of
+from smp_motor_ident.tune.plant import sample
 from smp_motor_ident.tune.reference import planned_change
 
 MOTORS = Path(__file__).resolve().parents[2] / "config" / "motors_paper.yaml"

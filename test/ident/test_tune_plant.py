@@ -12,7 +12,8 @@ from smp_motor_control.pid import Pid, PidGains
 from smp_motor_ident.tune.feedback import Feedback, closed_loop, spectral_radius
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.margins import batch_margins, grid_for, loop_margins
-from smp_motor_ident.tune.plant import Motors, sample
+from smp_motor_ident.tune.motors import Motors
+from smp_motor_ident.tune.plant import sample
 from smp_motor_ident.tune.response import Controller, minimum_jerk, simulate
 
 # Motor 1 of the paper's Table 1, and a first-order motor.

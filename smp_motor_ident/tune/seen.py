@@ -1,0 +1,124 @@
+r"""How the loop sees the speed through the observer: a linear filter of angle and voltage.
+
+The observer's angle only ever appears as its difference ``e`` from the counted one, so the filter
+has no state that grows.  With ``r = (speed, acceleration, load)`` and, over one sample, the angle
+``s`` that was swept and the mean voltage ``v``,
+
+    nu = e + s - F_0 r - G_0 v,   e <- (1 - K_0) nu,   r <- F r + G v + K nu
+
+which is ``state <- advance state + by_angle s + by_voltage v``.
+
+References
+----------
+R. F. Stengel, Optimal Control and Estimation (1994), section 4.3: the steady-state Kalman filter.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import expm
+
+from smp_motor_control.motor_model import MotorModel
+from smp_motor_control.observer import ObserverNoise
+from smp_motor_control.observer_gain import steady_gain
+from smp_motor_ident.tune.arrays import Array, Complex
+
+SPEED = 1
+"""Where the speed is in the state."""
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """The observer as a filter, the same for every motor that it may meet.
+
+    Attributes
+    ----------
+    advance : ndarray, shape (q, q)
+    by_angle, by_voltage : ndarray, shape (q,)
+    taps : ndarray, shape (m,)
+        Shares of the last controller outputs in the mean voltage of a sample, as the observer
+        is told it and shifts it by the delay of its model.
+    """
+
+    advance: Array
+    by_angle: Array
+    by_voltage: Array
+    taps: Array
+
+    def transfer(self, z: Complex) -> tuple[Complex, Complex]:
+        """Return the transfer from swept angle and from mean voltage to the speed seen.
+
+        Parameters
+        ----------
+        z : ndarray of complex, shape (f,)
+
+        Returns
+        -------
+        from_angle, from_voltage : ndarray of complex, shape (f,)
+            Of what happens between a sample and the next one to the speed at the first.
+        """
+        eye = np.eye(self.by_angle.size)
+        inputs = np.stack([self.by_angle, self.by_voltage], axis=1)
+        found = np.linalg.solve(z[:, None, None] * eye - self.advance, inputs[None])
+        return found[:, SPEED, 0], found[:, SPEED, 1]
+
+
+def seen_by_observer(
+    model: MotorModel, sample_time: float, quantum: float, noise: ObserverNoise, loop_delay: float
+) -> Seen:
+    """Return the steady-state observer of a model as a filter.
+
+    Parameters
+    ----------
+    model : MotorModel
+        What the observer believes.
+    sample_time : float
+        [s].
+    quantum : float
+        Angle of a count [rad].
+    noise : ObserverNoise
+        What it expects.
+    loop_delay : float
+        From the controller's output to the voltage [s].
+
+    Returns
+    -------
+    Seen
+    """
+    K, tau, tp = model.dc_gain, model.time_constant, model.time_constant_product
+    gain = steady_gain(model, quantum, noise, sample_time)
+    if tp:
+        drift = np.array(
+            [
+                [0.0, 1.0, 0.0, 0.0],
+                [0.0, 0.0, 1.0, 0.0],
+                [0.0, -1 / tp, -tau / tp, -K / tp],
+                [0.0, 0.0, 0.0, 0.0],
+            ]
+        )
+        entry, correct = np.array([0.0, 0.0, K / tp, 0.0]), np.array(gain[:4])
+    else:
+        drift = np.array([[0.0, 1.0, 0.0], [0.0, -1 / tau, -K / tau], [0.0, 0.0, 0.0]])
+        entry, correct = np.array([0.0, K / tau, 0.0]), np.array([gain[0], gain[1], gain[3]])
+    size = entry.size
+    block = np.zeros((size + 1, size + 1))
+    block[:size, :size], block[:size, size] = drift, entry
+    step = expm(block * sample_time)
+    F, G = step[:size, :size], step[:size, size]
+    # Rows: what the innovation is made of.
+    innovation = np.concatenate([[1.0], -F[0, 1:]])
+    advance = np.zeros((size, size))
+    advance[0] = (1 - correct[0]) * innovation
+    advance[1:, 1:] = F[1:, 1:]
+    advance[1:] += correct[1:, None] * innovation
+    by_angle = np.concatenate([[1 - correct[0]], correct[1:]])
+    by_voltage = np.concatenate([[0.0], G[1:]]) - G[0] * by_angle
+    total = loop_delay + model.delay
+    whole = math.floor(total / sample_time + 1e-9)
+    late = min(max(total / sample_time - whole, 0.0), 1.0)
+    taps = np.zeros(whole + 2)
+    taps[whole], taps[whole + 1] = 1 - late, late
+    return Seen(advance, by_angle, by_voltage, taps if late else taps[:-1])

@@ -1,0 +1,108 @@
+"""Where the loop shall take its speed from: the hardware, counts differenced, or the observer.
+
+Each candidate costs in its own way: a difference over more samples makes less noise and more
+lag, the observer makes little of both while its model is right.  All are designed for, and the
+gains that reject a load best within the same margins and the same ripple tell which to take.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+from smp_motor_ident.errors import DesignError
+from smp_motor_ident.result import Estimate
+from smp_motor_ident.tune.case import prepare, solve
+from smp_motor_ident.tune.loop import Loop
+from smp_motor_ident.tune.problem import ripple
+
+WINDOWS = (2, 4, 8, 16)
+"""Samples to difference over that are tried beside what the hardware reports."""
+
+WORTH_WINDOW, WORTH_OBSERVER = 1.15, 1.5
+"""How many times better a load must be rejected for a longer window, and for the observer, which
+leans on the model, to be taken."""
+
+DRAWS = 200
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What one source allows.
+
+    Attributes
+    ----------
+    loop : Loop
+        With the source.
+    integral : float
+        Integral gain within the margins [V/rad, wheel]; the error that a load leaves is its
+        inverse.
+    ripple : float
+        Voltage from quantisation [V rms].
+    """
+
+    loop: Loop
+    integral: float
+    ripple: float
+
+    @property
+    def name(self) -> str:
+        """In words."""
+        if self.loop.speed_source == "difference":
+            return f"counts differenced over {self.loop.difference_window} samples"
+        return {"measured": "the reported speed", "observer": "the observer"}[
+            self.loop.speed_source
+        ]
+
+
+def choose_source(estimate: Estimate, loop: Loop, **targets: Any) -> tuple[Loop, str]:
+    """Return the loop with the speed source to take, and the reason.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        The motor, with its uncertainty: it decides how far the observer is to be trusted.
+    loop : Loop
+        With the source that is there in any case.
+    **targets
+        Margins, as the method 'margin' takes them.
+
+    Returns
+    -------
+    loop : Loop
+    reason : str
+        One sentence with what the candidates allow.
+    """
+    usual = _trial(estimate, loop, targets)
+    if loop.counts_per_revolution is None:
+        return loop, "the reported speed: the encoder's counts are not known"
+    windows = [
+        _trial(estimate, replace(loop, speed_source="difference", difference_window=w), targets)
+        for w in WINDOWS
+        if w > loop.difference_window
+    ]
+    watched = _trial(estimate, replace(loop, speed_source="observer"), targets)
+    best = usual
+    longer = max((t for t in windows if t is not None), key=lambda t: t.integral, default=None)
+    for trial, worth in ((longer, WORTH_WINDOW), (watched, WORTH_OBSERVER)):
+        if trial is not None and (best is None or trial.integral > worth * best.integral):
+            best = trial
+    if best is None:
+        return loop, "the reported speed: no source allows what is asked"
+    told = "; ".join(
+        f"{t.name} allows i = {t.integral:.3g} V/rad at {1e3 * t.ripple:.3g} mV of ripple"
+        for t in (usual, longer, watched)
+        if t is not None
+    )
+    return best.loop, f"{best.name}: {told}"
+
+
+def _trial(estimate: Estimate, loop: Loop, targets: dict[str, Any]) -> Trial | None:
+    # The ripple that the loop allows is a limit here: nothing is gained by noise.
+    strict = replace(loop, noise_voltage=loop.noise_limit)
+    try:
+        case = prepare(estimate, strict, "margin", {**targets, "samples": DRAWS})
+        feedback = solve(case)[0]
+    except DesignError:
+        return None
+    return Trial(loop, feedback.i * loop.gear_ratio, ripple(case.problem, feedback))

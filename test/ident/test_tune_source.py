@@ -1,0 +1,130 @@
+"""The observer in the loop, and the choice of where the speed comes from."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from smp_motor_control.motor_file import load_motors
+from smp_motor_control.motor_model import MotorModel
+from smp_motor_control.plant import DriveSettings
+from smp_motor_control.simulation import Timing, simulate_closed_loop
+from smp_motor_control.wheel_loop import LoopSettings
+from smp_motor_ident.commands.tune import main, read_estimates
+from smp_motor_ident.tune import Loop, design
+from smp_motor_ident.tune.feedback import spectral_radius
+from smp_motor_ident.tune.motors import Motors, motors_of
+from smp_motor_ident.tune.plant import sample
+from smp_motor_ident.tune.response import Controller, simulate
+from smp_motor_ident.tune.source import choose_source
+
+MOTORS = Path(__file__).resolve().parents[2] / "config" / "motors_paper.yaml"
+
+
+@pytest.fixture(scope="module")
+def estimates():
+    return read_estimates(MOTORS)
+
+
+def observed(rate: float, **more) -> Loop:
+    return Loop(sample_time=1 / rate, speed_source="observer", **more)
+
+
+def test_an_observer_with_the_right_model_sees_the_speed_itself(estimates):
+    motors = motors_of(estimates["front_left"])
+    loop = observed(200.0, delay=0.01)  # whole samples: the mean voltage is the voltage
+    omega = np.geomspace(1.0, 600.0, 50)
+    seen = sample(motors, loop).response(omega)
+    true = sample(motors, loop, window=0).response(omega)
+    np.testing.assert_allclose(seen, true, rtol=1e-6)  # rounding of the matrix exponential
+
+
+def test_the_response_of_a_wrong_model_is_that_of_the_simulated_loop(estimates):
+    believed = motors_of(estimates["front_left"])
+    actual = Motors(
+        1.1 * believed.a0, 0.9 * believed.a1, believed.a2, believed.delay, believed.static_voltage
+    )
+    loop = observed(500.0, delay=0.0013)
+    plant = sample(actual, loop, believed=believed)
+    feedback = design(estimates["front_left"], loop).feedback
+    # At the gain at which the response says that it oscillates the simulated loop neither grows
+    # nor decays, and the eigenvalues say the same.
+    omega = np.linspace(5.0, np.pi * 500.0, 200_000)
+    L = (plant.response(omega) * feedback.response(omega, 1 / 500))[0]
+    crossings = np.flatnonzero((L[:-1].imag > 0) != (L[1:].imag > 0))
+    ultimate = 1 / max(-L[k].real for k in crossings)
+    for factor, grows in ((0.97, False), (1.03, True)):
+        trial = feedback.scaled(factor * ultimate)
+        assert (spectral_radius(plant, trial)[0] > 1) == grows
+        speed = simulate(plant, Controller(trial), np.ones(1500)).speed[0]
+        off = np.abs(speed - 1)
+        assert (off[-300:].max() > off[600:900].max()) == grows
+
+
+@pytest.mark.parametrize("rate", [200.0, 1000.0])
+def test_gain_margin_holds_on_the_running_loop_with_its_observer(estimates, rate):
+    T = 1 / rate
+    one = design(estimates["rear_left"], observed(rate))
+    # Without friction and clamp the loop is linear but for the counts.
+    entry = load_motors(MOTORS)["rear_left"]
+    entry = replace(
+        entry, parameters=replace(entry.parameters, coulomb_friction=0.0), supply_voltage=1e6
+    )
+    model = MotorModel(**{**one.motor, "static_voltage": 0.0})
+
+    def late_ripple(factor: float) -> float:
+        gains = replace(
+            one.gains, p=factor * one.gains.p, i=factor * one.gains.i, d=factor * one.gains.d,
+            u_clamp_min=-1e6, u_clamp_max=1e6, i_clamp_min=-1e6, i_clamp_max=1e6,
+            feedforward_static=0.0, antiwindup_strategy="none",
+        )  # fmt: skip
+        run = simulate_closed_loop(
+            entry,
+            LoopSettings(gains=gains, speed_source="observer", model=model),
+            # The observer learns the interval at rest, where the loop has nothing to do.
+            lambda time: 2.0 if time > 0.2 else 0.0,
+            400 * T + 1.0,
+            timing=Timing(sample_time=T, delay=T),
+            drive=DriveSettings(command_timeout=np.inf),
+        )
+        return float(np.abs(run.velocity[-100:] - 2.0).max())
+
+    margin = one.margins.gain
+    # A tenth inside it the loop has come to rest within the noise of its counts, a tenth beyond it
+    # has not: what grows does not stop before the clamp, which is not reached here.
+    assert late_ripple(1 + 0.9 * (margin - 1)) < 0.5
+    assert late_ripple(1.1 * margin) > 10.0
+
+
+def test_at_1_khz_the_observer_is_taken_and_said_why(estimates):
+    loop, why = choose_source(estimates["rear_left"], Loop(sample_time=0.001))
+    assert loop.speed_source == "observer"
+    assert "the reported speed allows i = " in why
+    plain = design(estimates["rear_left"], Loop(sample_time=0.001, noise_voltage=0.48))
+    better = design(estimates["rear_left"], replace(loop, noise_voltage=0.48))
+    assert better.gains.i > 1.5 * plain.gains.i
+    assert better.performance.ripple <= 1.01 * 0.48
+
+
+def test_at_200_hz_the_reported_speed_does(estimates):
+    loop, _ = choose_source(estimates["rear_left"], Loop(sample_time=0.005))
+    assert loop.speed_source == "measured"
+
+
+def test_without_counts_there_is_nothing_to_choose(estimates):
+    loop, why = choose_source(estimates["rear_left"], Loop(counts_per_revolution=None))
+    assert loop.speed_source == "measured"
+    assert "not known" in why
+
+
+def test_the_choice_is_printed_and_can_be_overruled(tmp_path, capsys):
+    for source in ("auto", "measured"):
+        output = tmp_path / f"{source}.yaml"
+        options = ["--rate", "1000", "--speed-source", source, "--output", str(output)]
+        assert main([str(MOTORS), *options]) == 0
+        assert ("speed from the observer" in capsys.readouterr().out) == (source == "auto")
+        chosen = "observer" if source == "auto" else "measured"
+        assert f"speed_source: {chosen}" in output.read_text()
