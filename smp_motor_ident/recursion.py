@@ -8,8 +8,6 @@ Derivation: docs/derivations.md, sections 4 to 7.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -43,6 +41,7 @@ from smp_motor_ident.lanes import (
     slide_state,
     turn,
 )
+from smp_motor_ident.sums import ROOM, TILE, robust, sum_up
 from smp_motor_ident.window import recall, remember
 
 __all__ = ["ANGLE", "MEAN_SPEED", "SPEED", "WINDOW", "run"]
@@ -50,36 +49,8 @@ __all__ = ["ANGLE", "MEAN_SPEED", "SPEED", "WINDOW", "run"]
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-TILE = 64  # whitened rows that are gathered before they are summed
-ROOM = LANES + 1  # of each: columns and residual
 ON_OFFSET, ON_R = SLOPE + CURRENT_OFFSET * LANES, SLOPE + R * LANES
 ON_DELAY, ON_WINDOW = SLOPE + DELAY * LANES, SLOPE + WINDOW * LANES
-
-
-@compiled
-def _sum_up(
-    rows: Array, count: int, p: int, tile: Array, normal: Array, gradient: Array, scores: Array
-) -> None:
-    """Add the products of the gathered rows, each of the columns and then the residual."""
-    for n in range(count):  # turned, so that the sums below run along memory
-        for j in range(p):
-            tile[j, n] = rows[n * ROOM + j]
-        tile[p, n] = rows[n * ROOM + LANES]
-    tile[: p + 1, count:] = 0.0
-    residual = tile[p]
-    for j in range(p):
-        one = tile[j]
-        for i in range(j + 1):
-            other = tile[i]
-            total = 0.0
-            for n in range(TILE):
-                total += one[n] * other[n]
-            normal[j, i] += total
-        total = 0.0
-        for n in range(TILE):
-            total += one[n] * residual[n]
-        gradient[j] += total
-        scores[j] += total
 
 
 @inlined
@@ -178,14 +149,6 @@ def _correct(
         x[n] += k0 * e0 + k1 * e1
         for j in range(LANES):
             m[n * LANES + j] -= k0 * m[D0 + j] + k1 * m[D1 + j]
-
-
-@inlined
-def _robust(r: float, huber: float) -> tuple[float, float]:
-    """Return a residual's loss, and the root of the weight that it has left."""
-    if abs(r) > huber:
-        return huber * (2 * abs(r) - huber), math.sqrt(huber / abs(r))
-    return r * r, 1.0
 
 
 @compiled
@@ -345,11 +308,11 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
                     spread[5] += 1.0
             else:
                 e1 = 0.0
-            loss0, u0 = _robust(w00 * e0, huber)
-            loss1, u1 = _robust(w10 * e0 + w11 * e1, huber)
+            loss0, u0 = robust(w00 * e0, huber)
+            loss1, u1 = robust(w10 * e0 + w11 * e1, huber)
             cost[g] += loss0 + loss1
             if filled >= block_length or count > TILE - 2:
-                _sum_up(rows, count, p, tile, normal[g], gradient[g], blocks[block])
+                sum_up(rows, count, p, tile, normal[g], gradient[g], blocks[block])
                 count = 0
             if filled >= block_length:
                 block += 1
@@ -373,7 +336,7 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
                 if friction and not stuck and x[1] * direction < 0.0:
                     direction = -direction
                     turn(m, direction)
-        _sum_up(rows, count, p, tile, normal[g], gradient[g], blocks[block])
+        sum_up(rows, count, p, tile, normal[g], gradient[g], blocks[block])
         for j in range(p):
             for i in range(j):
                 normal[g, i, j] = normal[g, j, i]

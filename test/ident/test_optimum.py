@@ -1,0 +1,180 @@
+"""The compiled passes against plain numpy and scipy: the same sums, the same least squares."""
+
+from dataclasses import replace
+
+import motors
+import numpy as np
+import pytest
+from scipy.linalg import expm
+from scipy.optimize import least_squares
+from scipy.signal import lfilter
+
+from smp_motor_ident import models, replay
+from smp_motor_ident.cold import cold_fit
+from smp_motor_ident.descent import Options, first_noise
+from smp_motor_ident.elimination import cholesky_solve, damped_step, eliminate
+from smp_motor_ident.estimate import estimate
+from smp_motor_ident.experiments import prepare
+from smp_motor_ident.models import Structure
+from smp_motor_ident.noise import proper, whitening
+from smp_motor_ident.passes import gather
+from smp_motor_ident.record import Record
+
+STEP = 2e-3
+
+
+def reference(voltage, a0, a1, a2, drive0, speed0):
+    """Return the speed by the matrix exponential and scipy's filter; drive0 = a1 w'(0)."""
+    block = np.zeros((3, 3))
+    block[0], block[1, 0] = [-a1 / a2, -a0 * a1 / a2, a1 / a2], 1 / a1
+    e = expm(block * STEP)
+    den = [1.0, -e[0, 0] - e[1, 1], e[0, 0] * e[1, 1] - e[0, 1] * e[1, 0]]
+    forced = lfilter([e[1, 2], e[1, 0] * e[0, 2] - e[0, 0] * e[1, 2]], den, voltage[1:])
+    free = np.zeros(len(voltage))
+    free[:2] = speed0, e[1, 0] * drive0 + e[1, 1] * speed0 + den[1] * speed0
+    return np.concatenate([[0.0], forced]) + lfilter([1.0], den, free)
+
+
+def random_record(seed, n=3000, noise=0.5):
+    """Return voltage and noisy speed of a random motor, in motion at the beginning."""
+    rng = np.random.default_rng(seed)
+    a0 = 10 ** rng.uniform(-2, -1)
+    tau = 10 ** rng.uniform(-1.7, -0.5)
+    a1, a2 = a0 * tau, a0 * tau**2 * 10 ** rng.uniform(-2, -0.3)
+    voltage = np.repeat(rng.uniform(-10, 10, n // 20 + 1), 20)[:n]
+    speed = reference(voltage, a0, a1, a2, rng.uniform(-1, 1), rng.uniform(-20, 20))
+    speed = speed + noise * rng.standard_normal(n)
+    record = Record("motor", STEP * np.arange(n), voltage, velocity=speed)
+    return record, np.log([a0, a1, a2])
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_cold_fit_is_the_least_squares_optimum_that_scipy_finds_from_the_truth(seed):
+    record, truth = random_record(seed)
+    fit = cold_fit(prepare([record], False), Structure("linear", friction="none"), Options())
+
+    def residual(x):
+        return reference(record.voltage, *np.exp(x[:3]), *x[3:]) - record.velocity
+
+    start = np.concatenate([truth, [0.0, record.velocity[0]]])
+    found = least_squares(residual, start, x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    ours = np.concatenate([fit.z[:3], fit.initial[0, :2]])
+    cost = (residual(ours) ** 2).sum()
+    # The prior on the initial state and the last step cost less than 1e-12, measured.
+    assert cost == pytest.approx(2 * found.cost, rel=1e-9)
+    deviation = np.sqrt(np.diag(fit.covariance()))
+    np.testing.assert_array_less(np.abs(fit.z[:3] - found.x[:3]), 1e-4 * deviation)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_without_noise_the_cold_fit_returns_the_motor_itself(seed):
+    record, truth = random_record(seed, noise=0.0)
+    fit = cold_fit(prepare([record], False), Structure("linear", friction="none"), Options())
+    # Rounding of speeds of 1e2 rad/s, summed over the record.
+    np.testing.assert_allclose(fit.z[:3], truth, atol=1e-8)
+
+
+@pytest.mark.parametrize("kind", ["speed", "angle"])
+@pytest.mark.parametrize("extra", [{}, {"load": True}, {"own_load": True}, {"shape": True}])
+@pytest.mark.parametrize("order", [1, 2])
+def test_one_copy_of_the_motor_gives_the_sums_of_the_general_recursion(kind, extra, order):
+    rng = np.random.default_rng(order)
+    record = motors.record("rear_left", current=False, static_voltage=0.0, seconds=2.0)
+    lost = record.velocity.copy()
+    lost[40:47] = np.nan
+    record = replace(record, velocity=lost)
+    data = prepare([record, record.slice(90, 400)], False, kind=kind)
+    structure = Structure("x", order, "none", **(extra if order == 2 else {}))
+    z = models.from_physical(3.3, 0.064, 0.03, 1.4e-5, 5.5e-5)
+    z[models.A1] += 0.1
+    z[models.LOAD] = 0.2
+    initial = data.initial + rng.uniform(-1, 1, (2, 4))
+    noise = np.diag([0.3, 1.0])
+    z = structure.complete(z)
+    fast = gather(data, structure, z, initial, noise=noise)
+    # A bound on the residuals that none reaches sends the same through the general recursion.
+    slow = gather(data, structure, z, initial, noise=noise, huber=1e9)
+    for name in ("normal", "gradient", "cost", "spread", "scores"):
+        a, b = getattr(fast, name), getattr(slow, name)
+        # Two orders of summation of a thousand products each.
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-10 * np.abs(b).max())
+    np.testing.assert_array_equal(fast.owner, slow.owner)
+
+
+def test_elimination_is_the_schur_complement():
+    rng = np.random.default_rng(0)
+    f, own, segments = 3, 2, 4
+    factor = rng.standard_normal((segments, 20, f + own))
+    normal = np.einsum("gni,gnj->gij", factor, factor)
+    gradient = rng.standard_normal((segments, f + own))
+    whole = np.zeros((f + segments * own, f + segments * own))
+    right = np.zeros(f + segments * own)
+    for g in range(segments):
+        at = [*range(f), *range(f + g * own, f + (g + 1) * own)]
+        whole[np.ix_(at, at)] += normal[g]
+        right[at] += gradient[g]
+    common, score = np.zeros((f, f)), np.zeros(f)
+    step, gain = np.zeros((segments, own)), np.zeros((segments, own, f))
+    no_scores = np.zeros((0, f + own)), np.zeros(0, dtype=np.int64)
+    eliminate(normal, gradient, np.zeros((segments, own)), 10**9, common, score, step, gain,
+              *no_scores)  # fmt: skip
+    # The prior weighs 1e-11 of a segment's information here.
+    expected = np.linalg.inv(np.linalg.inv(whole)[:f, :f])
+    np.testing.assert_allclose(common, expected, rtol=1e-7)
+    np.testing.assert_allclose(np.linalg.solve(common, score), np.linalg.solve(whole, right)[:f])
+
+
+def test_a_column_of_which_only_rounding_is_left_counts_as_unknown():
+    common, score = np.zeros((2, 2)), np.zeros(2)
+    column = np.array([1.0, 2.0, 3.0])
+    a = np.stack([np.array([1.0, -1.0, 2.0]), column, column])
+    normal = (a @ a.T)[None]
+    normal[0, 1, 1] -= 1e-15  # the second common column is the segment's own
+    gradient = np.ones((1, 3))
+    no_scores = np.zeros((0, 3)), np.zeros(0, dtype=np.int64)
+    eliminate(normal, gradient, np.zeros((1, 1)), 10**18, common, score, np.zeros((1, 1)),
+              np.zeros((1, 1, 2)), *no_scores)  # fmt: skip
+    assert common[1, 1] == 0.0 or common[1, 1] > 1e-12
+    step, _ = damped_step(common, score, 1e-9, np.eye(11, 2), np.zeros(11),
+                          np.full(11, -np.inf), np.full(11, np.inf))  # fmt: skip
+    assert np.all(np.isfinite(step))
+
+
+def test_a_singular_system_is_solved_without_what_it_does_not_tell():
+    a, b = np.ones((2, 2)), np.ones((2, 1))
+    cholesky_solve(a, b)
+    np.testing.assert_allclose(b.ravel(), [1.0, 0.0])
+
+
+def test_current_lost_at_every_other_sample_still_gives_the_motor():
+    record = motors.record("rear_left", static_voltage=0.0, seconds=2.0)
+    amps = record.current.copy()
+    amps[::2] = np.nan
+    thinned = replace(record, current=amps, velocity=None)
+    noise = first_noise(prepare([thinned], True))
+    assert np.all(np.isfinite(noise))
+    found = estimate(thinned, "electromechanical")
+    truth = motors.truth("rear_left", 0.0)
+    # 10 mA of noise on 3 A, 600 readings: tenths of a percent.
+    assert found.value("resistance") == pytest.approx(truth["resistance"], rel=0.01)
+
+
+@pytest.mark.parametrize("broken", [np.nan, np.inf, -1.0, 0.0])
+def test_a_covariance_that_is_none_is_replaced_by_one_that_can_be(broken):
+    fixed = proper(np.array([[1.0, 3.0], [3.0, broken]]))
+    assert np.all(np.linalg.eigvalsh(fixed) > 0)
+    w = whitening(fixed)[:, :2]
+    np.testing.assert_allclose(w @ fixed @ w.T, np.eye(2), atol=1e-12)  # rounding
+
+
+def test_information_of_a_motor_that_never_moves_is_finite():
+    n = 400
+    record = Record("motor", 0.01 * np.arange(n), np.zeros(n), velocity=np.zeros(n))
+    data = prepare([record], False)
+    structure = Structure("x", friction="none", load=True)
+    fit = cold_fit(
+        prepare([random_record(0)[0]], False), Structure("x", friction="none"), Options()
+    )
+    gain, step, covariance = replay.promise(data, replace(fit, initial=data.initial), structure)
+    assert np.isfinite(gain)
+    assert np.all(np.isfinite(step)) and np.all(np.isfinite(covariance))
