@@ -5,7 +5,7 @@ signals: the speed sent once more through the motor (``W``, with ``Q = R i`` of 
 ``D = te Q'``), the two free decays, and a constant.  Two recursions of second order are run
 therefore, whatever the number of parameters; sums of squares and products are gathered tile
 by tile in the basis, and mapped to the parameters once per segment.
-Derivation: docs/derivations.md, section 7.
+Derivation: docs/derivations.md, section 6.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Small dense algebra of a fit, compiled: at a few parameters numpy's calls cost more than it.
 
-Derivation: docs/derivations.md, section 8.
+Derivation: docs/derivations.md, sections 6 and 8.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """What happens inside one interval: sliding, reversal, sticking and breaking loose.
 
 Coulomb switching and sticking are located inside the interval; the sensitivities jump there.
-Derivation: docs/derivations.md, sections 4 and 5.
+Derivation: docs/derivations.md, section 5.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 Each row of 16 lanes holds one quantity for all columns of the problem.  One array, and rows at
 fixed places in it, let the compiler see that they do not overlap: it then advances all columns
 at once with the processor's vector instructions.
-Derivation: docs/derivations.md, section 7.
+Derivation: docs/derivations.md, section 4.
 """
 
 from __future__ import annotations

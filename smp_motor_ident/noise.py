@@ -1,6 +1,6 @@
 """What the residuals tell of the noise: innovation gain, covariance, whitening, deviance.
 
-Derivation: docs/derivations.md, sections 6 and 8.
+Derivation: docs/derivations.md, sections 6 and 7.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """One pass over the data: which compiled loop, its memory, and the normal equations after it.
 
-Derivation: docs/derivations.md, sections 7 and 8.
+Derivation: docs/derivations.md, sections 6 to 8.
 """
 
 from __future__ import annotations

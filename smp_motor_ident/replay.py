@@ -1,6 +1,6 @@
 """What a fitted motor says about data: predictions, information, steps, states of other data.
 
-Derivation: docs/derivations.md, sections 7 to 9.
+Derivation: docs/derivations.md, sections 6 to 9.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The angle a window ago, for a speed that is a mean over it.
 
-Derivation: docs/derivations.md, section 6.
+Derivation: docs/derivations.md, section 4.
 """
 
 from __future__ import annotations
