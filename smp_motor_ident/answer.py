@@ -42,7 +42,7 @@ class Answer:
     loose: tuple[str, ...] = field(default=())
 
 
-def answer(fit: Fit, fixed: Mapping[str, float]) -> Answer:
+def answer(fit: Fit, fixed: Mapping[str, float], unseen_friction: float = 0.0) -> Answer:
     """Turn a fit into quantities.
 
     Parameters
@@ -51,6 +51,8 @@ def answer(fit: Fit, fixed: Mapping[str, float]) -> Answer:
         Of any structure.
     fixed : mapping of str to float
         What the user gave.
+    unseen_friction : float
+        Standard deviation of a friction that the structure leaves out [V].
 
     Returns
     -------
@@ -73,6 +75,8 @@ def answer(fit: Fit, fixed: Mapping[str, float]) -> Answer:
     names = tuple(values)
     stacked = np.array([rows[n] for n in names]).reshape(len(names), matrix.shape[1])
     joint = stacked @ cov @ stacked.T
+    if unseen_friction > 0:
+        joint += np.diag(np.square([_friction(n, fit) * unseen_friction for n in names]))
     std = np.sqrt(np.maximum(np.diag(joint), 0.0))
     spread = dict(zip(names, std))
     combinations = {n: _quantity(n, values[n], spread[n]) for n in reported}
@@ -106,6 +110,14 @@ def answer(fit: Fit, fixed: Mapping[str, float]) -> Answer:
         joint[np.ix_(keep, keep)],
         tuple(loose),
     )
+
+
+def _friction(name: str, fit: Fit) -> float:
+    """Return how much of a quantity a volt of Coulomb friction is."""
+    if name == "coulomb_friction" and fit.structure.current:
+        values, _ = models.physical(fit.z)
+        return values["motor_constant"] / values["resistance"]
+    return float(name == "static_voltage")
 
 
 def _reported(structure: models.Structure) -> list[str]:

@@ -19,7 +19,9 @@ from smp_motor_ident.experiments import Experiments, between_samples, prepare
 from smp_motor_ident.fit import Fit, Prior
 from smp_motor_ident.horizon import extend, grow
 from smp_motor_ident.models import MODELS, PHYSICAL, Structure
-from smp_motor_ident.quantisation import blurred, widened
+from smp_motor_ident.nuisance import blurred, unseen_friction
+from smp_motor_ident.profile import profiled
+from smp_motor_ident.quantisation import widened
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import Candidate, Estimate, FitPercent
 from smp_motor_ident.screening import screen
@@ -110,8 +112,9 @@ def estimate(
         )
     chosen = _constrain(_for_final(data, rungs[-1].fit), rungs[-1].fit, options, known, bounds)
     final = _for_final(data, chosen)
-    chosen = blurred(final, widened(final, chosen), _instants(group, hold))
-    result = answer(chosen, known)
+    chosen = profiled(final, widened(final, chosen), options)
+    chosen, unseen = unseen_friction(final, blurred(final, chosen, _instants(group, hold)))
+    result = answer(chosen, known, unseen)
     fitted = validate.speed_fit(group, final, chosen)
     _refuse(group, chosen, result, fitted)
     _refuse_offset(group, chosen)

@@ -1,4 +1,4 @@
-"""How far counts and instants that are not exact can mislead an estimate.
+"""How far counts that are not exact can mislead an estimate.
 
 Quantisation is not noise: where the motion repeats, so does its error, and more samples do
 not average it away.  The fitted motor is replayed with the counter's zero at random places;
@@ -13,8 +13,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident import models, replay
 from smp_motor_ident import recursion as rc
+from smp_motor_ident import replay
 from smp_motor_ident.experiments import Experiments
 from smp_motor_ident.fit import Fit
 
@@ -96,34 +96,3 @@ def _errors(
         counts[np.isnan(data.output)] = np.nan
         errors.append(replay.one_step(replace(data, output=counts, current=current), fit))
     return np.array(errors)
-
-
-def blurred(data: Experiments, fit: Fit, instant: float) -> Fit:
-    """Return the fit with its covariance widened by what the input's instants leave open.
-
-    Parameters
-    ----------
-    data : Experiments
-        What was fitted.
-    fit : Fit
-        Without delay among its coordinates.
-    instant : float
-        Standard deviation of a common error of the input's instants [s].
-
-    Returns
-    -------
-    Fit
-        With the covariance of the estimate's answer to such an error added: ``G instant^2 G'``
-        where ``G = N^-1 N_delay``.
-    """
-    structure = fit.structure
-    if instant <= 0 or structure.delay or "delay" in structure.held or not structure.free():
-        return fit
-    both = replay.information(data, replace(fit, structure=structure.with_(delay=True)))
-    keep = [i for i, c in enumerate(structure.with_(delay=True).free()) if c != models.DELAY]
-    late = structure.with_(delay=True).free().index(models.DELAY)
-    own = both[np.ix_(keep, keep)]
-    scale = np.sqrt(np.maximum(np.diag(own), 1e-300))
-    inverse = np.linalg.pinv(own / np.outer(scale, scale), rcond=1e-12, hermitian=True)
-    answer = inverse @ (both[keep, late] / scale) / scale
-    return replace(fit, blur=instant**2 * np.outer(answer, answer))
