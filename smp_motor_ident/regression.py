@@ -270,7 +270,7 @@ def search(
     angle: bool,
     friction: bool,
 ) -> Array:
-    """Return coefficients by least squares and twice by instruments, for several cut-offs.
+    """Return coefficients by least squares and then by instruments, for several cut-offs.
 
     Parameters
     ----------
@@ -303,7 +303,7 @@ def search(
     count = 0
     for cutoff in cutoffs:
         theta: Array = np.zeros(m)
-        for trial in range(3):
+        for trial in range(2):
             sums = np.zeros((m, m + 3))
             for g in range(steps.shape[0]):
                 a, b, step = bounds[g], bounds[g + 1], steps[g]
@@ -319,7 +319,7 @@ def search(
                 tools = columns if trial == 0 else answers
                 instrumental(columns, tools, right, a + skip, b, sums)
             theta = solved(sums)
-            if trial == 2 or not motor_like(theta, order):
+            if not motor_like(theta, order):
                 break
             found[count, :m] = theta
             count += 1

@@ -1,4 +1,4 @@
-"""A start from cold: state-variable filters, linear least squares, two instrumental steps.
+"""A start from cold: state-variable filters, linear least squares, one instrumental step.
 
 Derivation: docs/derivations.md, section 10.
 """
