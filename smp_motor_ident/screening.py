@@ -14,6 +14,7 @@ Array = NDArray[np.float64]
 
 FEWEST = 40
 MOST_LOST = 0.3
+METER = 0.01  # of the supply, or of a level: what a voltmeter may scatter
 
 
 def screen(records: Sequence[Record]) -> list[str]:
@@ -91,14 +92,22 @@ def _lost(record: Record) -> list[str]:
 
 def _excitation(records: Sequence[Record], where: str) -> None:
     largest = max(float(np.abs(r.voltage).max()) for r in records)
-    if largest == 0.0:
+    supply = max(r.hardware.supply_voltage or 0.0 for r in records)
+    if largest <= METER * supply:
         raise InsufficientExcitationError(
-            f"{where}: no excitation, the voltage is 0 V throughout; drive the motor with a "
-            "sine, square or Fourier voltage while recording"
+            f"{where}: no excitation, the voltage stays within {largest:.3g} V of 0 V; drive the "
+            "motor with a sine, square or Fourier voltage while recording"
         )
-    if all(float(np.ptp(r.voltage)) < 1e-3 * largest for r in records):
+    # What a voltmeter scatters around a level is no excitation; a step is, for it is no scatter.
+    levels = [float(np.mean(r.voltage)) for r in records]
+    still = [
+        float(np.std(r.voltage)) < METER * abs(level)
+        and float(np.ptp(r.voltage)) < 10 * METER * abs(level)
+        for r, level in zip(records, levels, strict=True)
+    ]
+    if all(still) and float(np.ptp(levels)) < METER * abs(levels[0]):
         raise InsufficientExcitationError(
-            f"{where}: the voltage is constant at {records[0].voltage[0]:.4g} V; a constant "
+            f"{where}: the voltage is constant at {levels[0]:.4g} V; a constant "
             "input cannot tell dynamics: record a square or Fourier voltage in both directions"
         )
 
@@ -132,41 +141,47 @@ def measured_speed(record: Record) -> Array:
 
 
 def _ratio(record: Record) -> None:
-    """Hold counts against the recorded velocity: their ratio is one, or something is wrong."""
-    if record.count is None or record.velocity is None:
-        return
-    if not record.hardware.counts_per_revolution:
-        return
+    """Hold what tells the motion against one another: their ratio is one, or something is wrong."""
+    per_turn = record.hardware.counts_per_revolution
+    angle, what = record.position, "position"
+    if record.count is not None and per_turn:
+        angle = np.asarray(record.count * (2 * np.pi / per_turn), dtype=np.float64)
+        what = "encoder counts"
+        if record.position is not None:
+            _compare(record, angle, what, record.position, "position")
+    if angle is not None and record.velocity is not None:
+        charge = np.cumsum(record.velocity[1:] * np.diff(record.time))
+        _compare(record, angle, what, np.concatenate([[0.0], charge]), "velocity")
+
+
+def _compare(record: Record, angle: Array, what: str, told: Array, other: str) -> None:
     where = _where([record])
-    angle = record.count * (2 * np.pi / record.hardware.counts_per_revolution)
     lag = max(1, min(10, len(record) // 10))
     dt = record.time[lag:] - record.time[:-lag]
-    counted = (angle[lag:] - angle[:-lag]) / dt
-    charge = np.concatenate([[0.0], np.cumsum(record.velocity[1:] * np.diff(record.time))])
-    told = (charge[lag:] - charge[:-lag]) / dt
-    ok = np.isfinite(told) & np.isfinite(counted)
+    a, b = (angle[lag:] - angle[:-lag]) / dt, (told[lag:] - told[:-lag]) / dt
+    ok = np.isfinite(a) & np.isfinite(b)
     for s in record.starts[1:]:
         ok[max(0, s - lag) : s] = False
-    a, b = counted[ok], told[ok]
+    a, b = a[ok], b[ok]
     if a.size < 20 or b.std() == 0:
         return
     if not np.any(a):
         raise SignalError(
-            f"{where}: dead encoder, the count stays at {record.count[0]} while the velocity "
+            f"{where}: dead encoder, the {what} stays while the {other} "
             f"reaches {np.abs(b).max():.3g} rad/s; check the encoder's cable"
         )
     slope = float(a @ b / (a @ a))
     together = float(a @ b / np.sqrt((a @ a) * (b @ b)))
     if together < -0.5:
         raise SignalError(
-            f"{where}: encoder counts run against the velocity (swapped sign); exchange the "
-            "encoder's channels A and B or the sign of the velocity"
+            f"{where}: {what} runs against the {other} (swapped sign); exchange the "
+            f"encoder's channels A and B or the sign of the {other}"
         )
     if together > 0.9 and not 0.95 < slope < 1.05:
         raise SignalError(
-            f"{where}: velocity is {slope:.4g} times what the encoder counts say; wrong gear "
+            f"{where}: {other} is {slope:.4g} times what the {what} says; wrong gear "
             f"ratio (now {record.hardware.gear_ratio:g}) or counts per revolution (now "
-            f"{record.hardware.counts_per_revolution:g}), correct the motor description"
+            f"{record.hardware.counts_per_revolution or 0:g}), correct the motor description"
         )
 
 

@@ -1,0 +1,82 @@
+"""Intervals say what the data tell: neither what a counter repeats nor what a model leaves out."""
+
+from dataclasses import replace
+
+import motors
+import numpy as np
+
+from smp_motor_control.excitation import Fourier
+from smp_motor_ident import recursion as rc
+from smp_motor_ident.estimate import estimate
+from smp_motor_ident.experiments import prepare
+from smp_motor_ident.identifiability import what_next
+from smp_motor_ident.models import PHYSICAL
+from smp_motor_ident.thinning import thinned
+
+
+def test_a_friction_that_does_not_show_is_nothing_within_an_interval():
+    recording = motors.record("rear_left", current=False, static_voltage=0.0, torque_noise=0.5)
+    friction = estimate(recording).combinations["static_voltage"]
+    # 0.5 V of torque noise over 3000 samples leave hundredths of a volt open, not nothing.
+    assert 1e-3 < friction.std < 0.1
+    assert friction.ci95[0] == 0.0
+    assert friction.value < 3 * friction.std
+
+
+def test_two_exact_speeds_widen_the_interval_where_the_counter_repeats_itself():
+    # A square wave in step with the sampling: the same counts again and again.
+    t = np.arange(2000) / 200.0
+    square = 12.0 * np.sign(np.sin(2 * np.pi * (t + 1e-6)))
+    wide = estimate(motors.record("front_left", voltage=square, kinds=("x",) * 2))
+    wander = square * (1 + 0.05 * np.sin(2 * np.pi * 0.11 * t))
+    narrow = estimate(motors.record("front_left", voltage=wander, kinds=("x",) * 2))
+    truth = motors.truth("front_left", 0.3)["dc_gain"]
+    for e in (wide, narrow):
+        assert abs(e.value("dc_gain") - truth) < 4 * e.combinations["dc_gain"].std
+    assert wide.combinations["dc_gain"].std > 1.3 * narrow.combinations["dc_gain"].std
+
+
+def test_thinning_keeps_the_charge_and_the_jumps_of_the_input():
+    recording = motors.record(
+        "rear_left", current=False, rate=5000.0, seconds=2.0, kinds=("square",)
+    )
+    few = replace(recording.hardware, counts_per_revolution=None)
+    angle = recording.count * motors.QUANTUM
+    data = prepare(
+        [replace(recording, count=None, velocity=None, position=angle, hardware=few)], False
+    )
+    thin = thinned(data)
+    assert data.kind == rc.ANGLE
+    assert thin.size < data.size / 4
+    charge = [float(np.sum(d.section_value[1:] * np.diff(d.section_end))) for d in (data, thin)]
+    # The last sample that is kept ends a few samples, of 10 V each, before the last one.
+    assert abs(charge[0] - charge[1]) <= 10.0 * (data.time[-1] - thin.time[-1]) + 1e-9
+    levels = [set(np.round(d.section_value, 9)) for d in (data, thin)]
+    assert levels[0] == levels[1]
+
+
+def test_an_oversampled_motor_is_recovered_without_current():
+    recording = motors.record(
+        "rear_left", current=False, rate=5000.0, seconds=1.5, torque_noise=0.5
+    )
+    result = estimate(recording)
+    truth = motors.truth("rear_left", 0.3)
+    for name in ("dc_gain", "time_constant", "static_voltage"):
+        q = result.combinations[name]
+        assert abs(q.value - truth[name]) < 4 * q.std, name  # as in test_estimate
+
+
+def test_following_a_proposal_brings_what_it_promised():
+    # front_right: K is 3 % of what limits the speed, which voltage and speed do not tell.
+    first = estimate(motors.record("front_right", current=False))
+    proposal = what_next(first, accuracy=0.05)
+    t = np.arange(int(proposal.duration * 200.0)) / 200.0
+    tones = Fourier(
+        amplitude=proposal.amplitude, lowest=proposal.band[0], highest=proposal.band[1], tones=16
+    )
+    then = estimate(motors.record("front_right", voltage=tones(t), seconds=proposal.duration))
+    truth = motors.truth("front_right", 0.3)
+    for name in PHYSICAL:
+        q = then.parameters[name]
+        # The tones are not the trial's own, and quantisation repeats a little: half more.
+        assert q.std < 1.5 * proposal.relative_std[name] * truth[name], name
