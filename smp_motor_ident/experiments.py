@@ -170,12 +170,18 @@ def _repeats(count: Integers, starts: Sequence[int]) -> NDArray[np.bool_]:
     to the fraction of a count that is unknown.  Of a long run the sample in the middle stays,
     which is late in neither direction, and of one that begins a segment the first.
     """
-    turned = np.flatnonzero(np.diff(count)) + 1
-    begin = np.unique(np.concatenate(([0], turned, np.asarray(starts, dtype=np.int64))))
+    first = np.zeros(count.size, dtype=np.bool_)  # of each segment
+    first[[0, *starts]] = True
+    begins = first.copy()
+    begins[1:] |= count[1:] != count[:-1]
+    begin = np.flatnonzero(begins)
     length = np.diff(np.append(begin, count.size))
-    repeats = np.repeat(length >= REST, length)
-    stays = begin + np.where(np.isin(begin, starts), 0, length // 2)
-    repeats[stays] = False
+    rests = length >= REST
+    if not rests.any():
+        return np.zeros(count.size, dtype=np.bool_)
+    repeats = np.repeat(rests, length)
+    stays = begin[rests]
+    repeats[stays + np.where(first[stays], 0, length[rests] // 2)] = False
     return repeats
 
 
