@@ -218,23 +218,26 @@ def _saturation(record: Record) -> None:
 
 
 def _frozen(record: Record) -> None:
-    """Refuse an encoder that stops counting half-way while the voltage goes on."""
-    if record.count is None or len(record) < 200:
-        return
-    moving = np.flatnonzero(np.diff(record.count)) + 1
-    edges = np.concatenate([[0], moving, [len(record) - 1]])
-    longest = int(np.argmax(np.diff(edges)))
-    a, b = int(edges[longest]), int(edges[longest + 1])
-    if b - a < max(100, 0.1 * len(record)):
-        return
-    still, rest = record.voltage[a:b], np.delete(record.voltage, np.arange(a, b))
-    if np.abs(still).mean() > 0.5 * np.abs(rest).mean():
-        raise SignalError(
-            f"{_where([record])}: dead encoder, the count stays at {record.count[a]} from "
-            f"t = {record.time[a]:.4g} s to {record.time[b]:.4g} s while the voltage reaches "
-            f"{np.abs(still).max():.3g} V; check the encoder's cable, or that nothing "
-            "blocks the motor"
-        )
+    """Refuse a sensor that stops half-way while the voltage goes on."""
+    for name in ("count", "position", "velocity"):
+        values = getattr(record, name)
+        if values is None or len(record) < 200:
+            continue
+        # A speed may well be constant; only at zero does it say that nothing turns.
+        moves = values != 0 if name == "velocity" else np.diff(values, prepend=np.nan) != 0
+        edges = np.concatenate([[0], np.flatnonzero(moves), [len(record) - 1]])
+        longest = int(np.argmax(np.diff(edges)))
+        a, b = int(edges[longest]), int(edges[longest + 1])
+        if b - a < max(100, 0.1 * len(record)):
+            continue
+        still, rest = record.voltage[a + 1 : b], np.delete(record.voltage, np.arange(a, b))
+        if np.abs(still).mean() > 0.5 * np.abs(rest).mean():
+            raise SignalError(
+                f"{_where([record])}: dead encoder, the {name} stays at {values[a + 1]:.6g} from "
+                f"t = {record.time[a]:.4g} s to {record.time[b]:.4g} s while the voltage reaches "
+                f"{np.abs(still).max():.3g} V; check the encoder's cable, or that nothing "
+                "blocks the motor"
+            )
 
 
 def _motion(records: Sequence[Record], where: str) -> None:
