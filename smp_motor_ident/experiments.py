@@ -18,6 +18,8 @@ EDGE = 0.02
 """Part of an interval next to its ends in which a switch counts as one at the sample."""
 REST = 10
 """Samples after which an unchanged count is a standstill."""
+JITTER = 2_000
+"""Samples that tell whether the stamps jitter."""
 FEW = 2_000
 """Samples that tell whether a speed repeats its values."""
 
@@ -61,6 +63,13 @@ class Experiments:
         """Whether the input changes at the samples, one value for each."""
         where = [a.__array_interface__["data"][0] for a in (self.section_end, self.time)]
         return bool(where[0] == where[1])
+
+    @cached_property
+    def jittered(self) -> float:
+        """The usual interval [s] where the stamps jitter around it, else 0."""
+        steps = np.diff(self.time[:JITTER])
+        off = np.abs(steps - self.step) > 1e-6 * self.step
+        return self.step if np.mean(off) > 0.2 else 0.0
 
     @property
     def size(self) -> int:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident._compile import compiled, inlined
+from smp_motor_ident.interpolation import NODES, POINTS, evaluate, expand, half_range
 from smp_motor_ident.propagator import ROW, WIDTH, first_order, second_order
 
 Array = NDArray[np.float64]
@@ -28,8 +29,17 @@ SIZE = WHOLE + ROW
 SLOTS = 4  # propagators that are kept, one more is scratch
 SLOT = ROW * LANES + ROW
 CACHE = (SLOTS + 1) * SLOT
-# Beside the propagators: their lengths [s], the next to be overwritten, the length at hand.
-NEXT, ACTIVE, MARKS = SLOTS, SLOTS + 1, SLOTS + 2
+# Beside the propagators: their lengths [s], the next to be overwritten, the length at hand,
+# and the middle and half the range of the lengths that are tabulated.
+NEXT, ACTIVE, MIDDLE, HALF, MARKS = range(SLOTS, SLOTS + 5)
+
+
+@compiled
+def _aligned(size: int) -> Array:
+    """Return zeros that begin where a line of the processor's cache does."""
+    room = np.zeros(size + 8)
+    shift = (-(int(room.ctypes.data) // 8)) % 8
+    return room[shift : shift + size]
 
 
 @compiled
@@ -80,7 +90,8 @@ def activate(m: Array, cache: Array, marks: Array, slot: int) -> None:
     m, cache : ndarray
         As in `fill`.
     marks : ndarray, shape (MARKS,)
-        Lengths of the slots [s], the next to be overwritten, the length at hand.
+        Lengths of the slots [s], the next to be overwritten, the length at hand, the table's
+        range.
     slot : int
         Which.
     """
@@ -91,10 +102,47 @@ def activate(m: Array, cache: Array, marks: Array, slot: int) -> None:
 
 
 @compiled
+def tabulate(
+    step: float, par: Array, m: Array, cache: Array, marks: Array, scratch: Array
+) -> Array:
+    """Return a table of the propagators around a usual interval.
+
+    Parameters
+    ----------
+    step : float
+        Usual interval [s] where the stamps jitter, else 0.
+    par, m, cache, marks, scratch
+        As in `fill` and `activate`; the range is put into ``marks``.
+
+    Returns
+    -------
+    ndarray, shape (NODES * SLOT,) or (0,)
+        For `interpolation.evaluate`.
+    """
+    half = half_range(step, par[0], par[1], par[2], par[3])
+    marks[MIDDLE], marks[HALF] = step, half
+    if half == 0.0:
+        return np.zeros(0)
+    table, values = _aligned(NODES * SLOT), np.empty(NODES * SLOT)
+    for n in range(NODES):
+        fill(step + half * POINTS[n], par, m, cache, SLOTS, scratch)
+        values[n * SLOT : (n + 1) * SLOT] = cache[SLOTS * SLOT :]
+    expand(values, table)
+    return table
+
+
+@compiled
 def prepare_slide(
-    h: float, slack: float, par: Array, m: Array, cache: Array, marks: Array, scratch: Array
+    h: float,
+    slack: float,
+    par: Array,
+    m: Array,
+    cache: Array,
+    marks: Array,
+    table: Array,
+    scratch: Array,
 ) -> None:
-    """Have the propagator over h at hand, computed or kept.
+    """Have the propagator over h at hand: tabulated, kept, or computed.
 
     Parameters
     ----------
@@ -102,9 +150,17 @@ def prepare_slide(
         Length of the interval [s].
     slack : float
         By how much another length may differ [s].
-    par, m, cache, marks, scratch
+    par, m, cache, marks
         As in `fill` and `activate`.
+    table : ndarray
+        Of `tabulate`.
+    scratch : ndarray, shape (WIDTH,)
+        Overwritten.
     """
+    if table.shape[0] > 0 and abs(h - marks[MIDDLE]) <= marks[HALF]:
+        evaluate(table, (h - marks[MIDDLE]) / marks[HALF], m, FORCED)
+        marks[ACTIVE] = h
+        return
     for n in range(SLOTS):
         if abs(marks[n] - h) <= slack:
             activate(m, cache, marks, n)
@@ -219,14 +275,6 @@ def turn(m: Array, direction: float) -> None:
     """
     for j in range(LANES):
         m[DF + j] = m[FORWARD + j] if direction > 0.0 else m[BACKWARD + j]
-
-
-@compiled
-def _aligned(size: int) -> Array:
-    """Return zeros that begin where a line of the processor's cache does."""
-    room = np.zeros(size + 8)
-    shift = (-(int(room.ctypes.data) // 8)) % 8
-    return room[shift : shift + size]
 
 
 @compiled

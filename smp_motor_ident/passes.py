@@ -13,11 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident import models, recursion
-from smp_motor_ident.cascade import run_sliding, squares_sliding
+from smp_motor_ident.cascade import run_sliding
 from smp_motor_ident.elimination import eliminate
 from smp_motor_ident.experiments import Experiments
 from smp_motor_ident.models import Structure, to_internal
 from smp_motor_ident.noise import whitening
+from smp_motor_ident.sliding import squares_sliding
 
 Array = NDArray[np.float64]
 
@@ -174,14 +175,21 @@ def gather(
     if predicted is None and _slides(data, structure, z, gain, huber):
         if p == 0:
             spread[0], spread[3] = squares_sliding(
-                data.time, data.starts, data.section_value, data.output, angle, par, initial
+                data.time,
+                data.starts,
+                data.section_value,
+                data.output,
+                angle,
+                par,
+                initial,
+                data.jittered,
             )
             used = 0
         else:
             used = run_sliding(
                 data.time, data.starts, data.section_value, data.output, angle, par, slope,
-                initial, own, 1 / math.sqrt(noise[0, 0]), normal, gradient, cost, spread, length,
-                scores, owner,
+                initial, own, data.jittered, 1 / math.sqrt(noise[0, 0]), normal, gradient, cost,
+                spread, length, scores, owner,
             )  # fmt: skip
     else:
         used = recursion.run(
@@ -189,7 +197,7 @@ def gather(
             data.output, data.current, data.kind, structure.friction != "none", par, slope,
             initial, own, gain, whitening(noise), huber, normal, gradient, cost, spread,
             length, scores, owner, _ring(data, par, p),
-            np.zeros((0, 3)) if predicted is None else predicted,
+            np.zeros((0, 3)) if predicted is None else predicted, data.jittered,
         )  # fmt: skip
     return Sums(normal, gradient, cost, spread, scores[:used], owner[:used])
 

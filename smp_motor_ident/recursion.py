@@ -39,6 +39,7 @@ from smp_motor_ident.lanes import (
     prepare_slide,
     slide_columns,
     slide_state,
+    tabulate,
     turn,
 )
 from smp_motor_ident.sums import ROOM, TILE, robust, sum_up
@@ -66,6 +67,7 @@ def _move(
     m: Array,
     cache: Array,
     marks: Array,
+    table: Array,
     scratch: Array,
     columns: bool,
 ) -> float:
@@ -73,7 +75,7 @@ def _move(
     if direction == STUCK:
         return advance(h, v, direction, load, par, x, m, cache, marks, scratch)
     if abs(marks[ACTIVE] - h) > slack:
-        prepare_slide(h, slack, par, m, cache, marks, scratch)
+        prepare_slide(h, slack, par, m, cache, marks, table, scratch)
     f = load
     if friction:
         f += par[VC_PLUS] if direction > 0.0 else -par[VC_MINUS]
@@ -178,6 +180,7 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
     block_segment: Integers,
     ring: Array,
     predicted: Array,
+    usual: float,
 ) -> int:
     """Run over all segments; fill the sums in place.
 
@@ -220,6 +223,8 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
         Memory for the window of MEAN_SPEED; shape (0, 0) otherwise.
     predicted : ndarray, shape (n, 3)
         Speed, output and current as predicted; shape (0, 3) where not wanted.
+    usual : float
+        Usual interval [s] where the stamps jitter; 0 where they do not.
 
     Returns
     -------
@@ -234,6 +239,7 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
     delay = par[DELAY]
     late = bool(np.any(slope[DELAY] != 0.0))
     m, cache, marks, scratch = begin(slope, local, friction)
+    table = tabulate(usual, par, m, cache, marks, scratch)
     x, past, rows = np.zeros(3), np.zeros(1 + p), np.zeros(TILE * ROOM)
     tile = np.zeros((ROOM, TILE))
     spread[:] = 0.0
@@ -275,8 +281,8 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
                 if h > 0.0:
                     slack = 1e-9 * h + 1e-15 * abs(target)
                     direction = _move(
-                        h, slack, v, direction, load, friction, par, x, m, cache, marks, scratch,
-                        columns,
+                        h, slack, v, direction, load, friction, par, x, m, cache, marks, table,
+                        scratch, columns,
                     )  # fmt: skip
                 now = end
                 if section < limit and change <= target + 1e-9 * (target - time[k - 1]):

@@ -178,3 +178,21 @@ def test_information_of_a_motor_that_never_moves_is_finite():
     gain, step, covariance = replay.promise(data, replace(fit, initial=data.initial), structure)
     assert np.isfinite(gain)
     assert np.all(np.isfinite(step)) and np.all(np.isfinite(covariance))
+
+
+@pytest.mark.parametrize("friction", ["none", "symmetric"])
+@pytest.mark.parametrize("order", [1, 2])
+def test_tabulated_propagators_of_jittered_stamps_are_the_exact_ones(order, friction):
+    record = motors.record("rear_left", current=False, seconds=2.0, rate=1000.0)
+    rng = np.random.default_rng(0)
+    late = np.sort(record.time + 1e-3 * rng.uniform(-0.09, 0.09, len(record)))
+    data = prepare([replace(record, time=late - late[0])], False, kind="speed")
+    assert data.jittered > 0
+    exact = replace(data)
+    exact.__dict__["jittered"] = 0.0
+    structure = Structure("x", order, friction)
+    z = structure.complete(models.from_physical(3.3, 0.064, 0.03, 1.4e-5, 5.5e-5, 2e-3))
+    a, b = (gather(d, structure, z, data.initial, noise=np.eye(2)) for d in (data, exact))
+    # The polynomial is exact to 1e-13; sums cancel by some orders more.
+    np.testing.assert_allclose(a.cost, b.cost, rtol=1e-9)
+    np.testing.assert_allclose(a.normal, b.normal, rtol=1e-8, atol=1e-10 * np.abs(b.normal).max())
