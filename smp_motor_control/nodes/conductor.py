@@ -35,14 +35,13 @@ import rclpy
 from geometry_msgs.msg import TwistStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
-from rcl_interfaces.msg import ParameterType
-from rcl_interfaces.srv import GetParameters, SetParametersAtomically
+from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from smp_interfaces.msg import MotorState
+from smp_motor_control.nodes.asking import SET, Asker, AskError
 
 PERIOD = 0.02
 """Interval [s] between two ``cmd_vel`` messages while driving."""
@@ -53,6 +52,10 @@ _TRANSITIONS = {
     "activate": Transition.TRANSITION_ACTIVATE,
     "deactivate": Transition.TRANSITION_DEACTIVATE,
 }
+
+
+PATIENCE = 10.0
+"""Longest wait for a service [s]."""
 
 
 class RequestError(Exception):
@@ -67,7 +70,7 @@ class Conductor(Node):
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self)
         self._cmd_vel = self.create_publisher(TwistStamped, "/cmd_vel", 1)
-        self._service_clients: dict[str, Any] = {}
+        self._asker = Asker(self, self._until, PATIENCE)
 
     def answer(self, request: dict[str, Any]) -> dict[str, Any]:
         """Do one request.
@@ -89,7 +92,7 @@ class Conductor(Node):
             return {"error": f"no such request: {name!r}"}
         try:
             return work(**arguments) or {}
-        except RequestError as error:
+        except (RequestError, AskError) as error:
             return {"error": str(error)}
         except Exception as error:  # an answer must come, or the tool waits for ever
             return {"error": f"{name}: {type(error).__name__}: {error}"}
@@ -121,7 +124,7 @@ class Conductor(Node):
     def do_wait_for_nodes(self, nodes: Sequence[str], timeout: float) -> None:
         """Wait until every node can be asked for its parameters."""
         for node in nodes:
-            client = self._client(SetParametersAtomically, f"{node}/set_parameters_atomically")
+            client = self._asker.client(SetParametersAtomically, f"{node}/{SET}")
             if not self._until(client.service_is_ready, timeout):
                 raise RequestError(f"{node} does not answer within {timeout:.0f} s")
 
@@ -141,37 +144,26 @@ class Conductor(Node):
     def do_change_state(self, node: str, transition: str) -> None:
         """Ask a lifecycle node for a transition."""
         request = ChangeState.Request(transition=Transition(id=_TRANSITIONS[transition]))
-        if not self._call(ChangeState, f"{node}/change_state", request).success:
+        # Asked once only: what was done already would be refused.
+        name = f"{node}/change_state"
+        if not self._asker.ask_all(ChangeState, {name: request}, again=PATIENCE)[name].success:
             raise RequestError(f"{node} refused to {transition}")
 
     def do_get_state(self, node: str, timeout: float) -> dict[str, Any]:
         """Return a lifecycle node's state; empty where there is no such node."""
-        client = self._client(GetState, f"{node}/get_state")
-        if not self._until(client.service_is_ready, timeout):
+        name = f"{node}/get_state"
+        if not self._until(self._asker.client(GetState, name).service_is_ready, timeout):
             return {"state": ""}
-        answer = self._call(GetState, f"{node}/get_state", GetState.Request())
+        answer = self._asker.ask_all(GetState, {name: GetState.Request()})[name]
         return {"state": answer.current_state.label}
 
     def do_set_parameters(self, node: str, parameters: dict[str, Any]) -> None:
         """Set all parameters at once, or none."""
-        request = SetParametersAtomically.Request(
-            parameters=[Parameter(n, value=v).to_parameter_msg() for n, v in parameters.items()]
-        )
-        name = f"{node}/set_parameters_atomically"
-        result = self._call(SetParametersAtomically, name, request).result
-        if not result.successful:
-            raise RequestError(f"{node} refused the parameters: {result.reason}")
+        self._asker.set_parameters({node: parameters})
 
     def do_get_parameters(self, node: str, names: Sequence[str]) -> dict[str, Any]:
         """Read parameters; those that are not set are left out."""
-        request = GetParameters.Request(names=list(names))
-        values = self._call(GetParameters, f"{node}/get_parameters", request).values
-        known = {
-            name: parameter_value_to_python(value)
-            for name, value in zip(names, values, strict=False)
-            if value.type != ParameterType.PARAMETER_NOT_SET
-        }
-        return {"parameters": known}
+        return {"parameters": self._asker.get_parameters({node: names})[node]}
 
     def do_drive(self, segments: Sequence[tuple[str, float, float, float]]) -> dict[str, Any]:
         """Drive segment after segment, and stop at the end whatever happens."""
@@ -203,20 +195,6 @@ class Conductor(Node):
         message.header.frame_id = "base_link"
         message.twist.linear.x, message.twist.angular.z = float(linear), float(angular)
         self._cmd_vel.publish(message)
-
-    def _client(self, kind: Any, name: str) -> Any:
-        if name not in self._service_clients:
-            self._service_clients[name] = self.create_client(kind, name)
-        return self._service_clients[name]
-
-    def _call(self, kind: Any, name: str, request: Any, timeout: float = 10.0) -> Any:
-        client = self._client(kind, name)
-        if not self._until(client.service_is_ready, timeout):
-            raise RequestError(f"{name}: no such service within {timeout:.0f} s")
-        future = client.call_async(request)
-        if not self._until(future.done, timeout):
-            raise RequestError(f"{name}: no answer within {timeout:.0f} s")
-        return future.result()
 
     def _until(self, condition: Callable[[], bool], timeout: float) -> bool:
         """Spin until the condition holds; return whether it did in time."""

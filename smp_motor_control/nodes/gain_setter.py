@@ -26,12 +26,11 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import rclpy
-from rcl_interfaces.msg import ParameterType
-from rcl_interfaces.srv import GetParameters, SetParametersAtomically
+from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.node import Node
-from rclpy.parameter import Parameter, parameter_value_to_python
 
 from smp_interfaces.msg import PidState
+from smp_motor_control.nodes.asking import SET, Asker, AskError
 from smp_motor_control.nodes.executor import LeanExecutor
 from smp_motor_control.nodes.runtime import STREAM_SUBSCRIBER, seconds, steady_timer
 
@@ -51,18 +50,8 @@ process itself was awake."""
 STARVED = 10.0
 """A step that comes so many usual steps late ran without control meanwhile."""
 
-ANSWER = 0.25
-"""Time in which a service answers, or is asked again [s]."""
-
 PATIENCE = 8.0
 """Longest wait for a service or a topic; on a busy machine discovery takes seconds [s]."""
-
-
-_GET, _SET = "get_parameters", "set_parameters_atomically"
-
-
-class Trouble(Exception):
-    """What is wrong, in a line for the user."""
 
 
 class Watch:
@@ -133,6 +122,10 @@ class Watch:
         return None
 
 
+def _node(wheel: str) -> str:
+    return f"/{wheel}/wheel_pid"
+
+
 def _span(states: list[PidState]) -> float:
     """Return the time between the first and the last state [s]."""
     return seconds(states[-1].header.stamp) - seconds(states[0].header.stamp)
@@ -157,7 +150,7 @@ class GainSetter(Node):
         self._executor.add_node(self)
         steady_timer(self, LOOK, lambda: None)  # wakes the executor
         self._old: dict[str, dict[str, Any]] = {}
-        self._known_clients: dict[str, Any] = {}
+        self._asker = Asker(self, self._until, PATIENCE)
 
     def do_read(self, wheels: Mapping[str, list[str]]) -> dict[str, Any]:
         """Read the parameters of every wheel; those that a node does not have are left out."""
@@ -171,12 +164,12 @@ class GainSetter(Node):
         for wheel, one in watches.items():
             self.create_subscription(PidState, f"/{wheel}/pid_state", one.take, STREAM_SUBSCRIBER)
             # Known to the wheel before it is needed, an answer is not lost on the way.
-            self._client(SetParametersAtomically, wheel, _SET)
+            self._asker.client(SetParametersAtomically, f"{_node(wheel)}/{SET}")
         old = self._get({wheel: list(new) for wheel, new in values.items()})
         self._until(lambda: all(w.seen for w in watches.values()), PATIENCE)
         silent = [wheel for wheel, one in watches.items() if not one.seen]
         if silent:
-            raise Trouble(
+            raise AskError(
                 f"{', '.join(silent)}: no pid_state within {PATIENCE:g} s; is wheel_pid active, "
                 "and has it a set-point?"
             )
@@ -188,7 +181,7 @@ class GainSetter(Node):
         try:
             self._set(values)
             reason = self._trial(watches, watch)
-        except Trouble as trouble:
+        except AskError as trouble:
             reason = str(trouble)
         if reason is None:
             self._old = {}
@@ -211,76 +204,15 @@ class GainSetter(Node):
         old, self._old = self._old, {}
         try:
             self._set(old)
-        except Trouble as trouble:
-            raise Trouble(f"the old gains could not be set again: {trouble}") from None
+        except AskError as trouble:
+            raise AskError(f"the old gains could not be set again: {trouble}") from None
 
     def _get(self, wheels: Mapping[str, list[str]]) -> dict[str, dict[str, Any]]:
-        requests = {wheel: GetParameters.Request(names=names) for wheel, names in wheels.items()}
-        answers = self._call(GetParameters, _GET, requests)
-        return {
-            wheel: {
-                name: parameter_value_to_python(value)
-                for name, value in zip(names, answers[wheel].values, strict=False)
-                if value.type != ParameterType.PARAMETER_NOT_SET
-            }
-            for wheel, names in wheels.items()
-        }
+        found = self._asker.get_parameters({_node(w): names for w, names in wheels.items()})
+        return {wheel: found[_node(wheel)] for wheel in wheels}
 
     def _set(self, values: Mapping[str, Mapping[str, Any]]) -> None:
-        requests = {
-            wheel: SetParametersAtomically.Request(
-                parameters=[Parameter(n, value=v).to_parameter_msg() for n, v in new.items()]
-            )
-            for wheel, new in values.items()
-        }
-        answers = self._call(SetParametersAtomically, _SET, requests)
-        refused = [
-            f"{wheel}: wheel_pid refused the gains: {answer.result.reason}"
-            for wheel, answer in answers.items()
-            if not answer.result.successful
-        ]
-        if refused:
-            raise Trouble("; ".join(refused))
-
-    def _client(self, kind: Any, wheel: str, service: str) -> Any:
-        name = f"/{wheel}/wheel_pid/{service}"
-        if name not in self._known_clients:
-            self._known_clients[name] = self.create_client(kind, name)
-        return self._known_clients[name]
-
-    def _call(self, kind: Any, service: str, requests: Mapping[str, Any]) -> dict[str, Any]:
-        """Ask all wheels at once; return the answers by wheel.
-
-        An answer is lost where the node has not yet discovered this client: who does not answer
-        is asked again, which does no harm.
-        """
-        clients = {wheel: self._client(kind, wheel, service) for wheel in requests}
-        asked: dict[str, list[Any]] = {wheel: [] for wheel in requests}
-
-        def answered(wheel: str) -> bool:
-            return any(future.done() for future in asked[wheel])
-
-        def all_answered() -> bool:
-            return all(map(answered, requests))
-
-        end = time.monotonic() + PATIENCE
-        while not all_answered() and time.monotonic() < end:
-            for wheel, request in requests.items():
-                if not answered(wheel) and clients[wheel].service_is_ready():
-                    asked[wheel].append(clients[wheel].call_async(request))
-            self._until(all_answered, ANSWER)
-        missing = [wheel for wheel in requests if not answered(wheel)]
-        for wheel, futures in asked.items():
-            for future in futures:
-                if not future.done():
-                    clients[wheel].remove_pending_request(future)
-        if missing:
-            there = all(asked[wheel] for wheel in missing)
-            what = "no answer" if there else "no such service"
-            hint = "" if there else "; is wheel_pid running?"
-            names = ", ".join(clients[wheel].srv_name for wheel in missing)
-            raise Trouble(f"{names}: {what} within {PATIENCE:g} s{hint}")
-        return {w: next(f for f in asked[w] if f.done()).result() for w in requests}
+        self._asker.set_parameters({_node(wheel): new for wheel, new in values.items()})
 
     def _until(self, condition: Callable[[], bool], timeout: float) -> bool:
         deadline = time.monotonic() + timeout
@@ -313,7 +245,7 @@ def main(argv: list[str] | None = None) -> int:
             request = json.loads(line)
             try:
                 answer = requests[request.pop("do")](**request)
-            except Trouble as trouble:
+            except AskError as trouble:
                 answer = {"error": str(trouble)}
             print(json.dumps(answer), flush=True)
     except KeyboardInterrupt:

@@ -4,8 +4,9 @@ The tool ``tune --relay`` starts it as a process of its own.  The wheel's contro
 deactivated for the time of the test and activated again.  First a constant voltage shows the
 speed to oscillate around, then the relay switches around it.  One line of JSON at the end:
 ``time`` [s] from the stamps, ``voltage`` [V] that was asked for after each sample, ``applied``
-[V, mean over the interval before the sample, None where the hardware does not tell] and ``speed``
-[rad/s, wheel], all around their rest; or ``error``.  Whatever ends it, the last command is zero.
+[V, mean over the interval before the sample, None where the hardware does not tell], ``speed``
+[rad/s, wheel] and ``angle`` [rad, wheel, None where it does not tell], all around their rest; or
+``error``.  Whatever ends it, the last command is zero.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from rclpy.node import Node
 
 from smp_interfaces.msg import MotorCommand, MotorState
 from smp_motor_control.nodes import runtime
+from smp_motor_control.nodes.asking import Asker, AskError
 
 PATIENCE = 8.0
 """Longest wait for the wheel and its controller; on a busy machine discovery takes seconds [s]."""
@@ -58,8 +60,9 @@ class RelayTest(Node):
         self.speeds: list[float] = []
         self.voltages: list[float] = []
         self.applied: list[float] = []
+        self.angles: list[float] = []
         self.heard = self.paused = False
-        self.known: dict[str, Any] = {}
+        self.asker = Asker(self, self.spin, 0.5)
         self.command = self.create_publisher(
             MotorCommand, f"/{wheel}/motor_command", runtime.STREAM_PUBLISHER
         )
@@ -82,6 +85,7 @@ class RelayTest(Node):
         self.speeds.append(speed)
         self.voltages.append(self.output)
         self.applied.append(message.voltage)
+        self.angles.append(message.position)
         self.send(self.output)
 
     def send(self, voltage: float) -> None:
@@ -103,11 +107,17 @@ class RelayTest(Node):
         self.output = self.bias + self.amplitude
         self.spin(lambda: False, seconds)
         applied = [v - self.bias for v in self.applied[first:]]
+        times = [t - self.stamps[first] for t in self.stamps[first:]]
+        angles = [
+            a - self.angles[first] - self.centre * t
+            for a, t in zip(self.angles[first:], times, strict=True)
+        ]
         return {
-            "time": [t - self.stamps[first] for t in self.stamps[first:]],
+            "time": times,
             "voltage": [v - self.bias for v in self.voltages[first:]],
             "applied": applied if all(map(math.isfinite, applied)) else None,
             "speed": [v - self.centre for v in self.speeds[first:]],
+            "angle": angles if all(map(math.isfinite, angles)) else None,
         }
 
     def spin(self, done: Callable[[], bool], seconds: float) -> bool:
@@ -171,14 +181,11 @@ class RelayTest(Node):
 
     def ask(self, kind: Any, service: str, request: Any) -> Any:
         """Ask the wheel's controller once; return its answer, or None."""
-        if service not in self.known:
-            name = f"/{self.wheel}/wheel_pid/{service}"
-            self.known[service] = self.create_client(kind, name)
-        client = self.known[service]
-        if not self.spin(client.service_is_ready, 0.5):
+        name = f"/{self.wheel}/wheel_pid/{service}"
+        try:
+            return self.asker.ask_all(kind, {name: request}, again=1.0)[name]
+        except AskError:
             return None
-        future = client.call_async(request)
-        return future.result() if self.spin(future.done, 0.5) else None
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -108,7 +108,7 @@ def evenly(answer: Mapping[str, Any]) -> tuple[Array, Array, float]:
     Parameters
     ----------
     answer : mapping
-        Of the node ``relay_test``: ``time``, ``voltage``, ``applied``, ``speed``.
+        Of the node ``relay_test``: ``time``, ``voltage``, ``applied``, ``speed``, ``angle``.
 
     Returns
     -------
@@ -124,10 +124,21 @@ def evenly(answer: Mapping[str, Any]) -> tuple[Array, Array, float]:
     DesignError
         When fewer than 20 samples came.
     """
-    time, speed = np.array(answer["time"]), np.array(answer["speed"])
+    time = np.array(answer["time"])
     if time.size < 20:
         raise DesignError(f"only {time.size} samples came while the relay switched")
-    step = float(np.median(np.diff(time)))
-    acted = answer["voltage"] if answer["applied"] is None else answer["applied"]
+    lasted = np.diff(time)
+    step = float(np.median(lasted))
     grid = np.arange(time[0], time[-1], step)
-    return np.interp(grid, time, acted), np.interp(grid, time, speed), step
+    if answer["applied"] is None:
+        turned = np.array(answer["voltage"])[:-1] * lasted
+    else:
+        turned = np.array(answer["applied"])[1:] * lasted
+    # Means over intervals, long and short, are exact as integrals at their ends.
+    volt_seconds = np.concatenate([[0.0], np.cumsum(turned)])
+    if answer["angle"] is None:
+        angle = np.concatenate([[0.0], np.cumsum(np.array(answer["speed"])[1:] * lasted)])
+    else:
+        angle = np.array(answer["angle"])
+    voltage, speed = (np.diff(np.interp(grid, time, x)) / step for x in (volt_seconds, angle))
+    return voltage, speed, step

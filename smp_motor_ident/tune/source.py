@@ -76,10 +76,12 @@ def choose_source(estimate: Estimate, loop: Loop, **targets: Any) -> tuple[Loop,
     usual = _trial(estimate, loop, targets)
     if loop.counts_per_revolution is None:
         return loop, "the reported speed: the encoder's counts are not known"
+    # Averaging longer helps only where the ripple is what holds the gains back.
+    noisy = usual is None or usual.ripple > 0.9 * loop.noise_limit
     windows = [
         _trial(estimate, replace(loop, speed_source="difference", difference_window=w), targets)
         for w in WINDOWS
-        if w > loop.difference_window
+        if noisy and w > loop.difference_window
     ]
     watched = _trial(estimate, replace(loop, speed_source="observer"), targets)
     best = usual

@@ -108,10 +108,15 @@ def test_relay_feedback_finds_the_ultimate_point_without_a_model(coefficients):
     quantum = one.loop.count_angle / one.loop.sample_time
     voltage, speed = oscillate(one, 3.0, quantum, 4.0)
     gain, period = read_oscillation(voltage, speed, one.loop.sample_time)
-    # The relay's hysteresis of one count and its switching at samples only make it find a point
-    # a little below the ultimate one: 35 % in gain is the literature's own figure for it.
-    assert gain == pytest.approx(one.ultimate[0], rel=0.35)
-    assert period == pytest.approx(one.ultimate[1], rel=0.35)
+    # What was read is a point of the loop's own response; counts of a tenth of the amplitude
+    # leave less than 1 %.
+    w = 2 * np.pi / period
+    response = one.plant.response(np.array([w]))[0, 0]
+    assert gain * abs(response) == pytest.approx(1.0, rel=0.02)
+    # And the one at which a relay oscillates: short of half a turn by what the hysteresis takes
+    # (Astrom and Hagglund 1984, equation 5), to the one sample within which it cannot switch.
+    short = np.arcsin(min(quantum * gain * np.pi / (4 * 3.0), 1.0))
+    assert abs(np.angle(-response) - short) <= w * one.loop.sample_time
     assert np.abs(voltage).max() == 3.0
 
 
@@ -126,6 +131,7 @@ def test_relay_feedback_bears_lost_samples():
         "voltage": voltage[kept].tolist(),
         "applied": acted[kept].tolist(),
         "speed": speed[kept].tolist(),
+        "angle": (0.005 * np.cumsum(speed))[kept].tolist(),
     }
     gain, period = read_oscillation(*evenly(answer))
     whole = read_oscillation(voltage, speed, 0.005)
@@ -138,7 +144,7 @@ def test_relay_feedback_bears_lost_samples():
 
 def test_relay_without_samples_is_told():
     with pytest.raises(DesignError, match="only 1 samples"):
-        evenly({"time": [0.0], "voltage": [0.0], "applied": None, "speed": [0.0]})
+        evenly({"time": [0.0], "voltage": [0.0], "applied": None, "speed": [0.0], "angle": None})
 
 
 def test_relay_that_does_not_oscillate_is_told():

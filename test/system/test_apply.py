@@ -141,7 +141,8 @@ def test_apply_changes_four_running_wheels_without_a_stop(process, robot, tmp_pa
     # Designed first: what a busy processor does to the wheels meanwhile is not the change's doing.
     # A machine that runs tests answers late at times: gains that bear 20 ms.
     gains = tmp_path / "good.yaml"
-    code, output = run_tune(process, MOTORS, "--delay", "0.02", "--output", gains)
+    options = ("--delay", "0.02", "--speed-source", "measured", "--output", gains)
+    code, output = run_tune(process, MOTORS, *options)
     assert code == 0, output
     begin = time.monotonic()
     code, output = run_tune(process, "--gains", gains, "--apply")
@@ -179,10 +180,10 @@ def test_bad_gains_are_taken_back_within_two_seconds(process, robot, eventually,
 
 
 def test_apply_without_running_wheels_says_so(process, ros_domain):
-    tune = process(sys.executable, "-m", "smp_motor_ident.commands.tune", MOTORS, "--apply")
-    assert tune.wait(150.0) == 1
-    assert "is wheel_pid running?" in tune.output
-    assert "Traceback" not in tune.output
+    code, output = run_tune(process, "--gains", ROOT / "config" / "gains.yaml", "--apply")
+    assert code == 1
+    assert "is wheel_pid running?" in output
+    assert "Traceback" not in output
 
 
 def period_with(motor, delay: float) -> float:

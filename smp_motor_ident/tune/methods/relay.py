@@ -27,6 +27,9 @@ LEAST_CYCLES = 4
 ALIKE = 0.25
 """Share by which the length of a cycle may differ from the usual one and still count."""
 
+BAND = 0.1
+"""Share of the frequency on either side of it that counts as the oscillation's."""
+
 
 def oscillate(
     problem: Problem, amplitude: float, hysteresis: float, seconds: float
@@ -117,18 +120,26 @@ def read_oscillation(voltage: Array, speed: Array, sample_time: float) -> tuple[
             f"only {alike.size} of {lengths.size} cycles are alike, it needs {LEAST_CYCLES}: the "
             "delay wanders; run it on a machine that is less busy"
         )
-    powers = np.array([_fundamental(voltage, speed, switches[k], lengths[k]) for k in alike])
-    sent, answered = np.sqrt(powers.sum(axis=0))
+    period = float(lengths[alike].mean())
+    sent, answered = _fundamentals(voltage[switches[0] :], speed[switches[0] :], 1 / period)
     if not answered > 0:
         raise DesignError("the wheel did not move under the relay; use a larger amplitude")
-    return float(sent / answered), float(lengths[alike].mean() * sample_time)
+    return sent / answered, period * sample_time
 
 
-def _fundamental(voltage: Array, speed: Array, first: int, length: int) -> tuple[float, float]:
-    """Return the squared fundamentals of one cycle."""
-    turn = np.exp(-2j * math.pi * np.arange(length) / length)
-    cycle = slice(first, first + length)
-    return abs(np.sum(turn * voltage[cycle])) ** 2, abs(np.sum(turn * speed[cycle])) ** 2
+def _fundamentals(voltage: Array, speed: Array, frequency: float) -> tuple[float, float]:
+    """Return the sizes of two signals around a frequency [per sample].
+
+    What the motor makes of a voltage does not depend on whether that repeats exactly: a record
+    whose cycles wander is as good, so long as it fades in and out.
+    """
+    time = np.arange(voltage.size)
+    fade = np.sin(np.pi * (time + 0.5) / voltage.size) ** 2
+    reach = max(BAND * frequency, 2 / voltage.size)
+    around = np.linspace(frequency - reach, frequency + reach, 41)
+    turns = np.exp(-2j * math.pi * np.outer(around, time)) * fade
+    sent, answered = (turns @ (x - np.mean(x)) for x in (voltage, speed))
+    return float(np.linalg.norm(sent)), float(np.linalg.norm(answered))
 
 
 def _solve(problem: Problem) -> Feedback:
