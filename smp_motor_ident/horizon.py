@@ -111,7 +111,7 @@ def _find_ratio(
         return free_run
     # Residuals no larger than the counter's own resolution leave nothing for torque noise.
     quiet = free_run.noise[0, 0] < FLOOR * part.quantum**2 / 12
-    if free_run.converged and (quiet or (near is not None and near.ratio == 0)):
+    if quiet or (free_run.converged and near is not None and near.ratio == 0):
         return free_run
     band = bandwidth(first.z, part)
     path: dict[float, Fit] = {}
