@@ -15,16 +15,19 @@ from known_motors import TABLE_1, recording, table
 
 from smp_motor_ident.cold import cold_fit
 from smp_motor_ident.descent import Options
+from smp_motor_ident.estimate import estimate
 from smp_motor_ident.experiments import prepare
 from smp_motor_ident.models import Structure
 from smp_motor_ident.record import Hardware, Record
 
 CASES = (
-    # what is measured, Coulomb friction [V]
-    ("speed", 0.0),
-    ("speed", 0.3),
-    ("counts", 0.0),
-    ("counts", 0.3),
+    # what is called, what is measured, Coulomb friction [V]
+    ("fit", "speed", 0.0),
+    ("fit", "speed", 0.3),
+    ("fit", "counts", 0.0),
+    ("fit", "counts", 0.3),
+    ("estimate()", "speed", 0.0),
+    ("estimate()", "counts", 0.3),
 )
 
 
@@ -50,21 +53,27 @@ def _load(folder: Path, counts: bool) -> Record:
                   None, arrays.get("count"), hardware=hardware)  # fmt: skip
 
 
-def child(folder: str, counts: bool, friction: bool) -> None:
+def child(folder: str, counts: bool, friction: bool, whole: bool) -> None:
     """Fit what lies in a folder and print time and memory as JSON."""
     record = _load(Path(folder), counts)
     structure = Structure("speed", friction="symmetric" if friction else "none")
-    short = record.slice(0, min(len(record), 8_000))
-    cold_fit(prepare([short], False), structure, Options())  # compiled code into memory
-    del short
+
+    def call(given: Record) -> list[float]:
+        if whole:
+            e = estimate(given, "second_order")
+            gain, tau = e.value("dc_gain"), e.value("time_constant")
+            product = e.value("time_constant_product")
+            return [float(x) for x in np.log([1 / gain, tau / gain, product / gain])]
+        return [float(x) for x in cold_fit(prepare([given], False), structure, Options()).z[:3]]
+
+    call(record.slice(0, min(len(record), 8_000)))  # compiled code into memory
     gc.collect()
     before = _resident()
     _mark()
     begun, spent = time.perf_counter(), time.process_time()
-    fit = cold_fit(prepare([record], False), structure, Options())
+    found = call(record)
     wall, processor = time.perf_counter() - begun, time.process_time() - spent
-    print(json.dumps({"wall": wall, "processor": processor, "more": _peak() - before,
-                      "z": list(fit.z), "passes": fit.passes}))  # fmt: skip
+    print(json.dumps({"wall": wall, "processor": processor, "more": _peak() - before, "z": found}))
 
 
 def growth(most: int) -> None:
@@ -77,23 +86,23 @@ def growth(most: int) -> None:
     """
     sizes = [n for n in (10_000, 100_000, 1_000_000, 10_000_000) if n <= most]
     rows, exponents = [], []
-    for kind, friction in CASES:
+    for what, kind, friction in CASES:
         times = []
         for n in sizes:
-            row, processor = _one(kind, friction, n)
+            row, processor = _one(what, kind, friction, n)
             rows.append(row)
             times.append(processor)
             print(row, flush=True)
         if len(sizes) > 2:
             slope = np.polyfit(np.log(sizes[1:]), np.log(times[1:]), 1)[0]
-            exponents.append(f"{kind}, {friction} V: {slope:.2f}")
-    head = ("output", "friction", "samples", "wall s", "processor s", "per sample", "record",
-            "more at its peak", "times the record", "error of ln a")  # fmt: skip
+            exponents.append(f"{what}, {kind}, {friction} V: {slope:.2f}")
+    head = ("call", "output", "friction", "samples", "wall s", "processor s", "per sample",
+            "record", "more at its peak", "times the record", "error of ln a")  # fmt: skip
     print("\n" + table(head, rows))
     print(f"\nexponent of the growth from 100,000 samples on: {'; '.join(exponents)}")
 
 
-def _one(kind: str, friction: float, n: int) -> tuple[tuple[object, ...], float]:
+def _one(what: str, kind: str, friction: float, n: int) -> tuple[tuple[object, ...], float]:
     counts = kind == "counts"
     made, z = recording(TABLE_1["rear_right"], current=False, seconds=n / 1000, rate=1000.0,
                         substeps=4, counts=counts, static_voltage=friction)  # fmt: skip
@@ -108,9 +117,11 @@ def _one(kind: str, friction: float, n: int) -> tuple[tuple[object, ...], float]
             np.save(Path(folder) / f"{name}.npy", values)
         size = sum(a.nbytes for a in arrays.values()) / 2**20
         del made, arrays
-        command = [sys.executable, __file__, folder, str(int(counts)), str(int(friction > 0))]
+        flags = (counts, friction > 0, what != "fit")
+        command = [sys.executable, __file__, folder, *(str(int(flag)) for flag in flags)]
         told = json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
     row = (
+        what,
         kind,
         f"{friction} V",
         n,
@@ -120,10 +131,10 @@ def _one(kind: str, friction: float, n: int) -> tuple[tuple[object, ...], float]
         f"{size:.1f} MiB",
         f"{told['more']:.1f} MiB",
         f"{told['more'] / size:.1f}",
-        f"{np.abs(np.array(told['z'])[:3] - z[:3]).max():.1e}",
+        f"{np.abs(np.array(told['z']) - z[:3]).max():.1e}",
     )
     return row, told["processor"]
 
 
 if __name__ == "__main__":
-    child(sys.argv[1], sys.argv[2] == "1", sys.argv[3] == "1")
+    child(sys.argv[1], *(flag == "1" for flag in sys.argv[2:]))
