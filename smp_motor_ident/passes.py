@@ -149,8 +149,8 @@ def gather(
         Covariance of (output, current); 1 each by default.
     huber : float
         Bound of the robust loss in standard deviations.
-    predicted : ndarray, shape (n, 3), optional
-        Filled with speed, output and current.
+    predicted : ndarray, shape (n, 1), (n, 2) or (n, 3), optional
+        Filled with the output; or with speed and output, and perhaps current.
     differentiate : bool
         Whether the columns of the problem are wanted.
 

@@ -89,7 +89,7 @@ def _errors(
     half = vectors * np.sqrt(np.maximum(values, 0.0))
     for _ in range(int(np.clip(MOST // data.size, *REPLAYS))):
         near = fit.structure.complete(fit.z + matrix @ (half @ rng.standard_normal(len(half))))
-        angle = replay.simulate(data, replace(fit, z=near))[:, 1]
+        angle = replay.outputs(data, replace(fit, z=near))
         shown = angle + rng.uniform(0, data.quantum) + noise * rng.standard_normal(data.size)
         wrong = np.floor(shown / data.quantum) * data.quantum - angle
         counts = predicted[:, 1] + wrong - wrong.mean()

@@ -139,6 +139,17 @@ def _observe_current(par: Array, x: Array, m: Array) -> float:
 
 
 @inlined
+def _note(row: Array, speed: float, y0: float, y1: float) -> None:
+    """Put into a row what it has room for: the output; speed, output (and current)."""
+    if row.shape[0] == 1:
+        row[0] = y0
+        return
+    row[0], row[1] = speed, y0
+    if row.shape[0] > 2:
+        row[2] = y1
+
+
+@inlined
 def _correct(
     gain: Array, e0: float, e1: float, ok0: bool, ok1: bool, stuck: bool, x: Array, m: Array
 ) -> None:
@@ -221,8 +232,9 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
         Scores are summed over runs of ``block_length`` samples into rows of ``blocks``.
     ring : ndarray, shape (r, 3 + 2 p)
         Memory for the window of MEAN_SPEED; shape (0, 0) otherwise.
-    predicted : ndarray, shape (n, 3)
-        Speed, output and current as predicted; shape (0, 3) where not wanted.
+    predicted : ndarray, shape (n, 1), (n, 2) or (n, 3)
+        Filled with the output; or with speed and output, and perhaps current; shape (0, 3)
+        where not wanted.
     usual : float
         Usual interval [s] where the stamps jitter; 0 where they do not.
 
@@ -292,7 +304,7 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
             y0 = _observe(kind, k, first, target, par, x, m, ring, past, columns)
             y1 = _observe_current(par, x, m) if has_current else 0.0
             if predicted.shape[0] > 0:
-                predicted[k, 0], predicted[k, 1], predicted[k, 2] = x[1], y0, y1
+                _note(predicted[k], x[1], y0, y1)
             # Residuals, whitened.
             e0 = output[k] - y0
             e1 = current[k] - y1 if has_current else 0.0

@@ -55,10 +55,30 @@ def simulate(data: Experiments, fit: Fit, gain: bool = False) -> Array:
 
     Returns
     -------
-    ndarray, shape (n, 3)
+    ndarray, shape (n, 2) or with current (n, 3)
         [rad/s], [output], [A].
     """
-    predicted = np.empty((data.size, 3))
+    return _predict(data, fit, gain, 3 if data.current.size else 2)
+
+
+def outputs(data: Experiments, fit: Fit, gain: bool = False) -> Array:
+    """Return the output alone as the fitted motor predicts it.
+
+    Parameters
+    ----------
+    data, fit, gain
+        As in `simulate`.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        [output].
+    """
+    return _predict(data, fit, gain, 1)[:, 0]
+
+
+def _predict(data: Experiments, fit: Fit, gain: bool, columns: int) -> Array:
+    predicted = np.empty((data.size, columns))
     gather(data, fit.structure, fit.z, fit.initial, fit.gain if gain else NO_GAIN, fit.noise,
            predicted=predicted, differentiate=False)  # fmt: skip
     return predicted

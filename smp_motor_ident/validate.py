@@ -174,7 +174,7 @@ def residual_tests(data: Experiments, fit: Fit, lags: int = 25) -> ResidualTests
     ResidualTests
         Of the mechanical output.
     """
-    residual = data.output - replay.simulate(data, fit, gain=True)[:, 1]
+    residual = data.output - replay.outputs(data, fit, gain=True)
     voltage = np.interp(data.time, data.section_end, data.section_value)
     if len(data.starts) > 2:
         voltage = np.concatenate(
