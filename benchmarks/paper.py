@@ -262,9 +262,9 @@ def our_step(wheel, design):
     """Return time, speed and voltage of a step as the wheel node makes it."""
     T = design.loop.sample_time
     time = T * np.arange(int(1.0 / T) + 1)
-    reference, forward = as_delivered(design, STEP, time)
+    reference, forward, high = as_delivered(design, STEP, time)
     speed, voltage, _ = run(
-        TABLE_1[wheel], from_gains(design.gains), Conditions(T, T), reference, forward
+        TABLE_1[wheel], from_gains(design.gains), Conditions(T, T), reference, forward, high=high
     )
     return time, speed, voltage
 

@@ -1,4 +1,4 @@
-"""Figure of a tuning: step, load step, loop gain and sensitivity of every wheel."""
+"""Figure of a tuning: step, load step, Bode, sensitivity and Nyquist of every wheel."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ from collections.abc import Mapping
 from typing import Any
 
 import matplotlib
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle
 
 from smp_motor_ident.tune.curves import Curves
 
@@ -44,28 +46,39 @@ def tuning_svg(wheels: Mapping[str, Curves], limit: float) -> str:
     str
         SVG document.
     """
-    figure = Figure(figsize=(9, 8), layout="constrained")
-    (step, load), (gain, phase), (sensitivity, spare) = figure.subplots(3, 2)
-    spare.set_axis_off()
+    figure = Figure(figsize=(9, 8.4), layout="constrained")
+    (step, load), (gain, phase), (sensitivity, nyquist) = figure.subplots(3, 2)
     for k, (wheel, c) in enumerate(wheels.items()):
         color = COLORS[k % len(COLORS)]
-        step.plot(1e3 * c.time, c.reference, ":", color=color, lw=0.8)
+        step.plot(1e3 * c.time, c.reference, color="0.75", lw=3.0, zorder=0)
         _band(step, 1e3 * c.time, c.step, color, wheel)
         _band(load, 1e3 * c.time, c.load, color, wheel)
         _band(gain, c.omega, c.gain, color, wheel)
         _band(phase, c.omega, c.phase, color, wheel)
         _band(sensitivity, c.omega, c.sensitivity, color, wheel)
-    handles, labels = step.get_legend_handles_labels()
-    spare.legend(handles, labels, loc="upper left")
-    _label(step, "change of set-point (dotted: reference)", "time [ms]", "wheel speed [rad/s]")
+        turn = np.exp(1j * np.deg2rad(c.phase[1])) * c.gain[1]
+        nyquist.plot(turn.real, turn.imag, color=color, lw=1.2)
+    figure.legend(*step.get_legend_handles_labels(), loc="outside upper center", ncols=4)
+    _label(step, "change of set-point (grey: reference)", "time [ms]", "wheel speed [rad/s]")
     _label(load, "load that takes 1 V", "time [ms]", "wheel speed [rad/s]")
     _label(gain, "loop gain", "frequency [rad/s]", "magnitude", log="loglog")
     gain.axhline(1.0, color="gray", lw=0.8)
     _label(phase, "phase of the loop gain", "frequency [rad/s]", "[deg]", log="x")
     phase.axhline(-180.0, color="gray", lw=0.8)
-    phase.set_ylim(-360, 0)
+    phase.set_ylim(-300, -60)
+    phase.set_yticks(range(-300, -59, 60))
+    for c, color in zip(wheels.values(), COLORS, strict=False):
+        crossing = c.omega[np.argmax(c.gain[1] < 1.0)]
+        phase.axvline(crossing, color=color, lw=0.8, ls=":")
+    phase.annotate(
+        "dotted: crossover", (0.02, 0.05), xycoords="axes fraction", fontsize=8, color="gray"
+    )
     _label(sensitivity, f"sensitivity (line: Ms {limit:g})", "frequency [rad/s]", "|S|", log="x")
     sensitivity.axhline(limit, color="gray", lw=0.8)
+    _label(nyquist, f"loop gain near -1 (circle: Ms {limit:g})", "real part", "imaginary part")
+    nyquist.add_patch(Circle((-1, 0), 1 / limit, color="0.9", zorder=0))
+    nyquist.plot(-1, 0, "+", color="gray")
+    nyquist.set(xlim=(-2.0, 0.6), ylim=(-1.6, 0.8), aspect="equal")
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
     return buffer.getvalue()

@@ -73,7 +73,7 @@ def curves(estimate: Estimate, design: Design) -> Curves:
     change = CHANGE * design.reference.max_velocity
     slow = float(nominal.a1[0] / nominal.a0[0])
     T = loop.sample_time
-    time = T * np.arange(int((design.reference.transition_time + 8 * slow) / T) + 2)
+    time = T * np.arange(int((design.reference.transition_time + 6 * slow) / T) + 2)
     usual = replace(loop, delay=loop.expected_delay)
     plan = sample(nominal, usual)
     planned = planned_change(plan, design.reference, change, time)
