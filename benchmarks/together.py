@@ -44,6 +44,9 @@ from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune import Loop, design
 
 ROOT = Path(__file__).resolve().parent.parent
+ENTRIES = load_motors(ROOT / "config" / "motors_paper.yaml")
+"""The paper's motors."""
+
 SPEED = 100.0
 """Of every motor after the step [rad/s], as in the paper's figures."""
 
@@ -296,7 +299,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--draws", type=int, default=5)
     arguments = parser.parse_args(argv)
     arguments.output.mkdir(parents=True, exist_ok=True)
-    entries = load_motors(ROOT / "config" / "motors_paper.yaml")
+    entries = ENTRIES
     results = []
     print("rate [Hz]  way        settling [ms]                    spread [ms]  overshoot [%]")
     for rate in arguments.rates:

@@ -1,0 +1,194 @@
+"""Do four unlike wheels arrive together on live nodes?  motor_plant, four wheel_pid, DDS.
+
+The motors are identified from a recorded bag (see benchmarks/together.py), the gains and the
+common reference designed by ``design_wheels`` from that, written as ``tune`` writes them, and
+loaded by the nodes.  Steps from rest to 100 rad/s of the motors and back to rest; the true
+speed, which the loop does not use, is what the plant reports (velocity_window 0).
+
+    python benchmarks/together_live.py [--rates 100 200 1000] [--steps 6]
+
+A step during which a sample came more than half a period late, or not at all, is told as
+disturbed: the machine ran something else then.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import subprocess
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import rclpy
+from sensor_msgs.msg import JointState
+from together import ENTRIES, SPEED, identify_recorded, settling_time
+
+from smp_interfaces.msg import MotorState, PidState
+from smp_motor_control.nodes import runtime
+from smp_motor_control.nodes.executor import LeanExecutor
+from smp_motor_ident.tune import Design, Loop, design_wheels
+from smp_motor_ident.tune.writing import gains_yaml
+
+DOMAIN = 98
+HOLD = 0.9
+"""How long a speed is asked for [s]."""
+
+SETPOINTS = 0.02
+"""Interval of the set-points [s]."""
+
+LATE = 1.5
+"""Of the period: a longer interval between samples tells of a disturbed step."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """How the wheels came to speed once.
+
+    Attributes
+    ----------
+    settling : dict of str to float
+        From the sample at which the wheel was first asked [s].
+    spread : float
+        Between the instants at which first and last wheel settled [s].
+    overshoot : float
+        Largest of all wheels [%].
+    interval : float
+        Longest between two samples of any wheel, in periods.
+    """
+
+    settling: dict[str, float]
+    spread: float
+    overshoot: float
+    interval: float
+
+
+class Probe:
+    """Asks all wheels for the same speed, and keeps what they did."""
+
+    def __init__(self, wheels: Sequence[str]) -> None:
+        rclpy.init(args=[], domain_id=DOMAIN)
+        self.node = rclpy.create_node("probe")
+        self.executor = LeanExecutor()
+        self.executor.add_node(self.node)
+        self.truth: dict[str, list[tuple[float, float]]] = {w: [] for w in wheels}
+        self.asked: dict[str, list[tuple[float, float]]] = {w: [] for w in wheels}
+        qos = runtime.STREAM_SUBSCRIBER
+        for wheel in wheels:
+            self.node.create_subscription(
+                MotorState, f"/{wheel}/motor_state",
+                lambda m, seen=self.truth[wheel]: seen.append(
+                    (runtime.seconds(m.header.stamp), m.velocity)), qos)  # fmt: skip
+            self.node.create_subscription(
+                PidState, f"/{wheel}/pid_state",
+                lambda m, seen=self.asked[wheel]: seen.append(
+                    (runtime.seconds(m.header.stamp), m.setpoint)), qos)  # fmt: skip
+        self.setpoints = self.node.create_publisher(JointState, "/wheel_setpoints", 1)
+        self.speed = 0.0
+        runtime.steady_timer(self.node, SETPOINTS, self._ask)
+
+    def _ask(self) -> None:
+        names = [f"{wheel}_wheel_joint" for wheel in self.truth]
+        self.setpoints.publish(JointState(name=names, velocity=[self.speed] * len(names)))
+
+    def drive(self, speed: float, duration: float) -> None:
+        """Ask for a speed for some time."""
+        self.speed = speed
+        end = time.monotonic() + duration
+        while time.monotonic() < end:
+            self.executor.spin_once()
+
+    def forget(self) -> None:
+        for seen in (*self.truth.values(), *self.asked.values()):
+            seen.clear()
+
+    def step(self, target: float, period: float) -> Step:
+        """Read a step that began after the last :meth:`forget`."""
+        settling, instants, overshoot, longest = {}, [], 0.0, 0.0
+        for wheel, seen in self.truth.items():
+            stamps, speed = np.array(seen).T
+            begin = next(t for t, setpoint in self.asked[wheel] if setpoint == target)
+            at = settling_time(stamps, speed / target)
+            settling[wheel] = at - begin
+            instants.append(at)
+            overshoot = max(overshoot, 100.0 * (speed.max() / target - 1.0))
+            longest = max(longest, float(np.diff(stamps).max()) / period)
+        return Step(settling, max(instants) - min(instants), overshoot, longest)
+
+    def close(self) -> None:
+        self.executor.shutdown()
+        self.node.destroy_node()
+        rclpy.shutdown()
+
+
+def designed(rate: float, seed: int) -> Mapping[str, Design]:
+    """Identify from a bag, and design for live nodes: the driver latches at its own rate."""
+    found = identify_recorded(ENTRIES, min(rate, 200.0), seed)
+    source = "difference" if rate < 500.0 else "observer"
+    loop = Loop(sample_time=1.0 / rate, speed_source=source)
+    return design_wheels(found, dict.fromkeys(found, loop), max_velocity=2.0).designs
+
+
+def measure(rate: float, steps: int, seed: int) -> tuple[list[Step], float]:
+    """Run the nodes and step; return what came of each step, and the transition [s]."""
+    designs = designed(rate, seed)
+    environment = {
+        **os.environ, "ROS_DOMAIN_ID": str(DOMAIN), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+    }  # fmt: skip
+    with tempfile.TemporaryDirectory() as folder:
+        gains = Path(folder) / "gains.yaml"
+        gains.write_text(gains_yaml(designs, ["Of benchmarks/together_live.py."]))
+        motors = Path(__file__).resolve().parent.parent / "config" / "motors_paper.yaml"
+        commands = [["motor_plant", "--ros-args", "-p", f"rate:={rate}", "-p", "velocity_window:=0",
+                     "-p", f"motors_file:={motors}"]]  # fmt: skip
+        commands += [["wheel_pid", "--ros-args", "-r", f"__ns:=/{wheel}", "--params-file", gains]
+                     for wheel in designs]  # fmt: skip
+        started = [subprocess.Popen(command, env=environment) for command in commands]
+        probe = Probe(list(designs))
+        target = SPEED / next(iter(designs.values())).loop.gear_ratio
+        found = []
+        try:
+            probe.drive(target, 5.0)
+            probe.drive(0.0, HOLD)
+            for _ in range(steps):
+                probe.forget()
+                probe.drive(target, HOLD)
+                found.append(probe.step(target, 1.0 / rate))
+                probe.drive(0.0, HOLD)
+        finally:
+            for process in started:
+                process.send_signal(signal.SIGINT)
+            for process in started:
+                process.wait(10.0)
+            probe.close()
+    return found, max(one.reference.transition_time for one in designs.values())
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--rates", type=float, nargs="+", default=[100.0, 200.0, 1000.0])
+    parser.add_argument("--steps", type=int, default=6)
+    parser.add_argument("--seed", type=int, default=1, help="of the recording")
+    arguments = parser.parse_args(argv)
+    print("rate [Hz]  transition [ms]  settling [ms]                  spread [ms]  overshoot [%]")
+    for rate in arguments.rates:
+        steps, transition = measure(rate, arguments.steps, arguments.seed)
+        for one in steps:
+            times = "  ".join(f"{1e3 * t:6.1f}" for t in one.settling.values())
+            told = (
+                "" if one.interval < LATE else f"  disturbed: a sample {one.interval:.1f} periods"
+            )
+            print(
+                f"{rate:9g}  {1e3 * transition:15.0f}  {times}  {1e3 * one.spread:11.1f}  "
+                f"{one.overshoot:13.2f}{told}",
+                flush=True,
+            )
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
