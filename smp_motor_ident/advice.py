@@ -14,6 +14,8 @@ from smp_motor_ident.fit import Fit
 from smp_motor_ident.models import PHYSICAL
 from smp_motor_ident.result import ResidualTests
 
+UNEXPLAINED = 9.0  # residual variance over that of the counter that no counter makes
+
 
 def doubts(
     fit: Fit,
@@ -51,6 +53,14 @@ def doubts(
         out.append(
             f"doubtful: held-out data fit {validation:.0f} % against {estimation:.0f} %; the "
             "motor or its load changed, or the excitation was too poor"
+        )
+    own = data.quantum**2 / 12
+    beyond = 0 < UNEXPLAINED * own < fit.noise[0, 0] and fit.ratio == 0
+    if data.kind == rc.ANGLE and beyond and tests.white is False:
+        out.append(
+            f"doubtful: the motion leaves the model by {np.sqrt(fit.noise[0, 0] / own):.0f} times "
+            "the counter's resolution, and not at random; sample faster, or look for what else "
+            "drives it"
         )
     if tests.independent_of_input is False and estimation < 95:
         out.append("the residuals still follow the voltage: the motor does what the model does not")

@@ -20,6 +20,8 @@ from smp_motor_ident.noise import deviance, kalman_gain
 
 Array = NDArray[np.float64]
 
+OPEN = 0.02  # standard deviation of ln L/R or ln R above which other starts are tried
+
 
 def candidates(data: Experiments, structure: Structure) -> list[Array]:
     """Return starting coordinates for a structure, from linear regressions.
@@ -112,7 +114,32 @@ def cold_fit(
         if len(tried) == keep:
             break
     assert best is not None
+    if structure.current:
+        best = _elsewhere(head, structure, best, options)
     return grow(data, structure, best, options, near)
+
+
+def _elsewhere(head: Experiments, structure: Structure, best: Fit, options: Options) -> Fit:
+    """Try other L, and other R at the same L, where the fit leaves them open.
+
+    An L/R of less than a sample, or an R that next to nothing falls off at, leaves a surface so
+    flat that a descent ends where it began.
+    """
+    free = structure.free()
+    std = np.sqrt(np.diag(best.covariance()))
+    open_ones = [i for i in (models.TE, models.LN_R) if i in free and std[free.index(i)] > OPEN]
+    if not open_ones:
+        return best
+    for change in ({models.A2: 1, models.TE: 1}, {models.TE: 1, models.LN_R: -1}):
+        for factor in (0.2, 0.5, 2.0, 5.0):
+            z = best.z.copy()
+            for i, power in change.items():
+                z[i] += power * np.log(factor)
+            other = descend(head, structure, structure.complete(z), best.initial, best.noise,
+                            best.ratio, options, 25, 0.1)  # fmt: skip
+            if other.deviance < best.deviance - 1:
+                best = other
+    return best
 
 
 def _distinct(ranked: Sequence[Array], step: float, keep: int) -> list[Array]:

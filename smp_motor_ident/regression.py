@@ -249,11 +249,12 @@ def motor_like(theta: Array, order: int) -> bool:
     for value in theta:
         if not math.isfinite(value):
             return False
-    if theta[0] <= 0.0 or theta[1] <= 0.0:
+    if theta[0] <= 0.0 or (theta[1] <= 0.0 and not (order == 2 and theta[2] > 0.0)):
         return False
-    if order == 2:
-        scale = theta[1] * theta[1] / theta[0]
-        theta[2] = min(theta[2], 5 * scale) if theta[2] > 0.0 else 0.02 * scale
+    if order == 2 and theta[2] > 0.0:  # a motor of little resistance rings: damping 0.02
+        theta[1] = max(theta[1], 0.04 * math.sqrt(theta[0] * theta[2]))
+    elif order == 2:
+        theta[2] = 0.02 * theta[1] * theta[1] / theta[0]
     if theta.shape[0] > order + 1:
         theta[order + 1] = max(theta[order + 1], 0.0)
     return True
