@@ -274,10 +274,10 @@ def _signs(records: Sequence[Record], where: str) -> None:
                 continue
             v = record.voltage[ok]
             if what == "current":
-                total += float(v @ y[ok])
+                total += float(np.einsum("i,i->", v, y[ok]))
             else:
                 total += _slow_product(v, y[ok])
-            power += float(np.sqrt((v @ v) * (y[ok] @ y[ok])))
+            power += float(np.sqrt(np.square(v).sum() * np.square(y[ok]).sum()))
         if power > 0 and total < -0.2 * power:
             raise SignalError(
                 f"{where}: swapped sign, {what} runs against the voltage "

@@ -190,10 +190,11 @@ def residual_tests(data: Experiments, fit: Fit, lags: int = 25) -> ResidualTests
     if n < 4 * lags or e.std() == 0 or u.std() == 0:
         return ResidualTests()
     band = norm.ppf(1 - 0.025 / lags) / np.sqrt(n)
-    auto = _lagged(e, e, lags)[1:] / (e @ e)
+    auto = _lagged(e, e, lags)
+    own = _lagged(u, u, lags)
     # The input's own colour widens the band of the cross-correlation where e is not white.
-    cross = _lagged(e, u, lags) / np.sqrt((e @ e) * (u @ u))
-    own = _lagged(u, u, lags)[1:] / (u @ u)
+    cross = _lagged(e, u, lags) / np.sqrt(auto[0] * own[0])
+    auto, own = auto[1:] / auto[0], own[1:] / own[0]
     widen = np.sqrt(max(1.0, 1 + 2 * float((auto * own).sum())))
     return ResidualTests(
         white=bool(np.abs(auto).max() < band),
