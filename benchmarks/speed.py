@@ -167,7 +167,8 @@ def main() -> None:
     """Run the comparison, or the growth."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--samples", type=int, default=60_000)
-    parser.add_argument("--peers", default=",".join(peers.PEERS))
+    usual = ",".join(name for name in peers.PEERS if name != "virtual")  # it takes minutes
+    parser.add_argument("--peers", default=usual, help=f"of {', '.join(peers.PEERS)}")
     parser.add_argument("--friction", action="store_true", help="only the motor with friction")
     parser.add_argument("--linear", action="store_true", help="only the linear motor")
     parser.add_argument("--repeats", type=int, default=9, help="of this project's fit")
