@@ -17,9 +17,11 @@ from smp_motor_ident.fit import Fit
 from smp_motor_ident.horizon import grow
 from smp_motor_ident.models import Structure
 from smp_motor_ident.noise import deviance, kalman_gain
+from smp_motor_ident.valley import shapes
 
 Array = NDArray[np.float64]
 
+SHAPES = 6  # of the same linear response that are refined
 OPEN = 0.02  # standard deviation of ln L/R or ln R above which other starts are tried
 
 
@@ -98,8 +100,9 @@ def cold_fit(
     best: Fit | None = None
     tried: list[Array] = []
     if models.TE in structure.free() and not structure.current:
-        ranked = [shaped for z in _distinct(ranked, data.step, 2) for shaped in _shapes(z)]
-        keep = len(ranked)
+        ranked = [shaped for z in _distinct(ranked, data.step, 2) for shaped in shapes(z)]
+        ranked = sorted(ranked, key=lambda z: _score(head, structure, z, noise))
+        keep = SHAPES
     for z in ranked:
         if any(_alike(z, other, data.step) for other in tried):
             continue
@@ -147,18 +150,6 @@ def _distinct(ranked: Sequence[Array], step: float, keep: int) -> list[Array]:
     for z in ranked:
         if len(out) < keep and not any(_alike(z, other, step) for other in out):
             out.append(z)
-    return out
-
-
-def _shapes(z: Array) -> list[Array]:
-    """Return the same response with L/R at several of the values that it leaves open."""
-    out = []
-    for factor in (1.02, 1.5, 2.5):
-        shaped = z.copy()
-        shaped[models.TE] = z[models.A2] - z[models.A1] + np.log(factor)
-        par, _ = models.to_internal(shaped, 2)
-        if factor < 1.1 or par[2] > 0.05 * np.exp(z[models.A0]):
-            out.append(shaped)
     return out
 
 

@@ -56,7 +56,11 @@ def grow(
     """
     part = data.head(min(HEAD * data.step, 60.0))
     best = _find_ratio(part, structure, first, options, near)
-    best = along_friction(part, structure, best, options)
+    found = along_friction(part, structure, best, options)
+    if found.ratio > 0 and found.deviance < best.deviance - PRICE:
+        again = _find_ratio(part, structure, found, options, found)
+        found = min(found, again, key=lambda f: f.deviance)
+    best = found
     return extend(data, structure, best, options)
 
 

@@ -6,6 +6,7 @@ Derivation: docs/derivations.md, section 10.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from smp_motor_ident import models
 from smp_motor_ident.descent import Options, descend
@@ -13,6 +14,9 @@ from smp_motor_ident.experiments import Experiments
 from smp_motor_ident.fit import Fit
 from smp_motor_ident.models import Structure
 
+Array = NDArray[np.float64]
+
+SHARES = (0.97, 0.7, 0.1)  # of a0 that K is
 OPEN = 0.3  # standard deviation of ln a2 above which other starts are tried
 
 
@@ -54,18 +58,48 @@ def along_friction(part: Experiments, structure: Structure, best: Fit, options: 
     return _scan_friction(part, structure, best, options, full)
 
 
+def shapes(z: Array) -> list[Array]:
+    """Return motors of the same linear response, by shares of the back-EMF in what limits it.
+
+    ``K = a0 - be`` and ``be te^2 - a1 te + a2 = 0``: which of two lags is the electric one,
+    and how much the motor brakes itself, is told by friction alone.
+
+    Parameters
+    ----------
+    z : ndarray, shape (11,)
+        Of the second order.
+
+    Returns
+    -------
+    list of ndarray, shape (11,)
+        They differ in L/R.
+    """
+    a0, a1, a2 = np.exp(z[: models.A2 + 1])
+    out = []
+    for share in SHARES:
+        roots = np.roots([(1 - share) * a0, -a1, a2])
+        for te in roots[np.abs(roots.imag) < 1e-9 * np.abs(roots)].real:
+            if te > 0:
+                shaped = z.copy()
+                shaped[models.TE] = np.log(te)
+                out.append(shaped)
+    return out or [z]
+
+
 def _along_lag(part: Experiments, structure: Structure, best: Fit, options: Options) -> Fit:
-    """Try other second time constants where the fit leaves it open."""
+    """Try other lags and shapes where the fit leaves them open, or what it leaves is not noise."""
     free = structure.free()
     if models.A2 not in free or models.TE not in free:
         return best
     i = free.index(models.A2)
-    if best.converged and best.covariance()[i, i] < OPEN**2:
-        return best
-    for share in (0.05, 0.2, 0.6):
-        z = best.z.copy()
-        z[models.A2] = 2 * z[models.A1] - z[models.A0] + np.log(share)
-        z[models.TE] = z[models.A2] - z[models.A1] + 0.02
+    starts = shapes(best.z) if best.ratio > 0 or not best.converged else []
+    if not best.converged or best.covariance()[i, i] > OPEN**2:
+        for share in (0.05, 0.2, 0.6):
+            z = best.z.copy()
+            z[models.A2] = 2 * z[models.A1] - z[models.A0] + np.log(share)
+            z[models.TE] = z[models.A2] - z[models.A1] + 0.02
+            starts.append(z)
+    for z in starts:
         other = descend(part, structure, structure.complete(z), best.initial, best.noise,
                         best.ratio, options, 30)  # fmt: skip
         if other.deviance < best.deviance - 1:
