@@ -25,6 +25,7 @@ PLAUSIBLE = np.array([1e-2, 1e-2, 1e-2, 0.25, 1e-4, 1e-4, 1e-4, 1e-2, 1e-4, 1e-2
 """Inverse squares of how far each coordinate z could be from any value at all."""
 STALL = 4, 0.02  # passes that together gain less deviance than this end a descent
 FREE = 0.1  # damping (relative to the diagonal) below which a step counts as undamped
+LARGEST = 80.0  # logarithm of a coordinate: 1e35
 ROUNDS = 12  # most times that the noise is estimated anew
 
 
@@ -314,9 +315,10 @@ def solve(
     Fit
         With ``converged`` False where the passes did not suffice.
     """
-    descent = _Descent(data, structure, z, initial, noise, ratio, huber, priors,
-                       _bounds(-np.inf) if lower is None else lower,
-                       np.full(11, np.inf) if upper is None else upper)  # fmt: skip
+    widest = _bounds()
+    lower = widest[0] if lower is None else lower
+    upper = widest[1] if upper is None else upper
+    descent = _Descent(data, structure, z, initial, noise, ratio, huber, priors, lower, upper)
     for n in range(ROUNDS):
         if not math.isfinite(descent.here.objective):
             break
@@ -330,11 +332,14 @@ def solve(
     return descent.result()
 
 
-def _bounds(low: float) -> Array:
-    lower = np.full(11, low)
+def _bounds() -> tuple[Array, Array]:
+    """Return bounds of z: what floating point can hold, and no negative volts or seconds."""
+    lower, upper = np.full(11, -np.inf), np.full(11, np.inf)
+    logarithms = [models.A0, models.A1, models.A2, models.TE, models.LN_R]
+    lower[logarithms], upper[logarithms] = -LARGEST, LARGEST
     lower[[models.VC_PLUS, models.VC_MINUS, models.DELAY]] = 0.0
     lower[models.WINDOW] = 1e-9
-    return lower
+    return lower, upper
 
 
 def _linearise(priors: Sequence[Prior], z: Array, matrix: Array) -> list[tuple[Array, float]]:

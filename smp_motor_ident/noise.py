@@ -149,6 +149,7 @@ def renewed(spread: Array, noise: Array, current: bool) -> Array:
     """
     fresh = noise.copy()
     fresh[0, 0] = max(spread[0] / max(spread[3], 1), LEAST)
+    fresh[0, 1] = fresh[1, 0] = 0.0
     if current:
         fresh[1, 1] = max(spread[1] / max(spread[4], 1), LEAST)
         limit = CLOSEST * math.sqrt(fresh[0, 0] * fresh[1, 1])

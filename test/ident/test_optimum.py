@@ -16,7 +16,7 @@ from smp_motor_ident.elimination import cholesky_solve, damped_step, eliminate
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.experiments import prepare
 from smp_motor_ident.models import Structure
-from smp_motor_ident.noise import proper, whitening
+from smp_motor_ident.noise import proper, renewed, whitening
 from smp_motor_ident.passes import gather
 from smp_motor_ident.record import Record
 
@@ -165,6 +165,15 @@ def test_a_covariance_that_is_none_is_replaced_by_one_that_can_be(broken):
     assert np.all(np.linalg.eigvalsh(fixed) > 0)
     w = whitening(fixed)[:, :2]
     np.testing.assert_allclose(w @ fixed @ w.T, np.eye(2), atol=1e-12)  # rounding
+
+
+@pytest.mark.parametrize("current", [True, False])
+def test_a_covariance_renewed_from_residuals_is_one_whatever_was_believed_before(current):
+    believed = np.array([[1.0, 0.9], [0.9, 1.0]])
+    spread = np.array([1e-6, 1e-6, 5e-7, 100.0, 100.0, 100.0])
+    fresh = renewed(spread, believed, current)
+    assert np.all(np.linalg.eigvalsh(fresh) > 0)
+    assert np.all(np.isfinite(whitening(fresh)))
 
 
 def test_information_of_a_motor_that_never_moves_is_finite():
