@@ -87,7 +87,8 @@ def extend(data: Experiments, structure: Structure, best: Fit, options: Options)
     if best.samples == data.size and best.converged:
         return best
     horizon = part.size * 4 if structure.friction != "none" else data.size
-    while horizon < data.size and best.ratio == 0:
+    # The last stretch is at most six times the one before, as those in between are.
+    while 1.5 * horizon < data.size and best.ratio == 0:
         longer = data.head(horizon * data.step)
         best = descend(
             longer, structure, best.z, initial_of(longer, best), best.noise, best.ratio, options, 8
