@@ -14,6 +14,7 @@ from smp_motor_ident.fit import Fit
 from smp_motor_ident.models import PHYSICAL
 from smp_motor_ident.result import ResidualTests
 
+TOO_FAST = 1.5  # radians a sample; at pi a ringing cannot be told from a slower one
 UNEXPLAINED = 9.0  # residual variance over that of the counter that no counter makes
 
 
@@ -62,6 +63,12 @@ def doubts(
             "the counter's resolution, and not at random; sample faster, or look for what else "
             "drives it"
         )
+    ring = _ring(fit)
+    if ring * data.step > TOO_FAST:
+        out.append(
+            f"doubtful: the answer rings at {ring / (2 * np.pi):.3g} Hz, which sampling at "
+            f"{1 / data.step:.4g} Hz hardly shows; sample faster"
+        )
     if tests.independent_of_input is False and estimation < 95:
         out.append("the residuals still follow the voltage: the motor does what the model does not")
     if s.offset and s.current:
@@ -81,6 +88,14 @@ def doubts(
             "command that switches between samples); the estimate allows for it"
         )
     return out
+
+
+def _ring(fit: Fit) -> float:
+    """Return the frequency at which an underdamped motor rings [rad/s], else 0."""
+    if fit.structure.order != 2:
+        return 0.0
+    a0, a1, a2 = np.exp(fit.z[: models.A2 + 1])
+    return float(np.sqrt(a0 / a2)) if a1 * a1 < a0 * a2 else 0.0
 
 
 def _unsettled(data: Experiments, fit: Fit) -> bool:

@@ -60,6 +60,11 @@ def grow(
     if found.ratio > 0 and found.deviance < best.deviance - PRICE:
         again = _find_ratio(part, structure, found, options, found)
         found = min(found, again, key=lambda f: f.deviance)
+    if found.ratio > 0 and found.noise[0, 0] < FLOOR * part.quantum**2 / 12:
+        # It came from afar on innovations; in free run nothing is left for torque noise.
+        free_run = descend(part, structure, found.z, found.initial, found.noise, 0.0, options, 40)
+        if free_run.noise[0, 0] < FLOOR * part.quantum**2 / 12:
+            found = along_friction(part, structure, free_run, options)
     best = found
     return extend(data, structure, best, options)
 

@@ -17,6 +17,8 @@ from smp_motor_ident.models import Structure
 Array = NDArray[np.float64]
 
 SHARES = (0.97, 0.7, 0.1)  # of a0 that K is
+SHAKES = 6  # fresh starts around a place where a descent was held
+SHAKE = (1.0, 0.3, 3.0)  # standard deviations (or e-folds, where these are more) to it
 OPEN = 0.3  # standard deviation of ln a2 above which other starts are tried
 
 
@@ -55,7 +57,26 @@ def along_friction(part: Experiments, structure: Structure, best: Fit, options: 
     best = _along_lag(part, structure, best, options)
     if best.converged or structure.friction != "symmetric":
         return best
-    return _scan_friction(part, structure, best, options, full)
+    return _shaken(part, structure, _scan_friction(part, structure, best, options, full), options)
+
+
+def _shaken(part: Experiments, structure: Structure, best: Fit, options: Options) -> Fit:
+    """Begin again around a descent that did not settle: a kink holds it at one place only."""
+    rng = np.random.default_rng(len(part.starts))
+    matrix = structure.matrix()
+    for n in range(SHAKES):
+        if best.converged:
+            break
+        values, vectors = np.linalg.eigh(best.covariance())
+        length = SHAKE[n % len(SHAKE)]
+        move = vectors @ (np.sqrt(np.maximum(values, 0.0)) * rng.standard_normal(len(values)))
+        largest = float(np.abs(matrix @ move)[[models.A0, models.A1, models.A2, models.TE]].max())
+        z = best.z + matrix @ move * min(length, length / max(largest, 1e-12))
+        other = descend(part, structure, structure.complete(z), best.initial, best.noise,
+                        best.ratio, options, 30)  # fmt: skip
+        if other.deviance < best.deviance:
+            best = other
+    return best
 
 
 def shapes(z: Array) -> list[Array]:
