@@ -26,6 +26,7 @@ PLAUSIBLE = np.array([1e-2, 1e-2, 1e-2, 0.25, 1e-4, 1e-4, 1e-4, 1e-2, 1e-4, 1e-2
 STALL = 4, 0.02  # passes that together gain less deviance than this end a descent
 FREE = 0.1  # damping (relative to the diagonal) below which a step counts as undamped
 LARGEST = 80.0  # logarithm of a coordinate: 1e35
+CLOSE = 0.3  # of the tolerance, within which a step is not even tried where there are kinks
 ROUNDS = 12  # most times that the noise is estimated anew
 
 
@@ -214,8 +215,11 @@ class _Descent:
         while self.passes < iterations:
             before = self.here.objective
             z, initial, size = self.step()
-            if self.smooth and self.damping < FREE and self.within(tolerance, size):
-                self.z, self.initial, self.converged = z, initial, True
+            near = tolerance if self.smooth else tolerance * CLOSE
+            if self.damping < FREE and self.within(near, size):
+                if self.smooth:  # elsewhere a kink may lie between
+                    self.z, self.initial = z, initial
+                self.converged = True
                 return
             new = self._pass(z, initial)
             # A step may be small because it is damped: only a nearly free one tells the end.
