@@ -172,14 +172,14 @@ def soonest(motor, conditions, target) -> float:
 
 def check(job) -> list[Outcome]:
     """Design one motor at one rate by every method, and try each."""
-    motor, rate = job
+    motor, rate, methods = job
     T = 1 / rate
     loop = Loop(sample_time=T, delay=T, gear_ratio=RATIO,
                 counts_per_revolution=COUNTS, supply_voltage=SUPPLY)  # fmt: skip
     conditions = Conditions(T, T)
     estimate = estimate_of(motor)
     outcomes, designs = [], {}
-    for method in METHODS:
+    for method in methods:
         outcome = Outcome(rate, method)
         outcomes.append(outcome)
         begin = time.perf_counter()
@@ -192,7 +192,8 @@ def check(job) -> list[Outcome]:
         outcome.designed, designs[method] = True, one
         try_design(outcome, motor, one, conditions, estimate)
     if RECOMMENDED in designs:
-        compare_with_rules(outcomes[0], motor, designs[RECOMMENDED], conditions, estimate, loop)
+        outcome = next(o for o in outcomes if o.method == RECOMMENDED)
+        compare_with_rules(outcome, motor, designs[RECOMMENDED], conditions, estimate, loop)
     return outcomes
 
 
@@ -319,11 +320,13 @@ def remembered(file: Path | None) -> dict[tuple[int, float], list[Outcome]]:
     """Return what a file holds of earlier runs, by motor and rate."""
     if file is None or not file.exists():
         return {}
-    lines = [json.loads(line) for line in file.read_text().splitlines()]
-    return {
-        (line["motor"], line["rate"]): [Outcome(**each) for each in line["outcomes"]]
-        for line in lines
-    }
+    found: dict[tuple[int, float], dict[str, Outcome]] = {}
+    for text in file.read_text().splitlines():
+        line = json.loads(text)
+        of = found.setdefault((line["motor"], line["rate"]), {})
+        # A later line replaces what it holds of an earlier one.
+        of.update({each["method"]: Outcome(**each) for each in line["outcomes"]})
+    return {key: list(of.values()) for key, of in found.items()}
 
 
 def main() -> int:
@@ -333,16 +336,21 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--rates", type=float, nargs="*", default=RATES)
     parser.add_argument("--output", type=Path, help="where outcomes are kept and taken up from")
+    parser.add_argument(
+        "--again", nargs="*", metavar="METHOD", help="try these anew, whatever FILE holds of them"
+    )
     arguments = parser.parse_args()
     motors = [*TABLE_1.values(), *random_motors(arguments.motors)]
     done = remembered(arguments.output)
     keys = [(k, rate) for k in range(len(motors)) for rate in arguments.rates]
-    left = [key for key in keys if key not in done]
+    left = keys if arguments.again else [key for key in keys if key not in done]
+    methods = arguments.again or list(METHODS)
     begin = time.perf_counter()
     with ProcessPoolExecutor(arguments.jobs) as pool:
-        found = pool.map(check, [(motors[k], rate) for k, rate in left])
+        found = pool.map(check, [(motors[k], rate, methods) for k, rate in left])
         for number, (key, outcomes) in enumerate(zip(left, found, strict=True)):
-            done[key] = outcomes
+            rest = [o for o in done.get(key, []) if o.method not in methods]
+            done[key] = [*outcomes, *rest]
             if arguments.output is not None:
                 line = {"motor": key[0], "rate": key[1], "outcomes": [asdict(o) for o in outcomes]}
                 with arguments.output.open("a") as file:

@@ -14,13 +14,16 @@ from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.methods import METHODS
 from smp_motor_ident.tune.motors import draw_motors, motors_of
 from smp_motor_ident.tune.plant import sample
-from smp_motor_ident.tune.problem import Method, Problem, Promise, ripple
+from smp_motor_ident.tune.problem import Method, Problem, Promise, checked, ripple
 from smp_motor_ident.tune.robust import Jury, Robustness, back_off, softer
 
 CLAMPED = 1 / 6
 """Largest ripple [share of the supply, rms] of any gains: three times it is half of the supply, and
 a loop whose noise is clamped is none."""
 
+
+WORK, FEWEST = 5e7, 50
+"""Draws times the cube of the loop's states that is spent at most; and least draws."""
 
 COMMON = (
     "max_velocity", "max_acceleration", "transition_time", "together", "samples", "seed",
@@ -79,8 +82,12 @@ def prepare(estimate: Estimate, loop: Loop, method: str, targets: dict[str, Any]
     plant = sample(motors_of(estimate), loop)
     problem = Problem(plant, loop, targets)
     promise = _promise(chosen, problem)
-    n = int(targets.get("samples") or 1000)
-    motors = draw_motors(estimate, n, np.random.default_rng(int(targets.get("seed") or 0)))
+    n = int(checked(targets, "samples") or 1000)
+    seed = int(checked(targets, "seed", least=-1) or 0)
+    # Eigenvalues cost with the cube of the states: fewer motors where a loop has many.
+    states = plant.taps.shape[1] + plant.window + 6
+    n = max(min(n, int(WORK / states**3)), FEWEST)
+    motors = draw_motors(estimate, n, np.random.default_rng(seed))
     draws = plant if motors is None else sample(motors, loop, believed=plant.motors)
     jury = Jury(draws, promise)
     return Case(estimate.wheel, chosen, problem, promise, jury, motors is not None)

@@ -18,7 +18,7 @@ from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.margins import Margins, loop_margins
 from smp_motor_ident.tune.performance import Performance, measure
 from smp_motor_ident.tune.plant import Plant, sample
-from smp_motor_ident.tune.problem import ripple
+from smp_motor_ident.tune.problem import checked, ripple
 from smp_motor_ident.tune.reference import Reference, controller_for, plan_reference
 from smp_motor_ident.tune.response import Controller
 from smp_motor_ident.tune.robust import Robustness
@@ -216,7 +216,7 @@ def _plan(
     plant: Plant, loop: Loop, controller: Controller, margins: Margins, targets: Mapping[str, Any]
 ) -> Reference:
     ratio = loop.gear_ratio
-    speed, rate = targets.get("max_velocity"), targets.get("max_acceleration")
+    speed, rate = checked(targets, "max_velocity"), checked(targets, "max_acceleration")
     return plan_reference(
         plant,
         loop,
@@ -224,7 +224,7 @@ def _plan(
         least=0.4 / margins.crossover if margins.crossover > 0 else 0.0,
         max_velocity=None if speed is None else speed * ratio,
         max_acceleration=None if rate is None else rate * ratio,
-        transition_time=targets.get("transition_time"),
+        transition_time=checked(targets, "transition_time"),
         together=bool(targets.get("together")),
     )
 

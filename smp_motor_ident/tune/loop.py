@@ -85,9 +85,14 @@ class Loop:
             if entry.name == "speed_source" or value is None:
                 continue
             bound = "positive" if entry.name in positive else "not negative"
-            good = value > 0 if bound == "positive" else value >= 0
-            if not (math.isfinite(value) and good):
-                raise ParameterError(f"{entry.name} is {value}; it must be finite and {bound}")
+            number = isinstance(value, int | float) and not isinstance(value, bool)
+            good = number and (value > 0 if bound == "positive" else value >= 0)
+            if not (good and math.isfinite(value)):
+                raise ParameterError(f"{entry.name} is {value!r}; it must be finite and {bound}")
+        if self.difference_window != int(self.difference_window):
+            raise ParameterError(
+                f"difference_window is {self.difference_window}; it must be a number of samples"
+            )
         if self.speed_source == "difference" and self.difference_window < 1:
             raise ParameterError("difference_window is 0; a difference needs at least 1 sample")
 

@@ -18,10 +18,14 @@ import numpy as np
 
 from smp_motor_control.motor_model import MotorModel
 from smp_motor_control.observer import ObserverNoise
+from smp_motor_ident.errors import DesignError
 from smp_motor_ident.tune.arrays import Array, Complex
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.motors import Motors
 from smp_motor_ident.tune.seen import Seen, seen_by_observer
+
+LONGEST = 300
+"""Samples of delay and averaging that a loop may have."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,12 +115,13 @@ class Plant:
         ndarray of complex, shape (n, f), [rad/s/V]
             One row per motor of the batch.
         """
+        instantaneous = window == 0 or (self.window == 0 and self.seen is None)
         window = self.window if window is None else window
         z = np.asarray(z, dtype=np.complex128)
         delays = z[None, :] ** -np.arange(self.taps.shape[1])[:, None]
         drive = np.einsum("nms,mf->nsf", self.taps, delays)
         state = _resolvent(self.phi, z, drive)
-        if window == 0 and self.seen is None:
+        if instantaneous:
             return state[:, 0]
         angle = np.einsum("ns,nsf->nf", self.phi_angle, state) + self.taps_angle @ delays
         if self.seen is not None:
@@ -171,6 +176,11 @@ def sample(
     -------
     Plant
         The sampled batch.
+
+    Raises
+    ------
+    DesignError
+        When delay and window are more samples than a loop can be designed for.
     """
     T = loop.sample_time
     seen = None
@@ -181,6 +191,13 @@ def sample(
     total = loop.loop_delay + motors.delay
     whole = np.floor(total / T + 1e-9).astype(int)
     late = np.clip(total - whole * T, 0.0, T)
+    if int(whole.max()) + window > LONGEST:
+        raise DesignError(
+            f"a delay of {1e3 * float(total.max()):.4g} ms and a window of {window} samples at "
+            f"{loop.rate:.4g} Hz are {int(whole.max()) + window} samples, of which at most "
+            f"{LONGEST} can be designed for; sample at {LONGEST / max(float(total.max()), T):.3g} "
+            "Hz or less, or average over fewer samples"
+        )
     A, B = _continuous(motors)
     n, s = B.shape
     phi, gamma, zeta = _integrals(A, B, np.full(n, T))

@@ -84,6 +84,12 @@ class Problem:
         return response
 
     @cached_property
+    def true_response(self) -> Complex:
+        """Response to the true speed, not the one that is seen, on the grid, shape (f,)."""
+        response: Complex = self.plant.response(self.omega, window=0)[0]
+        return response
+
+    @cached_property
     def reduced(self) -> FirstOrderDelay:
         """Half-rule reduction; hold and averaging window count as delay.
 
@@ -147,12 +153,52 @@ class Problem:
         DesignError
             When it is not a finite number above ``least``.
         """
-        value = self.targets.get(name)
-        if value is None:
-            return default
-        if not (math.isfinite(value) and value > least):
-            raise DesignError(f"{name} is {value}; it must be a finite number above {least:g}")
-        return float(value)
+        value = checked(self.targets, name, least)
+        return default if value is None else value
+
+    @property
+    def structure(self) -> str:
+        """``pi`` or ``pid`` as the caller asks for it, empty where he does not.
+
+        Raises
+        ------
+        DesignError
+            When it is neither.
+        """
+        value = self.targets.get("structure")
+        if value not in (None, "pi", "pid"):
+            raise DesignError(f"structure is {value!r}; it must be pi or pid")
+        return str(value or "")
+
+
+def checked(targets: Mapping[str, Any], name: str, least: float = 0.0) -> float | None:
+    """Return a numeric target, or None where it is not given.
+
+    Parameters
+    ----------
+    targets : mapping of str to Any
+        What the caller asks for.
+    name : str
+        Keyword of the target.
+    least : float
+        The target must be above this.
+
+    Returns
+    -------
+    float or None
+
+    Raises
+    ------
+    DesignError
+        When it is not a finite number above ``least``.
+    """
+    value = targets.get(name)
+    if value is None:
+        return None
+    number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+    if not (number and math.isfinite(value) and value > least):
+        raise DesignError(f"{name} is {value!r}; it must be a finite number above {least:g}")
+    return float(value)
 
 
 @dataclass(frozen=True)

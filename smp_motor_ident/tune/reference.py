@@ -247,7 +247,7 @@ def plan_reference(
     quickest = plan.transition_time
     if max_acceleration is not None:
         steepest = _steepest(plant, loop, speed, quickest)
-        if not 0 < max_acceleration <= steepest:
+        if max_acceleration > steepest:
             raise DesignError(
                 f"max_acceleration {max_acceleration / ratio:.4g} rad/s^2 is beyond the motor: a "
                 f"change by {speed / ratio:.3g} rad/s within {PEAK:.0%} of "
@@ -256,7 +256,7 @@ def plan_reference(
             )
         plan = replace(plan, max_acceleration=max_acceleration)
     if transition_time is not None:
-        if not quickest - 1e-9 <= transition_time < math.inf:
+        if transition_time < quickest - 1e-9:
             raise DesignError(
                 f"transition_time {transition_time:.4g} s is too short for the loop: without "
                 f"overshoot a change takes at least {quickest:.3g} s; ask for that or more"
@@ -291,7 +291,7 @@ def _reachable(plant: Plant, loop: Loop, wished: float | None) -> float:
             f"dry friction takes {plant.motors.static_voltage[0]:.3g} V of the "
             f"{loop.supply_voltage:g} V supply: the motor cannot turn; raise the supply"
         )
-    if wished is not None and not 0 < wished <= top:
+    if wished is not None and wished > top:
         raise DesignError(
             f"max_velocity {wished / ratio:.4g} rad/s is beyond the motor: {HEADROOM:.0%} of "
             f"{loop.supply_voltage:g} V reaches {top / ratio:.4g} rad/s; ask for that or less"

@@ -138,11 +138,37 @@ def test_delay_of_the_estimate_counts_like_delay_of_the_loop():
         ({"maximum_sensitivity": 0.9}, "maximum_sensitivity is 0.9"),
         ({"focus": "sport"}, "focus is 'sport'"),
         ({"gain": 1.0}, "knows no target 'gain'"),
+        ({"bandwidth": 1e-6}, "bandwidth 1e-06 rad/s cannot keep"),
+        ({"bandwidth": "fast"}, "bandwidth is 'fast'; it must be a finite number"),
+        ({"maximum_sensitivity": 1.01}, "the nearest that holds has Ms 1.05"),
+        ({"structure": "p"}, "structure is 'p'; it must be pi or pid"),
+        ({"max_velocity": -1.0}, "max_velocity is -1.0"),
+        ({"max_acceleration": math.nan}, "max_acceleration is nan"),
+        ({"transition_time": math.inf}, "transition_time is inf"),
+        ({"samples": -5}, "samples is -5"),
     ],
 )
 def test_impossible_demand_is_refused_with_the_limit(targets, words):
     with pytest.raises(DesignError, match=words):
         design(estimate(), Loop(), **targets)
+
+
+@pytest.mark.parametrize(
+    ("loop", "words"),
+    [
+        (Loop(sample_time=1e-5, delay=0.5), "sample at 600 Hz or less"),
+        (Loop(difference_window=1000), "average over fewer samples"),
+        (Loop(supply_voltage=1e-3), "the nearest that holds has a ripple of|nothing near it"),
+    ],
+)
+def test_impossible_loop_is_refused_with_what_to_do(loop, words):
+    with pytest.raises(DesignError, match=words):
+        design(estimate(), loop)
+
+
+def test_a_low_phase_margin_is_no_reason_to_refuse():
+    # Ms 1.4 leaves 42 deg in any case.
+    assert design(estimate(), Loop(), phase_margin=1.0).margins.phase > 41.0
 
 
 def test_nearest_acceleration_that_the_refusal_tells_is_accepted():

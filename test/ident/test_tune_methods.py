@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -11,12 +13,13 @@ from smp_motor_ident.tune.feedback import Feedback, closed_loop
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.margins import loop_margins
 from smp_motor_ident.tune.methods import METHODS
+from smp_motor_ident.tune.methods.margin import at_sensitivity
 from smp_motor_ident.tune.methods.pole_placement import place
 from smp_motor_ident.tune.methods.relay import oscillate, read_oscillation
 from smp_motor_ident.tune.methods.ziegler_nichols import from_ultimate
 from smp_motor_ident.tune.motors import Motors
 from smp_motor_ident.tune.plant import sample
-from smp_motor_ident.tune.problem import FirstOrderDelay, Problem, ripple
+from smp_motor_ident.tune.problem import FirstOrderDelay, Problem, noise_filter, ripple
 
 # The paper's Table 1 as a0, a1, a2 [V s/rad and its powers].
 PAPER = (
@@ -156,6 +159,7 @@ def test_relay_that_does_not_oscillate_is_told():
 @pytest.mark.parametrize("sample_time", [0.01, 0.005, 0.001])
 def test_margin_method_keeps_margin_sensitivity_and_ripple(coefficients, sample_time):
     one = problem(coefficients, sample_time)
+    one = replace(one, loop=replace(one.loop, noise_voltage=one.loop.noise_limit))
     feedback = METHODS["margin"].solve(one)
     margins = loop_margins(one.plant, feedback)
     assert margins.stable
@@ -163,6 +167,29 @@ def test_margin_method_keeps_margin_sensitivity_and_ripple(coefficients, sample_
     assert margins.phase >= 0.995 * 60
     assert margins.sensitivity <= 1.005 * 1.4
     assert ripple(one, feedback) <= 1.005 * one.loop.noise_limit
+
+
+@pytest.mark.parametrize("coefficients", PAPER)
+@pytest.mark.parametrize("sample_time", [0.01, 0.005, 0.002, 0.001])
+def test_margin_method_is_no_softer_than_simc_at_the_same_sensitivity(coefficients, sample_time):
+    one = problem(coefficients, sample_time)
+    feedback = METHODS["margin"].solve(one)
+    peak = loop_margins(one.plant, feedback).sensitivity
+    simc = at_sensitivity(one, METHODS["simc"].solve(one), peak)
+    # The scale goes in steps of 1 %.
+    assert feedback.i >= 1.01 * simc.i
+
+
+def test_margin_method_does_not_let_counts_shake_the_wheel_out_of_its_band():
+    # A motor of little inertia at 500 Hz, whose counts would move it by more than 2 % of a change
+    # by a tenth of its top speed.
+    one = problem((1 / 34.0, 0.04 / 34.0, 0.019 * 0.04**2 / 34.0), 0.002)
+    feedback = METHODS["margin"].solve(one)
+    omega, T = one.omega, 0.002
+    control = feedback.response(omega, T)
+    through = np.abs(control * one.true_response / (1 + control * one.response)) ** 2
+    shaking = np.sqrt(np.trapezoid(through * noise_filter(one, omega), omega) / omega[-1])
+    assert shaking <= 5e-4 * 1.35 * 12 * 34.0 * 1.01
 
 
 def test_margin_method_rejects_a_load_better_than_a_grid_of_pi_gains():

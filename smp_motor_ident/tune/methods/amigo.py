@@ -16,7 +16,7 @@ from smp_motor_ident.tune.problem import Method, Problem, Promise
 def _solve(problem: Problem) -> Feedback:
     model = problem.reduced
     K, T, L = model.gain, model.time_constant, model.delay
-    if str(problem.targets.get("structure") or "pi") == "pid":
+    if problem.structure == "pid":
         p = (0.2 + 0.45 * T / L) / K
         td = 0.5 * L * T / (0.3 * L + T)
         ti = (0.4 * L + 0.8 * T) / (L + 0.1 * T) * L

@@ -20,12 +20,21 @@ import numpy as np
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.tune.arrays import Array, Complex
 from smp_motor_ident.tune.feedback import Feedback, spectral_radius
+from smp_motor_ident.tune.margins import loop_margins
 from smp_motor_ident.tune.methods.simc import SIMC
 from smp_motor_ident.tune.problem import Method, Problem, Promise, noise_filter
 
 FOCUS = ("balanced", "tracking", "load")
-MORE_RIPPLE = 8
-"""Steps of a fifth by which the default limit of the ripple may be raised."""
+MORE_RIPPLE, ENOUGH = 8, 1.2
+"""Steps of a fifth by which the default limit of the ripple may be raised, until the integral gain
+is so many times that of SIMC."""
+
+STEADY = 5e-4
+"""Largest share of the top speed, rms, by which quantisation may shake the wheel: four times that
+is the 2 % within which a change by a tenth of the top speed settles."""
+
+STEADY_AT_MOST = 1.35
+"""Factor on that where the ripple may be more, too: three times is what settles then."""
 
 PEAK = {"balanced": 1.25, "tracking": 1.05, "load": math.inf}
 """Largest peak of the complementary sensitivity, by what the design is for."""
@@ -61,9 +70,22 @@ def _solve(problem: Problem) -> Feedback:
     if found is None:
         raise DesignError(
             f"no controller keeps a phase margin of {margin:g} deg, Ms {peak:g} and a ripple of "
-            f"{problem.loop.noise_limit:.3g} V; allow a higher Ms or ripple, or shorten the delay"
+            f"{problem.loop.noise_limit:.3g} V; {_nearest(problem, margin, peak, focus)}"
         )
     return found[0]
+
+
+def _nearest(problem: Problem, margin: float, peak: float, focus: str) -> str:
+    """Return in words the nearest demand that can be met."""
+    for more in (1.05, 1.1, 1.2, 1.3, 1.4, 1.6, 2.0):
+        if more > peak and _search(problem, margin, more, focus) is not None:
+            return f"the nearest that holds has Ms {more:g}"
+    for factor in (2.0, 5.0, 10.0, 100.0):
+        limit = factor * problem.loop.noise_limit
+        noisier = replace(problem, loop=replace(problem.loop, noise_voltage=limit))
+        if _search(noisier, margin, max(peak, 1.4), focus) is not None:
+            return f"the nearest that holds has a ripple of {limit:.3g} V and Ms {max(peak, 1.4):g}"
+    return "nothing near it does; shorten the delay, or take an encoder with more counts"
 
 
 def _no_softer_than_simc(
@@ -77,17 +99,20 @@ def _no_softer_than_simc(
         return found
     rule = SIMC.solve(replace(problem, targets={}))
     allowed = problem.loop.noise_limit
-    best = found
+    trial, best, most = found, found, 0.0
     for _ in range(MORE_RIPPLE):
-        if (
-            best is not None
-            and best[0].i >= at_sensitivity(problem, rule, _peak(problem, best[0])).i
-        ):
-            return best
+        if trial is not None:
+            same = at_sensitivity(problem, rule, _peak(problem, trial[0]))
+            better = trial[0].i / same.i
+            if better > 1.02 * most:
+                best, most = trial, better
+            # The integral of the error is 1/i; that of its magnitude is up to some percent more.
+            if better >= ENOUGH:
+                break
         allowed *= 1.2
         noisier = replace(problem, loop=replace(problem.loop, noise_voltage=allowed))
-        best = _search(noisier, margin, peak, focus)
-    return found
+        trial = _search(noisier, margin, peak, focus)
+    return best
 
 
 def _peak(problem: Problem, feedback: Feedback) -> float:
@@ -123,7 +148,9 @@ def _search(
 ) -> _Found | None:
     """Return the best feedback and its crossover, zooming in twice, or None."""
     omega = problem.omega
-    shares = np.zeros(1) if problem.targets.get("structure") == "pi" else _SHARES
+    # Ms leaves at least this phase: less need not be looked for.
+    margin = max(margin, 0.95 * math.degrees(2 * math.asin(min(0.5 / peak, 1.0))))
+    shares = np.zeros(1) if problem.structure == "pi" else _SHARES
     if bandwidth is None:
         crossovers = np.geomspace(omega[0], 0.6 * omega[-1], 60)
     else:
@@ -214,7 +241,13 @@ def _hold(problem: Problem, c: _Candidates, margin: float, peak: float, hump: fl
     good &= np.where(near, np.abs(np.angle(-loop)), np.pi).min(axis=1) >= np.deg2rad(0.9 * margin)
     power = np.abs(control * back) ** 2 * noise_filter(problem, omega)
     ripple = np.sqrt(np.trapezoid(power, omega, axis=1) / omega[-1])
-    return np.asarray(good & (ripple <= problem.loop.noise_limit))
+    good &= ripple <= problem.loop.noise_limit
+    shaking = np.trapezoid(power * np.abs(problem.true_response) ** 2, omega, axis=1) / omega[-1]
+    top = problem.loop.supply_voltage / float(problem.plant.motors.a0[0])
+    # Who is allowed more ripple is allowed a little more of this.
+    more = problem.loop.noise_limit / (0.04 * problem.loop.supply_voltage)
+    more = min(max(more, 1.0), STEADY_AT_MOST)
+    return np.asarray(good & (np.sqrt(shaking) <= STEADY * more * top))
 
 
 def _at_bandwidth(problem: Problem, wished: float, margin: float, peak: float) -> Feedback:
@@ -222,7 +255,7 @@ def _at_bandwidth(problem: Problem, wished: float, margin: float, peak: float) -
     found = None
     if wished < nyquist:
         found = _search(problem, margin, peak, "load", bandwidth=wished)
-    if found is not None:
+    if found is not None and loop_margins(problem.plant, found[0]).crossover < 1.05 * wished:
         return found[0]
     nearest = _search(problem, margin, peak, "tracking")
     hint = (

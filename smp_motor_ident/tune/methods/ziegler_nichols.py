@@ -45,7 +45,7 @@ def from_ultimate(problem: Problem, rule: str, gain: float, period: float) -> Fe
     -------
     Feedback
     """
-    ruled = by_rule(rule, str(problem.targets.get("structure") or "pi"), gain, period)
+    ruled = by_rule(rule, problem.structure or "pi", gain, period)
     if not ruled.d:
         return ruled
     return replace(ruled, filter_time=problem.filter_time(ruled.filter_time))
