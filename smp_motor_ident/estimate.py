@@ -226,11 +226,11 @@ def _hold(
     if base.order != 2 or "window" in base.held or sum(len(r) for r in group) > MANY:
         return "held", None
     plain = prepare(group, base.current)
-    if thinned(plain) is not plain:
+    if plain.kind != rc.ANGLE or thinned(plain) is not plain:
         return "held", None  # how the command ran within so short an interval does not show
     others = {h: prepare(group, base.current, hold=h) for h in ("switched", "middle")}
     others = {h: d for h, d in others.items() if d.section_end.size > plain.section_end.size}
-    if plain.kind != rc.ANGLE or not others:
+    if not others:
         return "held", None
     say("how the command was held between samples")
     options = Options(huber=huber)
