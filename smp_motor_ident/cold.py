@@ -17,7 +17,7 @@ from smp_motor_ident.fit import Fit
 from smp_motor_ident.horizon import grow
 from smp_motor_ident.models import Structure
 from smp_motor_ident.noise import deviance, kalman_gain
-from smp_motor_ident.valley import shapes
+from smp_motor_ident.valley import better, shapes
 
 Array = NDArray[np.float64]
 
@@ -110,9 +110,10 @@ def cold_fit(
         ratio = ratio_of(bandwidth(z, head), head.step, head.kind)
         one = descend(head, structure, z, head.initial, noise, ratio, options, 25, 0.1)
         again = best is not None and abs(one.deviance - best.deviance) < 0.1
-        if best is None or one.deviance < best.deviance:
+        if best is None or better(one, best):
             best = one
-        if (again or structure.friction == "none") and one.converged:
+        agreed = again and models.TE not in structure.free()
+        if (agreed or structure.friction == "none") and one.converged:
             break  # two starts agree, or the surface is smooth
         if len(tried) == keep:
             break

@@ -351,7 +351,7 @@ def _validation(
         if not kept:
             return None
         data = _for_final(prepare(fitted, fit.structure.current, hold=hold), fit)
-        if np.ptp(data.section_value) == 0:
+        if np.ptp(data.section_value) == 0 or all(np.ptp(r.voltage) == 0 for r in kept):
             return None
         start = Fit(**{**vars(fit), "initial": data.initial})
         value = validate.held_out(kept, refine(data, fit.structure, start, fit.z, options), hold)

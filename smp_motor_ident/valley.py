@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 SHARES = (0.97, 0.7, 0.1)  # of a0 that K is
 SHAKES = 6  # fresh starts around a place where a descent was held
 SHAKE = (1.0, 0.3, 3.0)  # standard deviations (or e-folds, where these are more) to it
+ALIKE = 0.5  # deviance by which two fits explain the data alike
 OPEN = 0.3  # standard deviation of ln a2 above which other starts are tried
 
 
@@ -50,14 +51,42 @@ def along_friction(part: Experiments, structure: Structure, best: Fit, options: 
         z = best.z.copy()
         z[models.VC_PLUS] = share * full
         z[models.A0] += np.log((full - share * full) / max(full - best.z[models.VC_PLUS], 1e-9))
-        other = descend(part, structure, structure.complete(z), best.initial, best.noise,
-                       best.ratio, options, 30)  # fmt: skip
-        if other.deviance < best.deviance - 1:
-            best = other
+        starts = [z]
+        if models.TE in structure.free() and best.z[models.VC_PLUS] < 1e-3 * full:
+            starts.append(z.copy())  # none at all may only be the other lag's friction
+            starts[1][models.TE] = z[models.A2] - z[models.A1] + 0.3
+        for z in starts:
+            other = descend(part, structure, structure.complete(z), best.initial, best.noise,
+                            best.ratio, options, 30)  # fmt: skip
+            if better(other, best):
+                best = other
     best = _along_lag(part, structure, best, options)
     if best.converged or structure.friction != "symmetric":
         return best
     return _shaken(part, structure, _scan_friction(part, structure, best, options, full), options)
+
+
+def better(one: Fit, other: Fit) -> bool:
+    """Tell which of two fits to keep: the likelier; of two alike the one that claims less.
+
+    Parameters
+    ----------
+    one, other : Fit
+        Of one structure to the same data.
+
+    Returns
+    -------
+    bool
+        Whether ``one`` is clearly likelier, or as likely and leaves friction more open.
+    """
+    if one.deviance < other.deviance - ALIKE:
+        return True
+    free = one.structure.free()
+    if one.deviance > other.deviance + ALIKE or models.VC_PLUS not in free:
+        return one.deviance < other.deviance
+    i = free.index(models.VC_PLUS)
+    mine, theirs = one.covariance()[i, i], other.covariance()[i, i]
+    return bool(mine > 4 * theirs or (mine > theirs / 4 and one.deviance < other.deviance))
 
 
 def _shaken(part: Experiments, structure: Structure, best: Fit, options: Options) -> Fit:
