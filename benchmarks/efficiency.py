@@ -87,10 +87,10 @@ def realisation(wheel: str, kind: str, current: bool, seed: int, args) -> dict:
     return {**line, "found": found, "doubtful": doubtful, "chosen": e.model, "seconds": spent}
 
 
-def cases() -> Iterator[tuple[str, str, bool]]:
-    """Yield every case."""
-    for wheel in TABLE_1:
-        for kind in KINDS:
+def cases(args) -> Iterator[tuple[str, str, bool]]:
+    """Yield every case asked for."""
+    for wheel in [args.wheel] if args.wheel else TABLE_1:
+        for kind in [args.voltage] if args.voltage else KINDS:
             for current in (True, False):
                 yield wheel, kind, current
 
@@ -103,9 +103,10 @@ def run(args) -> list[dict]:
         lines = [json.loads(x) for x in path.read_text().splitlines() if x]
     mine = [x for x in lines if x["torque"] == args.torque and x["model"] == args.model]
     done = {(*x["case"], x["seed"]) for x in mine}
-    mine = [x for x in mine if x["seed"] < args.realisations]
+    wanted = set(cases(args))
+    mine = [x for x in mine if x["seed"] < args.realisations and tuple(x["case"]) in wanted]
     for seed in range(args.realisations):
-        for case in cases():
+        for case in cases(args):
             if (*case, seed) in done:
                 continue
             line = realisation(*case, seed, args)
@@ -140,13 +141,15 @@ def main() -> None:
     parser.add_argument("--realisations", type=int, default=100)
     parser.add_argument("--torque", type=float, default=0.0, help="torque noise [V]")
     parser.add_argument("--seconds", type=float, default=10.0, help="length of a record")
+    parser.add_argument("--wheel", choices=tuple(TABLE_1), help="only this one")
+    parser.add_argument("--voltage", choices=KINDS, help="only this one")
     parser.add_argument("--model", choices=("known", "auto"), default="known")
     parser.add_argument("--lines", help="file of realisations, appended to")
     args = parser.parse_args()
     begun = time.perf_counter()
     lines = run(args)
     rows, inside, asked, above, total = [], 0, 0, 0, 0
-    for case in cases():
+    for case in cases(args):
         here = [x for x in lines if tuple(x["case"]) == case]
         mean, hits, tries, silent = judge(here)
         worst = max(mean, key=lambda n: mean[n])
