@@ -30,8 +30,9 @@ SLOTS = 4  # propagators that are kept, one more is scratch
 SLOT = ROW * LANES + ROW
 CACHE = (SLOTS + 1) * SLOT
 # Beside the propagators: their lengths [s], the next to be overwritten, the length at hand,
-# and the middle and half the range of the lengths that are tabulated.
-NEXT, ACTIVE, MIDDLE, HALF, MARKS = range(SLOTS, SLOTS + 5)
+# the middle and half the range of the lengths that are tabulated, and whether there are columns
+# that the propagator's derivatives reach.
+NEXT, ACTIVE, MIDDLE, HALF, REACHED, MARKS = range(SLOTS, SLOTS + 6)
 
 
 @compiled
@@ -96,8 +97,13 @@ def activate(m: Array, cache: Array, marks: Array, slot: int) -> None:
         Which.
     """
     at = slot * SLOT
-    for n in range(SLOT):
-        m[FORCED + n] = cache[at + n]
+    if marks[REACHED] > 0.0:
+        for n in range(SLOT):
+            m[FORCED + n] = cache[at + n]
+    else:
+        at += SLOT - ROW
+        for n in range(ROW):
+            m[WHOLE + n] = cache[at + n]
     marks[ACTIVE] = marks[slot] if slot < SLOTS else -1.0
 
 
@@ -298,8 +304,8 @@ def begin(
         As elsewhere here.
     """
     m, cache, marks = _aligned(SIZE), _aligned(CACHE), np.full(MARKS, -1.0)
-    marks[NEXT] = 0.0
     n_common = slope.shape[1]
+    marks[NEXT], marks[REACHED] = 0.0, 1.0 if n_common > 0 else 0.0
     for j in range(n_common):
         for i in range(11):
             m[SLOPE + LANES * i + j] = slope[i, j]
