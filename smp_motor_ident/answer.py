@@ -142,8 +142,12 @@ def _physical_rows(
     fit: Fit, fixed: Mapping[str, float], matrix: Array, cov: Array
 ) -> tuple[dict[str, tuple[float, Array]], list[str]]:
     """Return value and gradient (by the free coordinates) of each parameter that is told."""
-    if fit.structure.current and fit.structure.order == 2:
+    # R and L known and L/R held: what is left follows from the coefficients one by one.
+    electric = {"ln_r", "ln_te"} <= set(fit.structure.held)
+    if (fit.structure.current or electric) and fit.structure.order == 2:
         values, gradients = models.physical(fit.z)
+        if values["motor_constant"] <= 0:
+            return {}, []
         return {n: (values[n], gradients[n] @ matrix) for n in values if n not in fixed}, []
     if fit.structure.order != 2:
         return {}, []

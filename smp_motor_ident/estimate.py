@@ -198,10 +198,10 @@ def _structure(
     model: str, use_current: bool, known: Mapping[str, float], group: Sequence[Record]
 ) -> Structure:
     held: dict[str, float] = {}
-    if use_current and "resistance" in known:
+    if "resistance" in known and (use_current or "inductance" in known):
         held["ln_r"] = float(np.log(known["resistance"]))
-        if "inductance" in known:
-            held["ln_te"] = float(np.log(known["inductance"] / known["resistance"]))
+    if "resistance" in known and "inductance" in known:
+        held["ln_te"] = float(np.log(known["inductance"] / known["resistance"]))
     if "delay" in known:
         held["delay"] = known["delay"]
     window = known.get("averaging_window", max(r.velocity_window for r in group))
