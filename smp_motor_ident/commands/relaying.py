@@ -23,6 +23,9 @@ from smp_motor_ident.tune.methods.ziegler_nichols import by_rule
 BIAS = 0.4
 """Share of the supply around which the relay switches, so that friction is not crossed."""
 
+GAP = 3.5
+"""Steps without a sample over which a record is not read."""
+
 
 def tune_by_relay(arguments: argparse.Namespace, files: Sequence[Path]) -> int:
     """Make a wheel oscillate and write the gains that follow.
@@ -127,18 +130,27 @@ def evenly(answer: Mapping[str, Any]) -> tuple[Array, Array, float]:
     time = np.array(answer["time"])
     if time.size < 20:
         raise DesignError(f"only {time.size} samples came while the relay switched")
+    step = float(np.median(np.diff(time)))
+    kept = _longest_stretch(time, GAP * step)
+    time = time[kept]
     lasted = np.diff(time)
-    step = float(np.median(lasted))
     grid = np.arange(time[0], time[-1], step)
     if answer["applied"] is None:
-        turned = np.array(answer["voltage"])[:-1] * lasted
+        turned = np.array(answer["voltage"])[kept][:-1] * lasted
     else:
-        turned = np.array(answer["applied"])[1:] * lasted
+        turned = np.array(answer["applied"])[kept][1:] * lasted
     # Means over intervals, long and short, are exact as integrals at their ends.
     volt_seconds = np.concatenate([[0.0], np.cumsum(turned)])
     if answer["angle"] is None:
-        angle = np.concatenate([[0.0], np.cumsum(np.array(answer["speed"])[1:] * lasted)])
+        angle = np.concatenate([[0.0], np.cumsum(np.array(answer["speed"])[kept][1:] * lasted)])
     else:
-        angle = np.array(answer["angle"])
+        angle = np.array(answer["angle"])[kept]
     voltage, speed = (np.diff(np.interp(grid, time, x)) / step for x in (volt_seconds, angle))
     return voltage, speed, step
+
+
+def _longest_stretch(time: Array, gap: float) -> slice:
+    """Return the part of a record in which no gap is longer: what acted in one is not known."""
+    ends = np.concatenate([[0], np.flatnonzero(np.diff(time) > gap) + 1, [time.size]])
+    k = int(np.argmax(np.diff(ends)))
+    return slice(int(ends[k]), int(ends[k + 1]))
