@@ -70,7 +70,10 @@ def doubts(
             f"{1 / data.step:.4g} Hz hardly shows; sample faster"
         )
     if tests.independent_of_input is False and estimation < 95:
-        out.append("the residuals still follow the voltage: the motor does what the model does not")
+        far = "doubtful: " if estimation < 90 else ""
+        out.append(
+            f"{far}the residuals still follow the voltage: the motor does what the model does not"
+        )
     if s.offset and s.current:
         offset = fit.z[models.OFFSET]
         out.append(

@@ -124,7 +124,7 @@ def needed(simple: Fit, rich: Fit) -> tuple[bool, str]:
     more = size(rich.structure) - size(simple.structure)
     gained = (simple.deviance - rich.deviance) / inflation(rich, simple)
     price = more * (float(np.log(simple.samples)) + SCEPSIS)
-    if not rich.converged and gained < 10 * price:
+    if not rich.converged and gained < SURELY * price:
         return False, "did not converge"
     if gained <= price:
         return (

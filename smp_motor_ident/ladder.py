@@ -17,8 +17,10 @@ from smp_motor_ident.fit import Fit
 from smp_motor_ident.lateness import averaged, with_delay
 from smp_motor_ident.models import Structure
 from smp_motor_ident.thinning import thinned
+from smp_motor_ident.valley import shaken
 
 HOPELESS = 40.0  # deviance on the head of the data by which a rung is out for good
+RIVAL = 20.0  # deviance by which a delay must do better than a second lag
 LITTLE = 0.02  # of the largest voltage: friction below it may be left out
 
 Say = Callable[[str], None]
@@ -144,13 +146,17 @@ def _orders(
             if fitted.deviance > least + HOPELESS * inflation(fitted):
                 rungs.append(Rung(_projected(data, fitted), f"rejected on {part.size} samples"))
                 continue
-            fitted = horizon.extend(_of_kind(data, fitted), fitted.structure, fitted, options)
+            every = _of_kind(data, fitted)
+            fitted = horizon.extend(every, fitted.structure, fitted, options)
+            fitted = shaken(every, fitted.structure, fitted, options)
         if best is None:
             best = fitted
             rungs.append(Rung(fitted, "the simplest" if len(rungs) == 0 else "the simplest left"))
             continue
         if size(fitted.structure) == size(best.structure):
-            verdict = fitted.deviance < best.deviance
+            # Every motor has a second lag, few have a delay: alike, the lag is believed.
+            lag = fitted.structure.order > best.structure.order
+            verdict = fitted.deviance < best.deviance + (RIVAL * inflation(fitted) if lag else 0.0)
             reason = f"fits {'better' if verdict else 'worse'} than {label(best.structure)}"
         else:
             verdict, reason = needed(best, fitted)

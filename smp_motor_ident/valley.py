@@ -63,7 +63,7 @@ def along_friction(part: Experiments, structure: Structure, best: Fit, options: 
     best = _along_lag(part, structure, best, options)
     if best.converged or structure.friction != "symmetric":
         return best
-    return _shaken(part, structure, _scan_friction(part, structure, best, options, full), options)
+    return shaken(part, structure, _scan_friction(part, structure, best, options, full), options)
 
 
 def better(one: Fit, other: Fit) -> bool:
@@ -89,8 +89,25 @@ def better(one: Fit, other: Fit) -> bool:
     return bool(mine > 4 * theirs or (mine > theirs / 4 and one.deviance < other.deviance))
 
 
-def _shaken(part: Experiments, structure: Structure, best: Fit, options: Options) -> Fit:
-    """Begin again around a descent that did not settle: a kink holds it at one place only."""
+def shaken(part: Experiments, structure: Structure, best: Fit, options: Options) -> Fit:
+    """Begin again around a descent that did not settle: a kink holds it at one place only.
+
+    Parameters
+    ----------
+    part : Experiments
+        What ``best`` was fitted to.
+    structure : Structure
+        What is free.
+    best : Fit
+        So far.
+    options : Options
+        Loss and prior knowledge.
+
+    Returns
+    -------
+    Fit
+        The likeliest; ``best`` itself where it has settled.
+    """
     rng = np.random.default_rng(len(part.starts))
     matrix = structure.matrix()
     for n in range(SHAKES):
