@@ -15,7 +15,7 @@ from smp_motor_ident.choice import Rung
 from smp_motor_ident.cold import cold_fit
 from smp_motor_ident.descent import Options, head, refine
 from smp_motor_ident.errors import InsufficientExcitationError, ParameterError, SignalError
-from smp_motor_ident.experiments import Experiments, between_samples, prepare
+from smp_motor_ident.experiments import Experiments, prepare
 from smp_motor_ident.fit import Fit, Prior
 from smp_motor_ident.horizon import extend, grow
 from smp_motor_ident.models import MODELS, PHYSICAL, Structure
@@ -25,6 +25,7 @@ from smp_motor_ident.quantisation import widened
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import Candidate, Estimate, FitPercent
 from smp_motor_ident.screening import screen
+from smp_motor_ident.sections import between_samples
 from smp_motor_ident.thinning import thinned
 
 Array = NDArray[np.float64]
