@@ -14,6 +14,10 @@ Array = NDArray[np.float64]
 
 FEWEST = 40
 MOST_LOST = 0.3
+RUNS = 2_000  # runs of samples in which signals are averaged before they are compared
+RUN_COLOUR = 20.0  # by which neighbouring runs' errors hang together, at most
+SURE = 6.0  # standard deviations of an offset
+LARGEST_OFFSET = 0.2  # of the largest current otherwise
 METER = 0.01  # of the supply, or of a level: what a voltmeter may scatter
 
 
@@ -50,6 +54,8 @@ def screen(records: Sequence[Record]) -> list[str]:
         _frozen(record)
     _motion(records, where)
     _signs(records, where)
+    for record in records:
+        _offset(record)
     return list(dict.fromkeys(warnings))
 
 
@@ -208,13 +214,22 @@ def _saturation(record: Record) -> None:
             if share < 0.01 or at.sum() < 5 * next_times or runs.sum() < 0.5 * at.sum():
                 continue
             low, high = np.percentile(v[at], [5, 95])
-            if high - low < 0.02 * np.ptp(v):
+            if high - low < 0.02 * np.ptp(v) and not _abrupt(x, at):
                 continue
             raise SignalError(
                 f"{where}: saturated sensor, {name} rests at {limit:.4g} {unit} in "
                 f"{share:.1%} of the samples while the voltage moves; widen its range or "
                 "lower the excitation"
             )
+
+
+def _abrupt(x: Array, at: NDArray[np.bool_]) -> bool:
+    """Tell a clipped signal from one that settles: it jumps to its limit, scatters elsewhere."""
+    enters = np.flatnonzero(at[1:] & ~at[:-1]) + 1
+    rest = x[(x != x.max()) & (x != x.min())]
+    if not enters.size or np.unique(rest).size < 0.5 * rest.size:
+        return False
+    return bool(np.median(np.abs(x[enters] - x[enters - 1])) > 1e-3 * np.ptp(x))
 
 
 def _frozen(record: Record) -> None:
@@ -272,17 +287,53 @@ def _signs(records: Sequence[Record], where: str) -> None:
             ok = np.isfinite(y)
             if ok.sum() < 20:
                 continue
-            v = record.voltage[ok]
-            if what == "current":
-                total += float(np.einsum("i,i->", v, y[ok]))
-            else:
-                total += _slow_product(v, y[ok])
-            power += float(np.sqrt(np.square(v).sum() * np.square(y[ok]).sum()))
+            v, x = _averaged(record, y)
+            together = float(np.einsum("i,i->", v, x))
+            total += together if what == "current" else _slow_product(v, x)
+            power += float(np.sqrt(np.square(v).sum() * np.square(x).sum()))
         if power > 0 and total < -0.2 * power:
             raise SignalError(
                 f"{where}: swapped sign, {what} runs against the voltage "
                 f"(correlation {total / power:.2f}); {remedy}"
             )
+
+
+def _averaged(record: Record, values: Array) -> tuple[Array, Array]:
+    """Return voltage and a signal as means over short runs, in which a counter's noise is small."""
+    k = max(1, len(record) // RUNS)
+    n = len(record) // k * k
+    ok = np.isfinite(values[:n]).reshape(-1, k)
+    y = np.where(ok, values[:n].reshape(-1, k), 0.0).sum(axis=1) / np.maximum(ok.sum(axis=1), 1)
+    keep = ok.any(axis=1)
+    return record.voltage[:n].reshape(-1, k).mean(axis=1)[keep], y[keep]
+
+
+def _offset(record: Record) -> None:
+    """Refuse a current that is not nothing where ``(v - K w) / R`` is.
+
+    Friction and load have no part in this: the electric equation does not know them.
+    """
+    if record.current is None or np.isfinite(record.current).sum() < FEWEST:
+        return
+    speed = measured_speed(record)
+    there = np.isfinite(record.current) & np.isfinite(speed)
+    v, i = _averaged(record, np.where(there, record.current, np.nan))
+    _, w = _averaged(record, np.where(there, speed, np.nan))
+    if len(v) < 20:
+        return
+    columns = np.column_stack([v, w, np.ones(len(v))])
+    answer, _, rank, _ = np.linalg.lstsq(columns, i, rcond=1e-8)
+    if rank < 3:
+        return
+    rest = i - columns @ answer
+    normal = np.linalg.inv(np.einsum("ni,nj->ij", columns, columns))
+    std = float(np.sqrt(normal[2, 2] * rest.var() * RUN_COLOUR))
+    offset, largest = float(answer[2]), float(np.nanmax(np.abs(record.current)))
+    if abs(offset) > max(SURE * std, LARGEST_OFFSET * max(largest - abs(offset), 1e-12)):
+        raise SignalError(
+            f"{_where([record])}: current has an offset of {offset:.2g} A where it reaches "
+            f"{largest:.3g} A; zero the current sensor at rest and record again"
+        )
 
 
 def _slow_product(v: Array, y: Array) -> float:
