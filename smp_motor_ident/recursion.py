@@ -15,7 +15,6 @@ from smp_motor_ident._compile import compiled, inlined
 from smp_motor_ident.events import advance, keeps_turning
 from smp_motor_ident.internal import (
     ANGLE,
-    CURRENT_OFFSET,
     DELAY,
     LOAD,
     MEAN_SPEED,
@@ -24,7 +23,6 @@ from smp_motor_ident.internal import (
     VC_MINUS,
     VC_PLUS,
     WINDOW,
-    R,
 )
 from smp_motor_ident.lanes import (
     ACTIVE,
@@ -33,7 +31,6 @@ from smp_motor_ident.lanes import (
     LANES,
     SLOPE,
     SQ,
-    ST,
     SW,
     begin,
     prepare_slide,
@@ -42,16 +39,15 @@ from smp_motor_ident.lanes import (
     tabulate,
     turn,
 )
+from smp_motor_ident.observation import note, observe, observe_current
 from smp_motor_ident.sums import ROOM, TILE, robust, sum_up
-from smp_motor_ident.window import recall, remember
 
 __all__ = ["ANGLE", "MEAN_SPEED", "SPEED", "WINDOW", "run"]
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-ON_OFFSET, ON_R = SLOPE + CURRENT_OFFSET * LANES, SLOPE + R * LANES
-ON_DELAY, ON_WINDOW = SLOPE + DELAY * LANES, SLOPE + WINDOW * LANES
+ON_DELAY = SLOPE + DELAY * LANES
 
 
 @inlined
@@ -102,51 +98,6 @@ def _switch(
         dv = -max(0.0, net - par[VC_PLUS]) - min(0.0, net + par[VC_MINUS])
     for j in range(LANES):
         m[SW + j] += dv / par[1] * m[ON_DELAY + j]
-
-
-@inlined
-def _observe(
-    kind: int, k: int, first: int, t: float, par: Array, x: Array, m: Array, ring: Array,
-    past: Array, columns: bool,
-) -> float:  # fmt: skip
-    """Return the mechanical output; put its derivative into D0."""
-    if kind == MEAN_SPEED:
-        remember(ring, k, t, x, m)
-        width = par[WINDOW]
-        p = past.shape[0] - 1
-        speed = recall(ring, k, first, t - width, p, past)
-        y = float((x[2] - past[0]) / width)
-        for j in range(p):
-            m[D0 + j] = (m[ST + j] - past[1 + j] + (speed - y) * m[ON_WINDOW + j]) / width
-        return y
-    if columns:
-        if kind == ANGLE:
-            for j in range(LANES):
-                m[D0 + j] = m[ST + j]
-        else:
-            for j in range(LANES):
-                m[D0 + j] = m[SW + j]
-    return float(x[2] if kind == ANGLE else x[1])
-
-
-@inlined
-def _observe_current(par: Array, x: Array, m: Array) -> float:
-    """Return the current; put its derivative into D1."""
-    amps = x[0] / par[R]
-    for j in range(LANES):
-        m[D1 + j] = m[SQ + j] / par[R] + m[ON_OFFSET + j] - amps * m[ON_R + j]
-    return float(amps + par[CURRENT_OFFSET])
-
-
-@inlined
-def _note(row: Array, speed: float, y0: float, y1: float) -> None:
-    """Put into a row what it has room for: the output; speed, output (and current)."""
-    if row.shape[0] == 1:
-        row[0] = y0
-        return
-    row[0], row[1] = speed, y0
-    if row.shape[0] > 2:
-        row[2] = y1
 
 
 @inlined
@@ -301,10 +252,10 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
                     section += 1
                     if late:
                         _switch(v, section_value[section], load, direction, friction, par, m)
-            y0 = _observe(kind, k, first, target, par, x, m, ring, past, columns)
-            y1 = _observe_current(par, x, m) if has_current else 0.0
+            y0 = observe(kind, k, first, target, par, x, m, ring, past, columns)
+            y1 = observe_current(par, x, m) if has_current else 0.0
             if predicted.shape[0] > 0:
-                _note(predicted[k], x[1], y0, y1)
+                note(predicted[k], x[1], y0, y1)
             # Residuals, whitened.
             e0 = output[k] - y0
             e1 = current[k] - y1 if has_current else 0.0
