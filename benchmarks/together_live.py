@@ -7,8 +7,8 @@ speed, which the loop does not use, is what the plant reports (velocity_window 0
 
     python benchmarks/together_live.py [--rates 100 200 1000] [--steps 6]
 
-A step during which a sample came more than half a period late, or not at all, is told as
-disturbed: the machine ran something else then.
+A step during which a sample or the answer to it came late by more than 0.7 of the period, or
+not at all, is told as disturbed: the machine ran something else then.
 """
 
 from __future__ import annotations
@@ -22,9 +22,12 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import rclpy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 from together import ENTRIES, SPEED, identify_recorded, settling_time
 
@@ -41,8 +44,8 @@ HOLD = 0.9
 SETPOINTS = 0.02
 """Interval of the set-points [s]."""
 
-LATE = 1.5
-"""Of the period: a longer interval between samples tells of a disturbed step."""
+LATE = 1.7
+"""Periods: a longer interval between samples, or to an answer, tells of a disturbed step."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +61,8 @@ class Step:
     overshoot : float
         Largest of all wheels [%].
     interval : float
-        Longest between two samples of any wheel, in periods.
+        Longest between two samples of any wheel, or from a sample to the answer to the one after
+        it, in periods.
     """
 
     settling: dict[str, float]
@@ -75,24 +79,23 @@ class Probe:
         self.node = rclpy.create_node("probe")
         self.executor = LeanExecutor()
         self.executor.add_node(self.node)
-        self.truth: dict[str, list[tuple[float, float]]] = {w: [] for w in wheels}
-        self.asked: dict[str, list[tuple[float, float]]] = {w: [] for w in wheels}
-        qos = runtime.STREAM_SUBSCRIBER
+        # As bytes, read afterwards: thousands a second come at 1 kHz.
+        self.states: dict[str, list[bytes]] = {w: [] for w in wheels}
+        self.asked: dict[str, list[bytes]] = {w: [] for w in wheels}
+        qos = QoSProfile(depth=2000, reliability=ReliabilityPolicy.BEST_EFFORT)
         for wheel in wheels:
-            self.node.create_subscription(
-                MotorState, f"/{wheel}/motor_state",
-                lambda m, seen=self.truth[wheel]: seen.append(
-                    (runtime.seconds(m.header.stamp), m.velocity)), qos)  # fmt: skip
-            self.node.create_subscription(
-                PidState, f"/{wheel}/pid_state",
-                lambda m, seen=self.asked[wheel]: seen.append(
-                    (runtime.seconds(m.header.stamp), m.setpoint)), qos)  # fmt: skip
+            for kind, name, seen in (
+                (MotorState, "motor_state", self.states), (PidState, "pid_state", self.asked),
+            ):  # fmt: skip
+                self.node.create_subscription(
+                    kind, f"/{wheel}/{name}", seen[wheel].append, qos, raw=True
+                )
         self.setpoints = self.node.create_publisher(JointState, "/wheel_setpoints", 1)
         self.speed = 0.0
         runtime.steady_timer(self.node, SETPOINTS, self._ask)
 
     def _ask(self) -> None:
-        names = [f"{wheel}_wheel_joint" for wheel in self.truth]
+        names = [f"{wheel}_wheel_joint" for wheel in self.states]
         self.setpoints.publish(JointState(name=names, velocity=[self.speed] * len(names)))
 
     def drive(self, speed: float, duration: float) -> None:
@@ -103,26 +106,51 @@ class Probe:
             self.executor.spin_once()
 
     def forget(self) -> None:
-        for seen in (*self.truth.values(), *self.asked.values()):
+        """Take in what has come, and drop it."""
+        self.catch_up()
+        for seen in (*self.states.values(), *self.asked.values()):
             seen.clear()
+
+    def catch_up(self) -> None:
+        """Spin until what was sent by now is here."""
+        now = runtime.seconds(self.node.get_clock().now().to_msg())
+        end = time.monotonic() + 5.0
+        while time.monotonic() < end and not all(
+            seen and _stamp(seen[-1], kind) > now
+            for kind, of in ((MotorState, self.states), (PidState, self.asked))
+            for seen in of.values()
+        ):
+            self.executor.spin_once()
 
     def step(self, target: float, period: float) -> Step:
         """Read a step that began after the last :meth:`forget`."""
+        self.catch_up()
         settling, instants, overshoot, longest = {}, [], 0.0, 0.0
-        for wheel, seen in self.truth.items():
-            stamps, speed = np.array(seen).T
-            begin = next(t for t, setpoint in self.asked[wheel] if setpoint == target)
+        for wheel, seen in self.states.items():
+            told = [deserialize_message(data, PidState) for data in self.asked[wheel]]
+            told = [m for m in told if m.setpoint == target]
+            begin = runtime.seconds(told[0].header.stamp)
+            answered = np.array([runtime.seconds(m.header.stamp) for m in told])
+            states = [deserialize_message(data, MotorState) for data in seen]
+            stamps = np.array([runtime.seconds(m.header.stamp) for m in states])
+            speed = np.array([m.velocity for m in states])[stamps > begin - 2 * period]
+            stamps = stamps[stamps > begin - 2 * period]
+            late = max(float(np.diff(answered).max()), period + max(m.age for m in told))
             at = settling_time(stamps, speed / target)
             settling[wheel] = at - begin
             instants.append(at)
             overshoot = max(overshoot, 100.0 * (speed.max() / target - 1.0))
-            longest = max(longest, float(np.diff(stamps).max()) / period)
+            longest = max(longest, float(np.diff(stamps).max()) / period, late / period)
         return Step(settling, max(instants) - min(instants), overshoot, longest)
 
     def close(self) -> None:
         self.executor.shutdown()
         self.node.destroy_node()
         rclpy.shutdown()
+
+
+def _stamp(data: bytes, kind: Any) -> float:
+    return runtime.seconds(deserialize_message(data, kind).header.stamp)
 
 
 def designed(rate: float, seed: int) -> Mapping[str, Design]:
@@ -133,7 +161,7 @@ def designed(rate: float, seed: int) -> Mapping[str, Design]:
     return design_wheels(found, dict.fromkeys(found, loop), max_velocity=2.0).designs
 
 
-def measure(rate: float, steps: int, seed: int) -> tuple[list[Step], float]:
+def measure(rate: float, steps: int, seed: int, priority: int) -> tuple[list[Step], float]:
     """Run the nodes and step; return what came of each step, and the transition [s]."""
     designs = designed(rate, seed)
     environment = {
@@ -147,7 +175,12 @@ def measure(rate: float, steps: int, seed: int) -> tuple[list[Step], float]:
                      "-p", f"motors_file:={motors}"]]  # fmt: skip
         commands += [["wheel_pid", "--ros-args", "-r", f"__ns:=/{wheel}", "--params-file", gains]
                      for wheel in designs]  # fmt: skip
-        started = [subprocess.Popen(command, env=environment) for command in commands]
+
+        def prefer() -> None:
+            if priority:
+                os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+
+        started = [subprocess.Popen(c, env=environment, preexec_fn=prefer) for c in commands]
         probe = Probe(list(designs))
         target = SPEED / next(iter(designs.values())).loop.gear_ratio
         found = []
@@ -172,11 +205,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--rates", type=float, nargs="+", default=[100.0, 200.0, 1000.0])
     parser.add_argument("--steps", type=int, default=6)
+    parser.add_argument(
+        "--priority", type=int, default=0, help="SCHED_FIFO priority of the nodes; 0 for none"
+    )
     parser.add_argument("--seed", type=int, default=1, help="of the recording")
     arguments = parser.parse_args(argv)
     print("rate [Hz]  transition [ms]  settling [ms]                  spread [ms]  overshoot [%]")
     for rate in arguments.rates:
-        steps, transition = measure(rate, arguments.steps, arguments.seed)
+        steps, transition = measure(rate, arguments.steps, arguments.seed, arguments.priority)
         for one in steps:
             times = "  ".join(f"{1e3 * t:6.1f}" for t in one.settling.values())
             told = (
