@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
@@ -15,6 +16,51 @@ OPTIONS: dict[str, Any] = {
     "nogil": True,
     "fastmath": {"contract", "nsz", "arcp", "reassoc"},
 }
+
+
+KERNELS = (
+    "_compile",
+    "cascade",
+    "elimination",
+    "events",
+    "internal",
+    "interpolation",
+    "kalman",
+    "lanes",
+    "observation",
+    "propagator",
+    "recursion",
+    "regression",
+    "sliding",
+    "sums",
+    "window",
+)
+"""Modules whose compiled functions take each other in."""
+
+
+def _stamp() -> tuple[tuple[int, int], ...]:
+    """Return what changes when any of these modules does."""
+    found = []
+    for name in KERNELS:
+        status = (Path(__file__).parent / f"{name}.py").stat()
+        found.append((status.st_mtime_ns, status.st_size))
+    return tuple(found)
+
+
+STAMP = _stamp()
+
+
+def _told_of_others(dispatcher: Any) -> Any:
+    """Make what lies on the disk void when any of the modules changed, not only its own.
+
+    Numba looks at the file of the outermost function alone: an edit of a function that was
+    compiled into it would go unnoticed.
+    """
+    file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
+    own = getattr(file, "_source_stamp", None)
+    if file is not None and own is not None:
+        file._source_stamp = (own, STAMP)
+    return dispatcher
 
 
 def compiled(function: F) -> F:
@@ -32,7 +78,7 @@ def compiled(function: F) -> F:
     callable
         The same function, compiled; the signature is unchanged.
     """
-    return cast(F, numba.njit(**OPTIONS)(function))
+    return cast(F, _told_of_others(numba.njit(**OPTIONS)(function)))
 
 
 def inlined(function: F) -> F:
@@ -48,4 +94,4 @@ def inlined(function: F) -> F:
     callable
         The same function, compiled; the signature is unchanged.
     """
-    return cast(F, numba.njit(forceinline=True, **OPTIONS)(function))
+    return cast(F, _told_of_others(numba.njit(forceinline=True, **OPTIONS)(function)))
