@@ -65,7 +65,7 @@ def unseen_friction(data: Experiments, fit: Fit) -> tuple[Fit, float]:
     if structure.friction != "none" or not structure.free():
         return fit, 0.0
     answer, left = _answer(data, fit, structure.with_(friction="symmetric"), models.VC_PLUS)
-    variance = float(np.median(fit.colour())) / max(left, 1e-12)
+    variance = float(np.max(fit.colour())) / max(left, 1e-12)
     return _wider(fit, answer, variance), float(np.sqrt(variance))
 
 

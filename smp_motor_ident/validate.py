@@ -66,7 +66,7 @@ def speed_fit(records: Sequence[Record], data: Experiments, fit: Fit) -> float:
     if data.kind != rc.ANGLE:
         return percent(data.output, at_once)
     lag = _lag(data, predicted[:, 1])
-    best = percent(_means(data, data.output, lag), _means(data, predicted[:, 1], lag))
+    best = percent(_means(data, _filled(data), lag), _means(data, predicted[:, 1], lag))
     given = [r.velocity for r in records]
     if all(v is not None for v in given):
         velocity = np.concatenate([v for v in given if v is not None])
@@ -87,6 +87,14 @@ def _lag(data: Experiments, angle: Array) -> int:
             break  # longer, and the motion itself would be averaged away
         lag *= 2
     return lag
+
+
+def _filled(data: Experiments) -> Array:
+    """Return counts with a standstill's repeats, which the fit leaves out, put back."""
+    if data.quantum == 0.0:
+        return data.output
+    last = np.maximum.accumulate(np.where(np.isfinite(data.output), np.arange(data.size), 0))
+    return np.asarray(data.output[last])
 
 
 def _means(data: Experiments, angle: Array, lag: int) -> Array:
