@@ -52,7 +52,8 @@ class _Descent:
         self.matrix = structure.matrix()
         self.own = own_columns(data, structure)
         self.current = data.current.size > 0
-        self.z, self.start, self.initial = structure.complete(z), initial.copy(), initial.copy()
+        self.z = structure.complete(np.minimum(np.maximum(z, lower), upper))
+        self.start, self.initial = initial.copy(), initial.copy()
         self.smooth = structure.friction == "none" and not structure.delay
         self.only_scale = not self.current and huber == math.inf and ratio == 0
         self.damping, self.passes, self.converged = 1e-3, 0, False

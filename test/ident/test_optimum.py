@@ -15,6 +15,7 @@ from smp_motor_ident.descent import Options, first_noise
 from smp_motor_ident.elimination import cholesky_solve, damped_step, eliminate
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.experiments import prepare
+from smp_motor_ident.fit import solve
 from smp_motor_ident.models import Structure
 from smp_motor_ident.noise import proper, renewed, whitening
 from smp_motor_ident.passes import gather
@@ -157,6 +158,17 @@ def test_current_lost_at_every_other_sample_still_gives_the_motor():
     truth = motors.truth("rear_left", 0.0)
     # 10 mA of noise on 3 A, 600 readings: tenths of a percent.
     assert found.value("resistance") == pytest.approx(truth["resistance"], rel=0.01)
+
+
+def test_a_start_outside_the_bounds_is_taken_to_them():
+    record, _ = random_record(1)
+    data = prepare([record], False).as_mean_speed()
+    structure = Structure("x", friction="none", window=True)
+    z = np.log([0.03, 1e-3, 1e-5, 1e-2, 1, 1, 1, 1, 1, 1, 1])
+    z[models.WINDOW], z[models.TE] = -0.1, 1e4
+    fit = solve(data, structure, z, data.initial, first_noise(data), iterations=3)
+    assert fit.z[models.WINDOW] > 0
+    assert np.all(np.isfinite(fit.z))
 
 
 @pytest.mark.parametrize("broken", [np.nan, np.inf, -1.0, 0.0])
