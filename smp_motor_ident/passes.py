@@ -207,7 +207,9 @@ def _ring(data: Experiments, par: Array, p: int) -> Array:
     if data.kind != recursion.MEAN_SPEED:
         return np.zeros((0, 0))
     steps = np.diff(data.time)
-    depth = 4 + math.ceil(par[recursion.WINDOW] / float(steps[steps > 0].min()))
+    # A descent may try any width; one that is no width at all is thrown out by its objective.
+    width = min(max(float(par[recursion.WINDOW]), 0.0), float(np.ptp(data.time)))
+    depth = 4 + math.ceil(width / float(steps[steps > 0].min()))
     return np.zeros((min(depth, data.size + 1), 3 + 2 * p))
 
 
