@@ -96,6 +96,16 @@ def test_resistance_and_inductance_fixed_separate_the_rest_without_current():
         assert abs(q.value - truth[name]) < SIGMAS * q.std, name
 
 
+def test_a_back_emf_of_three_percent_is_told_once_resistance_and_inductance_are():
+    truth = motors.truth("front_right", 0.3)
+    known = {n: truth[n] for n in ("resistance", "inductance")}
+    result = estimate(motors.record("front_right", current=False), fixed=known)
+    for name in ("motor_constant", "inertia", "viscous_friction"):
+        q = result.parameters[name]
+        assert abs(q.value - truth[name]) < SIGMAS * q.std, name
+        assert q.std < 0.1 * truth[name], name  # the bound is 1.5 % for 12 s
+
+
 def test_resistance_and_friction_fixed_leave_two_motors_and_are_refused():
     truth = motors.truth("front_left", 0.0)
     recording = motors.record("front_left", current=False, static_voltage=0.0)

@@ -78,6 +78,25 @@ def test_a_speed_that_has_nothing_to_do_with_the_voltage_is_refused():
         estimate(replace(GOOD, count=None, velocity=noise))
 
 
+def test_an_angle_that_stops_half_way_is_a_dead_encoder():
+    angle = GOOD.count[np.minimum(np.arange(N), N // 2)] * motors.QUANTUM
+    with pytest.raises(SignalError, match="dead encoder, the position stays"):
+        estimate(replace(GOOD, count=None, velocity=None, position=angle))
+
+
+def test_a_current_clipped_by_a_two_level_command_is_saturated():
+    random = np.repeat(np.sign(np.random.default_rng(2).standard_normal(N // 40)), 40) * 8.0
+    good = motors.record("rear_left", voltage=random, seconds=4.0)
+    with pytest.raises(SignalError, match="saturated sensor, current"):
+        estimate(replace(good, current=np.clip(good.current, -0.6, 0.6)))
+
+
+def test_a_voltmeter_that_scatters_around_a_level_is_a_constant_input():
+    noise = 0.01 * np.random.default_rng(3).standard_normal(N)
+    with pytest.raises(InsufficientExcitationError, match="constant at 6"):
+        estimate(motors.record("rear_left", seconds=4.0, voltage=6.0 + noise))
+
+
 def test_a_small_offset_of_the_current_is_removed_and_said():
     result = estimate(replace(GOOD, current=GOOD.current + 0.05))
     assert any("offset" in w for w in result.warnings)
