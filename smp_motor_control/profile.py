@@ -167,18 +167,24 @@ class Profile:
         transition = MinimumJerk(start, target, minimum_jerk_duration(step, limits, least))
         # A start from rest is exact but for the voltage.  A moving start may ask for more: time
         # helps, but only without the jerk that it started with, which would act all the longer.
-        while abs(start.acceleration) < limits.acceleration and not self._keeps(transition):
+        while not self._keeps(transition):
             start = start._replace(jerk=0.0)
             transition = MinimumJerk(start, target, transition.duration * _STRETCH)
         return transition
 
     def _keeps(self, transition: MinimumJerk) -> bool:
-        """Tell whether acceleration, jerk and voltage keep their limits (to one part in 1000)."""
+        """Tell whether acceleration, jerk and voltage keep their limits (to one part in 1000).
+
+        An acceleration that is beyond its limit already, since that was lowered, may only fall.
+        """
         seen = [transition.at(s * transition.duration) for s in _LOOKS]
         if self.drive is not None and not self._affords(self.drive, transition, seen):
             return False
+        largest = max(
+            1.001 * self.limits.acceleration, (1 + 1e-9) * abs(transition.start.acceleration)
+        )
         return (
-            max(abs(x.acceleration) for x in seen) <= 1.001 * self.limits.acceleration
+            max(abs(x.acceleration) for x in seen) <= largest
             and max(abs(x.jerk) for x in seen) <= 1.001 * self.limits.jerk
         )
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 from scipy.optimize import linprog
@@ -93,6 +93,7 @@ targets = st.lists(st.tuples(st.floats(-6.0, 6.0), st.integers(1, 80)), min_size
 @settings(deadline=None)
 @pytest.mark.parametrize("transition_time", [0.0, 0.15])
 @given(targets=targets)
+@example(targets=[(-3.0, 47), (-4.53125, 62), (-5.0, 42), (-1.65625, 52), (0.0, 8), (-5.0, 32)])
 def test_reference_keeps_its_limits_through_any_change_of_mind(
     transition_time: float, targets: list
 ) -> None:
@@ -278,3 +279,18 @@ def test_an_acceleration_limit_holds_beside_the_voltage() -> None:
     seen = [profile.step(0.001) for _ in range(round(profile.duration / 0.001))]
     assert max(x.acceleration for x in seen) <= 1.001 * 40.0
     assert max(drive.needed(x) for x in seen) <= 1.001 * 10.0
+
+
+def test_a_limit_lowered_on_the_way_lets_the_acceleration_only_fall() -> None:
+    profile = Profile(ProfileLimits(acceleration=30.0, jerk=600.0), transition_time=0.15)
+    profile.set_target(3.0)
+    for _ in range(30):
+        profile.step(0.002)
+    profile.configure(ProfileLimits(acceleration=5.0, jerk=600.0), transition_time=0.15)
+    profile.set_target(4.0)
+    largest = abs(profile.now.acceleration)
+    assert largest > 5.0
+    while profile.moving:
+        # A fall that starts without jerk overshoots nothing; rounding alone.
+        assert abs(profile.step(0.002).acceleration) <= largest * (1 + 1e-6)
+    assert profile.now == Reference(4.0, 0.0, 0.0)
