@@ -15,12 +15,13 @@ from pathlib import Path
 import numpy as np
 from known_motors import TABLE_1, recording, table
 
-from smp_motor_ident import fit, models
-from smp_motor_ident.cold import cold_fit
-from smp_motor_ident.descent import Options
+from smp_motor_ident import models
 from smp_motor_ident.errors import SmpError
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.experiments import prepare
+from smp_motor_ident.fitting import fit
+from smp_motor_ident.fitting.cold import cold_fit
+from smp_motor_ident.fitting.descent import Options
+from smp_motor_ident.kernel.experiments import prepare
 from smp_motor_ident.models import Structure
 
 CASES = {

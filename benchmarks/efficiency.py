@@ -17,13 +17,13 @@ import numpy as np
 from known_motors import CURRENT_NOISE, QUANTUM, TABLE_1, recording, table
 
 from smp_motor_ident import models
-from smp_motor_ident import recursion as rc
 from smp_motor_ident.errors import SmpError
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.experiments import prepare
+from smp_motor_ident.kernel import recursion as rc
+from smp_motor_ident.kernel.experiments import prepare
+from smp_motor_ident.kernel.noise import kalman_gain
+from smp_motor_ident.kernel.passes import evaluate
 from smp_motor_ident.models import PHYSICAL, Structure
-from smp_motor_ident.noise import kalman_gain
-from smp_motor_ident.passes import evaluate
 
 COMBINATIONS = ("dc_gain", "time_constant", "time_constant_product")
 KINDS = ("sine", "square", "fourier", "plain square")

@@ -12,8 +12,8 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.signal import cont2discrete, lfilter
 
-from smp_motor_ident.experiments import prepare
-from smp_motor_ident.fit import solve
+from smp_motor_ident.fitting.fit import solve
+from smp_motor_ident.kernel.experiments import prepare
 from smp_motor_ident.models import Structure
 from smp_motor_ident.record import Record
 

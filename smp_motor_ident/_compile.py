@@ -18,33 +18,11 @@ OPTIONS: dict[str, Any] = {
 }
 
 
-KERNELS = (
-    "_compile",
-    "cascade",
-    "elimination",
-    "events",
-    "internal",
-    "interpolation",
-    "kalman",
-    "lanes",
-    "observation",
-    "propagator",
-    "recursion",
-    "regression",
-    "sliding",
-    "sums",
-    "window",
-)
-"""Modules whose compiled functions take each other in."""
-
-
 def _stamp() -> tuple[tuple[int, int], ...]:
-    """Return what changes when any of these modules does."""
-    found = []
-    for name in KERNELS:
-        status = (Path(__file__).parent / f"{name}.py").stat()
-        found.append((status.st_mtime_ns, status.st_size))
-    return tuple(found)
+    """Return what changes when a module does whose functions are compiled into each other."""
+    here = Path(__file__)
+    files = [here, *sorted((here.parent / "kernel").glob("*.py"))]
+    return tuple((file.stat().st_mtime_ns, file.stat().st_size) for file in files)
 
 
 STAMP = _stamp()

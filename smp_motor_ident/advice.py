@@ -6,11 +6,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from smp_motor_ident import models, replay
-from smp_motor_ident import recursion as rc
-from smp_motor_ident.answer import Answer
-from smp_motor_ident.experiments import Experiments
-from smp_motor_ident.fit import Fit
+from smp_motor_ident import models
+from smp_motor_ident.fitting import replay
+from smp_motor_ident.fitting.answer import Answer
+from smp_motor_ident.fitting.fit import Fit
+from smp_motor_ident.kernel import recursion as rc
+from smp_motor_ident.kernel.experiments import Experiments
 from smp_motor_ident.models import PHYSICAL
 from smp_motor_ident.result import ResidualTests
 

@@ -7,26 +7,27 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident import ladder, models, validate
-from smp_motor_ident import recursion as rc
+from smp_motor_ident import models, validate
 from smp_motor_ident.advice import advise, doubts
-from smp_motor_ident.answer import Answer, answer
-from smp_motor_ident.choice import Rung
-from smp_motor_ident.cold import cold_fit
-from smp_motor_ident.descent import Options, head, refine
 from smp_motor_ident.errors import InsufficientExcitationError, ParameterError, SignalError
-from smp_motor_ident.experiments import Experiments, prepare
-from smp_motor_ident.fit import Fit, Prior
-from smp_motor_ident.horizon import extend, grow
+from smp_motor_ident.fitting import ladder
+from smp_motor_ident.fitting.answer import Answer, answer
+from smp_motor_ident.fitting.choice import Rung
+from smp_motor_ident.fitting.cold import cold_fit
+from smp_motor_ident.fitting.descent import Options, head, refine
+from smp_motor_ident.fitting.fit import Fit, Prior
+from smp_motor_ident.fitting.horizon import extend, grow
+from smp_motor_ident.fitting.nuisance import blurred, unseen_friction
+from smp_motor_ident.fitting.profile import profiled
+from smp_motor_ident.fitting.quantisation import widened
+from smp_motor_ident.fitting.thinning import thinned
+from smp_motor_ident.kernel import recursion as rc
+from smp_motor_ident.kernel.experiments import Experiments, prepare
+from smp_motor_ident.kernel.sections import between_samples
 from smp_motor_ident.models import MODELS, PHYSICAL, Structure
-from smp_motor_ident.nuisance import blurred, unseen_friction
-from smp_motor_ident.profile import profiled
-from smp_motor_ident.quantisation import widened
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import Candidate, Estimate, FitPercent
 from smp_motor_ident.screening import screen
-from smp_motor_ident.sections import between_samples
-from smp_motor_ident.thinning import thinned
 
 Array = NDArray[np.float64]
 

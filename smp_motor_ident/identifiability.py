@@ -14,10 +14,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident import models, replay
-from smp_motor_ident import recursion as rc
-from smp_motor_ident.experiments import prepare
-from smp_motor_ident.fit import Fit
+from smp_motor_ident import models
+from smp_motor_ident.fitting import replay
+from smp_motor_ident.fitting.fit import Fit
+from smp_motor_ident.kernel import recursion as rc
+from smp_motor_ident.kernel.experiments import prepare
 from smp_motor_ident.models import PHYSICAL, Structure
 from smp_motor_ident.record import Hardware, Record
 from smp_motor_ident.result import Estimate

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from smp_motor_ident import recursion as rc
-from smp_motor_ident import replay
-from smp_motor_ident.experiments import Experiments, prepare
-from smp_motor_ident.fit import Fit
+from smp_motor_ident.fitting import replay
+from smp_motor_ident.fitting.fit import Fit
+from smp_motor_ident.kernel import recursion as rc
+from smp_motor_ident.kernel.experiments import Experiments, prepare
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import Estimate, ResidualTests
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from smp_motor_ident import models
-from smp_motor_ident import recursion as rc
-from smp_motor_ident.experiments import prepare
+from smp_motor_ident.kernel import recursion as rc
+from smp_motor_ident.kernel.experiments import prepare
+from smp_motor_ident.kernel.noise import kalman_gain
+from smp_motor_ident.kernel.passes import gather
 from smp_motor_ident.models import Structure
-from smp_motor_ident.noise import kalman_gain
-from smp_motor_ident.passes import gather
 
 NO_GAIN = np.zeros((3, 2))
 

@@ -10,8 +10,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident import recursion
-from smp_motor_ident.kalman import steady_gain
+from smp_motor_ident.kernel import recursion
+from smp_motor_ident.kernel.kalman import steady_gain
 from smp_motor_ident.models import to_internal
 
 Array = NDArray[np.float64]

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident import models
-from smp_motor_ident import recursion as rc
-from smp_motor_ident.experiments import Experiments
-from smp_motor_ident.fit import Fit, Prior, solve
+from smp_motor_ident.fitting.fit import Fit, Prior, solve
+from smp_motor_ident.kernel import recursion as rc
+from smp_motor_ident.kernel.experiments import Experiments
 from smp_motor_ident.models import Structure
 
 Array = NDArray[np.float64]

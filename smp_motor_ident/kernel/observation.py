@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident._compile import inlined
-from smp_motor_ident.internal import ANGLE, CURRENT_OFFSET, MEAN_SPEED, WINDOW, R
-from smp_motor_ident.lanes import D0, D1, LANES, SLOPE, SQ, ST, SW
-from smp_motor_ident.window import recall, remember
+from smp_motor_ident.kernel.internal import ANGLE, CURRENT_OFFSET, MEAN_SPEED, WINDOW, R
+from smp_motor_ident.kernel.lanes import D0, D1, LANES, SLOPE, SQ, ST, SW
+from smp_motor_ident.kernel.window import recall, remember
 
 Array = NDArray[np.float64]
 

@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident import models
-from smp_motor_ident.elimination import damped_step
-from smp_motor_ident.experiments import Experiments
-from smp_motor_ident.fitted import Fit, Prior
+from smp_motor_ident.fitting.fitted import Fit, Prior
+from smp_motor_ident.kernel.elimination import damped_step
+from smp_motor_ident.kernel.experiments import Experiments
+from smp_motor_ident.kernel.noise import deviance, gain_for, proper, renewed
+from smp_motor_ident.kernel.passes import Pass, evaluate, own_columns
 from smp_motor_ident.models import Structure, to_internal
-from smp_motor_ident.noise import deviance, gain_for, proper, renewed
-from smp_motor_ident.passes import Pass, evaluate, own_columns
 
 __all__ = ["Fit", "Prior", "solve"]
 

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident._compile import compiled, inlined
-from smp_motor_ident.events import advance, keeps_turning
-from smp_motor_ident.internal import (
+from smp_motor_ident.kernel.events import advance, keeps_turning
+from smp_motor_ident.kernel.internal import (
     ANGLE,
     DELAY,
     LOAD,
@@ -24,7 +24,7 @@ from smp_motor_ident.internal import (
     VC_PLUS,
     WINDOW,
 )
-from smp_motor_ident.lanes import (
+from smp_motor_ident.kernel.lanes import (
     ACTIVE,
     D0,
     D1,
@@ -39,8 +39,8 @@ from smp_motor_ident.lanes import (
     tabulate,
     turn,
 )
-from smp_motor_ident.observation import note, observe, observe_current
-from smp_motor_ident.sums import ROOM, TILE, robust, sum_up
+from smp_motor_ident.kernel.observation import note, observe, observe_current
+from smp_motor_ident.kernel.sums import ROOM, TILE, robust, sum_up
 
 __all__ = ["ANGLE", "MEAN_SPEED", "SPEED", "WINDOW", "run"]
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident import models
-from smp_motor_ident.fit import Fit
+from smp_motor_ident.fitting.fit import Fit
 from smp_motor_ident.models import PHYSICAL
 from smp_motor_ident.result import UNITS, Quantity
 

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident import models
-from smp_motor_ident.experiments import Experiments
-from smp_motor_ident.fit import Fit, solve
+from smp_motor_ident.fitting.fit import Fit, solve
+from smp_motor_ident.kernel.experiments import Experiments
+from smp_motor_ident.kernel.passes import NO_GAIN, Pass, evaluate, gather
 from smp_motor_ident.models import Structure
-from smp_motor_ident.passes import NO_GAIN, Pass, evaluate, gather
 
 Array = NDArray[np.float64]
 

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident._compile import compiled, inlined
-from smp_motor_ident.internal import BE, STUCK, VC_MINUS, VC_PLUS
-from smp_motor_ident.lanes import (
+from smp_motor_ident.kernel.internal import BE, STUCK, VC_MINUS, VC_PLUS
+from smp_motor_ident.kernel.lanes import (
     LANES,
     SLOTS,
     SW,
@@ -25,7 +25,7 @@ from smp_motor_ident.lanes import (
     stay,
     turn,
 )
-from smp_motor_ident.propagator import speed_at
+from smp_motor_ident.kernel.propagator import speed_at
 
 Array = NDArray[np.float64]
 

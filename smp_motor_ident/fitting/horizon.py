@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident import models
-from smp_motor_ident import recursion as rc
-from smp_motor_ident.descent import HEAD, Options, bandwidth, descend, initial_of, ratio_of
-from smp_motor_ident.experiments import Experiments
-from smp_motor_ident.fit import Fit
+from smp_motor_ident.fitting.descent import HEAD, Options, bandwidth, descend, initial_of, ratio_of
+from smp_motor_ident.fitting.fit import Fit
+from smp_motor_ident.fitting.valley import along_friction
+from smp_motor_ident.kernel import recursion as rc
+from smp_motor_ident.kernel.experiments import Experiments
 from smp_motor_ident.models import Structure
-from smp_motor_ident.valley import along_friction
 
 Array = NDArray[np.float64]
 

@@ -7,17 +7,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from smp_motor_ident import descent, horizon, models, replay
-from smp_motor_ident import recursion as rc
-from smp_motor_ident.choice import Rung, inflation, label, needed, size
-from smp_motor_ident.cold import cold_fit
-from smp_motor_ident.descent import Options
-from smp_motor_ident.experiments import Experiments
-from smp_motor_ident.fit import Fit
-from smp_motor_ident.lateness import averaged, with_delay
+from smp_motor_ident import models
+from smp_motor_ident.fitting import descent, horizon, replay
+from smp_motor_ident.fitting.choice import Rung, inflation, label, needed, size
+from smp_motor_ident.fitting.cold import cold_fit
+from smp_motor_ident.fitting.descent import Options
+from smp_motor_ident.fitting.fit import Fit
+from smp_motor_ident.fitting.lateness import averaged, with_delay
+from smp_motor_ident.fitting.thinning import thinned
+from smp_motor_ident.fitting.valley import shaken
+from smp_motor_ident.kernel import recursion as rc
+from smp_motor_ident.kernel.experiments import Experiments
 from smp_motor_ident.models import Structure
-from smp_motor_ident.thinning import thinned
-from smp_motor_ident.valley import shaken
 
 HOPELESS = 40.0  # deviance on the head of the data by which a rung is out for good
 RIVAL = 20.0  # deviance by which a delay must do better than a second lag

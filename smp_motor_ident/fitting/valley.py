@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident import models
-from smp_motor_ident.descent import Options, descend
-from smp_motor_ident.experiments import Experiments
-from smp_motor_ident.fit import Fit
+from smp_motor_ident.fitting.descent import Options, descend
+from smp_motor_ident.fitting.fit import Fit
+from smp_motor_ident.kernel.experiments import Experiments
 from smp_motor_ident.models import Structure
 
 Array = NDArray[np.float64]

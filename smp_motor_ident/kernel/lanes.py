@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident._compile import compiled, inlined
-from smp_motor_ident.interpolation import NODES, POINTS, evaluate, expand, half_range
-from smp_motor_ident.propagator import ROW, WIDTH, first_order, second_order
+from smp_motor_ident.kernel.interpolation import NODES, POINTS, evaluate, expand, half_range
+from smp_motor_ident.kernel.propagator import ROW, WIDTH, first_order, second_order
 
 Array = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident._compile import compiled
-from smp_motor_ident.sliding import (
+from smp_motor_ident.kernel.sliding import (
     FREE_Q,
     FREE_W,
     NUMBERS,

@@ -12,9 +12,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident import models, replay
-from smp_motor_ident.experiments import Experiments
-from smp_motor_ident.fit import Fit
+from smp_motor_ident import models
+from smp_motor_ident.fitting import replay
+from smp_motor_ident.fitting.fit import Fit
+from smp_motor_ident.kernel.experiments import Experiments
 from smp_motor_ident.models import Structure
 
 Array = NDArray[np.float64]

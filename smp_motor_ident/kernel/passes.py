@@ -12,13 +12,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident import models, recursion
-from smp_motor_ident.cascade import run_sliding
-from smp_motor_ident.elimination import eliminate
-from smp_motor_ident.experiments import Experiments
+from smp_motor_ident import models
+from smp_motor_ident.kernel import recursion
+from smp_motor_ident.kernel.cascade import run_sliding
+from smp_motor_ident.kernel.elimination import eliminate
+from smp_motor_ident.kernel.experiments import Experiments
+from smp_motor_ident.kernel.noise import whitening
+from smp_motor_ident.kernel.sliding import squares_sliding
 from smp_motor_ident.models import Structure, to_internal
-from smp_motor_ident.noise import whitening
-from smp_motor_ident.sliding import squares_sliding
 
 Array = NDArray[np.float64]
 

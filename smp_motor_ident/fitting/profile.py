@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from smp_motor_ident import models
-from smp_motor_ident.descent import Options, descend
-from smp_motor_ident.experiments import Experiments
-from smp_motor_ident.fit import Fit
+from smp_motor_ident.fitting.descent import Options, descend
+from smp_motor_ident.fitting.fit import Fit
+from smp_motor_ident.kernel.experiments import Experiments
 
 Array = NDArray[np.float64]
 

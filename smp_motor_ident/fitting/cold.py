@@ -10,14 +10,15 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident import models, replay, start
-from smp_motor_ident.descent import HEAD, Options, bandwidth, descend, first_noise, ratio_of
-from smp_motor_ident.experiments import Experiments
-from smp_motor_ident.fit import Fit
-from smp_motor_ident.horizon import grow
+from smp_motor_ident import models
+from smp_motor_ident.fitting import replay, start
+from smp_motor_ident.fitting.descent import HEAD, Options, bandwidth, descend, first_noise, ratio_of
+from smp_motor_ident.fitting.fit import Fit
+from smp_motor_ident.fitting.horizon import grow
+from smp_motor_ident.fitting.valley import better, shapes
+from smp_motor_ident.kernel.experiments import Experiments
+from smp_motor_ident.kernel.noise import deviance, kalman_gain
 from smp_motor_ident.models import Structure
-from smp_motor_ident.noise import deviance, kalman_gain
-from smp_motor_ident.valley import better, shapes
 
 Array = NDArray[np.float64]
 

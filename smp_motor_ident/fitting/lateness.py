@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from smp_motor_ident import descent, models, start
-from smp_motor_ident.cold import cold_fit
-from smp_motor_ident.descent import Options
-from smp_motor_ident.experiments import Experiments
-from smp_motor_ident.fit import Fit
+from smp_motor_ident import models
+from smp_motor_ident.fitting import descent, start
+from smp_motor_ident.fitting.cold import cold_fit
+from smp_motor_ident.fitting.descent import Options
+from smp_motor_ident.fitting.fit import Fit
+from smp_motor_ident.kernel.experiments import Experiments
 from smp_motor_ident.models import Structure
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident._compile import compiled, inlined
-from smp_motor_ident.lanes import LANES
+from smp_motor_ident.kernel.lanes import LANES
 
 Array = NDArray[np.float64]
 

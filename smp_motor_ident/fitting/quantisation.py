@@ -13,10 +13,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident import recursion as rc
-from smp_motor_ident import replay
-from smp_motor_ident.experiments import Experiments
-from smp_motor_ident.fit import Fit
+from smp_motor_ident.fitting import replay
+from smp_motor_ident.fitting.fit import Fit
+from smp_motor_ident.kernel import recursion as rc
+from smp_motor_ident.kernel.experiments import Experiments
 
 Array = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident._compile import compiled
-from smp_motor_ident.propagator import WIDTH, first_order, second_order
+from smp_motor_ident.kernel.propagator import WIDTH, first_order, second_order
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -9,9 +9,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident import recursion as rc
+from smp_motor_ident.kernel import recursion as rc
+from smp_motor_ident.kernel.sections import sections_of
 from smp_motor_ident.record import Record
-from smp_motor_ident.sections import sections_of
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]

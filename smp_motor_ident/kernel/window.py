@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident._compile import compiled
-from smp_motor_ident.lanes import ST, SW
+from smp_motor_ident.kernel.lanes import ST, SW
 
 Array = NDArray[np.float64]
 

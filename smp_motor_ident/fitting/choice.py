@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from smp_motor_ident import models
-from smp_motor_ident.fit import Fit
+from smp_motor_ident.fitting.fit import Fit
 from smp_motor_ident.models import Structure
 
 SCEPSIS = 4.0  # deviance of prior odds of e^2 to 1 against any addition: many are tried

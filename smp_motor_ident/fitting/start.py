@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident import models
-from smp_motor_ident import recursion as rc
-from smp_motor_ident.experiments import Experiments
-from smp_motor_ident.regression import filtered, friction_sign, instrumental, search, solved
+from smp_motor_ident.kernel import recursion as rc
+from smp_motor_ident.kernel.experiments import Experiments
+from smp_motor_ident.kernel.regression import filtered, friction_sign, instrumental, search, solved
 
 Array = NDArray[np.float64]
 

@@ -1,0 +1,1 @@
+"""One pass over the data, compiled: propagate, differentiate, and gather the normal equations."""
