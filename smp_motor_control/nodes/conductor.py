@@ -40,7 +40,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
-from smp_interfaces.msg import MotorState
+from smp_interfaces.msg import MotorState, PidState
 from smp_motor_control.nodes.asking import SET, Asker, AskError
 
 PERIOD = 0.02
@@ -55,7 +55,10 @@ _TRANSITIONS = {
 
 
 PATIENCE = 10.0
-"""Longest wait for a service [s]."""
+"""Longest wait for a service, and for wheels that shall follow [s]."""
+
+LEAD = 1.0
+"""Standstill that is commanded before a drive at least [s]."""
 
 
 class RequestError(Exception):
@@ -165,12 +168,15 @@ class Conductor(Node):
         """Read parameters; those that are not set are left out."""
         return {"parameters": self._asker.get_parameters({node: names})[node]}
 
-    def do_drive(self, segments: Sequence[tuple[str, float, float, float]]) -> dict[str, Any]:
+    def do_drive(
+        self, segments: Sequence[tuple[str, float, float, float]], wheels: Sequence[str]
+    ) -> dict[str, Any]:
         """Drive segment after segment, and stop at the end whatever happens."""
         if not self._until(lambda: self._cmd_vel.get_subscription_count() > 0, 10.0):
             raise RequestError("nobody listens on /cmd_vel: start skid_steer")
         times = []
         try:
+            self._stand_until_followed(wheels)
             for name, linear, angular, duration in segments:
                 begin = _seconds(self.get_clock().now().to_msg())
                 self._drive_for(linear, angular, duration)
@@ -178,6 +184,28 @@ class Conductor(Node):
         finally:
             self.stop()
         return {"segments": times}
+
+    def _stand_until_followed(self, wheels: Sequence[str]) -> None:
+        """Command standstill until the wheels hear it: who just joined is still being found."""
+        heard: dict[str, float] = dict.fromkeys(wheels, 0.0)
+        qos = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+        subscriptions = [
+            self.create_subscription(
+                PidState,
+                f"/{wheel}/pid_state",
+                lambda message, wheel=wheel: heard.update({wheel: time.monotonic()}),
+                qos,
+            )
+            for wheel in wheels
+        ]
+        begin = time.monotonic()
+        while time.monotonic() < begin + LEAD or min(heard.values()) < begin + LEAD:
+            silent = [f"/{wheel}/pid_state" for wheel in wheels if heard[wheel] < begin + LEAD]
+            if time.monotonic() > begin + PATIENCE:
+                raise RequestError(f"standstill is commanded, but {', '.join(silent)} is silent")
+            self._drive_for(0.0, 0.0, PERIOD)
+        for subscription in subscriptions:
+            self.destroy_subscription(subscription)
 
     def _drive_for(self, linear: float, angular: float, duration: float) -> None:
         end = time.monotonic() + duration

@@ -220,7 +220,9 @@ def drive(
     drives = []
     for attempt in range(1, ATTEMPTS + 1):
         bag = steps.record(robot, "drive" if attempt == 1 else f"drive_{attempt}")
-        answer = robot.conductor.ask("drive", segments=DRIVE, patience=60.0)
+        answer = robot.conductor.ask(
+            "drive", segments=DRIVE, wheels=list(robot.wheels), patience=60.0
+        )
         robot.processes.stop("record")
         stall = longest_stall(bag, robot.wheels)
         drives.append((stall, bag, [tuple(segment) for segment in answer["segments"]]))
