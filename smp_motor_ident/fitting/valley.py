@@ -56,8 +56,7 @@ def along_friction(part: Experiments, structure: Structure, best: Fit, options: 
             starts.append(z.copy())  # none at all may only be the other lag's friction
             starts[1][models.TE] = z[models.A2] - z[models.A1] + 0.3
         for z in starts:
-            other = descend(part, structure, structure.complete(z), best.initial, best.noise,
-                            best.ratio, options, 30)  # fmt: skip
+            other = _from(z, part, structure, best, options)
             if better(other, best):
                 best = other
     best = _along_lag(part, structure, best, options)
@@ -118,8 +117,7 @@ def shaken(part: Experiments, structure: Structure, best: Fit, options: Options)
         move = vectors @ (np.sqrt(np.maximum(values, 0.0)) * rng.standard_normal(len(values)))
         largest = float(np.abs(matrix @ move)[[models.A0, models.A1, models.A2, models.TE]].max())
         z = best.z + matrix @ move * min(length, length / max(largest, 1e-12))
-        other = descend(part, structure, structure.complete(z), best.initial, best.noise,
-                        best.ratio, options, 30)  # fmt: skip
+        other = _from(z, part, structure, best, options)
         if other.deviance < best.deviance:
             best = other
     return best
@@ -153,6 +151,12 @@ def shapes(z: Array) -> list[Array]:
     return out or [z]
 
 
+def _from(z: Array, part: Experiments, structure: Structure, best: Fit, options: Options) -> Fit:
+    """Descend from other coordinates in the surroundings of the best fit so far."""
+    start = structure.complete(z)
+    return descend(part, structure, start, best.initial, best.noise, best.ratio, options, 30)
+
+
 def _along_lag(part: Experiments, structure: Structure, best: Fit, options: Options) -> Fit:
     """Try other lags and shapes where the fit leaves them open, or what it leaves is not noise."""
     free = structure.free()
@@ -167,8 +171,7 @@ def _along_lag(part: Experiments, structure: Structure, best: Fit, options: Opti
             z[models.TE] = z[models.A2] - z[models.A1] + 0.02
             starts.append(z)
     for z in starts:
-        other = descend(part, structure, structure.complete(z), best.initial, best.noise,
-                        best.ratio, options, 30)  # fmt: skip
+        other = _from(z, part, structure, best, options)
         if other.deviance < best.deviance - 1:
             best = other
     return best

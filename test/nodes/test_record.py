@@ -1,0 +1,179 @@
+"""record as a process: nothing lost, nothing changed, whatever ends it."""
+
+from __future__ import annotations
+
+import re
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from std_msgs.msg import Float64, String
+from traffic import (
+    BEST_EFFORT,
+    LATCHED,
+    RELIABLE,
+    WHEELS,
+    all_states,
+    contents,
+    publish_steadily,
+    raw,
+    so_far,
+)
+
+from smp_interfaces.msg import MotorDescription, MotorState
+from smp_motor_ident.bag import BagWriter, read_records
+from smp_motor_ident.errors import BagError
+
+
+@pytest.mark.parametrize(
+    ("ending", "qos"),
+    [
+        (signal.SIGINT, RELIABLE),
+        (signal.SIGTERM, RELIABLE),
+        (signal.SIGKILL, RELIABLE),
+    ],
+)
+def test_four_wheels_at_a_kilohertz_are_recorded_without_a_lost_message(
+    node: Node,
+    process: Callable[..., Any],
+    eventually: Callable[..., None],
+    tmp_path: Path,
+    ending: signal.Signals,
+    qos: QoSProfile,
+) -> None:
+    bag = tmp_path / "bag"
+    publishers = [node.create_publisher(MotorState, f"/{w}/motor_state", qos) for w in WHEELS]
+    recorder = process("record", "--output", bag)
+    eventually(lambda: all(p.get_subscription_count() for p in publishers), deadline=20.0)
+    sent = publish_steadily(publishers, 2000, 1000.0)
+    if ending == signal.SIGKILL:
+        # What a kill may cost is what came since the last flush, half a second ago at most.
+        eventually(lambda: all_states(so_far(bag)) == [2000] * 4, deadline=10.0, message="flush")
+    else:
+        for publisher in publishers:
+            publisher.wait_for_all_acked()
+    recorder.send_signal(ending)
+    code = recorder.wait(5.0)
+    found = contents(bag)
+    for wheel in WHEELS:
+        assert found[f"/{wheel}/motor_state"] == sent
+    if ending != signal.SIGKILL:
+        assert code == 0
+        assert "2000  /rear_right/motor_state" in recorder.output
+        assert "lost" not in recorder.output
+    records = read_records(bag)
+    assert all(len(records[wheel]) == 2000 for wheel in WHEELS)
+    assert not any("missing" in note for note in records["front_left"].notes)
+
+
+def test_best_effort_messages_are_recorded_or_told_as_lost(
+    node: Node, process: Callable[..., Any], eventually: Callable[..., None], tmp_path: Path
+) -> None:
+    bag = tmp_path / "bag"
+    names = [f"/{wheel}/motor_state" for wheel in WHEELS]
+    publishers = [node.create_publisher(MotorState, name, BEST_EFFORT) for name in names]
+    recorder = process("record", "--output", bag)
+    eventually(lambda: all(p.get_subscription_count() for p in publishers), deadline=20.0)
+    sent = publish_steadily(publishers, 2000, 1000.0)
+    # Nobody acknowledges best effort: it is all there when no more comes.
+    seen: list[int] = []
+
+    def at_rest() -> bool:
+        seen.append(sum(all_states(so_far(bag))))
+        return len(seen) > 5 and 0 < seen[-1] == seen[-5]
+
+    # Looks 0.2 s apart, so that four of them are longer than from flush to flush.
+    eventually(at_rest, deadline=20.0, step=lambda: time.sleep(0.2))
+    recorder.interrupt()
+    assert recorder.wait(5.0) == 0
+    found = contents(bag)
+    for name in names:
+        places = [sent.index(data) for data in found[name]]
+        assert places == sorted(set(places))
+        # The kernel of DDS holds some hundred messages for a process that does not run: a machine
+        # that stands still for a tenth of a second may lose as many.
+        assert len(places) > 1700
+        lost = places[-1] - places[0] + 1 - len(places)
+        told = re.search(rf"{name}  \((\d+) lost\)", recorder.output)
+        assert lost == (int(told[1]) if told else 0)
+
+
+def test_late_publishers_latched_ones_and_mixed_qos_are_recorded(
+    node: Node, process: Callable[..., Any], eventually: Callable[..., None], tmp_path: Path
+) -> None:
+    bag = tmp_path / "bag"
+    description = node.create_publisher(MotorDescription, "/w/motor_description", LATCHED)
+    description.publish(MotorDescription(joint_name="early", gear_ratio=65.5))
+    recorder = process("record", "-o", bag)
+    eventually(lambda: description.get_subscription_count() > 0, deadline=20.0)
+    late = node.create_publisher(Float64, "/late", BEST_EFFORT)
+    eventually(lambda: late.get_subscription_count() > 0)
+    sent = publish_steadily([late], 20, 200.0, lambda k: Float64(data=float(k)))
+    # A second, reliable publisher of a topic that is taken best effort changes nothing; a best
+    # effort one beside a reliable one makes the recorder ask for less.
+    mixed = [node.create_publisher(Float64, "/mixed", RELIABLE)]
+    eventually(lambda: mixed[0].get_subscription_count() > 0)
+    mixed.append(node.create_publisher(Float64, "/mixed", BEST_EFFORT))
+    eventually(lambda: all(p.get_subscription_count() for p in mixed))
+    both = [publish_steadily([p], 5, 200.0, lambda k: Float64(data=float(k))) for p in mixed]
+    eventually(lambda: len(so_far(bag).get("/mixed", [])) == 10)
+    recorder.interrupt()
+    assert recorder.wait(5.0) == 0
+    found = contents(bag)
+    assert len(found["/w/motor_description"]) == 1
+    assert found["/late"] == sent
+    assert sorted(found["/mixed"]) == sorted(both[0] + both[1])
+
+
+def test_topics_are_chosen_by_name_and_pattern(
+    node: Node, process: Callable[..., Any], eventually: Callable[..., None], tmp_path: Path
+) -> None:
+    names = ("/a/x", "/a/y", "/b/x", "/c")
+    publishers = {name: node.create_publisher(Float64, name, LATCHED) for name in names}
+    for publisher in publishers.values():
+        publisher.publish(Float64(data=1.0))
+    bag = tmp_path / "bag"
+    recorder = process("record", "-o", bag, "c", "--regex", "/./x", "--exclude", "/b/.*")
+    eventually(lambda: {"/a/x", "/c"} <= set(so_far(bag)), 20.0)
+    recorder.interrupt()
+    assert recorder.wait(5.0) == 0
+    assert set(contents(bag)) == {"/a/x", "/c"}
+
+
+def test_a_bag_is_replaced_only_by_force_and_nothing_else_ever(
+    process: Callable[..., Any], eventually: Callable[..., None], tmp_path: Path
+) -> None:
+    bag, folder = tmp_path / "bag", tmp_path / "folder"
+    with BagWriter(bag) as writer:
+        writer.write("/old", "std_msgs/msg/Float64", bytes(12), 1)
+    folder.mkdir()
+    (folder / "thesis.txt").write_text("important")
+    for arguments, reason in (
+        (("-o", bag), "exists already"),
+        (("-o", folder, "--force"), "is no bag"),
+        (("-o", bag, "--regex", "("), "no regular expression"),
+    ):
+        refused = process("record", *arguments)
+        assert refused.wait(20.0) == 2
+        assert reason in refused.output
+        assert "Traceback" not in refused.output
+    assert set(contents(bag)) == {"/old"}
+    assert (folder / "thesis.txt").exists()
+    recorder = process("record", "-o", bag, "--force")
+    eventually(lambda: "recording to" in recorder.output, deadline=20.0)
+    recorder.interrupt()
+    assert recorder.wait(5.0) == 0
+    assert "/old" not in contents(bag)
+
+
+def test_message_of_another_type_than_its_topic_is_not_written(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.write("/number", "std_msgs/msg/Float64", raw(Float64(data=4.0)), 1_000)
+        with pytest.raises(BagError, match="is of the type std_msgs/msg/Float64, not"):
+            bag.write("/number", "std_msgs/msg/String", raw(String(data="four")), 2_000)
+        assert bag.counts == {"/number": 1}
