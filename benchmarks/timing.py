@@ -1,14 +1,16 @@
 """Timing of ``wheel_pid`` against a bare node that only echoes, in one run.
 
-    python benchmarks/timing.py                 # everything, about two minutes
+    python benchmarks/timing.py                 # everything, about four minutes
     python benchmarks/timing.py --only echo     # ratios against the bare node
     python benchmarks/timing.py --only wheels   # four wheels at 500 Hz for 60 s
     python benchmarks/timing.py --only core     # one PID step
-    python benchmarks/timing.py --only wheels --priority 50   # with SCHED_FIFO, where granted
+    python benchmarks/timing.py --only wheels --priority 0   # without real-time priority
 
 The feeder publishes ``motor_state`` at a fixed rate and takes the time until the middleware has
 received the command that answers it.  An answer is late when the next sample was sent before.
-Echo and controller run in turn, several times; medians are reported.
+Echo and controller run in turn, several times; medians are reported.  The four wheels run with
+``scheduling_priority`` where the system grants it, the feeder one below: a controller comes
+before whoever feeds it.
 """
 
 from __future__ import annotations
@@ -47,8 +49,10 @@ GAINS = {
 }
 
 
-def echo() -> None:
+def echo(priority: int) -> None:
     """Be the bare node: what is the least that rclpy can do per sample."""
+    if priority:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
     from rclpy.node import Node
@@ -84,79 +88,71 @@ class Result:
 
 
 class Feeder:
-    """Publishes feedback and set-points of some wheels and notes when the answers come in."""
+    """Publishes feedback and set-points of some wheels and notes when the answers came in.
+
+    The middleware stamps an answer when it receives it; the feeder takes them between two ticks,
+    so that it does not stand in the way of those whom it measures.
+    """
 
     def __init__(self, wheels: list[str]) -> None:
         import rclpy
         from sensor_msgs.msg import JointState
 
         from smp_interfaces.msg import MotorCommand, MotorState
-        from smp_motor_control.nodes.executor import LeanExecutor
         from smp_motor_control.nodes.runtime import STREAM_PUBLISHER, STREAM_SUBSCRIBER
 
         rclpy.init(args=[])
-        self.node = rclpy.create_node("feeder")
+        self.node = rclpy.create_node("feeder", start_parameter_services=False)
         self.wheels = wheels
-        self.states, self.messages = {}, {}
         self.sent: dict[str, list[int]] = {wheel: [] for wheel in wheels}
         self.received: dict[str, dict[int, int]] = {wheel: {} for wheel in wheels}
-        for wheel in wheels:
-            self.states[wheel] = self.node.create_publisher(
-                MotorState, f"/{wheel}/motor_state", STREAM_PUBLISHER
+        self.messages = {wheel: MotorState() for wheel in wheels}
+        self.states = {
+            wheel: self.node.create_publisher(MotorState, f"/{wheel}/motor_state", STREAM_PUBLISHER)
+            for wheel in wheels
+        }
+        self.commands = {
+            wheel: self.node.create_subscription(
+                MotorCommand, f"/{wheel}/motor_command", lambda message: None, STREAM_SUBSCRIBER
             )
-            self.messages[wheel] = MotorState()
-            self.node.create_subscription(
-                MotorCommand,
-                f"/{wheel}/motor_command",
-                lambda message, info, received=self.received[wheel]: self.answered(
-                    message, info, received
-                ),
-                STREAM_SUBSCRIBER,
-            )
-        self.published = -math.inf
+            for wheel in wheels
+        }
+        self.command_type = MotorCommand
         self.setpoints = self.node.create_publisher(
             JointState, "/wheel_setpoints", STREAM_PUBLISHER
         )
         self.setpoint = JointState(
             name=[f"{w}_wheel_joint" for w in wheels], velocity=[1.0] * len(wheels)
         )
-        self.executor = LeanExecutor()
-        self.executor.add_node(self.node)
 
-    def answered(self, message: object, info: dict[str, int], received: dict[int, int]) -> None:
-        """Note when the middleware received the answer to the stamp that it carries."""
-        stamp = message.header.stamp
-        received[stamp.sec * 1_000_000_000 + stamp.nanosec] = info["received_timestamp"]
+    def take(self) -> None:
+        """Note when the middleware received each answer, by the stamp that it carries."""
+        for wheel, subscription in self.commands.items():
+            received = self.received[wheel]
+            while taken := subscription.handle.take_message(self.command_type, False):
+                stamp = taken[0].header.stamp
+                at = stamp.sec * 1_000_000_000 + stamp.nanosec
+                received[at] = taken[1]["received_timestamp"]
 
     def feed(self, rate: float, duration: float) -> None:
-        """Publish at a rate; answers are taken in between."""
-        from smp_motor_control.nodes.runtime import steady_timer
+        """Publish at a rate; the sample after a late one follows a whole period later."""
+        due = time.perf_counter()
+        for tick in range(round(duration * rate)):
+            due = max(due + 1.0 / rate, time.perf_counter())
+            time.sleep(max(0.0, due - time.perf_counter()))
+            self.take()
+            self.publish(tick % max(1, round(rate / 20)) == 0)
+        time.sleep(0.2)
+        self.take()
 
-        self.tick, self.left = 0, round(duration * rate)
-        timer = steady_timer(self.node, 1.0 / rate, lambda: self.publish(rate))
-        while self.left > 0:
-            self.executor.spin_once()
-        self.node.destroy_timer(timer)
-        rest = steady_timer(self.node, 0.05, lambda: None)
-        end = time.perf_counter() + 0.2
-        while time.perf_counter() < end:
-            self.executor.spin_once()
-        self.node.destroy_timer(rest)
-
-    def publish(self, rate: float) -> None:
-        """Publish one sample of every wheel, and the set-point 20 times a second."""
-        now = time.perf_counter()
-        if self.left <= 0 or now - self.published < 0.5 / rate:
-            return  # the timer keeps its phase: a late tick is soon followed by another
-        self.published = now
-        self.left -= 1
-        self.tick += 1
-        if self.tick % max(1, round(rate / 20)) == 0:
+    def publish(self, with_setpoint: bool) -> None:
+        """Publish one sample of every wheel."""
+        if with_setpoint:
             self.setpoints.publish(self.setpoint)
         for wheel in self.wheels:
             message = self.messages[wheel]
-            message.velocity = 0.9 + 0.1 * math.sin(self.tick * 0.01)
-            message.encoder_count = self.tick
+            message.encoder_count += 1
+            message.velocity = 0.9 + 0.1 * math.sin(message.encoder_count * 0.01)
             now = time.time_ns()
             stamp = message.header.stamp
             stamp.sec, stamp.nanosec = divmod(now, 1_000_000_000)
@@ -197,7 +193,8 @@ class Feeder:
 def start(kind: str, wheel: str, priority: int = 0) -> subprocess.Popen[bytes]:
     """Start the echo or the controller of one wheel."""
     if kind == "echo":
-        command = [sys.executable, str(Path(__file__).resolve()), "--echo", "--ros-args"]
+        command = [sys.executable, str(Path(__file__).resolve()), "--echo", str(priority)]
+        command.append("--ros-args")
     else:
         given = [f"{name}:={value}" for name, value in GAINS.items()]
         given.append(f"scheduling_priority:={priority}")
@@ -268,19 +265,33 @@ def compare(rate: float, duration: float, repeats: int) -> bool:
     return held
 
 
+def real_time_granted() -> bool:
+    """Tell whether this process may ask for SCHED_FIFO."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+    except OSError:
+        return False
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    return True
+
+
 def wheels(rate: float, duration: float, priority: int) -> bool:
-    """Measure four wheels at once beside four bare nodes; the feeder keeps time as they do."""
+    """Measure four wheels at once beside four bare nodes; the feeder gives way to them."""
     from smp_motor_control import WHEELS
     from smp_motor_control.nodes.keeping_time import keep_time
 
+    if priority and not real_time_granted():
+        print("  the system grants no real-time priority: running without")
+        priority = 0
     feeder = Feeder(list(WHEELS))
-    keep_time(feeder.node, priority, ())  # the bare nodes inherit it
+    keep_time(feeder.node, max(0, priority - 1), ())
     results = {
         kind: measure(feeder, kind, rate, duration, priority) for kind in ("echo", "wheel_pid")
     }
     for kind, result in results.items():
         print(
-            f"four {kind} at {rate:g} Hz for {duration:g} s: {100 * result.answered:.3f} % "
+            f"four {kind} at {rate:g} Hz for {duration:g} s, "
+            f"priority {priority or 'none'}: {100 * result.answered:.3f} % "
             f"answered before the next sample (p50 {1e3 * result.p50:.2f} ms, "
             f"p99 {1e3 * result.p99:.2f} ms, cpu {100 * result.cpu:.1f} % each)"
         )
@@ -313,7 +324,9 @@ def main() -> int:
     parser.add_argument("--duration", type=float, default=10.0, help="of each run [s]")
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--wheels-duration", type=float, default=60.0)
-    parser.add_argument("--priority", type=int, default=0, help="SCHED_FIFO, of the four wheels")
+    parser.add_argument(
+        "--priority", type=int, default=50, help="SCHED_FIFO of the four wheels; 0 for none"
+    )
     arguments = parser.parse_args()
     os.environ.setdefault("ROS_DOMAIN_ID", "98")
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
@@ -334,7 +347,9 @@ def main() -> int:
 
 if __name__ == "__main__":
     if "--echo" in sys.argv:
-        sys.argv.remove("--echo")
-        echo()
+        at = sys.argv.index("--echo")
+        priority = int(sys.argv[at + 1])
+        del sys.argv[at : at + 2]
+        echo(priority)
     else:
         sys.exit(main())

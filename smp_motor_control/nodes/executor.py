@@ -4,11 +4,15 @@ The stock executor gathers all entities, builds a wait set and wraps every callb
 anew for every message, and wakes itself twice for each.  This one gathers again only when an
 entity was made or destroyed, and calls plain callbacks of subscriptions and timers directly.
 Everything else, and whatever is a coroutine, goes the stock way.
+
+While messages come in quick succession it waits for them and for timers alone, and looks at
+the many other entities of a node (services, clients, events) only every :data:`LOOK`.
 """
 
 from __future__ import annotations
 
 import inspect
+import time
 from contextlib import ExitStack
 from typing import Any
 
@@ -20,15 +24,17 @@ from rclpy.waitable import NumberOfEntities
 
 _FOR_EVER = -1
 
+LOOK = 20_000_000
+"""Longest time that messages keep a service waiting [ns]."""
+
 
 class _WaitSet:
     """The wait set of one collection of entities, which it keeps alive."""
 
-    def __init__(self, executor: LeanExecutor) -> None:
-        self.key = executor.entities()
+    def __init__(self, executor: LeanExecutor, key: tuple[tuple[Any, ...], ...]) -> None:
+        self.key = key
         self._stack = ExitStack()
-        self._executor = executor
-        subscriptions, timers, clients, services, guards, waitables = self.key
+        subscriptions, timers, clients, services, guards, waitables = key
         self.waitables = [w for w in waitables if self._hold(w)]
         total = NumberOfEntities()
         for waitable in self.waitables:
@@ -70,15 +76,15 @@ class _WaitSet:
         """Let go of the entities, so that destroyed ones are."""
         self._stack.close()
 
-    def wait(self) -> None:
-        """Wait for ever, until something is ready."""
+    def wait(self, timeout: int) -> None:
+        """Wait until something is ready, or the time is over [ns]."""
         waits = self._waits
         waits.clear_entities()
         for add, handle in self._adders:
             add(handle)
         for waitable in self.waitables:
             waitable.add_to_wait_set(waits)
-        waits.wait(_FOR_EVER)
+        waits.wait(timeout)
 
     def ready(self, kind: str) -> list[Any]:
         """Return the entities of a kind that are ready."""
@@ -95,7 +101,8 @@ class LeanExecutor(SingleThreadedExecutor):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
-        self._waits: _WaitSet | None = None
+        self._waits: tuple[_WaitSet, _WaitSet] | None = None
+        self._look_at = self._heard = 0
         self._plain: dict[Any, bool] = {}
 
     def entities(self) -> tuple[tuple[Any, ...], ...]:
@@ -135,12 +142,11 @@ class LeanExecutor(SingleThreadedExecutor):
         if timeout_sec is not None:
             super().spin_once(timeout_sec)
             return
-        waits = self._waits
-        if waits is None:
-            self._plain = {}
-            waits = self._waits = _WaitSet(self)
+        everything, stream = self._waits or self._gather()
+        left = self._look_at - time.monotonic_ns()
+        waits, longest = (stream, left) if left > 0 else (everything, _FOR_EVER)
         try:
-            waits.wait()
+            waits.wait(longest)
         except InvalidHandle:  # an event of something that was just destroyed
             self._release()
             return
@@ -149,17 +155,32 @@ class LeanExecutor(SingleThreadedExecutor):
         waitables = waits.ready_waitables()
         for timer in waits.ready("timer"):
             self._do_timer(timer)
-        for subscription in waits.ready("subscription"):
+        messages = waits.ready("subscription")
+        for subscription in messages:
             self._do_subscription(subscription)
         for guard in waits.ready("guard_condition"):
             self._do_guard(guard)
+        if waits is everything:
+            self._do_rest(everything, waitables)
+        self._pace(bool(messages), waits is everything)
+        if self._tasks:
+            self._do_tasks()
+
+    def _do_rest(self, waits: _WaitSet, waitables: list[Any]) -> None:
         for kind, take in (("client", self._take_client), ("service", self._take_service)):
             for entity in waits.ready(kind):
                 self._do_stock(entity, take)
         for waitable in waitables:
             self._do_stock(waitable, self._take_waitable)
-        if self._tasks:
-            self._do_tasks()
+
+    def _pace(self, heard: bool, looked: bool) -> None:
+        """Set until when to wait for messages alone."""
+        now = time.monotonic_ns()
+        if looked:
+            in_succession = heard and now - self._heard < LOOK
+            self._look_at = now + LOOK if in_succession else 0
+        if heard:
+            self._heard = now
 
     def _do_guard(self, guard: Any) -> None:
         if guard is self._guard:
@@ -168,14 +189,22 @@ class LeanExecutor(SingleThreadedExecutor):
             guard._executor_triggered = True
             self._do_stock(guard, self._take_guard_condition)
 
+    def _gather(self) -> tuple[_WaitSet, _WaitSet]:
+        self._plain = {}
+        key = self.entities()
+        subscriptions, timers, _, _, guards, _ = key
+        stream = (subscriptions, timers, (), (), guards, ())
+        self._waits = waits = (_WaitSet(self, key), _WaitSet(self, stream))
+        return waits
+
     def _gather_again(self) -> None:
-        if self._waits is not None and self._waits.key != self.entities():
+        if self._waits is not None and self._waits[0].key != self.entities():
             self._release()
 
     def _release(self) -> None:
-        if self._waits is not None:
-            self._waits.release()
-            self._waits = None
+        for waits in self._waits or ():
+            waits.release()
+        self._waits = None
 
     def _is_plain(self, entity: Any) -> bool:
         plain = self._plain.get(entity)
