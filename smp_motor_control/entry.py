@@ -3,7 +3,13 @@
 from __future__ import annotations
 
 import importlib
+import os
 from collections.abc import Callable
+
+# One thread for linear algebra: our matrices are small, and the library waits for a second
+# thread in a busy loop, which under SCHED_FIFO need never end.
+for _library in ("OPENBLAS", "MKL", "OMP"):
+    os.environ.setdefault(f"{_library}_NUM_THREADS", "1")
 
 
 def _program(module: str, interrupted: int) -> Callable[[], int]:

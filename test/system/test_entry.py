@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -33,3 +36,18 @@ def test_ctrl_c_while_importing_ends_an_executable_without_a_traceback(
     # A tool may have come as far as its arguments, which it then refuses.
     assert started.wait(5.0) in (code, 2 if code else 0)
     assert "Traceback" not in started.output
+
+
+def test_linear_algebra_stays_on_one_thread():
+    """A second is waited for in a busy loop: at real-time priority that need never end."""
+    program = (
+        "import os\n"
+        "import smp_motor_control.entry\n"
+        "import numpy, scipy.linalg\n"
+        "scipy.linalg.expm(numpy.eye(300))\n"
+        "print(len(os.listdir('/proc/self/task')))\n"
+    )
+    environment = {k: v for k, v in os.environ.items() if not k.endswith("_NUM_THREADS")}
+    command = [sys.executable, "-c", program]
+    told = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert told.stdout.strip() == "1"
