@@ -87,11 +87,23 @@ def doubts(
             "looks like a delay is that filter, not the motor"
         )
     if fit.ratio > 0 and data.kind == rc.ANGLE:
+        if not s.current and _two_levels(data):
+            out.append(
+                "doubtful: a command of two levels tells friction from gain at its reversals "
+                "alone, and a load that fluctuates hides them; add a sine, a Fourier wave, or "
+                "the current"
+            )
         out.append(
             "the motion scatters beyond the counter's resolution (a load that fluctuates, or a "
             "command that switches between samples); the estimate allows for it"
         )
     return out
+
+
+def _two_levels(data: Experiments) -> bool:
+    """Tell whether the command is a plain square: one voltage there, the same one back."""
+    levels = np.abs(data.section_value)
+    return bool(np.mean(levels > 0.98 * levels.max()) > 0.95)
 
 
 def _ring(fit: Fit) -> float:

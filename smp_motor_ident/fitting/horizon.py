@@ -155,7 +155,9 @@ def _likeliest(path: dict[float, Fit], fitted: Callable[[Fit, float], Fit]) -> F
         i = xs.index(min(xs, key=lambda x: path[x].deviance))
         best = path[xs[i]]
         if i in (0, len(xs) - 1):  # not bracketed yet
-            x = xs[i] + (WALK if i or len(xs) == 1 else -WALK)
+            # From one point first towards the motor's own bandwidth: a poorer model's is farther.
+            outward = xs[i] > 0.0 if len(xs) == 1 else i == 0
+            x = xs[i] + (-WALK if outward else WALK)
             if abs(x) > MOST:
                 break
         else:

@@ -55,6 +55,28 @@ def test_a_linear_motor_is_recovered_without_friction():
     assert q.value < 0.01 * 10 * 0.011 / 12.9
 
 
+@pytest.mark.parametrize("wheel", WHEELS)
+@pytest.mark.parametrize("noise", [0.005, 0.05])
+def test_little_torque_noise_is_not_taken_for_much(wheel, noise):
+    """A poorer model calls for more: from there the walk must find back to the motor's own."""
+    found = estimate(
+        motors.record(wheel, kinds=("fourier",), seconds=20.0, current=False, torque_noise=noise)
+    )
+    check(found, motors.truth(wheel, 0.3), ("dc_gain", "time_constant", "static_voltage"))
+    told = motors.record(wheel, current=False, torque_noise=noise)
+    check(estimate(told), motors.truth(wheel, 0.3), ("dc_gain", "time_constant"))
+
+
+@pytest.mark.parametrize("wheel", WHEELS)
+def test_a_plain_square_under_a_load_that_fluctuates_is_doubtful(wheel):
+    square = motors.record(wheel, kinds=("square",), seconds=20.0, current=False, torque_noise=0.01)
+    assert any("two levels" in w for w in estimate(square).warnings)
+    fourier = motors.record(
+        wheel, kinds=("fourier",), seconds=20.0, current=False, torque_noise=0.01
+    )
+    assert not any("two levels" in w for w in estimate(fourier).warnings)
+
+
 def test_torque_disturbance_widens_the_intervals_and_does_not_ruin_the_estimate():
     quiet = estimate(motors.record("rear_right"))
     noisy = estimate(motors.record("rear_right", torque_noise=0.5))
