@@ -14,6 +14,7 @@ from multiprocessing.connection import Connection
 
 import numpy as np
 
+PRIORITY = 99
 PERIOD = 0.0005
 LATE = 0.0005
 """How late a witness must wake to count [s]; usual is a twentieth of that."""
@@ -22,7 +23,7 @@ LATE = 0.0005
 def _watch(processor: int, line: Connection) -> None:
     """Send begin and end of each stand-still [ns of the system's clock] when asked."""
     os.sched_setaffinity(0, {processor})
-    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(99))
+    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
     found: list[tuple[int, int]] = []
     while not line.poll():
         due = time.time_ns() + round(PERIOD * 1e9)

@@ -29,6 +29,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import stillness
 from stillness import Witness, touched
 
 CPU_LIMIT, LATENCY_LIMIT, ANSWERED_LIMIT, STEP_LIMIT = 1.4, 1.3, 0.999, 3e-6
@@ -138,8 +139,11 @@ class Feeder:
         """Publish at a rate; the sample after a late one follows a whole period later."""
         due = time.perf_counter()
         for tick in range(round(duration * rate)):
-            due = max(due + 1.0 / rate, time.perf_counter())
+            due += 1.0 / rate
             time.sleep(max(0.0, due - time.perf_counter()))
+            late = time.perf_counter() - due
+            if late > 0.1 / rate:
+                due += late
             self.take()
             self.publish(tick % max(1, round(rate / 20)) == 0)
         time.sleep(0.2)
@@ -211,6 +215,7 @@ def cpu_seconds(pid: int) -> float:
 def measure(feeder: Feeder, kind: str, rate: float, duration: float, priority: int = 0) -> Result:
     """Run one kind of node under the feed."""
     witness = Witness() if priority else None
+    still = np.empty((0, 2), dtype=np.int64)
     processes = [start(kind, wheel, priority) for wheel in feeder.wheels]
     try:
         feeder.forget()
@@ -223,14 +228,16 @@ def measure(feeder: Feeder, kind: str, rate: float, duration: float, priority: i
             process.send_signal(signal.SIGKILL if kind == "echo" else signal.SIGINT)
         for process in processes:
             process.wait(10)
+        if witness is not None:
+            still = witness.stop()
     sent, after, took = (np.concatenate(part) for part in zip(*map(feeder.times, feeder.wheels)))
     answered = sent + 1e9 * took < after
     if priority and not answered.all():
-        still = touched(sent, after, witness.stop())
+        within = touched(sent, after, still)
         print(
             f"  {np.count_nonzero(~answered)} of {took.size} not in time, longest "
-            f"{1e3 * np.nanmax(took):.1f} ms; {np.count_nonzero(~answered & still)} of them while "
-            f"the machine stood still; in time otherwise {100 * answered[~still].mean():.3f} %"
+            f"{1e3 * np.nanmax(took):.1f} ms; {np.count_nonzero(~answered & within)} of them while "
+            f"the machine stood still; in time otherwise {100 * answered[~within].mean():.3f} %"
         )
     return Result(
         cpu=sum(used) / duration / len(used),
@@ -268,7 +275,7 @@ def compare(rate: float, duration: float, repeats: int) -> bool:
 def real_time_granted() -> bool:
     """Tell whether this process may ask for SCHED_FIFO."""
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(stillness.PRIORITY))
     except OSError:
         return False
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))

@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable
 
 # One thread for linear algebra: our matrices are small, and the library waits for a second
-# thread in a busy loop, which under SCHED_FIFO need never end.
+# thread in a busy loop, which under SCHED_FIFO may never end.
 for _library in ("OPENBLAS", "MKL", "OMP"):
     os.environ.setdefault(f"{_library}_NUM_THREADS", "1")
 

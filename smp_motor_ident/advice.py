@@ -87,11 +87,10 @@ def doubts(
             "looks like a delay is that filter, not the motor"
         )
     if fit.ratio > 0 and data.kind == rc.ANGLE:
-        if not s.current and _two_levels(data):
+        if not s.current and _plain_square(data):
             out.append(
-                "doubtful: a command of two levels tells friction from gain at its reversals "
-                "alone, and a load that fluctuates hides them; add a sine, a Fourier wave, or "
-                "the current"
+                "doubtful: a plain square tells friction from gain at its reversals alone, and a "
+                "load that fluctuates hides them; add a sine, a Fourier wave, or the current"
             )
         out.append(
             "the motion scatters beyond the counter's resolution (a load that fluctuates, or a "
@@ -100,10 +99,16 @@ def doubts(
     return out
 
 
-def _two_levels(data: Experiments) -> bool:
-    """Tell whether the command is a plain square: one voltage there, the same one back."""
-    levels = np.abs(data.section_value)
-    return bool(np.mean(levels > 0.98 * levels.max()) > 0.95)
+def _plain_square(data: Experiments) -> bool:
+    """Tell whether the command, where it is not at rest, is one voltage there and one back."""
+    driven = data.section_value[
+        np.abs(data.section_value) > 0.05 * np.abs(data.section_value).max()
+    ]
+    there, back = driven[driven > 0], -driven[driven < 0]
+    if not there.size or not back.size:
+        return False
+    level = np.where(driven > 0, np.median(there), np.median(back))
+    return bool(np.mean(np.abs(np.abs(driven) - level) < 0.03 * level) > 0.95)
 
 
 def _ring(fit: Fit) -> float:

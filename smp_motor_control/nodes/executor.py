@@ -5,8 +5,8 @@ anew for every message, and wakes itself twice for each.  This one gathers again
 entity was made or destroyed, and calls plain callbacks of subscriptions and timers directly.
 Everything else, and whatever is a coroutine, goes the stock way.
 
-While messages come in quick succession it waits for them and for timers alone, and looks at
-the many other entities of a node (services, clients, events) only every :data:`LOOK`.
+While messages come in quick succession it waits for them, for timers and for guard conditions
+alone, and looks at the many other entities of a node only every :data:`LOOK`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from rclpy.waitable import NumberOfEntities
 _FOR_EVER = -1
 
 LOOK = 20_000_000
-"""Longest time that messages keep a service waiting [ns]."""
+"""Longest time that messages keep services, clients, events and actions waiting [ns]."""
 
 
 class _WaitSet:
@@ -102,7 +102,7 @@ class LeanExecutor(SingleThreadedExecutor):
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         self._waits: tuple[_WaitSet, _WaitSet] | None = None
-        self._look_at = self._heard = 0
+        self._stream_until = self._heard = 0
         self._plain: dict[Any, bool] = {}
 
     def entities(self) -> tuple[tuple[Any, ...], ...]:
@@ -143,7 +143,7 @@ class LeanExecutor(SingleThreadedExecutor):
             super().spin_once(timeout_sec)
             return
         everything, stream = self._waits or self._gather()
-        left = self._look_at - time.monotonic_ns()
+        left = self._stream_until - time.monotonic_ns()
         waits, longest = (stream, left) if left > 0 else (everything, _FOR_EVER)
         try:
             waits.wait(longest)
@@ -152,7 +152,9 @@ class LeanExecutor(SingleThreadedExecutor):
             return
         if not self.context.ok():
             raise ExternalShutdownException()
-        waitables = waits.ready_waitables()
+        # First what tells of entities that the callbacks to come may destroy.
+        for waitable in waits.ready_waitables():
+            self._do_stock(waitable, self._take_living)
         for timer in waits.ready("timer"):
             self._do_timer(timer)
         messages = waits.ready("subscription")
@@ -161,24 +163,25 @@ class LeanExecutor(SingleThreadedExecutor):
         for guard in waits.ready("guard_condition"):
             self._do_guard(guard)
         if waits is everything:
-            self._do_rest(everything, waitables)
+            for kind, take in (("client", self._take_client), ("service", self._take_service)):
+                for entity in waits.ready(kind):
+                    self._do_stock(entity, take)
         self._pace(bool(messages), waits is everything)
         if self._tasks:
             self._do_tasks()
 
-    def _do_rest(self, waits: _WaitSet, waitables: list[Any]) -> None:
-        for kind, take in (("client", self._take_client), ("service", self._take_service)):
-            for entity in waits.ready(kind):
-                self._do_stock(entity, take)
-        for waitable in waitables:
-            self._do_stock(waitable, self._take_waitable)
+    def _take_living(self, waitable: Any) -> Any:
+        try:
+            return self._take_waitable(waitable)
+        except InvalidHandle:  # of something that a callback of this round destroyed
+            return None
 
     def _pace(self, heard: bool, looked: bool) -> None:
         """Set until when to wait for messages alone."""
         now = time.monotonic_ns()
         if looked:
             in_succession = heard and now - self._heard < LOOK
-            self._look_at = now + LOOK if in_succession else 0
+            self._stream_until = now + LOOK if in_succession else 0
         if heard:
             self._heard = now
 

@@ -264,12 +264,12 @@ class Processes:
 
 
 def _command(node: str) -> list[str]:
-    """Return how a node is started: as its installed executable, else from its module."""
+    """Return how a node is started: as its installed executable, else as that would."""
     for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
         executable = Path(prefix) / "lib" / "smp_motor_control" / node
         if prefix and executable.is_file():
             return [str(executable)]
-    start = f"import sys; from smp_motor_control.nodes.{node} import main; sys.exit(main())"
+    start = f"import sys; from smp_motor_control.entry import {node}; sys.exit({node}())"
     return [sys.executable, "-c", start]
 
 

@@ -158,7 +158,7 @@ def _likeliest(path: dict[float, Fit], fitted: Callable[[Fit, float], Fit]) -> F
             # From one point first towards the motor's own bandwidth: a poorer model's is farther.
             outward = xs[i] > 0.0 if len(xs) == 1 else i == 0
             x = xs[i] + (-WALK if outward else WALK)
-            if abs(x) > MOST:
+            if abs(x) > max(MOST, abs(xs[i])):
                 break
         else:
             (a, b, c), y = xs[i - 1 : i + 2], [path[x].deviance for x in xs[i - 1 : i + 2]]

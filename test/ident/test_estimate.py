@@ -67,14 +67,19 @@ def test_little_torque_noise_is_not_taken_for_much(wheel, noise):
     check(estimate(told), motors.truth(wheel, 0.3), ("dc_gain", "time_constant"))
 
 
+def _told_of_a_plain_square(wheel: str, voltage: np.ndarray) -> bool:
+    told = motors.record(wheel, current=False, torque_noise=0.01, voltage=voltage, seconds=25.0)
+    return any("a plain square" in w for w in estimate(told).warnings)
+
+
 @pytest.mark.parametrize("wheel", WHEELS)
 def test_a_plain_square_under_a_load_that_fluctuates_is_doubtful(wheel):
-    square = motors.record(wheel, kinds=("square",), seconds=20.0, current=False, torque_noise=0.01)
-    assert any("two levels" in w for w in estimate(square).warnings)
-    fourier = motors.record(
-        wheel, kinds=("fourier",), seconds=20.0, current=False, torque_noise=0.01
-    )
-    assert not any("two levels" in w for w in estimate(fourier).warnings)
+    t = np.arange(4000) / 200.0
+    square = np.where(np.sin(2 * np.pi * 0.9173 * t + 0.2) > 0, 10.0, -9.0)
+    square += 0.02 * np.random.default_rng(1).standard_normal(t.size)  # as it was measured
+    rest = np.zeros(400)
+    assert _told_of_a_plain_square(wheel, np.concatenate([rest, square, rest]))
+    assert not _told_of_a_plain_square(wheel, 10.0 * np.sin(2 * np.pi * 1.0371 * t))
 
 
 def test_torque_disturbance_widens_the_intervals_and_does_not_ruin_the_estimate():

@@ -5,18 +5,22 @@ from __future__ import annotations
 import signal
 import sys
 import time
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import pytest
 import rclpy
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
 from std_msgs.msg import Float64, String
 from std_srvs.srv import Trigger
 
 from smp_motor_control.errors import ParameterError
-from smp_motor_control.nodes.executor import LeanExecutor
+from smp_motor_control.nodes.executor import LeanExecutor, _WaitSet
 from smp_motor_control.nodes.runtime import STREAM_PUBLISHER, STREAM_SUBSCRIBER, steady_timer
 from smp_motor_control.nodes.settings import Parameters, described
 
@@ -113,6 +117,88 @@ def test_lean_executor_lives_through_entities_made_and_destroyed_in_callbacks(co
     node.destroy_timer(renewing)
     before = len(heard)
     spin_until(executor, node, lambda: len(heard) > before + 10)
+
+
+@pytest.fixture
+def waits(monkeypatch) -> Counter[str]:
+    """Count what the executor waits for: messages alone, or everything."""
+    counted: Counter[str] = Counter()
+    wait = _WaitSet.wait
+
+    def counting(self: _WaitSet, timeout: int) -> None:
+        services = self.key[3]
+        counted["everything" if services else "messages"] += 1
+        wait(self, timeout)
+
+    monkeypatch.setattr(_WaitSet, "wait", counting)
+    return counted
+
+
+def test_a_stream_is_waited_for_alone_and_keeps_nobody_waiting_for_long(context, executor, waits):
+    node = rclpy.create_node("streaming", context=context)
+    executor.add_node(node)
+    node.create_service(Trigger, "ask", lambda _, r: Trigger.Response(success=True))
+    client = node.create_client(Trigger, "ask")
+    heard: list[float] = []
+    node.create_subscription(Float64, "x", lambda m: heard.append(m.data), STREAM_SUBSCRIBER)
+    publisher = node.create_publisher(Float64, "x", STREAM_PUBLISHER)
+    timer = steady_timer(node, 0.002, lambda: publisher.publish(Float64(data=1.0)))
+    spin_until(executor, node, lambda: client.service_is_ready() and len(heard) > 20)
+    waits.clear()
+    heard.clear()
+    spin_until(executor, node, lambda: len(heard) > 200)
+    assert waits["messages"] > 2 * waits["everything"] > 0
+
+    def call() -> None:
+        future = client.call_async(Trigger.Request())
+        spin_until(executor, node, future.done)
+
+    begin = time.monotonic()
+    for _ in range(20):
+        call()
+    assert time.monotonic() - begin < 10.0  # a busy machine's; a fiftieth of it is usual
+
+    refused: list[object] = []
+    node.create_subscription(
+        Float64, "x", lambda _: None,
+        QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL),
+        event_callbacks=SubscriptionEventCallbacks(incompatible_qos=refused.append),
+    )  # fmt: skip
+    spin_until(executor, node, lambda: refused)
+    node.destroy_timer(timer)
+    call()
+
+
+def test_an_event_of_what_was_just_destroyed_does_not_end_the_spin(context, executor):
+    node = rclpy.create_node("destroying", context=context)
+    executor.add_node(node)
+    reliable = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
+    told: list[str] = []
+    found: dict[str, Subscription] = {}
+
+    def destroy_the_other(name: str, other: str) -> None:
+        told.append(name)
+        node.destroy_subscription(found[other])
+
+    for name, other in (("one", "two"), ("two", "one")):
+        events = SubscriptionEventCallbacks(
+            incompatible_qos=lambda _, name=name, other=other: destroy_the_other(name, other)
+        )
+        found[name] = node.create_subscription(
+            Float64, "x", lambda _: None, reliable, event_callbacks=events
+        )
+    third = node.create_subscription(Float64, "x", lambda _: None, reliable)
+    executor.spin_once()  # gathers all of it
+
+    # Both are ready in one round, and so is the timer, which destroys a third with an event.
+    node.create_publisher(Float64, "x", STREAM_SUBSCRIBER)
+    time.sleep(0.3)
+    destroying = steady_timer(node, 0.01, lambda: node.destroy_subscription(third))
+    spin_until(executor, node, lambda: told)
+    node.destroy_timer(destroying)
+    for _ in range(20):
+        spin_until(executor, node, lambda: True)
+    assert told in (["one"], ["two"])
 
 
 def test_exception_in_a_callback_comes_out_of_the_spin(context, executor):

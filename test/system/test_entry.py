@@ -39,15 +39,19 @@ def test_ctrl_c_while_importing_ends_an_executable_without_a_traceback(
 
 
 def test_linear_algebra_stays_on_one_thread():
-    """A second is waited for in a busy loop: at real-time priority that need never end."""
-    program = (
-        "import os\n"
-        "import smp_motor_control.entry\n"
-        "import numpy, scipy.linalg\n"
-        "scipy.linalg.expm(numpy.eye(300))\n"
-        "print(len(os.listdir('/proc/self/task')))\n"
-    )
+    """A second is waited for in a busy loop: at real-time priority that may never end."""
     environment = {k: v for k, v in os.environ.items() if not k.endswith("_NUM_THREADS")}
-    command = [sys.executable, "-c", program]
-    told = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
-    assert told.stdout.strip() == "1"
+
+    def threads(before: str) -> int:
+        program = (
+            f"import os\n{before}\nimport numpy, scipy.linalg\n"
+            "scipy.linalg.expm(numpy.eye(300))\n"
+            "print(len(os.listdir('/proc/self/task')))\n"
+        )
+        command = [sys.executable, "-c", program]
+        told = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+        return int(told.stdout)
+
+    if threads("") == 1:
+        pytest.skip("this machine's linear algebra has one thread anyway")
+    assert threads("import smp_motor_control.entry") == 1
