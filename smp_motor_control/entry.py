@@ -24,7 +24,19 @@ def _program(module: str, interrupted: int) -> Callable[[], int]:
     return run
 
 
-def _node(name: str) -> Callable[[], int]:
+def node(name: str) -> Callable[[], int]:
+    """Return what runs a node.
+
+    Parameters
+    ----------
+    name : str
+        Of its module, such as ``conductor``.
+
+    Returns
+    -------
+    callable
+        Runs until a signal and returns the exit code.
+    """
     return _program(f"smp_motor_control.nodes.{name}", 0)
 
 
@@ -32,14 +44,14 @@ def _tool(name: str) -> Callable[[], int]:
     return _program(f"smp_motor_ident.commands.{name}", 130)
 
 
-wheel_pid = _node("wheel_pid")
-motor_plant = _node("motor_plant")
-skid_steer = _node("skid_steer")
-teleop_wheels = _node("teleop_wheels")
-excite = _node("excite")
-record = _node("record")
-play = _node("play")
-identifier = _node("identifier")
+wheel_pid = node("wheel_pid")
+motor_plant = node("motor_plant")
+skid_steer = node("skid_steer")
+teleop_wheels = node("teleop_wheels")
+excite = node("excite")
+record = node("record")
+play = node("play")
+identifier = node("identifier")
 identify = _tool("identify")
 tune = _tool("tune")
 commission = _tool("commission")

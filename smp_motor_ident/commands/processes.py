@@ -269,7 +269,7 @@ def _command(node: str) -> list[str]:
         executable = Path(prefix) / "lib" / "smp_motor_control" / node
         if prefix and executable.is_file():
             return [str(executable)]
-    start = f"import sys; from smp_motor_control.entry import {node}; sys.exit({node}())"
+    start = f"import sys; from smp_motor_control.entry import node; sys.exit(node({node!r})())"
     return [sys.executable, "-c", start]
 
 
