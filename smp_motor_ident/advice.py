@@ -16,6 +16,7 @@ from smp_motor_ident.models import PHYSICAL
 from smp_motor_ident.result import ResidualTests
 
 TOO_FAST = 1.5  # radians a sample; at pi a ringing cannot be told from a slower one
+STEADY = 4.0  # time constants after which a motor's speed is steady
 UNEXPLAINED = 9.0  # residual variance over that of the counter that no counter makes
 
 
@@ -87,7 +88,7 @@ def doubts(
             "looks like a delay is that filter, not the motor"
         )
     if fit.ratio > 0 and data.kind == rc.ANGLE:
-        if not s.current and _plain_square(data):
+        if not s.current and _plain_square(data, fit):
             out.append(
                 "doubtful: a plain square tells friction from gain at its reversals alone, and a "
                 "load that fluctuates hides them; add a sine, a Fourier wave, or the current"
@@ -99,16 +100,24 @@ def doubts(
     return out
 
 
-def _plain_square(data: Experiments) -> bool:
-    """Tell whether the command, where it is not at rest, is one voltage there and one back."""
-    driven = data.section_value[
-        np.abs(data.section_value) > 0.05 * np.abs(data.section_value).max()
-    ]
+def _plain_square(data: Experiments, fit: Fit) -> bool:
+    """Tell whether the command goes there and back, always as far, and waits for steady speed.
+
+    Rest before and after it does not count; two levels in quick succession are another matter.
+    """
+    value = data.section_value
+    driven = value[np.abs(value) > 0.05 * np.abs(value).max()]
     there, back = driven[driven > 0], -driven[driven < 0]
     if not there.size or not back.size:
         return False
     level = np.where(driven > 0, np.median(there), np.median(back))
-    return bool(np.mean(np.abs(np.abs(driven) - level) < 0.03 * level) > 0.95)
+    turns = data.section_end[:-1][np.diff(np.sign(value)) != 0]
+    lag = float(np.exp(fit.z[models.A1] - fit.z[models.A0]))
+    return bool(
+        np.mean(np.abs(np.abs(driven) - level) < 0.03 * level) > 0.95
+        and turns.size > 1
+        and np.median(np.diff(turns)) > STEADY * lag
+    )
 
 
 def _ring(fit: Fit) -> float:

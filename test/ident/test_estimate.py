@@ -80,6 +80,8 @@ def test_a_plain_square_under_a_load_that_fluctuates_is_doubtful(wheel):
     rest = np.zeros(400)
     assert _told_of_a_plain_square(wheel, np.concatenate([rest, square, rest]))
     assert not _told_of_a_plain_square(wheel, 10.0 * np.sin(2 * np.pi * 1.0371 * t))
+    bits = np.random.default_rng(2).choice([-10.0, 10.0], t.size // 10)
+    assert not _told_of_a_plain_square(wheel, np.repeat(bits, 10))
 
 
 def test_torque_disturbance_widens_the_intervals_and_does_not_ruin_the_estimate():
