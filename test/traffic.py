@@ -69,8 +69,7 @@ def publish_steadily(
     sent = []
     begin = time.monotonic()
     for k in range(count):
-        while time.monotonic() < begin + k / rate:
-            time.sleep(0.0002)
+        time.sleep(max(0.0, begin + k / rate - time.monotonic()))
         data = raw(make(k))
         sent.append(data)
         for publisher in publishers:

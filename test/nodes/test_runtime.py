@@ -192,7 +192,11 @@ def test_an_event_of_what_was_just_destroyed_does_not_end_the_spin(context, exec
 
     # Both are ready in one round, and so is the timer, which destroys a third with an event.
     node.create_publisher(Float64, "x", STREAM_SUBSCRIBER)
-    time.sleep(0.3)
+    everything, _ = executor._waits
+    end = time.monotonic() + 10.0
+    while len(everything.ready_waitables()) < 3:
+        assert time.monotonic() < end, "no event of the three"
+        everything.wait(10_000_000)
     destroying = steady_timer(node, 0.01, lambda: node.destroy_subscription(third))
     spin_until(executor, node, lambda: told)
     node.destroy_timer(destroying)
