@@ -18,9 +18,9 @@ from pathlib import Path
 import numpy as np
 from known_motors import TABLE_1, independent, table
 
-from smp_motor_ident import models
 from smp_motor_ident.errors import SmpError
 from smp_motor_ident.estimate import estimate
+from smp_motor_ident.model import structures as models
 from smp_motor_ident.record import Hardware, Record
 
 WAVES = ("sine", "square", "fourier", "prbs", "steps", "chirp", "ramps")

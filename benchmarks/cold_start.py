@@ -15,14 +15,14 @@ from pathlib import Path
 import numpy as np
 from known_motors import TABLE_1, recording, table
 
-from smp_motor_ident import models
 from smp_motor_ident.errors import SmpError
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.fitting import fit
-from smp_motor_ident.fitting.cold import cold_fit
-from smp_motor_ident.fitting.descent import Options
-from smp_motor_ident.kernel.experiments import prepare
-from smp_motor_ident.models import Structure
+from smp_motor_ident.estimation import fit
+from smp_motor_ident.estimation.cold import cold_fit
+from smp_motor_ident.estimation.descent import Options
+from smp_motor_ident.likelihood.experiments import prepare
+from smp_motor_ident.model import structures as models
+from smp_motor_ident.model.structures import Structure
 
 CASES = {
     "linear, voltage only": (False, False, 0.0),

@@ -16,14 +16,14 @@ from pathlib import Path
 import numpy as np
 from known_motors import CURRENT_NOISE, QUANTUM, TABLE_1, recording, table
 
-from smp_motor_ident import models
 from smp_motor_ident.errors import SmpError
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.kernel import recursion as rc
-from smp_motor_ident.kernel.experiments import prepare
-from smp_motor_ident.kernel.noise import kalman_gain
-from smp_motor_ident.kernel.passes import evaluate
-from smp_motor_ident.models import PHYSICAL, Structure
+from smp_motor_ident.likelihood import recursion as rc
+from smp_motor_ident.likelihood.experiments import prepare
+from smp_motor_ident.likelihood.noise import kalman_gain
+from smp_motor_ident.likelihood.passes import evaluate
+from smp_motor_ident.model import structures as models
+from smp_motor_ident.model.structures import PHYSICAL, Structure
 
 COMBINATIONS = ("dc_gain", "time_constant", "time_constant_product")
 KINDS = ("sine", "square", "fourier", "plain square")

@@ -14,10 +14,10 @@ import numpy as np
 from known_motors import TABLE_1, recording, table
 
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.fitting.cold import cold_fit
-from smp_motor_ident.fitting.descent import Options
-from smp_motor_ident.kernel.experiments import prepare
-from smp_motor_ident.models import Structure
+from smp_motor_ident.estimation.cold import cold_fit
+from smp_motor_ident.estimation.descent import Options
+from smp_motor_ident.likelihood.experiments import prepare
+from smp_motor_ident.model.structures import Structure
 from smp_motor_ident.record import Hardware, Record
 
 CASES = (

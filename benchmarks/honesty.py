@@ -13,14 +13,14 @@ import argparse
 import numpy as np
 from known_motors import CURRENT_NOISE, QUANTUM, TABLE_1, recording, table
 
-from smp_motor_ident import models
+from smp_motor_ident.diagnosis.identifiability import structural
 from smp_motor_ident.errors import SmpError
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.fitting.answer import LOOSE
-from smp_motor_ident.identifiability import structural
-from smp_motor_ident.kernel.experiments import prepare
-from smp_motor_ident.kernel.passes import NO_GAIN, evaluate
-from smp_motor_ident.models import PHYSICAL, Structure
+from smp_motor_ident.estimation.answer import LOOSE
+from smp_motor_ident.likelihood.experiments import prepare
+from smp_motor_ident.likelihood.passes import NO_GAIN, evaluate
+from smp_motor_ident.model import structures as models
+from smp_motor_ident.model.structures import PHYSICAL, Structure
 
 CASES = (
     (True, ()),

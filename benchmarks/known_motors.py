@@ -16,7 +16,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "test" / "ident")]
 
 import independent  # noqa: E402
 
-from smp_motor_ident import models  # noqa: E402
+from smp_motor_ident.model import structures as models  # noqa: E402
 from smp_motor_ident.record import Hardware, Record  # noqa: E402
 
 QUANTUM = 2 * np.pi / 500

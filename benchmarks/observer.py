@@ -24,9 +24,9 @@ from pathlib import Path
 import numpy as np
 
 from smp_motor_control.encoder import DifferencedSpeed
-from smp_motor_control.motor import Motor
-from smp_motor_control.motor_file import MotorEntry, load_motors
-from smp_motor_control.motor_model import MotorModel
+from smp_motor_control.motor.file import MotorEntry, load_motors
+from smp_motor_control.motor.friction import Motor
+from smp_motor_control.motor.model import MotorModel
 from smp_motor_control.observer import SpeedObserver
 from smp_motor_control.pid import Pid, PidGains
 

@@ -25,7 +25,7 @@ from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import JointState
 
 from smp_interfaces.msg import MotorState, PidState
-from smp_motor_control.motor_file import MotorEntry, load_motors
+from smp_motor_control.motor.file import MotorEntry, load_motors
 from smp_motor_control.nodes import runtime
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -12,9 +12,9 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.signal import cont2discrete, lfilter
 
-from smp_motor_ident.fitting.fit import solve
-from smp_motor_ident.kernel.experiments import prepare
-from smp_motor_ident.models import Structure
+from smp_motor_ident.estimation.fit import solve
+from smp_motor_ident.likelihood.experiments import prepare
+from smp_motor_ident.model.structures import Structure
 from smp_motor_ident.record import Record
 
 GUESS = (0.1, 1e-2, 1e-4)

@@ -28,10 +28,10 @@ from growth import growth  # noqa: E402
 from known_motors import TABLE_1, recording, table  # noqa: E402
 
 from smp_motor_ident.estimate import estimate  # noqa: E402
-from smp_motor_ident.fitting.cold import cold_fit  # noqa: E402
-from smp_motor_ident.fitting.descent import Options  # noqa: E402
-from smp_motor_ident.kernel.experiments import prepare  # noqa: E402
-from smp_motor_ident.models import Structure  # noqa: E402
+from smp_motor_ident.estimation.cold import cold_fit  # noqa: E402
+from smp_motor_ident.estimation.descent import Options  # noqa: E402
+from smp_motor_ident.likelihood.experiments import prepare  # noqa: E402
+from smp_motor_ident.model.structures import Structure  # noqa: E402
 from smp_motor_ident.record import Record  # noqa: E402
 
 NOISE = 2.0  # rad/s

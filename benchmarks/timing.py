@@ -309,7 +309,7 @@ def wheels(rate: float, duration: float, priority: int) -> bool:
 def core() -> bool:
     """Measure one step of the PID, and of the whole loop around it."""
     from smp_motor_control.pid import Pid, PidGains
-    from smp_motor_control.wheel_loop import LoopSettings, WheelLoop
+    from smp_motor_control.wheel.loop import LoopSettings, WheelLoop
 
     names = PidGains.__dataclass_fields__
     gains = PidGains(**{k: v for k, v in GAINS.items() if k in names})

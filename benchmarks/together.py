@@ -26,17 +26,17 @@ from rclpy.serialization import serialize_message
 
 from smp_interfaces.msg import MotorDescription, MotorState
 from smp_motor_control.excitation import Fourier
-from smp_motor_control.motor_file import MotorEntry, load_motors
-from smp_motor_control.motor_model import MotorModel
+from smp_motor_control.motor.file import MotorEntry, load_motors
+from smp_motor_control.motor.model import MotorModel
 from smp_motor_control.pid import PidGains
-from smp_motor_control.simulation import (
+from smp_motor_control.wheel.loop import LoopSettings
+from smp_motor_control.wheel.simulation import (
     DriveSettings,
     Run,
     Timing,
     simulate_closed_loop,
     simulate_open_loop,
 )
-from smp_motor_control.wheel_loop import LoopSettings
 from smp_motor_ident.bag import read_records
 from smp_motor_ident.bag.writer import BagWriter
 from smp_motor_ident.estimate import estimate

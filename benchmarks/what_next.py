@@ -14,9 +14,9 @@ import numpy as np
 from known_motors import CURRENT_NOISE, QUANTUM, TABLE_1, independent, recording, table
 
 from smp_motor_control.excitation import Fourier
-from smp_motor_ident import models
+from smp_motor_ident.diagnosis.identifiability import what_next
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.identifiability import what_next
+from smp_motor_ident.model import structures as models
 from smp_motor_ident.record import Hardware, Record
 
 

@@ -8,7 +8,7 @@ lint() { ruff check --quiet .; }
 types() { mypy --no-error-summary; }
 imports() { lint-imports --no-logo; }
 docstrings() {
-  find smp_motor_control smp_motor_ident -name '*.py' -not -path 'smp_motor_control/nodes/*' -print0 |
+  find smp_motor_control smp_motor_ident -name '*.py' -not -path '*/nodes/*' -print0 |
     xargs -0 python scripts/docstrings.py
 }
 

@@ -72,20 +72,7 @@ def _check_bits(bits: int) -> None:
 
 
 def wrap(count: int, bits: int) -> int:
-    """Return a count as a two's complement counter of this width shows it.
-
-    Parameters
-    ----------
-    count : int
-        Total counts.
-    bits : int
-        Width; 0 never wraps.
-
-    Returns
-    -------
-    int
-        In ``[-2^(bits-1), 2^(bits-1))``.
-    """
+    """Return a count as a two's complement counter of this width shows it."""
     if bits == 0:
         return count
     half = 1 << (bits - 1)
@@ -149,18 +136,7 @@ class Unwrapper:
         self._shown = None
 
     def __call__(self, count: int) -> int:
-        """Return the total counts after the counter showed ``count``.
-
-        Parameters
-        ----------
-        count : int
-            As the hardware reports it.
-
-        Returns
-        -------
-        int
-            Total counts; the first call returns ``count`` itself.
-        """
+        """Return the total counts after the counter showed ``count``."""
         if self._shown is None:
             self._total = count
         else:

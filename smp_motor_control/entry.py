@@ -24,24 +24,13 @@ def _program(module: str, interrupted: int) -> Callable[[], int]:
     return run
 
 
-def node(name: str) -> Callable[[], int]:
-    """Return what runs a node.
-
-    Parameters
-    ----------
-    name : str
-        Of its module, such as ``conductor``.
-
-    Returns
-    -------
-    callable
-        Runs until a signal and returns the exit code.
-    """
-    return _program(f"smp_motor_control.nodes.{name}", 0)
+def node(name: str, package: str = "smp_motor_control") -> Callable[[], int]:
+    """Return what runs the node of that name until a signal, and returns the exit code."""
+    return _program(f"{package}.nodes.{name}", 0)
 
 
 def _tool(name: str) -> Callable[[], int]:
-    return _program(f"smp_motor_ident.commands.{name}", 130)
+    return _program(f"smp_motor_ident.cli.{name}", 130)
 
 
 wheel_pid = node("wheel_pid")
@@ -49,9 +38,9 @@ motor_plant = node("motor_plant")
 skid_steer = node("skid_steer")
 teleop_wheels = node("teleop_wheels")
 excite = node("excite")
-record = node("record")
-play = node("play")
-identifier = node("identifier")
+record = node("record", "smp_motor_ident")
+play = node("play", "smp_motor_ident")
+identifier = node("identifier", "smp_motor_ident")
 identify = _tool("identify")
 tune = _tool("tune")
 commission = _tool("commission")

@@ -54,18 +54,7 @@ class Excitation(ABC):
     @overload
     def __call__(self, time: Array) -> Array: ...
     def __call__(self, time: float | Array) -> float | Array:
-        """Return the signal at one or many instants.
-
-        Parameters
-        ----------
-        time : float or ndarray
-            Since the start [s].
-
-        Returns
-        -------
-        float or ndarray
-            Voltage [V] within the amplitude.
-        """
+        """Return the signal at one or many instants."""
         times = np.atleast_1d(np.asarray(time, dtype=np.float64))
         begun = times >= 0
         shape = self._shape(np.where(begun, times, 0.0))

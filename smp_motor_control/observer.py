@@ -1,6 +1,6 @@
 """Motor speed from encoder counts and voltage by a steady-state Kalman filter.
 
-State ``(theta, w, w', d)`` of the identified motor (see :mod:`~smp_motor_control.motor_model`)
+State ``(theta, w, w', d)`` of the identified motor (see :mod:`~smp_motor_control.motor.model`)
 with the load ``d`` as a random walk, so that the speed has no bias under any constant load:
 
     theta' = w,   tp w'' + tau w' + w = K (v - friction - d + n_v),   d' = n_d,
@@ -24,7 +24,7 @@ from collections import deque
 
 from smp_motor_control.encoder import DifferencedSpeed, Encoder, Unwrapper
 from smp_motor_control.errors import ParameterError
-from smp_motor_control.motor_model import MotorModel
+from smp_motor_control.motor.model import MotorModel
 from smp_motor_control.observer_gain import ObserverNoise, steady_gain
 
 __all__ = ["ObserverNoise", "SpeedObserver"]

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm, solve_discrete_are
 
 from smp_motor_control.errors import ParameterError
-from smp_motor_control.motor_model import MotorModel
+from smp_motor_control.motor.model import MotorModel
 
 Array = NDArray[np.float64]
 

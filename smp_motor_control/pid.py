@@ -306,15 +306,6 @@ class Pid:
 
         The next step with these inputs gives ``output``, as far as integral action and its
         clamps allow.
-
-        Parameters
-        ----------
-        output : float
-            The command in force [V].
-        reference, measurement : float
-            Inputs of the next step [rad/s].
-        acceleration : float
-            Acceleration of the reference [rad/s^2].
         """
         self.reset()
         self._previous = self._weight_d * reference - measurement

@@ -7,27 +7,28 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident import models, validate
-from smp_motor_ident.advice import advise, doubts
+from smp_motor_ident.diagnosis import validation as validate
+from smp_motor_ident.diagnosis.advice import advise, doubts
+from smp_motor_ident.diagnosis.screening import screen
 from smp_motor_ident.errors import InsufficientExcitationError, ParameterError, SignalError
-from smp_motor_ident.fitting import ladder
-from smp_motor_ident.fitting.answer import Answer, answer
-from smp_motor_ident.fitting.choice import Rung
-from smp_motor_ident.fitting.cold import cold_fit
-from smp_motor_ident.fitting.descent import Options, head, refine
-from smp_motor_ident.fitting.fit import Fit, Prior
-from smp_motor_ident.fitting.horizon import extend, grow
-from smp_motor_ident.fitting.nuisance import blurred, unseen_friction
-from smp_motor_ident.fitting.profile import profiled
-from smp_motor_ident.fitting.quantisation import widened
-from smp_motor_ident.fitting.thinning import thinned
-from smp_motor_ident.kernel import recursion as rc
-from smp_motor_ident.kernel.experiments import Experiments, prepare
-from smp_motor_ident.kernel.sections import between_samples
-from smp_motor_ident.models import MODELS, PHYSICAL, Structure
+from smp_motor_ident.estimation import ladder
+from smp_motor_ident.estimation.answer import Answer, answer
+from smp_motor_ident.estimation.choice import Rung
+from smp_motor_ident.estimation.cold import cold_fit
+from smp_motor_ident.estimation.descent import Options, head, refine
+from smp_motor_ident.estimation.fit import Fit, Prior
+from smp_motor_ident.estimation.horizon import extend, grow
+from smp_motor_ident.estimation.nuisance import blurred, unseen_friction
+from smp_motor_ident.estimation.profile import profiled
+from smp_motor_ident.estimation.quantisation import widened
+from smp_motor_ident.estimation.thinning import thinned
+from smp_motor_ident.likelihood import recursion as rc
+from smp_motor_ident.likelihood.experiments import Experiments, prepare
+from smp_motor_ident.likelihood.sections import between_samples
+from smp_motor_ident.model import structures as models
+from smp_motor_ident.model.structures import MODELS, PHYSICAL, Structure
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import Candidate, Estimate, FitPercent
-from smp_motor_ident.screening import screen
 
 Array = NDArray[np.float64]
 

@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from smp_motor_ident.finding import Finding, gravest
 from smp_motor_ident.record import Hardware
 
 Array = NDArray[np.float64]
@@ -118,6 +119,7 @@ class Estimate:
     fit_percent: FitPercent = FitPercent()
     candidates: tuple[Candidate, ...] = ()
     residuals: ResidualTests = ResidualTests()
+    findings: tuple[Finding, ...] = ()
     warnings: tuple[str, ...] = ()
     advice: tuple[str, ...] = ()
     samples: int = 0
@@ -130,6 +132,11 @@ class Estimate:
     def unidentifiable(self) -> tuple[str, ...]:
         """Parameters that the data cannot tell."""
         return tuple(n for n, q in self.parameters.items() if q.status == "unidentifiable")
+
+    @property
+    def unreliable(self) -> bool:
+        """Whether a stated number may be off by more than its interval."""
+        return gravest(self.findings) in ("unreliable", "refused")
 
     @property
     def identifiable(self) -> bool:
@@ -228,6 +235,7 @@ class Estimate:
                 "white": self.residuals.white,
                 "independent_of_input": self.residuals.independent_of_input,
             },
+            "findings": [f.to_document() for f in self.findings],
             "warnings": list(self.warnings),
             "advice": list(self.advice),
             "samples": self.samples,
@@ -278,6 +286,7 @@ class Estimate:
             fit_percent=FitPercent(fit.get("estimation"), fit.get("validation")),
             candidates=tuple(Candidate(**c) for c in document.get("candidates", [])),
             residuals=ResidualTests(**document.get("residuals", {})),
+            findings=tuple(Finding.from_document(f) for f in document.get("findings", ())),
             warnings=tuple(document.get("warnings", ())),
             advice=tuple(document.get("advice", ())),
             samples=document.get("samples", 0),

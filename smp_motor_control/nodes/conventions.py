@@ -52,17 +52,7 @@ LATCHED = QoSProfile(
 
 
 def send_last(publisher: Publisher, message: Any, timeout: float = 0.3) -> None:
-    """Publish a last message and wait until those who take it reliably have it.
-
-    Parameters
-    ----------
-    publisher : rclpy.publisher.Publisher
-        Of the topic.
-    message : object
-        Such as a zero command.
-    timeout : float
-        Longest wait [s].
-    """
+    """Publish a last message and wait until those who take it reliably have it."""
     publisher.publish(message)
     publisher.wait_for_all_acked(Duration(seconds=timeout))
     # Best-effort readers acknowledge nothing: give the datagram time to leave the process.
@@ -90,18 +80,7 @@ def steady_timer(node: Node, period: float, callback: Callable[[], None]) -> Tim
 
 
 def wheel_of(node: Node) -> str:
-    """Return the wheel whose namespace a node lives in.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-        Such as ``/front_left/wheel_pid``, also below a robot's namespace.
-
-    Returns
-    -------
-    str
-        Such as ``front_left``; empty in the root namespace.
-    """
+    """Return the wheel whose namespace a node lives in."""
     return str(node.get_namespace().rsplit("/", 1)[-1])
 
 

@@ -85,18 +85,7 @@ class Settings:
         return WHEELS if "all" in self.wheels else tuple(dict.fromkeys(self.wheels))
 
     def signal_of(self, wheel: int) -> Excitation:
-        """Return the bounded signal of the n-th wheel.
-
-        Parameters
-        ----------
-        wheel : int
-            Its place among the chosen.
-
-        Returns
-        -------
-        Excitation
-            In volts of seconds.
-        """
+        """Return the bounded signal of the n-th wheel."""
         kind = SIGNALS[self.signal]
         names = {f.name for f in fields(kind)}
         given = {n: getattr(self, n) for n in names if hasattr(self, n)}

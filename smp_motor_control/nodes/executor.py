@@ -106,13 +106,7 @@ class LeanExecutor(SingleThreadedExecutor):
         self._plain: dict[Any, bool] = {}
 
     def entities(self) -> tuple[tuple[Any, ...], ...]:
-        """Return what to wait for.
-
-        Returns
-        -------
-        tuple of tuple
-            Subscriptions, timers, clients, services, guard conditions and waitables.
-        """
+        """Return what to wait for."""
         nodes = self.get_nodes()
         kinds = ("subscriptions", "timers", "clients", "services", "guards", "waitables")
         return tuple(

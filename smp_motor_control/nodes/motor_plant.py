@@ -22,10 +22,10 @@ from std_msgs.msg import Float64
 
 from smp_interfaces.msg import MotorCommand, MotorDescription, MotorState
 from smp_motor_control.errors import ParameterError
-from smp_motor_control.motor_file import MotorEntry, load_motors, nest, parse_motors
+from smp_motor_control.motor.file import MotorEntry, load_motors, nest, parse_motors
+from smp_motor_control.motor.hardware import DrivenMotor, DriveSettings, Supply
 from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.settings import Parameters, described, given_parameters, nested
-from smp_motor_control.plant import DrivenMotor, DriveSettings, Supply
 
 _FIXED = ParameterDescriptor(description="As in a motor file.", read_only=True)
 _DRIVE = {

@@ -13,8 +13,8 @@ from rclpy.time import Time
 from sensor_msgs.msg import JointState
 
 from smp_motor_control import WHEELS
-from smp_motor_control.odometry import Odometry
-from smp_motor_control.wheel_feedback import WheelSample
+from smp_motor_control.body.odometry import Odometry
+from smp_motor_control.body.wheel_travel import WheelSample
 
 UNKNOWN = 1e6
 """Variance of what wheels on a plane cannot tell: height, roll and pitch."""
@@ -39,22 +39,7 @@ class FrameSettings(Protocol):
 
 
 def frame_prefix(enable: bool, prefix: str, namespace: str) -> str:
-    """Return what comes before the names of the frames.
-
-    Parameters
-    ----------
-    enable : bool
-        Whether there is a prefix at all.
-    prefix : str
-        As given; the namespace where it is empty.
-    namespace : str
-        Of the node.
-
-    Returns
-    -------
-    str
-        Empty, or with a slash at its end alone.
-    """
+    """Return what comes before the names of the frames."""
     inner = (prefix or namespace).strip("/") if enable else ""
     return f"{inner}/" if inner else ""
 
@@ -124,15 +109,7 @@ class OdometryOutput:
             self._tf.publish(self._transforms)
 
     def publish_joints(self, wheels: Mapping[str, WheelSample], stamp: float) -> None:
-        """Publish the wheels that were heard.
-
-        Parameters
-        ----------
-        wheels : mapping of str to WheelSample
-            Newest sample of each.
-        stamp : float
-            ROS time [s].
-        """
+        """Publish the wheels that were heard."""
         heard = [w for w in WHEELS if w in wheels and math.isfinite(wheels[w].position)]
         if not heard:
             return

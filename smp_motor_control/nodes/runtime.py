@@ -222,11 +222,6 @@ def refuse_impossible_transitions(node: LifecycleNode) -> None:
     """Answer a request for a transition that the present state does not have, and live on.
 
     rclpy raises in the service's callback instead, which ends the node.
-
-    Parameters
-    ----------
-    node : rclpy.lifecycle.LifecycleNode
-        Whose service is guarded.
     """
     service = node._service_change_state
     change = service.callback

@@ -122,27 +122,7 @@ def _entries(settings: type) -> dict[str, _Entry]:
 
 
 def coerce(name: str, value: Any, default: Any) -> Any:
-    """Return a parameter's value in the type of its default.
-
-    Parameters
-    ----------
-    name : str
-        For the message.
-    value : object
-        As ROS, a YAML file or a command line gave it.
-    default : bool, int, float, str or tuple
-        Of the type that is wanted.
-
-    Returns
-    -------
-    object
-        Of the type of ``default``; sequences become tuples.
-
-    Raises
-    ------
-    ParameterError
-        When the value is of another type.
-    """
+    """Return a parameter's value in the type of its default."""
     wanted = type(default)
     if wanted is float and type(value) is int:
         return float(value)
@@ -268,18 +248,7 @@ class Parameters(Generic[S]):
 
 
 def given_parameters(node: Node) -> dict[str, Any]:
-    """Return what the command line, launch and parameter files set for a node.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-        The node.
-
-    Returns
-    -------
-    dict
-        Plain values by name.
-    """
+    """Return what the command line, launch and parameter files set for a node."""
     return {name: parameter.value for name, parameter in node._parameter_overrides.items()}
 
 

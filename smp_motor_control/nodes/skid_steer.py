@@ -11,19 +11,13 @@ from rclpy.node import Node
 from sensor_msgs.msg import Imu, JointState
 
 from smp_interfaces.msg import MotorState
+from smp_motor_control.body.kinematics import LEFT, RIGHT, BodyCommand, Odometry, Verdict
+from smp_motor_control.body.odometry import LEAST_STEP
+from smp_motor_control.body.wheel_travel import WheelFeedback, WheelSample
 from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.odometry_output import OdometryOutput
 from smp_motor_control.nodes.settings import Parameters
 from smp_motor_control.nodes.skid_steer_settings import Settings
-from smp_motor_control.odometry import LEAST_STEP
-from smp_motor_control.skid_steer import (
-    LEFT,
-    RIGHT,
-    BodyCommand,
-    Odometry,
-    Verdict,
-)
-from smp_motor_control.wheel_feedback import WheelFeedback, WheelSample
 
 IMPLAUSIBLE = 4.0
 """Wheels that seem to turn this many times faster than they can have had their counter reset."""

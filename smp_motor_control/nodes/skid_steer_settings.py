@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields
 
+from smp_motor_control.body.kinematics import HeadingHold, SkidSteer, SpeedLimiter
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.nodes.settings import described, nested
-from smp_motor_control.skid_steer import HeadingHold, SkidSteer, SpeedLimiter
 
 _LIMITS = {
     "min_velocity": "Lowest velocity; NaN takes the negative of max_velocity.",

@@ -116,13 +116,7 @@ def in_background(fd: int) -> bool:
 
 
 def require_terminal() -> None:
-    """Refuse to go on without a terminal to read keys from.
-
-    Raises
-    ------
-    SmpError
-        When standard input is no terminal, or this process runs in its background.
-    """
+    """Refuse to go on without a terminal to read keys from."""
     if not sys.stdin.isatty():
         raise SmpError("standard input is not a terminal: start it in a terminal of its own")
     if in_background(sys.stdin.fileno()):

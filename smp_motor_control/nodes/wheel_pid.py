@@ -17,7 +17,7 @@ from sensor_msgs.msg import JointState
 from smp_interfaces.msg import MotorCommand, MotorDescription, MotorState, PidState
 from smp_motor_control.encoder import Encoder
 from smp_motor_control.errors import ParameterError
-from smp_motor_control.motor import Gearbox
+from smp_motor_control.motor.friction import Gearbox
 from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.settings import Parameters
 from smp_motor_control.nodes.wheel_report import (
@@ -30,8 +30,8 @@ from smp_motor_control.nodes.wheel_report import (
 )
 from smp_motor_control.nodes.wheel_settings import Settings
 from smp_motor_control.pid import PidOutput
-from smp_motor_control.supervision import Fault, FaultDetector, FeedbackClock, Latch, Verdict
-from smp_motor_control.wheel_loop import WheelLoop
+from smp_motor_control.wheel.loop import WheelLoop
+from smp_motor_control.wheel.supervision import Fault, FaultDetector, FeedbackClock, Latch, Verdict
 
 _LARGEST_SETPOINT = 1e4
 _FRESH, _FIRST, _LATE = Verdict.FRESH, Verdict.FIRST, Verdict.LATE

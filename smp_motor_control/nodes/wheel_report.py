@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from rclpy.node import Node
 
 from smp_motor_control.nodes import runtime
-from smp_motor_control.supervision import FeedbackClock, Latch, Verdict
+from smp_motor_control.wheel.supervision import FeedbackClock, Latch, Verdict
 
 WAITING = "waiting for a set-point"
 DRIVING = "driving"
@@ -77,13 +77,7 @@ class WheelReport:
             self._diagnostics = None
 
     def enter(self, state: str) -> None:
-        """Be in a state from now on, and tell at once if it is a new one.
-
-        Parameters
-        ----------
-        state : str
-            One of this module's, or the name of a fault.
-        """
+        """Be in a state from now on, and tell at once if it is a new one."""
         if state is not self.state:
             self.state = state
             if self._diagnostics is not None:
@@ -98,13 +92,7 @@ class WheelReport:
         self.enter(BAD_FEEDBACK if refused else NO_FEEDBACK)
 
     def refuse(self, what: str) -> None:
-        """Count something that was left out.
-
-        Parameters
-        ----------
-        what : str
-            In words.
-        """
+        """Count something that was left out."""
         self._refused[what] = self._refused.get(what, 0) + 1
 
     def _totals(self) -> dict[str, int]:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from smp_motor_control.errors import ParameterError
-from smp_motor_control.motor_model import MotorModel
+from smp_motor_control.motor.model import MotorModel
 from smp_motor_control.nodes.settings import described, nested
 from smp_motor_control.observer import ObserverNoise
 from smp_motor_control.pid import PidGains
-from smp_motor_control.profile import Drive, ProfileLimits
-from smp_motor_control.supervision import FaultLimits
-from smp_motor_control.wheel_loop import LoopSettings
+from smp_motor_control.reference.profile import Drive, ProfileLimits
+from smp_motor_control.wheel.loop import LoopSettings
+from smp_motor_control.wheel.supervision import FaultLimits
 
 _GAINS = {
     "p": "Proportional gain [V s/rad, wheel].",

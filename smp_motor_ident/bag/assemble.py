@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_control.motor import Gearbox
+from smp_motor_control.motor.friction import Gearbox
 from smp_motor_ident.bag.axis import Series, on_one_axis
 from smp_motor_ident.bag.counter import unwrap_angle
 from smp_motor_ident.bag.mapping import MotorMap, Signal
@@ -56,31 +56,7 @@ def assemble(
     tables: Mapping[str, Table],
     source: str,
 ) -> Record:
-    """Make one motor's record.
-
-    Parameters
-    ----------
-    wheel : str
-        Its name.
-    plan : MotorMap
-        Signals and options.
-    hardware : Hardware
-        Gearbox, encoder and supply.
-    tables : mapping of str to Table
-        By topic; the key '' is the CSV file.
-    source : str
-        Name of the recording.
-
-    Returns
-    -------
-    Record
-        At the motor shaft, with notes on everything that was repaired or assumed.
-
-    Raises
-    ------
-    BagError
-        When signals that are needed have no samples.
-    """
+    """Make one motor's record."""
     motor = _Motor(
         wheel, plan, hardware, Gearbox(hardware.gear_ratio), tables, f"{source}: {wheel}"
     )

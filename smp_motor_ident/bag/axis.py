@@ -61,35 +61,7 @@ def on_one_axis(
     source: str,
     notes: list[str],
 ) -> Record:
-    """Make a record of signals that were sampled each at its own instants.
-
-    Parameters
-    ----------
-    wheel : str
-        Name of the motor.
-    plan : MotorMap
-        Its options ``held`` and ``gap``.
-    hardware : Hardware
-        Encoder and supply.
-    series : dict of str to Series
-        Voltage and at least the output ``axis_name``.
-    axis_name : {'count', 'position', 'velocity'}
-        The output whose instants become the record's.
-    source : str
-        Name of the recording.
-    notes : list of str
-        What was found so far.
-
-    Returns
-    -------
-    Record
-        With segments, and notes on every repair.
-
-    Raises
-    ------
-    BagError
-        When fewer than two samples are left.
-    """
+    """Make a record of signals that were sampled each at its own instants."""
     notes = list(notes)
     held = plan.held or "after"
     if "supply" in series:

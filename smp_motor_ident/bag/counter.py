@@ -102,20 +102,7 @@ def _resets(count: Integers, steps: Integers, guess: Array, measured: bool) -> I
 
 
 def unwrap_angle(angle: Array) -> tuple[Array, bool]:
-    """Undo the wrap-around of an angle that stays within one turn.
-
-    Parameters
-    ----------
-    angle : ndarray, shape (n,), [rad]
-        At the shaft where it is measured; NaN where lost.
-
-    Returns
-    -------
-    angle : ndarray, shape (n,), [rad]
-        Continuous.
-    wrapped : bool
-        Whether it did wrap.
-    """
+    """Undo the wrap-around of an angle that stays within one turn."""
     sound = np.isfinite(angle)
     values = angle[sound]
     if values.size < 2 or np.ptp(values) > 2 * np.pi * 1.001:

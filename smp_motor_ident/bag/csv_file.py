@@ -138,27 +138,7 @@ def _is_number(text: str) -> bool:
 
 
 def read_table(path: Path, names: list[str], time: tuple[str, float] | float) -> Table:
-    """Read columns of a CSV file as a table.
-
-    Parameters
-    ----------
-    path : Path
-        Of the file.
-    names : list of str
-        Columns.
-    time : tuple of str and float, or float
-        Column with the time and its unit [s], or the interval between rows [s].
-
-    Returns
-    -------
-    Table
-        Rows without a time are left out and noted.
-
-    Raises
-    ------
-    BagError
-        As `CsvFile` does.
-    """
+    """Read columns of a CSV file as a table."""
     file = CsvFile(path)
     seconds: Array
     if isinstance(time, tuple):

@@ -15,23 +15,7 @@ BETWEEN = 1.0
 
 
 def join_records(records: list[Record]) -> Record:
-    """Join recordings of one motor; each begins a new segment, one second behind the last.
-
-    Parameters
-    ----------
-    records : list of Record
-        At least one, all of the same motor.
-
-    Returns
-    -------
-    Record
-        A signal that only some recordings have is left out, or NaN where it may be.
-
-    Raises
-    ------
-    BagError
-        When their gearboxes or encoders differ.
-    """
+    """Join recordings of one motor; each begins a new segment, one second behind the last."""
     if len(records) == 1:
         return records[0]
     first = records[0]

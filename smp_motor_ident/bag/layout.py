@@ -36,18 +36,7 @@ class Layout:
     numbers: tuple[Number | None, ...]
 
     def matches(self, batch: Batch) -> NDArray[np.bool_]:
-        """Return which messages have this layout.
-
-        Parameters
-        ----------
-        batch : Batch
-            Messages of the type.
-
-        Returns
-        -------
-        ndarray of bool
-            One per message.
-        """
+        """Return which messages have this layout."""
         same: NDArray[np.bool_] = np.equal(batch.length, self.length)
         for offset, word in self.checks:
             if not same.any():
@@ -172,22 +161,7 @@ class Decoded:
         parts: list[list[NDArray[Any] | None]],
         width: int,
     ) -> Decoded:
-        """Return what several layouts gave as one, in the order of the messages.
-
-        Parameters
-        ----------
-        rows : list of ndarray of int64
-            Indices of the messages of each layout.
-        parts : list of list of ndarray or None
-            The columns that each layout gave; None: a column that it does not have.
-        width : int
-            Number of columns.
-
-        Returns
-        -------
-        Decoded
-            All of them, sorted by message.
-        """
+        """Return what several layouts gave as one, in the order of the messages."""
         if not rows:
             return cls(np.zeros(0, np.int64), [None] * width, [None] * width)
         if len(rows) == 1:

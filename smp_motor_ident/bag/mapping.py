@@ -268,23 +268,7 @@ def from_document(document: Any, where: str = "mapping") -> SignalMap:
 
 
 def of(mapping: Any) -> SignalMap:
-    """Return any form of a mapping as `SignalMap`.
-
-    Parameters
-    ----------
-    mapping : SignalMap, dict, path of a YAML file, or list of command-line items
-        None is an empty mapping.
-
-    Returns
-    -------
-    SignalMap
-        Validated.
-
-    Raises
-    ------
-    BagError
-        As `parse` and `load` do.
-    """
+    """Return any form of a mapping as `SignalMap`."""
     if mapping is None:
         return SignalMap()
     if isinstance(mapping, SignalMap):

@@ -105,13 +105,7 @@ class McapFile:
         return [self._channels[key] for key in sorted(self._channels)]
 
     def promised(self) -> dict[str, int] | None:
-        """Return what the summary counts.
-
-        Returns
-        -------
-        dict of str to int, or None
-            Messages by topic; None without a summary.
-        """
+        """Return what the summary counts."""
         if self._summary is None or self._summary.statistics is None:
             return None
         counts: Counter[str] = Counter()
@@ -120,20 +114,7 @@ class McapFile:
         return dict(counts)
 
     def batches(self, wanted: Callable[[Channel], bool]) -> Iterator[tuple[float, Batch]]:
-        """Walk over the file.
-
-        Parameters
-        ----------
-        wanted : callable
-            Says of a channel whether its messages are asked for.
-
-        Yields
-        ------
-        fraction : float
-            Of the file that is read.
-        batch : Batch
-            Messages of one channel.
-        """
+        """Walk over the file."""
         size = self.path.stat().st_size
         with self.path.open("rb") as file:
             file.seek(8)

@@ -48,22 +48,7 @@ DEFAULT_QOS: dict[str, Any] = {
 
 
 def topic_entry(name: str, type_name: str, profiles: list[dict[str, Any]], type_hash: str) -> str:
-    """Return what the file says of a topic, but for its number of messages.
-
-    Parameters
-    ----------
-    name, type_name : str
-        Topic and message type.
-    profiles : list of dict
-        QoS of its publishers, keys as in `DEFAULT_QOS`.
-    type_hash : str
-        REP-2011 hash of the type.
-
-    Returns
-    -------
-    str
-        Indented lines.
-    """
+    """Return what the file says of a topic, but for its number of messages."""
     entry = {
         "name": name,
         "type": type_name,
@@ -77,22 +62,7 @@ def topic_entry(name: str, type_name: str, profiles: list[dict[str, Any]], type_
 def document(
     file: str, distribution: str, first: int, last: int, topics: Iterable[tuple[str, int]]
 ) -> str:
-    """Return the whole text; it is put together by hand since it is written every half second.
-
-    Parameters
-    ----------
-    file, distribution : str
-        Name of the storage file and of the ROS distribution.
-    first, last : int
-        Log time [ns] of the earliest and the latest message; 0 without messages.
-    topics : iterable of (str, int)
-        What `topic_entry` gave, and the number of messages.
-
-    Returns
-    -------
-    str
-        Of the file.
-    """
+    """Return the whole text; it is put together by hand since it is written every half second."""
     entries = list(topics)
     parts = [f"    - topic_metadata:\n{text}      message_count: {n}\n" for text, n in entries]
     return _METADATA.format(

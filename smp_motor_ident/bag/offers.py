@@ -183,18 +183,7 @@ def _fields(types: Types, batch: Any) -> tuple[list[str], str]:
 
 
 def fields_of(template: Template) -> Iterator[str]:
-    """Yield the paths of a message's numbers, without its header.
-
-    Parameters
-    ----------
-    template : Template
-        Of a message.
-
-    Yields
-    ------
-    str
-        As a mapping takes it.
-    """
+    """Yield the paths of a message's numbers, without its header."""
     for name, value in template.root.items():
         if name != "header":
             yield from _paths(name, value, template.root)
@@ -221,18 +210,7 @@ def _paths(path: str, value: Any, parent: dict[str, Any]) -> Iterator[str]:
 
 
 def suggest(offers: list[Offer]) -> list[str]:
-    """Guess which fields are voltage and motion of which wheel, by their names.
-
-    Parameters
-    ----------
-    offers : list of Offer
-        Of one recording.
-
-    Returns
-    -------
-    list of str
-        Items for ``--map``; to be checked by the user, above all scales and units.
-    """
+    """Guess which fields are voltage and motion of which wheel, by their names."""
     wheels: dict[str, dict[str, str]] = {}
     time = ""
     for offer in offers:

@@ -77,20 +77,7 @@ class Recording:
         return found
 
     def batches(self, wanted: Callable[[Channel], bool]) -> Iterator[tuple[float, Batch]]:
-        """Read all files, and note every message that is missing.
-
-        Parameters
-        ----------
-        wanted : callable
-            Says of a channel whether its messages are asked for.
-
-        Yields
-        ------
-        fraction : float
-            Of the recording that is read.
-        batch : Batch
-            Messages of one channel.
-        """
+        """Read all files, and note every message that is missing."""
         counts: Counter[str] = Counter()
         seen: set[str] = set()
         total, before = max(self.size(), 1), 0
@@ -138,25 +125,7 @@ class Recording:
 
 
 def open_storage(path: Path, folder: Path) -> Storage:
-    """Open a file by what it begins with, whatever it is called.
-
-    Parameters
-    ----------
-    path : Path
-        MCAP or SQLite, perhaps compressed as a whole.
-    folder : Path
-        Where a compressed file is unpacked.
-
-    Returns
-    -------
-    Storage
-        With a problem noted where the compression was cut off.
-
-    Raises
-    ------
-    BagError
-        When it cannot be read, naming the reason.
-    """
+    """Open a file by what it begins with, whatever it is called."""
     head = _head(path)
     problems: list[str] = []
     plain = path

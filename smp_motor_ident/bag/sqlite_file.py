@@ -138,20 +138,7 @@ class SqliteFile:
         return None
 
     def batches(self, wanted: Callable[[Channel], bool]) -> Iterator[tuple[float, Batch]]:
-        """Read the messages in the order in which they were written.
-
-        Parameters
-        ----------
-        wanted : callable
-            Says of a topic whether its messages are asked for.
-
-        Yields
-        ------
-        fraction : float
-            Of the file that is read.
-        batch : Batch
-            Messages of one topic.
-        """
+        """Read the messages in the order in which they were written."""
         asked = {channel.id: channel for channel in self._channels if wanted(channel)}
         if not asked:
             return

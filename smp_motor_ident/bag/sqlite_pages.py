@@ -96,20 +96,7 @@ def _row(pages: _Pages, page: bytes, at: int) -> Row | None:
 
 
 def salvage(path: Path) -> Iterator[tuple[float, list[Row]]]:
-    """Read the messages of every whole leaf page, in the order of the file.
-
-    Parameters
-    ----------
-    path : Path
-        Of a SQLite file that has lost its end or some of its pages.
-
-    Yields
-    ------
-    fraction : float
-        Of the file that is read.
-    rows : list of Row
-        Of one page.
-    """
+    """Read the messages of every whole leaf page, in the order of the file."""
     count = path.stat().st_size
     with path.open("rb") as file:
         pages = _Pages(file, file.read(100))

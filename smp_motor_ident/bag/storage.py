@@ -113,18 +113,7 @@ class Storage(Protocol):
         ...
 
     def batches(self, wanted: Callable[[Channel], bool]) -> Iterator[tuple[float, Batch]]:
-        """Yield the fraction of the file that is read, and a batch.
-
-        Parameters
-        ----------
-        wanted : callable
-            Whether a channel's messages are to be read.
-
-        Yields
-        ------
-        tuple of float and Batch
-            Fraction 0 to 1, and the messages that follow those before.
-        """
+        """Yield the fraction of the file that is read, and a batch."""
         ...
 
 
@@ -154,43 +143,12 @@ def gather(data: Bytes, at: Integers, dtype: str) -> NDArray[Any]:
 
 
 def message_type(name: str) -> str:
-    """Return a type name with its ``/msg/``, which the oldest bags leave out.
-
-    Parameters
-    ----------
-    name : str
-        Such as ``std_msgs/Header``.
-
-    Returns
-    -------
-    str
-        Such as ``std_msgs/msg/Header``.
-    """
+    """Return a type name with its ``/msg/``, which the oldest bags leave out."""
     return re.sub(r"^(\w+)/(\w+)$", r"\1/msg/\2", name)
 
 
 def decompress(data: bytes, compression: str, size: int) -> bytes:
-    """Decompress a block, or what can be had of one that is cut off.
-
-    Parameters
-    ----------
-    data : bytes
-        Compressed block, perhaps without its end.
-    compression : {'', 'zstd', 'lz4'}
-        As the file names it.
-    size : int
-        Of the result where it is known, else 0.
-
-    Returns
-    -------
-    bytes
-        Shorter than ``size`` where the block is damaged.
-
-    Raises
-    ------
-    BagError
-        For a compression that nobody here knows.
-    """
+    """Decompress a block, or what can be had of one that is cut off."""
     if compression in ("", "none"):
         return data
     try:
@@ -210,20 +168,7 @@ def decompress(data: bytes, compression: str, size: int) -> bytes:
 
 
 def decompress_messages(batch: Batch) -> tuple[Batch, int]:
-    """Decompress messages that were compressed one by one.
-
-    Parameters
-    ----------
-    batch : Batch
-        As stored.
-
-    Returns
-    -------
-    Batch
-        With plain messages, those without that could not be decompressed.
-    int
-        Number of these.
-    """
+    """Decompress messages that were compressed one by one."""
     sound = batch.length >= 4
     if not sound.any():
         return batch, 0

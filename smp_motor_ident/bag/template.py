@@ -71,23 +71,7 @@ class Template:
 
 
 def parse_path(path: str) -> list[str | int]:
-    """Split a field path such as ``velocity[left_wheel_joint]`` or ``a.b[2].c``.
-
-    Parameters
-    ----------
-    path : str
-        Fields joined by dots; an index or a name in brackets.
-
-    Returns
-    -------
-    list of str or int
-        Steps; a name in brackets keeps its opening bracket.
-
-    Raises
-    ------
-    BagError
-        When it is no such path.
-    """
+    """Split a field path such as ``velocity[left_wheel_joint]`` or ``a.b[2].c``."""
     steps: list[str | int] = []
     position = 0
     while position < len(path):
@@ -178,43 +162,12 @@ class _Parser:
 
 
 def take_apart(data: bytes, name: str, definitions: Definitions) -> Template:
-    """Return where everything in a message stands.
-
-    Parameters
-    ----------
-    data : bytes
-        The serialized message.
-    name : str
-        Its type.
-    definitions : Definitions
-        Of that type and all in it.
-
-    Returns
-    -------
-    Template
-        Positions instead of values.
-
-    Raises
-    ------
-    DecodeError
-        When the bytes are no such message.
-    """
+    """Return where everything in a message stands."""
     return _Parser(data, definitions).parse(name)
 
 
 def names_beside(parent: Mapping[str, Any]) -> dict[str, list[Text]]:
-    """Return the lists of strings of a message, those called a name first.
-
-    Parameters
-    ----------
-    parent : mapping
-        A message of a template.
-
-    Returns
-    -------
-    dict of str to list of Text
-        By field.
-    """
+    """Return the lists of strings of a message, those called a name first."""
     lists = {
         key: value
         for key, value in parent.items()
@@ -224,27 +177,7 @@ def names_beside(parent: Mapping[str, Any]) -> dict[str, list[Text]]:
 
 
 def locate(template: Template, path: Sequence[str | int]) -> tuple[Number | None, list[Text]]:
-    """Find a number in a template.
-
-    Parameters
-    ----------
-    template : Template
-        Of one message.
-    path : sequence of str or int
-        From `parse_path`.
-
-    Returns
-    -------
-    number : Number or None
-        None where the message lacks the name or the index that is asked for.
-    names : list of Text
-        Names on which the place depends.
-
-    Raises
-    ------
-    BagError
-        When no message of the type can have it.
-    """
+    """Find a number in a template."""
     here: Any = template.root
     parent: Mapping[str, Any] = template.root
     names: list[Text] = []

@@ -36,18 +36,7 @@ class ClockFit:
     origin: int
 
     def to_log(self, stamp: Integers) -> Integers:
-        """Return stamps on the recorder's clock.
-
-        Parameters
-        ----------
-        stamp : ndarray of int64, [ns]
-            Header stamps.
-
-        Returns
-        -------
-        ndarray of int64, [ns]
-            Log times that they stand for.
-        """
+        """Return stamps on the recorder's clock."""
         since = (stamp - self.origin).astype(np.float64)
         shift = np.rint(self.offset + self.drift * since).astype(np.int64)
         result: Integers = stamp + shift
@@ -59,16 +48,6 @@ def fit_clock(stamp: Integers, log: Integers) -> ClockFit:
 
     A message is logged some latency after its stamp, and latency is never negative and has
     a tail: the line goes through the fastest messages of each part of the recording.
-
-    Parameters
-    ----------
-    stamp, log : ndarray of int64, shape (n,), [ns]
-        Of the same messages.
-
-    Returns
-    -------
-    ClockFit
-        Without drift where the recording is shorter than ten seconds.
     """
     origin = int(np.min(stamp))
     since = (stamp - origin).astype(np.float64)
@@ -88,20 +67,7 @@ def fit_clock(stamp: Integers, log: Integers) -> ClockFit:
 
 
 def judge_stamps(stamp: Integers | None, log: Integers) -> str:
-    """Return why header stamps cannot be the samples' time; empty where they can.
-
-    Parameters
-    ----------
-    stamp : ndarray of int64, shape (n,), [ns], or None
-        Header stamps; None where messages have none.
-    log : ndarray of int64, shape (n,), [ns]
-        Log times.
-
-    Returns
-    -------
-    str
-        A reason in words.
-    """
+    """Return why header stamps cannot be the samples' time; empty where they can."""
     if stamp is None:
         return "the messages carry no stamp"
     if stamp.size < 2:
@@ -120,16 +86,6 @@ def epochs(time: Integers) -> list[tuple[int, int]]:
 
     Single samples out of order are no reason to split, nor are shuffled ones: only long runs,
     each in order by itself, are parts of their own.
-
-    Parameters
-    ----------
-    time : ndarray of int64, shape (n,), [ns]
-        In the order of logging.
-
-    Returns
-    -------
-    list of (int, int)
-        Begin and end of each part; one part where the clock went on.
     """
     whole = [(0, time.size)]
     if time.size < 40:
@@ -198,18 +154,7 @@ class Rhythm:
 
 
 def rhythm(time: Integers) -> Rhythm:
-    """Return how regularly the samples come.
-
-    Parameters
-    ----------
-    time : ndarray of int64, shape (n,), [ns]
-        In order.
-
-    Returns
-    -------
-    Rhythm
-        Interval 0 for less than two samples.
-    """
+    """Return how regularly the samples come."""
     if time.size < 2:
         return Rhythm(0.0, False)
     steps = np.diff(time)
@@ -218,24 +163,7 @@ def rhythm(time: Integers) -> Rhythm:
 
 
 def mean_held(time: Integers, value: Array, held: str, at: Integers) -> Array:
-    """Average a held input over the intervals between output samples.
-
-    Parameters
-    ----------
-    time : ndarray of int64, shape (m,), [ns]
-        Instants of the input, in order.
-    value : ndarray, shape (m,)
-        What holds from that instant on (``after``) or up to it (``before``).
-    held : {'after', 'before'}
-        Which of these.
-    at : ndarray of int64, shape (n,), [ns]
-        Output instants, in order, none before the first of the input.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        Mean over ``(at[k-1], at[k]]``; the first is what holds there.
-    """
+    """Average a held input over the intervals between output samples."""
     origin = int(time[0])
     seconds = (time - origin) * 1e-9
     wanted = (at - origin) * 1e-9

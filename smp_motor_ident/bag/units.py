@@ -50,25 +50,7 @@ _ALIASES = {
 
 
 def check_unit(signal: str, unit: str) -> str:
-    """Return the unit under its usual name.
-
-    Parameters
-    ----------
-    signal : str
-        Such as ``velocity``.
-    unit : str
-        As the user wrote it; empty for SI.
-
-    Returns
-    -------
-    str
-        A unit that `factor` knows.
-
-    Raises
-    ------
-    BagError
-        When the signal cannot come in that unit.
-    """
+    """Return the unit under its usual name."""
     known = [*FACTORS[signal], *([_COUNTS[signal]] if signal in _COUNTS else [])]
     if signal == "voltage":
         known += _DUTY
@@ -85,27 +67,7 @@ def check_unit(signal: str, unit: str) -> str:
 def factor(
     signal: str, unit: str, *, counts_per_revolution: float | None, supply_voltage: float | None
 ) -> float:
-    """Return what a value in the unit must be multiplied by.
-
-    Parameters
-    ----------
-    signal, unit : str
-        As `check_unit` returned it.
-    counts_per_revolution : float or None
-        For ticks.
-    supply_voltage : float or None
-        [V], for a duty cycle.
-
-    Returns
-    -------
-    float
-        Factor to SI.
-
-    Raises
-    ------
-    BagError
-        When the unit needs a figure that is not given.
-    """
+    """Return what a value in the unit must be multiplied by."""
     if unit in FACTORS[signal]:
         return FACTORS[signal][unit]
     if unit in _DUTY:

@@ -15,17 +15,6 @@ def same_response(estimate: Estimate) -> dict[str, tuple[float, float]]:
     real and not negative for ``max(0, a0 - a1^2/(4 a2)) <= K <= a0``.  At ``K = a0`` (b = 0) the
     larger root is ``a1 a0/R``, the smaller one vanishes and takes L to infinity.
 
-    Parameters
-    ----------
-    estimate : Estimate
-        With ``dc_gain``, ``time_constant``, ``time_constant_product`` and a known resistance.
-
-    Returns
-    -------
-    dict of str to tuple of float
-        Smallest and largest value by parameter; empty where the data tell K, or too little is
-        known.
-
     References
     ----------
     docs/derivations.md, what voltage and speed can tell.

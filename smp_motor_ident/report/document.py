@@ -82,16 +82,6 @@ def motor_entry(estimate: Estimate) -> dict[str, float | int]:
 
     Physical parameters where the data could tell all of them, else the combinations: a motor
     of the same response from voltage to speed.
-
-    Parameters
-    ----------
-    estimate : Estimate
-        Of one motor.
-
-    Returns
-    -------
-    dict
-        Entry of ``motors.yaml``.
     """
     parameters = estimate.parameters
     physical = all(_known(parameters.get(name)) for name in PHYSICAL)

@@ -80,20 +80,7 @@ def _role_names(axes: Axes, parts: Sequence[Comparison]) -> None:
 
 @styled
 def detail(wheel: str, parts: Sequence[Comparison]) -> str:
-    """Draw the liveliest short stretch of held-out data close up, with its residual below.
-
-    Parameters
-    ----------
-    wheel : str
-        Name of the wheel.
-    parts : sequence of Comparison
-        Validation is preferred to estimation.
-
-    Returns
-    -------
-    str
-        SVG.
-    """
+    """Draw the liveliest short stretch of held-out data close up, with its residual below."""
     held_out = [p for p in parts if p.role == "validation"] or list(parts)
     part = _liveliest(held_out)
     figure, (top, bottom) = canvas(
@@ -176,18 +163,7 @@ def _stems(axes: Axes, correlation: Correlation, title: str) -> None:
 
 @styled
 def certainty(estimate: Estimate) -> str:
-    """Draw how well each quantity is known, as a percentage of itself.
-
-    Parameters
-    ----------
-    estimate : Estimate
-        Of one motor.
-
-    Returns
-    -------
-    str
-        SVG.
-    """
+    """Draw how well each quantity is known, as a percentage of itself."""
     held = _without_repeats(estimate)
     figure, axes = canvas(4.7, 0.7 + 0.3 * len(held))
     axes.set(xscale="log", xlim=(1e-3, 300), ylim=(len(held) - 0.4, -0.6))
@@ -236,18 +212,7 @@ def _certainty_bar(axes: Axes, row: int, quantity: Quantity) -> None:
 
 @styled
 def correlation_matrix(estimate: Estimate) -> str:
-    """Draw the correlations between the errors of the estimates.
-
-    Parameters
-    ----------
-    estimate : Estimate
-        Of one motor.
-
-    Returns
-    -------
-    str
-        SVG, or an empty string where there are fewer than two quantities.
-    """
+    """Draw the correlations between the errors of the estimates."""
     std = np.sqrt(np.diag(estimate.covariance))
     known = np.flatnonzero(std > 0)
     if known.size < 2:
@@ -276,18 +241,7 @@ def correlation_matrix(estimate: Estimate) -> str:
 
 @styled
 def side_by_side(estimates: Mapping[str, Estimate]) -> str:
-    """Draw every combination of every wheel with its 95 % interval, wheels side by side.
-
-    Parameters
-    ----------
-    estimates : mapping of str to Estimate
-        By wheel.
-
-    Returns
-    -------
-    str
-        SVG.
-    """
+    """Draw every combination of every wheel with its 95 % interval, wheels side by side."""
     names = [
         name
         for name in ("dc_gain", "time_constant", "time_constant_product", "static_voltage", "delay")

@@ -54,19 +54,6 @@ class Correlation:
 def correlations(parts: Sequence[Comparison], lags: int = 40) -> tuple[Correlation, Correlation]:
     """Correlate the residuals with themselves and with the input.
 
-    Parameters
-    ----------
-    parts : sequence of Comparison
-        Stretches; correlated one by one and pooled by their length.
-    lags : int
-        Largest lag [samples].
-
-    Returns
-    -------
-    tuple of Correlation
-        Autocorrelation at lags 0 to `lags`, and cross-correlation from the voltage at lags
-        ``-lags`` to `lags` (positive: the residual follows the voltage).
-
     References
     ----------
     L. Ljung, *System Identification: Theory for the User*, 2nd ed., section 16.6.
@@ -108,20 +95,7 @@ def _lagged(late: Array, early: Array, lags: int) -> Array:
 
 
 def thin(time: Array, values: Array, points: int = 1600) -> tuple[Array, Array]:
-    """Keep the smallest and largest value of each of ``points / 2`` stretches.
-
-    Parameters
-    ----------
-    time, values : ndarray, shape (n,)
-        A curve.
-    points : int
-        Roughly as many as a screen shows.
-
-    Returns
-    -------
-    tuple of ndarray
-        A curve that looks the same drawn.
-    """
+    """Keep the smallest and largest value of each of ``points / 2`` stretches."""
     if values.size <= points:
         return time, values
     size = -(-values.size // (points // 2))

@@ -73,20 +73,7 @@ styled = matplotlib.rc_context(_STYLE)
 
 
 def canvas(width: float, height: float, **layout: Any) -> tuple[Figure, Any]:
-    """Return an empty figure in the page's style, with its axes.
-
-    Parameters
-    ----------
-    width, height : float
-        [inch]; the page scales the figure to its column.
-    **layout
-        Passed on to ``Figure.subplots``.
-
-    Returns
-    -------
-    tuple of Figure and Axes or array of Axes
-        Ready to draw on.
-    """
+    """Return an empty figure in the page's style, with its axes."""
     figure = Figure(figsize=(width, height), layout="constrained")
     return figure, figure.subplots(**layout)
 
@@ -106,22 +93,7 @@ def note(axes: Axes, text: str) -> None:
 
 
 def to_svg(figure: Figure, name: str, description: str) -> str:
-    """Return a figure as an SVG element to set into a page.
-
-    Parameters
-    ----------
-    figure : Figure
-        Drawn with :data:`COLOR`.
-    name : str
-        Unique on the page; keeps the identifiers of two figures apart.
-    description : str
-        Read aloud in place of the picture.
-
-    Returns
-    -------
-    str
-        ``<svg ...>`` without XML head, coloured by CSS variables.
-    """
+    """Return a figure as an SVG element to set into a page."""
     buffer = io.StringIO()
     with matplotlib.rc_context({"svg.hashsalt": name}):
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})

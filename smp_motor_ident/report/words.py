@@ -126,18 +126,7 @@ def spread(std: float | None) -> str:
 
 
 def typeset(unit: str) -> str:
-    """Return a unit as one prints it.
-
-    Parameters
-    ----------
-    unit : str
-        Such as ``kg m^2``.
-
-    Returns
-    -------
-    str
-        Such as ``kg m²``.
-    """
+    """Return a unit as one prints it."""
     return unit.replace("^2", "²").replace("ohm", "Ω")
 
 

@@ -148,21 +148,7 @@ def finish(case: Case, feedback: Feedback, factor: float, robustness: Robustness
 
 
 def with_reference(case: Case, one: Design, reference: Reference) -> Design:
-    """Return a design with another reference, and the figures that go with it.
-
-    Parameters
-    ----------
-    case : Case
-        That it was made from.
-    one : Design
-        The design.
-    reference : Reference
-        Within what its own was.
-
-    Returns
-    -------
-    Design
-    """
+    """Return a design with another reference, and the figures that go with it."""
     controller = controller_for(one.loop, one.feedback)
     figures = measure(case.problem, _usual(case), controller, reference, one.performance.ripple)
     return replace(one, reference=reference, performance=figures)
@@ -175,21 +161,7 @@ def _usual(case: Case) -> Plant:
 
 
 def wheel_gains(controller: Controller, plant: Plant, loop: Loop) -> PidGains:
-    """Return the running controller's settings, per wheel rad/s.
-
-    Parameters
-    ----------
-    controller : Controller
-        At the motor shaft.
-    plant : Plant
-        The motor, for the feed-forward.
-    loop : Loop
-        Its gear ratio and supply.
-
-    Returns
-    -------
-    PidGains
-    """
+    """Return the running controller's settings, per wheel rad/s."""
     ratio, fb, m = loop.gear_ratio, controller.feedback, plant.motors
     tracking = controller.tracking
     limit = loop.supply_voltage

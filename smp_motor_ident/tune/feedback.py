@@ -70,18 +70,7 @@ class Feedback:
 
 
 def terms(omega: Array, sample_time: float, filter_time: float) -> tuple[Complex, Complex]:
-    """Return the responses of integrator and filtered derivative, each with unit gain.
-
-    Parameters
-    ----------
-    omega : ndarray, shape (f,), [rad/s]
-    sample_time, filter_time : float
-        [s].
-
-    Returns
-    -------
-    integral, derivative : ndarray of complex, shape (f,)
-    """
+    """Return the responses of integrator and filtered derivative, each with unit gain."""
     z = np.exp(1j * np.asarray(omega) * sample_time)
     keep = filter_time / (filter_time + sample_time)
     return sample_time / (z - 1), (1 - keep) * (z - 1) / (sample_time * (z - keep))
@@ -92,18 +81,6 @@ def closed_loop(plant: Plant, feedback: Feedback) -> Array:
 
     The state is: motor, the angles run through in the last ``window`` steps or the observer, the
     voltages still under way, integral, and derivative filter.
-
-    Parameters
-    ----------
-    plant : Plant
-        A batch of ``n``.
-    feedback : Feedback
-        One controller for all of them.
-
-    Returns
-    -------
-    ndarray, shape (n, q, q)
-        Stable where every eigenvalue lies inside the unit circle.
     """
     n, m, s = plant.taps.shape
     T, window, seen = plant.sample_time, plant.window, plant.seen

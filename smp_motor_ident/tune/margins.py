@@ -55,21 +55,7 @@ class Margins:
 
 
 def frequencies(sample_time: float, slowest: float, count: int = 500) -> Array:
-    """Return a logarithmic grid from well below the loop's slowest corner to Nyquist.
-
-    Parameters
-    ----------
-    sample_time : float
-        [s].
-    slowest : float
-        Slowest corner of the loop [rad/s].
-    count : int
-        Number of frequencies.
-
-    Returns
-    -------
-    ndarray, shape (count,), [rad/s]
-    """
+    """Return a logarithmic grid from well below the loop's slowest corner to Nyquist."""
     nyquist = math.pi / sample_time
     return np.geomspace(min(0.02 * slowest, 1e-3 * nyquist), nyquist, count)
 

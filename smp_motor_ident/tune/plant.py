@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from smp_motor_control.motor_model import MotorModel
+from smp_motor_control.motor.model import MotorModel
 from smp_motor_control.observer import ObserverNoise
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.tune.arrays import Array, Complex
@@ -134,17 +134,7 @@ class Plant:
         return response
 
     def angle_noise(self, omega: Array) -> Array:
-        """Return how an error of the counted angle shows in the speed.
-
-        Parameters
-        ----------
-        omega : ndarray, shape (f,), [rad/s]
-
-        Returns
-        -------
-        ndarray, shape (f,), [1/s^2]
-            Squared magnitude.
-        """
+        """Return how an error of the counted angle shows in the speed."""
         T = self.sample_time
         if self.seen is not None:
             z = np.exp(1j * np.asarray(omega) * T)

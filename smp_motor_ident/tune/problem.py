@@ -172,26 +172,7 @@ class Problem:
 
 
 def checked(targets: Mapping[str, Any], name: str, least: float = 0.0) -> float | None:
-    """Return a numeric target, or None where it is not given.
-
-    Parameters
-    ----------
-    targets : mapping of str to Any
-        What the caller asks for.
-    name : str
-        Keyword of the target.
-    least : float
-        The target must be above this.
-
-    Returns
-    -------
-    float or None
-
-    Raises
-    ------
-    DesignError
-        When it is not a finite number above ``least``.
-    """
+    """Return a numeric target, or None where it is not given."""
     value = targets.get(name)
     if value is None:
         return None

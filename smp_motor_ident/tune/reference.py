@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from smp_motor_control.profile import Drive, Profile, ProfileLimits
+from smp_motor_control.reference.profile import Drive, Profile, ProfileLimits
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.tune.arrays import Array
 from smp_motor_ident.tune.feedback import Feedback
@@ -79,21 +79,7 @@ class Reference:
 
 
 def controller_for(loop: Loop, feedback: Feedback) -> Controller:
-    """Return the running controller of a loop.
-
-    Parameters
-    ----------
-    loop : Loop
-        Its supply is the clamp.
-    feedback : Feedback
-        The gains.
-
-    Returns
-    -------
-    Controller
-        With the anti-windup that suits the gains: [1], section 3.5.  Proportional and derivative
-        action see the whole reference: it is smooth, and what the wheel shall do.
-    """
+    """Return the running controller of a loop."""
     tracking = math.inf
     if feedback.i > 0 and feedback.d > 0:
         tracking = math.sqrt(feedback.d / feedback.i)
@@ -103,20 +89,7 @@ def controller_for(loop: Loop, feedback: Feedback) -> Controller:
 
 
 def measured_lag(plant: Plant, loop: Loop) -> float:
-    """Return how much later than the reference the measurement shows it [s].
-
-    Parameters
-    ----------
-    plant : Plant
-        A batch of one.
-    loop : Loop
-        Delay and hold.
-
-    Returns
-    -------
-    float
-        Delay of loop and motor, and half the averaging window.
-    """
+    """Return how much later than the reference the measurement shows it [s]."""
     dead = loop.expected_delay + float(plant.motors.delay[0])
     window = 0 if loop.speed_source == "observer" else plant.window
     return dead + 0.5 * loop.sample_time * window
@@ -144,23 +117,7 @@ class Change:
 
 
 def planned_change(plant: Plant, plan: Reference, distance: float, time: Array) -> Change:
-    """Return what the running loop makes of a change of set-point from rest.
-
-    Parameters
-    ----------
-    plant : Plant
-        A batch of one; the feed-forward is that of its motor.
-    plan : Reference
-        The plan.
-    distance : float
-        Change of speed [rad/s].
-    time : ndarray, shape (k,), [s]
-        Sampling instants from the change on.
-
-    Returns
-    -------
-    Change
-    """
+    """Return what the running loop makes of a change of set-point from rest."""
     m, T = plant.motors, plant.sample_time
     profile = plan.profile()
     profile.set_target(distance, T)
@@ -207,39 +164,7 @@ def plan_reference(
     transition_time: float | None = None,
     together: bool = False,
 ) -> Reference:
-    """Return the fastest reference that the motor can follow without overshoot.
-
-    Parameters
-    ----------
-    plant : Plant
-        A batch of one, sampled with the loop's usual delay.
-    loop : Loop
-        Its supply is the limit.
-    controller : Controller
-        The design.
-    least : float
-        Duration that a change takes in any case [s], such as the time in which the feedback can
-        answer: a shorter one gains little, and hammers the motor with every small change.
-    max_velocity : float or None
-        [rad/s, motor]; None takes 90 % of what the headroom reaches.
-    max_acceleration : float or None
-        [rad/s^2, motor]; None follows from the others.
-    transition_time : float or None
-        Of every change of set-point [s]; None takes the shortest.
-    together : bool
-        Whether it is one of several motors that shall arrive together: then the feedback, which
-        takes up what loads them differently, is left nothing undone for doubt about the delay,
-        and the transition is as long as that asks for.
-
-    Returns
-    -------
-    Reference
-
-    Raises
-    ------
-    DesignError
-        When the motor cannot reach the speed or the acceleration that is asked for.
-    """
+    """Return the fastest reference that the motor can follow without overshoot."""
     ratio = loop.gear_ratio
     speed = _reachable(plant, loop, max_velocity)
     plan = _fastest(plant, loop, speed, together)

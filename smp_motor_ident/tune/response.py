@@ -227,21 +227,6 @@ def _run(
 def minimum_jerk(distance: float, duration: float, time: Array) -> tuple[Array, Array, Array]:
     """Return the smoothest change of speed over a duration, its rate and its jerk.
 
-    Parameters
-    ----------
-    distance : float
-        Change of speed [rad/s].
-    duration : float
-        [s].
-    time : ndarray, shape (k,), [s]
-        From the start of the change.
-
-    Returns
-    -------
-    speed : ndarray, shape (k,), [rad/s]
-    acceleration : ndarray, shape (k,), [rad/s^2]
-    jerk : ndarray, shape (k,), [rad/s^3]
-
     References
     ----------
     T. Flash, N. Hogan, The coordination of arm movements, J. Neuroscience 5 (1985), 1688-1703.
@@ -322,17 +307,7 @@ class LoadFigures:
 
 
 def load_figures(time: Array, speed: Array) -> LoadFigures:
-    """Read the response to a load of 1 V at time 0 around a speed of 0.
-
-    Parameters
-    ----------
-    time, speed : ndarray, shape (k,)
-        [s], [rad/s].
-
-    Returns
-    -------
-    LoadFigures
-    """
+    """Read the response to a load of 1 V at time 0 around a speed of 0."""
     loss = np.abs(speed)
     outside = np.flatnonzero(loss > 0.1 * loss.max())
     last = int(outside[-1]) + 1

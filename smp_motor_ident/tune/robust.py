@@ -44,18 +44,7 @@ class Judge(Protocol):
     """Whoever can say what gains do over some motors."""
 
     def judge(self, feedback: Feedback) -> Robustness:
-        """Return what the gains do; see :meth:`Jury.judge`.
-
-        Parameters
-        ----------
-        feedback : Feedback
-            The gains.
-
-        Returns
-        -------
-        Robustness
-            Over the motors that the judge knows.
-        """
+        """Return what the gains do; see :meth:`Jury.judge`."""
 
 
 class Jury:
@@ -76,17 +65,7 @@ class Jury:
         self.response = plant.response(self.omega)
 
     def judge(self, feedback: Feedback) -> Robustness:
-        """Return what the gains do over the batch.
-
-        Parameters
-        ----------
-        feedback : Feedback
-            The gains.
-
-        Returns
-        -------
-        Robustness
-        """
+        """Return what the gains do over the batch."""
         loop = self.response * feedback.response(self.omega, self.plant.sample_time)
         m = batch_margins(loop, self.omega)
         stable = spectral_radius(self.plant, feedback) < 1
@@ -110,21 +89,6 @@ def back_off(jury: Judge, feedback: Feedback) -> tuple[Feedback, float, Robustne
 
     Proportional and derivative action shrink with the factor, integral action with its square,
     so that the loop keeps its shape while its crossover moves down.
-
-    Parameters
-    ----------
-    jury : Judge
-        The motors and the promise.
-    feedback : Feedback
-        What the rule gave.
-
-    Returns
-    -------
-    feedback : Feedback
-        With the largest factor that holds.
-    factor : float
-        1 where nothing had to give.
-    robustness : Robustness
     """
     verdict = jury.judge(feedback)
     if verdict.holds >= SHARE:
@@ -152,19 +116,7 @@ def back_off(jury: Judge, feedback: Feedback) -> tuple[Feedback, float, Robustne
 
 
 def softer(feedback: Feedback, factor: float) -> Feedback:
-    """Return gains with a lower crossover and the same shape of the loop.
-
-    Parameters
-    ----------
-    feedback : Feedback
-        The gains.
-    factor : float
-        Of proportional and derivative action; integral action shrinks with its square.
-
-    Returns
-    -------
-    Feedback
-    """
+    """Return gains with a lower crossover and the same shape of the loop."""
     return Feedback(
         feedback.p * factor,
         feedback.i * factor**2,

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import expm
 
-from smp_motor_control.motor_model import MotorModel
+from smp_motor_control.motor.model import MotorModel
 from smp_motor_control.observer import ObserverNoise
 from smp_motor_control.observer_gain import steady_gain
 from smp_motor_ident.tune.arrays import Array, Complex
@@ -69,25 +69,7 @@ class Seen:
 def seen_by_observer(
     model: MotorModel, sample_time: float, quantum: float, noise: ObserverNoise, loop_delay: float
 ) -> Seen:
-    """Return the steady-state observer of a model as a filter.
-
-    Parameters
-    ----------
-    model : MotorModel
-        What the observer believes.
-    sample_time : float
-        [s].
-    quantum : float
-        Angle of a count [rad].
-    noise : ObserverNoise
-        What it expects.
-    loop_delay : float
-        From the controller's output to the voltage [s].
-
-    Returns
-    -------
-    Seen
-    """
+    """Return the steady-state observer of a model as a filter."""
     K, tau, tp = model.dc_gain, model.time_constant, model.time_constant_product
     gain = steady_gain(model, quantum, noise, sample_time)
     if tp:

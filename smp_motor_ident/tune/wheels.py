@@ -9,8 +9,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from smp_motor_control.profile import Drive, Reference
-from smp_motor_control.voltage_limited import VoltageLimited
+from smp_motor_control.reference.profile import Drive, Reference
+from smp_motor_control.reference.time_optimal import VoltageLimited
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune.case import Case, prepare, solve
@@ -138,19 +138,7 @@ def _together(
 
 
 def common_drive(designs: Mapping[str, Design]) -> Drive:
-    """Return the motor whose fastest changes are within what every one of these can do.
-
-    Parameters
-    ----------
-    designs : mapping of str to Design
-        By wheel.
-
-    Returns
-    -------
-    Drive
-        At the wheels: the largest time constants, and as much of the least top speed as leaves
-        each motor within its own voltage at every instant of changes small and large.
-    """
+    """Return the motor whose fastest changes are within what every one of these can do."""
     drives = [
         replace(one.reference.drive, top_speed=one.reference.drive.top_speed / one.loop.gear_ratio)
         for one in designs.values()

@@ -6,8 +6,8 @@ import math
 
 import pytest
 
+from smp_motor_control.body.kinematics import BodyCommand, Verdict
 from smp_motor_control.errors import ParameterError
-from smp_motor_control.skid_steer import BodyCommand, Verdict
 
 
 def test_nothing_is_asked_before_the_first_command_even_if_that_is_nan() -> None:

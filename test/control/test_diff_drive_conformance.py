@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
+from smp_motor_control.body.kinematics import Odometry, RateLimiter, SkidSteer, SpeedLimiter
 from smp_motor_control.errors import ParameterError
-from smp_motor_control.skid_steer import Odometry, RateLimiter, SkidSteer, SpeedLimiter
 
 FILE = Path(__file__).parent.parent / "data" / "conformance" / "diff_drive_cases.json"
 CASES = json.loads(FILE.read_text(encoding="utf-8"))

@@ -8,7 +8,7 @@ import pytest
 
 from smp_motor_control import WHEELS
 from smp_motor_control.errors import ParameterError
-from smp_motor_control.motor_file import load_motors
+from smp_motor_control.motor.file import load_motors
 
 PAPER = Path(__file__).parents[2] / "config" / "motors_paper.yaml"
 GOOD = """/motor_plant:

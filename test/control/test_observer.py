@@ -9,8 +9,8 @@ import pytest
 
 from smp_motor_control.encoder import DifferencedSpeed, Encoder
 from smp_motor_control.errors import ParameterError
-from smp_motor_control.motor import Motor, MotorParameters
-from smp_motor_control.motor_model import MotorModel
+from smp_motor_control.motor.friction import Motor, MotorParameters
+from smp_motor_control.motor.model import MotorModel
 from smp_motor_control.observer import ObserverNoise, SpeedObserver
 
 # Table 1 of the paper, motors 1 (oscillating poles) and 2 (real poles), and one without L.

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from smp_motor_control.errors import ParameterError
-from smp_motor_control.motor import Motor
-from smp_motor_control.motor_file import load_motors
-from smp_motor_control.plant import DrivenMotor, DriveSettings, Supply
+from smp_motor_control.motor.file import load_motors
+from smp_motor_control.motor.friction import Motor
+from smp_motor_control.motor.hardware import DrivenMotor, DriveSettings, Supply
 
 ENTRY = load_motors(Path(__file__).parents[2] / "config" / "motors_paper.yaml")["rear_right"]
 IDEAL = DriveSettings(command_timeout=math.inf)

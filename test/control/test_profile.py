@@ -13,8 +13,8 @@ from scipy.linalg import expm
 from scipy.optimize import linprog
 
 from smp_motor_control.errors import ParameterError
-from smp_motor_control.motor import MotorParameters
-from smp_motor_control.profile import (
+from smp_motor_control.motor.friction import MotorParameters
+from smp_motor_control.reference.profile import (
     PEAK_ACCELERATION,
     PEAK_JERK,
     Drive,
@@ -26,7 +26,7 @@ from smp_motor_control.profile import (
     peak_voltage,
     shortest_common_transition,
 )
-from smp_motor_control.voltage_limited import VoltageLimited
+from smp_motor_control.reference.time_optimal import VoltageLimited
 
 # Table 1 of the paper: J, K, L, R, b.
 PAPER = [

@@ -12,16 +12,16 @@ import pytest
 from smp_motor_control import WHEELS
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.excitation import Fourier
-from smp_motor_control.motor_file import load_motors
-from smp_motor_control.motor_model import MotorModel
+from smp_motor_control.motor.file import load_motors
+from smp_motor_control.motor.model import MotorModel
 from smp_motor_control.pid import PidGains
-from smp_motor_control.simulation import (
+from smp_motor_control.wheel.loop import LoopSettings, WheelLoop
+from smp_motor_control.wheel.simulation import (
     DriveSettings,
     Timing,
     simulate_closed_loop,
     simulate_open_loop,
 )
-from smp_motor_control.wheel_loop import LoopSettings, WheelLoop
 
 MOTORS = load_motors(Path(__file__).parents[2] / "config" / "motors_paper.yaml")
 GAINS = PidGains(p=2.5, i=80.0, d=0.05, derivative_filter_time_constant=0.005)
@@ -60,7 +60,7 @@ def test_open_loop_reaches_the_gain_of_the_motor():
 
 
 def test_recorded_voltage_explains_the_recorded_motion_whatever_the_jitter_and_delay():
-    from smp_motor_control.motor import Motor
+    from smp_motor_control.motor.friction import Motor
 
     entry = MOTORS["rear_left"]
     signal = Fourier(amplitude=10.0)

@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from smp_motor_control.errors import ParameterError
-from smp_motor_control.skid_steer import (
+from smp_motor_control.body.kinematics import (
     LEFT,
     RIGHT,
     HeadingHold,
@@ -18,7 +17,8 @@ from smp_motor_control.skid_steer import (
     SkidSteer,
     SpeedLimiter,
 )
-from smp_motor_control.skid_steer import side_mean as mean_of
+from smp_motor_control.body.kinematics import side_mean as mean_of
+from smp_motor_control.errors import ParameterError
 
 ROBOT = SkidSteer(
     wheel_separation=0.4, wheel_radius=0.1, wheel_separation_multiplier=1.5, max_wheel_speed=3.0

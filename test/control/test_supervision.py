@@ -7,7 +7,7 @@ import math
 import pytest
 
 from smp_motor_control.errors import ParameterError
-from smp_motor_control.supervision import (
+from smp_motor_control.wheel.supervision import (
     Fault,
     FaultDetector,
     FaultLimits,

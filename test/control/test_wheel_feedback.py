@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from smp_motor_control.wheel_feedback import WheelFeedback, WheelSample
+from smp_motor_control.body.wheel_travel import WheelFeedback, WheelSample
 
 TIMEOUT = 0.5
 

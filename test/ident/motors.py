@@ -5,7 +5,7 @@ from __future__ import annotations
 import independent
 import numpy as np
 
-from smp_motor_ident import models
+from smp_motor_ident.model import structures as models
 from smp_motor_ident.record import Hardware, Record
 
 QUANTUM = 2 * np.pi / 500

@@ -7,10 +7,10 @@ import motors
 import numpy as np
 import pytest
 
+from smp_motor_ident.diagnosis.identifiability import structural, what_next
 from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.identifiability import structural, what_next
-from smp_motor_ident.models import PHYSICAL
+from smp_motor_ident.model.structures import PHYSICAL
 
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 # Of some fifty quantities tested one in 2000 passes four standard deviations by chance.

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from scipy.signal import cont2discrete, lfilter
 
-from smp_motor_control.motor_file import load_motors
-from smp_motor_ident.commands.identify import OUTPUTS, main
+from smp_motor_control.motor.file import load_motors
+from smp_motor_ident.cli.identify import OUTPUTS, main
 
 GAIN, LAG, STEP = 25.0, 0.06, 0.01
 MAP = ("--map", "time=t", "voltage=u", "velocity=w")

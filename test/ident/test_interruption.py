@@ -8,7 +8,7 @@ import weakref
 
 import pytest
 
-from smp_motor_ident.commands import interruption
+from smp_motor_ident.cli import interruption
 
 
 class Thing:

@@ -6,12 +6,12 @@ import motors
 import numpy as np
 
 from smp_motor_control.excitation import Fourier
+from smp_motor_ident.diagnosis.identifiability import what_next
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.fitting.thinning import thinned
-from smp_motor_ident.identifiability import what_next
-from smp_motor_ident.kernel import recursion as rc
-from smp_motor_ident.kernel.experiments import prepare
-from smp_motor_ident.models import PHYSICAL
+from smp_motor_ident.estimation.thinning import thinned
+from smp_motor_ident.likelihood import recursion as rc
+from smp_motor_ident.likelihood.experiments import prepare
+from smp_motor_ident.model.structures import PHYSICAL
 
 
 def test_a_friction_that_does_not_show_is_nothing_within_an_interval():

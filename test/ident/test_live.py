@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from smp_motor_ident.live import Demands, Window, missing
+from smp_motor_ident.estimation.live import Demands, Window, missing
 from smp_motor_ident.record import Hardware
 
 RATIO, COUNTS, STEP = 65.5, 500.0, 0.005

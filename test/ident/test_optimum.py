@@ -9,17 +9,17 @@ from scipy.linalg import expm
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
-from smp_motor_ident import models
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.fitting import replay
-from smp_motor_ident.fitting.cold import cold_fit
-from smp_motor_ident.fitting.descent import Options, first_noise
-from smp_motor_ident.fitting.fit import solve
-from smp_motor_ident.kernel.elimination import cholesky_solve, damped_step, eliminate
-from smp_motor_ident.kernel.experiments import prepare
-from smp_motor_ident.kernel.noise import proper, renewed, whitening
-from smp_motor_ident.kernel.passes import gather
-from smp_motor_ident.models import Structure
+from smp_motor_ident.estimation import replay
+from smp_motor_ident.estimation.cold import cold_fit
+from smp_motor_ident.estimation.descent import Options, first_noise
+from smp_motor_ident.estimation.fit import solve
+from smp_motor_ident.likelihood.elimination import cholesky_solve, damped_step, eliminate
+from smp_motor_ident.likelihood.experiments import prepare
+from smp_motor_ident.likelihood.noise import proper, renewed, whitening
+from smp_motor_ident.likelihood.passes import gather
+from smp_motor_ident.model import structures as models
+from smp_motor_ident.model.structures import Structure
 from smp_motor_ident.record import Record
 
 STEP = 2e-3

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.linalg import expm, solve_discrete_are
 
-from smp_motor_ident.kernel.kalman import steady_gain
-from smp_motor_ident.kernel.propagator import WIDTH, first_order, second_order
+from smp_motor_ident.likelihood.kalman import steady_gain
+from smp_motor_ident.likelihood.propagator import WIDTH, first_order, second_order
 
 # ln te, ln tm, K, be: overdamped, critical to rounding, oscillating, very stiff.
 CASES = [

@@ -7,12 +7,12 @@ import motors
 import numpy as np
 import pytest
 
-from smp_motor_ident import models
-from smp_motor_ident.kernel import recursion as rc
-from smp_motor_ident.kernel.experiments import prepare
-from smp_motor_ident.kernel.noise import kalman_gain
-from smp_motor_ident.kernel.passes import gather
-from smp_motor_ident.models import Structure
+from smp_motor_ident.likelihood import recursion as rc
+from smp_motor_ident.likelihood.experiments import prepare
+from smp_motor_ident.likelihood.noise import kalman_gain
+from smp_motor_ident.likelihood.passes import gather
+from smp_motor_ident.model import structures as models
+from smp_motor_ident.model.structures import Structure
 
 NO_GAIN = np.zeros((3, 2))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from smp_motor_ident.kernel.experiments import REST, prepare
+from smp_motor_ident.likelihood.experiments import REST, prepare
 from smp_motor_ident.record import Hardware, Record
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from smp_motor_control.motor_file import load_motors
+from smp_motor_control.motor.file import load_motors
 
 ROOT = Path(__file__).resolve().parents[2]
 ENTRIES = load_motors(ROOT / "config" / "motors_paper.yaml")

@@ -12,7 +12,7 @@ import yaml
 
 from smp_motor_control import WHEELS
 from smp_motor_control.pid import PidGains
-from smp_motor_ident.commands.tune import main
+from smp_motor_ident.cli.tune import main
 from smp_motor_ident.record import Hardware
 from smp_motor_ident.report.document import identification_document
 from smp_motor_ident.result import Estimate, Quantity

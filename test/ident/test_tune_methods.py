@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from smp_motor_ident.commands.relaying import evenly
+from smp_motor_ident.cli.relaying import evenly
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.tune.feedback import Feedback, closed_loop
 from smp_motor_ident.tune.loop import Loop

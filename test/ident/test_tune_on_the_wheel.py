@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from smp_motor_control.motor_file import load_motors
-from smp_motor_control.motor_model import MotorModel
-from smp_motor_control.plant import DriveSettings
-from smp_motor_control.profile import ProfileLimits, Reference
-from smp_motor_control.simulation import Timing, simulate_closed_loop
-from smp_motor_control.voltage_limited import VoltageLimited
-from smp_motor_control.wheel_loop import LoopSettings, WheelLoop
-from smp_motor_ident.commands.tune import read_estimates
+from smp_motor_control.motor.file import load_motors
+from smp_motor_control.motor.hardware import DriveSettings
+from smp_motor_control.motor.model import MotorModel
+from smp_motor_control.reference.profile import ProfileLimits, Reference
+from smp_motor_control.reference.time_optimal import VoltageLimited
+from smp_motor_control.wheel.loop import LoopSettings, WheelLoop
+from smp_motor_control.wheel.simulation import Timing, simulate_closed_loop
+from smp_motor_ident.cli.tune import read_estimates
 from smp_motor_ident.tune import Loop, design, design_wheels
 from smp_motor_ident.tune.motors import motors_of
 from smp_motor_ident.tune.plant import sample

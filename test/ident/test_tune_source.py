@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from smp_motor_control.motor_file import load_motors
-from smp_motor_control.motor_model import MotorModel
-from smp_motor_control.plant import DriveSettings
-from smp_motor_control.simulation import Timing, simulate_closed_loop
-from smp_motor_control.wheel_loop import LoopSettings
-from smp_motor_ident.commands.tune import main, read_estimates
+from smp_motor_control.motor.file import load_motors
+from smp_motor_control.motor.hardware import DriveSettings
+from smp_motor_control.motor.model import MotorModel
+from smp_motor_control.wheel.loop import LoopSettings
+from smp_motor_control.wheel.simulation import Timing, simulate_closed_loop
+from smp_motor_ident.cli.tune import main, read_estimates
 from smp_motor_ident.tune import Loop, design
 from smp_motor_ident.tune.feedback import spectral_radius
 from smp_motor_ident.tune.motors import Motors, motors_of

@@ -17,7 +17,7 @@ from sensor_msgs.msg import JointState
 
 from smp_interfaces.msg import MotorState
 from smp_motor_control import WHEELS
-from smp_motor_control.motor_file import load_motors
+from smp_motor_control.motor.file import load_motors
 from smp_motor_control.nodes.executor import LeanExecutor
 from smp_motor_ident.tune.methods.ziegler_nichols import RULES
 
@@ -133,7 +133,7 @@ def robot(process, eventually, tmp_path):
 
 
 def run_tune(process, *arguments):
-    tune = process(sys.executable, "-m", "smp_motor_ident.commands.tune", *arguments)
+    tune = process(sys.executable, "-m", "smp_motor_ident.cli.tune", *arguments)
     return tune.wait(150.0), tune.output
 
 

@@ -121,21 +121,7 @@ def _peak(problem: Problem, feedback: Feedback) -> float:
 
 
 def at_sensitivity(problem: Problem, shape: Feedback, peak: float) -> Feedback:
-    """Scale gains by the largest factor that keeps Ms.
-
-    Parameters
-    ----------
-    problem : Problem
-        The sampled plant.
-    shape : Feedback
-        What a rule gave.
-    peak : float
-        Largest Ms.
-
-    Returns
-    -------
-    Feedback
-    """
+    """Scale gains by the largest factor that keeps Ms."""
     factors = np.geomspace(0.01, 4.0, 800)
     base = problem.response * shape.response(problem.omega, problem.loop.sample_time)
     over = np.abs(1 + factors[:, None] * base).min(axis=1) < 1 / peak

@@ -27,19 +27,6 @@ def place(problem: Problem, natural_frequency: float, damping: float) -> Feedbac
 
     The characteristic equation ``1 + P(z) (p + i T / (z - 1)) = 0`` at that point is linear in
     the gains: two real equations for two numbers.
-
-    Parameters
-    ----------
-    problem : Problem
-        The sampled plant.
-    natural_frequency : float
-        [rad/s].
-    damping : float
-        Between 0 and 1 [-].
-
-    Returns
-    -------
-    Feedback
     """
     T = problem.loop.sample_time
     pole = natural_frequency * (-damping + 1j * math.sqrt(1 - damping**2))

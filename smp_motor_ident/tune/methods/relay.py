@@ -34,26 +34,7 @@ BAND = 0.1
 def oscillate(
     problem: Problem, amplitude: float, hysteresis: float, seconds: float
 ) -> tuple[Array, Array]:
-    """Run the sampled loop with a relay in place of the controller.
-
-    Parameters
-    ----------
-    problem : Problem
-        Plant, encoder and delay.
-    amplitude : float
-        Of the relay [V].
-    hysteresis : float
-        The speed must pass this on either side before the relay switches [rad/s].
-    seconds : float
-        How long.
-
-    Returns
-    -------
-    voltage : ndarray, shape (k,), [V]
-        The relay's output.
-    speed : ndarray, shape (k,), [rad/s]
-        As measured, with the encoder's quantisation.
-    """
+    """Run the sampled loop with a relay in place of the controller."""
     plant, count = problem.plant, problem.loop.count_angle
     T, window = plant.sample_time, plant.window
     steps = int(seconds / T)

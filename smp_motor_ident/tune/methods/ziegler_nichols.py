@@ -28,23 +28,7 @@ RULES = {
 
 
 def from_ultimate(problem: Problem, rule: str, gain: float, period: float) -> Feedback:
-    """Apply a rule to an ultimate point, whoever found it.
-
-    Parameters
-    ----------
-    problem : Problem
-        Its target ``structure`` is ``pi`` (default) or ``pid``.
-    rule : str
-        ``ziegler_nichols`` or ``tyreus_luyben``.
-    gain : float
-        Ultimate gain [V s/rad].
-    period : float
-        Ultimate period [s].
-
-    Returns
-    -------
-    Feedback
-    """
+    """Apply a rule to an ultimate point, whoever found it."""
     ruled = by_rule(rule, problem.structure or "pi", gain, period)
     if not ruled.d:
         return ruled

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from smp_motor_ident.bag.transport import measure_delay
-from smp_motor_ident.commands.tune import main as tune
+from smp_motor_ident.cli.tune import main as tune
 from smp_motor_ident.errors import BagError
 
 MOTORS = Path(__file__).resolve().parents[3] / "config" / "motors_paper.yaml"

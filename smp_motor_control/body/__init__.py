@@ -1,0 +1,1 @@
+"""The body on its wheels: kinematics, limits and odometry."""

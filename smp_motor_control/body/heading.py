@@ -1,0 +1,109 @@
+"""Holding the heading of the body against uneven ground, with a yaw from outside."""
+
+from __future__ import annotations
+
+import math
+
+from smp_motor_control.errors import ParameterError
+
+
+def wrapped(angle: float) -> float:
+    """Return an angle in [-pi, pi]."""
+    return math.remainder(angle, 2.0 * math.pi)
+
+
+class HeadingHold:
+    """PI controller of the yaw whose reference is the integral of the commanded yaw rate.
+
+    ``w_out = w_cmd + clamp(p e + i integral(e))`` with ``e = wrap(integral(w_cmd) - yaw)``.
+
+    Parameters
+    ----------
+    p : float
+        [1/s].
+    i : float
+        [1/s^2].
+    max_correction : float
+        Largest yaw rate that is added [rad/s].
+    max_error : float
+        Beyond this the body was turned by something stronger: the present yaw is the new
+        reference [rad].
+
+    Raises
+    ------
+    ParameterError
+        When a gain is negative or a limit not positive.
+
+    Examples
+    --------
+    >>> hold = HeadingHold(p=2.0, i=0.0)
+    >>> hold.step(0.0, yaw=0.3, dt=0.02), round(hold.step(0.0, yaw=0.2, dt=0.02), 6)
+    (0.0, 0.2)
+    """
+
+    def __init__(
+        self, p: float = 2.0, i: float = 0.5, max_correction: float = 0.5, max_error: float = 0.7
+    ) -> None:
+        self.configure(p, i, max_correction, max_error)
+        self.reset()
+
+    def configure(self, p: float, i: float, max_correction: float, max_error: float) -> None:
+        """Change the settings; the reference stays.
+
+        Parameters
+        ----------
+        p, i, max_correction, max_error : float
+            As for the class.
+
+        Raises
+        ------
+        ParameterError
+            When a gain is negative or a limit not positive.
+        """
+        for name, value in {"p": p, "i": i}.items():
+            if not 0.0 <= value < math.inf:
+                raise ParameterError(f"heading {name} is {value}: must not be negative")
+        for name, value in {"max_correction": max_correction, "max_error": max_error}.items():
+            if not 0.0 < value < math.inf:
+                raise ParameterError(f"heading {name} is {value}: must be positive")
+        self._p, self._i = p, i
+        self._max_correction, self._max_error = max_correction, max_error
+
+    def reset(self) -> None:
+        """Take the next yaw as the reference; for a body at rest, or without a yaw."""
+        self._reference: float | None = None
+        self._integral = 0.0
+
+    def step(self, angular: float, yaw: float, dt: float) -> float:
+        """Return the yaw rate to command so that the heading follows the one asked for.
+
+        Parameters
+        ----------
+        angular : float
+            Yaw rate asked for [rad/s].
+        yaw : float
+            Measured [rad], wrapped or not.
+        dt : float
+            [s].
+
+        Returns
+        -------
+        float
+            [rad/s]; what was asked for where the yaw is not finite.
+        """
+        if not math.isfinite(yaw):
+            self.reset()
+            return angular
+        if self._reference is None:
+            self._reference = yaw
+            return angular
+        self._reference = wrapped(self._reference + angular * dt)
+        error = wrapped(self._reference - yaw)
+        if abs(error) > self._max_error:
+            self._reference, self._integral = yaw, 0.0
+            return angular
+        correction = self._p * error + self._integral
+        limit = self._max_correction
+        if abs(correction) < limit or correction * error < 0.0:
+            self._integral += self._i * error * dt
+        return angular + min(max(correction, -limit), limit)

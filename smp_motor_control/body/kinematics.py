@@ -1,0 +1,159 @@
+"""Kinematics of a body on four wheels that steers by skidding.
+
+``left = (v - w B/2) / (r m_left)``, ``right = (v + w B/2) / (r m_right)`` with the effective
+separation ``B = wheel_separation * wheel_separation_multiplier``; angles counter-clockwise.
+Odometry, speed limits, commands and heading are in modules of their own and offered here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import NamedTuple
+
+from smp_motor_control import WHEELS
+from smp_motor_control.body.command import BodyCommand, Verdict
+from smp_motor_control.body.heading import HeadingHold
+from smp_motor_control.body.odometry import Odometry, PoseCovariance
+from smp_motor_control.body.speed_limiter import RateLimiter, SpeedLimiter
+from smp_motor_control.errors import ParameterError
+
+__all__ = [
+    "LEFT",
+    "RIGHT",
+    "BodyCommand",
+    "HeadingHold",
+    "Odometry",
+    "PoseCovariance",
+    "RateLimiter",
+    "SideSpeeds",
+    "SkidSteer",
+    "SpeedLimiter",
+    "Verdict",
+]
+
+LEFT = tuple(wheel for wheel in WHEELS if wheel.endswith("left"))
+RIGHT = tuple(wheel for wheel in WHEELS if wheel.endswith("right"))
+
+
+class SideSpeeds(NamedTuple):
+    """Speeds of the wheels of both sides [rad/s].
+
+    Attributes
+    ----------
+    left, right : float
+        Positive forward.
+    """
+
+    left: float
+    right: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class SkidSteer:
+    """Geometry of the body, and what its wheels can do.
+
+    Attributes
+    ----------
+    wheel_separation : float
+        Between the middles of left and right wheels [m].
+    wheel_radius : float
+        [m].
+    wheel_separation_multiplier : float
+        Above 1 for a body that skids: it turns less than its wheels would roll it.
+    left_wheel_radius_multiplier, right_wheel_radius_multiplier : float
+        Correction of the radius of a side.
+    max_wheel_speed : float
+        What every wheel reaches [rad/s].
+
+    Raises
+    ------
+    ParameterError
+        When a value is not positive.
+
+    Examples
+    --------
+    >>> SkidSteer(wheel_separation=0.4, wheel_radius=0.1).wheel_speeds(0.0, 1.0)
+    SideSpeeds(left=-2.0, right=2.0)
+    """
+
+    wheel_separation: float
+    wheel_radius: float
+    wheel_separation_multiplier: float = 1.0
+    left_wheel_radius_multiplier: float = 1.0
+    right_wheel_radius_multiplier: float = 1.0
+    max_wheel_speed: float = math.inf
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not value > 0.0 or (math.isinf(value) and field.name != "max_wheel_speed"):
+                raise ParameterError(f"{field.name} is {value}: must be positive and finite")
+
+    @property
+    def effective_separation(self) -> float:
+        """Separation [m] that wheels without skid would need to turn as the body does."""
+        return self.wheel_separation * self.wheel_separation_multiplier
+
+    @property
+    def left_radius(self) -> float:
+        """Effective radius of the left wheels [m]."""
+        return self.wheel_radius * self.left_wheel_radius_multiplier
+
+    @property
+    def right_radius(self) -> float:
+        """Effective radius of the right wheels [m]."""
+        return self.wheel_radius * self.right_wheel_radius_multiplier
+
+    def wheel_speeds(self, linear: float, angular: float) -> SideSpeeds:
+        """Return the wheel speeds that roll the body as asked."""
+        half = angular * self.effective_separation / 2.0
+        return SideSpeeds((linear - half) / self.left_radius, (linear + half) / self.right_radius)
+
+    def body_velocity(self, left: float, right: float) -> tuple[float, float]:
+        """Return how the body moves when its wheels turn."""
+        left, right = left * self.left_radius, right * self.right_radius
+        return (left + right) / 2.0, (right - left) / self.effective_separation
+
+    def reachable_share(self, linear: float, angular: float) -> float:
+        """Return by what a command must be scaled for every wheel to follow.
+
+        Linear and angular velocity shrink alike, so the path keeps its shape.
+
+        Parameters
+        ----------
+        linear, angular : float
+            Velocity of the body [m/s], [rad/s].
+
+        Returns
+        -------
+        float
+            At most 1.
+        """
+        fastest = max(map(abs, self.wheel_speeds(linear, angular)))
+        if math.isinf(fastest):  # beyond what a number can hold
+            return 0.0
+        return 1.0 if fastest <= self.max_wheel_speed else self.max_wheel_speed / fastest
+
+    def reachable_wheel_speeds(self, linear: float, angular: float) -> SideSpeeds:
+        """Return the wheel speeds for a command, scaled until every wheel can follow.
+
+        Parameters
+        ----------
+        linear, angular : float
+            Velocity of the body [m/s], [rad/s].
+
+        Returns
+        -------
+        SideSpeeds
+            None faster than ``max_wheel_speed``.
+        """
+        share = self.reachable_share(linear, angular)
+        return self.wheel_speeds(linear * share, angular * share)
+
+
+def side_mean(values: Mapping[str, float], side: Sequence[str]) -> float:
+    """Return the mean over the wheels of a side that are known."""
+    known = [values[wheel] for wheel in side if math.isfinite(values.get(wheel, math.nan))]
+    return sum(known) / len(known) if known else math.nan

@@ -1,0 +1,265 @@
+"""Where a body with two sides of wheels is, from how they turned, and how sure that is."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import NamedTuple
+
+from smp_motor_control.errors import ParameterError
+
+LEAST_STEP = 1e-6
+"""Time steps [s] below this one are not integrated."""
+
+
+class PoseCovariance(NamedTuple):
+    """Upper triangle of the covariance of (x, y, heading) in [m^2], [m rad], [rad^2]."""
+
+    xx: float
+    xy: float
+    xh: float
+    yy: float
+    yh: float
+    hh: float
+
+
+class Odometry:
+    """Pose and velocity of the body from the turning of its wheels.
+
+    Over one step the body moves on an arc, ``h1 = h0 + w dt``,
+    ``x += v/w (sin h1 - sin h0)``, ``y -= v/w (cos h1 - cos h0)``.
+
+    Parameters
+    ----------
+    wheel_separation : float
+        Between the sides, with its multiplier for skid [m].
+    left_radius, right_radius : float
+        Of the wheels, with their multipliers [m].
+    window : int
+        Number of steps that the reported velocity is averaged over.
+    travel_noise : float
+        Variance of a side's travel that one metre adds [m^2/m].
+    turn_noise : float
+        Variance of the heading that a turn by one radian adds [rad^2/rad]: the skid.
+    max_wheel_speed : float
+        Positions that would need a faster wheel are a counter that was reset, not motion
+        [rad/s].
+
+    Attributes
+    ----------
+    x, y, heading : float
+        Pose [m], [m], [rad]; the heading is not wrapped.
+    linear, angular : float
+        Velocity [m/s], [rad/s].
+    covariance : PoseCovariance
+        Of the pose, since the last :meth:`set_odometry`.
+
+    Raises
+    ------
+    ParameterError
+        When a length is not positive, a noise negative, or the window below 1.
+
+    References
+    ----------
+    R. Siegwart, I. Nourbakhsh and D. Scaramuzza, *Introduction to Autonomous Mobile Robots*,
+    2nd ed., MIT Press 2011, section 5.2.4, for the growth of the covariance.
+
+    Examples
+    --------
+    >>> odometry = Odometry(wheel_separation=0.5, left_radius=0.1, right_radius=0.1)
+    >>> odometry.update_from_velocity(10.0, 10.0, 0.5)
+    True
+    >>> odometry.x
+    0.5
+    """
+
+    def __init__(
+        self,
+        wheel_separation: float,
+        left_radius: float,
+        right_radius: float,
+        window: int = 10,
+        travel_noise: float = 1e-4,
+        turn_noise: float = 1e-2,
+        max_wheel_speed: float = math.inf,
+    ) -> None:
+        self.configure(wheel_separation, left_radius, right_radius, travel_noise, turn_noise)
+        if window < 1:
+            raise ParameterError(f"window is {window} steps: must be at least 1")
+        if not max_wheel_speed > 0.0:
+            raise ParameterError(f"max_wheel_speed is {max_wheel_speed} rad/s: must be positive")
+        self.max_wheel_speed = max_wheel_speed
+        self._velocities: deque[tuple[float, float]] = deque(maxlen=window)
+        self.reset()
+
+    def configure(
+        self,
+        wheel_separation: float,
+        left_radius: float,
+        right_radius: float,
+        travel_noise: float,
+        turn_noise: float,
+    ) -> None:
+        """Change the geometry or the noise from the next step on; the pose stays.
+
+        Parameters
+        ----------
+        wheel_separation, left_radius, right_radius : float
+            [m].
+        travel_noise, turn_noise : float
+            [m^2/m], [rad^2/rad].
+
+        Raises
+        ------
+        ParameterError
+            When a length is not positive or a noise negative.
+        """
+        lengths = {
+            "wheel_separation": wheel_separation,
+            "left_radius": left_radius,
+            "right_radius": right_radius,
+        }
+        for name, value in lengths.items():
+            if not 0.0 < value < math.inf:
+                raise ParameterError(f"{name} is {value} m: must be positive")
+        for name, value in {"travel_noise": travel_noise, "turn_noise": turn_noise}.items():
+            if not 0.0 <= value < math.inf:
+                raise ParameterError(f"{name} is {value}: must not be negative")
+        self._separation, self._left, self._right = wheel_separation, left_radius, right_radius
+        self._travel_noise, self._turn_noise = travel_noise, turn_noise
+
+    def reset(self) -> None:
+        """Start at the origin, at rest, with no wheel position known."""
+        self.set_odometry(0.0, 0.0, 0.0)
+        self.forget_positions()
+        self.linear = self.angular = 0.0
+        self._velocities.clear()
+
+    def set_odometry(self, x: float, y: float, heading: float) -> None:
+        """Declare where the body is, without doubt."""
+        self.x, self.y, self.heading = x, y, heading
+        self.covariance = PoseCovariance(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+    def forget_positions(self) -> None:
+        """Take the next wheel positions as where the wheels have been all along."""
+        self._positions: tuple[float, float] | None = None
+
+    def update_from_velocity(self, left: float, right: float, dt: float) -> bool:
+        """Integrate the wheel speeds of both sides.
+
+        Parameters
+        ----------
+        left, right : float
+            Mean of the side's wheels [rad/s].
+        dt : float
+            [s].
+
+        Returns
+        -------
+        bool
+            False where the step is too short, or a speed not finite: nothing has changed.
+        """
+        if not (LEAST_STEP <= dt < math.inf and math.isfinite(left) and math.isfinite(right)):
+            return False
+        left, right = left * self._left, right * self._right
+        if not math.isfinite((abs(left) + abs(right)) * dt):
+            return False
+        self._velocities.append(((left + right) / 2.0, (right - left) / self._separation))
+        self._integrate(left * dt, right * dt)
+        count = len(self._velocities)
+        self.linear = sum(v for v, _ in self._velocities) / count
+        self.angular = sum(w for _, w in self._velocities) / count
+        return True
+
+    def update_from_position(self, left: float, right: float, dt: float) -> bool:
+        """Integrate the difference of wheel positions to those of the step before."""
+        if not (LEAST_STEP <= dt < math.inf and math.isfinite(left) and math.isfinite(right)):
+            return False
+        before, self._positions = self._positions, (left, right)
+        if before is None:
+            return False
+        turned_left, turned_right = left - before[0], right - before[1]
+        if max(abs(turned_left), abs(turned_right)) > self.max_wheel_speed * dt:
+            return False
+        return self.update_from_velocity(turned_left / dt, turned_right / dt, dt)
+
+    def update_open_loop(self, linear: float, angular: float, dt: float) -> bool:
+        """Integrate what was commanded, where no wheel tells how it turned.
+
+        Parameters
+        ----------
+        linear, angular : float
+            [m/s], [rad/s].
+        dt : float
+            [s].
+
+        Returns
+        -------
+        bool
+            False where the step is too short, or a speed not finite: nothing has changed.
+        """
+        if not (LEAST_STEP <= dt < math.inf and math.isfinite(linear) and math.isfinite(angular)):
+            return False
+        self.linear, self.angular = linear, angular
+        half = angular * self._separation / 2.0
+        self._integrate((linear - half) * dt, (linear + half) * dt)
+        return True
+
+    def twist_variances(self, span: float) -> tuple[float, float]:
+        """Return how sure the reported velocity is.
+
+        Parameters
+        ----------
+        span : float
+            Time that the velocity is averaged over [s].
+
+        Returns
+        -------
+        tuple of float
+            Variance of the linear [m^2/s^2] and of the angular velocity [rad^2/s^2].
+        """
+        half = self.angular * self._separation / 2.0
+        rolled = self._travel_noise * (abs(self.linear - half) + abs(self.linear + half)) / span
+        skidded = self._turn_noise * abs(self.angular) / span
+        return rolled / 4.0, rolled / self._separation**2 + skidded
+
+    def _integrate(self, left: float, right: float) -> None:
+        """Move along an arc of the given lengths of both sides [m]."""
+        travel, turn = (left + right) / 2.0, (right - left) / self._separation
+        self._spread(left, right, travel, turn)
+        heading = self.heading + turn
+        if abs(turn) < 1e-6:
+            middle = self.heading + turn / 2.0
+            self.x += travel * math.cos(middle)
+            self.y += travel * math.sin(middle)
+        else:
+            radius = travel / turn
+            self.x += radius * (math.sin(heading) - math.sin(self.heading))
+            self.y -= radius * (math.cos(heading) - math.cos(self.heading))
+        self.heading = heading
+
+    def _spread(self, left: float, right: float, travel: float, turn: float) -> None:
+        """Advance the covariance: ``P = F P F' + G Q G'`` with inputs (travel, turn)."""
+        p, k, b = self.covariance, self._travel_noise, self._separation
+        q_tt = k * (abs(left) + abs(right)) / 4.0
+        q_th = k * (abs(right) - abs(left)) / (2.0 * b)
+        q_hh = k * (abs(left) + abs(right)) / (b * b) + self._turn_noise * abs(turn)
+        middle = self.heading + turn / 2.0
+        cos, sin = math.cos(middle), math.sin(middle)
+        # Columns of F (heading) and of G (turn, half of it), both perpendicular to the travel.
+        fx, fy = -travel * sin, travel * cos
+        gx, gy = fx / 2.0, fy / 2.0
+        xh, yh = p.xh + fx * p.hh, p.yh + fy * p.hh
+        self.covariance = PoseCovariance(
+            p.xx + fx * (p.xh + xh) + cos * cos * q_tt + 2.0 * cos * gx * q_th + gx * gx * q_hh,
+            p.xy
+            + fy * p.xh
+            + fx * yh
+            + cos * sin * q_tt
+            + (cos * gy + sin * gx) * q_th
+            + gx * gy * q_hh,
+            xh + cos * q_th + gx * q_hh,
+            p.yy + fy * (p.yh + yh) + sin * sin * q_tt + 2.0 * sin * gy * q_th + gy * gy * q_hh,
+            yh + sin * q_th + gy * q_hh,
+            p.hh + q_hh,
+        )

@@ -1,0 +1,261 @@
+"""Motors as a ROS parameter file: what the plant simulates and the tools start from.
+
+::
+
+    /motor_plant:
+      ros__parameters:
+        motors:
+          front_left:
+            resistance: 12.919        # or the combinations dc_gain, time_constant,
+            inductance: 0.30994       # time_constant_product and static_voltage
+            ...
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from smp_motor_control.encoder import Encoder
+from smp_motor_control.errors import ParameterError
+from smp_motor_control.motor.friction import Gearbox, MotorParameters
+
+PHYSICAL = (
+    "resistance",
+    "inductance",
+    "motor_constant",
+    "inertia",
+    "viscous_friction",
+    "coulomb_friction",
+)
+COMBINATIONS = ("dc_gain", "time_constant", "time_constant_product", "static_voltage")
+HARDWARE = {
+    "gear_ratio": 1.0,
+    "counts_per_revolution": 500.0,
+    "encoder_bits": 0,
+    "supply_voltage": 12.0,
+    "delay": 0.0,
+}
+"""What may stand beside the motor's parameters, and what holds where it does not."""
+
+_OPTIONAL = ("coulomb_friction", "time_constant_product", "static_voltage")
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*\Z")
+
+
+@dataclass(frozen=True)
+class MotorEntry:
+    """One motor of a file, with what is around it.
+
+    Attributes
+    ----------
+    parameters : MotorParameters
+        At the motor shaft.
+    gearbox : Gearbox
+        Between motor and wheel.
+    encoder : Encoder
+        On the motor shaft.
+    supply_voltage : float
+        [V].
+    delay : float
+        From a commanded voltage to its effect [s].
+    resistance : float
+        As the file gives it [ohm]; NaN where it gives combinations alone, and then neither
+        currents nor torques of ``parameters`` mean anything.
+    """
+
+    parameters: MotorParameters
+    gearbox: Gearbox
+    encoder: Encoder
+    supply_voltage: float
+    delay: float = 0.0
+    resistance: float = math.nan
+
+    @property
+    def knows_current(self) -> bool:
+        """Whether the current follows from the parameters."""
+        return not math.isnan(self.resistance)
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML with the numbers of ROS: ``1e-6`` is one, not text."""
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]+\Z"),
+    list("-+0123456789."),
+)
+
+
+def load_motors(path: str | Path, wheels: Iterable[str] | None = None) -> dict[str, MotorEntry]:
+    """Read the motors of a ROS parameter file.
+
+    Parameters
+    ----------
+    path : str or Path
+        YAML, as in ``config/motors_paper.yaml`` or written by ``identify``.
+    wheels : iterable of str, optional
+        Motors that must be there.
+
+    Returns
+    -------
+    dict of str to MotorEntry
+        By wheel, in the order of the file.
+
+    Raises
+    ------
+    ParameterError
+        When the file cannot be read, lacks a motor or a key, or has an unknown or
+        impossible one; the message names the file, the motor and the value.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+        document = yaml.load(text, Loader=_Loader)
+    except OSError as error:
+        raise ParameterError(f"{path}: cannot be read: {error.strerror}") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        line = " ".join(str(error).split())
+        raise ParameterError(f"{path}: is not YAML: {line}") from None
+    motors = _find_motors(document, str(path))
+    return parse_motors(motors, str(path), wheels)
+
+
+def _find_motors(document: Any, source: str) -> Mapping[str, Any]:
+    """Return the ``motors`` of the first node in a parameter file that has them."""
+    pending = [document]
+    while pending:
+        level = pending.pop(0)
+        if not isinstance(level, Mapping):
+            continue
+        parameters = level.get("ros__parameters")
+        if isinstance(parameters, Mapping):
+            motors = parameters.get("motors")
+            dotted = {str(k)[7:]: v for k, v in parameters.items() if str(k).startswith("motors.")}
+            if dotted:
+                return nest(dotted)
+            if isinstance(motors, Mapping):
+                return motors
+        pending.extend(level.values())
+    raise ParameterError(
+        f"{source}: has no motors; expected /motor_plant: ros__parameters: motors: front_left: ..."
+    )
+
+
+def nest(dotted: Mapping[str, Any]) -> dict[str, Any]:
+    """Return nested mappings of keys with dots, as ROS names parameters.
+
+    Parameters
+    ----------
+    dotted : mapping
+        Such as ``{"front_left.inertia": 1e-6}``.
+
+    Returns
+    -------
+    dict
+        Such as ``{"front_left": {"inertia": 1e-6}}``.
+    """
+    top: dict[str, Any] = {}
+    for key, value in dotted.items():
+        *way, last = key.split(".")
+        level = top
+        for part in way:
+            inner = level.setdefault(part, {})
+            level = inner if isinstance(inner, dict) else {}
+        level[last] = value
+    return top
+
+
+def parse_motors(
+    motors: Mapping[str, Any], source: str, wheels: Iterable[str] | None = None
+) -> dict[str, MotorEntry]:
+    """Return the motors of an already nested mapping.
+
+    Parameters
+    ----------
+    motors : mapping of str to mapping
+        By wheel.
+    source : str
+        Named in messages.
+    wheels : iterable of str, optional
+        Motors that must be there.
+
+    Returns
+    -------
+    dict of str to MotorEntry
+        By wheel.
+
+    Raises
+    ------
+    ParameterError
+        As :func:`load_motors`.
+    """
+    entries = {str(name): _entry(motors[name], f"{source}: {name}") for name in motors}
+    for name in entries:
+        if not _NAME.match(name):
+            raise ParameterError(f"{source}: motor {name!r} cannot be a ROS name")
+    missing = [wheel for wheel in wheels or () if wheel not in entries]
+    if missing or not entries:
+        have = ", ".join(entries) or "none"
+        raise ParameterError(
+            f"{source}: motor {missing[0] if missing else ''} is missing; has {have}"
+        )
+    return entries
+
+
+def _entry(values: Any, where: str) -> MotorEntry:
+    if not isinstance(values, Mapping):
+        raise ParameterError(f"{where}: is {values!r}; expected the motor's parameters")
+    combined = any(name in values for name in COMBINATIONS)
+    names = (*COMBINATIONS, "resistance") if combined else PHYSICAL
+    known = (*names, *HARDWARE)
+    for key in values:
+        if key not in known:
+            raise ParameterError(f"{where}: unknown key {key!r}; known are {', '.join(known)}")
+    required = [n for n in names if n not in _OPTIONAL and not (combined and n == "resistance")]
+    for name in required:
+        if name not in values:
+            raise ParameterError(f"{where}: {name} is missing")
+    numbers = {key: _number(value, f"{where}: {key}") for key, value in values.items()}
+    hardware = {key: numbers.pop(key, default) for key, default in HARDWARE.items()}
+    try:
+        if combined:
+            parameters = MotorParameters.from_combinations(**numbers)
+        else:
+            parameters = MotorParameters(**numbers)
+        return _with_hardware(parameters, numbers.get("resistance", math.nan), hardware)
+    except ParameterError as error:
+        raise ParameterError(f"{where}: {error}") from None
+
+
+def _with_hardware(
+    parameters: MotorParameters, resistance: float, hardware: Mapping[str, float]
+) -> MotorEntry:
+    if not hardware["supply_voltage"] > 0:
+        raise ParameterError(
+            f"supply_voltage is {hardware['supply_voltage']!r} V; it must be positive"
+        )
+    if not hardware["delay"] >= 0:
+        raise ParameterError(f"delay is {hardware['delay']!r} s; it must be zero or positive")
+    bits = hardware["encoder_bits"]
+    return MotorEntry(
+        parameters=parameters,
+        gearbox=Gearbox(hardware["gear_ratio"]),
+        encoder=Encoder(hardware["counts_per_revolution"], int(bits) if bits == int(bits) else -1),
+        supply_voltage=hardware["supply_voltage"],
+        delay=hardware["delay"],
+        resistance=resistance,
+    )
+
+
+def _number(value: Any, where: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise ParameterError(f"{where} is {value!r}; it must be a number")
+    if not math.isfinite(value):
+        raise ParameterError(f"{where} is {value!r}; it must be finite")
+    return float(value)

@@ -1,0 +1,203 @@
+"""What a DC motor and its gearbox are: validated numbers, and the one conversion between shafts."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smp_motor_control.errors import ParameterError
+
+_UNITS = {
+    "resistance": "ohm",
+    "inductance": "H",
+    "motor_constant": "N m/A",
+    "inertia": "kg m^2",
+    "viscous_friction": "N m s/rad",
+    "coulomb_friction": "N m",
+}
+_MAY_BE_ZERO = ("inductance", "viscous_friction", "coulomb_friction")
+Motion = TypeVar("Motion", float, NDArray[np.float64])
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotorParameters:
+    """Physical parameters of a brushed DC motor at its own shaft.
+
+    Attributes
+    ----------
+    resistance : float
+        Armature resistance R [ohm], positive.
+    inductance : float
+        Armature inductance L [H]; 0 leaves the first-order motor.
+    motor_constant : float
+        Torque constant = back-EMF constant K [N m/A = V s/rad], positive.
+    inertia : float
+        Inertia J of everything that turns [kg m^2], positive.
+    viscous_friction : float
+        b [N m s/rad].
+    coulomb_friction : float
+        Tc [N m]; also the largest torque at which the rotor sticks.
+
+    Raises
+    ------
+    ParameterError
+        When a value is not a finite number or has a sign that no motor can have.
+    """
+
+    resistance: float
+    inductance: float
+    motor_constant: float
+    inertia: float
+    viscous_friction: float
+    coulomb_friction: float = 0.0
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if isinstance(value, bool) or not isinstance(value, (int, float)):
+                raise ParameterError(f"{item.name} is {value!r}; it must be a number")
+            zero_allowed = item.name in _MAY_BE_ZERO
+            if not math.isfinite(value) or value < 0 or (value == 0 and not zero_allowed):
+                wanted = "zero or positive" if zero_allowed else "positive"
+                unit = _UNITS[item.name]
+                raise ParameterError(f"{item.name} is {value!r} {unit}; it must be {wanted}")
+            object.__setattr__(self, item.name, float(value))
+
+    @classmethod
+    def from_combinations(
+        cls,
+        *,
+        dc_gain: float,
+        time_constant: float,
+        time_constant_product: float = 0.0,
+        static_voltage: float = 0.0,
+        resistance: float = 1.0,
+    ) -> MotorParameters:
+        """Return a motor that answers a voltage like the one with these combinations.
+
+        Voltage and speed do not tell the physical parameters apart; of all motors with the
+        same response this takes the one without viscous friction: ``K = a0``,
+        ``J = a1 K / R``, ``L = a2 R / a1``.  The response is the same while the motor
+        slides; where friction switches, it is if the original has no viscous friction.
+        """
+        named = {"dc_gain": dc_gain, "time_constant": time_constant, "resistance": resistance}
+        for name, value in named.items():
+            if not (math.isfinite(value) and value > 0):
+                raise ParameterError(f"{name} is {value!r}; it must be positive")
+        named = {"time_constant_product": time_constant_product, "static_voltage": static_voltage}
+        for name, value in named.items():
+            if not (math.isfinite(value) and value >= 0):
+                raise ParameterError(f"{name} is {value!r}; it must be zero or positive")
+        motor_constant = 1.0 / dc_gain
+        return cls(
+            resistance=resistance,
+            inductance=time_constant_product * resistance / time_constant,
+            motor_constant=motor_constant,
+            inertia=time_constant * motor_constant**2 / resistance,
+            viscous_friction=0.0,
+            coulomb_friction=static_voltage * motor_constant / resistance,
+        )
+
+    @property
+    def a0(self) -> float:
+        """Voltage per speed in steady state, ``(R b + K^2) / K`` [V s/rad]."""
+        return (
+            self.resistance * self.viscous_friction + self.motor_constant**2
+        ) / self.motor_constant
+
+    @property
+    def a1(self) -> float:
+        """``(R J + L b) / K`` [V s^2/rad]."""
+        return (
+            self.resistance * self.inertia + self.inductance * self.viscous_friction
+        ) / self.motor_constant
+
+    @property
+    def a2(self) -> float:
+        """``L J / K`` [V s^3/rad]."""
+        return self.inductance * self.inertia / self.motor_constant
+
+    @property
+    def dc_gain(self) -> float:
+        """Speed per volt in steady state, without Coulomb friction [rad/s/V]."""
+        return 1.0 / self.a0
+
+    @property
+    def time_constant(self) -> float:
+        """``a1 / a0`` [s], the sum of the two time constants."""
+        return self.a1 / self.a0
+
+    @property
+    def time_constant_product(self) -> float:
+        """``a2 / a0`` [s^2], the product of the two time constants."""
+        return self.a2 / self.a0
+
+    @property
+    def static_voltage(self) -> float:
+        """Voltage at which the unloaded motor breaks loose, ``R Tc / K`` [V]."""
+        return self.resistance * self.coulomb_friction / self.motor_constant
+
+
+@dataclass(frozen=True)
+class Gearbox:
+    """The one place that converts between motor shaft and wheel.
+
+    Attributes
+    ----------
+    ratio : float
+        Motor revolutions per wheel revolution; positive.
+
+    Raises
+    ------
+    ParameterError
+        When the ratio is not a positive finite number.
+
+    Examples
+    --------
+    >>> Gearbox(65.5).to_motor(2.0)
+    131.0
+    """
+
+    ratio: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.ratio) and self.ratio > 0):
+            raise ParameterError(f"gear ratio is {self.ratio!r}; it must be positive")
+
+    def to_motor(self, wheel: Motion) -> Motion:
+        """Return the motor's angle [rad], speed [rad/s] or acceleration of a wheel's.
+
+        Parameters
+        ----------
+        wheel : float or ndarray
+            Angle, speed or acceleration of the wheel.
+
+        Returns
+        -------
+        float or ndarray
+            ``ratio`` times as much.
+        """
+        return wheel * self.ratio
+
+    def to_wheel(self, motor: Motion) -> Motion:
+        """Return the wheel's angle [rad], speed [rad/s] or acceleration of a motor's.
+
+        Parameters
+        ----------
+        motor : float or ndarray
+            Angle, speed or acceleration of the motor.
+
+        Returns
+        -------
+        float or ndarray
+            ``1 / ratio`` times as much.
+        """
+        return motor / self.ratio
+
+    def torque_to_motor(self, wheel_torque: float) -> float:
+        """Return the torque that a load on the wheel puts on the motor shaft (no losses)."""
+        return wheel_torque / self.ratio

@@ -1,0 +1,1 @@
+"""References of a speed: within limits, smooth, and as fast as the voltage allows."""

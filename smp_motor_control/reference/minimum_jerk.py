@@ -1,0 +1,239 @@
+"""Transitions of a speed from one value to another: within limits, smooth, on time.
+
+Two kinds of transition lead from the reference's present velocity, acceleration and jerk to a
+new target at rest (acceleration 0):
+
+*Limited*: the fastest that keeps to acceleration and jerk limits.  The acceleration rises
+with the largest jerk, is held, and falls with the largest jerk.
+
+*Minimum jerk*: the polynomial of fifth order in velocity that is fixed by
+
+    v(0) = v0, v'(0) = a0, v''(0) = j0,   v(T) = v1, v'(T) = 0, v''(T) = 0,
+
+of a duration T that is chosen.  From rest it is ``v0 + D (10 s^3 - 15 s^4 + 6 s^5)`` with
+``s = t/T``, ``D = v1 - v0``; its peak acceleration is ``15/8 |D|/T`` at ``s = 1/2`` and its peak
+jerk ``10/sqrt(3) |D|/T^2`` at ``s = (1 -+ 1/sqrt(3))/2``.  Wheels that share T arrive together,
+whatever their own step.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from smp_motor_control.errors import ParameterError
+
+PEAK_ACCELERATION = 15.0 / 8.0
+"""Peak acceleration of the minimum-jerk transition from rest, in units of ``|D|/T``."""
+
+PEAK_JERK = 10.0 / math.sqrt(3.0)
+"""Peak jerk of the minimum-jerk transition from rest, in units of ``|D|/T^2``."""
+
+
+class Reference(NamedTuple):
+    """The reference at one instant.
+
+    Attributes
+    ----------
+    velocity : float
+        [rad/s].
+    acceleration : float
+        [rad/s^2].
+    jerk : float
+        [rad/s^3].
+    """
+
+    velocity: float
+    acceleration: float
+    jerk: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProfileLimits:
+    """What a reference must keep to; infinite where there is no limit.
+
+    Attributes
+    ----------
+    velocity, acceleration, jerk : float
+        [rad/s], [rad/s^2], [rad/s^3], all positive.
+
+    Raises
+    ------
+    ParameterError
+        When a limit is NaN, zero or negative.
+    """
+
+    velocity: float = math.inf
+    acceleration: float = math.inf
+    jerk: float = math.inf
+
+    def __post_init__(self) -> None:
+        for name in ("velocity", "acceleration", "jerk"):
+            value = getattr(self, name)
+            if not value > 0.0:
+                raise ParameterError(f"limit of {name} is {value}: must be positive")
+
+    @classmethod
+    def from_parameters(
+        cls, max_velocity: float, max_acceleration: float, max_jerk: float
+    ) -> ProfileLimits:
+        """Return the limits that ROS parameters mean, where 0 is no limit.
+
+        Parameters
+        ----------
+        max_velocity, max_acceleration, max_jerk : float
+            [rad/s], [rad/s^2], [rad/s^3]; 0 for none.
+
+        Returns
+        -------
+        ProfileLimits
+            With infinity in place of 0.
+
+        Raises
+        ------
+        ParameterError
+            When a value is NaN or negative.
+        """
+        return cls(
+            velocity=max_velocity or math.inf,
+            acceleration=max_acceleration or math.inf,
+            jerk=max_jerk or math.inf,
+        )
+
+
+class MinimumJerk:
+    """Polynomial of fifth order from a moving start to a target at rest.
+
+    Parameters
+    ----------
+    start : Reference
+        Velocity, acceleration and jerk to begin with.
+    target : float
+        Velocity to end with [rad/s].
+    duration : float
+        [s], positive.
+
+    References
+    ----------
+    T. Flash and N. Hogan, "The coordination of arm movements", J. Neuroscience 5 (1985),
+    equations 5 and 6: the same polynomial, there of position.
+    """
+
+    __slots__ = ("_c", "duration", "start", "target")
+
+    def __init__(self, start: Reference, target: float, duration: float) -> None:
+        if not (duration > 0.0 and math.isfinite(duration)):
+            raise ParameterError(f"duration of a transition is {duration} s: must be positive")
+        self.start, self.target, self.duration = start, target, duration
+        step = target - start.velocity
+        slope = start.acceleration * duration
+        bend = start.jerk * duration * duration
+        self._c = (
+            start.velocity,
+            slope,
+            bend / 2.0,
+            10.0 * step - 6.0 * slope - 1.5 * bend,
+            -15.0 * step + 8.0 * slope + 1.5 * bend,
+            6.0 * step - 3.0 * slope - 0.5 * bend,
+        )
+
+    def at(self, t: float) -> Reference:
+        """Return the reference at an instant.
+
+        Parameters
+        ----------
+        t : float
+            Time since the start of the transition [s].
+
+        Returns
+        -------
+        Reference
+            The start before it, the target at rest after its end.
+        """
+        if t >= self.duration:
+            return Reference(self.target, 0.0, 0.0)
+        if t <= 0.0:
+            return self.start
+        c0, c1, c2, c3, c4, c5 = self._c
+        s = t / self.duration
+        return Reference(
+            c0 + s * (c1 + s * (c2 + s * (c3 + s * (c4 + s * c5)))),
+            (c1 + s * (2.0 * c2 + s * (3.0 * c3 + s * (4.0 * c4 + s * 5.0 * c5)))) / self.duration,
+            (2.0 * c2 + s * (6.0 * c3 + s * (12.0 * c4 + s * 20.0 * c5))) / self.duration**2,
+        )
+
+
+class Limited:
+    """The fastest transition within limits of acceleration and jerk.
+
+    Parameters
+    ----------
+    start : Reference
+        Velocity and acceleration to begin with.
+    target : float
+        Velocity to end with [rad/s].
+    limits : ProfileLimits
+        Of acceleration and jerk; without either the target is reached at once.
+    """
+
+    __slots__ = ("_legs", "duration", "target")
+
+    def __init__(self, start: Reference, target: float, limits: ProfileLimits) -> None:
+        self.target = target
+        self._legs: list[tuple[float, float, float, float]] = []  # (end time, v, a, j) at its start
+        self.duration = 0.0
+        largest, jerk = limits.acceleration, limits.jerk
+        v, a = start.velocity, start.acceleration
+        if math.isinf(jerk):
+            if math.isfinite(largest):
+                self._append(abs(target - v) / largest, v, math.copysign(largest, target - v), 0.0)
+            return
+        # Where the velocity comes to rest if the acceleration is taken away now.
+        sign = math.copysign(1.0, target - (v + a * abs(a) / (2.0 * jerk)))
+        a *= sign
+        step = sign * (target - v)
+        peak = min(math.sqrt(max(jerk * step + a * a / 2.0, 0.0)), largest)
+        rise = math.copysign(jerk, peak - a)
+        gained = (peak * peak - a * a) / (2.0 * rise) + peak * peak / (2.0 * jerk)
+        v, a, _ = self._append((peak - a) / rise, v, sign * a, sign * rise)
+        hold = (step - gained) / peak if peak > 0.0 else 0.0
+        if hold > 0.0:
+            v, a, _ = self._append(hold, v, sign * peak, 0.0)
+        self._append(peak / jerk, v, sign * peak, -sign * jerk)
+
+    def _append(self, length: float, v: float, a: float, j: float) -> Reference:
+        self.duration += length
+        self._legs.append((self.duration, v, a, j))
+        return Reference(v + length * (a + length * j / 2.0), a + length * j, j)
+
+    def at(self, t: float) -> Reference:
+        """Return the reference at an instant.
+
+        Parameters
+        ----------
+        t : float
+            Time since the start of the transition [s], not negative.
+
+        Returns
+        -------
+        Reference
+            The target at rest after its end.
+        """
+        begin = 0.0
+        for end, v, a, j in self._legs:
+            if t < end:
+                t -= begin
+                return Reference(v + t * (a + t * j / 2.0), a + t * j, j)
+            begin = end
+        return Reference(self.target, 0.0, 0.0)
+
+
+def minimum_jerk_duration(step: float, limits: ProfileLimits, least: float = 0.0) -> float:
+    """Return how long a minimum-jerk transition from rest has to take within limits."""
+    size = abs(step)
+    return max(
+        least,
+        PEAK_ACCELERATION * size / limits.acceleration,
+        math.sqrt(PEAK_JERK * size / limits.jerk),
+    )

@@ -1,0 +1,242 @@
+"""The reference of a wheel's speed: within its limits, smooth, and on time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from smp_motor_control.errors import ParameterError
+from smp_motor_control.reference.feasibility import peak_voltage, shortest_common_transition
+from smp_motor_control.reference.minimum_jerk import (
+    PEAK_ACCELERATION,
+    PEAK_JERK,
+    Limited,
+    MinimumJerk,
+    ProfileLimits,
+    Reference,
+    minimum_jerk_duration,
+)
+from smp_motor_control.reference.time_optimal import Drive, VoltageLimited
+
+__all__ = [
+    "PEAK_ACCELERATION",
+    "PEAK_JERK",
+    "UNLIMITED",
+    "Drive",
+    "Limited",
+    "MinimumJerk",
+    "Profile",
+    "ProfileLimits",
+    "Reference",
+    "minimum_jerk_duration",
+    "peak_voltage",
+    "shortest_common_transition",
+]
+
+UNLIMITED = ProfileLimits()
+"""A reference that jumps."""
+
+_STRETCH = 1.1
+_LOOKS = tuple(k / 32.0 for k in range(32))
+
+
+class Profile:
+    """The reference of one wheel, led from target to target without a jump.
+
+    Parameters
+    ----------
+    limits : ProfileLimits
+        What the reference keeps to; targets beyond the velocity limit are clipped.
+    transition_time : float
+        Duration [s] of every change of the target along a minimum-jerk polynomial, stretched
+        where a limit asks for it; 0 takes the fastest transition within the limits.
+    drive : Drive or None
+        The motor and its voltage, where changes shall keep to that: one for which the voltage
+        does not do in ``transition_time`` is made as fast as the voltage allows.
+
+    Raises
+    ------
+    ParameterError
+        When ``transition_time`` is negative or not finite.
+
+    Examples
+    --------
+    >>> profile = Profile(ProfileLimits(acceleration=2.0))
+    >>> profile.set_target(1.0)
+    >>> profile.step(0.25)
+    Reference(velocity=0.5, acceleration=2.0, jerk=0.0)
+    """
+
+    def __init__(
+        self,
+        limits: ProfileLimits = UNLIMITED,
+        transition_time: float = 0.0,
+        drive: Drive | None = None,
+    ) -> None:
+        self.configure(limits, transition_time, drive)
+        self.reset()
+
+    def configure(
+        self, limits: ProfileLimits, transition_time: float, drive: Drive | None = None
+    ) -> None:
+        """Change limits and duration from the next change of the target on.
+
+        Parameters
+        ----------
+        limits : ProfileLimits
+            New limits.
+        transition_time : float
+            [s].
+        drive : Drive or None
+            The motor and its voltage.
+
+        Raises
+        ------
+        ParameterError
+            When ``transition_time`` is negative or not finite.
+        """
+        if not 0.0 <= transition_time < math.inf:
+            raise ParameterError(
+                f"transition_time is {transition_time} s: must be finite and not negative"
+            )
+        self.limits, self.transition_time, self.drive = limits, transition_time, drive
+
+    def reset(self, velocity: float = 0.0) -> None:
+        """Rest at a velocity, such as the measured one when a loop is closed.
+
+        Parameters
+        ----------
+        velocity : float
+            [rad/s].
+        """
+        self.target = velocity
+        self.now = Reference(velocity, 0.0, 0.0)
+        self._transition: MinimumJerk | Limited | VoltageLimited | None = None
+        self._elapsed = 0.0
+
+    @property
+    def moving(self) -> bool:
+        """Whether the reference is still under way to its target."""
+        return self._transition is not None
+
+    @property
+    def duration(self) -> float:
+        """Of the transition that is under way [s]; 0 at rest."""
+        return 0.0 if self._transition is None else self._transition.duration
+
+    def set_target(self, velocity: float, sample_time: float = 0.005) -> None:
+        """Head for a velocity from wherever the reference is now.
+
+        Parameters
+        ----------
+        velocity : float
+            [rad/s]; the target that is in force already changes nothing.
+        sample_time : float
+            Interval over which the voltage is held [s], of which a transition as fast as the
+            voltage allows is made up.
+
+        Raises
+        ------
+        ParameterError
+            When it is not finite; the old target stays.
+        """
+        if not math.isfinite(velocity):
+            raise ParameterError(f"target velocity is {velocity}: must be finite")
+        velocity = min(max(velocity, -self.limits.velocity), self.limits.velocity)
+        if velocity == self.target:
+            return
+        self.target = velocity
+        self._elapsed = 0.0
+        self._transition = self._to(velocity, sample_time)
+
+    def _to(self, target: float, sample_time: float) -> MinimumJerk | Limited | VoltageLimited:
+        limits = self.limits
+        if self.drive is not None and math.isinf(min(limits.acceleration, limits.jerk)):
+            if self.transition_time > 0.0:
+                smooth = MinimumJerk(self.now, target, self.transition_time)
+                if self._keeps(smooth):
+                    return smooth
+            return VoltageLimited(self.now, target, self.drive, sample_time, self.transition_time)
+        if self.transition_time > 0.0 or self.drive is not None:
+            return self._minimum_jerk(target, max(self.transition_time, sample_time))
+        return Limited(self.now, target, limits)
+
+    def _minimum_jerk(self, target: float, least: float) -> MinimumJerk:
+        limits, start = self.limits, self.now
+        step = target - start.velocity
+        transition = MinimumJerk(start, target, minimum_jerk_duration(step, limits, least))
+        # A start from rest is exact but for the voltage.  A moving start may ask for more: time
+        # helps, but only without the jerk that it started with, which would act all the longer.
+        while not self._keeps(transition):
+            start = start._replace(jerk=0.0)
+            transition = MinimumJerk(start, target, transition.duration * _STRETCH)
+        return transition
+
+    def _keeps(self, transition: MinimumJerk) -> bool:
+        """Tell whether acceleration, jerk and voltage keep their limits (to one part in 1000).
+
+        An acceleration that is beyond its limit already, since that was lowered, may only fall.
+        """
+        seen = [transition.at(s * transition.duration) for s in _LOOKS]
+        if self.drive is not None and not self._affords(self.drive, transition, seen):
+            return False
+        largest = max(
+            1.001 * self.limits.acceleration, (1 + 1e-9) * abs(transition.start.acceleration)
+        )
+        return (
+            max(abs(x.acceleration) for x in seen) <= largest
+            and max(abs(x.jerk) for x in seen) <= 1.001 * self.limits.jerk
+        )
+
+    def _affords(self, drive: Drive, transition: MinimumJerk, seen: Sequence[Reference]) -> bool:
+        """Tell whether the voltage does; where nothing but the voltage limits, or from rest.
+
+        Of a transition that starts with an acceleration more time makes more voltage.
+        """
+        if transition.start.acceleration and math.isfinite(self.limits.acceleration):
+            return True
+        most = max(drive.top_speed, abs(transition.start.velocity), 1.02 * abs(transition.target))
+        return max(abs(drive.needed(x)) for x in seen) <= 1.001 * most
+
+    def step(self, dt: float) -> Reference:
+        """Advance by one sample.
+
+        Parameters
+        ----------
+        dt : float
+            [s], not negative.
+
+        Returns
+        -------
+        Reference
+            The reference at the new instant, within the velocity limit.
+        """
+        if self._transition is None:
+            return self.now
+        self._elapsed += dt
+        self.now = self._clip(self._transition.at(self._elapsed))
+        if self._elapsed >= self._transition.duration:
+            self._transition = None
+        return self.now
+
+    def ahead(self, lead: float) -> Reference:
+        """Return where the reference will be if the target stays.
+
+        Parameters
+        ----------
+        lead : float
+            [s] from now, not negative.
+
+        Returns
+        -------
+        Reference
+            For a feed-forward that makes up for delay and for holding the output.
+        """
+        if self._transition is None:
+            return self.now
+        return self._clip(self._transition.at(self._elapsed + lead))
+
+    def _clip(self, reference: Reference) -> Reference:
+        if abs(reference.velocity) <= self.limits.velocity:
+            return reference
+        return Reference(math.copysign(self.limits.velocity, reference.velocity), 0.0, 0.0)

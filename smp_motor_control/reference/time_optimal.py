@@ -1,0 +1,274 @@
+"""The fastest change of speed that a voltage allows, in whole samples.
+
+A motor obeys ``tp w'' + tau w' + w = u``, where u is the speed that its voltage would hold for
+ever.  Between bounds ``|u| <= U`` the fastest way from one speed to another at rest is u at
+one bound, then at the other (Pontryagin); with u held over samples the same two stretches are
+made of whole samples, and their two values follow exactly from the two end conditions.
+
+References
+----------
+L. S. Pontryagin et al., *The Mathematical Theory of Optimal Processes* (1962), section 5;
+K. J. Astrom, B. Wittenmark, *Computer-Controlled Systems* (1997), section 4.3 on dead-beat.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+from smp_motor_control.errors import ParameterError
+from smp_motor_control.reference.minimum_jerk import Reference
+
+_EASY = 1.0 + 1e-9
+_BISECTIONS = 60
+_FIRST_ORDER = 1e-6
+"""Product of the time constants, as a share of their sum squared, that counts as none."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drive:
+    """What a motor can do with the voltage that a change of speed may use.
+
+    Attributes
+    ----------
+    top_speed : float
+        That this voltage, less what dry friction takes, would hold for ever [rad/s].
+    time_constant : float
+        Sum of the motor's time constants [s].
+    time_constant_product : float
+        Their product [s^2]; 0 for a motor of first order.
+
+    Raises
+    ------
+    ParameterError
+        When a value is not finite, negative, or a zero that must not be.
+    """
+
+    top_speed: float
+    time_constant: float
+    time_constant_product: float = 0.0
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            positive = field.name != "time_constant_product"
+            if not 0.0 <= value < math.inf or (positive and value == 0.0):
+                wanted = "positive" if positive else "zero or positive"
+                raise ParameterError(f"{field.name} of the drive is {value}: must be {wanted}")
+
+    def needed(self, reference: Reference) -> float:
+        """Return u, the speed that the voltage of an instant would hold for ever.
+
+        Parameters
+        ----------
+        reference : Reference
+            Speed, acceleration and jerk.
+
+        Returns
+        -------
+        float
+            [rad/s], with its sign.
+        """
+        bend = self.time_constant_product * reference.jerk
+        return reference.velocity + self.time_constant * reference.acceleration + bend
+
+
+_State = tuple[float, float]
+"""Speed and acceleration."""
+
+
+class _Motor:
+    """Exact responses to a constant u."""
+
+    def __init__(self, drive: Drive) -> None:
+        self.tau, self.tp = drive.time_constant, drive.time_constant_product
+        if self.tp <= _FIRST_ORDER * self.tau**2:
+            self.tp = 0.0
+            return
+        self.sigma = self.tau / (2.0 * self.tp)
+        square = self.sigma**2 - 1.0 / self.tp
+        self.real, self.root = square >= 0.0, max(math.sqrt(abs(square)), 1e-6 * self.sigma)
+
+    def after(self, state: _State, u: float, t: float) -> _State:
+        """Return the state after a time."""
+        w, a = state
+        off = w - u
+        if not self.tp:
+            off *= math.exp(-t / self.tau)
+            return u + off, -off / self.tau
+        c, s = self._modes(t)
+        bend = self.sigma * s
+        return u + off * (c + bend) + a * s, a * (c - bend) - off * s / self.tp
+
+    def _modes(self, t: float) -> tuple[float, float]:
+        r, sigma = self.root, self.sigma
+        if self.real:
+            grown, shrunk = math.exp((r - sigma) * t), math.exp(-(r + sigma) * t)
+            return (grown + shrunk) / 2.0, (grown - shrunk) / (2.0 * r)
+        decay = math.exp(-sigma * t)
+        return decay * math.cos(r * t), decay * math.sin(r * t) / r
+
+    def until_even(self, state: _State, u: float) -> float:
+        """Return when u, which brakes it, has taken the acceleration away [s]."""
+        w, a = state
+        if a == 0.0:
+            return 0.0
+        turn = self.root * a / (self.sigma * a + (w - u) / self.tp)
+        if self.real:
+            return math.atanh(min(turn, 1.0 - 1e-15)) / self.root
+        return (math.atan(turn) if turn >= 0.0 else math.atan(turn) + math.pi) / self.root
+
+    def jerk(self, state: _State, u: float) -> float:
+        """Return the change of the acceleration; none is told for a motor of first order."""
+        w, a = state
+        return (u - w - self.tau * a) / self.tp if self.tp else 0.0
+
+
+class VoltageLimited:
+    """The fastest transition within a voltage, of whole samples.
+
+    Parameters
+    ----------
+    start : Reference
+        Speed and acceleration to begin with.
+    target : float
+        Speed to end with [rad/s].
+    drive : Drive
+        The motor and its voltage.
+    sample_time : float
+        Interval over which the voltage is held [s].
+    least : float
+        Duration that it takes in any case [s].
+
+    Raises
+    ------
+    ParameterError
+        When ``sample_time`` is not positive.
+
+    Notes
+    -----
+    A target at or beyond the top speed is headed for with as much voltage as holding it takes
+    and a fiftieth more.
+    """
+
+    __slots__ = ("_legs", "_motor", "duration", "target")
+
+    def __init__(
+        self,
+        start: Reference,
+        target: float,
+        drive: Drive,
+        sample_time: float,
+        least: float = 0.0,
+    ) -> None:
+        if not 0.0 < sample_time < math.inf:
+            raise ParameterError(f"sample_time of a transition is {sample_time} s: not positive")
+        self.target = target
+        self._motor = motor = _Motor(drive)
+        top = max(drive.top_speed, 1.02 * abs(target))
+        state = (start.velocity, start.acceleration if motor.tp else 0.0)
+        first, second = _quickest(motor, state, target, top)
+        samples = max(math.ceil(max(first + second, least) / sample_time - 1e-6), 1)
+        lag = second / sample_time
+        while (legs := _whole(motor, state, target, top, samples, lag, sample_time)) is None:
+            samples += max(1, samples // 16)
+        self._legs: list[tuple[float, _State, float]] = []
+        self.duration = 0.0
+        for u, length in legs:
+            self.duration += length
+            self._legs.append((self.duration, state, u))
+            state = motor.after(state, u, length)
+
+    def at(self, t: float) -> Reference:
+        """Return the reference at an instant.
+
+        Parameters
+        ----------
+        t : float
+            Time since the start of the transition [s], not negative.
+
+        Returns
+        -------
+        Reference
+            The target at rest after its end.
+        """
+        begin, motor = 0.0, self._motor
+        for end, state, u in self._legs:
+            if t < end * (1.0 - 1e-12):
+                now = motor.after(state, u, t - begin)
+                return Reference(*now, motor.jerk(now, u))
+            begin = end
+        return Reference(self.target, 0.0, 0.0)
+
+
+def _quickest(motor: _Motor, state: _State, target: float, top: float) -> tuple[float, float]:
+    """Return the lengths of the two stretches, in continuous time [s]."""
+    speed = state[0]
+    if not motor.tp:
+        bound = math.copysign(top, target - speed)
+        return motor.tau * math.log((bound - speed) / (bound - target)), 0.0
+    brake = -math.copysign(top, state[1])
+    even = motor.after(state, brake, motor.until_even(state, brake))[0]
+    bound = math.copysign(top, target - even)
+
+    def ending(first: float) -> tuple[float, float]:
+        """Return where the first stretch, and braking after it, lead, and how long that takes."""
+        switch = motor.after(state, bound, first)
+        if switch[1] * bound <= 0.0:  # it still slows down from the other direction
+            return switch[0], 0.0
+        second = motor.until_even(switch, -bound)
+        return motor.after(switch, -bound, second)[0], second
+
+    short, long = 0.0, 0.25 * motor.tau
+    for _ in range(_BISECTIONS):
+        if (ending(long)[0] - target) * bound >= 0.0:
+            break
+        short, long = long, 2.0 * long
+    for _ in range(_BISECTIONS):
+        if long - short < 1e-4 * long:
+            break
+        middle = 0.5 * (short + long)
+        if (ending(middle)[0] - target) * bound >= 0.0:
+            long = middle
+        else:
+            short = middle
+    return long, ending(long)[1]
+
+
+_Legs = tuple[tuple[float, float], ...]
+"""For each stretch u [rad/s] and its length [s]."""
+
+
+def _whole(
+    motor: _Motor,
+    state: _State,
+    target: float,
+    top: float,
+    samples: int,
+    lag: float,
+    sample_time: float,
+) -> _Legs | None:
+    """Return two stretches of so many samples in all that end exactly at the target, or None."""
+    most = max(top, abs(state[0])) * _EASY
+    if not motor.tp:
+        left = math.exp(-samples * sample_time / motor.tau)
+        u = (target - state[0] * left) / (1.0 - left)
+        return ((u, samples * sample_time),) if abs(u) <= most else None
+    best: _Legs | None = None
+    for late in sorted({min(max(int(lag) + k, 1), samples - 1) for k in (-1, 0, 1, 2)}):
+        if late < 1:
+            continue
+        lengths = (samples - late) * sample_time, late * sample_time
+        free = motor.after(motor.after(state, 0.0, lengths[0]), 0.0, lengths[1])
+        one = motor.after(motor.after((0.0, 0.0), 1.0, lengths[0]), 0.0, lengths[1])
+        two = motor.after((0.0, 0.0), 1.0, lengths[1])
+        determinant = one[0] * two[1] - one[1] * two[0]
+        if determinant == 0.0:
+            continue
+        gap, rest = target - free[0], -free[1]
+        u1 = (gap * two[1] - rest * two[0]) / determinant
+        u2 = (rest * one[0] - gap * one[1]) / determinant
+        found = max(abs(u1), abs(u2))
+        if found <= most and (best is None or found < max(abs(u) for u, _ in best)):
+            best = ((u1, lengths[0]), (u2, lengths[1]))
+    return best

@@ -1,0 +1,1 @@
+"""One wheel: its speed loop and what keeps it safe, without ROS."""

@@ -1,0 +1,306 @@
+"""One wheel's speed loop without ROS: speed source, reference, PID.
+
+Set-point and speeds are the wheel's; counts and the model are the motor's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+from smp_motor_control.encoder import DifferencedSpeed, Encoder
+from smp_motor_control.errors import ParameterError
+from smp_motor_control.motor.friction import Gearbox
+from smp_motor_control.motor.model import MotorModel
+from smp_motor_control.observer import ObserverNoise, SpeedObserver
+from smp_motor_control.pid import Pid, PidGains, PidOutput
+from smp_motor_control.reference.path import ReferencePath
+from smp_motor_control.reference.profile import Drive, Profile, ProfileLimits, Reference
+
+SPEED_SOURCES = ("measured", "difference", "observer")
+
+_LEARNING = 20
+"""Samples from which the observer learns the usual interval."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoopSettings:
+    """Everything that shapes the loop.
+
+    Attributes
+    ----------
+    gains : PidGains
+        Volts of wheel speeds.
+    limits : ProfileLimits
+        Of the reference, at the wheel.
+    transition_time : float
+        Duration of every change of set-point [s]; 0: as fast as the limits allow.
+    speed_source : {'measured', 'difference', 'observer'}
+        What is fed back: the speed that the hardware reports, counts differenced, or the
+        observer's.
+    difference_window : int
+        Samples to difference over.
+    model : MotorModel or None
+        Of the motor, for the observer, and for the jerk in the feed-forward.
+    noise : ObserverNoise
+        What the observer expects.
+    reference_delay : float
+        How much later than the reference the measured speed can show it [s]: delay and
+        averaging of the loop.  The error is taken from the reference of that long ago, so that
+        a wheel that does what its model says is left alone; 0: from the present one.
+    reference_doubt : float
+        By which that delay may be wrong [s]: there is no error while the measurement is what
+        the reference was within so much of it.
+    drive : Drive or None
+        Motor and voltage that changes of set-point keep to, in wheel rad/s; see
+        :class:`~smp_motor_control.reference.profile.Profile`.
+
+    Raises
+    ------
+    ParameterError
+        When a value is out of range, or the observer lacks its model.
+    """
+
+    gains: PidGains = field(default_factory=PidGains)
+    limits: ProfileLimits = field(default_factory=ProfileLimits)
+    transition_time: float = 0.0
+    speed_source: str = "measured"
+    difference_window: int = 4
+    model: MotorModel | None = None
+    noise: ObserverNoise = field(default_factory=ObserverNoise)
+    reference_delay: float = 0.0
+    reference_doubt: float = 0.0
+    drive: Drive | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("reference_delay", "reference_doubt", "transition_time"):
+            value = getattr(self, name)
+            if not 0.0 <= value < math.inf:
+                raise ParameterError(f"{name} is {value!r} s; it must be zero or positive")
+        if self.speed_source not in SPEED_SOURCES:
+            known = ", ".join(SPEED_SOURCES)
+            raise ParameterError(f"speed_source is {self.speed_source!r}; known are {known}")
+        if self.difference_window < 1:
+            raise ParameterError(
+                f"difference_window is {self.difference_window!r}; it must be at least 1"
+            )
+        if self.speed_source == "observer" and self.model is None:
+            raise ParameterError(
+                "speed_source is 'observer', which needs model.dc_gain and model.time_constant"
+            )
+
+    def within(self, supply_voltage: float) -> LoopSettings:
+        """Return the same with the output limited to what a supply can give.
+
+        Parameters
+        ----------
+        supply_voltage : float
+            [V]; infinite where unknown.
+
+        Returns
+        -------
+        LoopSettings
+            With both output clamps within the supply.
+
+        Raises
+        ------
+        ParameterError
+            When a clamp leaves nothing within the supply.
+        """
+        gains = replace(
+            self.gains,
+            u_clamp_min=max(self.gains.u_clamp_min, -supply_voltage),
+            u_clamp_max=min(self.gains.u_clamp_max, supply_voltage),
+        )
+        return replace(self, gains=gains)
+
+
+class WheelLoop:
+    """Speed loop of one wheel, one step per feedback sample.
+
+    Parameters
+    ----------
+    settings : LoopSettings
+        Changed later with :meth:`configure`.
+    gearbox, encoder : Gearbox, Encoder, optional
+        Of the wheel; without, only the reported speed can be fed back.
+    max_load : float
+        Loads beyond this voltage contradict the observer's model [V].
+
+    Attributes
+    ----------
+    pid : Pid
+        The controller.
+    profile : Profile
+        Source of the reference.
+    reference : Reference
+        Of the last step.
+    source : str
+        Where the speed came from in the last step.
+    """
+
+    def __init__(
+        self,
+        settings: LoopSettings,
+        gearbox: Gearbox | None = None,
+        encoder: Encoder | None = None,
+        max_load: float = math.inf,
+    ) -> None:
+        self.settings = settings
+        self.pid = Pid(settings.gains)
+        self.profile = Profile(settings.limits, settings.transition_time, settings.drive)
+        self.reference = Reference(0.0, 0.0, 0.0)
+        self._path = ReferencePath(self.profile)
+        self.source = "measured"
+        self.set_hardware(gearbox, encoder, max_load)
+
+    def set_hardware(
+        self, gearbox: Gearbox | None, encoder: Encoder | None, max_load: float = math.inf
+    ) -> None:
+        """Tell what is between motor and wheel.
+
+        Parameters
+        ----------
+        gearbox : Gearbox or None
+            None where unknown.
+        encoder : Encoder or None
+            None where unknown.
+        max_load : float
+            [V], see the class.
+        """
+        self._gearbox, self._encoder, self._max_load = gearbox, encoder, max_load
+        self._renew_speed()
+
+    def configure(self, settings: LoopSettings) -> None:
+        """Change settings while running, without a jump of the output.
+
+        Parameters
+        ----------
+        settings : LoopSettings
+            Valid by construction.
+        """
+        old, self.settings = self.settings, settings
+        self.pid.set_gains(settings.gains)
+        self.profile.configure(settings.limits, settings.transition_time, settings.drive)
+        shaped = ("speed_source", "difference_window", "model", "noise")
+        if any(getattr(old, name) != getattr(settings, name) for name in shaped):
+            self._renew_speed()
+
+    def _renew_speed(self) -> None:
+        self._observer: SpeedObserver | None = None
+        self._differenced: DifferencedSpeed | None = None
+        self._intervals: list[float] = []
+        self._time = 0.0
+        self._speed_of: Callable[[float, float, int, float], float] = self._measured
+        if self.settings.speed_source == "measured" or None in (self._gearbox, self._encoder):
+            return
+        assert self._encoder is not None
+        self._differenced = DifferencedSpeed(self._encoder, self.settings.difference_window)
+        self._speed_of = self._difference
+        if self.settings.speed_source == "observer":
+            self._speed_of = self._learn
+
+    def reset_speed(self) -> None:
+        """Forget past samples, as after lost feedback."""
+        if self._differenced is not None:
+            self._differenced.reset()
+        if self._observer is not None:
+            self._observer.reset()
+
+    def speed(self, dt: float, velocity: float, count: int, voltage: float) -> float:
+        """Return the wheel's speed after one more sample.
+
+        Parameters
+        ----------
+        dt : float
+            Interval that ends with it [s], positive.
+        velocity : float
+            As the hardware reports it [rad/s, wheel].
+        count : int
+            As the counter shows it [counts, motor].
+        voltage : float
+            Mean over the interval [V].
+
+        Returns
+        -------
+        float
+            [rad/s, wheel]; NaN while the source has too few samples.
+        """
+        return self._speed_of(dt, velocity, count, voltage)
+
+    def _measured(self, dt: float, velocity: float, count: int, voltage: float) -> float:
+        self.source = "measured"
+        return velocity
+
+    def _difference(self, dt: float, velocity: float, count: int, voltage: float) -> float:
+        assert self._differenced is not None and self._gearbox is not None
+        self.source = "difference"
+        self._time += dt
+        return self._gearbox.to_wheel(self._differenced.step(self._time, count))
+
+    def _learn(self, dt: float, velocity: float, count: int, voltage: float) -> float:
+        """Difference until the usual interval is known, then start the observer."""
+        self._intervals.append(dt)
+        if len(self._intervals) >= _LEARNING:
+            usual = sorted(self._intervals)[len(self._intervals) // 2]
+            settings = self.settings
+            assert settings.model is not None and self._encoder is not None
+            self._observer = SpeedObserver(
+                settings.model,
+                usual,
+                self._encoder,
+                settings.noise,
+                settings.difference_window,
+                self._max_load,
+            )
+            self._intervals = []
+            self._speed_of = self._observe
+        return self._difference(dt, velocity, count, voltage)
+
+    def _observe(self, dt: float, velocity: float, count: int, voltage: float) -> float:
+        observer = self._observer
+        assert observer is not None and self._gearbox is not None
+        speed = observer.step(count, voltage, dt)
+        self.source = "observer" if observer.trusted else "difference (observer not trusted)"
+        return self._gearbox.to_wheel(speed)
+
+    def start(self, measurement: float) -> None:
+        """Close the loop on a wheel that turns at ``measurement``, without a jump.
+
+        Parameters
+        ----------
+        measurement : float
+            [rad/s, wheel].
+        """
+        self.pid.reset()
+        self._path.start(measurement)
+
+    def step(self, setpoint: float, measurement: float, dt: float) -> PidOutput:
+        """Advance reference and controller by one sample.
+
+        Parameters
+        ----------
+        setpoint, measurement : float
+            [rad/s, wheel].
+        dt : float
+            [s], positive.
+
+        Returns
+        -------
+        PidOutput
+            Volts and their parts.
+        """
+        settings, profile = self.settings, self.profile
+        if settings.reference_delay:
+            path = self._path
+            now = path.step(setpoint, dt)
+            delay, doubt = settings.reference_delay, settings.reference_doubt
+            nominal, compared = path.ago(delay, doubt, measurement)
+            forward = path.forward(compared, settings.gains, settings.model)
+            self.reference = now._replace(velocity=nominal)
+            return self.pid.step(compared, measurement, dt, forward)
+        if setpoint != profile.target:
+            profile.set_target(setpoint, dt)
+        self.reference = reference = profile.step(dt)
+        return self.pid.step(reference.velocity, measurement, dt, reference.acceleration)

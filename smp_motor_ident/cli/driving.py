@@ -1,0 +1,122 @@
+"""How the wheels answered ``cmd_vel``, from the recording of a drive."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import savgol_filter
+
+from smp_motor_control.encoder import unwrap
+from smp_motor_control.motor.friction import Gearbox
+from smp_motor_ident.bag.columns import Columns, read_columns
+from smp_motor_ident.record import Hardware
+from smp_motor_ident.tune.response import step_figures
+
+Array = NDArray[np.float64]
+
+SMOOTHING = 0.05
+"""Length [s] of the parabola whose slope is taken as the speed."""
+
+LEAST_CHANGE = 0.8
+"""A smaller change of the set-point [rad/s, wheel] is no step to judge."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """One wheel's answer to one change of ``cmd_vel``.
+
+    Attributes
+    ----------
+    segment : str
+        Name of the manoeuvre that began.
+    before, after : float
+        Speed before, and set-point [rad/s, wheel].
+    rise, settling : float
+        10 to 90 %, and until within 2 % of the change [s]; NaN where it did not.
+    overshoot : float
+        Beyond the set-point [% of the change].
+    """
+
+    segment: str
+    before: float
+    after: float
+    rise: float
+    settling: float
+    overshoot: float
+
+
+def read_answers(
+    bag: Path, segments: Sequence[tuple[str, float, float]], hardware: Mapping[str, Hardware]
+) -> dict[str, list[Answer]]:
+    """Measure rise, settling and overshoot of every wheel in every segment."""
+    wanted = {f"/{wheel}/motor_state": ["encoder_count"] for wheel in hardware}
+    wanted |= {f"/{wheel}/pid_state": ["setpoint"] for wheel in hardware}
+    read = read_columns(bag, wanted)
+    answers = {}
+    for wheel, known in hardware.items():
+        time, speed = wheel_speed(read[f"/{wheel}/motor_state"], known)
+        asked = read[f"/{wheel}/pid_state"]
+        found = [_answer(time, speed, asked, *segment) for segment in segments]
+        answers[wheel] = [a for a in found if a is not None]
+    return answers
+
+
+def longest_stall(bag: Path, wheels: Sequence[str]) -> float:
+    """Return how long the machine that simulates stood still at worst."""
+    wanted = {f"/{wheel}/motor_state": ["encoder_count"] for wheel in wheels}
+    wanted |= {f"/{wheel}/pid_state": ["age"] for wheel in wheels}
+    read = read_columns(bag, wanted)
+    gaps = (np.diff(c.time) for c in read.values() if "age" not in c.fields)
+    ages = (c.fields["age"] for c in read.values() if "age" in c.fields)
+    return max(float(np.max(found)) for found in (*gaps, *ages))
+
+
+def wheel_speed(state: Columns, hardware: Hardware) -> tuple[Array, Array]:
+    """Return the wheel's speed as its encoder saw it.
+
+    Parameters
+    ----------
+    state : Columns
+        With ``encoder_count``.
+    hardware : Hardware
+        Of the wheel.
+
+    Returns
+    -------
+    time : ndarray, shape (n,), [s]
+        Even.
+    speed : ndarray, shape (n,), [rad/s, wheel]
+        Slope of a parabola over :data:`SMOOTHING`, so that one count is not taken for motion.
+    """
+    counts = unwrap(state.fields["encoder_count"], hardware.encoder_bits)
+    turn = 2 * np.pi / float(hardware.counts_per_revolution or 1.0)
+    angle = Gearbox(hardware.gear_ratio).to_wheel(turn) * (counts - counts[0])
+    step = float(np.median(np.diff(state.time)))
+    time = np.arange(state.time[0], state.time[-1], step)
+    even = np.interp(time, state.time, angle)
+    window = max(2 * round(SMOOTHING / step / 2) + 1, 5)
+    speed = np.asarray(savgol_filter(even, window, 2, deriv=1, delta=step), dtype=np.float64)
+    return time, speed
+
+
+def _answer(
+    time: Array, speed: Array, asked: Columns, name: str, begin: float, end: float
+) -> Answer | None:
+    """Read one segment; its set-point is the last one asked for in it."""
+    during = np.flatnonzero((asked.time > begin) & (asked.time < end))
+    before = (time > begin - 0.3) & (time < begin)
+    inside = (time >= begin) & (time < end)
+    if during.size == 0 or not inside.any():
+        return None
+    start = float(speed[before].mean()) if before.any() else 0.0
+    final = float(asked.fields["setpoint"][during[-1]])
+    if abs(final - start) < LEAST_CHANGE:
+        return None
+    told = step_figures(
+        time[inside] - begin, speed[inside] - start, np.zeros(inside.sum()), final - start
+    )
+    return Answer(name, start, final, told.rise, told.settling, told.overshoot)

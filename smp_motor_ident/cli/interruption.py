@@ -1,0 +1,64 @@
+"""Ctrl-C that is not lost: remembered when it comes, raised again where a tool waits.
+
+Python drops an exception that a signal handler raises inside some callbacks, among them those
+around a fork; a tool that is just starting a process would then go on as if nobody had asked.
+"""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_requested = threading.Event()
+_held = threading.Event()
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Let SIGINT, SIGTERM and SIGHUP interrupt what runs in the block."""
+    previous = {number: signal.signal(number, _interrupt) for number in _SIGNALS}
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+        if previous[signal.SIGINT] is not _interrupt:
+            _requested.clear()
+
+
+def check() -> None:
+    """Raise the interruption that was asked for, if Python has dropped it."""
+    if _requested.is_set():
+        raise KeyboardInterrupt
+
+
+@contextmanager
+def held() -> Iterator[None]:
+    """Let the block come to its end before an interruption is raised.
+
+    Yields
+    ------
+    None
+        For what must not be left half done, such as starting a process and noting it.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        At the end of the block, when a signal came inside it.
+    """
+    _held.set()
+    try:
+        yield
+    finally:
+        _held.clear()
+    check()
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    _requested.set()
+    if not _held.is_set():
+        raise KeyboardInterrupt

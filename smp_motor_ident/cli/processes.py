@@ -1,0 +1,259 @@
+"""Starting the nodes as processes of their own, and leaving none of them behind."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import fcntl
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import IO
+
+from smp_motor_control.errors import SmpError
+from smp_motor_ident.cli import interruption
+
+_PR_SET_PDEATHSIG = 1
+_LIBC = ctypes.CDLL(None, use_errno=True)
+
+
+class ProcessError(SmpError):
+    """A node ended by itself, or does not do what it should."""
+
+    exit_code = 1
+
+
+def free_domain(first: int = 215, last: int = 232) -> int:
+    """Claim a ROS domain that nobody on this machine uses, for as long as this process lives.
+
+    References
+    ----------
+    DDSI-RTPS 2.5, section 9.6.1.1: port 7400 + 250 domain + 10 belongs to participant 0.
+    """
+    count = last - first + 1
+    for k in range(count):
+        domain = first + (os.getpid() + k) % count
+        if _claim(domain) and _port_is_free(7400 + 250 * domain + 10):
+            return domain
+    raise ProcessError(f"all ROS domains from {first} to {last} are in use; end one of their users")
+
+
+_CLAIMS: list[IO[str]] = []
+
+
+def _claim(domain: int) -> bool:
+    """Lock the domain's file; the lock ends with this process."""
+    path = Path(tempfile.gettempdir()) / f"smp_domain_{domain}_{os.getuid()}.lock"
+    claim = path.open("w")
+    try:
+        fcntl.flock(claim, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        claim.close()
+        return False
+    _CLAIMS.append(claim)
+    return True
+
+
+def _port_is_free(port: int) -> bool:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.bind(("", port))
+        except OSError:
+            return False
+    return True
+
+
+def stop_when_orphaned() -> None:
+    """Interrupt this process when whoever started it is gone."""
+    parent = os.getppid()
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(0.5)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+class Processes:
+    """A set of node processes that ends with the block that holds it, however that ends.
+
+    Each is the leader of its own process group, is asked to stop by SIGINT, then by SIGTERM,
+    then killed; the kernel sends it SIGTERM if this process dies without a word.
+
+    Parameters
+    ----------
+    logs : Path
+        Folder for one ``NAME.log`` each.
+    environment : mapping of str to str
+        Added to this process's environment.
+    """
+
+    def __init__(self, logs: Path, environment: Mapping[str, str] | None = None) -> None:
+        self._logs = logs
+        self._environment = {**os.environ, **(environment or {}), "PYTHONUNBUFFERED": "1"}
+        self._running: dict[str, subprocess.Popen[bytes]] = {}
+
+    def __enter__(self) -> Processes:
+        """Begin."""
+        self._logs.mkdir(parents=True, exist_ok=True)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Stop all; a second Ctrl-C meanwhile does not keep any alive."""
+        kept = {s: signal.signal(s, signal.SIG_IGN) for s in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            self.stop(*self._running)
+        finally:
+            for number, handler in kept.items():
+                signal.signal(number, handler)
+
+    def start(
+        self, name: str, node: str, *arguments: str, pipes: bool = False, priority: int = 0
+    ) -> subprocess.Popen[bytes]:
+        """Start a node.
+
+        Parameters
+        ----------
+        name : str
+            Under which it is known here, and its log is called.
+        node : str
+            Name of its executable.
+        *arguments : str
+            Passed on to it.
+        pipes : bool
+            Whether its standard input and output are pipes rather than the log.
+        priority : int
+            Real-time priority, if the system grants it; so a busy machine does not slow the
+            simulated robot down. 0 for none.
+
+        Returns
+        -------
+        subprocess.Popen
+            The running process.
+        """
+        self._logs.mkdir(parents=True, exist_ok=True)
+        parent = os.getpid()
+        with (self._logs / f"{name}.log").open("wb") as log, interruption.held():
+            process = self._running[name] = subprocess.Popen(
+                [*_command(node), *arguments],
+                stdin=subprocess.PIPE if pipes else subprocess.DEVNULL,
+                stdout=subprocess.PIPE if pipes else log,
+                stderr=log,
+                env=self._environment,
+                start_new_session=True,
+                preexec_fn=lambda: _prepare(parent, priority),
+            )
+        return process
+
+    def check(self, but: str = "") -> None:
+        """Look whether all still run."""
+        interruption.check()
+        for name, process in self._running.items():
+            if name != but and process.poll() is not None:
+                raise ProcessError(
+                    f"{name} ended with exit code {process.returncode}: {self.last_words(name)}"
+                )
+
+    def last_words(self, name: str) -> str:
+        """Return the last line that a process logged."""
+        path = self._logs / f"{name}.log"
+        lines = path.read_text(errors="replace").strip().splitlines() if path.exists() else []
+        return f"{lines[-1] if lines else 'it said nothing'} (log: {path})"
+
+    def wait(self, name: str, timeout: float) -> None:
+        """Wait for a process that ends by itself.
+
+        Parameters
+        ----------
+        name : str
+            As given to :meth:`start`.
+        timeout : float
+            [s].
+
+        Raises
+        ------
+        ProcessError
+            When it does not end in time or not with exit code 0, or another one ends.
+        """
+        process = self._running[name]
+        deadline = time.monotonic() + timeout
+        while process.poll() is None:
+            if time.monotonic() > deadline:
+                raise ProcessError(f"{name} is not done after {timeout:.0f} s")
+            self.check(but=name)
+            time.sleep(0.05)
+        del self._running[name]
+        if process.returncode != 0:
+            raise ProcessError(
+                f"{name} ended with exit code {process.returncode}: {self.last_words(name)}"
+            )
+
+    def stop(self, *names: str) -> None:
+        """Stop processes together: politely, then firmly.
+
+        Parameters
+        ----------
+        *names : str
+            As given to :meth:`start`.
+        """
+        group = [self._running.pop(name) for name in names if name in self._running]
+        for number, patience in ((signal.SIGINT, 5.0), (signal.SIGTERM, 2.0), (signal.SIGKILL, 5)):
+            for process in group:
+                _signal(process, number)
+            if _ended(group, patience):
+                break
+        for process in group:
+            _signal(process, signal.SIGKILL)  # what a node may have left in its group
+            for pipe in (process.stdin, process.stdout):
+                if pipe is not None:
+                    pipe.close()
+
+
+def _command(node: str) -> list[str]:
+    """Return how a node is started: as its installed executable, else as that would."""
+    for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
+        executable = Path(prefix) / "lib" / "smp_motor_control" / node
+        if prefix and executable.is_file():
+            return [str(executable)]
+    start = f"import sys; from smp_motor_control.entry import node; sys.exit(node({node!r})())"
+    return [sys.executable, "-c", start]
+
+
+def _prepare(parent: int, priority: int) -> None:
+    """Between fork and exec: let the kernel end this process when `parent` dies."""
+    _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    if os.getppid() != parent:
+        os._exit(1)
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)  # a shell's background job ignores SIGINT
+    if priority:
+        with contextlib.suppress(PermissionError):
+            os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(priority))
+
+
+def _signal(process: subprocess.Popen[bytes], number: int) -> None:
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, number)
+
+
+def _ended(group: Sequence[subprocess.Popen[bytes]], patience: float) -> bool:
+    deadline = time.monotonic() + patience
+    while any(process.poll() is None for process in group):
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.02)
+    return True

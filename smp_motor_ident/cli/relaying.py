@@ -1,0 +1,114 @@
+"""tune --relay: gains of one running wheel from a bounded oscillation, without a model."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from smp_motor_ident.cli.processes import ProcessError, Processes
+from smp_motor_ident.errors import DesignError, ParameterError
+from smp_motor_ident.report.document import check_free, write_together
+from smp_motor_ident.tune.arrays import Array
+from smp_motor_ident.tune.methods.relay import read_oscillation
+from smp_motor_ident.tune.methods.ziegler_nichols import by_rule
+
+BIAS = 0.4
+"""Share of the supply around which the relay switches, so that friction is not crossed."""
+
+GAP = 3.5
+"""Steps without a sample over which a record is not read."""
+
+
+def tune_by_relay(arguments: argparse.Namespace, files: Sequence[Path]) -> int:
+    """Make a wheel oscillate and write the gains that follow."""
+    supply, wheel = arguments.supply, arguments.relay
+    if supply is None or not 0 < supply < math.inf:
+        raise ParameterError("--relay needs the supply voltage; give --supply")
+    amplitude = 0.25 * supply if arguments.relay_amplitude is None else arguments.relay_amplitude
+    bias = BIAS * supply
+    if not 0 < amplitude <= supply - bias:
+        raise ParameterError(
+            f"--relay-amplitude is {amplitude:g} V; it must be within {supply - bias:g} V around "
+            f"a bias of {bias:g} V"
+        )
+    check_free(files, arguments.force)
+    values = {
+        "bias": bias,
+        "amplitude": amplitude,
+        "hysteresis": arguments.relay_hysteresis,
+        "seconds": arguments.relay_seconds,
+    }
+    print(f"{wheel} turns at {bias:g} V, then switches by {amplitude:g} V around it")
+    options = [text for name, value in values.items() for text in (f"--{name}", str(value))]
+    with tempfile.TemporaryDirectory() as logs, Processes(Path(logs)) as processes:
+        test = processes.start("relay_test", "relay_test", wheel, *options, pipes=True)
+        assert test.stdout is not None
+        line = test.stdout.readline()
+        if not line:
+            raise ProcessError(f"relay_test ended: {processes.last_words('relay_test')}")
+        answer = json.loads(line)
+        processes.wait("relay_test", 30.0)
+    if "error" in answer:
+        raise ProcessError(answer["error"])
+    gain, period = read_oscillation(*evenly(answer))
+    rule, structure = arguments.rule or "tyreus_luyben", arguments.structure or "pi"
+    ruled = by_rule(rule, structure, gain, period)
+    told = (
+        f"{wheel}: ultimate gain {gain:.4g} V s/rad (wheel), period {1e3 * period:.3g} ms; {rule}: "
+        f"p {ruled.p:.4g}, i {ruled.i:.4g}, d {ruled.d:.4g}"
+    )
+    print(told)
+    if files:
+        parameters = {
+            "p": ruled.p,
+            "i": ruled.i,
+            "d": ruled.d,
+            "derivative_filter_time_constant": ruled.filter_time,
+            "u_clamp_min": -float(supply),
+            "u_clamp_max": float(supply),
+            "antiwindup_strategy": "back_calculation",
+        }
+        tree = {f"/{wheel}/wheel_pid": {"ros__parameters": parameters}}
+        text = f"# Tuned by relay feedback. {told}\n" + yaml.safe_dump(tree, sort_keys=False)
+        write_together({files[0]: text}, arguments.force)
+        print(f"written: {files[0]}")
+    return 0
+
+
+def evenly(answer: Mapping[str, Any]) -> tuple[Array, Array, float]:
+    """Return a recorded oscillation on an even grid, whatever samples were lost."""
+    time = np.array(answer["time"])
+    if time.size < 20:
+        raise DesignError(f"only {time.size} samples came while the relay switched")
+    step = float(np.median(np.diff(time)))
+    kept = _longest_stretch(time, GAP * step)
+    time = time[kept]
+    lasted = np.diff(time)
+    grid = np.arange(time[0], time[-1], step)
+    if answer["applied"] is None:
+        turned = np.array(answer["voltage"])[kept][:-1] * lasted
+    else:
+        turned = np.array(answer["applied"])[kept][1:] * lasted
+    # Means over intervals, long and short, are exact as integrals at their ends.
+    volt_seconds = np.concatenate([[0.0], np.cumsum(turned)])
+    if answer["angle"] is None:
+        angle = np.concatenate([[0.0], np.cumsum(np.array(answer["speed"])[kept][1:] * lasted)])
+    else:
+        angle = np.array(answer["angle"])[kept]
+    voltage, speed = (np.diff(np.interp(grid, time, x)) / step for x in (volt_seconds, angle))
+    return voltage, speed, step
+
+
+def _longest_stretch(time: Array, gap: float) -> slice:
+    """Return the part of a record in which no gap is longer: what acted in one is not known."""
+    ends = np.concatenate([[0], np.flatnonzero(np.diff(time) > gap) + 1, [time.size]])
+    k = int(np.argmax(np.diff(ends)))
+    return slice(int(ends[k]), int(ends[k + 1]))

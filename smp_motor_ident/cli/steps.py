@@ -1,0 +1,168 @@
+"""The way from a standing robot to tuned wheels, step by step: shared by demo and commission."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from smp_motor_ident.cli import identify, tune
+from smp_motor_ident.cli.conductor import Conductor
+from smp_motor_ident.cli.processes import ProcessError, Processes
+from smp_motor_ident.errors import ParameterError
+from smp_motor_ident.report.document import read_identification
+from smp_motor_ident.result import Estimate
+
+
+@dataclass(frozen=True)
+class Excitation:
+    """One signal that all wheels are excited with.
+
+    Attributes
+    ----------
+    signal : str
+        As the node ``excite`` names it.
+    duration : float
+        [s].
+    amplitude : float
+        [V].
+    """
+
+    signal: str
+    duration: float
+    amplitude: float
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A robot whose nodes run, and where its results go."""
+
+    processes: Processes
+    conductor: Conductor
+    wheels: tuple[str, ...]
+    folder: Path
+
+    def wheel_nodes(self) -> list[str]:
+        """Return the full names of the wheels' controllers."""
+        return [f"/{wheel}/wheel_pid" for wheel in self.wheels]
+
+    def switch(self, transition: str) -> None:
+        """Let every wheel's controller go through a lifecycle transition.
+
+        Parameters
+        ----------
+        transition : str
+            ``configure``, ``activate`` or ``deactivate``.
+        """
+        for node in self.wheel_nodes():
+            self.conductor.ask("change_state", node=node, transition=transition)
+
+
+TOPICS = "/(.*/)?(motor_.*|pid_state|wheel_setpoints|cmd_vel|odom|joint_states|diagnostics)"
+"""What is worth keeping of a robot, for ``record``."""
+
+
+def record(robot: Robot, name: str) -> Path:
+    """Begin to record.
+
+    Parameters
+    ----------
+    robot : Robot
+        That runs.
+    name : str
+        Of the bag.
+
+    Returns
+    -------
+    Path
+        Where it is written.
+    """
+    bag = robot.folder / name
+    robot.processes.start("record", "record", "--output", str(bag), "--regex", TOPICS)
+    topics = [f"/{wheel}/motor_state" for wheel in robot.wheels]
+    robot.conductor.ask("wait_for_listener", node="record", topics=topics, timeout=20.0)
+    return bag
+
+
+def excite(robot: Robot, plan: Sequence[Excitation]) -> None:
+    """Move all wheels by one signal after the other."""
+    for part in plan:
+        parameters = {
+            "signal": part.signal,
+            "wheels": f"[{', '.join(robot.wheels)}]",
+            "amplitude": float(part.amplitude),
+            "duration": float(part.duration),
+        }
+        arguments = [a for n, v in parameters.items() for a in ("-p", f"{n}:={v}")]
+        robot.processes.start("excite", "excite", "--ros-args", *arguments)
+        robot.processes.wait("excite", part.duration + 20.0)
+
+
+def identify_wheels(bag: Path, output: Path, *options: str) -> dict[str, Estimate]:
+    """Run ``identify`` on a bag."""
+    _succeed("identify", identify.main([str(bag), "--output", str(output), *options]))
+    return read_identification(output)
+
+
+def tune_wheels(identified: Path, output: Path, *options: str) -> dict[str, dict[str, Any]]:
+    """Run ``tune`` on an identification."""
+    _succeed("tune", tune.main([str(identified), "--output", str(output), *options]))
+    return read_parameters(output)
+
+
+def _succeed(tool: str, code: int) -> None:
+    if code == 130:
+        raise KeyboardInterrupt
+    if code != 0:
+        raise ProcessError(f"{tool} ended with exit code {code}, see above")
+
+
+def read_parameters(path: Path) -> dict[str, dict[str, Any]]:
+    """Read a ROS parameter file."""
+    try:
+        document = yaml.safe_load(path.read_text(encoding="utf-8"))
+        return {
+            "/" + node.strip("/"): dict(_flat(entry["ros__parameters"]))
+            for node, entry in document.items()
+        }
+    except (OSError, yaml.YAMLError, KeyError, TypeError, AttributeError) as error:
+        raise ParameterError(f"{path}: is no ROS parameter file ({error})") from None
+
+
+def _flat(tree: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
+    pairs: list[tuple[str, Any]] = []
+    for name, value in tree.items():
+        if isinstance(value, Mapping):
+            pairs += _flat(value, f"{prefix}{name}.")
+        else:
+            pairs.append((prefix + name, value))
+    return pairs
+
+
+def set_gains(robot: Robot, gains: Mapping[str, Mapping[str, Any]]) -> None:
+    """Set gains in the running controllers through their parameter services.
+
+    Parameters
+    ----------
+    robot : Robot
+        That runs.
+    gains : mapping of str to mapping
+        Parameters by full node name.
+    """
+    for node, parameters in gains.items():
+        robot.conductor.ask("set_parameters", node=node, parameters=dict(parameters))
+
+
+def config(name: str) -> Path:
+    """Return a file of ``config/``, from the installation or from the sources."""
+    prefixes = [Path(p) for p in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if p]
+    places = [prefix / "share" / "smp_motor_control" / "config" for prefix in prefixes]
+    places.append(Path(__file__).resolve().parents[2] / "config")
+    for place in places:
+        if (place / name).is_file():
+            return place / name
+    raise ParameterError(f"config/{name}: not found; run 'make setup', or source the workspace")

@@ -1,0 +1,81 @@
+"""Results as tables for a terminal, a pipe or a log."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from smp_motor_ident.report import words
+from smp_motor_ident.result import Estimate, Quantity
+
+_COLOR = {"estimated": "green", "fixed": "cyan", "unidentifiable": "red"}
+
+
+def console() -> Console:
+    """Return the console of standard output; wide enough for a table when it is no terminal."""
+    return Console(width=None if sys.stdout.isatty() else 110, highlight=False, markup=False)
+
+
+def table(title: str, *columns: str, left: int = 1) -> Table:
+    """Return an empty table.
+
+    Parameters
+    ----------
+    title : str
+        Set above it.
+    *columns : str
+        Headings.
+    left : int
+        How many of the first columns hold words; the others are aligned right.
+
+    Returns
+    -------
+    Table
+        To which rows are added.
+    """
+    made = Table(
+        title=title or None,
+        title_justify="left",
+        title_style="bold",
+        box=box.SIMPLE_HEAD,
+        pad_edge=False,
+    )
+    for k, column in enumerate(columns):
+        made.add_column(column, justify="left" if k < left else "right", no_wrap=True)
+    return made
+
+
+def estimate_table(estimate: Estimate) -> Table:
+    """Return what is known of one motor."""
+    fit = estimate.fit_percent
+    told = [f"{words.label(estimate.wheel)}: {words.model(estimate.model)}"]
+    if fit.estimation is not None:
+        told.append(f"fit {fit.estimation:.2f} %")
+    if fit.validation is not None:
+        told.append(f"held out {fit.validation:.2f} %")
+    made = table(", ".join(told), "quantity", "value", "std", "95 % interval", "unit", "status")
+    made.columns[4].justify = made.columns[5].justify = "left"
+    for name, quantity in {**estimate.combinations, **estimate.parameters}.items():
+        made.add_row(*quantity_cells(name, quantity))
+    return made
+
+
+def quantity_cells(name: str, quantity: Quantity) -> Sequence[str | Text]:
+    """Return one quantity as the cells of a row."""
+    interval = "—"
+    if quantity.ci95 is not None:
+        low, high = (words.number(bound, quantity.std) for bound in quantity.ci95)
+        interval = f"{low} … {high}"
+    return (
+        name,
+        words.number(quantity.value, quantity.std),
+        words.spread(quantity.std),
+        interval,
+        quantity.unit,
+        Text(words.status(quantity), style=_COLOR[quantity.status]),
+    )

@@ -1,0 +1,135 @@
+"""The arguments of tune, and the loop that they describe."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from smp_motor_ident.bag.transport import TransportDelay
+from smp_motor_ident.cli import frame
+from smp_motor_ident.errors import ParameterError
+from smp_motor_ident.result import Estimate
+from smp_motor_ident.tune import METHODS, Loop
+from smp_motor_ident.tune.loop import SPEED_SOURCES
+
+TARGETS = (
+    "phase_margin",
+    "maximum_sensitivity",
+    "focus",
+    "bandwidth",
+    "structure",
+    "closed_loop_time_constant",
+    "natural_frequency",
+    "damping",
+    "relay_amplitude",
+    "rule",
+    "max_velocity",
+    "max_acceleration",
+    "transition_time",
+)
+
+
+DEFAULT_RATE = 200.0
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the tool's arguments."""
+    p = frame.Parser(prog="tune", description="Design gains that hold on the loop that will run.")
+    p.add_argument(
+        "source", type=Path, nargs="?", help="identification.json, its folder, or motors.yaml"
+    )
+    p.add_argument(
+        "--output", type=Path, help="parameter file to write; gains.json and a figure go beside it"
+    )
+    p.add_argument("--method", default="margin", help=", ".join(METHODS))
+    p.add_argument("--compare", action="store_true", help="show every method; take the recommended")
+    loop = p.add_argument_group("the loop that will run")
+    loop.add_argument("--rate", type=float, help="steps per second [Hz]; else that of the bag")
+    loop.add_argument(
+        "--delay", type=float, help="measurement to voltage, beyond the hold [s]; else one sample"
+    )
+    loop.add_argument(
+        "--bag", type=Path, help="measure both delays: a bag with motor_state and motor_command "
+        "of the driving wheels",
+    )  # fmt: skip
+    loop.add_argument("--usual-delay", type=float, help="what it usually is [s]; else --delay")
+    loop.add_argument(
+        "--speed-source", choices=("auto", *SPEED_SOURCES), default="auto",
+        help="auto compares what each allows, and says why",
+    )  # fmt: skip
+    loop.add_argument("--difference-window", type=int, default=1, help="[samples]")
+    loop.add_argument("--gear-ratio", type=float, help="else as identified")
+    loop.add_argument("--counts-per-revolution", type=float, help="else as identified")
+    loop.add_argument("--supply", type=float, help="[V]; else as identified")
+    aim = p.add_argument_group("what to aim at")
+    aim.add_argument("--phase-margin", type=float, help="[deg], 60")
+    aim.add_argument("--maximum-sensitivity", type=float, help="Ms, 1.4")
+    aim.add_argument("--focus", choices=("balanced", "tracking", "load"))
+    aim.add_argument("--bandwidth", type=float, help="crossover [rad/s]")
+    aim.add_argument("--structure", choices=("pi", "pid"))
+    aim.add_argument("--closed-loop-time-constant", type=float, help="[s], of simc and lambda")
+    aim.add_argument("--natural-frequency", type=float, help="[rad/s], of pole_placement")
+    aim.add_argument("--damping", type=float, help="of pole_placement, 0.8")
+    aim.add_argument("--max-velocity", type=float, help="[rad/s, wheel]")
+    aim.add_argument("--max-acceleration", type=float, help="[rad/s^2, wheel]")
+    aim.add_argument("--transition-time", type=float, help="of a change of set-point [s]")
+    p.add_argument(
+        "--alone", action="store_true",
+        help="each wheel as fast as its own voltage allows, instead of all together",
+    )  # fmt: skip
+    p.add_argument("--sets", choices=("auto", "one", "each"), default="auto",
+                   help="one set of gains for all wheels, or one each")  # fmt: skip
+    p.add_argument(
+        "--apply",
+        action="store_true",
+        help="set the gains in the running wheels, watch, take them back if a loop misbehaves",
+    )
+    p.add_argument(
+        "--gains", type=Path, help="with --apply and without a source: gains of this file"
+    )
+    p.add_argument("--watch", type=float, default=3.0, help="trial after --apply [s]")
+    relay = p.add_argument_group("relay feedback on a running wheel, without a model")
+    relay.add_argument("--relay", metavar="WHEEL", help="make it oscillate, and tune from that")
+    relay.add_argument("--relay-amplitude", type=float, help="[V]; a quarter of the supply")
+    relay.add_argument("--relay-hysteresis", type=float, default=0.05, help="[rad/s, wheel]")
+    relay.add_argument("--relay-seconds", type=float, default=4.0)
+    relay.add_argument("--rule", choices=("tyreus_luyben", "ziegler_nichols"))
+    p.add_argument("--force", action="store_true", help="replace files that exist")
+    return p
+
+
+def loop_for(
+    estimate: Estimate, arguments: argparse.Namespace, measured: TransportDelay | None = None
+) -> Loop:
+    """Return the loop of one wheel: what the user says, else what the bag knew."""
+    hardware = estimate.hardware
+    supply = _first(arguments.supply, hardware.supply_voltage)
+    if supply is None:
+        raise ParameterError(
+            f"{arguments.source}: {estimate.wheel}: the supply voltage is not known; give --supply"
+        )
+    if arguments.rate is not None and not arguments.rate > 0:
+        raise ParameterError(f"--rate is {arguments.rate}; it must be positive")
+    if arguments.rate is not None:
+        sample_time = 1.0 / arguments.rate
+    else:
+        sample_time = estimate.sample_time or 1.0 / DEFAULT_RATE
+    usual, longest = (None, None) if measured is None else measured.until_applied(sample_time)
+    if arguments.delay is not None:
+        usual = None  # it is the longest, which nothing measured may pass
+    return Loop(
+        sample_time=sample_time,
+        delay=_first(arguments.delay, longest),
+        usual_delay=_first(arguments.usual_delay, usual),
+        gear_ratio=_first(arguments.gear_ratio, hardware.gear_ratio) or 0.0,
+        counts_per_revolution=_first(
+            arguments.counts_per_revolution, hardware.counts_per_revolution
+        ),
+        supply_voltage=supply,
+        speed_source="measured" if arguments.speed_source == "auto" else arguments.speed_source,
+        difference_window=arguments.difference_window,
+    )
+
+
+def _first(given: float | None, identified: float | None) -> float | None:
+    return identified if given is None else given

@@ -1,0 +1,137 @@
+"""Results of the demo against the known truth: a table per wheel, and what must hold."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from smp_motor_control.motor.file import MotorEntry
+from smp_motor_ident.cli.driving import Answer
+from smp_motor_ident.cli.tables import console, table
+from smp_motor_ident.report import words
+from smp_motor_ident.result import Estimate, Quantity
+
+MOST_OVERSHOOT = 2.0  # percent of the change
+MOST_SETTLING = 1.0  # s: the manoeuvres take longer
+MOST_GAIN_ERROR = 0.5  # percent
+MOST_DEVIATIONS = 3.0  # of its own standard deviations, for every parameter of a wheel
+WORST_DEVIATIONS = 4.0
+# Of 40 numbers, of which some 26 are independent, one lies beyond 3 by chance in one run of 15
+# (and beyond 4 in one of 600): so one wheel may, and none may beyond 4.
+
+
+GAINS = ("p", "i", "d", "feedforward_static", "feedforward_velocity", "feedforward_acceleration")
+"""What is printed of a controller."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """One thing that the demo must show: the worst figure, its limit, and where it occurred."""
+
+    name: str
+    worst: float
+    limit: float
+    where: str
+    unit: str
+
+    @property
+    def holds(self) -> bool:
+        """Whether the figure exists and is within its limit."""
+        return self.worst <= self.limit
+
+
+def true_quantities(entry: MotorEntry) -> dict[str, float]:
+    """Return all that can be compared with an estimate."""
+    motor = entry.parameters
+    names = ("dc_gain", "time_constant", "time_constant_product", "static_voltage")
+    truth = {name: float(getattr(motor, name)) for name in names}
+    if entry.knows_current:
+        physical = ("resistance", "inductance", "motor_constant", "inertia")
+        physical += ("viscous_friction", "coulomb_friction")  # type: ignore[assignment]
+        truth |= {name: float(getattr(motor, name)) for name in physical}
+    return truth
+
+
+def _compared(entry: MotorEntry, estimate: Estimate) -> list[tuple[str, float, Quantity]]:
+    """Return name, truth and estimate of every quantity that the estimate claims to know."""
+    held = {**estimate.combinations, **estimate.parameters}
+    truth = true_quantities(entry)
+    return [(n, t, held[n]) for n, t in truth.items() if n in held and held[n].value is not None]
+
+
+def show(
+    truth: Mapping[str, MotorEntry],
+    estimates: Mapping[str, Estimate],
+    gains: Mapping[str, Mapping[str, Any]],
+    answers: Mapping[str, Sequence[Answer]],
+) -> None:
+    """Print one table per wheel."""
+    out = console()
+    for wheel in estimates:
+        estimate = estimates[wheel]
+        title = f"{words.label(wheel)}: {words.model(estimate.model)}"
+        made = table(title, "", "true", "identified", "std", "error/std", "unit")
+        made.columns[5].justify = "left"
+        for name, true, quantity in _compared(truth[wheel], estimate):
+            std = quantity.std or 0.0
+            error = (quantity.value or 0.0) - true
+            made.add_row(
+                name,
+                words.number(true),
+                words.number(quantity.value, quantity.std),
+                words.spread(quantity.std) if quantity.status == "estimated" else "given",
+                f"{error / std:+.1f}" if std else "",
+                quantity.unit,
+            )
+        mine = gains[f"/{wheel}/wheel_pid"]
+        told = ", ".join(f"{n} {mine[n]:.4g}" for n in GAINS if mine.get(n))
+        driven = table("", "manoeuvre", "from", "to", "rise", "settling", "overshoot")
+        for one in answers[wheel]:
+            times = (f"{1e3 * seconds:.0f} ms" for seconds in (one.rise, one.settling))
+            overshoot = f"{one.overshoot:.2f} %"
+            driven.add_row(
+                one.segment, f"{one.before:+.2f}", f"{one.after:+.2f} rad/s", *times, overshoot
+            )
+        out.print(made)
+        out.print(f"gains (volts, wheel rad/s): {told}", soft_wrap=True)
+        out.print(driven)
+
+
+def check(
+    truth: Mapping[str, MotorEntry],
+    estimates: Mapping[str, Estimate],
+    answers: Mapping[str, Sequence[Answer]],
+) -> list[Check]:
+    """Hold the results against the limits."""
+    gain, deviation, over, settled = [], [], [], []
+    beyond = set()
+    for wheel in estimates:
+        for name, true, quantity in _compared(truth[wheel], estimates[wheel]):
+            error = abs((quantity.value or math.nan) - true)
+            if name == "dc_gain":
+                gain.append((100.0 * error / true, wheel))
+            if quantity.status == "estimated":
+                deviations = error / (quantity.std or 1e-300)
+                deviation.append((deviations, f"{wheel} {name}"))
+                if not deviations <= MOST_DEVIATIONS:
+                    beyond.add(wheel)
+        for answer in answers[wheel]:
+            over.append((answer.overshoot, f"{wheel} {answer.segment}"))
+            settled.append((answer.settling, f"{wheel} {answer.segment}"))
+    return [
+        _worst("error of the DC gain", gain, MOST_GAIN_ERROR, "%"),
+        _worst("error of a parameter", deviation, WORST_DEVIATIONS, "standard deviations"),
+        Check("wheels with an error beyond 3", len(beyond), 1, ", ".join(beyond) or "-", "wheels"),
+        _worst("overshoot", over, MOST_OVERSHOOT, "%"),
+        _worst("settling time", settled, MOST_SETTLING, "s"),
+    ]
+
+
+def _worst(name: str, found: Sequence[tuple[float, str]], limit: float, unit: str) -> Check:
+    """Return the largest figure; one that does not exist (NaN), or none at all, is worst."""
+    figure, where = max(
+        found, key=lambda one: math.inf if math.isnan(one[0]) else one[0], default=(math.nan, "-")
+    )
+    return Check(name, figure, limit, where, unit)

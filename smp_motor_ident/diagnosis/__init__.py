@@ -1,0 +1,1 @@
+"""What data and results are worth: checks before, tests after, advice."""

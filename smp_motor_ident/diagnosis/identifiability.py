@@ -1,0 +1,292 @@
+"""What the data can and cannot tell, and what to record next.
+
+Structural: the rank of the sensitivities, scaled so that units do not matter.  Practical:
+certainty against value.  Both come from the Fisher information of the fitted model, which
+also tells, before anything is recorded, what an excitation would teach.
+Derivation: docs/derivations.md, section 11.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smp_motor_ident.estimation import replay
+from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.likelihood import recursion as rc
+from smp_motor_ident.likelihood.experiments import prepare
+from smp_motor_ident.model import structures as models
+from smp_motor_ident.model.structures import PHYSICAL, Structure
+from smp_motor_ident.record import Hardware, Record
+from smp_motor_ident.result import Estimate
+
+Array = NDArray[np.float64]
+
+AMPLITUDES = (0.4, 0.7, 1.0)
+SHARES = (0.97, 0.7, 0.3, 0.03)  # of a0 that K may be, where the current was not measured
+LARGEST_RESISTANCE = 15.0  # [ohm] allowed for where it is not known either
+SPREADS = (0.5, 2.0, 6.0)
+TRIAL = 10.0
+
+
+@dataclass(frozen=True, eq=False)
+class Rank:
+    """Structural identifiability of a set of parameters.
+
+    Attributes
+    ----------
+    singular_values : ndarray
+        Of the sensitivities by the logarithms of the parameters, largest 1.
+    rank : int
+        Of them above ``tolerance``.
+    blind : tuple of dict
+        Directions in which the response does not change: parameter to exponent.
+    """
+
+    singular_values: Array
+    rank: int
+    blind: tuple[Mapping[str, float], ...]
+
+
+def structural(
+    parameters: Mapping[str, float],
+    current: bool,
+    fixed: Sequence[str] = (),
+    tolerance: float = 1e-7,
+) -> Rank:
+    """Return which parameters of the linear motor its signals can separate at all.
+
+    ``w/v`` shows ``a0, a1, a2``; with current ``i/v = (J s + b)/(K ...)`` shows all five.
+
+    Parameters
+    ----------
+    parameters : mapping of str to float
+        R, L, K, J, b by the names of `models.PHYSICAL`.
+    current : bool
+        Whether the current is measured.
+    fixed : sequence of str
+        Parameters known beforehand.
+    tolerance : float
+        Below it a singular value counts as zero.
+
+    Returns
+    -------
+    Rank
+        By the logarithms of the free parameters, so without units.
+    """
+    names = [n for n in PHYSICAL[:5] if n not in fixed]
+    frequency = np.asarray(2 * np.pi * np.geomspace(0.05, 50, 40), dtype=np.float64)
+    base = np.log([parameters[n] for n in names])
+    rows = []
+    for j in range(len(names)):
+        sides = []
+        for sign in (1, -1):
+            x = base.copy()
+            x[j] += sign * 1e-5
+            sides.append(
+                _response({**parameters, **dict(zip(names, np.exp(x)))}, frequency, current)
+            )
+        rows.append((sides[0] - sides[1]) / 2e-5)
+    _, s, vt = np.linalg.svd(np.array(rows).T, full_matrices=False)
+    s = s / s[0]
+    rank = int((s > tolerance).sum())
+    blind = tuple(
+        {n: float(v) for n, v in zip(names, vt[k]) if abs(v) > 0.02} for k in range(rank, len(s))
+    )
+    return Rank(s, rank, blind)
+
+
+def _response(p: Mapping[str, float], frequency: Array, current: bool) -> Array:
+    """Return logarithms of gain and phase over frequency, stacked."""
+    s = 1j * frequency
+    r, el, k = p["resistance"], p["inductance"], p["motor_constant"]
+    j, b = p["inertia"], p["viscous_friction"]
+    below = (el * s + r) * (j * s + b) + k * k
+    parts = [np.log(k / below)]
+    if current:
+        parts.append(np.log((j * s + b) / below))
+    out = np.concatenate(parts)
+    return np.concatenate([out.real, np.unwrap(out.imag)])
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """An excitation that would bring a quantity to a wanted accuracy.
+
+    Attributes
+    ----------
+    amplitude : float
+        [V].
+    band : tuple of float
+        Lowest and highest frequency [Hz] of a Fourier voltage with incommensurate tones.
+    duration : float
+        [s].
+    relative_std : mapping of str to float
+        What it would leave uncertain, as a fraction of the value.
+    measure_current : bool
+        Whether the current must be recorded for it.
+    words : str
+        The advice in one sentence.
+    """
+
+    amplitude: float
+    band: tuple[float, float]
+    duration: float
+    relative_std: Mapping[str, float]
+    measure_current: bool
+    words: str
+
+
+def what_next(
+    estimate: Estimate,
+    accuracy: float = 0.01,
+    supply: float | None = None,
+    longest: float = 600.0,
+    current_noise: float = 0.01,
+) -> Proposal:
+    """Propose the excitation that would bring every parameter to a wanted accuracy.
+
+    Several amplitudes and bands are simulated with the estimated motor; the Fisher
+    information of each, which grows in proportion to the length, tells how long it must be.
+    Where the current was not measured a family of motors answers the same: the promise holds
+    for the least favourable of them whose back-EMF is at least 3 % of what limits the speed.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        Of the motor, so far.
+    accuracy : float
+        Wanted relative standard deviation.
+    supply : float, optional
+        Largest voltage [V]; by default that of the hardware, else 12 V.
+    longest : float
+        Longest acceptable recording [s].
+    current_noise : float
+        Of the current sensor [A], where the current is not measured yet.
+
+    Returns
+    -------
+    Proposal
+        The shortest one that suffices, or the best one of length ``longest``.
+    """
+    limit = supply or estimate.hardware.supply_voltage or 12.0
+    family, needs_current = _family(estimate, current_noise)
+    step = estimate.sample_time or 0.005
+    corner = 1 / (2 * np.pi * max(estimate.value("time_constant"), 4 * step))
+    best: Proposal | None = None
+    for share in AMPLITUDES:
+        for spread in SPREADS:
+            band = (max(0.05, 0.1 * corner), min(corner * spread, 0.4 / step))
+            record = _trial(share * limit, band, step, estimate.hardware)
+            relative = _least_certain(record, family)
+            length = TRIAL * (max(relative.values()) / accuracy) ** 2
+            duration = float(np.clip(length, 5.0, longest))
+            after = {n: v * float(np.sqrt(TRIAL / duration)) for n, v in relative.items()}
+            words = _words(share * limit, band, duration, needs_current, after, accuracy)
+            made = Proposal(share * limit, band, duration, after, needs_current, words)
+            if best is None or _cost(made, accuracy) < _cost(best, accuracy):
+                best = made
+    assert best is not None
+    return best
+
+
+def _cost(p: Proposal, accuracy: float) -> tuple[float, float, float]:
+    return (max(0.0, max(p.relative_std.values()) / accuracy - 1.0), p.duration, p.amplitude)
+
+
+def _family(estimate: Estimate, current_noise: float) -> tuple[list[Fit], bool]:
+    """Return the motors that answer as the estimated one does, and whether current is lacking."""
+    known = {n: q.value for n, q in estimate.parameters.items() if n in PHYSICAL}
+    told = known.get("resistance") or estimate.hardware.resistance
+    r = told or LARGEST_RESISTANCE
+    z = np.zeros(11)
+    gain, tau = estimate.value("dc_gain"), estimate.value("time_constant")
+    product = estimate.value("time_constant_product") or 0.02 * tau**2
+    z[models.A0] = -np.log(gain)
+    z[models.A1] = np.log(tau / gain)
+    z[models.A2] = np.log(product / gain)
+    z[models.LN_R] = np.log(r)
+    z[models.VC_PLUS] = z[models.VC_MINUS] = estimate.value("static_voltage")
+    friction = "symmetric" if z[models.VC_PLUS] > 0 else "none"
+    structure = Structure("electromechanical", 2, friction, current=True)
+    turn = estimate.hardware.counts_per_revolution
+    noise = np.diag([(2 * np.pi / turn) ** 2 / 12 if turn else 1e-4, current_noise**2])
+    f = len(structure.free())
+    fits = []
+    for te in _electric(estimate, z):
+        z = z.copy()
+        z[models.TE] = np.log(te)
+        fits.append(
+            Fit(structure, z, np.zeros((1, 4)), noise, 0.0, np.zeros((3, 2)), 0.0, 0.0, np.eye(f),
+                np.zeros((0, f)), 0, True, 0, rc.ANGLE)
+        )  # fmt: skip
+    return fits, not estimate.model.startswith("electromechanical")
+
+
+def _electric(estimate: Estimate, z: Array) -> list[float]:
+    """Return L/R, or the values of it that the response leaves open: be = a1/te - a2/te^2."""
+    inductance, r = estimate.value("inductance"), estimate.value("resistance")
+    if inductance > 0 and r > 0:
+        return [inductance / r]
+    a0, a1, a2 = np.exp(z[:3])
+    out = []
+    for share in SHARES:
+        be = (1 - share) * a0
+        roots = np.roots([be, -a1, a2])
+        real = roots[np.abs(roots.imag) < 1e-9 * np.abs(roots)].real
+        out += [float(te) for te in real if te > 0]
+    return out or [float(1.1 * a2 / a1)]
+
+
+def _trial(amplitude: float, band: tuple[float, float], step: float, hardware: Hardware) -> Record:
+    t = np.arange(int(TRIAL / step), dtype=np.float64) * step
+    tones = np.geomspace(*band, 16) * (1 + 0.013 * np.sin(np.arange(16) * 2.399))
+    phases = np.pi * np.arange(16) ** 2 / 16
+    v = np.cos(2 * np.pi * np.outer(t, tones) + phases).sum(axis=1)
+    v *= amplitude / np.abs(v).max()
+    return Record("trial", t, v, np.zeros(len(t)), None, np.zeros(len(t)), hardware=hardware)
+
+
+def _least_certain(record: Record, family: Sequence[Fit]) -> dict[str, float]:
+    """Return the largest relative standard deviation of each parameter over a family."""
+    each = [_relative_std(record, fit) for fit in family]
+    return {n: max(one[n] for one in each) for n in each[0]}
+
+
+def _relative_std(record: Record, fit: Fit) -> dict[str, float]:
+    data = replace(prepare([record], True), kind=rc.ANGLE)
+    information = replay.information(data, fit)
+    cov = replace(fit, information=information).covariance()
+    values, gradients = models.physical(fit.z)
+    matrix = fit.structure.matrix()
+    out = {}
+    for name in PHYSICAL:
+        if name == "coulomb_friction" and fit.structure.friction == "none":
+            continue
+        row = gradients[name] @ matrix
+        scale = abs(values[name]) or 1.0
+        if name == "viscous_friction":  # often next to nothing: against what turns the motor
+            scale = max(scale, 0.05 * values["motor_constant"] ** 2 / values["resistance"])
+        out[name] = float(np.sqrt(row @ cov @ row) / scale)
+    return out
+
+
+def _words(
+    amplitude: float,
+    band: tuple[float, float],
+    duration: float,
+    needs_current: bool,
+    after: Mapping[str, float],
+    accuracy: float,
+) -> str:
+    worst = max(after, key=lambda n: after[n])
+    reached = "every parameter" if after[worst] <= 1.001 * accuracy else f"all but {worst}"
+    return (
+        f"record {duration:.0f} s of a Fourier voltage of {amplitude:.3g} V peak with tones from "
+        f"{band[0]:.2g} to {band[1]:.2g} Hz in both directions"
+        + (", with the motor current measured" if needs_current else "")
+        + f": {reached} would be known within {accuracy:.2%} ({worst} to {after[worst]:.2%})"
+    )

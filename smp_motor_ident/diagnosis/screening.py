@@ -1,0 +1,333 @@
+"""Bad data named for what it is, before any number is made of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smp_motor_ident.errors import InsufficientExcitationError, SignalError
+from smp_motor_ident.record import Record
+
+Array = NDArray[np.float64]
+
+FEWEST = 40
+MOST_LOST = 0.3
+RUNS = 2_000  # runs of samples in which signals are averaged before they are compared
+RUN_COLOUR = 20.0  # by which neighbouring runs' errors hang together, at most
+SURE = 6.0  # standard deviations of an offset
+LARGEST_OFFSET = 0.2  # of the largest current otherwise
+METER = 0.01  # of the supply, or of a level: what a voltmeter may scatter
+
+
+def screen(records: Sequence[Record]) -> list[str]:
+    """Refuse records that cannot lead to a right answer; name the reason and the remedy.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        Of one motor.
+
+    Returns
+    -------
+    list of str
+        Warnings about what can be lived with.
+
+    Raises
+    ------
+    SignalError
+        When signals contradict each other or physics: lost samples, dead encoder, swapped
+        sign, wrong ratio between counts and speed, saturated sensor.
+    InsufficientExcitationError
+        When the voltage or the motion does not suffice.
+    """
+    warnings: list[str] = []
+    where = _where(records)
+    _length(records, where)
+    for record in records:
+        warnings += _lost(record)
+    _excitation(records, where)
+    for record in records:
+        _saturation(record)
+        _ratio(record)
+        _frozen(record)
+    _motion(records, where)
+    _signs(records, where)
+    for record in records:
+        _offset(record)
+    return list(dict.fromkeys(warnings))
+
+
+def _where(records: Sequence[Record]) -> str:
+    sources = ", ".join(dict.fromkeys(r.source for r in records if r.source))
+    return f"{sources or 'record'}: {records[0].wheel}"
+
+
+def _length(records: Sequence[Record], where: str) -> None:
+    samples = sum(len(r) for r in records)
+    if samples < FEWEST:
+        duration = sum(r.duration for r in records)
+        raise InsufficientExcitationError(
+            f"{where}: too short, {samples} samples in {duration:.3g} s; record at least "
+            f"{FEWEST} samples, better 20 s or more with the voltage changing all the time"
+        )
+
+
+def _lost(record: Record) -> list[str]:
+    where = _where([record])
+    out = []
+    for name in ("velocity", "position"):
+        values = getattr(record, name)
+        if values is None or (record.count is not None and record.hardware.counts_per_revolution):
+            continue
+        lost = float(np.mean(~np.isfinite(values)))
+        if lost > MOST_LOST and (name == "velocity" or record.velocity is None):
+            raise SignalError(
+                f"{where}: {name} is NaN in {lost:.0%} of the samples; "
+                "repair the sensor or its connection and record again"
+            )
+        if lost > 0:
+            out.append(f"{name} is NaN in {lost:.1%} of the samples; they were left out")
+    if record.current is not None:
+        lost = float(np.mean(~np.isfinite(record.current)))
+        if 0 < lost < 1:
+            out.append(f"current is NaN in {lost:.1%} of the samples; they were left out")
+    return out
+
+
+def _excitation(records: Sequence[Record], where: str) -> None:
+    largest = max(float(np.abs(r.voltage).max()) for r in records)
+    supply = max(r.hardware.supply_voltage or 0.0 for r in records)
+    if largest <= METER * supply:
+        raise InsufficientExcitationError(
+            f"{where}: no excitation, the voltage stays within {largest:.3g} V of 0 V; drive the "
+            "motor with a sine, square or Fourier voltage while recording"
+        )
+    # What a voltmeter scatters around a level is no excitation; a step is, for it is no scatter.
+    levels = [float(np.mean(r.voltage)) for r in records]
+    still = [
+        float(np.std(r.voltage)) < METER * abs(level)
+        and float(np.ptp(r.voltage)) < 10 * METER * abs(level)
+        for r, level in zip(records, levels, strict=True)
+    ]
+    if all(still) and float(np.ptp(levels)) < METER * abs(levels[0]):
+        raise InsufficientExcitationError(
+            f"{where}: the voltage is constant at {levels[0]:.4g} V; a constant "
+            "input cannot tell dynamics: record a square or Fourier voltage in both directions"
+        )
+
+
+def measured_speed(record: Record) -> Array:
+    """Return the best speed at hand: from counts, angle, or as recorded."""
+    per_turn = record.hardware.counts_per_revolution
+    if record.count is not None and per_turn:
+        angle = record.count * (2 * np.pi / per_turn)
+    elif record.velocity is not None:
+        return record.velocity
+    elif record.position is not None:
+        angle = record.position
+    else:
+        return np.full(len(record), np.nan)
+    speed = np.full(len(record), np.nan)
+    speed[1:] = np.diff(angle) / np.diff(record.time)
+    speed[list(record.starts)] = np.nan
+    return speed
+
+
+def _ratio(record: Record) -> None:
+    """Hold what tells the motion against one another: their ratio is one, or something is wrong."""
+    per_turn = record.hardware.counts_per_revolution
+    angle, what = record.position, "position"
+    if record.count is not None and per_turn:
+        angle = np.asarray(record.count * (2 * np.pi / per_turn), dtype=np.float64)
+        what = "encoder counts"
+        if record.position is not None:
+            _compare(record, angle, what, record.position, "position")
+    if angle is not None and record.velocity is not None:
+        charge = np.cumsum(record.velocity[1:] * np.diff(record.time))
+        _compare(record, angle, what, np.concatenate([[0.0], charge]), "velocity")
+
+
+def _compare(record: Record, angle: Array, what: str, told: Array, other: str) -> None:
+    where = _where([record])
+    lag = max(1, min(10, len(record) // 10))
+    dt = record.time[lag:] - record.time[:-lag]
+    a, b = (angle[lag:] - angle[:-lag]) / dt, (told[lag:] - told[:-lag]) / dt
+    ok = np.isfinite(a) & np.isfinite(b)
+    for s in record.starts[1:]:
+        ok[max(0, s - lag) : s] = False
+    a, b = a[ok], b[ok]
+    if a.size < 20 or b.std() == 0:
+        return
+    if not np.any(a):
+        raise SignalError(
+            f"{where}: dead encoder, the {what} stays while the {other} "
+            f"reaches {np.abs(b).max():.3g} rad/s; check the encoder's cable"
+        )
+    slope = float(a @ b / (a @ a))
+    together = float(a @ b / np.sqrt((a @ a) * (b @ b)))
+    if together < -0.5:
+        raise SignalError(
+            f"{where}: {what} runs against the {other} (swapped sign); exchange the "
+            f"encoder's channels A and B or the sign of the {other}"
+        )
+    if together > 0.9 and not 0.95 < slope < 1.05:
+        raise SignalError(
+            f"{where}: {other} is {slope:.4g} times what the {what} says; wrong gear "
+            f"ratio (now {record.hardware.gear_ratio:g}) or counts per revolution (now "
+            f"{record.hardware.counts_per_revolution or 0:g}), correct the motor description"
+        )
+
+
+def _saturation(record: Record) -> None:
+    """Refuse a speed or current that rests at its limit while the voltage moves."""
+    where = _where([record])
+    for name, unit in (("velocity", "rad/s"), ("current", "A")):
+        values = getattr(record, name)
+        if values is None:
+            continue
+        ok = np.isfinite(values)
+        x, v = values[ok], record.voltage[ok]
+        if x.size < 50 or np.unique(x).size < 20:
+            continue
+        for limit in (x.max(), x.min()):
+            at = x == limit
+            if limit == 0.0:
+                continue
+            share = float(at.mean())
+            levels, times = np.unique(x, return_counts=True)
+            next_times = times[-2] if limit == levels[-1] else times[1]
+            runs = at[1:] & at[:-1]
+            # A resting sensor shows its limit far more often than the level beside it.
+            if share < 0.01 or at.sum() < 5 * next_times or runs.sum() < 0.5 * at.sum():
+                continue
+            low, high = np.percentile(v[at], [5, 95])
+            if high - low < 0.02 * np.ptp(v) and not _abrupt(x, at):
+                continue
+            raise SignalError(
+                f"{where}: saturated sensor, {name} rests at {limit:.4g} {unit} in "
+                f"{share:.1%} of the samples while the voltage moves; widen its range or "
+                "lower the excitation"
+            )
+
+
+def _abrupt(x: Array, at: NDArray[np.bool_]) -> bool:
+    """Tell a clipped signal from one that settles: it jumps to its limit, scatters elsewhere."""
+    enters = np.flatnonzero(at[1:] & ~at[:-1]) + 1
+    rest = x[(x != x.max()) & (x != x.min())]
+    if not enters.size or np.unique(rest).size < 0.5 * rest.size:
+        return False
+    return bool(np.median(np.abs(x[enters] - x[enters - 1])) > 1e-3 * np.ptp(x))
+
+
+def _frozen(record: Record) -> None:
+    """Refuse a sensor that stops half-way while the voltage goes on."""
+    for name in ("count", "position", "velocity"):
+        values = getattr(record, name)
+        if values is None or len(record) < 200:
+            continue
+        # A speed may well be constant; only at zero does it say that nothing turns.
+        moves = values != 0 if name == "velocity" else np.diff(values, prepend=np.nan) != 0
+        edges = np.concatenate([[0], np.flatnonzero(moves), [len(record) - 1]])
+        longest = int(np.argmax(np.diff(edges)))
+        a, b = int(edges[longest]), int(edges[longest + 1])
+        if b - a < max(100, 0.1 * len(record)):
+            continue
+        still, rest = record.voltage[a + 1 : b], np.delete(record.voltage, np.arange(a, b))
+        if np.abs(still).mean() > 0.5 * np.abs(rest).mean():
+            raise SignalError(
+                f"{_where([record])}: dead encoder, the {name} stays at {values[a + 1]:.6g} from "
+                f"t = {record.time[a]:.4g} s to {record.time[b]:.4g} s while the voltage reaches "
+                f"{np.abs(still).max():.3g} V; check the encoder's cable, or that nothing "
+                "blocks the motor"
+            )
+
+
+def _motion(records: Sequence[Record], where: str) -> None:
+    moved = [
+        np.nanmax(np.abs(s)) if np.isfinite(s).any() else 0.0 for s in map(measured_speed, records)
+    ]
+    largest = max(float(np.abs(r.voltage).max()) for r in records)
+    counts = [int(np.ptp(r.count)) for r in records if r.count is not None]
+    if max(moved) == 0.0:
+        raise SignalError(
+            f"{where}: dead encoder or a motor that does not turn: the output stays constant "
+            f"while the voltage reaches {largest:.3g} V; check the encoder, or drive harder"
+        )
+    if counts and len(counts) == len(records) and max(counts) < 20:
+        raise InsufficientExcitationError(
+            f"{where}: the motor moved by {max(counts)} encoder counts only; "
+            "excite with more voltage or for longer"
+        )
+
+
+def _signs(records: Sequence[Record], where: str) -> None:
+    """Refuse speed or current that answers the voltage with the wrong sign."""
+    for what, remedy in (
+        ("speed", "swap the motor's leads or the encoder's channels"),
+        ("current", "swap the current sensor's sign"),
+    ):
+        total = power = 0.0
+        for record in records:
+            y = measured_speed(record) if what == "speed" else record.current
+            if y is None:
+                continue
+            ok = np.isfinite(y)
+            if ok.sum() < 20:
+                continue
+            v, x = _averaged(record, y)
+            together = float(np.einsum("i,i->", v, x))
+            total += together if what == "current" else _slow_product(v, x)
+            power += float(np.sqrt(np.square(v).sum() * np.square(x).sum()))
+        if power > 0 and total < -0.2 * power:
+            raise SignalError(
+                f"{where}: swapped sign, {what} runs against the voltage "
+                f"(correlation {total / power:.2f}); {remedy}"
+            )
+
+
+def _averaged(record: Record, values: Array) -> tuple[Array, Array]:
+    """Return voltage and a signal as means over short runs, in which a counter's noise is small."""
+    k = max(1, len(record) // RUNS)
+    n = len(record) // k * k
+    ok = np.isfinite(values[:n]).reshape(-1, k)
+    y = np.where(ok, values[:n].reshape(-1, k), 0.0).sum(axis=1) / np.maximum(ok.sum(axis=1), 1)
+    keep = ok.any(axis=1)
+    return record.voltage[:n].reshape(-1, k).mean(axis=1)[keep], y[keep]
+
+
+def _offset(record: Record) -> None:
+    """Refuse a current that is not nothing where ``(v - K w) / R`` is.
+
+    Friction and load have no part in this: the electric equation does not know them.
+    """
+    if record.current is None or np.isfinite(record.current).sum() < FEWEST:
+        return
+    speed = measured_speed(record)
+    there = np.isfinite(record.current) & np.isfinite(speed)
+    v, i = _averaged(record, np.where(there, record.current, np.nan))
+    _, w = _averaged(record, np.where(there, speed, np.nan))
+    if len(v) < 20:
+        return
+    columns = np.column_stack([v, w, np.ones(len(v))])
+    answer, _, rank, _ = np.linalg.lstsq(columns, i, rcond=1e-8)
+    if rank < 3:
+        return
+    rest = i - columns @ answer
+    normal = np.linalg.inv(np.einsum("ni,nj->ij", columns, columns))
+    std = float(np.sqrt(normal[2, 2] * rest.var() * RUN_COLOUR))
+    offset, largest = float(answer[2]), float(np.nanmax(np.abs(record.current)))
+    if abs(offset) > max(SURE * std, LARGEST_OFFSET * max(largest - abs(offset), 1e-12)):
+        raise SignalError(
+            f"{_where([record])}: current has an offset of {offset:.2g} A where it reaches "
+            f"{largest:.3g} A; zero the current sensor at rest and record again"
+        )
+
+
+def _slow_product(v: Array, y: Array) -> float:
+    """Return the largest (by size) inner product of voltage and a later speed."""
+    n = len(v)
+    lags = np.unique(np.minimum(np.geomspace(1, max(2, n // 50), 12).astype(int), n // 4)) - 1
+    products = [float(np.einsum("i,i->", v[: n - k], y[k:])) for k in lags]
+    return max(products, key=abs)

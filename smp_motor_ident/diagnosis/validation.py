@@ -1,0 +1,287 @@
+"""Validation: fit on held-out data, tests of the residuals, comparison of wheels."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+from smp_motor_ident.estimation import replay
+from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.likelihood import recursion as rc
+from smp_motor_ident.likelihood.experiments import Experiments, prepare
+from smp_motor_ident.record import Record
+from smp_motor_ident.result import Estimate, ResidualTests
+
+Array = NDArray[np.float64]
+
+COARSE = 0.02  # of the speed's scatter: what a counter's resolution may add to it
+MOST = 200_000  # samples beyond which the tests of residuals learn nothing new
+
+
+def percent(measured: Array, predicted: Array) -> float:
+    """Return the normalised fit ``100 (1 - |y - yhat| / |y - mean y|)``.
+
+    Parameters
+    ----------
+    measured, predicted : ndarray, shape (n,)
+        NaN where lost.
+
+    Returns
+    -------
+    float
+        100 is perfect, 0 is no better than the mean.
+    """
+    ok = np.isfinite(measured) & np.isfinite(predicted)
+    y, z = measured[ok], predicted[ok]
+    scatter = float(np.sqrt(np.square(y - y.mean()).sum())) if y.size else 0.0
+    if scatter == 0.0:
+        return float("nan")
+    return float(100 * (1 - np.sqrt(np.square(y - z).sum()) / scatter))
+
+
+def speed_fit(records: Sequence[Record], data: Experiments, fit: Fit) -> float:
+    """Return the fit percent of the freely simulated speed.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        What ``data`` was prepared from.
+    data : Experiments
+        With the initial states of ``fit``.
+    fit : Fit
+        The motor.
+
+    Returns
+    -------
+    float
+        Against the recorded speed; against counts or angles as mean speeds over so many
+        samples that their resolution is 2 % of the speed's scatter (one where it is fine).
+    """
+    predicted = replay.simulate(data, fit)
+    at_once = predicted[:, 1] if data.kind != rc.ANGLE else predicted[:, 0]
+    if data.kind != rc.ANGLE:
+        return percent(data.output, at_once)
+    lag = _lag(data, predicted[:, 1])
+    best = percent(_means(data, _filled(data), lag), _means(data, predicted[:, 1], lag))
+    given = [r.velocity for r in records]
+    if all(v is not None for v in given):
+        velocity = np.concatenate([v for v in given if v is not None])
+        told = percent(velocity, at_once), percent(velocity, _means(data, predicted[:, 1], 1))
+        best = max([best, *(x for x in told if np.isfinite(x))])
+    return best
+
+
+def _lag(data: Experiments, angle: Array) -> int:
+    """Return over how many samples angles tell a speed, and not mostly their resolution."""
+    y = data.output[np.isfinite(data.output)]
+    rough = np.diff(y, n=4).var() / 70 if y.size > 8 else 0.0  # fourth differences: 1 4 6 4 1
+    noise = np.sqrt(2 * max(rough, data.quantum**2 / 12))
+    first = float(np.nanstd(_means(data, angle, 1)))
+    lag = 1
+    while noise / (lag * data.step) > COARSE * first and 8 * lag < data.size:
+        if np.nanstd(_means(data, angle, 2 * lag)) < 0.7 * first:
+            break  # longer, and the motion itself would be averaged away
+        lag *= 2
+    return lag
+
+
+def _filled(data: Experiments) -> Array:
+    """Return counts with a standstill's repeats, which the fit leaves out, put back."""
+    if data.quantum == 0.0:
+        return data.output
+    last = np.maximum.accumulate(np.where(np.isfinite(data.output), np.arange(data.size), 0))
+    return np.asarray(data.output[last])
+
+
+def _means(data: Experiments, angle: Array, lag: int) -> Array:
+    speed = np.full(data.size, np.nan)
+    speed[lag:] = (angle[lag:] - angle[:-lag]) / (data.time[lag:] - data.time[:-lag])
+    for first in data.starts[:-1]:
+        speed[first : first + lag] = np.nan
+    return speed
+
+
+def held_out(records: Sequence[Record], fit: Fit, hold: str = "held") -> float:
+    """Return the fit percent on records that the fit has not seen.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        Only their initial states and constant loads are fitted.
+    fit : Fit
+        The motor.
+    hold : str
+        As in `experiments.prepare`.
+
+    Returns
+    -------
+    float
+        See `speed_fit`.
+    """
+    kind = "speed" if fit.kind != rc.ANGLE else "auto"
+    data = prepare(records, False, kind, hold)
+    if fit.kind == rc.MEAN_SPEED and data.kind == rc.SPEED:
+        data = data.as_mean_speed()
+    return speed_fit(records, data, replay.settle(data, fit))
+
+
+def split(records: Sequence[Record], share: float = 0.7) -> tuple[list[Record], list[Record]]:
+    """Divide records into a part to fit and a part to hold out.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        Of one motor.
+    share : float
+        Part to fit: whole records where there are three or more, else time.
+
+    Returns
+    -------
+    fitted, kept : list of Record
+        ``kept`` is empty where the records are too short to divide.
+    """
+    if len(records) >= 3:
+        n = max(1, round((1 - share) * len(records)))
+        kept = list(range(1, len(records), max(1, len(records) // n)))[:n]
+        return (
+            [r for i, r in enumerate(records) if i not in kept],
+            [r for i, r in enumerate(records) if i in kept],
+        )
+    fitted, kept_records = [], []
+    for record in records:
+        cut = int(share * len(record))
+        if cut < 50 or len(record) - cut < 25:
+            fitted.append(record)
+            continue
+        fitted.append(record.slice(0, cut))
+        kept_records.append(record.slice(cut, len(record)))
+    return fitted, kept_records
+
+
+def residual_tests(data: Experiments, fit: Fit, lags: int = 25) -> ResidualTests:
+    """Test the innovations for whiteness and for independence from the input.
+
+    Autocorrelations (cross-correlations with the voltage) at up to ``lags`` lags stay, with
+    95 % confidence for all of them together, inside ``+- z / sqrt(n)``.
+
+    Parameters
+    ----------
+    data : Experiments
+        What was fitted.
+    fit : Fit
+        With its innovation gain.
+    lags : int
+        How many.
+
+    Returns
+    -------
+    ResidualTests
+        Of the mechanical output.
+    """
+    residual = data.output - replay.outputs(data, fit, gain=True)
+    voltage = np.interp(data.time, data.section_end, data.section_value)
+    if len(data.starts) > 2:
+        voltage = np.concatenate(
+            [
+                np.interp(data.time[a:b], *_input_of(data, g))
+                for g, (a, b) in enumerate(zip(data.starts[:-1], data.starts[1:]))
+            ]
+        )
+    ok = np.isfinite(residual)
+    e = np.where(ok, residual - residual[ok].mean(), 0.0)[:MOST]
+    u = (voltage - voltage.mean())[:MOST]
+    n = int(ok[:MOST].sum())
+    if n < 4 * lags or e.std() == 0 or u.std() == 0:
+        return ResidualTests()
+    band = norm.ppf(1 - 0.025 / lags) / np.sqrt(n)
+    auto = _lagged(e, e, lags)
+    own = _lagged(u, u, lags)
+    # The input's own colour widens the band of the cross-correlation where e is not white.
+    cross = _lagged(e, u, lags) / np.sqrt(auto[0] * own[0])
+    auto, own = auto[1:] / auto[0], own[1:] / own[0]
+    widen = np.sqrt(max(1.0, 1 + 2 * float((auto * own).sum())))
+    return ResidualTests(
+        white=bool(np.abs(auto).max() < band),
+        independent_of_input=bool(np.abs(cross).max() < band * widen),
+    )
+
+
+def _lagged(a: Array, b: Array, lags: int) -> Array:
+    """Return the inner products of a and b, b delayed by 0 to ``lags`` samples."""
+    n = len(a)
+    return np.array([np.einsum("i,i->", a[k:], b[: n - k]) for k in range(lags + 1)])
+
+
+def _input_of(data: Experiments, g: int) -> tuple[Array, Array]:
+    first = int(data.section_start[g])
+    last = int(data.section_start[g + 1]) if g + 2 < len(data.starts) else len(data.section_end)
+    return data.section_end[first:last], data.section_value[first:last]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One quantity across wheels.
+
+    Attributes
+    ----------
+    name : str
+        Quantity.
+    mean : float
+        Over the wheels.
+    spread : float
+        Largest minus smallest over the mean.
+    outlier : str or None
+        Wheel that stands out most from the others.
+    sigmas : float
+        By how many standard deviations of the difference.
+    """
+
+    name: str
+    mean: float
+    spread: float
+    outlier: str | None
+    sigmas: float
+
+
+def compare(estimates: Mapping[str, Estimate]) -> list[Comparison]:
+    """Put wheels side by side.
+
+    Parameters
+    ----------
+    estimates : mapping of str to Estimate
+        By wheel.
+
+    Returns
+    -------
+    list of Comparison
+        For every quantity that all wheels have; ``sigmas`` compares the wheel with the
+        mean of the others, by both their uncertainties and the others' own scatter.
+    """
+    names = [n for e in estimates.values() for n in (*e.parameters, *e.combinations)]
+    out = []
+    for name in dict.fromkeys(names):
+        wheels, values, stds = [], [], []
+        for wheel, estimate in estimates.items():
+            q = estimate.combinations.get(name) or estimate.parameters.get(name)
+            if q is not None and q.value is not None and q.std is not None:
+                wheels.append(wheel)
+                values.append(q.value)
+                stds.append(q.std)
+        if len(wheels) < 2 or len(wheels) != len(estimates):
+            continue
+        v, s = np.array(values), np.array(stds)
+        sigmas = np.zeros(len(v))
+        for i in range(len(v)):
+            others = np.delete(v, i)
+            scatter = others.var(ddof=1) if len(others) > 1 else 0.0
+            variance = s[i] ** 2 + (np.delete(s, i) ** 2).sum() / len(others) ** 2 + scatter
+            sigmas[i] = abs(v[i] - others.mean()) / np.sqrt(max(variance, 1e-300))
+        worst = int(np.argmax(sigmas))
+        mean = float(v.mean())
+        spread = float(np.ptp(v) / abs(mean)) if mean else float("nan")
+        out.append(Comparison(name, mean, spread, wheels[worst], float(sigmas[worst])))
+    return out

@@ -1,0 +1,137 @@
+"""The rule of choice: richer only where the data reject the simpler, with the reason in words."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.model import structures as models
+from smp_motor_ident.model.structures import Structure
+
+SCEPSIS = 4.0  # deviance of prior odds of e^2 to 1 against any addition: many are tried
+SURELY = 3.0  # times the price: a gain that rejects the simpler model whatever is left loose
+
+
+@dataclass(frozen=True, eq=False)
+class Rung:
+    """A fitted structure and what was decided about it."""
+
+    fit: Fit
+    reason: str = ""
+
+    @property
+    def label(self) -> str:
+        """Name of the structure with what was added to it."""
+        return label(self.fit.structure)
+
+    @property
+    def bic(self) -> float:
+        """Bayesian information criterion: deviance + parameters x ln(samples)."""
+        return self.fit.deviance + size(self.fit.structure) * float(np.log(self.fit.samples))
+
+
+def label(structure: Structure) -> str:
+    """Return a structure's name in words.
+
+    Parameters
+    ----------
+    structure : Structure
+        Any.
+
+    Returns
+    -------
+    str
+        Such as ``first_order with delay``.
+    """
+    added = [
+        word
+        for flag, word in (
+            (structure.friction == "none", "no friction"),
+            (structure.friction == "asymmetric", "asymmetric friction"),
+            (structure.load, "load"),
+            (structure.delay, "delay"),
+            (structure.window, "averaged speed"),
+            (structure.offset, "current offset"),
+        )
+        if flag
+    ]
+    return structure.name + (" with " + ", ".join(added) if added else "")
+
+
+def size(structure: Structure) -> int:
+    """Return the number of parameters that a structure is charged for.
+
+    Parameters
+    ----------
+    structure : Structure
+        With its free coordinates.
+
+    Returns
+    -------
+    int
+        L/R beside the response's own coefficients is not charged: leaving it free is honest
+        about what is not known, it claims nothing.
+    """
+    free = structure.free()
+    return len(free) - (models.TE in free and not structure.current)
+
+
+def inflation(fit: Fit, beside: Fit | None = None) -> float:
+    """Return by how much the scores scatter more than white residuals would let them.
+
+    Under coloured residuals the deviance that a needless coordinate gains is chi-square times
+    the ratio of its variance to that of white residuals.
+    """
+    colour = fit.colour()
+    middle = float(np.median(colour))
+    if beside is None:
+        return max(1.0, middle)
+    free, before = fit.structure.free(), beside.structure.free()
+    added = [colour[free.index(i)] for i in free if i not in before]
+    return float(max([1.0, middle, *added, *beside.colour()]))
+
+
+def needed(simple: Fit, rich: Fit) -> tuple[bool, str]:
+    """Decide whether the data reject the simpler of two models.
+
+    Parameters
+    ----------
+    simple, rich : Fit
+        On the same data.
+
+    Returns
+    -------
+    verdict : bool
+        Whether ``rich`` is needed.
+    reason : str
+        In words.
+    """
+    more = size(rich.structure) - size(simple.structure)
+    gained = (simple.deviance - rich.deviance) / inflation(rich, simple)
+    price = more * (float(np.log(simple.samples)) + SCEPSIS)
+    if not rich.converged and gained < SURELY * price:
+        return False, "did not converge"
+    if gained <= price:
+        return (
+            False,
+            f"no better than {label(simple.structure)} (gain {gained:.0f}, price {price:.0f})",
+        )
+    loose = _loose(simple, rich)
+    if loose and gained < SURELY * price:
+        return False, f"its {loose} cannot be told from these data"
+    return True, f"{label(simple.structure)} is rejected (gain {gained:.0f}, price {price:.0f})"
+
+
+def _loose(simple: Fit, rich: Fit) -> str:
+    cov = rich.covariance()
+    free = rich.structure.free()
+    for i in set(free) - set(simple.structure.free()):
+        name = models.Z_NAMES[i]
+        std = float(np.sqrt(cov[free.index(i), free.index(i)]))
+        if name in ("delay", "window") and std > 0.4 * rich.z[i]:
+            return name
+        if name == "ln_a2" and std > 0.4:
+            return "second time constant"
+    return ""

@@ -1,0 +1,178 @@
+"""From a cold start to the right minimum: rank candidates, refine the best, grow the horizon.
+
+Derivation: docs/derivations.md, sections 8 and 10.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smp_motor_ident.estimation import replay, start
+from smp_motor_ident.estimation.descent import (
+    HEAD,
+    Options,
+    bandwidth,
+    descend,
+    first_noise,
+    ratio_of,
+)
+from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.estimation.horizon import grow
+from smp_motor_ident.estimation.valley import better, shapes
+from smp_motor_ident.likelihood.experiments import Experiments
+from smp_motor_ident.likelihood.noise import deviance, kalman_gain
+from smp_motor_ident.model import structures as models
+from smp_motor_ident.model.structures import Structure
+
+Array = NDArray[np.float64]
+
+SHAPES = 6  # of the same linear response that are refined
+OPEN = 0.02  # standard deviation of ln L/R or ln R above which other starts are tried
+
+
+def candidates(data: Experiments, structure: Structure) -> list[Array]:
+    """Return starting coordinates for a structure, from linear regressions.
+
+    Parameters
+    ----------
+    data : Experiments
+        Prepared records.
+    structure : Structure
+        What will be fitted.
+
+    Returns
+    -------
+    list of ndarray, shape (11,)
+        Unranked.
+    """
+    found = start.current_candidates(data) if structure.current else []
+    if not found:
+        frictions = (False,) if structure.friction == "none" else (True, False)
+        found = start.speed_candidates(data, structure.order, frictions=frictions)
+    if not found and structure.order == 2:
+        for z in start.speed_candidates(data, 1):
+            z[models.A2] = 2 * z[models.A1] - z[models.A0] - np.log(20)
+            z[models.TE] = z[models.A2] - z[models.A1]
+            found.append(z)
+    for z in found:
+        if structure.window:
+            z[models.WINDOW] = 1.02 * data.step
+    return found
+
+
+def cold_fit(
+    data: Experiments,
+    structure: Structure,
+    options: Options,
+    extra: Sequence[Array] = (),
+    keep: int = 3,
+    own: bool = True,
+    near: Fit | None = None,
+) -> Fit | None:
+    """Fit a structure without any guess.
+
+    Parameters
+    ----------
+    data : Experiments
+        Prepared records.
+    structure : Structure
+        What is free.
+    options : Options
+        Loss and prior knowledge.
+    extra : sequence of ndarray, shape (11,)
+        Further starts, such as a simpler structure's answer.
+    keep : int
+        How many of the ranked candidates are refined.
+    own : bool
+        Whether the regressions' candidates join ``extra``.
+    near : Fit, optional
+        Of another structure on the same data: its torque noise is a good first guess.
+
+    Returns
+    -------
+    Fit or None
+        None where no candidate could be simulated.
+    """
+    head = data.head(min(8.0, HEAD * data.step))
+    starts = [
+        structure.complete(z) for z in [*extra, *(candidates(data, structure) if own else [])]
+    ]
+    starts = [z for z in starts if np.all(np.isfinite(z))]
+    if not starts:
+        return None
+    noise = first_noise(head)
+    ranked = sorted(starts, key=lambda z: _score(head, structure, z, noise))
+    best: Fit | None = None
+    tried: list[Array] = []
+    if models.TE in structure.free() and not structure.current:
+        ranked = [shaped for z in _distinct(ranked, data.step, 2) for shaped in shapes(z)]
+        ranked = sorted(ranked, key=lambda z: _score(head, structure, z, noise))
+        keep = SHAPES
+    for z in ranked:
+        if any(_alike(z, other, data.step) for other in tried):
+            continue
+        tried.append(z)
+        ratio = ratio_of(bandwidth(z, head), head.step, head.kind)
+        one = descend(head, structure, z, head.initial, noise, ratio, options, 25, 0.1)
+        again = best is not None and abs(one.deviance - best.deviance) < 0.1
+        if best is None or better(one, best):
+            best = one
+        agreed = again and models.TE not in structure.free()
+        if (agreed or structure.friction == "none") and one.converged:
+            break  # two starts agree, or the surface is smooth
+        if len(tried) == keep:
+            break
+    assert best is not None
+    if structure.current:
+        best = _elsewhere(head, structure, best, options)
+    return grow(data, structure, best, options, near)
+
+
+def _elsewhere(head: Experiments, structure: Structure, best: Fit, options: Options) -> Fit:
+    """Try other L, and other R at the same L, where the fit leaves them open.
+
+    An L/R of less than a sample, or an R that next to nothing falls off at, leaves a surface so
+    flat that a descent ends where it began.
+    """
+    free = structure.free()
+    std = np.sqrt(np.diag(best.covariance()))
+    open_ones = [i for i in (models.TE, models.LN_R) if i in free and std[free.index(i)] > OPEN]
+    if not open_ones:
+        return best
+    for change in ({models.A2: 1, models.TE: 1}, {models.TE: 1, models.LN_R: -1}):
+        for factor in (0.2, 0.5, 2.0, 5.0):
+            z = best.z.copy()
+            for i, power in change.items():
+                z[i] += power * np.log(factor)
+            other = descend(head, structure, structure.complete(z), best.initial, best.noise,
+                            best.ratio, options, 25, 0.1)  # fmt: skip
+            if other.deviance < best.deviance - 1:
+                best = other
+    return best
+
+
+def _distinct(ranked: Sequence[Array], step: float, keep: int) -> list[Array]:
+    out: list[Array] = []
+    for z in ranked:
+        if len(out) < keep and not any(_alike(z, other, step) for other in out):
+            out.append(z)
+    return out
+
+
+def _alike(z: Array, other: Array, step: float) -> bool:
+    d = np.abs(z - other)
+    late = max(d[models.DELAY], d[models.WINDOW]) / step
+    return bool(d[:5].max() < 0.05 and late < 0.5)
+
+
+def _score(head: Experiments, structure: Structure, z: Array, noise: Array) -> float:
+    """Return the deviance of a candidate on the innovations (robust against drift)."""
+    ratio = ratio_of(bandwidth(z, head), head.step, head.kind)
+    relative = noise[1, 1] / noise[0, 0] if head.current.size else 0.0
+    gain, _ = kalman_gain(z, structure.order, head.kind, head.step, ratio, relative)
+    spread = replay.run_spread(head, structure, z, gain, noise)
+    value = deviance(spread)
+    return value if np.isfinite(value) else np.inf

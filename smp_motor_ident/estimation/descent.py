@@ -1,0 +1,151 @@
+"""One descent and its surroundings: what the user asked, the noise guessed, where to begin."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smp_motor_ident.estimation.fit import Fit, Prior, solve
+from smp_motor_ident.likelihood import recursion as rc
+from smp_motor_ident.likelihood.experiments import Experiments
+from smp_motor_ident.model import structures as models
+from smp_motor_ident.model.structures import Structure
+
+Array = NDArray[np.float64]
+
+HEAD = 12_000  # samples on which candidates and noise levels are compared
+
+
+@dataclass(frozen=True)
+class Options:
+    """What the user asked of a fit.
+
+    Attributes
+    ----------
+    huber : float
+        Bound of the robust loss [standard deviations]; infinite for least squares.
+    priors : tuple of Prior
+        Physical parameters that are known.
+    lower, upper : ndarray, shape (11,), optional
+        Bounds of z.
+    """
+
+    huber: float = np.inf
+    priors: tuple[Prior, ...] = ()
+    lower: Array | None = None
+    upper: Array | None = None
+
+
+def head(data: Experiments) -> Experiments:
+    """Return the part on which models are compared, or all where that is little more.
+
+    Parameters
+    ----------
+    data : Experiments
+        Prepared records.
+
+    Returns
+    -------
+    Experiments
+        Of `HEAD` samples or so; ``data`` itself where it has less than three times as many.
+    """
+    part = data.head(HEAD * data.step)
+    return part if data.size > 3 * part.size else data
+
+
+def ratio_of(bandwidth: float, step: float, kind: int) -> float:
+    """Return the torque-noise ratio at which the innovations follow with a bandwidth."""
+    return bandwidth ** (4 if kind == rc.ANGLE else 2) * step
+
+
+def bandwidth(z: Array, data: Experiments) -> float:
+    """Return the motor's own bandwidth, as far as the sampling shows it."""
+    return float(min(np.exp(z[models.A0] - z[models.A1]), 0.2 / data.step))
+
+
+def first_noise(data: Experiments) -> Array:
+    """Return a first guess of the residuals' covariance, from resolution and scatter."""
+    y = data.output[:HEAD]
+    v0 = max(data.quantum**2 / 12, 1e-12 * _variance(y, 0), 1e-4 * _variance(y, 4) / 70, 1e-18)
+    v1 = 1.0
+    if data.current.size:
+        i = data.current[:HEAD]
+        v1 = max(_variance(i, 2) / 6 * 0.1, 1e-8 * _variance(i, 0), 1e-12)
+    return np.diag([v0, v1])
+
+
+def _variance(x: Array, order: int) -> float:
+    """Return the variance of differences; across lost samples where there are no others."""
+    d = np.diff(x, n=order)
+    there = d[np.isfinite(d)]
+    if there.size < 8:
+        there = np.diff(x[np.isfinite(x)], n=order)
+    return float(np.var(there)) if there.size else 0.0
+
+
+def initial_of(data: Experiments, fit: Fit) -> Array:
+    """Return a fit's initial states for more data; those it lacks from the measurements."""
+    initial = data.initial.copy()
+    n = min(len(initial), len(fit.initial))
+    initial[:n] = fit.initial[:n]
+    return initial
+
+
+def descend(
+    data: Experiments,
+    structure: Structure,
+    z: Array,
+    initial: Array,
+    noise: Array,
+    ratio: float,
+    options: Options,
+    iterations: int,
+    tolerance: float = 1e-2,
+) -> Fit:
+    """Run `fit.solve` with the user's options."""
+    return solve(
+        data,
+        structure,
+        z,
+        initial,
+        noise,
+        ratio,
+        options.huber,
+        options.priors,
+        iterations,
+        tolerance,
+        lower=options.lower,
+        upper=options.upper,
+    )
+
+
+def refine(data: Experiments, structure: Structure, near: Fit, z: Array, options: Options) -> Fit:
+    """Fit a structure from another's answer on the same data.
+
+    Parameters
+    ----------
+    data : Experiments
+        Prepared records.
+    structure : Structure
+        What is free now.
+    near : Fit
+        The other's answer.
+    z : ndarray, shape (11,)
+        Coordinates to start from.
+    options : Options
+        Loss and prior knowledge.
+
+    Returns
+    -------
+    Fit
+        With the noise ratio of ``near``.
+    """
+    return descend(data, structure, z, initial_of(data, near), near.noise, near.ratio, options, 30)
+
+
+def restate(data: Experiments, structure: Structure, fit: Fit, options: Options) -> Fit:
+    """Return a fit's coordinates as the answer of a structure in which more is free."""
+    once = descend(data, structure, fit.z, fit.initial, fit.noise, fit.ratio, options, 1)
+    return replace(once, z=fit.z, initial=fit.initial, converged=fit.converged)

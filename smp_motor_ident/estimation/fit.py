@@ -1,0 +1,268 @@
+"""Least squares on the innovations: Levenberg-Marquardt steps and the noise.
+
+Derivation: docs/derivations.md, section 8.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smp_motor_ident.estimation.fitted import Fit, Prior
+from smp_motor_ident.likelihood.elimination import damped_step
+from smp_motor_ident.likelihood.experiments import Experiments
+from smp_motor_ident.likelihood.noise import deviance, gain_for, proper, renewed
+from smp_motor_ident.likelihood.passes import Pass, evaluate, own_columns
+from smp_motor_ident.model import structures as models
+from smp_motor_ident.model.structures import Structure, to_internal
+
+__all__ = ["Fit", "Prior", "solve"]
+
+Array = NDArray[np.float64]
+
+STALL = 4, 0.02  # passes that together gain less deviance than this end a descent
+FREE = 0.1  # damping (relative to the diagonal) below which a step counts as undamped
+LARGEST = 80.0  # logarithm of a coordinate: 1e35
+CLOSE = 0.3  # of the tolerance, within which a step is not even tried where there are kinks
+ROUNDS = 12  # most times that the noise is estimated anew
+
+
+class _Descent:
+    """A fit under way: where it is, and what the last pass gave there."""
+
+    def __init__(
+        self,
+        data: Experiments,
+        structure: Structure,
+        z: Array,
+        initial: Array,
+        noise: Array,
+        ratio: float,
+        huber: float,
+        priors: Sequence[Prior],
+        lower: Array,
+        upper: Array,
+    ) -> None:
+        self.data, self.structure, self.huber, self.priors = data, structure, huber, priors
+        self.ratio = ratio
+        self.lower, self.upper = lower, upper
+        self.matrix = structure.matrix()
+        self.own = own_columns(data, structure)
+        self.current = data.current.size > 0
+        self.z = structure.complete(np.minimum(np.maximum(z, lower), upper))
+        self.start, self.initial = initial.copy(), initial.copy()
+        self.smooth = structure.friction == "none" and not structure.delay
+        self.only_scale = not self.current and huber == math.inf and ratio == 0
+        self.damping, self.passes, self.converged = 1e-3, 0, False
+        self.look(proper(noise))
+
+    def _pass(self, z: Array, initial: Array) -> Pass:
+        self.passes += 1
+        return evaluate(
+            self.data, self.structure, z, initial, self.start, self.gain, self.noise, self.huber,
+            _linearise(self.priors, z, self.matrix),
+        )  # fmt: skip
+
+    def look(self, noise: Array) -> None:
+        """Pass where it is, with this noise and the gain that goes with it."""
+        self.noise = noise
+        self.gain = gain_for(self.z, self.structure.order, self.data.kind, self.data.step,
+                             self.ratio, noise, self.current)  # fmt: skip
+        self.here: Pass = self._pass(self.z, self.initial)
+
+    def look_again(self, noise: Array) -> None:
+        """Do the same for another noise; where it is but another scale, without a pass."""
+        if self.only_scale and not self.priors:
+            self.here = self.here.scaled(float(self.noise[0, 0] / noise[0, 0]))
+            self.noise = noise
+        else:
+            self.look(noise)
+
+    def step(self) -> tuple[Array, Array, float]:
+        """Return where the damped step leads, and its length in standard deviations."""
+        here = self.here
+        step, size = damped_step(
+            here.normal, here.gradient, self.damping, self.matrix, self.z, self.lower, self.upper
+        )
+        z = np.minimum(np.maximum(self.z + self.matrix @ step, self.lower), self.upper)
+        z = self.structure.complete(z)
+        _one_sign(z, self.structure)
+        moved = self.initial.copy()
+        moved[:, list(self.own)] += here.local_step - here.local_gain @ step
+        return z, moved, size
+
+    def within(self, tolerance: float, size: float) -> bool:
+        """Tell whether a step is so small that another pass would not tell more."""
+        own = self.here.local_promise
+        return self.matrix.shape[1] > 0 and size < tolerance and 0 <= own < tolerance**2
+
+    def settled(self) -> bool:
+        """Tell whether an undamped step would stay within half a standard deviation."""
+        here = self.here
+        return bool(
+            damped_step(
+                here.normal, here.gradient, 1e-9, self.matrix, self.z, self.lower, self.upper
+            )[1]
+            < 0.5
+        )
+
+    def descend(self, iterations: int, tolerance: float, first: bool) -> None:
+        """Step until the end, or (the first time) until the noise is worth another look."""
+        recent: list[float] = []
+        self.converged = False
+        while self.passes < iterations:
+            before = self.here.objective
+            z, initial, size = self.step()
+            near = tolerance if self.smooth else tolerance * CLOSE
+            if self.damping < FREE and self.within(near, size):
+                if self.smooth:  # elsewhere a kink may lie between
+                    self.z, self.initial = z, initial
+                self.converged = True
+                return
+            new = self._pass(z, initial)
+            # A step may be small because it is damped: only a nearly free one tells the end.
+            small = z.size > 0 and size < tolerance and self.damping < FREE
+            gained = max(before - new.objective, 0.0)
+            if new.objective <= before:
+                recent.append(gained * self.data.size / max(before, 1e-300))
+            if len(recent) >= STALL[0] and sum(recent[-STALL[0] :]) < STALL[1]:
+                self.converged = self.settled()
+                return
+            if new.objective <= before * (1 + 1e-12):
+                self.z, self.initial, self.here = z, initial, new
+                self.damping = max(self.damping * 0.1, 1e-9)
+                if small or (gained < 1e-9 * new.objective and self.damping < FREE):
+                    self.converged = True
+                    return
+                if first and gained < 1e-3 * new.objective and not small:
+                    return
+            else:
+                if small:
+                    self.converged = True
+                    return
+                self.damping = max(self.damping, 1e-6) * 8
+                if self.damping > 1e6:  # a kink: no step leads down, small or large
+                    self.converged = self.settled()
+                    return
+
+    def result(self) -> Fit:
+        """Return the fit as it stands."""
+        here, noise, information, scores = self.here, self.noise, self.here.normal, self.here.scores
+        value = math.inf
+        if math.isfinite(here.objective):
+            noise, value = renewed(here.spread, self.noise, self.current), deviance(here.spread)
+            if not self.current:
+                grow = self.noise[0, 0] / noise[0, 0]
+                information, scores = information * grow, scores * grow
+        return Fit(
+            structure=self.structure,
+            z=self.z,
+            initial=self.initial,
+            noise=noise,
+            ratio=self.ratio,
+            gain=self.gain,
+            objective=here.objective,
+            deviance=value,
+            information=information,
+            scores=scores,
+            passes=self.passes,
+            converged=self.converged and math.isfinite(here.objective),
+            samples=self.data.size,
+            kind=self.data.kind,
+        )
+
+
+def solve(
+    data: Experiments,
+    structure: Structure,
+    z: Array,
+    initial: Array,
+    noise: Array,
+    ratio: float = 0.0,
+    huber: float = np.inf,
+    priors: Sequence[Prior] = (),
+    iterations: int = 40,
+    tolerance: float = 1e-2,
+    lower: Array | None = None,
+    upper: Array | None = None,
+) -> Fit:
+    """Minimise the innovations' sum of squares from a start, noise covariance included.
+
+    Levenberg-Marquardt in z with the initial states eliminated; the noise covariance is
+    re-estimated from the residuals until it stays (concentrated likelihood).
+
+    Parameters
+    ----------
+    data : Experiments
+        Prepared records.
+    structure : Structure
+        What is free.
+    z, initial, noise : ndarray
+        Start: coordinates, initial states, covariance of the output and current residuals.
+    ratio : float
+        Torque noise over output noise, see `noise.kalman_gain`.
+    huber : float
+        Bound of the robust loss in standard deviations.
+    priors : sequence of Prior
+        What the user knows of physical parameters.
+    iterations : int
+        Most passes over the data.
+    tolerance : float
+        Ends when a step is below this fraction of every standard deviation.
+    lower, upper : ndarray, shape (11,), optional
+        Bounds of z.
+
+    Returns
+    -------
+    Fit
+        With ``converged`` False where the passes did not suffice.
+    """
+    widest = _bounds()
+    lower = widest[0] if lower is None else lower
+    upper = widest[1] if upper is None else upper
+    descent = _Descent(data, structure, z, initial, noise, ratio, huber, priors, lower, upper)
+    for n in range(ROUNDS):
+        if not math.isfinite(descent.here.objective):
+            break
+        descent.descend(iterations, tolerance, n == 0)
+        fresh = renewed(descent.here.spread, descent.noise, descent.current)
+        same = np.abs(np.log(np.diag(fresh) / np.diag(descent.noise))).max() < 2e-2
+        done = descent.converged and (same or descent.only_scale)
+        if descent.passes >= iterations or done or n + 1 == ROUNDS:
+            break
+        descent.look_again(fresh)
+    return descent.result()
+
+
+def _bounds() -> tuple[Array, Array]:
+    """Return bounds of z: what floating point can hold, and no negative volts or seconds."""
+    lower, upper = np.full(11, -np.inf), np.full(11, np.inf)
+    logarithms = [models.A0, models.A1, models.A2, models.TE, models.LN_R]
+    lower[logarithms], upper[logarithms] = -LARGEST, LARGEST
+    lower[[models.VC_PLUS, models.VC_MINUS, models.DELAY]] = 0.0
+    lower[models.WINDOW] = 1e-9
+    return lower, upper
+
+
+def _linearise(priors: Sequence[Prior], z: Array, matrix: Array) -> list[tuple[Array, float]]:
+    if not priors:
+        return []
+    values, gradients = models.physical(z)
+    return [
+        (gradients[p.name] @ matrix / p.std, (p.value - values[p.name]) / p.std) for p in priors
+    ]
+
+
+def _one_sign(z: Array, structure: Structure) -> None:
+    """Keep K and (without current) b of one sign, in place."""
+    if structure.order != 2 or structure.current or models.TE not in structure.free():
+        return
+    z[models.TE] = max(z[models.TE], z[models.A2] - z[models.A1])
+    for _ in range(60):
+        par, _ = to_internal(z, 2)
+        if par[2] > 0.02 * np.exp(z[models.A0]):
+            return
+        z[models.TE] += 0.3 if z[models.TE] > z[models.A2] - z[models.A1] + 0.7 else -0.05

@@ -1,0 +1,118 @@
+"""A fit as it ended: coordinates, information, noise, and the covariance that follows.
+
+Derivation: docs/derivations.md, section 9.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smp_motor_ident.model.structures import Structure
+
+Array = NDArray[np.float64]
+
+PLAUSIBLE = np.array([1e-2, 1e-2, 1e-2, 0.25, 1e-4, 1e-4, 1e-4, 1e-2, 1e-4, 1e-2, 1e-2])
+"""Inverse squares of how far each coordinate z could be from any value at all."""
+
+
+@dataclass(frozen=True)
+class Prior:
+    """A statement of the user, ``row z = value`` within ``std``, linear around the estimate."""
+
+    name: str
+    value: float
+    std: float
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A structure fitted to experiments.
+
+    Attributes
+    ----------
+    structure : Structure
+        What was free.
+    z : ndarray, shape (11,)
+        Coordinates.
+    initial : ndarray, shape (g, 4)
+        q, w, angle, load of each segment.
+    noise : ndarray, shape (2, 2)
+        Covariance of the innovations of (output, current).
+    ratio : float
+        Intensity of the torque noise over the output's noise variance.
+    gain : ndarray, shape (3, 2)
+        Innovation gain.
+    objective : float
+        Weighted sum of squares.
+    deviance : float
+        -2 log likelihood, up to a constant of the data.
+    information : ndarray, shape (f, f)
+        Normal matrix of the free coordinates, initial states eliminated.
+    scores : ndarray, shape (blocks, f)
+        Scores summed over runs of samples.
+    passes : int
+        Runs over the data that it took.
+    converged : bool
+        Whether the last step was small.
+    samples, kind : int
+        Of the data.
+    widen : ndarray, shape (f,), optional
+        Factors on the standard deviations, see `quantisation.widened`.
+    blur : ndarray, shape (f, f), optional
+        Covariance from instants that are not known exactly, see `quantisation.blurred`.
+    """
+
+    structure: Structure
+    z: Array
+    initial: Array
+    noise: Array
+    ratio: float
+    gain: Array
+    objective: float
+    deviance: float
+    information: Array
+    scores: Array
+    passes: int
+    converged: bool
+    samples: int
+    kind: int
+    widen: Array | None = None
+    blur: Array | None = None
+
+    def covariance(self) -> Array:
+        """Return the covariance of the free coordinates, shape (f, f).
+
+        The inverse information, widened coordinate by coordinate where the scores of
+        whole runs of samples scatter more than white residuals would let them.
+        """
+        cov = self._white()
+        widen = np.sqrt(self.colour())
+        cov = cov * np.outer(widen, widen)
+        if self.widen is not None:
+            cov = cov * np.outer(self.widen, self.widen)
+        if self.blur is not None:
+            cov = cov + self.blur
+        return cov
+
+    def colour(self) -> Array:
+        """Return by how much each variance is larger than of white residuals, shape (f,)."""
+        cov = self._white()
+        n = len(self.scores)
+        if n <= 2 * cov.shape[0]:
+            return np.ones(cov.shape[0])
+        moved = (self.scores - self.scores.mean(axis=0)) @ cov
+        sandwich = np.square(moved).sum(axis=0) * (n / (n - 1))
+        return np.asarray(np.maximum(1.0, sandwich / np.maximum(np.diag(cov), 1e-300)))
+
+    def _white(self) -> Array:
+        # Every coordinate lies within some e-folds or volts of any motor's: without that a
+        # direction that the data leave open would count as known.
+        information = self.information + np.diag(PLAUSIBLE[list(self.structure.free())])
+        scale = np.sqrt(np.diag(information))
+        values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
+        vectors = vectors / scale[:, None]
+        cov: Array = (vectors / np.maximum(values, 1e-15)) @ vectors.T
+        return cov

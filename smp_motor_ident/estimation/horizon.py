@@ -1,0 +1,197 @@
+"""Torque noise found on the head of the data, and the horizon grown from there.
+
+Derivation: docs/derivations.md, sections 7 and 10.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smp_motor_ident.estimation.descent import (
+    HEAD,
+    Options,
+    bandwidth,
+    descend,
+    initial_of,
+    ratio_of,
+)
+from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.estimation.valley import along_friction
+from smp_motor_ident.likelihood import recursion as rc
+from smp_motor_ident.likelihood.experiments import Experiments
+from smp_motor_ident.model import structures as models
+from smp_motor_ident.model.structures import Structure
+
+Array = NDArray[np.float64]
+
+FLOOR = 1.3  # residual variance over that of quantisation, below which there is no more
+WALK = 0.6  # step of the logarithm of the bandwidth while its best is not bracketed
+CLOSE = 0.15  # spacing of the same at which the best is known well enough
+MOST = 5.0  # farthest from the motor's own bandwidth
+PRICE = 12.0  # deviance that torque noise must explain before it is believed
+
+
+def grow(
+    data: Experiments,
+    structure: Structure,
+    first: Fit,
+    options: Options,
+    near: Fit | None = None,
+) -> Fit:
+    """Find the noise ratio on a growing horizon, then fit all data.
+
+    Parameters
+    ----------
+    data : Experiments
+        Prepared records.
+    structure : Structure
+        What is free.
+    first : Fit
+        On the head of the data, with a high ratio.
+    options : Options
+        Loss and prior knowledge.
+    near : Fit, optional
+        Of another structure, whose ratio is a good first guess.
+
+    Returns
+    -------
+    Fit
+        On all data.
+    """
+    part = data.head(min(HEAD * data.step, 60.0))
+    best = _find_ratio(part, structure, first, options, near)
+    found = along_friction(part, structure, best, options)
+    if found.ratio > 0 and found.deviance < best.deviance - PRICE:
+        again = _find_ratio(part, structure, found, options, found)
+        found = min(found, again, key=lambda f: f.deviance)
+    if found.ratio > 0 and found.noise[0, 0] < FLOOR * part.quantum**2 / 12:
+        # It came from afar on innovations; in free run nothing is left for torque noise.
+        free_run = descend(part, structure, found.z, found.initial, found.noise, 0.0, options, 40)
+        if free_run.noise[0, 0] < FLOOR * part.quantum**2 / 12:
+            found = along_friction(part, structure, free_run, options)
+    best = found
+    return extend(data, structure, best, options)
+
+
+def extend(data: Experiments, structure: Structure, best: Fit, options: Options) -> Fit:
+    """Carry a fit of the head on to all data, on a growing horizon.
+
+    Parameters
+    ----------
+    data : Experiments
+        Prepared records.
+    structure : Structure
+        What is free.
+    best : Fit
+        On the head of the data.
+    options : Options
+        Loss and prior knowledge.
+
+    Returns
+    -------
+    Fit
+        On all data.
+    """
+    part = data.head(min(HEAD * data.step, 60.0))
+    if best.samples == data.size and best.converged:
+        return best
+    horizon = part.size * 4 if structure.friction != "none" else data.size
+    # The last stretch is at most six times the one before, as those in between are.
+    while 1.5 * horizon < data.size and best.ratio == 0:
+        longer = data.head(horizon * data.step)
+        best = descend(
+            longer, structure, best.z, initial_of(longer, best), best.noise, best.ratio, options, 8
+        )
+        horizon *= 6
+    return descend(
+        data, structure, best.z, initial_of(data, best), best.noise, best.ratio, options, 25
+    )
+
+
+def _find_ratio(
+    part: Experiments, structure: Structure, first: Fit, options: Options, near: Fit | None
+) -> Fit:
+    """Walk from following to free run; keep the likeliest ratio of torque noise."""
+
+    def fitted(near: Fit, ratio: float, passes: int) -> Fit:
+        initial = initial_of(part, near)
+        one = descend(part, structure, near.z, initial, near.noise, ratio, options, passes)
+        return _at_rest(part, structure, one, options)
+
+    # A speed output survives torque noise in free run, and free run has no bias where the
+    # model is not the motor; the innovations form is for angles, which drift.
+    free_run = fitted(first, 0.0, 30)
+    if part.kind != rc.ANGLE:
+        return free_run
+    # Residuals no larger than the counter's own resolution leave nothing for torque noise.
+    quiet = free_run.noise[0, 0] < FLOOR * part.quantum**2 / 12
+    if quiet or (free_run.converged and near is not None and near.ratio == 0):
+        return free_run
+    band = bandwidth(first.z, part)
+    path: dict[float, Fit] = {}
+    here = first
+
+    def walked(near: Fit, x: float) -> Fit:
+        return fitted(near, ratio_of(band * float(np.exp(x)), part.step, part.kind), 15)
+
+    if near is not None and near.ratio > 0:
+        x = float(np.log((near.ratio / part.step) ** 0.25 / band))
+        path[x] = fitted(first, near.ratio, 20)
+        best = _likeliest(path, walked)
+        return min(free_run, best, key=lambda f: f.deviance + PRICE * (f.ratio > 0))
+    for factor in (1.0, 0.3, 0.1, 0.03, 0.01):
+        here = fitted(here, ratio_of(band * factor, part.step, part.kind), 20)
+        path[float(np.log(factor))] = here
+        worst = here.deviance - min(f.deviance for f in path.values())
+        if worst > (60 if here.converged else 2000):
+            break
+    else:
+        free_run = min(free_run, fitted(here, 0.0, 20), key=lambda f: f.deviance)
+    if free_run.deviance < min(f.deviance for f in path.values()) + PRICE:
+        return free_run
+    return _likeliest(path, walked)
+
+
+def _likeliest(path: dict[float, Fit], fitted: Callable[[Fit, float], Fit]) -> Fit:
+    """Refine the logarithm of a bandwidth by parabolas through the deviance."""
+    for _ in range(14):
+        xs = sorted(path)
+        i = xs.index(min(xs, key=lambda x: path[x].deviance))
+        best = path[xs[i]]
+        if i in (0, len(xs) - 1):  # not bracketed yet
+            # From one point first towards the motor's own bandwidth: a poorer model's is farther.
+            outward = xs[i] > 0.0 if len(xs) == 1 else i == 0
+            x = xs[i] + (-WALK if outward else WALK)
+            if abs(x) > max(MOST, abs(xs[i])):
+                break
+        else:
+            (a, b, c), y = xs[i - 1 : i + 2], [path[x].deviance for x in xs[i - 1 : i + 2]]
+            rise, fall = (y[2] - y[1]) / (c - b), (y[1] - y[0]) / (b - a)
+            if (c - a) * (rise - fall) < 0.2:  # flat to a tenth of a deviance
+                break
+            x = 0.5 * (a + b) - 0.5 * fall * (c - a) / (rise - fall)
+            if c - a > 2.5 * WALK or abs(x - b) < 0.02 * (c - a):
+                x = 0.5 * (a + b) if b - a > c - b else 0.5 * (b + c)
+            if max(c - b, b - a) < CLOSE:
+                break
+        path[x] = fitted(best, x)
+    return min(path.values(), key=lambda f: f.deviance)
+
+
+def _at_rest(data: Experiments, structure: Structure, fit: Fit, options: Options) -> Fit:
+    """Try whether segments that begin slowly began at rest: friction makes that a kink."""
+    if structure.friction == "none":
+        return fit
+    first = np.abs(fit.initial[:, 1])
+    slow = (first > 0) & (
+        first < 0.05 * np.exp(-fit.z[models.A0]) * np.abs(data.section_value).max()
+    )
+    if not slow.any():
+        return fit
+    initial = fit.initial.copy()
+    initial[slow, 1] = 0.0
+    other = descend(data, structure, fit.z, initial, fit.noise, fit.ratio, options, 12)
+    return other if other.deviance < fit.deviance else fit

@@ -1,0 +1,351 @@
+"""Choice among the ladder: the simplest model that the data do not reject, with reasons."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from smp_motor_ident.estimation import descent, horizon, replay
+from smp_motor_ident.estimation.choice import Rung, inflation, label, needed, size
+from smp_motor_ident.estimation.cold import cold_fit
+from smp_motor_ident.estimation.descent import Options
+from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.estimation.lateness import averaged, with_delay
+from smp_motor_ident.estimation.thinning import thinned
+from smp_motor_ident.estimation.valley import shaken
+from smp_motor_ident.likelihood import recursion as rc
+from smp_motor_ident.likelihood.experiments import Experiments
+from smp_motor_ident.model import structures as models
+from smp_motor_ident.model.structures import Structure
+
+HOPELESS = 40.0  # deviance on the head of the data by which a rung is out for good
+RIVAL = 20.0  # deviance by which a delay must do better than a second lag
+LITTLE = 0.02  # of the largest voltage: friction below it may be left out
+
+Say = Callable[[str], None]
+
+
+def explore(
+    data: Experiments,
+    base: Structure,
+    options: Options,
+    auto: bool,
+    say: Say,
+    first: Fit | None = None,
+) -> list[Rung]:
+    """Fit the rungs that come into question; the last one is the choice.
+
+    Parameters
+    ----------
+    data : Experiments
+        Prepared records.
+    base : Structure
+        What the user asked for, or where ``auto`` begins.
+    options : Options
+        Loss and prior knowledge.
+    auto : bool
+        Whether the order may be chosen.
+    say : callable
+        Told what is being done.
+    first : Fit, optional
+        Of ``base``, where it is known already.
+
+    Returns
+    -------
+    list of Rung
+        In the order of trial, the chosen one at the end.
+    """
+    smooth = _frictionless(data, base, options, auto, say)
+    if smooth:
+        return smooth
+    rungs: list[Rung] = []
+    if base.current or not auto:
+        if first is None or first.structure != base:
+            first = _cold(data, base, options, say)
+        if first is None:
+            return []
+        best = first
+        rungs.append(Rung(first, "asked for" if not auto else "current is measured"))
+        if auto and data.kind == rc.SPEED:
+            best = _try_average(data, best, options, rungs, say)
+    else:
+        found = _orders(data, base, options, say, rungs)
+        if found is None:
+            return []
+        best = found
+    best = _variations(data, best, options, rungs, say)
+    reason = next((r.reason for r in rungs if r.fit is best), "")
+    return [r for r in rungs if r.fit is not best] + [Rung(best, reason)]
+
+
+def _cold(data: Experiments, s: Structure, options: Options, say: Say) -> Fit | None:
+    say(f"fitting {label(s)}")
+    if s.delay:
+        return with_delay(data, s, options, None)
+    return cold_fit(data, s, options)
+
+
+def _frictionless(
+    data: Experiments, base: Structure, options: Options, auto: bool, say: Say
+) -> list[Rung]:
+    """Climb without friction where the score of a linear motor asks for none.
+
+    Where there is none, a descent with friction has no bottom to find: L/R beside the
+    response's own coefficients is told by friction alone.
+    """
+    if base.current or base.friction != "symmetric" or options.priors or data.quantum > 0:
+        return []
+    plain = base.with_(friction="none", shape=False)
+    head = descent.head(data)
+    quick = cold_fit(head, plain, options)
+    if quick is None or not quick.converged or _friction_shows(head, quick, False):
+        return []
+    rungs = explore(data, plain, options, auto, say, quick if head is data else None)
+    if not rungs or _friction_shows(_of_kind(data, rungs[-1].fit), rungs[-1].fit, True):
+        return []
+    reason = f"{rungs[-1].reason}; no Coulomb friction shows"
+    return [*rungs[:-1], Rung(rungs[-1].fit, reason)]
+
+
+def _friction_shows(data: Experiments, fit: Fit, surely_small: bool) -> bool:
+    """Tell by the score whether Coulomb friction is there, or may be and is not little."""
+    structure = fit.structure.with_(friction="symmetric")
+    _, step, cov = replay.promise(data, fit, structure)
+    i = structure.free().index(models.VC_PLUS)
+    std = float(np.sqrt(max(cov[i, i], 1e-300)) * np.sqrt(inflation(fit)))
+    found = max(float(step[i]), 0.0)
+    if not np.isfinite(found) or (found / std) ** 2 > 0.5 * np.log(fit.samples):
+        return True
+    return surely_small and found + 2 * std > LITTLE * float(np.abs(data.section_value).max())
+
+
+def _of_kind(data: Experiments, fit: Fit) -> Experiments:
+    return data.as_mean_speed() if fit.kind == rc.MEAN_SPEED else data
+
+
+def _orders(
+    data: Experiments, base: Structure, options: Options, say: Say, rungs: list[Rung]
+) -> Fit | None:
+    """Climb, by the number of parameters, as far as the data ask.
+
+    Rungs that the head of a long record rejects by far are not fitted to all of it.
+    """
+    part = descent.head(thinned(data))
+    tried: list[Fit] = []
+    for structure in _ladder(base, data.kind == rc.SPEED, data.quantum > 0):
+        say(f"fitting {label(structure)}")
+        fitted = _one(part, structure, options, tried)
+        if fitted is not None:
+            tried.append(_no_worse(_of_kind(part, fitted), fitted, tried, options))
+    tried = _from_richer(part, tried, options)
+    least = min((f.deviance for f in tried), default=0.0)
+    best: Fit | None = None
+    for fitted in tried:
+        if part is not data:
+            if fitted.deviance > least + HOPELESS * inflation(fitted):
+                rungs.append(Rung(_projected(data, fitted), f"rejected on {part.size} samples"))
+                continue
+            every = _of_kind(data, fitted)
+            fitted = horizon.extend(every, fitted.structure, fitted, options)
+            fitted = shaken(every, fitted.structure, fitted, options)
+        if best is None:
+            best = fitted
+            rungs.append(Rung(fitted, "the simplest" if len(rungs) == 0 else "the simplest left"))
+            continue
+        if size(fitted.structure) == size(best.structure):
+            # Every motor has a second lag, few have a delay: alike, the lag is believed.
+            lag = fitted.structure.order > best.structure.order
+            verdict = fitted.deviance < best.deviance + (RIVAL * inflation(fitted) if lag else 0.0)
+            reason = f"fits {'better' if verdict else 'worse'} than {label(best.structure)}"
+        else:
+            verdict, reason = needed(best, fitted)
+        rungs.append(Rung(fitted, reason))
+        if verdict:
+            best = fitted
+    return best
+
+
+def _no_worse(data: Experiments, fit: Fit, known: list[Fit], options: Options) -> Fit:
+    """Hold a fit against those that it contains: their answers are starts as good as any."""
+    free = set(fit.structure.free())
+    inner = [f for f in known if f.kind == fit.kind and set(f.structure.free()) < free]
+    least = min(inner, key=lambda f: f.deviance, default=fit)
+    if least.deviance >= fit.deviance:
+        return fit
+    z = least.z.copy()
+    if fit.structure.order > least.structure.order:
+        z[models.A2] = 2 * z[models.A1] - z[models.A0] + np.log(0.02)
+        z[models.TE] = z[models.A2] - z[models.A1]
+    if fit.structure.delay and not least.structure.delay:
+        z[models.DELAY] = 0.1 * data.step
+    again = descent.refine(data, fit.structure, least, fit.structure.complete(z), options)
+    return min(fit, again, key=lambda f: f.deviance)
+
+
+def _from_richer(data: Experiments, tried: list[Fit], options: Options) -> list[Fit]:
+    """Start the simpler rungs from the likeliest one as well: its torque noise may be theirs."""
+    best = min(tried, key=lambda f: f.deviance, default=None)
+    out = []
+    for fit in tried:
+        free, more = set(fit.structure.free()), set(best.structure.free()) if best else set()
+        if best is not None and free < more and fit.kind == best.kind:
+            z = best.z.copy()
+            late = z[models.DELAY] * (models.DELAY not in free)
+            if fit.structure.order == 2 and late > 0:
+                z[models.A2] = np.logaddexp(z[models.A2], z[models.A1] + np.log(late))
+            part = _of_kind(data, fit)
+            again = descent.refine(part, fit.structure, best, fit.structure.complete(z), options)
+            fit = min(fit, again, key=lambda f: f.deviance)
+        out.append(fit)
+    return out
+
+
+def _projected(data: Experiments, fit: Fit) -> Fit:
+    """Return a fit of the head with its deviance projected to all data."""
+    return replace(
+        fit,
+        initial=descent.initial_of(data, fit),
+        deviance=fit.deviance * data.size / fit.samples,
+        samples=data.size,
+    )
+
+
+def _ladder(base: Structure, speed: bool, coarse: bool) -> list[Structure]:
+    """Return the rungs by number of parameters.
+
+    A speed that comes in coarse steps is a difference of counts, a mean over a window by its
+    making: a second time constant is asked for beside that window, not in its place.
+    """
+    first = replace(base, name="first_order", order=1, shape=False)
+    second = replace(base, name="second_order", order=2, shape=True)
+    late, late2 = first.with_(delay=True), second.with_(delay=True)
+    if not speed:
+        rungs = [first, late, second, late2]
+    elif coarse:
+        rungs = [first, late, first.with_(window=True), late.with_(window=True)]
+        rungs += [second.with_(window=True), late2.with_(window=True)]
+    else:
+        rungs = [first, late, first.with_(window=True), second, late.with_(window=True)]
+        rungs += [second.with_(window=True), late2]
+    return [r for r in rungs if not (r.delay and "delay" in base.held)]
+
+
+def _one(data: Experiments, structure: Structure, options: Options, known: list[Fit]) -> Fit | None:
+    """Fit one rung, started from what the rungs below it found."""
+    if structure.window:
+        late = replace(structure, name="first_order", order=1, shape=False, delay=True)
+        twin = _find(known, late) or _find(known, late.with_(window=False))
+        if twin is None or structure.order == 1:
+            twin = _find(known, structure.with_(window=False, delay=True))
+        return averaged(data, structure, options, twin)
+    if structure.delay:
+        return with_delay(data, structure, options, _find(known, structure.with_(delay=False)))
+    extra = []
+    if structure.order == 2 and known:
+        z = min(known, key=lambda f: f.deviance).z.copy()
+        slow = np.exp(z[models.A1] - z[models.A0])
+        z[models.A2] = z[models.A1] + np.log(max(z[models.DELAY] + z[models.WINDOW], 0.05 * slow))
+        z[models.TE] = z[models.A2] - z[models.A1]
+        z[models.DELAY] = 0.0
+        extra = [z]
+    near = min(known, key=lambda f: f.deviance, default=None)
+    return cold_fit(data, structure, options, extra, near=near)
+
+
+def _find(known: list[Fit], structure: Structure) -> Fit | None:
+    return next((f for f in known if f.structure == structure), None)
+
+
+def _variations(data: Experiments, best: Fit, options: Options, rungs: list[Rung], say: Say) -> Fit:
+    """Add what the data ask for, take away what they do not show."""
+    s = best.structure
+    if best.kind == rc.MEAN_SPEED:
+        data = data.as_mean_speed()
+    trials: list[dict[str, object]] = []
+    if best.structure.current:
+        trials.append({"offset": True})
+        if "delay" not in s.held and not best.structure.delay:
+            trials.append({"delay": True})
+    if best.structure.friction != "asymmetric":
+        trials.append({"load": True})
+    if best.structure.friction == "symmetric":
+        trials.append({"friction": "asymmetric", "load": True})
+    for change in trials:
+        richer = best.structure.with_(**change)
+        if richer == best.structure or not _promising(data, best, richer):
+            continue
+        say(f"trying {label(richer)}")
+        z = best.z.copy()
+        if "delay" in change:
+            z[models.DELAY] = 0.3 * data.step
+        other = descent.refine(data, richer, best, z, options)
+        verdict, reason = needed(best, other)
+        if verdict and "delay" in change and other.z[models.DELAY] < 0.03 * data.step:
+            verdict, reason = False, "a delay of hundredths of a sample is how the input was held"
+        if verdict and other.ratio > 0:  # what looked like torque noise may have been this
+            other = horizon.grow(data, richer, other, options)
+        rungs.append(Rung(other, reason))
+        if verdict:
+            best = other
+    return _without_friction(data, best, options, rungs)
+
+
+def _promising(data: Experiments, best: Fit, richer: Structure) -> bool:
+    """Tell from the score whether a fit of more is worth its passes."""
+    if not best.converged:
+        return True
+    gain, _, _ = replay.promise(data, best, richer)
+    price = (size(richer) - size(best.structure)) * float(np.log(best.samples))
+    return not gain < 0.5 * price * inflation(best)
+
+
+def _without_friction(data: Experiments, best: Fit, options: Options, rungs: list[Rung]) -> Fit:
+    """Leave Coulomb friction out where the data show that there is next to none."""
+    s = best.structure
+    if s.friction != "symmetric" or "vc_plus" in s.held:
+        return best
+    smooth = s.with_(friction="none", shape=False)
+    head = _of_kind(descent.head(data), best)
+    if head.size < data.size:
+        with_it = descent.refine(head, s, best, best.z, options)
+        without = descent.refine(head, smooth, with_it, best.z, options)
+        if without.deviance > with_it.deviance + HOPELESS * inflation(with_it):
+            return best
+    plain = descent.refine(data, smooth, best, best.z, options)
+    if plain.deviance < best.deviance:  # then friction has led astray
+        z = plain.z.copy()
+        z[models.VC_PLUS] = 1e-3 * np.abs(data.section_value).max()
+        again = descent.refine(data, s, plain, s.complete(z), options)
+        best = min(best, again, key=lambda f: f.deviance)
+    cov = best.covariance()
+    i = s.free().index(models.VC_PLUS)
+    most = best.z[models.VC_PLUS] + 2 * float(np.sqrt(cov[i, i]))
+    # Friction that the data do not tell stays: leaving it out would make the gain certain.
+    if most < LITTLE * np.abs(data.section_value).max() or plain.deviance < best.deviance:
+        # A descent that did not settle is no reason to believe in none.
+        gained = (plain.deviance - best.deviance) / inflation(best)
+        if gained <= float(np.log(best.samples)):
+            rungs.append(Rung(plain, "no Coulomb friction shows"))
+            return plain
+    return best
+
+
+def _try_average(
+    data: Experiments, best: Fit, options: Options, rungs: list[Rung], say: Say
+) -> Fit:
+    """Try a speed averaged over a window of a sample or more, current being measured."""
+    structure = best.structure.with_(window=True)
+    say(f"trying {label(structure)}")
+    starts = []
+    for width in (1.02, 2.0, 4.0):
+        z = best.z.copy()
+        z[models.WINDOW] = width * data.step
+        starts.append(z)
+    fitted = cold_fit(data.as_mean_speed(), structure, options, starts, keep=3, own=False)
+    if fitted is None:
+        return best
+    verdict, reason = needed(best, fitted)
+    rungs.append(Rung(fitted, reason))
+    return fitted if verdict else best

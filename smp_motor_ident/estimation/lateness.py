@@ -1,0 +1,81 @@
+"""Outputs that come late: a delay, a speed averaged over a window; each from several starts.
+
+Derivation: docs/derivations.md, section 10.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from smp_motor_ident.estimation import descent, start
+from smp_motor_ident.estimation.cold import cold_fit
+from smp_motor_ident.estimation.descent import Options
+from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.likelihood.experiments import Experiments
+from smp_motor_ident.model import structures as models
+from smp_motor_ident.model.structures import Structure
+
+
+def with_delay(
+    data: Experiments, delayed: Structure, options: Options, plain: Fit | None
+) -> Fit | None:
+    """Fit with a delay, started from several: the surface has a valley for each sample."""
+    structure = delayed.with_(delay=False)
+    starts = []
+    if plain is not None:
+        z = plain.z.copy()
+        z[models.DELAY] = 0.2 * data.step
+        starts.append(z)
+    for lag in (0, 1, 2, 4, 8, 16, 32):
+        # The regressions of a lagged input are those of a delayed motor.
+        for z in start.lagged_candidates(data, structure, lag):
+            z[models.DELAY] = max(lag - 0.5, 0.1) * data.step
+            starts.append(z)
+    fit = cold_fit(data, delayed, options, starts, keep=4, own=False, near=plain)
+    return _snap(data, fit, options)
+
+
+def _snap(data: Experiments, fit: Fit | None, options: Options) -> Fit | None:
+    """Try a whole number of samples of delay: the surface has a kink there.
+
+    A switch of the input that falls on a sampling instant makes the derivative by the delay
+    jump; a descent that comes near such a point stays short of it.
+    """
+    if fit is None:
+        return None
+    best = fit
+    for n in {int(fit.z[models.DELAY] / data.step), int(fit.z[models.DELAY] / data.step) + 1}:
+        whole = fit.structure.with_(held={**fit.structure.held, "delay": n * data.step})
+        other = descent.refine(data, whole, fit, fit.z, options)
+        if other.deviance < best.deviance - 1:
+            best = descent.restate(data, fit.structure, other, options)
+    return best
+
+
+def averaged(
+    data: Experiments, structure: Structure, options: Options, twin: Fit | None
+) -> Fit | None:
+    """Fit a speed averaged over a window, started from what looked like a delay."""
+    if twin is None:
+        return None
+    lag = max(twin.z[models.DELAY] + 0.5 * twin.z[models.WINDOW], 0.5 * data.step)
+    starts = []
+    if twin.structure.window:
+        z = twin.z.copy()
+        z[models.A2] = z[models.A1] + np.log(0.1 * lag)
+        z[models.TE] = z[models.A2] - z[models.A1]
+        starts.append(z)
+    for width in (0.5, 1.0, 1.6) if structure.delay else (1.0, 2.0, 3.0):
+        z = twin.z.copy()
+        z[models.WINDOW] = max(width * lag, 1.01 * data.step)
+        z[models.DELAY] = max(lag - 0.5 * z[models.WINDOW], 0.1 * data.step)
+        if not structure.delay:
+            z[models.DELAY] = 0.0
+        if structure.order == 2 and twin.structure.order == 1:
+            z[models.A2] = z[models.A1] + np.log(0.3 * lag)
+            z[models.TE] = z[models.A2] - z[models.A1]
+        starts.append(z)
+    mean = data.as_mean_speed()
+    own = structure.order == 2 and not structure.delay
+    fitted = cold_fit(mean, structure, options, starts, keep=3, own=own)
+    return _snap(mean, fitted, options) if structure.delay else fitted

@@ -1,0 +1,98 @@
+"""How far counts that are not exact can mislead an estimate.
+
+Quantisation is not noise: where the motion repeats, so does its error, and more samples do
+not average it away.  The fitted motor is replayed with the counter's zero at random places;
+one Gauss-Newton step from each replay tells the estimate's error on this very motion.
+Derivation: docs/derivations.md, section 9.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smp_motor_ident.estimation import replay
+from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.likelihood import recursion as rc
+from smp_motor_ident.likelihood.experiments import Experiments
+
+Array = NDArray[np.float64]
+
+REPLAYS = 8, 32  # fewest and most
+MOST = 500_000  # samples in all replays
+REACH = 2.0  # standard deviations to which motions near the estimate are replayed
+
+
+def widened(data: Experiments, fit: Fit, seed: int = 0) -> Fit:
+    """Return the fit with its covariance widened where quantisation repeats.
+
+    Parameters
+    ----------
+    data : Experiments
+        What was fitted.
+    fit : Fit
+        With the covariance of independent errors.
+    seed : int
+        Of the counter's random zeros.
+
+    Returns
+    -------
+    Fit
+        Unchanged where noise dithers the counter or the replays agree with the covariance.
+    """
+    if data.kind != rc.ANGLE or data.quantum == 0 or fit.ratio > 0:
+        return fit
+    own = data.quantum**2 / 12
+    if fit.noise[0, 0] > 3 * own or not fit.structure.free():
+        return fit
+    cov = fit.covariance()
+    counted, metered = (np.diag(share) for share in _shares(data, fit))
+    expected = np.maximum(metered + counted, 1e-300)
+    rng = np.random.default_rng(seed)
+    excess = np.ones(len(cov))
+    # How the counter errs hangs on the motion itself, known as well as the estimate tells:
+    # a first round shows how well that is, the second takes it from there.
+    for _ in range(2):
+        spread = REACH**2 * cov * np.sqrt(np.outer(excess, excess))
+        errors = _errors(data, fit, own, spread, rng)
+        # Only what the counter does is replayed; what the current's noise does is known.
+        second = metered + np.mean(np.square(errors), axis=0)
+        excess = np.maximum(second / np.maximum(expected, np.diag(cov)), excess)
+    return replace(fit, widen=np.sqrt(excess))
+
+
+def _shares(data: Experiments, fit: Fit) -> tuple[Array, Array]:
+    """Return the covariances that independent errors of counter and current would make."""
+    whole = replay.information(data, fit)
+    inverse = replay.inverse(whole)
+    if not data.current.size:
+        return inverse, np.zeros_like(inverse)
+    lost = replace(data, current=np.full(data.size, np.nan))
+    counter = replay.information(lost, fit)
+    return inverse @ counter @ inverse, inverse @ (whole - counter) @ inverse
+
+
+def _errors(
+    data: Experiments, fit: Fit, own: float, spread: Array, rng: np.random.Generator
+) -> Array:
+    """Return the estimate's errors where nothing but the counter errs, shape (replays, f)."""
+    matrix = fit.structure.matrix()
+    predicted = replay.simulate(data, fit)
+    noise = np.sqrt(max(fit.noise[0, 0] - own, 0.0))
+    current = data.current
+    if current.size:
+        current = np.where(np.isnan(current), np.nan, predicted[:, 2])
+    errors = []
+    values, vectors = np.linalg.eigh(spread)
+    half = vectors * np.sqrt(np.maximum(values, 0.0))
+    for _ in range(int(np.clip(MOST // data.size, *REPLAYS))):
+        near = fit.structure.complete(fit.z + matrix @ (half @ rng.standard_normal(len(half))))
+        angle = replay.outputs(data, replace(fit, z=near))
+        shown = angle + rng.uniform(0, data.quantum) + noise * rng.standard_normal(data.size)
+        wrong = np.floor(shown / data.quantum) * data.quantum - angle
+        counts = predicted[:, 1] + wrong - wrong.mean()
+        counts[np.isnan(data.output)] = np.nan
+        errors.append(replay.one_step(replace(data, output=counts, current=current), fit))
+    return np.array(errors)

@@ -1,0 +1,160 @@
+"""What a fitted motor says about data: predictions, information, steps, states of other data.
+
+Derivation: docs/derivations.md, sections 6 to 9.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smp_motor_ident.estimation.fit import Fit, solve
+from smp_motor_ident.likelihood.experiments import Experiments
+from smp_motor_ident.likelihood.passes import NO_GAIN, Pass, evaluate, gather
+from smp_motor_ident.model import structures as models
+from smp_motor_ident.model.structures import Structure
+
+Array = NDArray[np.float64]
+
+
+def run_spread(
+    data: Experiments, structure: Structure, z: Array, gain: Array, noise: Array
+) -> Array:
+    """Return the sums of squared residuals of coordinates as they are."""
+    return gather(data, structure, z, data.initial, gain, noise, differentiate=False).spread
+
+
+def simulate(data: Experiments, fit: Fit, gain: bool = False) -> Array:
+    """Return speed, output and current as the fitted motor predicts them.
+
+    Parameters
+    ----------
+    data : Experiments
+        With as many segments as the fit has initial states.
+    fit : Fit
+        Coordinates, initial states.
+    gain : bool
+        Whether measurements correct the state (innovations) or not (free run).
+
+    Returns
+    -------
+    ndarray, shape (n, 2) or with current (n, 3)
+        [rad/s], [output], [A].
+    """
+    return _predict(data, fit, gain, 3 if data.current.size else 2)
+
+
+def outputs(data: Experiments, fit: Fit, gain: bool = False) -> Array:
+    """Return the output alone as the fitted motor predicts it.
+
+    Parameters
+    ----------
+    data, fit, gain
+        As in `simulate`.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        [output].
+    """
+    return _predict(data, fit, gain, 1)[:, 0]
+
+
+def _predict(data: Experiments, fit: Fit, gain: bool, columns: int) -> Array:
+    predicted = np.empty((data.size, columns))
+    gather(data, fit.structure, fit.z, fit.initial, fit.gain if gain else NO_GAIN, fit.noise,
+           predicted=predicted, differentiate=False)  # fmt: skip
+    return predicted
+
+
+def _again(data: Experiments, structure: Structure, fit: Fit) -> Pass:
+    z = structure.complete(fit.z)
+    return evaluate(data, structure, z, fit.initial, fit.initial, fit.gain, fit.noise)
+
+
+def inverse(normal: Array, rcond: float = 1e-13) -> Array:
+    """Return the pseudo-inverse of a normal matrix, whatever the units of its coordinates."""
+    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    scaled = np.linalg.pinv(normal / np.outer(scale, scale), rcond=rcond, hermitian=True)
+    return np.asarray(scaled / np.outer(scale, scale))
+
+
+def information(data: Experiments, fit: Fit) -> Array:
+    """Return the Fisher information that experiments would give about a fit's coordinates.
+
+    Parameters
+    ----------
+    data : Experiments
+        Their times and voltages; outputs may be zero.
+    fit : Fit
+        Coordinates and noise.
+
+    Returns
+    -------
+    ndarray, shape (f, f)
+        Initial states eliminated.
+    """
+    return _again(data, fit.structure, fit).normal
+
+
+def one_step(data: Experiments, fit: Fit) -> Array:
+    """Return the Gauss-Newton step that other outputs on the same motion would ask for."""
+    here = _again(data, fit.structure, fit)
+    return np.asarray(inverse(here.normal) @ here.gradient)
+
+
+def promise(data: Experiments, fit: Fit, richer: Structure) -> tuple[float, Array, Array]:
+    """Return what freeing more would gain, by the score: one pass in place of a fit.
+
+    Parameters
+    ----------
+    data : Experiments
+        What was fitted.
+    fit : Fit
+        Converged.
+    richer : Structure
+        In which more is free.
+
+    Returns
+    -------
+    gain : float
+        Deviance, to second order.
+    step : ndarray, shape (f,)
+        Undamped step of the free coordinates.
+    covariance : ndarray, shape (f, f)
+        Of white residuals.
+    """
+    here = _again(data, richer, fit)
+    covariance = inverse(here.normal)
+    step = covariance @ here.gradient
+    return float(here.gradient @ step), step, covariance
+
+
+def settle(data: Experiments, fit: Fit, iterations: int = 12) -> Fit:
+    """Fit only the initial states and constant loads of other data (free run).
+
+    Parameters
+    ----------
+    data : Experiments
+        Such as held-out records.
+    fit : Fit
+        The motor.
+    iterations : int
+        Most passes.
+
+    Returns
+    -------
+    Fit
+        With the initial states and loads of ``data``; the motor is as it was.
+    """
+    free = fit.structure.free()
+    held = {**fit.structure.held, **{models.Z_NAMES[i]: float(fit.z[i]) for i in free}}
+    if models.TE not in free and "ln_te" not in held:
+        held["ln_te"] = float(fit.z[models.TE])
+    if fit.structure.friction == "symmetric":
+        held["vc_minus"] = float(fit.z[models.VC_MINUS])
+    structure = fit.structure.with_(held=held, own_load=True)
+    done = solve(data, structure, fit.z, data.initial, fit.noise, iterations=iterations)
+    return replace(done, structure=fit.structure, z=fit.z)

@@ -1,0 +1,178 @@
+"""A start from cold: state-variable filters, linear least squares, one instrumental step.
+
+Derivation: docs/derivations.md, section 10.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smp_motor_ident.likelihood import recursion as rc
+from smp_motor_ident.likelihood.experiments import Experiments
+from smp_motor_ident.likelihood.regression import (
+    filtered,
+    friction_sign,
+    instrumental,
+    search,
+    solved,
+)
+from smp_motor_ident.model import structures as models
+
+Array = NDArray[np.float64]
+
+GRIDS = 8  # segments that are looked at
+
+
+@dataclass(frozen=True, eq=False)
+class Uniform:
+    """One segment on an even grid: mean voltage per interval, output and current at its end."""
+
+    step: float
+    voltage: Array
+    output: Array
+    current: Array | None
+
+
+def resample(data: Experiments, g: int, most: int = 8_000) -> Uniform | None:
+    """Put segment ``g`` on an even grid (for the start only)."""
+    a, b = int(data.starts[g]), int(min(data.starts[g + 1], data.starts[g] + most))
+    t, y = data.time[a:b], data.output[a:b]
+    ok = np.isfinite(y)
+    if ok.sum() < 12:
+        return None
+    steps = np.diff(t)
+    if data.plain and ok.all() and np.abs(steps - data.step).max() < 1e-6 * data.step:
+        there = data.current[a:b] if data.current.size else None
+        if there is None or np.isfinite(there).all():
+            return Uniform(data.step, data.section_value[a:b], y, there)
+    step = float(np.median(steps))
+    grid = np.arange(t[0], t[-1] + 0.5 * step, step)
+    grid = grid[grid <= t[-1] + 1e-9 * step]
+    last = int(data.section_start[g + 1]) if g + 2 < len(data.starts) else len(data.section_end)
+    first = int(data.section_start[g])
+    ends = data.section_end[first:last]
+    last = first + int(np.searchsorted(ends, t[-1])) + 1
+    ends, values = data.section_end[first:last], data.section_value[first:last]
+    charge = np.concatenate([[0.0], np.cumsum(values[1:] * np.diff(ends))])
+    mean = np.diff(np.interp(grid, ends, charge)) / step
+    voltage = np.concatenate([[values[0]], mean])
+    current = None
+    if data.current.size:
+        i = data.current[a:b]
+        if np.isfinite(i).sum() > 12:
+            current = np.interp(grid, t[np.isfinite(i)], i[np.isfinite(i)])
+    return Uniform(step, voltage, np.interp(grid, t[ok], y[ok]), current)
+
+
+def cutoffs(data: Experiments, count: int = 7) -> Array:
+    """Return filter cut-offs [rad/s] spread over what the sampling can show."""
+    high = 1.0 / data.step
+    low = max(2.0, high / 300)
+    return np.asarray(np.geomspace(low, high, count), dtype=np.float64)
+
+
+def lagged_candidates(data: Experiments, structure: models.Structure, lag: int) -> list[Array]:
+    """Return candidates for a motor that answers ``lag`` samples late."""
+    return speed_candidates(data, structure.order, lag)
+
+
+def speed_candidates(
+    data: Experiments, order: int, lag: int = 0, frictions: tuple[bool, ...] = (True, False)
+) -> list[Array]:
+    """Return candidate coordinates from voltage and the mechanical output.
+
+    Least squares on ``v = a2 w'' + a1 w' + a0 w + Vc sign(w)`` after filtering, for several
+    cut-offs, with and without friction, each refined by one instrumental-variable step.
+    """
+    grids = [_late(u, lag) for u in _grids(data)]
+    if not grids:
+        return []
+    out: list[Array] = []
+    voltage = np.concatenate([u.voltage for u in grids])
+    output = np.concatenate([u.output for u in grids])
+    bounds = np.cumsum([0, *(len(u.output) for u in grids)])
+    steps = np.array([u.step for u in grids])
+    bands = cutoffs(data, 7 if lag == 0 else 4)
+    angle = data.kind == rc.ANGLE
+    for friction in frictions:
+        for theta in search(voltage, output, bounds, steps, bands, order, angle, friction):
+            out.append(_to_z(theta, order))
+    return out
+
+
+def _grids(data: Experiments) -> list[Uniform]:
+    segments = range(min(len(data.starts) - 1, GRIDS))
+    return [u for g in segments if (u := resample(data, g)) is not None]
+
+
+def _late(u: Uniform, lag: int) -> Uniform:
+    if lag == 0 or lag >= len(u.voltage):
+        return u
+    voltage = np.concatenate([np.full(lag, u.voltage[0]), u.voltage[:-lag]])
+    return Uniform(u.step, voltage, u.output, u.current)
+
+
+def _to_z(theta: Array, order: int) -> Array:
+    """Return the coordinates of a0, a1 (, a2) and the volts of friction."""
+    z = np.zeros(11)
+    z[: order + 1] = np.log(theta[: order + 1])
+    if order == 2:
+        z[models.TE] = z[models.A2] - z[models.A1]
+    z[models.VC_PLUS] = z[models.VC_MINUS] = theta[-1]
+    return z
+
+
+def current_candidates(data: Experiments) -> list[Array]:
+    """Return candidate coordinates from voltage, current and the mechanical output.
+
+    The electric equation ``v = L i' + R i + K w`` and the mechanical
+    ``K i = J w' + b w + Tc sign(w)`` are two linear regressions, filtered.
+    """
+    grids = [u for u in _grids(data) if u.current is not None]
+    out: list[Array] = []
+    if not grids:
+        return out
+    for cutoff in cutoffs(data):
+        electric, mechanic = np.zeros((4, 7)), np.zeros((4, 7))
+        for u in grids:
+            _both_equations(u, cutoff, data.kind == rc.ANGLE, electric, mechanic)
+        el, me = solved(electric), solved(mechanic)
+        inductance, r, k = el[:3]
+        if not (r > 0 and k > 0):
+            continue
+        inductance = inductance if inductance > 0 else 1e-3 * r * data.step
+        j, b, tc = k * me[0], max(k * me[1], 0.0), max(k * me[2], 0.0)
+        if not j > 0:
+            continue
+        z = models.from_physical(r, inductance, k, j, b, tc)
+        z[models.OFFSET] = 0.0
+        out.append(z)
+    return out
+
+
+def _both_equations(
+    u: Uniform, cutoff: float, angle: bool, electric: Array, mechanic: Array
+) -> None:
+    """Add one grid to the sums of both regressions."""
+    assert u.current is not None
+    extra = 1 if angle else 0
+    n = 1 + extra
+    rest = 0.0 if angle else float(u.output[0])
+    f = filtered(u.output - u.output[0], cutoff, u.step, n)
+    speed, slope = f[extra] + rest, f[extra + 1]
+    i, di = filtered(u.current, cutoff, u.step, n)[:2]
+    held = u.voltage.copy()  # at an instant: half-way between two held intervals
+    held[:-1] = 0.5 * (held[:-1] + held[1:])
+    v = filtered(held, cutoff, u.step, n)[0]
+    slow = filtered(u.output - u.output[0], min(cutoff, 0.3 / u.step), u.step, n)[extra]
+    sign = filtered(friction_sign(slow + rest), cutoff, u.step, n)[0]
+    one = np.ones_like(i)
+    skip = min(int(4 / (cutoff * u.step)) + 2, len(v) // 3)
+    for columns, right, sums in (
+        (np.stack([di, i, speed, one]), v, electric),
+        (np.stack([slope, speed, sign, one]), i, mechanic),
+    ):
+        instrumental(columns, columns, right, skip, len(v), sums)

@@ -1,0 +1,162 @@
+"""The valley along which friction and gain trade where the current is not measured.
+
+Derivation: docs/derivations.md, section 10.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smp_motor_ident.estimation.descent import Options, descend
+from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.likelihood.experiments import Experiments
+from smp_motor_ident.model import structures as models
+from smp_motor_ident.model.structures import Structure
+
+Array = NDArray[np.float64]
+
+SHARES = (0.97, 0.7, 0.1)  # of a0 that K is
+SHAKES = 6  # fresh starts around a place where a descent was held
+SHAKE = (1.0, 0.3, 3.0)  # standard deviations (or e-folds, where these are more) to it
+ALIKE = 0.5  # deviance by which two fits explain the data alike
+OPEN = 0.3  # standard deviation of ln a2 above which other starts are tried
+
+
+def along_friction(part: Experiments, structure: Structure, best: Fit, options: Options) -> Fit:
+    """Try other shares of friction and gain that turn the motor as fast at full voltage.
+
+    Without current the two trade against each other along a long curved valley.
+    """
+    if structure.current or models.VC_PLUS not in structure.free():
+        return best
+    full = float(np.abs(part.section_value).max())
+    for share in (0.01, 0.025, 0.06):
+        z = best.z.copy()
+        z[models.VC_PLUS] = share * full
+        z[models.A0] += np.log((full - share * full) / max(full - best.z[models.VC_PLUS], 1e-9))
+        starts = [z]
+        if models.TE in structure.free() and best.z[models.VC_PLUS] < 1e-3 * full:
+            starts.append(z.copy())  # none at all may only be the other lag's friction
+            starts[1][models.TE] = z[models.A2] - z[models.A1] + 0.3
+        for z in starts:
+            other = _from(z, part, structure, best, options)
+            if better(other, best):
+                best = other
+    best = _along_lag(part, structure, best, options)
+    if best.converged or structure.friction != "symmetric":
+        return best
+    return shaken(part, structure, _scan_friction(part, structure, best, options, full), options)
+
+
+def better(one: Fit, other: Fit) -> bool:
+    """Tell which of two fits to keep: the likelier; of two alike the one that claims less."""
+    if one.deviance < other.deviance - ALIKE:
+        return True
+    free = one.structure.free()
+    if one.deviance > other.deviance + ALIKE or models.VC_PLUS not in free:
+        return one.deviance < other.deviance
+    i = free.index(models.VC_PLUS)
+    mine, theirs = one.covariance()[i, i], other.covariance()[i, i]
+    return bool(mine > 4 * theirs or (mine > theirs / 4 and one.deviance < other.deviance))
+
+
+def shaken(part: Experiments, structure: Structure, best: Fit, options: Options) -> Fit:
+    """Begin again around a descent that did not settle: a kink holds it at one place only."""
+    rng = np.random.default_rng(len(part.starts))
+    matrix = structure.matrix()
+    for n in range(SHAKES):
+        if best.converged:
+            break
+        values, vectors = np.linalg.eigh(best.covariance())
+        length = SHAKE[n % len(SHAKE)]
+        move = vectors @ (np.sqrt(np.maximum(values, 0.0)) * rng.standard_normal(len(values)))
+        largest = float(np.abs(matrix @ move)[[models.A0, models.A1, models.A2, models.TE]].max())
+        z = best.z + matrix @ move * min(length, length / max(largest, 1e-12))
+        other = _from(z, part, structure, best, options)
+        if other.deviance < best.deviance:
+            best = other
+    return best
+
+
+def shapes(z: Array) -> list[Array]:
+    """Return motors of the same linear response, by shares of the back-EMF in what limits it.
+
+    ``K = a0 - be`` and ``be te^2 - a1 te + a2 = 0``: which of two lags is the electric one,
+    and how much the motor brakes itself, is told by friction alone.
+    """
+    a0, a1, a2 = np.exp(z[: models.A2 + 1])
+    out = []
+    for share in SHARES:
+        roots = np.roots([(1 - share) * a0, -a1, a2])
+        for te in roots[np.abs(roots.imag) < 1e-9 * np.abs(roots)].real:
+            if te > 0:
+                shaped = z.copy()
+                shaped[models.TE] = np.log(te)
+                out.append(shaped)
+    return out or [z]
+
+
+def _from(z: Array, part: Experiments, structure: Structure, best: Fit, options: Options) -> Fit:
+    """Descend from other coordinates in the surroundings of the best fit so far."""
+    start = structure.complete(z)
+    return descend(part, structure, start, best.initial, best.noise, best.ratio, options, 30)
+
+
+def _along_lag(part: Experiments, structure: Structure, best: Fit, options: Options) -> Fit:
+    """Try other lags and shapes where the fit leaves them open, or what it leaves is not noise."""
+    free = structure.free()
+    if models.A2 not in free or models.TE not in free:
+        return best
+    i = free.index(models.A2)
+    starts = shapes(best.z) if best.ratio > 0 or not best.converged else []
+    if not best.converged or best.covariance()[i, i] > OPEN**2:
+        for share in (0.05, 0.2, 0.6):
+            z = best.z.copy()
+            z[models.A2] = 2 * z[models.A1] - z[models.A0] + np.log(share)
+            z[models.TE] = z[models.A2] - z[models.A1] + 0.02
+            starts.append(z)
+    for z in starts:
+        other = _from(z, part, structure, best, options)
+        if other.deviance < best.deviance - 1:
+            best = other
+    return best
+
+
+def _scan_friction(
+    part: Experiments, structure: Structure, best: Fit, options: Options, full: float
+) -> Fit:
+    """Search friction by the profile of the deviance: the others are fitted at each value.
+
+    Where the motor sticks often, the joint surface has a kink at every start and stop, and a
+    descent along the valley ends at one of them; across the valley it does not.
+    """
+    profile: dict[float, Fit] = {}
+
+    def at(level: float) -> Fit:
+        if level not in profile:
+            near = min(profile.values(), key=lambda f: abs(_level(f) - level), default=best)
+            z = near.z.copy()
+            z[models.A0] += np.log((full - level) / max(full - _level(near), 1e-9))
+            fixed = structure.with_(held={**structure.held, "vc_plus": level})
+            profile[level] = descend(part, fixed, fixed.complete(z), near.initial, near.noise,
+                                    best.ratio, options, 12, 0.1)  # fmt: skip
+        return profile[level]
+
+    grid = sorted({_level(best), *(full * np.array([0.003, 0.008, 0.016, 0.025, 0.04, 0.08]))})
+    for level in grid:
+        at(level)
+    for _ in range(8):
+        levels = sorted(profile)
+        i = levels.index(min(levels, key=lambda x: profile[x].deviance))
+        low, high = levels[max(i - 1, 0)], levels[min(i + 1, len(levels) - 1)]
+        at(0.5 * (low + levels[i]) if levels[i] - low > high - levels[i] else
+           0.5 * (high + levels[i]))  # fmt: skip
+    least = min(profile.values(), key=lambda f: f.deviance)
+    if least.deviance >= best.deviance - 1:
+        return best
+    return descend(part, structure, least.z, least.initial, least.noise, best.ratio, options, 30)
+
+
+def _level(fit: Fit) -> float:
+    return float(fit.z[models.VC_PLUS])

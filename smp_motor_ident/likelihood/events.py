@@ -1,0 +1,195 @@
+"""What happens inside one interval: sliding, reversal, sticking and breaking loose.
+
+Coulomb switching and sticking are located inside the interval; the sensitivities jump there.
+Derivation: docs/derivations.md, section 5.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smp_motor_ident._compile import compiled, inlined
+from smp_motor_ident.likelihood.internal import BE, STUCK, VC_MINUS, VC_PLUS
+from smp_motor_ident.likelihood.lanes import (
+    LANES,
+    SLOTS,
+    SW,
+    WHOLE,
+    activate,
+    fill,
+    slide_columns,
+    slide_state,
+    stay,
+    turn,
+)
+from smp_motor_ident.likelihood.propagator import speed_at
+
+Array = NDArray[np.float64]
+
+EVENTS = 32  # most in one interval
+
+
+@compiled
+def _zero_crossing(  # noqa: C901 - one search, branches for how it starts
+    h: float, par: Array, x: Array, sign: float, v: float, f: float
+) -> float:
+    """Return when within (0, h) the sliding speed reaches zero, or -1."""
+    te, tm, k, be = par[0], par[1], par[2], par[3]
+    w1, a1 = speed_at(h, te, tm, k, be, x[0], x[1], v, f)
+    hi = h
+    rounding = 1e-12 * (abs(x[1]) + abs(v - f) / (k + be))
+    if sign * w1 >= -rounding:
+        _, a0 = speed_at(0.0, te, tm, k, be, x[0], x[1], v, f)
+        if not (sign * a0 < 0.0 and sign * a1 > 0.0):
+            return -1.0
+        lo = 0.0  # a dip inside the interval: find its bottom
+        for _ in range(40):
+            mid = 0.5 * (lo + hi)
+            _, a = speed_at(mid, te, tm, k, be, x[0], x[1], v, f)
+            if sign * a < 0.0:
+                lo = mid
+            else:
+                hi = mid
+        w1, _ = speed_at(hi, te, tm, k, be, x[0], x[1], v, f)
+        if sign * w1 >= -rounding:
+            return -1.0
+    lo = 0.0
+    t = hi * max(0.0, min(1.0, x[1] / (x[1] - w1)))
+    if sign * x[1] <= 0.0:  # just started from rest: the crossing is after the peak
+        _, a0 = speed_at(0.0, te, tm, k, be, x[0], x[1], v, f)
+        if sign * a0 <= 0.0:
+            return 0.0
+        peak = hi
+        for _ in range(50):
+            mid = 0.5 * (lo + peak)
+            _, a = speed_at(mid, te, tm, k, be, x[0], x[1], v, f)
+            if sign * a > 0.0:
+                lo = mid
+            else:
+                peak = mid
+        t = 0.5 * (lo + hi)
+    for _ in range(60):  # Newton, kept inside the bracket
+        w, a = speed_at(t, te, tm, k, be, x[0], x[1], v, f)
+        if sign * w > 0.0:
+            lo = t
+        else:
+            hi = t
+        step = -w / a if a != 0.0 else hi - lo
+        new = t + step
+        if not (lo < new < hi):
+            new = 0.5 * (lo + hi)
+        if abs(new - t) < 1e-13 * h:
+            return float(new)
+        t = new
+    return float(t)
+
+
+@inlined
+def keeps_turning(m: Array, par: Array, x: Array, sign: float, v: float, f: float) -> bool:
+    """Tell from the propagator at hand that the speed does not reach zero on the way."""
+    q, w = x[0], x[1]
+    end = m[WHOLE + 2] * q + m[WHOLE + 3] * w + m[WHOLE + 7] * v - m[WHOLE + 10] * f
+    if sign * end < 0.0 or sign * w <= 0.0:
+        return False
+    if par[0] == 0.0:
+        return True
+    drive = m[WHOLE] * q + m[WHOLE + 1] * w + m[WHOLE + 6] * v - m[WHOLE + 9] * f
+    return not (sign * (q - par[BE] * w - f) < 0.0 and sign * (drive - par[BE] * end - f) > 0.0)
+
+
+@compiled
+def _breakaway(h: float, v: float, load: float, par: Array, x: Array) -> tuple[float, float]:
+    """Return when within h the stuck motor breaks loose (h: it does not), and which way."""
+    drive = x[0] - load if par[0] > 0.0 else v - load
+    end = v - load
+    if end > par[VC_PLUS]:
+        limit, direction = par[VC_PLUS], 1.0
+    elif end < -par[VC_MINUS]:
+        limit, direction = -par[VC_MINUS], -1.0
+    else:
+        return h, STUCK
+    wait = 0.0
+    if par[0] > 0.0 and (limit - drive) * (end - drive) > 0.0:
+        ratio = (limit - end) / (drive - end)
+        wait = -par[0] * math.log(ratio) if ratio > 0.0 else h
+    return (wait, direction) if wait < h else (h, STUCK)
+
+
+@compiled
+def _stop(load: float, f: float, v: float, par: Array, x: Array, m: Array) -> float:
+    """Put the speed to zero, let the columns jump, and return the direction from there."""
+    x[1] = 0.0
+    net = (x[0] if par[0] > 0.0 else v) - load
+    before = net - (f - load)
+    direction, after = STUCK, 0.0
+    if net > par[VC_PLUS]:
+        direction, after = 1.0, net - par[VC_PLUS]
+    elif net < -par[VC_MINUS]:
+        direction, after = -1.0, net + par[VC_MINUS]
+    ratio = after / before if before != 0.0 else 0.0
+    for j in range(LANES):
+        m[SW + j] *= ratio
+    return direction
+
+
+@compiled
+def advance(
+    h: float,
+    v: float,
+    direction: float,
+    load: float,
+    par: Array,
+    x: Array,
+    m: Array,
+    cache: Array,
+    marks: Array,
+    scratch: Array,
+) -> float:
+    """Advance by h at constant v under friction, through all events; return the direction.
+
+    Parameters
+    ----------
+    h, v : float
+        Length of the interval [s] and voltage.
+    direction : float
+        1, -1 or STUCK.
+    load : float
+        Constant load [V].
+    par : ndarray, shape (11,)
+        Internal parameters.
+    x : ndarray, shape (3,)
+        State; updated.
+    m, cache, marks, scratch : ndarray
+        Of `lanes`; updated.
+
+    Returns
+    -------
+    float
+        Direction afterwards.
+    """
+    left = h
+    for _ in range(EVENTS):
+        if direction == STUCK:
+            wait, direction = _breakaway(left, v, load, par, x)
+            stay(wait, par, x, m, v)
+            left -= wait
+            if direction == STUCK:
+                break
+        turn(m, direction)
+        f = load + (par[VC_PLUS] if direction > 0.0 else -par[VC_MINUS])
+        t = _zero_crossing(left, par, x, direction, v, f)
+        span = t if t >= 0.0 else left
+        fill(span, par, m, cache, SLOTS, scratch)
+        activate(m, cache, marks, SLOTS)
+        slide_columns(m, x[0], x[1], v, f)
+        slide_state(m, x, v, f)
+        if t < 0.0:
+            break
+        direction = _stop(load, f, v, par, x, m)
+        left -= t
+        if left <= 1e-14 * h:
+            break
+    return direction

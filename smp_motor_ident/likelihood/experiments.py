@@ -1,0 +1,285 @@
+"""Records made ready for the recursion: one output, its kind, the input as it was held."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smp_motor_ident.likelihood import recursion as rc
+from smp_motor_ident.likelihood.sections import sections_of
+from smp_motor_ident.record import Record
+
+Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+REST = 10
+"""Samples after which an unchanged count is a standstill."""
+JITTER = 2_000
+"""Samples that tell whether the stamps jitter."""
+FEW = 2_000
+"""Samples that tell whether a speed repeats its values."""
+
+
+@dataclass(frozen=True, eq=False)
+class Experiments:
+    """Arrays as `recursion.run` takes them.
+
+    Attributes
+    ----------
+    time, output, current : ndarray
+        As in `recursion.run`; ``current`` of shape (0,) where there is none.
+    starts : ndarray of int, shape (g + 1,)
+        Segment boundaries.
+    section_end, section_value, section_start : ndarray
+        The input.
+    kind : int
+        SPEED, ANGLE or MEAN_SPEED.
+    step : float
+        Median sampling interval [s].
+    quantum : float
+        Resolution of the output [rad or rad/s]; 0 where it has none.
+    initial : ndarray, shape (g, 4)
+        First guess of q (0), speed, angle and load of each segment.
+    """
+
+    time: Array
+    output: Array
+    current: Array
+    starts: Integers
+    section_end: Array
+    section_value: Array
+    section_start: Integers
+    kind: int
+    step: float
+    quantum: float
+    initial: Array
+
+    @property
+    def plain(self) -> bool:
+        """Whether the input changes at the samples, one value for each."""
+        where = [a.__array_interface__["data"][0] for a in (self.section_end, self.time)]
+        return bool(where[0] == where[1])
+
+    @cached_property
+    def jittered(self) -> float:
+        """The usual interval [s] where the stamps jitter around it, else 0."""
+        steps = np.diff(self.time[:JITTER])
+        off = np.abs(steps - self.step) > 1e-6 * self.step
+        return self.step if np.mean(off) > 0.2 else 0.0
+
+    @property
+    def size(self) -> int:
+        """Number of samples."""
+        return int(self.time.size)
+
+    def as_mean_speed(self) -> Experiments:
+        """Return the same experiments, the speed taken for a mean over a trailing window."""
+        return replace(self, kind=rc.MEAN_SPEED)
+
+    def head(self, duration: float) -> Experiments:
+        """Return all up to ``duration`` seconds after the first voltage, of all segments together.
+
+        A standstill before the first voltage teaches nothing, so it does not count.
+
+        Parameters
+        ----------
+        duration : float
+            [s].
+
+        Returns
+        -------
+        Experiments
+            Views of the same arrays.
+        """
+        left = duration + self._lead
+        for g in range(len(self.starts) - 1):
+            a, b = int(self.starts[g]), int(self.starts[g + 1])
+            span = self.time[b - 1] - self.time[a]
+            if span >= left:
+                end = a + int(np.searchsorted(self.time[a:b], self.time[a] + left)) + 1
+                end = min(max(end, a + 2), b)
+                return self._cut(g + 1, end)
+            left -= span
+        return self
+
+    @cached_property
+    def _lead(self) -> float:
+        """Return how long [s] it takes until a twentieth of the largest voltage is exceeded."""
+        level = np.abs(self.section_value)
+        first = int(np.argmax(level > 0.05 * level.max()))
+        before = 0.0
+        for g in range(len(self.starts) - 1):
+            begin, last = self.time[self.starts[g]], self.time[self.starts[g + 1] - 1]
+            if g + 2 == len(self.starts) or first < self.section_start[g + 1]:
+                return before + max(float(self.section_end[first] - begin), 0.0)
+            before += float(last - begin)
+        return before
+
+    def _cut(self, segments: int, end: int) -> Experiments:
+        starts = self.starts[: segments + 1].copy()
+        starts[-1] = end
+        return Experiments(
+            self.time[:end],
+            self.output[:end],
+            self.current[:end],
+            starts,
+            self.section_end,
+            self.section_value,
+            self.section_start[: segments + 1],
+            self.kind,
+            self.step,
+            self.quantum,
+            self.initial[:segments],
+        )
+
+
+def output_of(record: Record, kind: str = "auto") -> tuple[Array, int, float]:
+    """Choose the mechanical output of a record: counts before angle before speed."""
+    per_turn = record.hardware.counts_per_revolution
+    if kind != "speed":
+        if record.count is not None and per_turn:
+            quantum = 2 * np.pi / per_turn
+            angle = (record.count - record.count[0]) * quantum
+            angle[_repeats(record.count, record.starts)] = np.nan
+            return angle, rc.ANGLE, quantum
+        if record.position is not None and np.isfinite(record.position).sum() > 2:
+            first = record.position[np.isfinite(record.position)][0]
+            return record.position - first, rc.ANGLE, 0.0
+    if record.velocity is None:
+        raise ValueError("record has no velocity")
+    mean = rc.MEAN_SPEED if record.velocity_window > 0 else rc.SPEED
+    return record.velocity, mean, speed_quantum(record.velocity)
+
+
+def _repeats(count: Integers, starts: Sequence[int]) -> NDArray[np.bool_]:
+    """Mark what a standing encoder only says again: its error is the same every time.
+
+    Taken for so many independent readings, a standstill would fix the angle far better than
+    to the fraction of a count that is unknown.  Of a long run the sample in the middle stays,
+    which is late in neither direction, and of one that begins a segment the first.
+    """
+    first = np.zeros(count.size, dtype=np.bool_)  # of each segment
+    first[[0, *starts]] = True
+    begins = first.copy()
+    begins[1:] |= count[1:] != count[:-1]
+    begin = np.flatnonzero(begins)
+    length = np.diff(np.append(begin, count.size))
+    rests = length >= REST
+    if not rests.any():
+        return np.zeros(count.size, dtype=np.bool_)
+    repeats = np.repeat(rests, length)
+    stays = begin[rests]
+    repeats[stays + np.where(first[stays], 0, length[rests] // 2)] = False
+    return repeats
+
+
+def speed_quantum(velocity: Array) -> float:
+    """Return the step in which a speed comes, 0 where it comes in none.
+
+    A coarse step means that the speed is a difference of counts, so a mean over a window.
+    """
+    x = velocity[:20_000]
+    x = x[np.isfinite(x)]
+    if x.size < 50:
+        return 0.0
+    span = float(np.ptp(x))
+    # Steps of a five-hundredth of the span or more repeat; a speed without steps hardly does.
+    few = np.sort(x[:: -(-x.size // FEW)])
+    if few.size > FEW // 2 and np.mean(np.diff(few) <= 1e-6 * span) < 0.2:
+        return 0.0
+    levels = np.unique(x)
+    steps = np.diff(levels)
+    steps = steps[steps > 1e-6 * max(span, 1e-300)]
+    if steps.size < 4:
+        return 0.0
+    quantum = float(np.median(steps))
+    whole = (levels - levels[0]) / quantum
+    # Published logs round: a twentieth of a step is allowed.
+    regular = np.mean(np.abs(whole - np.round(whole)) < 0.05)
+    return quantum if regular > 0.95 and 2e-3 * span < quantum < 0.2 * span else 0.0
+
+
+def prepare(
+    records: Sequence[Record], use_current: bool, kind: str = "auto", hold: str = "held"
+) -> Experiments:
+    """Put records one after the other; segments keep their own state.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        Of one motor.
+    use_current : bool
+        Whether current is an output.
+    kind : {'auto', 'speed', 'angle'}
+        Which mechanical output.
+    hold : {'held', 'switched', 'middle'}
+        How the command ran inside the intervals of which the voltage is the mean: constant;
+        switching where two-level jumps nearby did; switching half-way.
+
+    Returns
+    -------
+    Experiments
+        Views where there is one record whose input needs no splitting.
+    """
+    outputs = [output_of(r, kind) for r in records]
+    if len({k for _, k, _ in outputs}) > 1:
+        outputs = [output_of(r, "speed") for r in records]
+    starts, ends, values, section_start = [], [], [], []
+    offset = sections = 0
+    for record in records:
+        end, value, index = sections_of(record, hold)
+        starts += [offset + s for s in record.starts]
+        section_start += [sections + int(index[s]) for s in record.starts]
+        ends.append(end)
+        values.append(value)
+        offset += len(record)
+        sections += len(end)
+    starts.append(offset)
+    section_start.append(sections)
+    time = _join([r.time for r in records])
+    output = _join([o for o, _, _ in outputs])
+    current = (
+        _join([r.current if r.current is not None else np.full(len(r), np.nan) for r in records])
+        if use_current
+        else np.zeros(0)
+    )
+    bounds = np.array(starts, dtype=np.int64)
+    steps = np.concatenate([np.diff(r.time[:200_000]) for r in records])
+    return Experiments(
+        time,
+        output,
+        current,
+        bounds,
+        _join(ends),
+        _join(values),
+        np.array(section_start, dtype=np.int64),
+        outputs[0][1],
+        float(np.median(steps)),
+        outputs[0][2],
+        _initial(time, output, bounds, outputs[0][1]),
+    )
+
+
+def _join(arrays: Sequence[Array]) -> Array:
+    return np.ascontiguousarray(arrays[0]) if len(arrays) == 1 else np.concatenate(arrays)
+
+
+def _initial(time: Array, output: Array, starts: Integers, kind: int) -> Array:
+    initial = np.zeros((len(starts) - 1, 4))
+    for g in range(len(starts) - 1):
+        a, b = int(starts[g]), int(min(starts[g + 1], starts[g] + 6))
+        y, t = output[a:b], time[a:b]
+        ok = np.isfinite(y)
+        if not ok.any():
+            continue
+        y, t = y[ok], t[ok]
+        if kind == rc.ANGLE:
+            initial[g, 2] = y[0]
+            if y.size > 1 and y.max() != y.min():
+                initial[g, 1] = (y[1] - y[0]) / (t[1] - t[0])
+        else:
+            initial[g, 1] = y[0]
+    return initial

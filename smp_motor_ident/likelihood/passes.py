@@ -1,0 +1,278 @@
+"""One pass over the data: which compiled loop, its memory, and the normal equations after it.
+
+Derivation: docs/derivations.md, sections 6 to 8.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smp_motor_ident.likelihood import recursion
+from smp_motor_ident.likelihood.cascade import run_sliding
+from smp_motor_ident.likelihood.elimination import eliminate
+from smp_motor_ident.likelihood.experiments import Experiments
+from smp_motor_ident.likelihood.noise import whitening
+from smp_motor_ident.likelihood.sliding import squares_sliding
+from smp_motor_ident.model import structures as models
+from smp_motor_ident.model.structures import Structure, to_internal
+
+Array = NDArray[np.float64]
+
+BLOCKS = 60  # runs of samples whose scores are summed, for the covariance of coloured residuals
+NO_GAIN = np.zeros((3, 2))
+
+
+@dataclass(frozen=True, eq=False)
+class Sums:
+    """What the loop over the samples gathered.
+
+    Attributes
+    ----------
+    normal, gradient, cost : ndarray, shapes (g, p, p), (g, p), (g,)
+        Of each segment; the common columns before its own.
+    spread : ndarray, shape (6,)
+        Sums of squares and product of the raw residuals, and their numbers.
+    scores, owner : ndarray, shapes (blocks, p) and (blocks,)
+        Scores summed over runs of samples, and the segments of these.
+    """
+
+    normal: Array
+    gradient: Array
+    cost: Array
+    spread: Array
+    scores: Array
+    owner: NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Pass:
+    """What one run over the data gave, the initial states eliminated.
+
+    Attributes
+    ----------
+    objective : float
+        Weighted sum of squares.
+    normal, gradient : ndarray, shapes (f, f) and (f,)
+        Of the common columns.
+    local_step, local_gain : ndarray, shapes (g, l) and (g, l, f)
+        Step of the own columns, and by how much it is less per common step.
+    local_promise : float
+        By how much the own steps alone lower the objective.
+    spread : ndarray, shape (6,)
+        As in `Sums`.
+    scores : ndarray, shape (blocks, f)
+        Scores summed over runs of samples.
+    """
+
+    objective: float
+    normal: Array
+    gradient: Array
+    local_step: Array
+    local_gain: Array
+    local_promise: float
+    spread: Array
+    scores: Array
+
+    def scaled(self, factor: float) -> Pass:
+        """Return the same under residuals that weigh otherwise.
+
+        Parameters
+        ----------
+        factor : float
+            Inverse variance over what it was.
+
+        Returns
+        -------
+        Pass
+            Steps are as they were.
+        """
+        return replace(
+            self,
+            objective=self.objective * factor,
+            local_promise=self.local_promise * factor,
+            normal=self.normal * factor,
+            gradient=self.gradient * factor,
+            scores=self.scores * factor,
+        )
+
+
+def own_columns(data: Experiments, structure: Structure) -> tuple[int, ...]:
+    """Return which of (q, w, angle, load) each segment has to itself.
+
+    Parameters
+    ----------
+    data : Experiments
+        Prepared records.
+    structure : Structure
+        What is free.
+
+    Returns
+    -------
+    tuple of int
+        Columns of `Experiments.initial`.
+    """
+    angle = (2,) if data.kind == recursion.ANGLE else ()
+    own = (1,) if structure.order == 1 else (0, 1)
+    return own + angle + ((3,) if structure.own_load else ())
+
+
+def gather(
+    data: Experiments,
+    structure: Structure,
+    z: Array,
+    initial: Array,
+    gain: Array = NO_GAIN,
+    noise: Array | None = None,
+    huber: float = np.inf,
+    predicted: Array | None = None,
+    differentiate: bool = True,
+) -> Sums:
+    """Run over the data once.
+
+    Parameters
+    ----------
+    data : Experiments
+        Prepared records.
+    structure : Structure
+        Order, friction and what is free.
+    z : ndarray, shape (11,)
+        Coordinates.
+    initial : ndarray, shape (g, 4)
+        q, w, angle, load of each segment.
+    gain : ndarray, shape (3, 2)
+        Innovation gain.
+    noise : ndarray, shape (2, 2), optional
+        Covariance of (output, current); 1 each by default.
+    huber : float
+        Bound of the robust loss in standard deviations.
+    predicted : ndarray, shape (n, 1), (n, 2) or (n, 3), optional
+        Filled with the output; or with speed and output, and perhaps current.
+    differentiate : bool
+        Whether the columns of the problem are wanted.
+
+    Returns
+    -------
+    Sums
+        Without columns where ``differentiate`` is False.
+    """
+    noise = np.eye(2) if noise is None else noise
+    par, internal = to_internal(z, structure.order)
+    slope = (
+        np.ascontiguousarray(internal @ structure.matrix()) if differentiate else internal[:, :0]
+    )
+    own = np.array(own_columns(data, structure) if differentiate else (), dtype=np.int64)
+    p, segments = slope.shape[1] + own.size, len(data.starts) - 1
+    length = max(1, -(-data.size // BLOCKS))
+    rows = data.size // length + 2 * segments + 2
+    scores, owner = np.empty((rows, p)), np.empty(rows, dtype=np.int64)
+    normal, gradient, cost = np.empty((segments, p, p)), np.empty((segments, p)), np.zeros(segments)
+    spread = np.zeros(6)
+    angle = data.kind == recursion.ANGLE
+    if predicted is None and _slides(data, structure, z, gain, huber):
+        if p == 0:
+            spread[0], spread[3] = squares_sliding(
+                data.time,
+                data.starts,
+                data.section_value,
+                data.output,
+                angle,
+                par,
+                initial,
+                data.jittered,
+            )
+            used = 0
+        else:
+            used = run_sliding(
+                data.time, data.starts, data.section_value, data.output, angle, par, slope,
+                initial, own, data.jittered, 1 / math.sqrt(noise[0, 0]), normal, gradient, cost,
+                spread, length, scores, owner,
+            )  # fmt: skip
+    else:
+        used = recursion.run(
+            data.time, data.starts, data.section_end, data.section_value, data.section_start,
+            data.output, data.current, data.kind, structure.friction != "none", par, slope,
+            initial, own, gain, whitening(noise), huber, normal, gradient, cost, spread,
+            length, scores, owner, _ring(data, par, p),
+            np.zeros((0, 3)) if predicted is None else predicted, data.jittered,
+        )  # fmt: skip
+    return Sums(normal, gradient, cost, spread, scores[:used], owner[:used])
+
+
+def _ring(data: Experiments, par: Array, p: int) -> Array:
+    """Return the memory for the window of a mean speed."""
+    if data.kind != recursion.MEAN_SPEED:
+        return np.zeros((0, 0))
+    steps = np.diff(data.time)
+    # A descent may try any width; one that is no width at all is thrown out by its objective.
+    width = min(max(float(par[recursion.WINDOW]), 0.0), float(np.ptp(data.time)))
+    depth = 4 + math.ceil(width / float(steps[steps > 0].min()))
+    return np.zeros((min(depth, data.size + 1), 3 + 2 * p))
+
+
+def _slides(data: Experiments, structure: Structure, z: Array, gain: Array, huber: float) -> bool:
+    """Tell whether `cascade.run_sliding` does: nothing happens between the samples."""
+    return bool(
+        structure.friction == "none"
+        and not structure.delay
+        and z[models.DELAY] == 0.0
+        and data.kind != recursion.MEAN_SPEED
+        and not data.current.size
+        and huber == math.inf
+        and not gain.any()
+        and data.plain
+    )
+
+
+def evaluate(
+    data: Experiments,
+    structure: Structure,
+    z: Array,
+    initial: Array,
+    start: Array,
+    gain: Array,
+    noise: Array,
+    huber: float = np.inf,
+    priors: Sequence[tuple[Array, float]] = (),
+) -> Pass:
+    """Run, add what is known beforehand, and eliminate the initial states.
+
+    Parameters
+    ----------
+    data, structure, z, initial
+        As in `gather`.
+    start : ndarray, shape (g, 4)
+        Initial states as they were first guessed.
+    gain, noise, huber
+        As in `gather`.
+    priors : sequence of (ndarray, float)
+        Rows of the common columns and by how much each misses, in standard deviations.
+
+    Returns
+    -------
+    Pass
+        With an infinite objective where the numbers left the range of floating point.
+    """
+    sums = gather(data, structure, z, initial, gain, noise, huber)
+    own = own_columns(data, structure)
+    segments, f, o = len(sums.cost), structure.matrix().shape[1], len(own)
+    common, score = np.zeros((f, f)), np.zeros(f)
+    step, local_gain = np.zeros((segments, o)), np.zeros((segments, o, f))
+    total = float(sums.cost.sum())
+    for row, miss in priors:
+        common += np.outer(row, row)
+        score += row * miss
+        total += miss * miss
+    away = (initial - start)[:, list(own)]
+    prior, promise = eliminate(sums.normal, sums.gradient, away, data.size, common, score, step,
+                               local_gain, sums.scores, sums.owner)  # fmt: skip
+    total += prior
+    if not math.isfinite(total + float(common.sum()) + float(score.sum()) + float(step.sum())):
+        return Pass(math.inf, np.zeros((f, f)), np.zeros(f), np.zeros_like(step),
+                    np.zeros_like(local_gain), 0.0, np.full(6, np.nan),
+                    np.zeros((0, f)))  # fmt: skip
+    return Pass(total, common, score, step, local_gain, promise, sums.spread, sums.scores[:, :f])

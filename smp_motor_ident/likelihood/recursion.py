@@ -1,0 +1,312 @@
+"""The compiled recursion: simulate, differentiate, and gather the normal equations.
+
+One pass over the samples carries the state ``(q, w, th)`` of `propagator`, its sensitivity
+to every column of the problem, and sums ``psi psi^T``, ``psi r`` and ``r^2`` of the whitened
+residuals on the way.  Nothing of the length of the record is allocated.
+Derivation: docs/derivations.md, sections 4 to 7.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smp_motor_ident._compile import compiled, inlined
+from smp_motor_ident.likelihood.events import advance, keeps_turning
+from smp_motor_ident.likelihood.internal import (
+    ANGLE,
+    DELAY,
+    LOAD,
+    MEAN_SPEED,
+    SPEED,
+    STUCK,
+    VC_MINUS,
+    VC_PLUS,
+    WINDOW,
+)
+from smp_motor_ident.likelihood.lanes import (
+    ACTIVE,
+    D0,
+    D1,
+    LANES,
+    SLOPE,
+    SQ,
+    SW,
+    begin,
+    prepare_slide,
+    slide_columns,
+    slide_state,
+    tabulate,
+    turn,
+)
+from smp_motor_ident.likelihood.observation import note, observe, observe_current
+from smp_motor_ident.likelihood.sums import ROOM, TILE, robust, sum_up
+
+__all__ = ["ANGLE", "MEAN_SPEED", "SPEED", "WINDOW", "run"]
+
+Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+ON_DELAY = SLOPE + DELAY * LANES
+
+
+@inlined
+def _move(
+    h: float,
+    slack: float,
+    v: float,
+    direction: float,
+    load: float,
+    friction: bool,
+    par: Array,
+    x: Array,
+    m: Array,
+    cache: Array,
+    marks: Array,
+    table: Array,
+    scratch: Array,
+    columns: bool,
+) -> float:
+    """Advance by h at constant v; return the direction of motion."""
+    if direction == STUCK:
+        return advance(h, v, direction, load, par, x, m, cache, marks, scratch)
+    if abs(marks[ACTIVE] - h) > slack:
+        prepare_slide(h, slack, par, m, cache, marks, table, scratch)
+    f = load
+    if friction:
+        f += par[VC_PLUS] if direction > 0.0 else -par[VC_MINUS]
+        if not keeps_turning(m, par, x, direction, v, f):
+            return advance(h, v, direction, load, par, x, m, cache, marks, scratch)
+    if columns:
+        slide_columns(m, x[0], x[1], v, f)
+    slide_state(m, x, v, f)
+    return direction
+
+
+@compiled
+def _switch(
+    v: float, new: float, load: float, direction: float, friction: bool, par: Array, m: Array
+) -> None:
+    """Let the columns feel that a later switch of the input comes later."""
+    dv = v - new
+    if par[0] > 0.0:
+        for j in range(LANES):
+            m[SQ + j] += dv / par[0] * m[ON_DELAY + j]
+        return
+    if friction and direction == STUCK:  # it starts, if at all, just now
+        net = new - load
+        dv = -max(0.0, net - par[VC_PLUS]) - min(0.0, net + par[VC_MINUS])
+    for j in range(LANES):
+        m[SW + j] += dv / par[1] * m[ON_DELAY + j]
+
+
+@inlined
+def _correct(
+    gain: Array, e0: float, e1: float, ok0: bool, ok1: bool, stuck: bool, x: Array, m: Array
+) -> None:
+    """Let the innovations move the state and its columns."""
+    for n in range(3):
+        if n == 1 and stuck:
+            continue
+        k0 = gain[n, 0] if ok0 else 0.0
+        k1 = gain[n, 1] if ok1 else 0.0
+        x[n] += k0 * e0 + k1 * e1
+        for j in range(LANES):
+            m[n * LANES + j] -= k0 * m[D0 + j] + k1 * m[D1 + j]
+
+
+@compiled
+def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between its steps
+    time: Array,
+    starts: Integers,
+    section_end: Array,
+    section_value: Array,
+    section_start: Integers,
+    output: Array,
+    current: Array,
+    kind: int,
+    friction: bool,
+    par: Array,
+    slope: Array,
+    initial: Array,
+    local: Integers,
+    gain: Array,
+    weight: Array,
+    huber: float,
+    normal: Array,
+    gradient: Array,
+    cost: Array,
+    spread: Array,
+    block_length: int,
+    blocks: Array,
+    block_segment: Integers,
+    ring: Array,
+    predicted: Array,
+    usual: float,
+) -> int:
+    """Run over all segments; fill the sums in place.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        Sampling instants [s].
+    starts : ndarray of int, shape (g + 1,)
+        First sample of each segment, and n.
+    section_end, section_value : ndarray, shape (m,)
+        Instants [s] until which the input was held at the values [V].
+    section_start : ndarray of int, shape (g,)
+        First section of each segment; it also holds what came before.
+    output, current : ndarray, shape (n,)
+        Mechanical output (NaN where lost); current [A], shape (0,) where it is not used.
+    kind : int
+        SPEED, ANGLE or MEAN_SPEED (over the trailing window).
+    friction : bool
+        Whether Coulomb friction is in the model.
+    par, slope : ndarray, shapes (11,) and (11, c)
+        Internal parameters (see the constants of this module; te and tm not as logarithms)
+        and their derivatives by the c common columns (those of te and tm logarithmic).
+    initial : ndarray, shape (g, 4)
+        q, w, th and load of each segment.
+    local : ndarray of int, shape (l,)
+        Which of these four are columns of the problem.
+    gain : ndarray, shape (3, 2)
+        Innovation gain from (output, current) to (q, w, th).
+    weight : ndarray, shape (2, 3)
+        Lower triangular whitening of (output, current); third column: of one alone.
+    huber : float
+        Residuals beyond this many standard deviations count linearly.
+    normal, gradient, cost : ndarray, shapes (g, p, p), (g, p), (g,)
+        Sums, p = c + l; overwritten.
+    spread : ndarray, shape (6,)
+        Sums of squares and product of the raw residuals, and their numbers; overwritten.
+    block_length, blocks, block_segment
+        Scores are summed over runs of ``block_length`` samples into rows of ``blocks``.
+    ring : ndarray, shape (r, 3 + 2 p)
+        Memory for the window of MEAN_SPEED; shape (0, 0) otherwise.
+    predicted : ndarray, shape (n, 1), (n, 2) or (n, 3)
+        Filled with the output; or with speed and output, and perhaps current; shape (0, 3)
+        where not wanted.
+    usual : float
+        Usual interval [s] where the stamps jitter; 0 where they do not.
+
+    Returns
+    -------
+    int
+        Number of rows of ``blocks`` in use.
+    """
+    n_common = slope.shape[1]
+    p = n_common + local.shape[0]
+    columns = p > 0
+    has_current = current.shape[0] > 0
+    has_gain = bool(np.any(gain != 0.0))
+    delay = par[DELAY]
+    late = bool(np.any(slope[DELAY] != 0.0))
+    m, cache, marks, scratch = begin(slope, local, friction)
+    table = tabulate(usual, par, m, cache, marks, scratch)
+    x, past, rows = np.zeros(3), np.zeros(1 + p), np.zeros(TILE * ROOM)
+    tile = np.zeros((ROOM, TILE))
+    spread[:] = 0.0
+    block = -1
+    for g in range(starts.shape[0] - 1):
+        first, last = starts[g], starts[g + 1]
+        normal[g], gradient[g], cost[g] = 0.0, 0.0, 0.0
+        m[: 3 * LANES] = 0.0
+        x[:] = initial[g, :3]
+        # A speed of exactly zero under friction is a motor at rest, not a free number: the
+        # cost has a kink there.
+        at_rest = friction and x[1] == 0.0
+        for j in range(local.shape[0]):
+            if local[j] < 3 and not (at_rest and local[j] == 1):
+                m[local[j] * LANES + n_common + j] = 1.0
+        load = par[LOAD] + initial[g, 3]
+        section = section_start[g]
+        limit = section_start[g + 1] - 1 if g + 2 < starts.shape[0] else section_end.shape[0] - 1
+        now = time[first]
+        direction = 1.0
+        if friction:
+            direction = STUCK if at_rest else (1.0 if x[1] > 0.0 else -1.0)
+        turn(m, direction)
+        block += 1
+        block_segment[block] = g
+        blocks[block] = 0.0
+        filled = count = 0
+        while section < limit and section_end[section] + delay <= now:
+            section += 1
+        for k in range(first, last):
+            target = time[k]
+            while now < target:
+                end = target
+                change = section_end[section] + delay
+                if section < limit and change < target - 1e-9 * (target - now):
+                    end = change
+                v = section_value[section]
+                h = end - now
+                if h > 0.0:
+                    slack = 1e-9 * h + 1e-15 * abs(target)
+                    direction = _move(
+                        h, slack, v, direction, load, friction, par, x, m, cache, marks, table,
+                        scratch, columns,
+                    )  # fmt: skip
+                now = end
+                if section < limit and change <= target + 1e-9 * (target - time[k - 1]):
+                    section += 1
+                    if late:
+                        _switch(v, section_value[section], load, direction, friction, par, m)
+            y0 = observe(kind, k, first, target, par, x, m, ring, past, columns)
+            y1 = observe_current(par, x, m) if has_current else 0.0
+            if predicted.shape[0] > 0:
+                note(predicted[k], x[1], y0, y1)
+            # Residuals, whitened.
+            e0 = output[k] - y0
+            e1 = current[k] - y1 if has_current else 0.0
+            ok0, ok1 = e0 == e0, has_current and e1 == e1
+            w00 = w10 = w11 = 0.0
+            if ok0:
+                w00 = weight[0, 0]
+                spread[0] += e0 * e0
+                spread[3] += 1.0
+            else:
+                e0 = 0.0
+            if ok1:
+                w11 = weight[1, 2]
+                spread[1] += e1 * e1
+                spread[4] += 1.0
+                if ok0:
+                    w10, w11 = weight[1, 0], weight[1, 1]
+                    spread[2] += e0 * e1
+                    spread[5] += 1.0
+            else:
+                e1 = 0.0
+            loss0, u0 = robust(w00 * e0, huber)
+            loss1, u1 = robust(w10 * e0 + w11 * e1, huber)
+            cost[g] += loss0 + loss1
+            if filled >= block_length or count > TILE - 2:
+                sum_up(rows, count, p, tile, normal[g], gradient[g], blocks[block])
+                count = 0
+            if filled >= block_length:
+                block += 1
+                block_segment[block] = g
+                blocks[block] = 0.0
+                filled = 0
+            filled += 1
+            if ok0 and columns:
+                for j in range(LANES):
+                    rows[count * ROOM + j] = u0 * w00 * m[D0 + j]
+                rows[count * ROOM + LANES] = u0 * w00 * e0
+                count += 1
+            if ok1 and columns:
+                for j in range(LANES):
+                    rows[count * ROOM + j] = u1 * (w10 * m[D0 + j] + w11 * m[D1 + j])
+                rows[count * ROOM + LANES] = u1 * (w10 * e0 + w11 * e1)
+                count += 1
+            if has_gain:
+                stuck = direction == STUCK
+                _correct(gain, e0, e1, ok0, ok1, stuck, x, m)
+                if friction and not stuck and x[1] * direction < 0.0:
+                    direction = -direction
+                    turn(m, direction)
+        sum_up(rows, count, p, tile, normal[g], gradient[g], blocks[block])
+        for j in range(p):
+            for i in range(j):
+                normal[g, i, j] = normal[g, j, i]
+    return block + 1

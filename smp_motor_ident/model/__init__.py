@@ -1,0 +1,1 @@
+"""What a motor may be: candidate structures and their parameters."""

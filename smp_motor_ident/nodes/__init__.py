@@ -1,0 +1,1 @@
+"""Nodes that need what is known of motors: record, play, identifier."""

@@ -1,0 +1,267 @@
+"""play: a bag's messages once more, byte for byte and in their own time."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import threading
+import time
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
+
+from smp_motor_control.errors import SmpError
+from smp_motor_control.nodes import runtime
+from smp_motor_ident.bag.replay import Replay, offered
+from smp_motor_ident.bag.storage import Channel
+from smp_motor_ident.nodes.bag_arguments import message_class, pattern, split_arguments
+
+DEPTH = 1000
+FIND_EACH_OTHER = 1.0
+"""Shortest wait [s] before the first message, so that subscribers find the publishers."""
+FIND_ANYBODY = 3.0
+"""Longest wait [s] for a first subscriber, where nobody listens yet."""
+FIND_AT_MOST = 5.0
+"""Longest wait [s] until everybody whom the graph shows is connected."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to play."""
+
+    rate: float = 1.0
+    start_offset: float = 0.0
+    loop: bool = False
+    clock_rate: float = 0.0
+    wait: float = FIND_EACH_OTHER
+
+
+class Player(Node):
+    """Publishes the messages of a bag from a thread of its own.
+
+    Parameters
+    ----------
+    replay : Replay
+        The bag.
+    channels : list of Channel
+        Topics that are wanted.
+    options : Options
+        How to play.
+
+    Raises
+    ------
+    SmpError
+        When none of the topics can be published.
+    """
+
+    def __init__(self, replay: Replay, channels: list[Channel], options: Options) -> None:
+        super().__init__("play")
+        self._replay, self._options = replay, options
+        self._outputs: dict[str, tuple[str, Publisher]] = {}
+        for channel in channels:
+            self._offer(channel)
+        if not self._outputs:
+            raise SmpError("no topic of the bag can be played")
+        self._clock: Publisher | None = None
+        if options.clock_rate:
+            self._clock = self.create_publisher(Clock, "/clock", 10)
+        self._clock_due = 0.0
+        self.sent: Counter[str] = Counter()
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _offer(self, channel: Channel) -> None:
+        kept, _ = self._outputs.get(channel.topic, (channel.type, None))
+        if kept != channel.type:  # a node cannot offer one topic with two types
+            self.get_logger().warning(
+                f"{channel.topic}: its messages of type {channel.type} are not played, "
+                f"only those of type {kept}"
+            )
+            return
+        message = message_class(channel.type)
+        if message is None or channel.encoding != "cdr":
+            why = f"its type {channel.type} is not installed here"
+            if channel.encoding != "cdr":
+                why = f"its messages are encoded as {channel.encoding}"
+            self.get_logger().warning(f"{channel.topic} is not played: {why}")
+            return
+        reliable, latched = offered(channel)
+        qos = QoSProfile(
+            depth=DEPTH,
+            reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+            durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+        )
+        publisher = self.create_publisher(message, channel.topic, qos)
+        self._outputs[channel.topic] = (channel.type, publisher)
+
+    def _run(self) -> None:
+        """Play until the end or until the node stops."""
+        code = 0
+        try:
+            self._wait_for_subscribers()
+            while not self._ended.is_set():
+                if not self._play_once() or not self._options.loop:
+                    break
+            for _, publisher in self._outputs.values():
+                if not self._ended.is_set():
+                    publisher.wait_for_all_acked(Duration(seconds=2.0))
+        except SmpError as error:
+            print(f"play: {error}", file=sys.stderr, flush=True)
+            code = error.exit_code
+        except Exception as error:
+            if not self._ended.is_set():
+                print(f"play: stopped by {error!r}", file=sys.stderr, flush=True)
+                code = 1
+        runtime.finish(code)
+
+    def _wait_for_subscribers(self) -> None:
+        """Wait until there is somebody, and everybody is connected, within limits."""
+        begin = time.monotonic()
+        while not self._ended.wait(0.02):
+            waited = time.monotonic() - begin
+            linked = [p.get_subscription_count() for _, p in self._outputs.values()]
+            known = [self.count_subscribers(p.topic_name) for _, p in self._outputs.values()]
+            enough = FIND_ANYBODY if not any(known) else 0.0
+            if any(link < count for link, count in zip(linked, known)):
+                enough = FIND_AT_MOST
+            if waited >= max(enough, self._options.wait):
+                return
+
+    def _play_once(self) -> bool:
+        """Play the bag from the offset to its end; return whether there was anything."""
+        options = self._options
+        begin: float | None = None
+        first = skipped = 0
+        for channel, stamp, data in self._replay.messages(lambda c: c.topic in self._outputs):
+            if not skipped:
+                first, skipped = stamp + round(options.start_offset * 1e9), 1
+            if stamp < first:
+                continue
+            if begin is None:
+                begin = time.monotonic()
+            due = begin + (stamp - first) * 1e-9 / options.rate
+            if not self._wait_until(due, begin, first):
+                return False
+            type_name, publisher = self._outputs[channel.topic]
+            if channel.type == type_name:
+                publisher.publish(data)
+                self.sent[channel.topic] += 1
+        if begin is None:
+            raise SmpError(
+                "there is no message"
+                + (f" behind an offset of {options.start_offset:g} s" if skipped else " in the bag")
+            )
+        return True
+
+    def _wait_until(self, due: float, begin: float, first: int) -> bool:
+        """Wait for a message's time, sending the clock meanwhile; False when stopped."""
+        while not self._ended.is_set():
+            now = time.monotonic()
+            if self._clock is not None and now >= self._clock_due:
+                elapsed = (min(now, due) - begin) * self._options.rate
+                self._send_clock(first + round(elapsed * 1e9))
+                self._clock_due = now + 1.0 / self._options.clock_rate
+            if now >= due:
+                return True
+            until = due if self._clock is None else min(due, self._clock_due)
+            # Short waits sleep: the event's own wait is too coarse for them.
+            if until - now > 0.05:
+                self._ended.wait(until - now - 0.02)
+            else:
+                time.sleep(max(until - now, 0.0))
+        return False
+
+    def _send_clock(self, stamp: int) -> None:
+        message = Clock()
+        message.clock.sec, message.clock.nanosec = divmod(stamp, 1_000_000_000)
+        assert self._clock is not None
+        self._clock.publish(message)
+
+    def on_stop(self) -> None:
+        """Stop the thread and tell what was sent."""
+        self._ended.set()
+        self._thread.join(timeout=1.0)
+        for note in self._replay.notes:
+            print(f"play: {note}", file=sys.stderr, flush=True)
+        for name, count in sorted(self.sent.items()):
+            print(f"{count:9d}  {name}", flush=True)
+        print(f"{sum(self.sent.values()):9d}  messages sent", flush=True)
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    made = argparse.ArgumentParser(
+        prog="play",
+        description="Publish the messages of a bag (MCAP or SQLite) again, as they were.",
+        epilog="Arguments for ROS, such as remappings, follow --ros-args.",
+    )
+    add = made.add_argument
+    add("bag", metavar="BAG", help="folder of the bag, or a bare .mcap or .db3 file")
+    add("--topics", nargs="+", default=[], metavar="TOPIC", help="only these")
+    add("--regex", "-e", default="", metavar="PATTERN", help="only topics that match as a whole")
+    add("--exclude", "-x", default="", metavar="PATTERN", help="not topics that match")
+    add("--rate", "-r", type=float, default=1.0, metavar="R", help="faster (2) or slower (0.5)")
+    add("--start-offset", type=float, default=0.0, metavar="S", help="begin so late in the bag")
+    add("--loop", "-l", action="store_true", help="begin again at the end")
+    add("--clock", nargs="?", type=float, const=40.0, default=0.0, metavar="HZ", help="send /clock")
+    add("--delay", type=float, default=FIND_EACH_OTHER, metavar="S", help="wait before the first")
+    return made
+
+
+def _options(arguments: argparse.Namespace) -> Options:
+    for name, low in (("rate", 1e-6), ("start_offset", 0.0), ("clock", 0.0), ("delay", 0.0)):
+        value = getattr(arguments, name)
+        if not low <= value < float("inf"):
+            option = "--" + name.replace("_", "-")
+            raise SmpError(
+                f"{option} is {value:g}; it must be {'positive' if low else '0 or more'}"
+            )
+    return Options(
+        arguments.rate,
+        arguments.start_offset,
+        arguments.loop,
+        arguments.clock,
+        arguments.delay,
+    )
+
+
+def _chosen(replay: Replay, arguments: argparse.Namespace) -> list[Channel]:
+    """Return the channels that the arguments ask for."""
+    wanted = pattern("--regex", arguments.regex)
+    unwanted = pattern("--exclude", arguments.exclude)
+    names = {name if name.startswith("/") else f"/{name}" for name in arguments.topics}
+    there = {channel.topic for channel in replay.channels}
+    if missing := names - there:
+        raise SmpError(
+            f"{arguments.bag}: has no topic {sorted(missing)[0]}; it has "
+            f"{', '.join(sorted(there)) or 'none'}"
+        )
+
+    def chosen(topic: str) -> bool:
+        if (unwanted and unwanted.fullmatch(topic)) or (arguments.clock and topic == "/clock"):
+            return False
+        asked = bool(names) or wanted is not None
+        return not asked or topic in names or bool(wanted and wanted.fullmatch(topic))
+
+    return [channel for channel in replay.channels if chosen(channel.topic)]
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the player."""
+    own, ros = split_arguments(sys.argv[1:] if argv is None else argv)
+    arguments = parser().parse_args(own)
+
+    def make() -> Any:
+        options = _options(arguments)
+        replay = Replay(Path(arguments.bag))
+        return Player(replay, _chosen(replay, arguments), options)
+
+    return runtime.run("play", make, ros)
