@@ -117,10 +117,10 @@ def main() -> None:
     parser.add_argument("--list", action="store_true", help="print every case")
     args = parser.parse_args()
     seed = args.seed if args.seed is not None else int(time.time())
+    words = [w.strip().lower() for w in args.effects.split(",") if w.strip()]
     chosen = [
-        k for k, e in enumerate(EFFECTS)
-        if not args.effects or any(w.strip().lower() in e.name.lower() for w in args.effects.split(","))
-    ]  # fmt: skip
+        k for k, e in enumerate(EFFECTS) if not words or any(w in e.name.lower() for w in words)
+    ]
     jobs = [
         (k, n % 3, seed * 1000 + 97 * k + n, args.rich) for k in chosen for n in range(args.motors)
     ]
@@ -128,12 +128,12 @@ def main() -> None:
     counts: dict[int, Counter[str]] = {k: Counter() for k in chosen}
     lines = []
     with ProcessPoolExecutor(args.processes) as pool:
-        for number, outcome, words in pool.map(judge, jobs, chunksize=1):
+        for number, outcome, about in pool.map(judge, jobs, chunksize=1):
             counts[number][outcome] += 1
-            lines.append((outcome, words))
+            lines.append((outcome, about))
     if args.list:
-        for outcome, words in lines:
-            print(f"{outcome:8} {words}")
+        for outcome, about in lines:
+            print(f"{outcome:8} {about}")
     print(f"\nseed {seed}, {args.motors} motors an effect, {time.time() - begin:.0f} s\n")
     print("| effect | " + " | ".join(OUTCOMES) + " |\n|" + " --- |" * (1 + len(OUTCOMES)))
     total: Counter[str] = Counter()
