@@ -114,6 +114,15 @@ class LoopSettings:
         )
         return replace(self, gains=gains)
 
+    @property
+    def reachable(self) -> float:
+        """Speed for which the voltage suffices by the feed-forward [rad/s]; infinite if unknown."""
+        gains = self.gains
+        if gains.feedforward_velocity <= 0.0:
+            return math.inf
+        most = min(gains.u_clamp_max, -gains.u_clamp_min) - gains.feedforward_static
+        return max(most, 0.0) / gains.feedforward_velocity
+
 
 class WheelLoop:
     """Speed loop of one wheel, one step per feedback sample.
@@ -169,7 +178,7 @@ class WheelLoop:
             [V], see the class.
         """
         self._gearbox, self._encoder, self._max_load = gearbox, encoder, max_load
-        self._renew_speed()
+        self.renew_speed()
 
     def configure(self, settings: LoopSettings) -> None:
         """Change settings while running, without a jump of the output.
@@ -184,9 +193,10 @@ class WheelLoop:
         self.profile.configure(settings.limits, settings.transition_time, settings.drive)
         shaped = ("speed_source", "difference_window", "model", "noise")
         if any(getattr(old, name) != getattr(settings, name) for name in shaped):
-            self._renew_speed()
+            self.renew_speed()
 
-    def _renew_speed(self) -> None:
+    def renew_speed(self) -> None:
+        """Make the speed's source anew from the settings."""
         self._observer: SpeedObserver | None = None
         self._differenced: DifferencedSpeed | None = None
         self._intervals: list[float] = []
