@@ -123,26 +123,7 @@ def damped_step(  # noqa: C901 - plain loops
     lower: Array,
     upper: Array,
 ) -> tuple[Array, float]:
-    """Return the damped Gauss-Newton step; columns pushed against a bound stay.
-
-    Parameters
-    ----------
-    normal, gradient : ndarray, shapes (f, f) and (f,)
-        Of the common columns.
-    damping : float
-        Relative to the diagonal.
-    matrix : ndarray, shape (11, f)
-        Of the structure.
-    z, lower, upper : ndarray, shape (11,)
-        Coordinates and their bounds.
-
-    Returns
-    -------
-    step : ndarray, shape (f,)
-        At most 1.5 in any logarithm.
-    size : float
-        Its length in standard deviations.
-    """
+    """Return the damped Gauss-Newton step; columns pushed against a bound stay."""
     f = gradient.shape[0]
     step = np.zeros(f)
     frozen = np.zeros(f, dtype=np.bool_)

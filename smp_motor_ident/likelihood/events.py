@@ -148,28 +148,7 @@ def advance(
     marks: Array,
     scratch: Array,
 ) -> float:
-    """Advance by h at constant v under friction, through all events; return the direction.
-
-    Parameters
-    ----------
-    h, v : float
-        Length of the interval [s] and voltage.
-    direction : float
-        1, -1 or STUCK.
-    load : float
-        Constant load [V].
-    par : ndarray, shape (11,)
-        Internal parameters.
-    x : ndarray, shape (3,)
-        State; updated.
-    m, cache, marks, scratch : ndarray
-        Of `lanes`; updated.
-
-    Returns
-    -------
-    float
-        Direction afterwards.
-    """
+    """Advance by h at constant v under friction, through all events; return the direction."""
     left = h
     for _ in range(EVENTS):
         if direction == STUCK:

@@ -83,16 +83,6 @@ class Experiments:
         """Return all up to ``duration`` seconds after the first voltage, of all segments together.
 
         A standstill before the first voltage teaches nothing, so it does not count.
-
-        Parameters
-        ----------
-        duration : float
-            [s].
-
-        Returns
-        -------
-        Experiments
-            Views of the same arrays.
         """
         left = duration + self._lead
         for g in range(len(self.starts) - 1):

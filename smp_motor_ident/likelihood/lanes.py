@@ -195,22 +195,7 @@ def turn(m: Array, direction: float) -> None:
 def begin(
     slope: Array, local: NDArray[np.int64], friction: bool
 ) -> tuple[Array, Array, Array, Array]:
-    """Return the lanes, cache, marks and scratch of a run.
-
-    Parameters
-    ----------
-    slope : ndarray, shape (11, c)
-        Derivatives of the internal parameters by the common columns.
-    local : ndarray of int, shape (l,)
-        Own columns of each segment.
-    friction : bool
-        Whether Coulomb friction is in the model.
-
-    Returns
-    -------
-    m, cache, marks, scratch : ndarray
-        As elsewhere here.
-    """
+    """Return the lanes, cache, marks and scratch of a run."""
     m, cache, marks = _aligned(SIZE), _aligned(CACHE), np.full(MARKS, -1.0)
     n_common = slope.shape[1]
     marks[NEXT], marks[REACHED] = 0.0, 1.0 if n_common > 0 else 0.0

@@ -23,28 +23,7 @@ CLOSEST = 0.95  # correlation of two outputs' residuals
 def kalman_gain(
     z: Array, order: int, kind: int, step: float, ratio: float, current_noise: float
 ) -> tuple[Array, Array]:
-    """Return the steady innovation gain of the sliding motor under torque noise.
-
-    Parameters
-    ----------
-    z : ndarray, shape (11,)
-        Coordinates.
-    order, kind : int
-        Of the structure and of the output.
-    step : float
-        Sampling interval [s].
-    ratio : float
-        Intensity of white noise on the acceleration over the output's noise variance.
-    current_noise : float
-        Variance of the current's noise over that of the output; 0 without current.
-
-    Returns
-    -------
-    gain : ndarray, shape (3, 2)
-        From (output, current) to (q, w, angle).
-    innovation : ndarray, shape (2, 2)
-        Covariance of the innovations over the output's noise variance.
-    """
+    """Return the steady innovation gain of the sliding motor under torque noise."""
     gain = np.zeros((3, 2))
     innovation = np.diag([1.0, current_noise if current_noise > 0 else 1.0])
     if ratio <= 0 or kind != recursion.ANGLE:
@@ -59,22 +38,7 @@ def kalman_gain(
 def gain_for(
     z: Array, order: int, kind: int, step: float, ratio: float, noise: Array, current: bool
 ) -> Array:
-    """Return the innovation gain that goes with a covariance of the innovations.
-
-    Parameters
-    ----------
-    z, order, kind, step, ratio
-        As in `kalman_gain`.
-    noise : ndarray, shape (2, 2)
-        Of the innovations (output, current).
-    current : bool
-        Whether current is an output.
-
-    Returns
-    -------
-    ndarray, shape (3, 2)
-        Zero where ``ratio`` is.
-    """
+    """Return the innovation gain that goes with a covariance of the innovations."""
     if ratio <= 0:
         return np.zeros((3, 2))
     relative = float(noise[1, 1] / noise[0, 0]) if current else 0.0
@@ -90,18 +54,7 @@ def gain_for(
 
 
 def proper(noise: Array) -> Array:
-    """Return the nearest covariance that can be one: finite, positive, not fully correlated.
-
-    Parameters
-    ----------
-    noise : ndarray, shape (2, 2)
-        Of (output, current); an output of which nothing is known has variance 1.
-
-    Returns
-    -------
-    ndarray, shape (2, 2)
-        Positive definite.
-    """
+    """Return the nearest covariance that can be one: finite, positive, not fully correlated."""
     v0, v1 = (float(v) if math.isfinite(v) and v > 0 else 1.0 for v in np.diag(noise))
     limit = CLOSEST * math.sqrt(v0 * v1)
     c = float(noise[1, 0])
@@ -120,22 +73,7 @@ def whitening(noise: Array) -> Array:
 
 
 def renewed(spread: Array, noise: Array, current: bool) -> Array:
-    """Return the covariance that the residuals show.
-
-    Parameters
-    ----------
-    spread : ndarray, shape (6,)
-        Of `recursion.run`.
-    noise : ndarray, shape (2, 2)
-        The covariance until now.
-    current : bool
-        Whether current is an output.
-
-    Returns
-    -------
-    ndarray, shape (2, 2)
-        Positive definite.
-    """
+    """Return the covariance that the residuals show."""
     fresh = noise.copy()
     fresh[0, 0] = max(spread[0] / max(spread[3], 1), LEAST)
     fresh[0, 1] = fresh[1, 0] = 0.0
@@ -147,18 +85,7 @@ def renewed(spread: Array, noise: Array, current: bool) -> Array:
 
 
 def deviance(spread: Array) -> float:
-    """Return -2 log likelihood up to a constant: N log det of the innovations' covariance.
-
-    Parameters
-    ----------
-    spread : ndarray, shape (6,)
-        Of `recursion.run`.
-
-    Returns
-    -------
-    float
-        Outputs taken together where both were there.
-    """
+    """Return -2 log likelihood up to a constant: N log det of the innovations' covariance."""
     v0 = spread[0] / max(spread[3], 1)
     if spread[4] < 1:
         return float(spread[3] * np.log(max(v0, 1e-300)))

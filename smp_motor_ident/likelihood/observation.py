@@ -55,15 +55,7 @@ def observe_current(par: Array, x: Array, m: Array) -> float:
 
 @inlined
 def note(row: Array, speed: float, y0: float, y1: float) -> None:
-    """Put into a row what it has room for: the output; speed, output (and current).
-
-    Parameters
-    ----------
-    row : ndarray, shape (1,), (2,) or (3,)
-        Overwritten.
-    speed, y0, y1 : float
-        Speed, output, current.
-    """
+    """Put into a row what it has room for: the output; speed, output (and current)."""
     if row.shape[0] == 1:
         row[0] = y0
         return

@@ -79,18 +79,7 @@ class Pass:
     scores: Array
 
     def scaled(self, factor: float) -> Pass:
-        """Return the same under residuals that weigh otherwise.
-
-        Parameters
-        ----------
-        factor : float
-            Inverse variance over what it was.
-
-        Returns
-        -------
-        Pass
-            Steps are as they were.
-        """
+        """Return the same under residuals that weigh otherwise."""
         return replace(
             self,
             objective=self.objective * factor,
@@ -102,20 +91,7 @@ class Pass:
 
 
 def own_columns(data: Experiments, structure: Structure) -> tuple[int, ...]:
-    """Return which of (q, w, angle, load) each segment has to itself.
-
-    Parameters
-    ----------
-    data : Experiments
-        Prepared records.
-    structure : Structure
-        What is free.
-
-    Returns
-    -------
-    tuple of int
-        Columns of `Experiments.initial`.
-    """
+    """Return which of (q, w, angle, load) each segment has to itself."""
     angle = (2,) if data.kind == recursion.ANGLE else ()
     own = (1,) if structure.order == 1 else (0, 1)
     return own + angle + ((3,) if structure.own_load else ())

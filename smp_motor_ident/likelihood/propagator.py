@@ -147,17 +147,7 @@ def second_order(row: Array, h: float, te: float, tm: float, k: float, be: float
 
 @compiled
 def first_order(row: Array, h: float, tm: float, k: float, be: float) -> None:
-    """Fill a propagator row of the first-order motor (``te = 0``; the state q is unused).
-
-    Parameters
-    ----------
-    row : ndarray, shape (60,)
-        Overwritten.
-    h : float
-        Length of the interval [s].
-    tm, k, be : float
-        As in `second_order`.
-    """
+    """Fill a propagator row of the first-order motor (``te = 0``; the state q is unused)."""
     for n in range(WIDTH):
         row[n] = 0.0
     r = (k + be) / tm

@@ -54,18 +54,7 @@ def sections_of(record: Record, hold: str) -> tuple[Array, Array, Integers]:
 
 
 def between_samples(record: Record) -> bool:
-    """Tell whether the command switched between samples, on a clock of its own.
-
-    Parameters
-    ----------
-    record : Record
-        One motor's signals.
-
-    Returns
-    -------
-    bool
-        True where at least four two-level switches show it.
-    """
+    """Tell whether the command switched between samples, on a clock of its own."""
     return bool(_jumps(record)[0].size >= 4)
 
 
