@@ -24,7 +24,7 @@ from smp_motor_ident.estimation.quantisation import widened
 from smp_motor_ident.estimation.thinning import thinned
 from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments, prepare
-from smp_motor_ident.likelihood.sections import between_samples
+from smp_motor_ident.likelihood.hold import between_samples
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import MODELS, PHYSICAL, Structure
 from smp_motor_ident.record import Record
@@ -232,7 +232,7 @@ def _hold(
     if plain.kind != rc.ANGLE or thinned(plain) is not plain:
         return "held", None  # how the command ran within so short an interval does not show
     others = {h: prepare(group, base.current, hold=h) for h in ("switched", "middle")}
-    others = {h: d for h, d in others.items() if d.section_end.size > plain.section_end.size}
+    others = {h: d for h, d in others.items() if d.hold_end.size > plain.hold_end.size}
     if not others:
         return "held", None
     say("how the command was held between samples")
@@ -354,7 +354,7 @@ def _validation(
         if not kept:
             return None
         data = _for_final(prepare(fitted, fit.structure.current, hold=hold), fit)
-        if np.ptp(data.section_value) == 0 or all(np.ptp(r.voltage) == 0 for r in kept):
+        if np.ptp(data.hold_value) == 0 or all(np.ptp(r.voltage) == 0 for r in kept):
             return None
         start = Fit(**{**vars(fit), "initial": data.initial})
         value = validate.held_out(kept, refine(data, fit.structure, start, fit.z, options), hold)

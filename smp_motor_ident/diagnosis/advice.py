@@ -105,13 +105,13 @@ def _plain_square(data: Experiments, fit: Fit) -> bool:
 
     Rest before and after it does not count; two levels in quick succession are another matter.
     """
-    value = data.section_value
+    value = data.hold_value
     driven = value[np.abs(value) > 0.05 * np.abs(value).max()]
     there, back = driven[driven > 0], -driven[driven < 0]
     if not there.size or not back.size:
         return False
     level = np.where(driven > 0, np.median(there), np.median(back))
-    turns = data.section_end[:-1][np.diff(np.sign(value)) != 0]
+    turns = data.hold_end[:-1][np.diff(np.sign(value)) != 0]
     lag = float(np.exp(fit.z[models.A1] - fit.z[models.A0]))
     return bool(
         np.mean(np.abs(np.abs(driven) - level) < 0.03 * level) > 0.95

@@ -183,7 +183,7 @@ def residual_tests(data: Experiments, fit: Fit, lags: int = 25) -> ResidualTests
         Of the mechanical output.
     """
     residual = data.output - replay.outputs(data, fit, gain=True)
-    voltage = np.interp(data.time, data.section_end, data.section_value)
+    voltage = np.interp(data.time, data.hold_end, data.hold_value)
     if len(data.starts) > 2:
         voltage = np.concatenate(
             [
@@ -217,9 +217,9 @@ def _lagged(a: Array, b: Array, lags: int) -> Array:
 
 
 def _input_of(data: Experiments, g: int) -> tuple[Array, Array]:
-    first = int(data.section_start[g])
-    last = int(data.section_start[g + 1]) if g + 2 < len(data.starts) else len(data.section_end)
-    return data.section_end[first:last], data.section_value[first:last]
+    first = int(data.hold_start[g])
+    last = int(data.hold_start[g + 1]) if g + 2 < len(data.starts) else len(data.hold_end)
+    return data.hold_end[first:last], data.hold_value[first:last]
 
 
 @dataclass(frozen=True)
