@@ -95,7 +95,7 @@ def render(report: Report) -> str:
 
 def _without(estimate: Estimate, notes: Sequence[str]) -> Estimate:
     """Leave out the warnings that are told as notes on the reading."""
-    return replace(estimate, warnings=tuple(w for w in estimate.warnings if w not in notes))
+    return replace(estimate, findings=tuple(f for f in estimate.findings if f.message not in notes))
 
 
 def _motor(estimate: Estimate, parts: Sequence[Comparison]) -> dict[str, object]:
@@ -106,7 +106,7 @@ def _motor(estimate: Estimate, parts: Sequence[Comparison]) -> dict[str, object]
         drawn = {
             "speed": figures.speed(wheel, parts),
             "detail": figures.detail(wheel, parts),
-            "residuals": figures.residuals(wheel, parts),
+            "residuals": figures.residuals(wheel, estimate.residuals),
         }
     drawn["certainty"] = figures.certainty(estimate)
     drawn["matrix"] = figures.correlation_matrix(estimate)
