@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident.diagnosis import validation as validate
+from smp_motor_ident.diagnosis.adequacy import adequacy, stated
 from smp_motor_ident.diagnosis.advice import advise, assess
 from smp_motor_ident.diagnosis.residuals import residual_tests
 from smp_motor_ident.diagnosis.screening import screen
@@ -125,7 +126,11 @@ def estimate(
     held = _validation(group, validation, chosen, options, hold)
     percent = FitPercent(fitted, held)
     tests = residual_tests(final, chosen)
-    findings += [*assess(final, chosen, percent, tests), *advise(chosen, result, known)]
+    findings += [
+        *assess(final, chosen, percent, tests),
+        *adequacy(final, chosen, stated(chosen, result), group[0].hardware.gear_ratio, tests),
+        *advise(chosen, result, known),
+    ]
     return Estimate(
         wheel=group[0].wheel,
         model=_name(chosen.structure),

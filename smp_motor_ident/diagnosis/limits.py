@@ -120,6 +120,35 @@ RESIDUAL_LEVEL = Limit(
     "test_findings.py",
 )
 
+# Adequacy of the model.
+
+EFFECT_LEVEL = Limit(
+    0.01,
+    "probability",
+    "that a clean record shows any of the effects, shared among all that are tried (Bonferroni)",
+    "test_adequacy.py",
+)
+EFFECT_BLOCKS = Limit(
+    6,
+    "degrees of freedom",
+    "with fewer stretches of data that show an effect its covariance, and "
+    "so the test's level, is not known",
+    "test_adequacy.py",
+)
+EFFECT_OWN = Limit(
+    1e-6,
+    "share of the sum of squares",
+    "an effect that the model's own coordinates imitate to a "
+    "thousandth is one of them; less is rounding of the differences",
+    "test_adequacy.py",
+)
+IMPLIED_BIAS = Limit(
+    1.96,
+    "standard deviations",
+    "the half-width of the 95 % interval that is stated",
+    "test_adequacy.py",
+)
+
 
 def table() -> str:
     """Return all limits as a page of Markdown."""
