@@ -19,9 +19,10 @@ from rosgraph_msgs.msg import Clock
 
 from smp_motor_control.errors import SmpError
 from smp_motor_control.nodes import runtime
+from smp_motor_control.ros_arguments import split_arguments
 from smp_motor_ident.bag.replay import Replay, offered
 from smp_motor_ident.bag.storage import Channel
-from smp_motor_ident.nodes.bag_arguments import message_class, pattern, split_arguments
+from smp_motor_ident.nodes.bag_arguments import message_class, pattern
 
 DEPTH = 1000
 FIND_EACH_OTHER = 1.0
