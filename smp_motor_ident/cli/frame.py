@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from smp_motor_control.errors import SmpError
+from smp_motor_control.ros_arguments import split_arguments
 from smp_motor_ident.cli.interruption import interruptible
 
 INTERRUPTED = 130
@@ -58,7 +59,9 @@ def run(
         0 done, 1 the data do not support the answer, 2 wrong usage or unreadable input.
     """
     try:
-        arguments = parser.parse_args(argv)
+        own, ros = split_arguments(sys.argv[1:] if argv is None else argv)
+        arguments = parser.parse_args(own)
+        arguments.ros_arguments = ros
     except SystemExit as end:
         return int(end.code or 0)
     try:

@@ -1,13 +1,12 @@
 """Every threshold of a decision about data and estimates, with its unit and its reason.
 
-``docs/limits.md`` is this table, printed: ``python -m smp_motor_ident.diagnosis.limits``.
+``docs/limits.md`` is this table, printed: ``python scripts/limits.py > docs/limits.md``.
 A limit's reason is a significance level, a cost or a physical limit; that some record came out
 right is none.
 """
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 
 
@@ -20,6 +19,26 @@ class Limit:
     reason: str
     test: str
 
+
+# Reading recordings (smp_motor_ident.bag).
+UNPACKED_LEAST = Limit(
+    256e6,
+    "byte",
+    "cost: what any machine that runs ROS can spare; a smaller file may always unpack to it",
+    "test/ident/bag/test_bounds.py",
+)
+UNPACKED_RATIO = Limit(
+    50.0,
+    "1",
+    "cost: 1 GB at most for a file of 10 MB, half of it unpacked bytes; telemetry packs 3 to 20",
+    "test/ident/bag/test_bounds.py",
+)
+STRAY_ROWS = Limit(
+    0.05,
+    "1",
+    "cost: an estimate without one row in twenty keeps its value; with more it is no table",
+    "test/ident/bag/test_csv.py",
+)
 
 # Assessment of a fit.
 
@@ -148,24 +167,3 @@ IMPLIED_BIAS = Limit(
     "the half-width of the 95 % interval that is stated",
     "test_adequacy.py",
 )
-
-
-def table() -> str:
-    """Return all limits as a page of Markdown."""
-    lines = [
-        "# Limits",
-        "",
-        "Every threshold of a decision; printed by `python -m smp_motor_ident.diagnosis.limits`.",
-        "",
-        "| limit | value | unit | reason | shown by |",
-        "| --- | --- | --- | --- | --- |",
-    ]
-    for name, limit in globals().items():
-        if isinstance(limit, Limit):
-            cells = (f"`{name}`", f"{limit.value:g}", limit.unit, limit.reason, f"`{limit.test}`")
-            lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
-
-
-if __name__ == "__main__":
-    sys.stdout.write(table())
