@@ -5,11 +5,16 @@ from __future__ import annotations
 import importlib
 import os
 from collections.abc import Callable
+from sys import stderr
 
 # One thread for linear algebra: our matrices are small, and the library waits for a second
 # thread in a busy loop, which under SCHED_FIFO may never end.
 for _library in ("OPENBLAS", "MKL", "OMP"):
     os.environ.setdefault(f"{_library}_NUM_THREADS", "1")
+
+
+MOST_DOMAIN = 232
+"""DDSI-RTPS 2.5, section 9.6.1.1: the ports of a higher domain lie beyond 65535."""
 
 
 def _program(module: str, interrupted: int) -> Callable[[], int]:
@@ -26,7 +31,19 @@ def _program(module: str, interrupted: int) -> Callable[[], int]:
 
 def node(name: str, package: str = "smp_motor_control") -> Callable[[], int]:
     """Return what runs the node of that name until a signal, and returns the exit code."""
-    return _program(f"{package}.nodes.{name}", 0)
+    program = _program(f"{package}.nodes.{name}", 0)
+
+    def run() -> int:
+        domain = os.environ.get("ROS_DOMAIN_ID", "").strip() or "0"
+        # DDS derives UDP ports from it; the library ends without a word where none is left.
+        if not (domain.isdecimal() and int(domain) <= MOST_DOMAIN):
+            print(
+                f"{name}: ROS_DOMAIN_ID is {domain!r}; it must be 0 to {MOST_DOMAIN}", file=stderr
+            )
+            return 2
+        return program()
+
+    return run
 
 
 def _tool(name: str) -> Callable[[], int]:

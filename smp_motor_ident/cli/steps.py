@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
+from smp_motor_control.parameter_file import read_parameters
 from smp_motor_ident.cli import identify, tune
 from smp_motor_ident.cli.conductor import Conductor
 from smp_motor_ident.cli.processes import ProcessError, Processes
@@ -119,28 +118,6 @@ def _succeed(tool: str, code: int) -> None:
         raise KeyboardInterrupt
     if code != 0:
         raise ProcessError(f"{tool} ended with exit code {code}, see above")
-
-
-def read_parameters(path: Path) -> dict[str, dict[str, Any]]:
-    """Read a ROS parameter file."""
-    try:
-        document = yaml.safe_load(path.read_text(encoding="utf-8"))
-        return {
-            "/" + node.strip("/"): dict(_flat(entry["ros__parameters"]))
-            for node, entry in document.items()
-        }
-    except (OSError, yaml.YAMLError, KeyError, TypeError, AttributeError) as error:
-        raise ParameterError(f"{path}: is no ROS parameter file ({error})") from None
-
-
-def _flat(tree: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
-    pairs: list[tuple[str, Any]] = []
-    for name, value in tree.items():
-        if isinstance(value, Mapping):
-            pairs += _flat(value, f"{prefix}{name}.")
-        else:
-            pairs.append((prefix + name, value))
-    return pairs
 
 
 def set_gains(robot: Robot, gains: Mapping[str, Mapping[str, Any]]) -> None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from smp_motor_ident.estimation import replay
 from smp_motor_ident.estimation.fit import Fit
@@ -197,7 +197,7 @@ def residual_tests(data: Experiments, fit: Fit, lags: int = 25) -> ResidualTests
     n = int(ok[:MOST].sum())
     if n < 4 * lags or e.std() == 0 or u.std() == 0:
         return ResidualTests()
-    band = norm.ppf(1 - 0.025 / lags) / np.sqrt(n)
+    band = ndtri(1 - 0.025 / lags) / np.sqrt(n)
     auto = _lagged(e, e, lags)
     own = _lagged(u, u, lags)
     # The input's own colour widens the band of the cross-correlation where e is not white.

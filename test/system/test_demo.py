@@ -16,8 +16,8 @@ import pytest
 
 from smp_motor_control import WHEELS
 from smp_motor_control.motor.file import load_motors
+from smp_motor_control.parameter_file import read_parameters
 from smp_motor_ident.bag import read_records
-from smp_motor_ident.cli.steps import read_parameters
 
 LIMIT = 150.0
 """What the demo may take [s] on two cores that are its own."""
