@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from smp_motor_control.errors import ParameterError
+from smp_motor_control.errors import ParameterError, check_range
 
 MAX_BITS = 63
 
@@ -40,9 +40,7 @@ class Encoder:
     bits: int = 0
 
     def __post_init__(self) -> None:
-        value = self.counts_per_revolution
-        if not (math.isfinite(value) and value > 0):
-            raise ParameterError(f"counts_per_revolution is {value!r}; it must be positive")
+        check_range("counts_per_revolution", self.counts_per_revolution, 1e-3, 1e9)
         _check_bits(self.bits)
 
     @property

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import importlib
 import os
+import sys
 from collections.abc import Callable
-from sys import stderr
 
 # One thread for linear algebra: our matrices are small, and the library waits for a second
 # thread in a busy loop, which under SCHED_FIFO may never end.
@@ -34,16 +34,20 @@ def node(name: str, package: str = "smp_motor_control") -> Callable[[], int]:
     program = _program(f"{package}.nodes.{name}", 0)
 
     def run() -> int:
-        domain = os.environ.get("ROS_DOMAIN_ID", "").strip() or "0"
-        # DDS derives UDP ports from it; the library ends without a word where none is left.
-        if not (domain.isdecimal() and int(domain) <= MOST_DOMAIN):
-            print(
-                f"{name}: ROS_DOMAIN_ID is {domain!r}; it must be 0 to {MOST_DOMAIN}", file=stderr
-            )
+        if wrong := wrong_domain():
+            print(f"{name}: {wrong}", file=sys.stderr)
             return 2
         return program()
 
     return run
+
+
+def wrong_domain() -> str:
+    """Return what is wrong with ROS_DOMAIN_ID, of which DDS itself says nothing; else nothing."""
+    domain = os.environ.get("ROS_DOMAIN_ID", "").strip() or "0"
+    if domain.isdecimal() and int(domain) <= MOST_DOMAIN:
+        return ""
+    return f"ROS_DOMAIN_ID is {domain!r}; it must be a whole number from 0 to {MOST_DOMAIN}"
 
 
 def _tool(name: str) -> Callable[[], int]:

@@ -22,7 +22,7 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from smp_motor_control.errors import ParameterError
+from smp_motor_control.errors import ParameterError, check_range
 
 PEAK_ACCELERATION = 15.0 / 8.0
 """Peak acceleration of the minimum-jerk transition from rest, in units of ``|D|/T``."""
@@ -61,7 +61,7 @@ class ProfileLimits:
     Raises
     ------
     ParameterError
-        When a limit is NaN, zero or negative.
+        When a limit is neither infinite nor a number from 1e-6 to 1e12.
     """
 
     velocity: float = math.inf
@@ -69,10 +69,10 @@ class ProfileLimits:
     jerk: float = math.inf
 
     def __post_init__(self) -> None:
-        for name in ("velocity", "acceleration", "jerk"):
+        for name, unit in (("velocity", ""), ("acceleration", "^2"), ("jerk", "^3")):
             value = getattr(self, name)
-            if not value > 0.0:
-                raise ParameterError(f"limit of {name} is {value}: must be positive")
+            if value != math.inf:
+                check_range(f"limit of {name}", value, 1e-6, 1e12, f"rad/s{unit}")
 
     @classmethod
     def from_parameters(

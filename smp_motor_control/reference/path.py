@@ -12,6 +12,9 @@ from smp_motor_control.reference.profile import Profile, Reference
 _RECENT = 5
 """Intervals of which the median is the usual one."""
 
+_NO_WEIGHT = 1e-12
+"""Feed-forward of the acceleration that is none; the others are taken in units of it."""
+
 
 class ReferencePath:
     """Leads the reference, and remembers where it was.
@@ -126,7 +129,7 @@ class ReferencePath:
         gained = following.acceleration - now.acceleration
         forward = (following.velocity - now.velocity) / dt
         weight = gains.feedforward_acceleration
-        if not weight:
+        if abs(weight) < _NO_WEIGHT:
             return forward
         mean = 0.5 * (now.velocity + following.velocity) - dt / 12.0 * gained
         forward += gains.feedforward_velocity / weight * (mean - compared)

@@ -36,6 +36,12 @@ __all__ = [
 UNLIMITED = ProfileLimits()
 """A reference that jumps."""
 
+_FASTEST = 1e9
+"""Target [rad/s] beyond which nothing turns; squares of it and its rates stay finite."""
+
+_SHORTEST = 1e-6
+"""Transition time [s] below which a change is as fast as the limits allow."""
+
 _STRETCH = 1.1
 _LOOKS = tuple(k / 32.0 for k in range(32))
 
@@ -99,7 +105,8 @@ class Profile:
             raise ParameterError(
                 f"transition_time is {transition_time} s: must be finite and not negative"
             )
-        self.limits, self.transition_time, self.drive = limits, transition_time, drive
+        self.limits, self.drive = limits, drive
+        self.transition_time = transition_time if transition_time >= _SHORTEST else 0.0
 
     def reset(self, velocity: float = 0.0) -> None:
         """Rest at a velocity, such as the measured one when a loop is closed.
@@ -142,7 +149,8 @@ class Profile:
         """
         if not math.isfinite(velocity):
             raise ParameterError(f"target velocity is {velocity}: must be finite")
-        velocity = min(max(velocity, -self.limits.velocity), self.limits.velocity)
+        most = min(self.limits.velocity, _FASTEST)
+        velocity = min(max(velocity, -most), most)
         if velocity == self.target:
             return
         self.target = velocity

@@ -5,14 +5,13 @@ from __future__ import annotations
 import argparse
 import shutil
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 
 from smp_motor_control import WHEELS
 from smp_motor_ident.cli import steps
-from smp_motor_ident.cli.conductor import Conductor
-from smp_motor_ident.cli.processes import ProcessError, Processes
+from smp_motor_ident.cli.commission import NAME
+from smp_motor_ident.cli.processes import ProcessError, Processes, connect
 from smp_motor_ident.errors import ParameterError
 
 SIGNALS = ("sine", "square", "fourier")
@@ -34,17 +33,15 @@ def _commission(
     wheels: tuple[str, ...],
     plan: Sequence[steps.Excitation],
 ) -> int:
-    with Processes(folder / "logs") as processes:
-        robot = steps.Robot(processes, Conductor(processes), wheels, folder)
-        rates = robot.conductor.ask("wait_for_wheels", wheels=list(wheels), timeout=10.0)["rates"]
+    ros = tuple(arguments.ros_arguments)
+    # The client leaves last: who excites has ended when the controllers are given back.
+    with connect(NAME, ros) as client, Processes(folder / "logs") as processes:
+        robot = steps.Robot(processes, client, wheels, folder, ros)
+        rates = client.wait_for_wheels(wheels, timeout=10.0)
         print("; ".join(f"{wheel} reports at {rate:.0f} Hz" for wheel, rate in rates.items()))
         _confirm(arguments, wheels)
-        with _controllers_off(robot):
-            bag = steps.record(robot, "excitation")
-            for part in plan:
-                print(f"exciting: {part.signal}, {part.amplitude:g} V, {part.duration:g} s")
-                steps.excite(robot, [part])
-            processes.stop("record")
+        with client.paused(wheels):
+            bag = _excited(robot, plan)
             results = folder / "identification"
             steps.identify_wheels(bag, results)
             gains = steps.tune_wheels(results, folder / "gains.yaml")
@@ -93,16 +90,13 @@ def _confirm(arguments: argparse.Namespace, wheels: Sequence[str]) -> None:
         raise ProcessError("nothing was moved")
 
 
-@contextmanager
-def _controllers_off(robot: steps.Robot) -> Iterator[None]:
-    """Switch active controllers off, and on again whatever happens."""
-    active = []
-    for node in robot.wheel_nodes():
-        if robot.conductor.ask("get_state", node=node, timeout=1.0)["state"] == "active":
-            robot.conductor.ask("change_state", node=node, transition="deactivate")
-            active.append(node)
+def _excited(robot: steps.Robot, plan: Sequence[steps.Excitation]) -> Path:
+    """Return the recording of excited wheels; whatever happens, nobody moves them afterwards."""
     try:
-        yield
+        bag = steps.record(robot, "excitation")
+        for part in plan:
+            print(f"exciting: {part.signal}, {part.amplitude:g} V, {part.duration:g} s")
+            steps.excite(robot, [part])
+        return bag
     finally:
-        for node in active:
-            robot.conductor.ask("change_state", node=node, transition="activate")
+        robot.processes.stop("excite", "record")

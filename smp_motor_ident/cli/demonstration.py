@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import shutil
 import time
 from collections.abc import Mapping
@@ -12,9 +13,14 @@ from typing import Any
 from smp_motor_control import WHEELS
 from smp_motor_control.motor.file import load_motors
 from smp_motor_ident.cli import steps
-from smp_motor_ident.cli.conductor import Conductor
+from smp_motor_ident.cli.demo import NAME
 from smp_motor_ident.cli.driving import longest_stall, read_answers
-from smp_motor_ident.cli.processes import Processes, free_domain, stop_when_orphaned
+from smp_motor_ident.cli.processes import (
+    Processes,
+    connect,
+    free_domain,
+    stop_when_orphaned,
+)
 from smp_motor_ident.cli.verdict import check, show
 from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.result import Estimate
@@ -53,9 +59,9 @@ def work(arguments: argparse.Namespace) -> int:
     truth = load_motors(motors, WHEELS)
     folder = _fresh(Path(arguments.output), arguments.keep)
     domain = free_domain() if arguments.domain is None else arguments.domain
-    environment = {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-    with Processes(folder / "logs", environment) as processes:
-        robot = start(processes, folder, motors, arguments.rate)
+    os.environ.update(ROS_DOMAIN_ID=str(domain), ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST")
+    with Processes(folder / "logs") as processes, connect(NAME) as client:
+        robot = start(steps.Robot(processes, client, WHEELS, folder), motors, arguments.rate)
         say(f"running: motor_plant, {len(WHEELS)} wheel_pid, skid_steer (ROS domain {domain})")
         estimates, gains = learn(robot, say)
         bag, segments = drive(robot, gains, say)
@@ -80,15 +86,13 @@ def _fresh(folder: Path, keep: bool) -> Path:
     return folder
 
 
-def start(processes: Processes, folder: Path, motors: Path, rate: float) -> steps.Robot:
+def start(robot: steps.Robot, motors: Path, rate: float) -> steps.Robot:
     """Start the simulated robot and wait until it lives; its controllers stay inactive.
 
     Parameters
     ----------
-    processes : Processes
-        In which the nodes are started.
-    folder : Path
-        For results.
+    robot : Robot
+        To be started.
     motors : Path
         Parameter file of the true motors.
     rate : float
@@ -99,16 +103,16 @@ def start(processes: Processes, folder: Path, motors: Path, rate: float) -> step
     Robot
         All nodes answer, all wheels report.
     """
+    processes, client = robot.processes, robot.client
     given = ["--ros-args", "-p", f"motors_file:={motors.resolve()}", "-p", f"rate:={rate}"]
     processes.start("motor_plant", "motor_plant", *given, priority=1)
     for wheel in WHEELS:
         place = ["--ros-args", "-r", f"__ns:=/{wheel}", "-p", "autostart:=false"]
         processes.start(f"{wheel}.wheel_pid", "wheel_pid", *place, priority=1)
     processes.start("skid_steer", "skid_steer", priority=1)
-    robot = steps.Robot(processes, Conductor(processes), WHEELS, folder)
-    nodes = ["/motor_plant", *robot.wheel_nodes(), "/skid_steer"]
-    robot.conductor.ask("wait_for_nodes", nodes=nodes, timeout=30.0)
-    robot.conductor.ask("wait_for_wheels", wheels=list(WHEELS), timeout=20.0)
+    nodes = ["motor_plant", *robot.wheel_nodes(), "skid_steer"]
+    client.wait_for_nodes(nodes, timeout=30.0)
+    client.wait_for_wheels(robot.wheels, timeout=20.0)
     robot.switch("configure")
     return robot
 
@@ -138,7 +142,7 @@ def drive(
     robot : Robot
         That runs.
     gains : mapping of str to mapping
-        Parameters by full node name.
+        Parameters by wheel.
     say : callable
         Told what goes on.
 
@@ -155,12 +159,10 @@ def drive(
     drives = []
     for attempt in range(1, ATTEMPTS + 1):
         bag = steps.record(robot, "drive" if attempt == 1 else f"drive_{attempt}")
-        answer = robot.conductor.ask(
-            "drive", segments=DRIVE, wheels=list(robot.wheels), patience=60.0
-        )
+        segments = robot.client.drive(DRIVE, robot.wheels)
         robot.processes.stop("record")
         stall = longest_stall(bag, robot.wheels)
-        drives.append((stall, bag, [tuple(segment) for segment in answer["segments"]]))
+        drives.append((stall, bag, segments))
         if stall <= STALL:
             break
         say(f"this machine stood still for {1e3 * stall:.0f} ms during drive {attempt}")

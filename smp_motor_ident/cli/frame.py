@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from typing import Any, NoReturn
 
 from smp_motor_control.errors import SmpError
+from smp_motor_control.ros_arguments import split_arguments
 from smp_motor_ident.cli.interruption import interruptible
 
 INTERRUPTED = 130
@@ -87,8 +88,10 @@ def run(
     before = sys.stdout
     sys.stdout = _Output(before or open(os.devnull, "w"))  # noqa: SIM115  (closed by the shell: None)
     try:
-        arguments = parser.parse_args(argv)
-        arguments.command = shlex.join((parser.prog, *(sys.argv[1:] if argv is None else argv)))
+        given = sys.argv[1:] if argv is None else argv
+        own, ros = split_arguments(given)
+        arguments = parser.parse_args(own)
+        arguments.command, arguments.ros_arguments = shlex.join((parser.prog, *given)), ros
         with interruptible(), warnings.catch_warnings():
             # Numerics that fail are dealt with where they occur; standard error is for the user.
             warnings.simplefilter("ignore", RuntimeWarning)
