@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import f as f_distribution
+from scipy.special import fdtrc
 
 from smp_motor_ident.diagnosis.effects import Effect
 from smp_motor_ident.diagnosis.limits import (
@@ -149,8 +149,8 @@ def _test(
     robust = float(moved @ np.linalg.pinv(middle, hermitian=True) @ moved) / q
     plain = float(moved @ np.linalg.solve(least, moved)) / q
     freedom = max(told - q, 1.0)
-    p_robust = float(f_distribution.sf(robust * freedom / (freedom + q - 1), q, freedom))
-    p_plain = float(f_distribution.sf(plain, q, max(n - q, 1)))
+    p_robust = float(fdtrc(q, freedom, robust * freedom / (freedom + q - 1)))
+    p_plain = float(fdtrc(q, max(n - q, 1), plain))
     p = p_plain if told - q < EFFECT_BLOCKS.value else max(p_robust, p_plain)
     return Evidence(effect, p, plain * q, errors.shifts[:, columns] @ size, columns)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from smp_motor_ident.diagnosis.limits import RESIDUAL_LEVEL
 from smp_motor_ident.estimation import replay
@@ -53,7 +53,7 @@ def residual_tests(data: Experiments, fit: Fit, lags: int = 25) -> ResidualTests
     n = int(ok[:MOST].sum())
     if n < 4 * lags or e.std() == 0 or u.std() == 0:
         return ResidualTests()
-    band = float(norm.ppf(1 - RESIDUAL_LEVEL.value / 2 / lags) / np.sqrt(n))
+    band = float(ndtri(1 - RESIDUAL_LEVEL.value / 2 / lags) / np.sqrt(n))
     auto = _lagged(e, e, lags)
     own = _lagged(u, u, lags)
     # Two independent coloured signals correlate by chance with the sum of the product of their

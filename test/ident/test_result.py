@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
 
@@ -36,14 +34,6 @@ def an_estimate() -> Estimate:
         sources=("bag",),
         hardware=Hardware(65.5, 500, 16, 12.0, None),
     )
-
-
-def test_json_keeps_everything():
-    estimate = an_estimate()
-    text = json.dumps(estimate.to_document(), allow_nan=False)
-    again = Estimate.from_document("front_left", json.loads(text))
-    assert again.to_document() == estimate.to_document()
-    np.testing.assert_array_equal(again.covariance, estimate.covariance)
 
 
 def test_an_unidentifiable_parameter_is_null_and_listed():
