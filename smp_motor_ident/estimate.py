@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident.diagnosis import validation as validate
-from smp_motor_ident.diagnosis.advice import advise, doubts
+from smp_motor_ident.diagnosis.adequacy import adequacy, stated
+from smp_motor_ident.diagnosis.advice import advise, assess
+from smp_motor_ident.diagnosis.residuals import residual_tests
 from smp_motor_ident.diagnosis.screening import screen
 from smp_motor_ident.errors import InsufficientExcitationError, ParameterError, SignalError
 from smp_motor_ident.estimation import ladder
@@ -98,8 +100,7 @@ def estimate(
     say = progress or (lambda _: None)
     known = _checked(model, fixed, loss, group)
     _check_bounds(bounds or {}, model, group)
-    warnings = screen(group)
-    warnings += [note for r in group for note in r.notes]
+    findings = screen(group)
     use_current = _has_current(group) and model in ("auto", "electromechanical")
     base = _structure(model, use_current, known, group)
     hold, first = _hold(group, base, LOSSES[loss], say)
@@ -123,7 +124,13 @@ def estimate(
     _refuse_offset(group, chosen)
     say("validating")
     held = _validation(group, validation, chosen, options, hold)
-    tests = validate.residual_tests(final, chosen)
+    percent = FitPercent(fitted, held)
+    tests = residual_tests(final, chosen)
+    findings += [
+        *assess(final, chosen, percent, tests),
+        *adequacy(final, chosen, stated(chosen, result), group[0].hardware.gear_ratio, tests),
+        *advise(chosen, result, known),
+    ]
     return Estimate(
         wheel=group[0].wheel,
         model=_name(chosen.structure),
@@ -131,13 +138,10 @@ def estimate(
         combinations=result.combinations,
         names=result.names,
         covariance=result.covariance,
-        fit_percent=FitPercent(fitted, held),
+        fit_percent=percent,
         candidates=_candidates(rungs, chosen, group, data),
         residuals=tests,
-        warnings=tuple(
-            dict.fromkeys(warnings + doubts(chosen, result, fitted, held, tests, final))
-        ),
-        advice=tuple(advise(chosen, result, known)),
+        findings=tuple(findings),
         samples=data.size,
         duration=float(sum(r.duration for r in group)),
         sample_time=data.step,
