@@ -80,9 +80,9 @@ class BodyCommand:
         """
         if age is not None and self.timeout > 0.0 and not age < self.timeout:
             return Verdict.STALE
-        self._born = steady_now - max(age or 0.0, 0.0)
         if not (math.isfinite(linear) and math.isfinite(angular)):
             return Verdict.NOT_FINITE
+        self._born = steady_now - max(age or 0.0, 0.0)
         self._velocity = (linear, angular)
         return Verdict.ZERO_STAMP if age is None else Verdict.ACCEPTED
 

@@ -30,8 +30,9 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from smp_motor_control.errors import SmpError
 from smp_motor_control.nodes import runtime
+from smp_motor_control.ros_arguments import split_arguments
 from smp_motor_ident.bag import BagWriter
-from smp_motor_ident.nodes.bag_arguments import message_class, pattern, split_arguments
+from smp_motor_ident.nodes.bag_arguments import message_class, pattern
 
 TAKE_PERIOD = 0.004
 LOOK_PERIOD = 0.05

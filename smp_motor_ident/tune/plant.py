@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from smp_motor_control.motor.model import MotorModel
+from smp_motor_control.motor.response import zero_order_hold
 from smp_motor_control.observer import ObserverNoise
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.tune.arrays import Array, Complex
@@ -33,7 +34,7 @@ LONGEST = 300
 class Plant:
     r"""A batch of sampled motors with their delay and the way their speed is measured.
 
-    ``x[k+1] = phi x[k] + sum_j taps[j] u[k-j]`` with ``x = (speed, scaled acceleration)``, last
+    ``x[k+1] = phi x[k] + sum_j taps[j] u[k-j]`` with ``x = (speed, acceleration)``, last
     the filtered speed where the sensor has a lag; the angle run through in the step is
     ``phi_angle x[k] + sum_j taps_angle[j] u[k-j]``.
 
@@ -198,16 +199,15 @@ def sample(motors: Motors, loop: Loop, *, believed: Motors | None = None) -> Pla
     whole = np.floor(total / T + 1e-9).astype(int)
     late = np.clip(total - whole * T, 0.0, T)
     _check_length(float(total.max()), float(window.max()), loop)
-    hold = _Hold(motors)
-    phi, gamma, phi_angle, zeta = hold.over(np.full(n, T))
-    _, newest, _, newest_angle = hold.over(T - late)
+    phi, gamma, phi_angle, zeta = _hold(motors, np.full(n, T))
+    _, newest, _, newest_angle = _hold(motors, T - late)
     # A window within one step sees the end of it only.
     tail = np.where(window > 0, np.minimum(window, T), T)
     if np.any(tail < T):
         begin = T - tail
-        _, _, seen, old = hold.over(begin)
-        new = hold.over(np.maximum(begin - late, 0.0))[3]
-        phi_angle, zeta, newest_angle = phi_angle - seen, zeta - old, newest_angle - new
+        _, _, before, old = _hold(motors, begin)
+        new = _hold(motors, np.maximum(begin - late, 0.0))[3]
+        phi_angle, zeta, newest_angle = phi_angle - before, zeta - old, newest_angle - new
     s = phi.shape[1]
     taps: Array = np.zeros((n, int(whole.max()) + 2, s))
     taps_angle: Array = np.zeros(taps.shape[:2])
@@ -274,81 +274,38 @@ def _observer(believed: Motors, loop: Loop) -> ObserverModel:
     )
 
 
-class _Hold:
-    """Response of a batch of motors, and of their sensors, to a voltage that is held."""
+def _hold(motors: Motors, t: Array) -> tuple[Array, Array, Array, Array]:
+    """Return transition, effect of a held volt, and both for the angle, over ``t``.
 
-    def __init__(self, motors: Motors) -> None:
-        a0, a1 = motors.a0, motors.a1
-        self.lag = motors.sensor_lag
-        self.first_order = bool(np.all(motors.a2 <= 1e-12 * a1 * a1 / a0))
-        if self.first_order:
-            self.A, self.B = (-a0 / a1)[:, None, None], (1 / a1)[:, None]
-            return
-        a2 = np.maximum(motors.a2, 1e-10 * a1 * a1 / a0)
-        natural = np.sqrt(a0 / a2)
-        self.A = np.zeros((a0.size, 2, 2))
-        self.A[:, 0, 1], self.A[:, 1, 0], self.A[:, 1, 1] = natural, -natural, -a1 / a2
-        self.B = np.zeros((a0.size, 2))
-        self.B[:, 1] = natural / a0
-
-    def over(self, t: Array) -> tuple[Array, Array, Array, Array]:
-        """Return transition, effect of a constant volt, and both for the angle, over ``t``."""
-        A, B = self.A, self.B
-        eye = np.eye(A.shape[1])
-        phi = self._transition(t)
-        first = np.linalg.solve(A, phi - eye)
-        second = np.linalg.solve(A, first - t[:, None, None] * eye)
-        gamma = np.einsum("nij,nj->ni", first, B)
-        zeta = np.einsum("nj,nj->n", second[:, 0], B)
-        if not np.any(self.lag > 0):
-            return phi, gamma, first[:, 0], zeta
-        n, s = B.shape
-        lag = np.maximum(self.lag, 1e-6 * np.max(self.lag))
-        shifted = A * lag[:, None, None] + eye
-        if np.any(near := np.abs(np.linalg.det(shifted)) < 1e-6):
-            lag = np.where(near, 1.00001 * lag, lag)
-            shifted = A * lag[:, None, None] + eye
-        decay = np.exp(-t / lag)
-        # What the filter makes of the free response, and of that to a constant volt.
-        filtered = np.linalg.solve(shifted, phi - decay[:, None, None] * eye)
-        driven = np.linalg.solve(A, filtered - (1 - decay)[:, None, None] * eye)
-        state, inputs = np.zeros((n, s + 1, s + 1)), np.zeros((n, s + 1))
-        state[:, :s, :s], state[:, s, :s], state[:, s, s] = phi, filtered[:, 0], decay
-        inputs[:, :s], inputs[:, s] = gamma, np.einsum("nj,nj->n", driven[:, 0], B)
-        # lag y' = w - y: the filtered angle lags by what the filter still holds.
-        angle = -lag[:, None] * state[:, s]
-        angle[:, :s] += first[:, 0]
-        angle[:, s] += lag
-        return state, inputs, angle, zeta - lag * inputs[:, s]
-
-    def _transition(self, t: Array) -> Array:
-        """Return exp(A t) in closed form, from two slow real modes to one all but algebraic."""
-        A = self.A
-        if self.first_order:
-            return np.asarray(np.exp(A * t[:, None, None]))
-        half, product = 0.5 * A[:, 1, 1], A[:, 0, 1] ** 2
-        root = np.sqrt((half**2 - product).astype(np.complex128))
-        fast = half - root
-        slow = product / fast
-        gap = np.where(np.abs(fast - slow) * t < 1e-6, 1.0, slow - fast)
-        grown, shrunk = np.exp(slow * t), np.exp(fast * t)
-        h = np.where(gap == 1.0, grown * t, (grown - shrunk) / gap)
-        g = (grown - slow * h).real
-        h_rate = (shrunk + slow * h).real
-        across = A[:, 0, 1] * h.real
-        return np.stack([np.stack([g, across], 1), np.stack([-across, h_rate], 1)], 1)
+    With a sensor of lag f its speed y is a third state: ``y + f y' = w`` has the particular
+    solution ``c1 w + c2 w'``, and the angle that it runs through lags by what it still holds.
+    """
+    gain, tau, tp = 1 / motors.a0, motors.a1 / motors.a0, motors.a2 / motors.a0
+    held = zero_order_hold(gain, tau, tp, t)
+    if not np.any(motors.sensor_lag > 0):
+        return held
+    f = np.maximum(motors.sensor_lag, 1e-6 * np.max(motors.sensor_lag))
+    f = np.where(np.abs(tp - tau * f + f * f) < 1e-6 * f * f, 1.00001 * f, f)
+    c2 = -f * tp / (tp - tau * f + f * f)
+    c1 = 1 - f * f / (tp - tau * f + f * f)
+    decay = np.exp(-t / f)
+    phi, gamma = np.zeros((t.size, 3, 3)), np.zeros((t.size, 3))
+    phi[:, :2, :2], phi[:, 2, 2] = held.transition, decay
+    rows = c1[:, None] * held.transition[:, 0] + c2[:, None] * held.transition[:, 1]
+    phi[:, 2, :2] = rows - decay[:, None] * np.stack([c1, c2], axis=1)
+    gamma[:, :2], gamma[:, 2] = held.forced, gain * (1 - phi[:, 2, 0] - decay)
+    angle = -f[:, None] * phi[:, 2]
+    angle[:, :2] += held.angle_transition
+    angle[:, 2] += f
+    return phi, gamma, angle, held.angle_forced - f * gamma[:, 2]
 
 
 def _resolvent(phi: Array, z: Complex, drive: Complex) -> Complex:
     """Return (z I - phi)^-1 drive for a batch; a sensor's state, the last of three, is fed only."""
-    if phi.shape[1] == 1:
-        solved: Complex = drive / (z - phi[:, :, 0])[:, None, :]
-        return solved
-    triangular = np.all(phi[:, :-1, -1] == 0)
-    if triangular:
-        inner = _resolvent(phi[:, :-1, :-1], z, drive[:, :-1])
-        last = np.einsum("ns,nsf->nf", phi[:, -1, :-1], inner) + drive[:, -1]
-        last = last / (z - phi[:, -1, -1, None])
+    if phi.shape[1] == 3:
+        inner = _resolvent(phi[:, :2, :2], z, drive[:, :2])
+        last = np.einsum("ns,nsf->nf", phi[:, 2, :2], inner) + drive[:, 2]
+        last = last / (z - phi[:, 2, 2, None])
         return np.concatenate([inner, last[:, None]], axis=1)
     a, b = z - phi[:, 0, 0, None], -phi[:, 0, 1, None]
     c, d = -phi[:, 1, 0, None], z - phi[:, 1, 1, None]

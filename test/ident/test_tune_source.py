@@ -38,7 +38,7 @@ def test_an_observer_with_the_right_model_sees_the_speed_itself(estimates):
     loop = observed(200.0, delay=0.01)  # whole samples: the mean voltage is the voltage
     omega = np.geomspace(1.0, 600.0, 50)
     seen = sample(motors, loop).response(omega)
-    true = sample(motors, loop, window=0).response(omega)
+    true = sample(motors, loop).response(omega, true_speed=True)
     np.testing.assert_allclose(seen, true, rtol=1e-6)  # rounding of the matrix exponential
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import signal
 import sys
 import threading
 import time
@@ -115,11 +116,12 @@ def robot(process, eventually, tmp_path):
     gains.write_text(yaml.safe_dump(tree))
     plant = ("-p", f"motors_file:={MOTORS}", "-p", "command_timeout:=2.0")
     started = [process("motor_plant", "--ros-args", *plant)]
-    for wheel in WHEELS:
-        ros = ("--ros-args", "-r", f"__ns:=/{wheel}", "--params-file", gains)
-        started.append(process("wheel_pid", *ros))
+    ros = ("--ros-args", "--params-file", gains)
+    pids = {w: process("wheel_pid", *ros, "-r", f"__ns:=/{w}") for w in WHEELS}
+    started.extend(pids.values())
     rclpy.init()
     one = Robot()
+    one.processes = pids
     try:
         eventually(
             one.at_speed,
@@ -177,6 +179,37 @@ def test_bad_gains_are_taken_back_within_two_seconds(process, robot, eventually,
             assert robot.gain(wheel, "p") == 1.0
             assert robot.gain(wheel, "i") == 15.0
         eventually(robot.at_speed, deadline=20.0, message="did not drive on")
+
+
+def test_a_wheel_that_stops_in_the_trial_is_settled_when_it_returns(
+    process, robot, eventually, tmp_path
+):
+    gains = tmp_path / "other.yaml"
+    tree = {f"/{wheel}/wheel_pid": {"ros__parameters": {"p": 1.1}} for wheel in WHEELS}
+    gains.write_text(yaml.safe_dump(tree))
+    tune = process(
+        sys.executable, "-m", "smp_motor_ident.cli.tune", "--gains", gains, "--apply", "--watch", 20
+    )
+    eventually(lambda: robot.gain("front_left") == 1.1, deadline=60.0, message=tune.output)
+    robot.processes["rear_left"].send_signal(signal.SIGSTOP)
+    eventually(lambda: "rear_left does not answer" in tune.output, 30.0, message=tune.output)
+    robot.processes["rear_left"].send_signal(signal.SIGCONT)
+    assert tune.wait(60.0) == 1
+    assert "rear_left is back and has its old gains" in tune.output
+    assert [robot.gain(wheel) for wheel in WHEELS] == [1.0] * len(WHEELS)
+
+
+def test_a_killed_tool_leaves_the_gains_as_they_were(process, robot, eventually, tmp_path):
+    gains = tmp_path / "other.yaml"
+    tree = {f"/{wheel}/wheel_pid": {"ros__parameters": {"p": 1.1}} for wheel in WHEELS}
+    gains.write_text(yaml.safe_dump(tree))
+    tune = process(
+        sys.executable, "-m", "smp_motor_ident.cli.tune", "--gains", gains, "--apply", "--watch", 60
+    )
+    eventually(lambda: robot.gain("rear_right") == 1.1, deadline=60.0, message=tune.output)
+    tune.send_signal(signal.SIGKILL)
+    for wheel in WHEELS:
+        eventually(lambda wheel=wheel: robot.gain(wheel) == 1.0, deadline=10.0, message=wheel)
 
 
 def test_apply_without_running_wheels_says_so(process, ros_domain):
