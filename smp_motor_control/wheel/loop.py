@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from smp_motor_control.encoder import DifferencedSpeed, Encoder
-from smp_motor_control.errors import ParameterError
+from smp_motor_control.errors import ParameterError, check_range
 from smp_motor_control.motor.friction import Gearbox
 from smp_motor_control.motor.model import MotorModel
 from smp_motor_control.observer import ObserverNoise, SpeedObserver
@@ -74,10 +74,9 @@ class LoopSettings:
     drive: Drive | None = None
 
     def __post_init__(self) -> None:
-        for name in ("reference_delay", "reference_doubt", "transition_time"):
-            value = getattr(self, name)
-            if not 0.0 <= value < math.inf:
-                raise ParameterError(f"{name} is {value!r} s; it must be zero or positive")
+        longest = {"reference_delay": 10.0, "reference_doubt": 1.0, "transition_time": 60.0}
+        for name, most in longest.items():
+            check_range(name, getattr(self, name), 0.0, most, "s")
         if self.speed_source not in SPEED_SOURCES:
             known = ", ".join(SPEED_SOURCES)
             raise ParameterError(f"speed_source is {self.speed_source!r}; known are {known}")
@@ -114,15 +113,6 @@ class LoopSettings:
             u_clamp_max=min(self.gains.u_clamp_max, supply_voltage),
         )
         return replace(self, gains=gains)
-
-    @property
-    def reachable(self) -> float:
-        """Speed for which the voltage suffices by the feed-forward [rad/s]; infinite if unknown."""
-        gains = self.gains
-        if gains.feedforward_velocity <= 0.0:
-            return math.inf
-        most = min(gains.u_clamp_max, -gains.u_clamp_min) - gains.feedforward_static
-        return max(most, 0.0) / gains.feedforward_velocity
 
 
 class WheelLoop:

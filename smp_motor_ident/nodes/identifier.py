@@ -4,7 +4,7 @@ Keeps a window of every wheel's ``motor_state``, estimates from it in a thread b
 callbacks, and publishes ``MotorParameters``.  Before a window has seen enough (time, motion,
 levels and changes of voltage, both directions) the message has no numbers and its ``status``
 begins with ``collecting`` and says what is missing; else it begins with ``valid`` or, with the
-estimator's warnings, ``doubtful``, or ``refused`` with the reason.
+reason, ``unreliable``, or ``refused`` with the reason.
 """
 
 from __future__ import annotations
@@ -162,8 +162,8 @@ class Identifier(Node):
             error = future.exception()
             if error is None:
                 found = future.result()
-                told = "; ".join(found.warnings)
-                wheel.tell(f"doubtful: {told}" if told else "valid", found)
+                why = "; ".join(f.message for f in found.findings if f.severity == "unreliable")
+                wheel.tell(f"unreliable: {why}" if why else "valid", found)
             elif isinstance(error, SmpError):
                 wheel.tell(f"refused: {error}")
             else:

@@ -190,7 +190,7 @@ class Player(Node):
         """Stop the thread and tell what was sent."""
         self._ended.set()
         self._thread.join(timeout=1.0)
-        for note in self._replay.notes:
+        for note in (f.message for f in self._replay.findings):
             print(f"play: {note}", file=sys.stderr, flush=True)
         for name, count in sorted(self.sent.items()):
             print(f"{count:9d}  {name}", flush=True)

@@ -1,9 +1,8 @@
-"""Columns of numbers by topic: what is left of a recording once it is decoded."""
+"""From messages to columns of numbers by topic."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -11,48 +10,20 @@ from numpy.typing import NDArray
 
 from smp_motor_ident.bag.layout import Decoder
 from smp_motor_ident.bag.source import Recording
-from smp_motor_ident.bag.storage import Batch, Channel, decompress_messages
+from smp_motor_ident.bag.storage import Batch, Channel, Integers, Table, damaged
 from smp_motor_ident.bag.types import Definitions, Types
+from smp_motor_ident.bag.unpack import Budget, decompress_messages
 from smp_motor_ident.errors import BagError
 
-Integers = NDArray[np.int64]
 Progress = Callable[[float, str], None]
 STAMP = ("header.stamp.sec", "header.stamp.nanosec")
-
-
-@dataclass(eq=False)
-class Table:
-    """Samples of one topic (or CSV file) in the order of the file.
-
-    Attributes
-    ----------
-    log : ndarray of int64, shape (n,), [ns]
-        When the recorder got them.
-    stamp : ndarray of int64, shape (n,), [ns], or None
-        What their header says.
-    columns : dict of str to ndarray, shape (n,)
-        By field path, in the type of the message.
-    present : dict of str to ndarray of bool
-        For columns that some messages lacked.
-    number : ndarray of int64, shape (n,), or None
-        The publisher's own count, where the recorder kept it for every message.
-    notes : list of str
-        What was found amiss.
-    """
-
-    log: Integers
-    stamp: Integers | None
-    columns: dict[str, NDArray[Any]]
-    present: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
-    number: Integers | None = None
-    notes: list[str] = field(default_factory=list)
 
 
 class _Collector:
     """Grows one topic's columns batch by batch."""
 
-    def __init__(self, topic: str, paths: list[str], types: Types) -> None:
-        self.topic, self.paths, self.types = topic, paths, types
+    def __init__(self, topic: str, paths: list[str], types: Types, budget: Budget) -> None:
+        self.topic, self.paths, self.types, self.budget = topic, paths, types, budget
         self._decoders: dict[tuple[str, str, str], Decoder] = {}
         self._log: list[Integers] = []
         self._number: list[Integers | None] = []
@@ -61,7 +32,7 @@ class _Collector:
         self.packed = 0
 
     def add(self, batch: Batch) -> None:
-        batch, lost = decompress_messages(batch)
+        batch, lost = decompress_messages(batch, self.budget)
         self.packed += lost
         if not len(batch):
             return
@@ -83,16 +54,16 @@ class _Collector:
     def _decoder(self, channel: Channel) -> Decoder:
         key = (channel.type, channel.definition_format, channel.definition)
         if key not in self._decoders:
-            if channel.encoding != "cdr":
+            if channel.encoding not in ("cdr", "ros1"):
                 raise BagError(
                     f"{self.topic}: its messages are encoded as {channel.encoding!r}; "
-                    "only 'cdr' can be read"
+                    "only 'cdr' and 'ros1' can be read"
                 )
             candidates = self.types.candidates(channel)
             paths = list(self.paths)
             if _has_stamp(candidates[0], channel.type):
                 paths += [name for name in STAMP if name not in paths]
-            self._decoders[key] = Decoder(channel.type, candidates, paths)
+            self._decoders[key] = Decoder(channel, candidates, paths)
         return self._decoders[key]
 
     def table(self) -> Table:
@@ -121,12 +92,11 @@ class _Collector:
         table = Table(log, _stamps(columns), columns, present, number)
         for decoder in self._decoders.values():
             if decoder.undecodable:
-                table.notes.append(
-                    f"{self.topic}: {decoder.undecodable} messages are no {decoder.name} "
-                    f"({decoder.reason}) and were left out"
-                )
+                text = f"{decoder.undecodable} messages are no {decoder.name} ({decoder.reason})"
+                table.findings.append(damaged(f"{self.topic}: {text} and were left out"))
         if self.packed:
-            table.notes.append(f"{self.topic}: {self.packed} messages could not be decompressed")
+            text = f"{self.topic}: {self.packed} messages could not be decompressed"
+            table.findings.append(damaged(text))
         return table
 
 
@@ -153,30 +123,15 @@ def collect(
     types: Types,
     progress: Progress | None = None,
 ) -> dict[str, Table]:
-    """Read the wanted fields of a bag in one pass over its files.
+    """Read the wanted fields by topic in one pass over a recording's files.
 
-    Parameters
-    ----------
-    recording : Recording
-        Its notes grow by whatever is lost.
-    wanted : mapping of str to list of str
-        Field paths by topic.
-    types : Types
-        For messages that the bag does not define.
-    progress : callable, optional
-        Called with the fraction that is read and the recording's name.
-
-    Returns
-    -------
-    dict of str to Table
-        By topic; empty tables for topics without messages.
-
-    Raises
-    ------
-    BagError
-        When a wanted field or type does not exist.
+    Topics without messages give empty tables; a field or type that does not exist is an error.
     """
-    collectors = {topic: _Collector(topic, paths, types) for topic, paths in wanted.items()}
+    if recording.is_table:
+        return {topic: recording.table(topic, fields) for topic, fields in wanted.items()}
+    collectors = {
+        topic: _Collector(topic, paths, types, recording.budget) for topic, paths in wanted.items()
+    }
     for fraction, batch in recording.batches(lambda channel: channel.topic in collectors):
         try:
             collectors[batch.channel.topic].add(batch)

@@ -12,34 +12,34 @@ from urllib.parse import quote
 
 import numpy as np
 
-from smp_motor_ident.bag.sqlite_pages import salvage
-from smp_motor_ident.bag.storage import Batch, Bytes, Channel, Integers, join, message_type
+from smp_motor_ident.bag.readers.format import Format
+from smp_motor_ident.bag.salvage import salvage
+from smp_motor_ident.bag.storage import (
+    Batch,
+    Bytes,
+    Channel,
+    Integers,
+    damaged,
+    join,
+    message_type,
+)
+from smp_motor_ident.bag.unpack import Budget
 from smp_motor_ident.errors import BagError
+from smp_motor_ident.finding import Finding
 
 MAGIC = b"SQLite format 3\0"
 _ROWS = 8192
+_BLOCK = 1 << 25
 
 
-class SqliteFile:
-    """One ``.db3`` file.
+class _SqliteFile:
+    """One ``.db3`` file, which is not changed; its name where ``path`` is a temporary copy."""
 
-    Parameters
-    ----------
-    path : Path
-        To be read; it is not changed.
-    name : str
-        The file's name for messages, where ``path`` is a temporary copy.
-
-    Raises
-    ------
-    BagError
-        Where it is no bag, or nothing of it can be read.
-    """
-
-    def __init__(self, path: Path, name: str = "") -> None:
+    def __init__(self, path: Path, name: str, budget: Budget) -> None:
         self.path = path
-        self.name = name or path.name
-        self.problems: list[str] = []
+        self.name = name
+        self.problems: list[Finding] = []
+        self._budget = budget
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         self._cut_off = False
         self._path_read = self._with_journal()
@@ -47,8 +47,11 @@ class SqliteFile:
         try:
             self._channels = self._read_channels()
         except (sqlite3.Error, UnicodeDecodeError, TypeError) as error:
-            reasons = "; ".join([" ".join(str(error).split()), *self.problems])
+            reasons = "; ".join([" ".join(str(error).split()), *(p.message for p in self.problems)])
             raise BagError(f"{self.name}: not a readable bag ({reasons})") from None
+
+    def _amiss(self, text: str) -> None:
+        self.problems.append(damaged(text))
 
     def _with_journal(self) -> Path:
         """Return the file, or where a journal lies beside it a copy of both.
@@ -68,7 +71,7 @@ class SqliteFile:
         copy = Path(self._folder.name) / self.path.name
         for original in (self.path, *journals):
             shutil.copyfile(original, copy.with_name(original.name))
-        self.problems.append(
+        self._amiss(
             f"{self.name}: was not closed; its journal {journals[0].name} was applied to a copy"
         )
         return copy
@@ -76,6 +79,8 @@ class SqliteFile:
     def _connect(self, path: Path) -> sqlite3.Connection:
         mode = "immutable=1" if self._folder is None else "mode=rw"
         database = sqlite3.connect(f"file:{quote(str(path.resolve()))}?{mode}", uri=True)
+        if hasattr(database, "setlimit"):  # limit 0 is that of a blob's length
+            database.setlimit(0, path.stat().st_size + (1 << 20))
         database.text_factory = lambda text: text.decode("utf-8", "replace")
         size = path.stat().st_size
         with path.open("rb") as file:
@@ -84,9 +89,7 @@ class SqliteFile:
         page = 65536 if page == 1 else page
         pages = int.from_bytes(head[28:32], "big")
         if self._folder is None and size < pages * page:
-            self.problems.append(
-                f"{self.name}: cut off at byte {size} of {pages * page} that it had"
-            )
+            self._amiss(f"{self.name}: cut off at byte {size} of {pages * page} that it had")
             self._cut_off = True
             # With this, SQLite reads a file that is shorter than its head says.
             database.execute("PRAGMA writable_schema=ON")
@@ -103,7 +106,7 @@ class SqliteFile:
                 rows = self._database.execute(f"{query} FROM message_definitions").fetchall()
             except sqlite3.DatabaseError as error:
                 rows = []
-                self.problems.append(f"{self.name}: its definitions cannot be read ({error})")
+                self._amiss(f"{self.name}: its definitions cannot be read ({error})")
             for kind, text, encoding in rows:
                 definitions[message_type(kind)] = (text, encoding)
         optional = [
@@ -124,13 +127,7 @@ class SqliteFile:
         ]
 
     def channels(self) -> list[Channel]:
-        """Return the topics of the file.
-
-        Returns
-        -------
-        list of Channel
-            In the order of their numbers.
-        """
+        """Return the topics of the file."""
         return self._channels
 
     def promised(self) -> dict[str, int] | None:
@@ -151,7 +148,7 @@ class SqliteFile:
                     yield min(1.0, last / total) if total > 0 else 1.0, batch
         except sqlite3.DatabaseError as error:
             if not self._cut_off:
-                self.problems.append(f"{self.name}: damaged behind message {last} ({error})")
+                self._amiss(f"{self.name}: damaged behind message {last} ({error})")
             yield from self._salvaged(asked, last)
 
     def _reads(self, asked: dict[int, Channel]) -> Iterator[tuple[int, list[Batch]]]:
@@ -167,9 +164,20 @@ class SqliteFile:
             last, topic, batch = read
             yield last, self._by_topic(topic, batch, asked)
         query = f"SELECT id, topic_id, timestamp, data {source}"
-        while rows := self._database.execute(query, (last,)).fetchall():
+        while rows := self._rows(query, last):
             last = rows[-1][0]
             yield last, list(self._split(rows, asked))
+
+    def _rows(self, query: str, last: int) -> list[tuple[int, int, int, bytes]]:
+        """Return the next rows; spoilt pages may give the same bytes to many of them."""
+        rows, size = [], 0
+        for row in self._database.execute(query, (last,)):
+            rows.append(row)
+            size += len(row[3]) if isinstance(row[3], (bytes, str)) else 0
+            if size > _BLOCK:
+                break
+        self._budget.take(size)
+        return rows
 
     def _in_bulk(self, source: str, last: int) -> tuple[int, Integers, Batch] | None:
         """Let SQLite put rows together in one blob; None where that cannot be trusted.
@@ -208,6 +216,7 @@ class SqliteFile:
         """Yield what single pages still hold behind the last row that the tree gave."""
         for fraction, rows in salvage(self._path_read):
             wanted = [row for row in rows if row[0] > last and row[1] in asked]
+            self._budget.take(sum(len(row[3]) for row in wanted))
             if wanted:
                 for batch in self._split(wanted, asked):
                     yield fraction, batch
@@ -229,7 +238,7 @@ class SqliteFile:
             joined = join(every, list(blobs), np.array(times, np.int64))
         except (TypeError, OverflowError):
             sound = [r for r in rows if isinstance(r[3], bytes) and isinstance(r[2], int)]
-            self.problems.append(
+            self._amiss(
                 f"{self.name}: {len(rows) - len(sound)} messages without data were left out"
             )
             if sound:
@@ -246,3 +255,6 @@ class SqliteFile:
             if which.size:
                 parts.append(replace(batch.take(which), channel=channel))
         return parts
+
+
+FORMAT = Format("SQLite bag", (".db3",), MAGIC, _SqliteFile, tables=False)

@@ -22,16 +22,19 @@ from mcap.exceptions import McapError
 from mcap.reader import SeekingReader
 from mcap.summary import Summary
 
+from smp_motor_ident.bag.readers.format import Format
 from smp_motor_ident.bag.storage import (
     Batch,
     Bytes,
     Channel,
     Integers,
-    decompress,
+    damaged,
     gather,
     message_type,
 )
+from smp_motor_ident.bag.unpack import Budget, decompress
 from smp_motor_ident.errors import BagError
+from smp_motor_ident.finding import Finding
 
 MAGIC = b"\x89MCAP0\r\n"
 NUMBERED = "publication_sequence"
@@ -43,26 +46,14 @@ _BLOCK = 1 << 22
 _DAMAGE = (McapError, struct.error, ValueError, OverflowError, MemoryError, KeyError)
 
 
-class McapFile:
-    """One ``.mcap`` file.
+class _McapFile:
+    """One ``.mcap`` file; its name for messages, where ``path`` is a temporary copy."""
 
-    Parameters
-    ----------
-    path : Path
-        To be read.
-    name : str
-        The file's name for messages, where ``path`` is a temporary copy.
-
-    Raises
-    ------
-    BagError
-        Where it does not begin as an MCAP file does.
-    """
-
-    def __init__(self, path: Path, name: str = "") -> None:
+    def __init__(self, path: Path, name: str, budget: Budget) -> None:
         self.path = path
-        self.name = name or path.name
-        self.problems: list[str] = []
+        self.name = name
+        self.problems: list[Finding] = []
+        self._budget = budget
         with path.open("rb") as file:
             if file.read(8) != MAGIC:
                 raise BagError(f"{self.name}: does not begin like an MCAP file")
@@ -92,13 +83,7 @@ class McapFile:
         return summary
 
     def channels(self) -> list[Channel]:
-        """Return the channels of the file, by a scan where it has no summary.
-
-        Returns
-        -------
-        list of Channel
-            In the order of their numbers.
-        """
+        """Return the channels of the file, by a scan where it has no summary."""
         if self._summary is None and not self._scanned:
             for _ in self.batches(lambda _: False):
                 pass
@@ -178,10 +163,10 @@ class McapFile:
             self._cut(start, "inside a chunk's head")
             return
         packed = body[28 + stream.count :][:stored]
-        data = decompress(packed, compression, size)
+        data = decompress(packed, compression, size, self._budget)
         sound = len(data) == size and (not crc or zlib.crc32(data) == crc)
         if whole and not sound:
-            self.problems.append(
+            self._amiss(
                 f"{self.name}: the chunk at byte {start} is damaged and was left out"
                 f"{self._count_of_chunk(start)}"
             )
@@ -190,7 +175,7 @@ class McapFile:
         if not whole:
             self._cut(start, f"inside a chunk of which {len(positions)} messages could be read")
         elif end != len(data):
-            self.problems.append(
+            self._amiss(
                 f"{self.name}: the chunk at byte {start} ends inside a record; "
                 f"{len(data) - end} of its bytes were left out"
             )
@@ -227,14 +212,14 @@ class McapFile:
         at = np.array(positions, np.int64)
         length: Integers = gather(raw, at + 1, "<i8") - 22
         if (length < 0).any():
-            self.problems.append(f"{self.name}: {int((length < 0).sum())} messages too short")
+            self._amiss(f"{self.name}: {int((length < 0).sum())} messages too short")
             at, length = at[length >= 0], length[length >= 0]
         ids = gather(raw, at + 9, "<u2")
         for key in np.unique(ids).tolist():
             channel = self._channels.get(key)
             which = ids == key
             if channel is None:
-                self.problems.append(
+                self._amiss(
                     f"{self.name}: {int(which.sum())} messages of channel {key}, "
                     "which the file does not describe, were left out"
                 )
@@ -301,7 +286,13 @@ class McapFile:
             return {}
         return {index.chunk_start_offset: index for index in self._summary.chunk_indexes}
 
+    def _amiss(self, text: str) -> None:
+        self.problems.append(damaged(text))
+
     def _cut(self, start: int, where: str) -> None:
         size = self.path.stat().st_size
         what = "damaged" if self._summary is not None else "cut off or damaged"
-        self.problems.append(f"{self.name}: {what} at byte {start} of {size} {where}".rstrip())
+        self._amiss(f"{self.name}: {what} at byte {start} of {size} {where}".rstrip())
+
+
+FORMAT = Format("MCAP", (".mcap",), MAGIC, _McapFile, tables=False)

@@ -38,7 +38,8 @@ def _integer(data: bytes, at: int, kind: int) -> int:
 class _Pages:
     """Access to the pages of a file."""
 
-    def __init__(self, file: BinaryIO, head: bytes) -> None:
+    def __init__(self, file: BinaryIO, head: bytes, length: int) -> None:
+        self.length = length
         size = int.from_bytes(head[16:18], "big")
         self.size = 65536 if size == 1 else size
         self.usable = self.size - head[20]
@@ -53,6 +54,8 @@ class _Pages:
 
     def payload(self, page: bytes, at: int, size: int) -> bytes:
         """Return a cell's content, which may go on in overflow pages."""
+        if size > self.length:
+            raise IndexError("the row is longer than the file")
         most = self.usable - 35
         if size <= most:
             return page[at : at + size]
@@ -99,7 +102,7 @@ def salvage(path: Path) -> Iterator[tuple[float, list[Row]]]:
     """Read the messages of every whole leaf page, in the order of the file."""
     count = path.stat().st_size
     with path.open("rb") as file:
-        pages = _Pages(file, file.read(100))
+        pages = _Pages(file, file.read(100), count)
         if pages.size < 512 or pages.usable < 480:
             return
         for number in range(2, count // pages.size + 1):
