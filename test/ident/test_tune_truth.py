@@ -223,7 +223,7 @@ def test_command_refuses_an_unreliable_result_unless_it_is_accepted(tmp_path, ca
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_any_inductance_at_any_rate_ends_in_stable_gains_or_a_reasoned_refusal(seed):
+def test_any_inductance_at_any_rate_ends_in_stable_gains(seed):
     """The short version of ``benchmarks/random_designs.py``."""
     rng = np.random.default_rng(seed)
     electrical, rate = 10 ** rng.uniform(-5, -2), 20 * 250 ** rng.uniform()
@@ -234,11 +234,7 @@ def test_any_inductance_at_any_rate_ends_in_stable_gains_or_a_reasoned_refusal(s
     }
     source = ("measured", "difference", "observer")[seed % 3]
     loop = replace(LOOP, sample_time=1 / rate, delay=None, speed_source=source)
-    try:
-        one = design(estimate(**values), loop, samples=60)
-    except DesignError as refusal:
-        assert "; " in str(refusal)
-    else:
-        assert one.margins.stable
-        assert one.performance.overshoot < 5.0
-        assert math.isfinite(one.specification.settling.value)
+    one = design(estimate(**values), loop, samples=60)
+    assert one.margins.stable
+    assert one.performance.overshoot < 5.0
+    assert math.isfinite(one.specification.settling.value)
