@@ -151,7 +151,7 @@ def check(design: Design, gains: Gains) -> Check:
 
 
 def duration(design: Design, gains: Gains) -> float:
-    """Return how long a change of set-point is looked at, slow tail of the integral included [s]."""
+    """Return how long a change of set-point is looked at, tail of the integral included [s]."""
     fb, a0 = gains.feedback, 1 / design.motor["dc_gain"]
     tail = 8 * (fb.p + a0) / fb.i if fb.i > 0 else 0.0
     return float(0.5 + 12 * design.motor["time_constant"] + tail)
