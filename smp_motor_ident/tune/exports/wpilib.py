@@ -18,7 +18,7 @@ from smp_motor_ident.tune.exports.target import Format, Gains, plant_of, rounded
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.margins import batch_margins, grid_for
 
-PHASE, GAIN, SENSITIVITY, PEAK = 60.0, 2.0, 1.4, 1.05
+PHASE, GAIN, SENSITIVITY, PEAK = 60.0, 2.0, 1.4, 1.01
 """Margins [deg], [-], [-], and the largest peak from set-point to speed, with feed-forward [-]."""
 
 
