@@ -6,6 +6,7 @@ from pathlib import Path
 
 from setuptools import find_packages, setup
 from setuptools.command.build_py import build_py
+from setuptools.command.develop import develop
 
 NAME = "smp_motor_control"
 EXECUTABLES = (
@@ -24,19 +25,33 @@ EXECUTABLES = (
 )
 
 
+def require_messages() -> None:
+    """Refuse to install half of the repository: executables that would not find their messages."""
+    prefixes = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
+    found = any(Path(p, "share/smp_interfaces/package.xml").is_file() for p in prefixes if p)
+    if "COLCON" in os.environ and not found:
+        here = Path(__file__).resolve().parent
+        raise SystemExit(
+            "smp_interfaces is not built yet, and colcon does not look for it below this package; "
+            f"type: colcon build --base-paths {here} {here}/smp_interfaces"
+        )
+
+
 class BuildPy(build_py):
-    """Refuses to install half of the repository: executables that would not find their messages."""
+    """As colcon build asks for."""
 
     def run(self) -> None:
-        """Look for smp_interfaces, which colcon does not find by itself below this package."""
-        prefixes = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
-        found = any(Path(p, "share/smp_interfaces/package.xml").is_file() for p in prefixes if p)
-        if "COLCON" in os.environ and not found:
-            here = os.path.relpath(Path(__file__).parent, os.environ.get("PWD", "."))
-            raise SystemExit(
-                "smp_interfaces is not built yet, and colcon does not look for it below this "
-                f"package; type: colcon build --base-paths {here} {here}/smp_interfaces"
-            )
+        """Build what is whole."""
+        require_messages()
+        super().run()
+
+
+class Develop(develop):
+    """As colcon build --symlink-install asks for."""
+
+    def run(self) -> None:
+        """Link what is whole."""
+        require_messages()
         super().run()
 
 
@@ -58,7 +73,7 @@ setup(
     ],
     install_requires=["setuptools"],
     extras_require={"test": ["pytest", "hypothesis"]},  # by which colcon test runs pytest
-    cmdclass={"build_py": BuildPy},
+    cmdclass={"build_py": BuildPy, "develop": Develop},
     zip_safe=False,
     entry_points={
         "console_scripts": [f"{name} = {NAME}.entry:{name}" for name in EXECUTABLES],

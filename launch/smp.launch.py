@@ -2,8 +2,8 @@
 
     ros2 launch smp_motor_control smp.launch.py                                   # simulated
     ros2 launch smp_motor_control smp.launch.py hardware:=external params_file:=gains.yaml
-    ros2 launch smp_motor_control smp.launch.py namespace:=robot1 left_wheels:=left right_wheels:=right \
-        motors:=motors.yaml params_file:=gains.yaml
+    ros2 launch smp_motor_control smp.launch.py namespace:=robot1 left_wheels:=left \\
+        right_wheels:=right motors:=motors.yaml params_file:=gains.yaml
 
 With ``hardware:=external`` something else must publish ``<wheel>/motor_state`` and
 ``<wheel>/motor_description`` and take ``<wheel>/motor_command`` in the robot's namespace.
@@ -65,12 +65,9 @@ def start(context, *_) -> list:
         )
 
     autostart = {"autostart": is_true(given, "autostart")}
-    nodes = [
-        node(
-            "wheel_pid", [given["params_file"], autostart], f"/{w}", respawn=True, respawn_delay=0.5
-        )
-        for w in wheels
-    ]
+    again = {"respawn": True, "respawn_delay": 0.5}
+    gains = [given["params_file"], autostart]
+    nodes = [node("wheel_pid", gains, f"/{wheel}", **again) for wheel in wheels]
     if given["hardware"] == "simulated":
         plant = {"motors_file": given["motors"], "rate": float(given["rate"])}
         nodes.append(node("motor_plant", [plant]))

@@ -60,8 +60,10 @@ def node(name: str, package: str = "smp_motor_control") -> Callable[[], int]:
         if wrong := wrong_domain():
             print(f"{name}: {wrong}", file=sys.stderr)
             return 2
-        if package == "smp_motor_control" and {"-h", "--help"} & set(sys.argv[1:]):
-            return _program(f"{package}.nodes.usage", 0)()
+        # Those of bags have arguments of their own, and their own help.
+        if name not in ("record", "play") and {"-h", "--help"} & set(sys.argv[1:]):
+            sys.argv[1:] = [f"{package}.nodes.{name}"]
+            return _program("smp_motor_control.nodes.usage", 0)()
         return program()
 
     return run

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
+import os
 import sys
-from pathlib import Path
 from typing import Any
 
 from smp_motor_control.nodes.settings import _entries
-from smp_motor_control.ros_arguments import split_arguments
 
 
 def usage(name: str, module: Any) -> str:
@@ -29,11 +29,11 @@ def usage(name: str, module: Any) -> str:
 
 
 def main() -> int:
-    """Print the help of the executable that was called."""
-    name = Path(sys.argv[0]).name
-    own, _ = split_arguments(sys.argv[1:])
-    if not {"-h", "--help"} & set(own):
-        print(f"{name}: --help stands before --ros-args", file=sys.stderr)
-        return 2
-    print(usage(name, importlib.import_module(f"smp_motor_control.nodes.{name}")))
+    """Print the help of the node whose module is the argument."""
+    module = sys.argv[1]
+    text = usage(module.rpartition(".")[2], importlib.import_module(module))
+    with contextlib.suppress(BrokenPipeError):
+        print(text, flush=True)
+        return 0
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the reader has gone
     return 0
