@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from smp_motor_ident.estimation import replay
-from smp_motor_ident.estimation.answer import Answer
 from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.estimation.quantities import Answer
 from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model import structures as models
