@@ -1,10 +1,10 @@
-# make setup | demo | test | check | paper | clean. Each but clean sets up first, which is skipped when it is done.
+# make setup | demo | test | check | docs | paper | clean. Each but clean sets up first, which is skipped when it is done.
 # PYTHON=/path/to/python3 chooses the Python (3.10 to 3.13); ARGS="..." is passed on to demo, test and paper.
 SHELL := bash
 ROOT := $(patsubst %/,%,$(dir $(abspath $(lastword $(MAKEFILE_LIST)))))
 IN := cd '$(ROOT)' && . ./setup.bash &&
 
-.PHONY: setup demo test check format paper lock clean
+.PHONY: setup demo test check format docs paper lock clean
 
 setup:
 	@PYTHON='$(PYTHON)' '$(ROOT)/scripts/setup.sh'
@@ -21,6 +21,9 @@ check: setup
 format: setup
 	@$(IN) ruff format && ruff check --fix
 
+docs: setup
+	@$(IN) sphinx-build -q docs docs/_build/html && echo "docs: $(ROOT)/docs/_build/html/README.html"
+
 paper: setup
 	@$(IN) exec python benchmarks/paper.py $(ARGS)
 
@@ -29,4 +32,4 @@ lock:
 	@cd '$(ROOT)' && exec scripts/lock.sh $(ARGS)
 
 clean:
-	@cd '$(ROOT)' && rm -rf .venv build install log .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis
+	@cd '$(ROOT)' && rm -rf .venv build install log .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis docs/_build

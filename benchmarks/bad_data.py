@@ -241,8 +241,8 @@ def judge(record: Record, truth: dict, words: str = "") -> dict:
               if q.status == "estimated" and q.std and n in truth}  # fmt: skip
     errors = {n: abs(q.value - truth[n]) / q.std for n, q in claims.items()}
     worst = max(errors, key=lambda n: errors[n])
-    doubt = [w for w in e.warnings if "doubtful" in w]
-    says = "doubtful" if doubt else ("wrong" if errors[worst] > FAR else "right")
+    doubt = e.unreliable or any("doubtful" in w for w in e.warnings)
+    says = "unreliable" if doubt else ("wrong" if errors[worst] > FAR else "right")
     off = abs(claims[worst].value / truth[worst] - 1) if truth[worst] else claims[worst].value
     return {"says": says, "words": "; ".join(e.warnings), "worst": worst, "sigmas": errors[worst],
             "off": off, "model": e.model, "fit": e.fit_percent.estimation,
@@ -286,12 +286,12 @@ def main() -> None:
             file.flush()
             print(f"\r{line['fault']} {len(lines)}   ", end="", flush=True)
     print()
-    says = ("named", "refused", "doubtful", "right", "wrong")
+    says = ("named", "refused", "unreliable", "right", "wrong")
     rows = []
     for fault in dict.fromkeys(x["fault"] for x in lines):
         here = [x for x in lines if x["fault"] == fault]
         rows.append((fault, len(here), *(sum(x["says"] == s for x in here) for s in says)))
-    head = ("fault", "records", "named", "refused for another reason", "answer called doubtful",
+    head = ("fault", "records", "named", "refused for another reason", "answer called unreliable",
             "answer within 5 std", "wrong answer")  # fmt: skip
     print(table(head, rows))
 

@@ -72,9 +72,9 @@ def answer(record, z) -> dict:
               if q.status == "estimated" and q.std and n in values}  # fmt: skip
     errors = {n: abs(q.value - values[n]) / q.std for n, q in claims.items()}
     worst = max(errors, key=lambda n: errors[n])
-    words = [w for w in e.warnings if "doubtful" in w]
+    words = [w for w in e.warnings if e.unreliable or "doubtful" in w]
     off = abs(claims[worst].value / values[worst] - 1) if values[worst] else 0.0
-    return {"says": "doubtful" if words else "sure", "words": "; ".join(words), "model": e.model,
+    return {"says": "unreliable" if words else "sure", "words": "; ".join(words), "model": e.model,
             "worst": worst, "sigmas": errors[worst], "off": off,
             "spent": time.perf_counter() - begun}  # fmt: skip
 
@@ -132,12 +132,12 @@ def main() -> None:
             (name, f"{right} of {len(here)} ({100 * right / len(here):.1f} %)", told,
              fine, len(rest) - told - fine,
              f"{sum(x['says'] == 'sure' for x in asked)} of {len(asked)}",
-             sum(x["says"] == "doubtful" for x in asked),
+             sum(x["says"] == "unreliable" for x in asked),
              sum(x["says"] == "refused" for x in asked), len(wrong),
              f"{1e3 * np.median([x['seconds'] for x in here]):.0f} ms")
         )  # fmt: skip
     head = ("case", "right minimum", "else told", "else the tool is right", "else silent",
-            "tool: sure", "doubtful",
+            "tool: sure", "unreliable",
             "refused", f"sure, yet off by > {FAR:g} std", "median time")  # fmt: skip
     print("\n" + table(head, rows))
 

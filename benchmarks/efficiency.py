@@ -83,8 +83,8 @@ def realisation(wheel: str, kind: str, current: bool, seed: int, args) -> dict:
         got = [q.value, q.std, *q.ci95] if q is not None and q.value is not None else None
         found[name] = [true, variance, got]
     spent = time.perf_counter() - begun
-    doubtful = any("doubtful" in w for w in e.warnings)
-    return {**line, "found": found, "doubtful": doubtful, "chosen": e.model, "seconds": spent}
+    unreliable = e.unreliable or any("doubtful" in w for w in e.warnings)
+    return {**line, "found": found, "unreliable": unreliable, "chosen": e.model, "seconds": spent}
 
 
 def cases(args) -> Iterator[tuple[str, str, bool]]:
@@ -160,11 +160,11 @@ def main() -> None:
         rows.append(
             (case[0], case[1], "yes" if case[2] else "no", f"{np.mean(list(mean.values())):.2f}",
              f"{mean[worst]:.2f} ({worst})", f"{100 * hits / max(tries, 1):.1f} %",
-             sum(x.get("doubtful", False) for x in here), silent,
+             sum(x.get("unreliable", False) for x in here), silent,
              sum("refused" in x for x in here))
         )  # fmt: skip
     head = ("motor", "voltage", "current", "mean MSE/CRB", "worst quantity", "coverage",
-            "doubtful", "no value", "refused")  # fmt: skip
+            "unreliable", "no value", "refused")  # fmt: skip
     print(table(head, rows))
     spent = [x["seconds"] for x in lines if "seconds" in x]
     print(

@@ -9,14 +9,15 @@ Usage: python benchmarks/honesty.py [--seconds 12]
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 
 import numpy as np
 from known_motors import CURRENT_NOISE, QUANTUM, TABLE_1, recording, table
 
 from smp_motor_ident.diagnosis.identifiability import structural
+from smp_motor_ident.diagnosis.limits import LOOSE_QUANTITY
 from smp_motor_ident.errors import SmpError
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.estimation.answer import LOOSE
 from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.likelihood.passes import NO_GAIN, evaluate
 from smp_motor_ident.model import structures as models
@@ -59,22 +60,17 @@ def theory(record, z, current: bool, known: tuple[str, ...]) -> tuple[bool, str]
     if known == ("resistance", "viscous_friction"):
         return False, "two roots"  # K^2 - a0 K + R b = 0
     std = least_certain(record, z, current, known)
-    return std < LOOSE, f"bound {std:.2g}"
+    return std < LOOSE_QUANTITY.value, f"bound {std:.2g}"
 
 
-def main() -> None:
-    """Run all cases and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seconds", type=float, default=12.0)
-    args = parser.parse_args()
-    rows = []
-    wrong = 0
+def run(seconds: float = 12.0) -> Iterator[dict]:
+    """Yield what theory says of every case, and what the tool does."""
     for wheel, p in TABLE_1.items():
         truth = dict(zip(PHYSICAL, p))
         for volts in (0.0, 0.4):
             for current, known in CASES:
                 record, z = recording(
-                    p, "all", current=current, static_voltage=volts, seconds=args.seconds
+                    p, "all", current=current, static_voltage=volts, seconds=seconds
                 )
                 can, why = theory(record, z, current, known)
                 try:
@@ -89,16 +85,29 @@ def main() -> None:
                     verdict = "separates all" if not says else "cannot: " + ", ".join(says)
                 except SmpError as refusal:
                     fine, verdict, close = False, str(refusal)[:60], True
-                wrong += not fine
-                rows.append(
-                    (wheel, volts, "yes" if current else "no", ", ".join(known) or "-",
-                     f"{'can' if can else 'cannot'} ({why})", verdict, "yes" if close else "NO",
-                     "as theory" if fine else "OTHERWISE")
-                )  # fmt: skip
-                print(rows[-1], flush=True)
+                yield {
+                    "motor": wheel, "friction": volts, "current": current, "fixed": known,
+                    "theory": f"{'can' if can else 'cannot'} ({why})", "tool": verdict,
+                    "close": close, "fine": fine,
+                }  # fmt: skip
+
+
+def main() -> None:
+    """Run all cases and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=12.0)
+    args = parser.parse_args()
+    rows = []
+    for line in run(args.seconds):
+        rows.append(
+            (line["motor"], line["friction"], "yes" if line["current"] else "no",
+             ", ".join(line["fixed"]) or "-", line["theory"], line["tool"],
+             "yes" if line["close"] else "NO", "as theory" if line["fine"] else "OTHERWISE")
+        )  # fmt: skip
+        print(rows[-1], flush=True)
     head = ("motor", "friction [V]", "current", "fixed", "theory", "the tool", "within 4 std", "")
     print("\n" + table(head, rows))
-    print(f"\n{len(rows) - wrong} of {len(rows)} as theory says")
+    print(f"\n{sum(row[-1] == 'as theory' for row in rows)} of {len(rows)} as theory says")
 
 
 if __name__ == "__main__":

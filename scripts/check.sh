@@ -11,9 +11,10 @@ docstrings() {
   find smp_motor_control smp_motor_ident -name '*.py' -not -path '*/nodes/*' -print0 |
     xargs -0 python scripts/docstrings.py
 }
+docs() { sphinx-build -q -W --keep-going docs docs/_build/html; }
 
 guards=("$@")
-[ $# -gt 0 ] || guards=(format lint types imports docstrings)
+[ $# -gt 0 ] || guards=(format lint types imports docstrings docs)
 failed=()
 for guard in "${guards[@]}"; do
   if output=$("$guard" 2>&1); then

@@ -14,3 +14,34 @@ class SmpError(Exception):
 
 class ParameterError(SmpError, ValueError):
     """A parameter has a value that no motor, controller or robot can have."""
+
+
+def check_range(name: str, value: float, low: float, high: float, unit: str = "") -> float:
+    """Return a number that lies between two limits, of which the message names both.
+
+    Parameters
+    ----------
+    name : str
+        Of the parameter.
+    value : float
+        What was given.
+    low, high : float
+        Smallest and largest number allowed.
+    unit : str
+        For the message.
+
+    Returns
+    -------
+    float
+        The value.
+
+    Raises
+    ------
+    ParameterError
+        When it is no number, or not between them.
+    """
+    number = not isinstance(value, (bool, str)) and hasattr(value, "__float__")
+    if number and low <= float(value) <= high:
+        return float(value)
+    given = f"{value!r} {unit}".rstrip()
+    raise ParameterError(f"{name} is {given}; it must be a number from {low:g} to {high:g}")

@@ -14,25 +14,159 @@ References
 ----------
 R. F. Stengel, *Optimal Control and Estimation*, Dover 1994, sections 4.3 and 4.5;
 Y. Bar-Shalom, X.-R. Li and T. Kirubarajan, *Estimation with Applications to Tracking and
-Navigation*, Wiley 2001, section 5.4 for the innovation test.
+Navigation*, Wiley 2001, section 5.4 for the innovation test; B. D. O. Anderson and
+J. B. Moore, *Optimal Filtering*, 1979, section 6.7 for the doubling of the Riccati equation.
 """
 
 from __future__ import annotations
 
 import math
 from collections import deque
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from smp_motor_control.encoder import DifferencedSpeed, Encoder, Unwrapper
-from smp_motor_control.errors import ParameterError
+from smp_motor_control.errors import ParameterError, check_range
 from smp_motor_control.motor.model import MotorModel
-from smp_motor_control.observer_gain import ObserverNoise, steady_gain
+from smp_motor_control.motor.response import FreeResponse, zero_order_hold
 
-__all__ = ["ObserverNoise", "SpeedObserver"]
+Array = NDArray[np.float64]
 
 _STEPS_PER_OCTAVE = 2
 _OCTAVES = 2
 _AGREE, _DISAGREE = 3.0, 9.0
 _INNOVATION_MEMORY = 0.05
+_DOUBLINGS = 100
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(6)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObserverNoise:
+    """How far the observer trusts the model and the counts.
+
+    Attributes
+    ----------
+    load : float
+        How much the load, as an armature voltage, wanders in one second [V/sqrt(s)].
+        Raises the bandwidth with which changes of the load are seen.
+    voltage : float
+        White noise of the voltage and of what the model leaves out [V sqrt(s)].
+    count : float
+        Standard deviation of the encoder's error [counts]; ``1/sqrt(12)`` is quantisation
+        alone.
+
+    Raises
+    ------
+    ParameterError
+        When a value is not positive, or beyond what the arithmetic can hold.
+    """
+
+    load: float = 1.0
+    voltage: float = 0.005
+    count: float = 1.0 / math.sqrt(12.0)
+
+    def __post_init__(self) -> None:
+        for name, unit in (("load", "V/sqrt(s)"), ("voltage", "V sqrt(s)"), ("count", "counts")):
+            check_range(f"observer noise of {name}", getattr(self, name), 1e-6, 1e6, unit)
+
+
+class SteadyGain(NamedTuple):
+    """Kalman gain in the steady state, per radian of innovation.
+
+    Attributes
+    ----------
+    angle, speed, acceleration, load : float
+        [-], [1/s], [1/s^2], [V/rad].
+    variance : float
+        Of the innovation [rad^2].
+    """
+
+    angle: float
+    speed: float
+    acceleration: float
+    load: float
+    variance: float
+
+
+def prediction(model: MotorModel, intervals: Array) -> tuple[Array, Array]:
+    """Return the exact transition of ``(angle, w, w', d)`` and the effect of the voltage."""
+    held = zero_order_hold(
+        model.dc_gain, model.time_constant, model.time_constant_product, intervals
+    )
+    F = np.zeros((len(intervals), 4, 4))
+    G = np.zeros((len(intervals), 4))
+    F[:, 0, 0] = F[:, 3, 3] = 1.0
+    F[:, 0, 1:3] = held.angle_transition
+    F[:, 1:3, 1:3] = held.transition
+    G[:, 0], G[:, 1:3] = held.angle_forced, held.forced
+    F[:, :3, 3] = -G[:, :3]
+    return F, G
+
+
+def steady_gain(model: MotorModel, quantum: float, noise: ObserverNoise, dt: float) -> SteadyGain:
+    """Return the steady-state Kalman gain for steps of a given length.
+
+    The noise of a step is gathered over a part of it that is short beside the fastest time
+    constant (Gauss-Legendre), then doubled, ``Q(2h) = F Q(h) F' + Q(h)``; the Riccati equation
+    is doubled as well.  Sums of positive terms alone: nothing overflows or cancels, however
+    small L/R is against the step.
+
+    Parameters
+    ----------
+    model : MotorModel
+        The identified motor.
+    quantum : float
+        Angle of one count [rad].
+    noise : ObserverNoise
+        What to expect of load, voltage and encoder.
+    dt : float
+        Length of the step [s].
+
+    Returns
+    -------
+    SteadyGain
+        Gains and variance of the innovation.
+    """
+    free = FreeResponse(model.time_constant, model.time_constant_product)
+    gain, tau, tp = model.dc_gain, model.time_constant, free.product
+    fastest = 1.0 / tau if not tp else max(-free.fast, 1.0 / math.sqrt(tp))
+    levels = max(math.ceil(math.log2(2.0 * dt * fastest)), 0)
+    spans = dt * 2.0 ** np.arange(-levels, 1)
+    F, _ = prediction(model, np.concatenate((spans, 0.5 * spans[0] * (1.0 + _NODES))))
+    # In counts, and in shares of a steady turn of one count per time constant.
+    lag = tau if not tp else 1.0 / fastest
+    scale = quantum * np.array([1.0, 1.0 / tau, 1.0 / (tau * lag), 1.0 / (gain * tau)])
+    F *= scale / scale[:, None]
+    entry = np.array([0.0, 0.0, gain / tp, 0.0] if tp else [0.0, gain / tau, 0.0, 0.0])
+    sources = np.stack((noise.voltage * entry, [0.0, 0.0, 0.0, noise.load])) / scale
+    answers = F[levels + 1 :] @ sources.T
+    Q = np.einsum("k,kia,kja->ij", 0.5 * spans[0] * _WEIGHTS, answers, answers)
+    for advance in F[:levels]:
+        Q = Q + advance @ Q @ advance.T
+    P = _steady_covariance(F[levels], Q, noise.count**2)
+    variance = P[0, 0] + noise.count**2
+    angle, speed, acceleration, load = (float(x) for x in P[:, 0] / variance * scale / quantum)
+    return SteadyGain(angle, speed, acceleration, load, float(variance) * quantum * quantum)
+
+
+def _steady_covariance(F: Array, Q: Array, R: float) -> Array:
+    """Return the covariance before a measurement of the first state, by doubling."""
+    A, H, eye = F.T, Q, np.eye(len(Q))
+    G = np.zeros_like(Q)
+    G[0, 0] = 1.0 / R
+    for _ in range(_DOUBLINGS):
+        both = np.linalg.solve((eye + G @ H).T, np.concatenate((A, H)).T).T
+        carried, seen = both[: len(Q)], both[len(Q) :]
+        added = A.T @ seen @ A
+        G = G + carried @ G @ A.T
+        A = carried @ A
+        G, H = 0.5 * (G + G.T), H + 0.5 * (added + added.T)
+        if np.all(np.diag(added) <= 1e-15 * np.diag(H)):
+            break
+    return H
 
 
 class SpeedObserver:
@@ -67,7 +201,7 @@ class SpeedObserver:
     Raises
     ------
     ParameterError
-        When ``sample_time``, ``window`` or ``max_load`` is not positive.
+        When ``sample_time``, ``window`` or ``max_load`` is out of range.
     """
 
     def __init__(
@@ -79,11 +213,11 @@ class SpeedObserver:
         window: int = 4,
         max_load: float = math.inf,
     ) -> None:
-        if not 0.0 < sample_time < math.inf:
-            raise ParameterError(f"sample_time of the observer is {sample_time} s: not positive")
+        check_range("sample_time of the observer", sample_time, 1e-7, 1e3, "s")
         if not max_load > 0.0:
             raise ParameterError(f"max_load of the observer is {max_load} V: must be positive")
         self._model, self._max_load = model, max_load
+        self._free = FreeResponse(model.time_constant, model.time_constant_product)
         self._quantum = encoder.angle_per_count
         self._unwrap = Unwrapper(encoder.bits)
         self._differenced = DifferencedSpeed(Encoder(encoder.counts_per_revolution), window)
@@ -173,26 +307,11 @@ class SpeedObserver:
 
     def _prepare(self, dt: float) -> None:
         """Compute what a step of this length needs; kept while the length stays the same."""
-        model, tp = self._model, self._model.time_constant_product
         self._dt = dt
         place = math.log2(max(dt / self._shortest, 1.0)) * _STEPS_PER_OCTAVE
         self._gain = self._gains[min(round(place), len(self._gains) - 1)]
         self._memory = min(dt / _INNOVATION_MEMORY, 1.0)
-        if tp == 0.0:
-            self._c = self._s = math.exp(-dt / model.time_constant)
-            return
-        sigma = model.time_constant / (2.0 * tp)
-        square = sigma * sigma - 1.0 / tp
-        root = math.sqrt(abs(square))
-        decay = math.exp(-sigma * dt)
-        if root * dt < 1e-6:
-            cos, sin = decay, decay * dt
-        elif square > 0.0:
-            grown, shrunk = math.exp((root - sigma) * dt), math.exp(-(root + sigma) * dt)
-            cos, sin = (grown + shrunk) / 2.0, (grown - shrunk) / (2.0 * root)
-        else:
-            cos, sin = decay * math.cos(root * dt), decay * math.sin(root * dt) / root
-        self._c, self._s, self._sigma = cos, sin, sigma
+        self._coefficients = self._free.after(dt)
 
     def _predict(self, voltage: float, dt: float) -> None:
         """Advance the state by the exact response to a constant voltage."""
@@ -206,17 +325,11 @@ class SpeedObserver:
                 drive -= static if speed > 0.0 else -static
         final = model.dc_gain * drive
         off = speed - final
-        tau, tp = model.time_constant, model.time_constant_product
-        if tp:
-            c, s, bend = self._c, self._s, self._sigma * self._s
-            new_off = off * (c + bend) + acceleration * s
-            new_acceleration = acceleration * (c - bend) - off * s / tp
-        else:
-            new_off = off * self._c
-            new_acceleration = -new_off / tau
-            tp = 0.0
-        # The integral of the equation of motion gives the angle.
-        self._theta += final * dt + tp * (acceleration - new_acceleration) + tau * (off - new_off)
+        g, h, g_rate, h_rate = self._coefficients
+        new_off = g * off + h * acceleration
+        new_acceleration = g_rate * off + h_rate * acceleration
+        swept = self._free.integral(off - new_off, acceleration - new_acceleration)
+        self._theta += final * dt + swept
         self._speed = final + new_off
         self.acceleration = new_acceleration
 

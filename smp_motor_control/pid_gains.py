@@ -5,10 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields
 
-from smp_motor_control.errors import ParameterError
+from smp_motor_control.errors import ParameterError, check_range
 
 EPSILON = 2.220446049250313e-16
 """Smallest number that counts as other than zero: of an error, a gain or a time step."""
+
+LARGEST = 1e9
+"""Of any gain, weight, clamp or time constant; products of three stay finite."""
 
 STRATEGIES = ("none", "back_calculation", "conditional_integration")
 """What may keep the integral from winding up while the output is clamped."""
@@ -48,9 +51,9 @@ class PidGains:
     Raises
     ------
     ParameterError
-        When a value is NaN, a gain is infinite, a time constant, dead band or static
-        feed-forward is negative, the output limits are not in order, the limits of the
-        integral do not enclose zero, or the strategy is unknown.
+        When a value is NaN or beyond 1e9 (limits may be infinite), a time constant, dead band
+        or static feed-forward is negative, the output limits are not in order, the limits of
+        the integral do not enclose zero, or the strategy is unknown.
 
     Examples
     --------
@@ -134,7 +137,6 @@ def _check_strategy(value: object) -> None:
 
 
 def _check_number(name: str, value: float) -> None:
-    if math.isnan(value) or (math.isinf(value) and name not in _CLAMPS):
-        raise ParameterError(f"{name} is {value}: must be a finite number")
-    if value < 0.0 and name in _NOT_NEGATIVE:
-        raise ParameterError(f"{name} is {value}: must not be negative")
+    if math.isinf(value) and name in _CLAMPS:
+        return
+    check_range(name, value, 0.0 if name in _NOT_NEGATIVE else -LARGEST, LARGEST)

@@ -1,4 +1,4 @@
-"""One typed door to numba, so that compiled functions keep their signatures for mypy."""
+"""One typed entry point to numba, so that compiled functions keep their signatures for mypy."""
 
 from __future__ import annotations
 
@@ -21,14 +21,15 @@ OPTIONS: dict[str, Any] = {
 def _stamp() -> tuple[tuple[int, int], ...]:
     """Return what changes when a module does whose functions are compiled into each other."""
     here = Path(__file__)
-    files = [here, *sorted((here.parent / "kernel").glob("*.py"))]
+    folders = (here.parent / name for name in ("likelihood", "model", "tune"))
+    files = [here, *(file for folder in folders for file in sorted(folder.glob("*.py")))]
     return tuple((file.stat().st_mtime_ns, file.stat().st_size) for file in files)
 
 
 STAMP = _stamp()
 
 
-def _told_of_others(dispatcher: Any) -> Any:
+def _stamped(dispatcher: Any) -> Any:
     """Make what lies on the disk void when any of the modules changed, not only its own.
 
     Numba looks at the file of the outermost function alone: an edit of a function that was
@@ -56,7 +57,7 @@ def compiled(function: F) -> F:
     callable
         The same function, compiled; the signature is unchanged.
     """
-    return cast(F, _told_of_others(numba.njit(**OPTIONS)(function)))
+    return cast(F, _stamped(numba.njit(**OPTIONS)(function)))
 
 
 def inlined(function: F) -> F:
@@ -72,4 +73,4 @@ def inlined(function: F) -> F:
     callable
         The same function, compiled; the signature is unchanged.
     """
-    return cast(F, _told_of_others(numba.njit(forceinline=True, **OPTIONS)(function)))
+    return cast(F, _stamped(numba.njit(forceinline=True, **OPTIONS)(function)))

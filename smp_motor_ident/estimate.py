@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident.diagnosis import validation as validate
-from smp_motor_ident.diagnosis.advice import advise, doubts
+from smp_motor_ident.diagnosis.adequacy import adequacy, stated
+from smp_motor_ident.diagnosis.advice import advise, assess
+from smp_motor_ident.diagnosis.residuals import residual_tests
 from smp_motor_ident.diagnosis.screening import screen
 from smp_motor_ident.errors import InsufficientExcitationError, ParameterError, SignalError
 from smp_motor_ident.estimation import ladder
@@ -27,7 +29,7 @@ from smp_motor_ident.estimation.thinning import thinned
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments, prepare
-from smp_motor_ident.likelihood.sections import between_samples
+from smp_motor_ident.likelihood.hold import between_samples
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import MODELS, PHYSICAL, Structure
 from smp_motor_ident.record import Record
@@ -102,8 +104,7 @@ def estimate(
     say = progress or (lambda _: None)
     known = _checked(model, fixed, loss, group)
     _check_bounds(bounds or {}, model, group)
-    warnings = screen(group)
-    warnings += [note for r in group for note in r.notes]
+    findings = screen(group)
     group = [excited(r) for r in group]
     use_current = _has_current(group) and model in ("auto", "electromechanical")
     base = _structure(model, use_current, known, group)
@@ -120,10 +121,8 @@ def estimate(
         )
     chosen = _constrain(_for_final(data, rungs[-1].fit), rungs[-1].fit, options, known, bounds)
     final = _for_final(data, chosen)
-    few = _for_final(thinned(final), chosen)
-    chosen = profiled(
-        few if final.size > MANY_TO_PROFILE else final, widened(final, chosen), options
-    )
+    few = thinned(final) if final.size > MANY_TO_PROFILE else final
+    chosen = profiled(few, widened(final, chosen), options)
     chosen, unseen = unseen_friction(final, blurred(final, chosen, _instants(group, hold)))
     chosen, change = heterogeneous(final, chosen)
     result = answer(chosen, known, unseen, _level(final))
@@ -132,7 +131,14 @@ def estimate(
     _refuse_offset(group, chosen)
     say("validating")
     held = _validation(group, validation, chosen, options, hold)
-    tests = validate.residual_tests(final, chosen)
+    percent = FitPercent(fitted, held)
+    tests = residual_tests(final, chosen)
+    findings += [
+        *assess(final, chosen, percent, tests),
+        *adequacy(final, chosen, stated(chosen, result), group[0].hardware.gear_ratio, tests),
+        *advise(chosen, result, known),
+        *_findings(result, change),
+    ]
     return Estimate(
         wheel=group[0].wheel,
         model=_name(chosen.structure),
@@ -140,14 +146,10 @@ def estimate(
         combinations=result.combinations,
         names=result.names,
         covariance=result.covariance,
-        fit_percent=FitPercent(fitted, held),
+        fit_percent=percent,
         candidates=_candidates(rungs, chosen, group, data),
         residuals=tests,
-        findings=tuple(_findings(result, change)),
-        warnings=tuple(
-            dict.fromkeys(warnings + doubts(chosen, result, fitted, held, tests, final))
-        ),
-        advice=tuple(advise(chosen, result, known)),
+        findings=tuple(findings),
         samples=data.size,
         duration=float(sum(r.duration for r in group)),
         sample_time=data.step,
@@ -158,8 +160,8 @@ def estimate(
 
 def _level(data: Experiments) -> float:
     """Return the voltage [V] at which the motor was driven longest."""
-    value = np.abs(data.section_value)
-    driven = data.section_value[value > 0.5 * value.max()]
+    value = np.abs(data.hold_value)
+    driven = data.hold_value[value > 0.5 * value.max()]
     return float(np.copysign(np.median(np.abs(driven)), driven.sum()))
 
 
@@ -278,7 +280,7 @@ def _hold(
     if plain.kind != rc.ANGLE or thinned(plain) is not plain:
         return "held", None  # how the command ran within so short an interval does not show
     others = {h: prepare(group, base.current, hold=h) for h in ("switched", "middle")}
-    others = {h: d for h, d in others.items() if d.section_end.size > plain.section_end.size}
+    others = {h: d for h, d in others.items() if d.hold_end.size > plain.hold_end.size}
     if not others:
         return "held", None
     say("how the command was held between samples")
@@ -400,7 +402,7 @@ def _validation(
         if not kept:
             return None
         data = _for_final(prepare(fitted, fit.structure.current, hold=hold), fit)
-        if np.ptp(data.section_value) == 0 or all(np.ptp(r.voltage) == 0 for r in kept):
+        if np.ptp(data.hold_value) == 0 or all(np.ptp(r.voltage) == 0 for r in kept):
             return None
         start = Fit(**{**vars(fit), "initial": data.initial})
         value = validate.held_out(kept, refine(data, fit.structure, start, fit.z, options), hold)

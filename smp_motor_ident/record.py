@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident.errors import SignalError
+from smp_motor_ident.finding import Finding
 
 Array = NDArray[np.float64]
 
@@ -69,8 +70,8 @@ class Record:
         Gearbox, encoder and supply.
     source : str
         Name of the bag or file.
-    notes : tuple of str
-        What was repaired or assumed while reading, in words for the user.
+    findings : tuple of Finding
+        What was repaired, assumed or lost while reading.
     velocity_window : float
         Length [s] of the trailing window over which ``velocity`` is known to be averaged;
         0 where it is instantaneous or unknown.
@@ -92,7 +93,7 @@ class Record:
     starts: tuple[int, ...] = (0,)
     hardware: Hardware = field(default_factory=Hardware)
     source: str = ""
-    notes: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
     velocity_window: float = 0.0
 
     def __post_init__(self) -> None:
@@ -129,6 +130,11 @@ class Record:
     def __len__(self) -> int:
         """Return the number of samples."""
         return int(self.time.size)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """The messages of the findings."""
+        return tuple(finding.message for finding in self.findings)
 
     @property
     def duration(self) -> float:

@@ -69,7 +69,7 @@ class Motor:
         self._viscous = parameters.viscous_friction
         self._coulomb = parameters.coulomb_friction
         self._determinant = self._resistance * self._viscous + self._constant**2
-        self._free = FreeResponse(parameters)
+        self._free = FreeResponse(parameters.time_constant, parameters.time_constant_product)
         self._electrical = 0.0
         if not self._free.first_order:
             self._electrical = parameters.inductance / parameters.resistance
@@ -236,10 +236,8 @@ class Motor:
         rate = (self._constant * self.current - self._viscous * self.speed - torque) / self._inertia
         after = c.g * deviation + c.h * rate
         rate_after = c.g_rate * deviation + c.h_rate * rate
-        free = self._free
-        # The equation itself, integrated once, gives the integral of the deviation.
-        integral = (free.sum * (after - deviation) - (rate_after - rate)) / free.product
-        self.angle += final_speed * dt + integral
+        swept = self._free.integral(deviation - after, rate - rate_after)
+        self.angle += final_speed * dt + swept
         self.speed = final_speed + after
         final_current = (self._viscous * voltage + self._constant * torque) / self._determinant
         self.current = (

@@ -8,10 +8,12 @@ with ``K = dc_gain``, ``tau = time_constant``, ``tp = time_constant_product`` an
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
-from smp_motor_control.errors import ParameterError
+from smp_motor_control.errors import check_range
+
+LONGEST_DELAY = 2.0
+"""From a voltage to its effect [s]; the observer keeps the voltages of that long."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,7 +36,7 @@ class MotorModel:
     Raises
     ------
     ParameterError
-        When a value is not finite or has a sign that no motor has.
+        When a value is not finite, or is one that no motor has.
     """
 
     dc_gain: float
@@ -44,12 +46,16 @@ class MotorModel:
     delay: float = 0.0
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            positive = field.name in ("dc_gain", "time_constant")
-            if not math.isfinite(value) or value < 0.0 or (positive and value == 0.0):
-                wanted = "positive" if positive else "zero or positive"
-                raise ParameterError(f"{field.name} of the model is {value}: must be {wanted}")
+        check_range("dc_gain of the model", self.dc_gain, 1e-9, 1e9, "rad/s/V")
+        tau = check_range("time_constant of the model", self.time_constant, 1e-7, 1e5, "s")
+        # The largest product leaves a thousandth of the critical damping.
+        limits = (
+            ("time_constant_product", 2.5e5 * tau * tau, "s^2"),
+            ("static_voltage", 1e6, "V"),
+            ("delay", LONGEST_DELAY, "s"),
+        )
+        for name, most, unit in limits:
+            check_range(f"{name} of the model", getattr(self, name), 0.0, most, unit)
 
     @property
     def a0(self) -> float:

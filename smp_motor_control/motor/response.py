@@ -1,11 +1,39 @@
-"""How a motor's speed decays to its steady value: the homogeneous solution in closed form."""
+r"""The exact response of a linear motor, for one motor and for a batch of them.
+
+Between two switchings of its friction a motor obeys, with e the deviation of the speed from
+its steady value ``K u``,
+
+    tp e'' + tau e' + e = 0,    tp = time_constant_product,    tau = time_constant.
+
+With the roots ``l1 >= l2`` of ``tp s^2 + tau s + 1``,
+
+    e(t) = g e(0) + h e'(0),   h = (e^(l1 t) - e^(l2 t)) / (l1 - l2),   g = e^(l1 t) - l1 h,
+
+written so that nothing cancels or overflows, from a complex pair to a fast root that has
+decayed within any interval of interest.  The equation itself, integrated once, gives the
+angle: ``int e = tau (e(0) - e(t)) + tp (e'(0) - e'(t))``.
+
+References
+----------
+K. J. Astrom, B. Wittenmark, *Computer-Controlled Systems*, 3rd ed. (1997), section 2.3:
+sampling with a zero-order hold.
+"""
 
 from __future__ import annotations
 
 import math
 from typing import NamedTuple
 
-from smp_motor_control.motor.parameters import MotorParameters
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from smp_motor_control.errors import ParameterError, check_range
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+NEGLIGIBLE = 1e-14
+"""``tp / tau^2`` up to which a motor is of first order: its response is the same to 1e-14."""
 
 
 class Coefficients(NamedTuple):
@@ -26,91 +54,245 @@ class Coefficients(NamedTuple):
 
 
 class FreeResponse:
-    """Solutions of the motor's homogeneous equation ``a2 e'' + a1 e' + a0 e = 0``.
-
-    With the roots ``l1 >= l2`` of the equation, ``h = (e^(l1 t) - e^(l2 t)) / (l1 - l2)``
-    and ``g = e^(l1 t) - l1 h``, written so that nothing cancels, from two slow real roots to
-    a complex pair to a fast root that is all but algebraic.
+    """How the speed of one motor decays to its steady value; scalar, for loops that run live.
 
     Parameters
     ----------
-    parameters : MotorParameters
-        The motor.
+    time_constant : float
+        Sum of the time constants [s], positive.
+    product : float
+        Product of the time constants [s^2]; 0 for a motor of first order.
 
     Attributes
     ----------
     first_order : bool
         Whether there is no inductance worth the name.
+    time_constant, product : float
+        As given; the product is 0 where the motor counts as one of first order.
     slow, fast : float
         Real parts of the roots [1/s].
     frequency : float
         Imaginary part of a complex pair [rad/s]; 0 for real roots.
-    sum, product : float
-        Of the roots; of a motor of second order only.
     """
 
-    def __init__(self, parameters: MotorParameters) -> None:
-        a0, a1, a2 = parameters.a0, parameters.a1, parameters.a2
-        self.first_order = a2 == 0.0 or not math.isfinite((a1 / a2) ** 2)
-        self.frequency = 0.0
+    def __init__(self, time_constant: float, product: float) -> None:
+        self.time_constant, self.product = time_constant, product
+        self.first_order = product <= NEGLIGIBLE * time_constant * time_constant
+        self.frequency = self.gap = 0.0
         if self.first_order:
-            self.slow = -a0 / a1
-            self.fast = -math.inf
+            self.product = 0.0
+            self.slow, self.fast = -1.0 / time_constant, -math.inf
             return
-        self.sum, self.product = -a1 / a2, a0 / a2
-        half = self.sum / 2
-        discriminant = half * half - self.product
-        if discriminant < 0:
+        half = -0.5 * time_constant / product
+        discriminant = half * half - 1.0 / product
+        if discriminant < 0.0:
             self.frequency = math.sqrt(-discriminant)
             self.slow = self.fast = half
-        else:
-            self.fast = half - math.sqrt(discriminant)
-            self.slow = self.product / self.fast
+            return
+        self.fast = half - math.sqrt(discriminant)
+        self.slow = 1.0 / (product * self.fast)
         self.gap = max(self.slow - self.fast, 0.0)
 
     def after(self, time: float) -> Coefficients:
-        """Return the coefficients of the response after some time.
-
-        Parameters
-        ----------
-        time : float
-            [s].
-
-        Returns
-        -------
-        Coefficients
-            Of deviation and rate at the start.
-        """
-        slow, fast = self.slow, self.fast
+        """Return the coefficients of the response after some time [s]."""
+        slow = self.slow
         decay = math.exp(slow * time)
         if self.first_order:
             return Coefficients(decay, 0.0, slow * decay, 0.0)
-        if self.frequency > 0:
+        if self.frequency > 0.0:
             cosine = decay * math.cos(self.frequency * time)
             h = decay * math.sin(self.frequency * time) / self.frequency
-            return Coefficients(cosine - slow * h, h, -self.product * h, cosine + slow * h)
-        h = -decay * math.expm1(-self.gap * time) / self.gap if self.gap > 0 else decay * time
-        h_rate = math.exp(fast * time) + slow * h
-        return Coefficients(decay - slow * h, h, -self.product * h, h_rate)
+            return Coefficients(cosine - slow * h, h, -h / self.product, cosine + slow * h)
+        h = -decay * math.expm1(-self.gap * time) / self.gap if self.gap > 0.0 else decay * time
+        h_rate = math.exp(self.fast * time) + slow * h
+        return Coefficients(decay - slow * h, h, -h / self.product, h_rate)
+
+    def integral(self, fall: float, rate_fall: float) -> float:
+        """Return the integral of a deviation that, with its rate, fell by so much."""
+        return self.time_constant * fall + self.product * rate_fall
 
     def turning_points(self, deviation: float, rate: float, until: float) -> list[float]:
-        """Return the instants at which the response turns round."""
-        if self.first_order or until <= 0:
+        """Return the instants before ``until`` at which the response turns round [s]."""
+        if self.first_order or until <= 0.0:
             return []
-        if self.frequency > 0:
-            across = self.product * deviation - rate * self.slow
+        if self.frequency > 0.0:
+            across = deviation / self.product - rate * self.slow
             first = (math.atan2(rate * self.frequency, across) % math.pi) / self.frequency
             period = math.pi / self.frequency
             count = max(0, math.ceil((until - first) / period))
             times = [first + k * period for k in range(count)]
         else:
             denominator = -self.slow * (rate - self.fast * deviation)
-            if denominator == 0:
+            if denominator == 0.0:
                 return []
             ratio = rate / denominator
-            if self.gap * ratio <= -1:
+            if self.gap * ratio <= -1.0:
                 return []
-            times = [math.log1p(self.gap * ratio) / self.gap if self.gap > 0 else ratio]
+            times = [math.log1p(self.gap * ratio) / self.gap if self.gap > 0.0 else ratio]
         # The instant of breaking loose is a turning point too, up to rounding: not that one.
         shortest = 1e-12 / abs(self.fast)
         return [t for t in times if shortest < t < until]
+
+
+class HeldResponse(NamedTuple):
+    """A batch of n motors over intervals of constant voltage u, state ``x = (w, w')``.
+
+    ``x <- transition x + forced u`` and ``angle += angle_transition x + angle_forced u``.
+
+    Attributes
+    ----------
+    transition : ndarray, shape (n, 2, 2)
+    forced : ndarray, shape (n, 2)
+    angle_transition : ndarray, shape (n, 2)
+    angle_forced : ndarray, shape (n,)
+    """
+
+    transition: Array
+    forced: Array
+    angle_transition: Array
+    angle_forced: Array
+
+
+def zero_order_hold(
+    dc_gain: ArrayLike, time_constant: ArrayLike, product: ArrayLike, interval: ArrayLike
+) -> HeldResponse:
+    """Return the exact sampled response of a batch of motors.
+
+    Parameters
+    ----------
+    dc_gain, time_constant, product : array_like, shape (n,) or ()
+        K [rad/s/V], sum [s] and product [s^2] of the time constants; a product of 0 is a motor
+        of first order, whose acceleration follows its speed and the voltage.
+    interval : array_like, shape (n,) or ()
+        [s].
+
+    Returns
+    -------
+    HeldResponse
+        Of the broadcast arguments.
+
+    Examples
+    --------
+    >>> held = zero_order_hold(10.0, 0.1, 0.0, 0.1)
+    >>> float(held.forced[0, 0].round(4))  # 10 (1 - 1/e)
+    6.3212
+    """
+    given = (dc_gain, time_constant, product, interval)
+    gain, tau, tp, t = np.broadcast_arrays(*(np.atleast_1d(np.asarray(x, float)) for x in given))
+    g, h, g_rate, h_rate, tp = _coefficients(tau, tp, t)
+    swept = tau * (1.0 - g) - tp * g_rate
+    return HeldResponse(
+        np.stack((np.stack((g, h), axis=-1), np.stack((g_rate, h_rate), axis=-1)), axis=-2),
+        np.stack((gain * (1.0 - g), -gain * g_rate), axis=-1),
+        np.stack((swept, tp * (1.0 - g)), axis=-1),
+        gain * (t - swept),
+    )
+
+
+def _coefficients(tau: Array, tp: Array, t: Array) -> tuple[Array, Array, Array, Array, Array]:
+    """Return what :meth:`FreeResponse.after` does, of a batch, and the products in force."""
+    first_order = tp <= NEGLIGIBLE * tau * tau
+    product = np.where(first_order, tau * tau, tp)  # any: its results are not taken
+    half = -0.5 * tau / product
+    square = half * half - 1.0 / product
+    root = np.sqrt(np.abs(square))
+    paired = square < 0.0
+    slow = np.where(paired, half, 1.0 / (product * (half - root)))
+    gap = np.where(paired | (root == 0.0), 1.0, 2.0 * root)
+    angle = root * t
+    cosine, sine = np.cos(angle), t * np.sinc(angle / np.pi)
+    spread = np.where(root == 0.0, t, -np.expm1(-gap * t) / gap)
+    decay = np.exp(slow * t)
+    h = decay * np.where(paired, sine, spread)
+    g = np.where(paired, decay * cosine, decay) - slow * h
+    h_rate = np.where(paired, decay * cosine, np.exp((half - root) * t)) + slow * h
+    alone = np.exp(-t / tau)
+    return (
+        np.where(first_order, alone, g),
+        np.where(first_order, 0.0, h),
+        np.where(first_order, -alone / tau, -h / product),
+        np.where(first_order, 0.0, h_rate),
+        np.where(first_order, 0.0, tp),
+    )
+
+
+def frequency_response(
+    dc_gain: ArrayLike, time_constant: ArrayLike, product: ArrayLike, omega: ArrayLike
+) -> Complex:
+    """Return ``K / (1 - tp w^2 + j tau w)`` from voltage to speed.
+
+    Parameters
+    ----------
+    dc_gain, time_constant, product : array_like, shape (n,) or ()
+        As in :func:`zero_order_hold`.
+    omega : array_like, shape (f,)
+        [rad/s].
+
+    Returns
+    -------
+    ndarray of complex, shape (n, f)
+        [rad/s/V].
+    """
+    gain, tau, tp = (np.atleast_1d(x)[:, None] for x in (dc_gain, time_constant, product))
+    w = np.atleast_1d(np.asarray(omega, dtype=np.float64))
+    response: Complex = gain / (1.0 - tp * w * w + 1j * tau * w)
+    return response
+
+
+def flexible_shaft(
+    motor: tuple[float, float, float, float, float],
+    load_inertia: float,
+    stiffness: float,
+    damping: float = 0.0,
+) -> tuple[Array, Array]:
+    """Return the state space of a motor that drives its encoder through a flexible shaft.
+
+    State ``(i, w_motor, w_load, twist)`` with ``twist = angle_motor - angle_load``:
+
+        L i' = v - R i - K w_m
+        J w_m' = K i - b w_m - s,   J_load w_l' = s,   s = stiffness twist + damping (w_m - w_l)
+
+    The encoder shows ``w_l``.  The antiresonance is at ``sqrt(stiffness / J_load)`` and the
+    free resonance at ``sqrt(stiffness (1/J + 1/J_load))``.
+
+    Parameters
+    ----------
+    motor : tuple of float
+        R [ohm], L [H], K [N m/A], J [kg m^2] and b [N m s/rad] at the motor shaft.
+    load_inertia : float
+        [kg m^2], positive.
+    stiffness : float
+        [N m/rad], positive.
+    damping : float
+        [N m s/rad].
+
+    Returns
+    -------
+    A : ndarray, shape (4, 4) or (3, 3)
+        Without inductance the current is no state.
+    B : ndarray, shape (4,) or (3,)
+        From the voltage.
+
+    Raises
+    ------
+    ParameterError
+        When a number is not finite or not of its sign.
+    """
+    R, L, K, J, b = motor
+    for name, value in (("load_inertia", load_inertia), ("stiffness", stiffness)):
+        check_range(name, value, 1e-18, 1e12)
+    check_range("damping", damping, 0.0, 1e12)
+    if not (R > 0.0 and L >= 0.0 and J > 0.0):
+        raise ParameterError(f"motor has R = {R}, L = {L}, J = {J}: R and J must be positive")
+    A = np.zeros((4, 4))
+    A[0] = (-R, -K, 0.0, 0.0)
+    A[1] = (K / J, -(b + damping) / J, damping / J, -stiffness / J)
+    A[2] = (0.0, damping / load_inertia, -damping / load_inertia, stiffness / load_inertia)
+    A[3, 1:3] = 1.0, -1.0
+    B = np.array([1.0, 0.0, 0.0, 0.0])
+    if L > 0.0:
+        A[0] /= L
+        return A, B / L
+    # Without inductance i = (v - K w) / R.
+    A[1] += A[1, 0] * np.array([0.0, -K / R, 0.0, 0.0])
+    return A[1:, 1:], np.array([K / (J * R), 0.0, 0.0])

@@ -2,7 +2,8 @@
 
 A node's ``main`` is ``return run("name", lambda: TheNode(), argv)``.  The node may define
 ``on_stop()``, which :func:`run` calls before it destroys the node whatever the reason of
-leaving: SIGINT, SIGTERM, :func:`finish`, or an exception in a callback.
+leaving: SIGINT, SIGTERM, SIGQUIT, SIGHUP (a closed terminal), :func:`finish`, or an exception in
+a callback.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from smp_motor_control.nodes.conventions import (
     LATCHED,
     STREAM_PUBLISHER,
     STREAM_SUBSCRIBER,
+    robot_topic,
     seconds,
     send_last,
     share,
@@ -50,6 +52,7 @@ __all__ = [
     "finish",
     "keep_time",
     "refuse_impossible_transitions",
+    "robot_topic",
     "run",
     "seconds",
     "send_last",
@@ -58,7 +61,7 @@ __all__ = [
     "wheel_of",
 ]
 
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGQUIT, signal.SIGHUP)
 
 
 class _Stop:
@@ -84,7 +87,9 @@ class _Stop:
         inlet, outlet = os.pipe()
         os.set_blocking(outlet, False)
         for number in _SIGNALS:
-            signal.signal(number, lambda *_: None)
+            # nohup asks to live on without a terminal.
+            if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
+                signal.signal(number, lambda *_: None)
         signal.set_wakeup_fd(outlet, warn_on_full_buffer=False)
         threading.Thread(target=self._read_signals, args=(inlet,), daemon=True).start()
 

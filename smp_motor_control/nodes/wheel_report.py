@@ -1,122 +1,110 @@
-"""What ``wheel_pid`` tells of its health: its state, and everything out of the ordinary."""
+"""What ``wheel_pid`` says of its health: its state, and everything out of the ordinary."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from typing import Any
 
 from rclpy.node import Node
 
+from smp_interfaces.msg import PidState
 from smp_motor_control.nodes import runtime
-from smp_motor_control.wheel.supervision import FeedbackClock, Latch, Verdict
-
-WAITING = "waiting for a set-point"
-DRIVING = "driving"
-TIMED_OUT = "set-point timed out: braked, then 0 V"
-NO_FEEDBACK = "no feedback: 0 V"
-LATE_FEEDBACK = "feedback is late: 0 V"
-BAD_FEEDBACK = "feedback is not a number or implausible: left out"
-INACTIVE = "not active"
+from smp_motor_control.wheel.controller import State, WheelController
+from smp_motor_control.wheel.freshness import Verdict
 
 _LEVELS = {
-    WAITING: runtime.OK,
-    DRIVING: runtime.OK,
-    INACTIVE: runtime.OK,
-    TIMED_OUT: runtime.WARN,
-    NO_FEEDBACK: runtime.ERROR,
-    LATE_FEEDBACK: runtime.ERROR,
-    BAD_FEEDBACK: runtime.ERROR,
+    State.WAITING: runtime.OK,
+    State.DRIVING: runtime.OK,
+    State.INACTIVE: runtime.OK,
+    State.TIMED_OUT: runtime.WARN,
+    State.NOT_OURS: runtime.WARN,
 }
 
 
 class WheelReport:
-    """Keeps state and counts of one wheel, and assesses them for ``/diagnostics``.
+    """Assesses one wheel for ``/diagnostics``, every second and on every change of its state."""
 
-    Parameters
-    ----------
-    feedback : FeedbackClock
-        Counts late, duplicated and reordered feedback.
-    latch : Latch
-        Holds the fault.
-    values : callable
-        Returns further values to tell.
-
-    Attributes
-    ----------
-    state : str
-        One of this module's, or the name of a fault.
-    timekeeping : list of str
-        What the system refused.
-    """
-
-    def __init__(
-        self, feedback: FeedbackClock, latch: Latch, values: Callable[[], dict[str, object]]
-    ) -> None:
-        self.state = INACTIVE
+    def __init__(self, node: Node, wheel: WheelController, joint: str) -> None:
         self.timekeeping: list[str] = []
-        self._feedback, self._latch, self._values = feedback, latch, values
-        self._refused: dict[str, int] = {}
+        self._wheel = wheel
         self._reported: dict[str, int] = {}
-        self._diagnostics: runtime.Diagnostics | None = None
-
-    def open(self, node: Node, joint: str) -> None:
-        """Begin to publish.
-
-        Parameters
-        ----------
-        node : rclpy.node.Node
-            Owner of the topic.
-        joint : str
-            Name of the hardware.
-        """
+        self._shown: State | None = None
+        self._log = node.get_logger()
         self._diagnostics = runtime.Diagnostics(node, self._assess, joint)
 
     def close(self) -> None:
         """Fall silent."""
-        if self._diagnostics is not None:
-            self._diagnostics.destroy()
-            self._diagnostics = None
+        self._diagnostics.destroy()
 
-    def enter(self, state: str) -> None:
-        """Be in a state from now on, and tell at once if it is a new one."""
-        if state is not self.state:
-            self.state = state
-            if self._diagnostics is not None:
-                self._diagnostics.publish()
-
-    def enter_silence(self) -> None:
-        """Be without usable feedback: late, refused, or none at all."""
-        recent = self._recent()
-        if self.state is LATE_FEEDBACK and recent.get(Verdict.LATE.value, 0) > 0:
-            return
-        refused = any(n > 0 for what, n in recent.items() if what.startswith("feedback"))
-        self.enter(BAD_FEEDBACK if refused else NO_FEEDBACK)
-
-    def refuse(self, what: str) -> None:
-        """Count something that was left out."""
-        self._refused[what] = self._refused.get(what, 0) + 1
+    def update(self) -> None:
+        """Publish at once where the state is a new one."""
+        if self._wheel.state is not self._shown:
+            self._shown = self._wheel.state
+            if self._shown is State.FAULT:
+                self._log.error(f"{self._state()[1]}; 0 V")
+            self._diagnostics.publish()
 
     def _totals(self) -> dict[str, int]:
         """Return how often each thing out of the ordinary has happened since the start."""
-        counts = self._feedback.counts
+        clock = self._wheel.clock
         usual = (Verdict.FRESH, Verdict.FIRST)
-        totals = {v.value: n for v, n in counts.items() if v not in usual}
-        return {**totals, "clock jumps": self._feedback.jumps, **self._refused}
+        totals = {v.value: n for v, n in clock.counts.items() if v not in usual}
+        return {**totals, "clock jumps": clock.jumps, **self._wheel.refused}
 
-    def _recent(self) -> dict[str, int]:
-        """Return the same since the last second's diagnostics."""
-        return {key: n - self._reported.get(key, 0) for key, n in self._totals().items()}
+    def _state(self) -> tuple[bytes, str]:
+        wheel = self._wheel
+        fault = wheel.recovery.fault
+        if fault is not None and wheel.state is not State.INACTIVE:
+            ending = "; latched: call ~/reset" if wheel.recovery.latched else ""
+            return runtime.ERROR, fault.value + ending
+        owner = f" ({wheel.owner})" if wheel.state is State.NOT_OURS else ""
+        return _LEVELS.get(wheel.state, runtime.ERROR), wheel.state.value + owner
 
     def _assess(self) -> tuple[bytes, str, Mapping[str, object]]:
-        message = self._latch.fault.value if self._latch.fault else self.state
-        level = _LEVELS.get(message, runtime.ERROR)
-        recent = {key: n for key, n in self._recent().items() if n}
-        if recent:
-            told = ", ".join(f"{n} x {key}" for key, n in recent.items())
-            message = f"{message}; in the last second: {told}"
-            level = max(level, runtime.WARN)
-        message = "; ".join([message, *self.timekeeping])
+        level, message = self._state()
         totals = self._totals()
-        if self._diagnostics is not None and self._diagnostics.due:
+        recent = {key: n - self._reported.get(key, 0) for key, n in totals.items()}
+        listed = ", ".join(f"{n} x {key}" for key, n in recent.items() if n)
+        if listed:
+            message = f"{message}; in the last second: {listed}"
+            level = max(level, runtime.WARN)
+        advice = [self._wheel.advice] if self._wheel.advice else []
+        if advice:
+            level = max(level, runtime.WARN)
+        if self._diagnostics.due:
             self._reported = totals
             runtime.collect_garbage()
-        return level, message, {**self._values(), **totals}
+        wheel, clock = self._wheel, self._wheel.clock
+        values: dict[str, object] = {
+            "steps": wheel.steps,
+            "set-point [rad/s]": "none" if wheel.setpoint is None else wheel.setpoint,
+            "output [V]": wheel.output,
+            "speed source": wheel.loop.source,
+            "feedback dt [s]": clock.dt,
+            "feedback age [s]": clock.age,
+            "offset of the feedback's clock [s]": clock.offset,
+            "faults since the wheel was sound": wheel.recovery.failures,
+        }
+        return level, "; ".join([message, *self.timekeeping, *advice]), {**values, **totals}
+
+
+def pid_state(wheel: WheelController, joint: str, stamp: Any) -> PidState:
+    """Return what the controller has just computed, as a message."""
+    out, reference = wheel.answer, wheel.loop.reference.velocity
+    state = PidState(
+        setpoint=wheel.target,
+        reference=reference,
+        measurement=wheel.measurement,
+        error=reference - wheel.measurement,
+        p_term=out.p_term,
+        i_term=out.i_term,
+        d_term=out.d_term,
+        feedforward=out.feedforward,
+        unsaturated=out.unsaturated,
+        output=wheel.output,
+        saturated=wheel.output != out.unsaturated,
+        dt=wheel.clock.dt,
+        age=wheel.clock.age,
+    )
+    state.header.stamp, state.header.frame_id = stamp, joint
+    return state

@@ -10,8 +10,9 @@ from smp_motor_control.nodes.settings import described, nested
 from smp_motor_control.observer import ObserverNoise
 from smp_motor_control.pid import PidGains
 from smp_motor_control.reference.profile import Drive, ProfileLimits
+from smp_motor_control.wheel.controller import WheelSettings
+from smp_motor_control.wheel.faults import FaultLimits
 from smp_motor_control.wheel.loop import LoopSettings
-from smp_motor_control.wheel.supervision import FaultLimits
 
 _GAINS = {
     "p": "Proportional gain [V s/rad, wheel].",
@@ -38,6 +39,8 @@ _FAULTS = {
     "stall_velocity": "Least speed that counts as turning [rad/s, wheel].",
     "stall_time": "Time without turning before the motor is switched off [s]; 0: never.",
     "runaway_time": "Time of turning against the voltage before that [s]; 0: never.",
+    "tracking_tolerance": "Share of the reference by which the speed may be off for long.",
+    "tracking_time": "Time of being off by more before the motor is switched off [s]; 0: never.",
 }
 _NOISE = {
     "load": "Wander of the load in one second, as a voltage [V/sqrt(s)].",
@@ -63,8 +66,8 @@ class Settings:
 
     Attributes
     ----------
-    loop : LoopSettings
-        What they make of the loop.
+    wheel : WheelSettings
+        What they make of the controller.
     """
 
     joint_name: str = described(
@@ -116,7 +119,8 @@ class Settings:
     faults: FaultLimits = nested(_NO_FAULTS_GIVEN, _FAULTS)  # noqa: RUF009
     fault_retry: float = described(
         2.0, "Pause before a wheel at fault is tried again under a set-point that is not zero "
-        "[s], doubled every time; 0: only after a zero set-point.", minimum=0.0,
+        "[s], doubled every time, three times at most; 0: only after a zero set-point.",
+        minimum=0.0, maximum=3600.0,
     )  # fmt: skip
     implausible_velocity: float = described(
         1000.0, "Feedback beyond this speed is left out [rad/s, wheel].", minimum=0.0
@@ -128,7 +132,7 @@ class Settings:
     cpu_affinity: tuple[int, ...] = described(
         (-1,), "Processors to run on; -1 for any.", read_only=True
     )
-    loop: LoopSettings = field(init=False, repr=False)
+    wheel: WheelSettings = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         limits = ProfileLimits.from_parameters(
@@ -146,7 +150,15 @@ class Settings:
             model=self._motor_model(),
             noise=self.observer,
         )
-        object.__setattr__(self, "loop", loop)
+        wheel = WheelSettings(
+            loop=loop,
+            faults=self.faults,
+            setpoint_timeout=self.setpoint_timeout,
+            feedback_timeout=self.feedback_timeout,
+            fault_retry=self.fault_retry,
+            implausible_velocity=self.implausible_velocity,
+        )
+        object.__setattr__(self, "wheel", wheel)
 
     def _drive(self) -> Drive | None:
         if self.drive_top_speed == 0.0:

@@ -36,6 +36,12 @@ __all__ = [
 UNLIMITED = ProfileLimits()
 """A reference that jumps."""
 
+_FASTEST = 1e9
+"""Target [rad/s] beyond which nothing turns; squares of it and its rates stay finite."""
+
+_SHORTEST = 1e-6
+"""Transition time [s] below which a change is as fast as the limits allow."""
+
 _STRETCH = 1.1
 _LOOKS = tuple(k / 32.0 for k in range(32))
 
@@ -79,27 +85,13 @@ class Profile:
     def configure(
         self, limits: ProfileLimits, transition_time: float, drive: Drive | None = None
     ) -> None:
-        """Change limits and duration from the next change of the target on.
-
-        Parameters
-        ----------
-        limits : ProfileLimits
-            New limits.
-        transition_time : float
-            [s].
-        drive : Drive or None
-            The motor and its voltage.
-
-        Raises
-        ------
-        ParameterError
-            When ``transition_time`` is negative or not finite.
-        """
+        """Change limits and duration from the next change of the target on."""
         if not 0.0 <= transition_time < math.inf:
             raise ParameterError(
                 f"transition_time is {transition_time} s: must be finite and not negative"
             )
-        self.limits, self.transition_time, self.drive = limits, transition_time, drive
+        self.limits, self.drive = limits, drive
+        self.transition_time = transition_time if transition_time >= _SHORTEST else 0.0
 
     def reset(self, velocity: float = 0.0) -> None:
         """Rest at a velocity, such as the measured one when a loop is closed.
@@ -125,24 +117,11 @@ class Profile:
         return 0.0 if self._transition is None else self._transition.duration
 
     def set_target(self, velocity: float, sample_time: float = 0.005) -> None:
-        """Head for a velocity from wherever the reference is now.
-
-        Parameters
-        ----------
-        velocity : float
-            [rad/s]; the target that is in force already changes nothing.
-        sample_time : float
-            Interval over which the voltage is held [s], of which a transition as fast as the
-            voltage allows is made up.
-
-        Raises
-        ------
-        ParameterError
-            When it is not finite; the old target stays.
-        """
+        """Head for a velocity from wherever the reference is now."""
         if not math.isfinite(velocity):
             raise ParameterError(f"target velocity is {velocity}: must be finite")
-        velocity = min(max(velocity, -self.limits.velocity), self.limits.velocity)
+        most = min(self.limits.velocity, _FASTEST)
+        velocity = min(max(velocity, -most), most)
         if velocity == self.target:
             return
         self.target = velocity
@@ -220,18 +199,7 @@ class Profile:
         return self.now
 
     def ahead(self, lead: float) -> Reference:
-        """Return where the reference will be if the target stays.
-
-        Parameters
-        ----------
-        lead : float
-            [s] from now, not negative.
-
-        Returns
-        -------
-        Reference
-            For a feed-forward that makes up for delay and for holding the output.
-        """
+        """Return where the reference will be if the target stays."""
         if self._transition is None:
             return self.now
         return self._clip(self._transition.at(self._elapsed + lead))

@@ -14,9 +14,10 @@ K. J. Astrom, B. Wittenmark, *Computer-Controlled Systems* (1997), section 4.3 o
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
-from smp_motor_control.errors import ParameterError
+from smp_motor_control.errors import check_range
+from smp_motor_control.motor.response import FreeResponse
 from smp_motor_control.reference.minimum_jerk import Reference
 
 _EASY = 1.0 + 1e-9
@@ -41,7 +42,7 @@ class Drive:
     Raises
     ------
     ParameterError
-        When a value is not finite, negative, or a zero that must not be.
+        When a value is not finite, or is one that no motor has.
     """
 
     top_speed: float
@@ -49,26 +50,13 @@ class Drive:
     time_constant_product: float = 0.0
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            positive = field.name != "time_constant_product"
-            if not 0.0 <= value < math.inf or (positive and value == 0.0):
-                wanted = "positive" if positive else "zero or positive"
-                raise ParameterError(f"{field.name} of the drive is {value}: must be {wanted}")
+        tau = check_range("time_constant of the drive", self.time_constant, 1e-7, 1e5, "s")
+        check_range("top_speed of the drive", self.top_speed, 1e-6, 1e12, "rad/s")
+        product, most = self.time_constant_product, 2.5e5 * tau * tau
+        check_range("time_constant_product of the drive", product, 0.0, most, "s^2")
 
     def needed(self, reference: Reference) -> float:
-        """Return u, the speed that the voltage of an instant would hold for ever.
-
-        Parameters
-        ----------
-        reference : Reference
-            Speed, acceleration and jerk.
-
-        Returns
-        -------
-        float
-            [rad/s], with its sign.
-        """
+        """Return u, the speed that the voltage of an instant would hold for ever."""
         bend = self.time_constant_product * reference.jerk
         return reference.velocity + self.time_constant * reference.acceleration + bend
 
@@ -81,45 +69,29 @@ class _Motor:
     """Exact responses to a constant u."""
 
     def __init__(self, drive: Drive) -> None:
-        self.tau, self.tp = drive.time_constant, drive.time_constant_product
-        if self.tp <= _FIRST_ORDER * self.tau**2:
-            self.tp = 0.0
-            return
-        self.sigma = self.tau / (2.0 * self.tp)
-        square = self.sigma**2 - 1.0 / self.tp
-        self.real, self.root = square >= 0.0, max(math.sqrt(abs(square)), 1e-6 * self.sigma)
+        tau, tp = drive.time_constant, drive.time_constant_product
+        self.free = FreeResponse(tau, tp if tp > _FIRST_ORDER * tau * tau else 0.0)
+        self.tau, self.tp = tau, self.free.product
 
     def after(self, state: _State, u: float, t: float) -> _State:
         """Return the state after a time."""
         w, a = state
         off = w - u
-        if not self.tp:
-            off *= math.exp(-t / self.tau)
-            return u + off, -off / self.tau
-        c, s = self._modes(t)
-        bend = self.sigma * s
-        return u + off * (c + bend) + a * s, a * (c - bend) - off * s / self.tp
-
-    def _modes(self, t: float) -> tuple[float, float]:
-        r, sigma = self.root, self.sigma
-        if self.real:
-            grown, shrunk = math.exp((r - sigma) * t), math.exp(-(r + sigma) * t)
-            return (grown + shrunk) / 2.0, (grown - shrunk) / (2.0 * r)
-        decay = math.exp(-sigma * t)
-        return decay * math.cos(r * t), decay * math.sin(r * t) / r
+        g, h, g_rate, h_rate = self.free.after(t)
+        return u + g * off + h * a, g_rate * off + h_rate * a
 
     def until_even(self, state: _State, u: float) -> float:
         """Return when u, which brakes it, has taken the acceleration away [s]."""
         w, a = state
         if a == 0.0:
             return 0.0
-        turn = self.root * a / (self.sigma * a + (w - u) / self.tp)
-        if self.real:
-            return math.atanh(min(turn, 1.0 - 1e-15)) / self.root
-        return (math.atan(turn) if turn >= 0.0 else math.atan(turn) + math.pi) / self.root
+        # Some twenty of the slowest time constants leave nothing.
+        longest = -20.0 / self.free.slow
+        turns = self.free.turning_points(w - u, a, longest)
+        return turns[0] if turns else longest
 
     def jerk(self, state: _State, u: float) -> float:
-        """Return the change of the acceleration; none is told for a motor of first order."""
+        """Return the change of the acceleration; 0 for a motor of first order."""
         w, a = state
         return (u - w - self.tau * a) / self.tp if self.tp else 0.0
 
@@ -143,7 +115,7 @@ class VoltageLimited:
     Raises
     ------
     ParameterError
-        When ``sample_time`` is not positive.
+        When ``sample_time`` is out of range.
 
     Notes
     -----
@@ -161,8 +133,7 @@ class VoltageLimited:
         sample_time: float,
         least: float = 0.0,
     ) -> None:
-        if not 0.0 < sample_time < math.inf:
-            raise ParameterError(f"sample_time of a transition is {sample_time} s: not positive")
+        check_range("sample_time of a transition", sample_time, 1e-9, 1e6, "s")
         self.target = target
         self._motor = motor = _Motor(drive)
         top = max(drive.top_speed, 1.02 * abs(target))
@@ -180,18 +151,7 @@ class VoltageLimited:
             state = motor.after(state, u, length)
 
     def at(self, t: float) -> Reference:
-        """Return the reference at an instant.
-
-        Parameters
-        ----------
-        t : float
-            Time since the start of the transition [s], not negative.
-
-        Returns
-        -------
-        Reference
-            The target at rest after its end.
-        """
+        """Return the reference at an instant."""
         begin, motor = 0.0, self._motor
         for end, state, u in self._legs:
             if t < end * (1.0 - 1e-12):

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from smp_motor_control.encoder import DifferencedSpeed, Encoder
-from smp_motor_control.errors import ParameterError
+from smp_motor_control.errors import ParameterError, check_range
 from smp_motor_control.motor.friction import Gearbox
 from smp_motor_control.motor.model import MotorModel
 from smp_motor_control.observer import ObserverNoise, SpeedObserver
@@ -74,10 +74,9 @@ class LoopSettings:
     drive: Drive | None = None
 
     def __post_init__(self) -> None:
-        for name in ("reference_delay", "reference_doubt", "transition_time"):
-            value = getattr(self, name)
-            if not 0.0 <= value < math.inf:
-                raise ParameterError(f"{name} is {value!r} s; it must be zero or positive")
+        longest = {"reference_delay": 10.0, "reference_doubt": 1.0, "transition_time": 60.0}
+        for name, most in longest.items():
+            check_range(name, getattr(self, name), 0.0, most, "s")
         if self.speed_source not in SPEED_SOURCES:
             known = ", ".join(SPEED_SOURCES)
             raise ParameterError(f"speed_source is {self.speed_source!r}; known are {known}")
@@ -170,7 +169,7 @@ class WheelLoop:
             [V], see the class.
         """
         self._gearbox, self._encoder, self._max_load = gearbox, encoder, max_load
-        self._renew_speed()
+        self.renew_speed()
 
     def configure(self, settings: LoopSettings) -> None:
         """Change settings while running, without a jump of the output.
@@ -185,9 +184,10 @@ class WheelLoop:
         self.profile.configure(settings.limits, settings.transition_time, settings.drive)
         shaped = ("speed_source", "difference_window", "model", "noise")
         if any(getattr(old, name) != getattr(settings, name) for name in shaped):
-            self._renew_speed()
+            self.renew_speed()
 
-    def _renew_speed(self) -> None:
+    def renew_speed(self) -> None:
+        """Make the speed's source anew from the settings."""
         self._observer: SpeedObserver | None = None
         self._differenced: DifferencedSpeed | None = None
         self._intervals: list[float] = []

@@ -12,18 +12,19 @@ from numpy.typing import NDArray
 
 from smp_motor_control.motor.friction import Gearbox
 from smp_motor_ident.bag.axis import Series, on_one_axis
-from smp_motor_ident.bag.counter import unwrap_angle
-from smp_motor_ident.bag.mapping import MotorMap, Signal
-from smp_motor_ident.bag.table import Table
-from smp_motor_ident.bag.timing import (
+from smp_motor_ident.bag.clock import (
     SAME_CLOCK,
     epochs,
     fit_clock,
     judge_stamps,
     rhythm,
 )
-from smp_motor_ident.bag.units import FACTORS, factor
+from smp_motor_ident.bag.counter import unwrap_angle
+from smp_motor_ident.bag.mapping import MotorMap, Signal
+from smp_motor_ident.bag.storage import Table, found
+from smp_motor_ident.bag.units import FACTORS, check_unit, factor
 from smp_motor_ident.errors import BagError
+from smp_motor_ident.finding import Finding, Severity
 from smp_motor_ident.record import Hardware, Record
 
 Array = NDArray[np.float64]
@@ -43,7 +44,13 @@ class _Motor:
     gearbox: Gearbox
     tables: Mapping[str, Table]
     where: str
-    notes: list[str] = field(default_factory=list)
+    findings: list[Finding] = field(default_factory=list)
+
+    def tell(self, code: str, text: str, severity: Severity = "note", **evidence: float) -> None:
+        """Note what was found, once."""
+        finding = found(code, text, severity, **evidence)
+        if finding not in self.findings:
+            self.findings.append(finding)
 
     def table(self, signal: Signal) -> Table:
         return self.tables[signal.topic]
@@ -61,9 +68,9 @@ def assemble(
         wheel, plan, hardware, Gearbox(hardware.gear_ratio), tables, f"{source}: {wheel}"
     )
     for topic in dict.fromkeys(s.topic for s in plan.signals.values()):
-        motor.notes += tables[topic].notes
-        if not tables[topic].log.size:
-            raise BagError(f"{motor.where}: {topic} has no messages")
+        motor.findings += tables[topic].findings
+        if not _log(tables[topic]).size:
+            raise BagError(f"{motor.where}: {topic or 'it'} has no messages")
     axis_name = next((name for name in _OUTPUTS if name in plan.signals), None)
     if axis_name is None or "voltage" not in plan.signals:
         missing = "voltage" if axis_name else "velocity, position or count"
@@ -76,49 +83,46 @@ def assemble(
     }
     if plan.signals["voltage"].topic == plan.signals[axis_name].topic:
         _drop_lost(motor, series, axis_name)
-    return on_one_axis(wheel, plan, hardware, series, axis_name, source, motor.notes)
+    return on_one_axis(wheel, plan, hardware, series, axis_name, source, motor.findings)
 
 
 def _clock(motor: _Motor) -> dict[str, Integers]:
     """Return the time [ns] of every topic's messages, all on one clock."""
     topics = list(dict.fromkeys(signal.topic for signal in motor.plan.signals.values()))
     tables = {topic: motor.tables[topic] for topic in topics}
-    if topics == [""]:
-        return {"": tables[""].log}
+    if all(table.clocked for table in tables.values()):
+        return {topic: _log(table) for topic, table in tables.items()}
     stamps = {topic: _stamp(motor, tables[topic]) for topic in topics}
     if motor.plan.clock == "log":
-        motor.notes.append("time: log times, as asked")
-        return {topic: table.log for topic, table in tables.items()}
+        motor.tell("time_base", "time: log times, as asked")
+        return {topic: _log(table) for topic, table in tables.items()}
     poor = {
         topic: reason
         for topic, table in tables.items()
-        if (reason := judge_stamps(stamps[topic], table.log))
+        if (reason := judge_stamps(stamps[topic], _log(table)))
     }
     if motor.plan.clock == "header" and poor:
         topic, reason = next(iter(poor.items()))
         raise BagError(f"{motor.where}: {topic} has no usable header time: {reason}")
     fits = {
-        t: fit_clock(stamp, tables[t].log)
+        t: fit_clock(stamp, _log(tables[t]))
         for t, stamp in stamps.items()
         if t not in poor and stamp is not None
     }
     offsets = [fit.offset for fit in fits.values()]
     if not poor and max(offsets) - min(offsets) < SAME_CLOCK:
-        motor.notes.append(
-            "time: header stamps (the instants of sampling, free of transport delay)"
-        )
+        text = "time: header stamps (the instants of sampling, free of transport delay)"
+        motor.tell("time_base", text)
         _tell_offset(motor, topics[0], fits)
         if any(len(epochs(stamp)) > 1 for stamp in stamps.values() if stamp is not None):
             return _set_back(motor, tables, stamps)
         return {topic: stamp for topic, stamp in stamps.items() if stamp is not None}
     if not fits:
-        motor.notes.append(f"time: log times ({next(iter(poor.values()))})")
-        return {topic: table.log for topic, table in tables.items()}
+        motor.tell("time_base", f"time: log times ({next(iter(poor.values()))})")
+        return {topic: _log(table) for topic, table in tables.items()}
     reason = "; ".join(f"{topic}: {why}" for topic, why in poor.items())
-    motor.notes.append(
-        "time: header stamps moved to the recorder's clock by their offset and drift, because "
-        + (reason or "the topics' clocks differ")
-    )
+    text = "time: header stamps moved to the recorder's clock by their offset and drift, because "
+    motor.tell("time_base", text + (reason or "the topics' clocks differ"))
     times = {}
     for topic, table in tables.items():
         stamp = stamps[topic]
@@ -126,8 +130,13 @@ def _clock(motor: _Motor) -> dict[str, Integers]:
             _tell_offset(motor, topic, fits, always=True)
             times[topic] = fits[topic].to_log(stamp)
         else:
-            times[topic] = table.log
+            times[topic] = _log(table)
     return times
+
+
+def _log(table: Table) -> Integers:
+    assert table.log is not None
+    return table.log
 
 
 def _set_back(
@@ -135,20 +144,20 @@ def _set_back(
 ) -> dict[str, Integers]:
     """Return times for a recording during which the clock of the stamps was set back."""
     if len(tables) > 1:
-        motor.notes[-1] = "time: log times (the clock of the header stamps was set back meanwhile)"
-        return {topic: table.log for topic, table in tables.items()}
+        motor.findings.pop()
+        text = "time: log times (the clock of the header stamps was set back meanwhile)"
+        motor.tell("time_base", text)
+        return {topic: _log(table) for topic, table in tables.items()}
     topic, table = next(iter(tables.items()))
     stamp = stamps[topic]
     assert stamp is not None
     time, parts = stamp.copy(), epochs(stamp)
     pause = 3 * round(rhythm(np.sort(stamp)).gap()) + _SECOND
     for (_, before), (begin, end) in pairwise(parts):
-        away = max(int(table.log[begin] - table.log[before - 1]), 0)
+        away = max(int(_log(table)[begin] - _log(table)[before - 1]), 0)
         time[begin:end] += time[:begin].max() + max(away, pause) - time[begin:end].min()
-    motor.notes.append(
-        f"{topic}: the clock of the header stamps was set back {len(parts) - 1} times; "
-        "a new segment each"
-    )
+    text = f"{topic}: the clock of the header stamps was set back {len(parts) - 1} times"
+    motor.tell("clock_set_back", f"{text}; a new segment each", "warning")
     return {topic: time}
 
 
@@ -160,7 +169,7 @@ def _stamp(motor: _Motor, table: Table) -> Integers | None:
     column = table.columns.get(signal.field)
     if column is None:
         return None
-    to_nanoseconds = FACTORS["time"][signal.unit] * 1e9
+    to_nanoseconds = FACTORS["time"][signal.unit or "s"] * 1e9
     if column.dtype.kind in "iu" and signal.scale == 1 and to_nanoseconds >= 1:
         # Whole nanoseconds since 1970 have no room in a float.
         whole: Integers = column.astype(np.int64) * round(to_nanoseconds)
@@ -174,10 +183,11 @@ def _stamp(motor: _Motor, table: Table) -> Integers | None:
 def _tell_offset(motor: _Motor, topic: str, fits: Mapping[str, Any], always: bool = False) -> None:
     fit = fits[topic]
     if always or abs(fit.offset) > 1e9 or abs(fit.drift) > 1e-4:
-        motor.notes.append(
+        text = (
             f"{topic}: the recorder's clock is {fit.offset * 1e-9:+.6f} s from the header's, "
             f"drifting by {fit.drift * 1e6:+.0f} ppm"
         )
+        motor.tell("clock_offset", text, offset=fit.offset * 1e-9, drift=fit.drift)
 
 
 def _series(motor: _Motor, name: str, signal: Signal, time: Integers) -> Series:
@@ -212,9 +222,10 @@ def _order(motor: _Motor, time: Integers, table: Table, topic: str) -> Integers:
     order = np.argsort(time, kind="stable")
     ordered = time[order]
     first = np.concatenate([[True], np.diff(ordered) > 0])
-    notes = []
+    where = topic or "rows"
     if late:
-        notes.append(f"{late} samples came out of order and were sorted")
+        text = f"{where}: {late} samples came out of order and were sorted"
+        motor.tell("samples_reordered", text, samples=late)
     if doubles := int((~first).sum()):
         again = order[~first]
         before = order[np.flatnonzero(~first) - 1]
@@ -223,14 +234,9 @@ def _order(motor: _Motor, time: Integers, table: Table, topic: str) -> Integers:
             for name, column in table.columns.items()
             if not np.array_equal(column[again], column[before], equal_nan=column.dtype.kind == "f")
         ]
-        notes.append(
-            f"{doubles} samples have the time of another and were left out"
-            + (f" although they differ in {', '.join(differ)}" if differ else " (duplicates)")
-        )
-    for note in notes:
-        text = f"{topic or 'rows'}: {note}"
-        if text not in motor.notes:
-            motor.notes.append(text)
+        text = f"{where}: {doubles} samples have the time of another and were left out"
+        text += f" although they differ in {', '.join(differ)}" if differ else " (duplicates)"
+        motor.tell("duplicate_samples", text, "warning" if differ else "note", samples=doubles)
     chosen: Integers = order[first]
     return chosen
 
@@ -242,6 +248,7 @@ def _converted(motor: _Motor, name: str, signal: Signal, raw: NDArray[Any]) -> N
         if raw.dtype.kind in "iu" and exact:
             return raw.astype(np.int64, copy=False)
         return raw.astype(np.float64) * signal.scale + signal.offset
+    unit = signal.unit or check_unit(name, "")
     values: Array = raw.astype(np.float64)
     if signal.scale != 1:
         values *= signal.scale
@@ -253,21 +260,24 @@ def _converted(motor: _Motor, name: str, signal: Signal, raw: NDArray[Any]) -> N
     try:
         by = factor(
             name,
-            signal.unit,
+            unit,
             counts_per_revolution=motor.hardware.counts_per_revolution,
             supply_voltage=supply,
+            wheel_radius=motor.plan.wheel_radius,
+            pwm_full_scale=motor.plan.pwm_full_scale,
         )
     except BagError as error:
-        raise BagError(f"{motor.where}: {error}") from None
+        seen = f" (its largest value here is {np.nanmax(np.abs(raw)):g})" if raw.size else ""
+        raise BagError(f"{motor.where}: {error}{seen if unit == 'pwm' else ''}") from None
     if by != 1:
         values *= by
     shaft = signal.shaft or motor.plan.shaft
-    if signal.unit.startswith("ticks"):
+    if unit.startswith("ticks"):
         shaft = signal.shaft or "motor"
     if name == "position" and not motor.plan.own:
         values, wrapped = unwrap_angle(values)
         if wrapped:
-            motor.notes.append("position: it wraps at one turn; wrap undone")
+            motor.tell("angle_wraps", "position: it wraps at one turn; wrap undone")
     if name in ("velocity", "position") and shaft == "wheel":
         values = motor.gearbox.to_motor(values)
     return values
@@ -280,11 +290,17 @@ def _drop_lost(motor: _Motor, series: dict[str, Series], axis_name: str) -> None
         return
     sound = np.isfinite(voltage.value)
     values = axis.value
+    both, either = sound & np.isfinite(values), sound | np.isfinite(values)
+    if both.sum() < 0.5 * either.sum():  # rows of several kinds: each signal has its own
+        for name, signal in series.items():
+            series[name] = signal.take(np.isfinite(signal.value))
+        return
     if axis_name == "count" and values.dtype.kind == "f":
         sound &= np.isfinite(values)
     if sound.all():
         return
-    motor.notes.append(f"{int((~sound).sum())} samples without a finite voltage were left out")
+    text = f"{int((~sound).sum())} samples without a finite voltage were left out"
+    motor.tell("no_voltage", text, "warning")
     for name, signal in series.items():
         if np.array_equal(signal.time, axis.time):
             series[name] = signal.take(sound)

@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from smp_motor_ident.bag.clock import mean_held, rhythm
 from smp_motor_ident.bag.counter import unwrap
 from smp_motor_ident.bag.mapping import MotorMap
-from smp_motor_ident.bag.timing import mean_held, rhythm
+from smp_motor_ident.bag.storage import found
 from smp_motor_ident.errors import BagError
+from smp_motor_ident.finding import Finding
 from smp_motor_ident.record import Hardware, Record
 
 Array = NDArray[np.float64]
@@ -36,18 +38,7 @@ class Series:
     bits: int | None = None
 
     def take(self, which: NDArray[Any]) -> Series:
-        """Return some of the samples.
-
-        Parameters
-        ----------
-        which : ndarray
-            Their indices, or a mask.
-
-        Returns
-        -------
-        Series
-            With the same width of the counter.
-        """
+        """Return some of the samples, by their indices or a mask."""
         number = None if self.number is None else self.number[which]
         return Series(self.time[which], self.value[which], number, self.bits)
 
@@ -59,17 +50,17 @@ def on_one_axis(
     series: dict[str, Series],
     axis_name: str,
     source: str,
-    notes: list[str],
+    findings: list[Finding],
 ) -> Record:
     """Make a record of signals that were sampled each at its own instants."""
-    notes = list(notes)
+    findings = list(findings)
     held = plan.held or "after"
     if "supply" in series:
         _times_supply(series)
     voltage = _finite(series["voltage"])
     axis = series[axis_name].time
     alike = np.array_equal(voltage.time, axis)
-    keep = np.ones(axis.size, bool) if alike else _covered(voltage, axis, notes)
+    keep = np.ones(axis.size, bool) if alike else _covered(voltage, axis, findings)
     if keep.sum() < 2:
         raise BagError(f"{source}: {wheel}: fewer than 2 samples have a voltage and an output")
     axis = axis[keep]
@@ -79,16 +70,16 @@ def on_one_axis(
             values[1:] = voltage.value[:-1]
     else:
         values = mean_held(voltage.time, voltage.value, held, axis)
-    starts = _count_starts(series, plan, hardware, keep, axis_name, notes)
-    starts |= _gaps(axis, plan, alike, held, voltage, values, notes)
+    starts = _count_starts(series, plan, hardware, keep, axis_name, findings)
+    starts |= _gaps(axis, plan, alike, held, voltage, values, findings)
     columns: dict[str, Any] = {"voltage": values}
     for name in ("current", "velocity", "position", "count"):
         if name in series:
-            columns[name] = _on_axis(name, series[name], axis, keep, notes)
+            columns[name] = _on_axis(name, series[name], axis, keep, findings)
     outputs = [v for n, v in columns.items() if n != "voltage" and v is not None]
     if not outputs:
         raise BagError(f"{source}: {wheel}: no output has a finite value")
-    axis, columns, starts = _without_stubs(axis, columns, starts, notes)
+    axis, columns, starts = _without_stubs(axis, columns, starts, findings)
     if axis.size < 2:
         raise BagError(f"{source}: {wheel}: fewer than 2 samples in a row are left")
     return Record(
@@ -97,7 +88,7 @@ def on_one_axis(
         starts=tuple(np.flatnonzero(starts).tolist()),
         hardware=hardware,
         source=source,
-        notes=tuple(dict.fromkeys(notes)),
+        findings=tuple(f for k, f in enumerate(findings) if f not in findings[:k]),
         velocity_window=plan.velocity_window,
         **columns,
     )
@@ -117,11 +108,12 @@ def _times_supply(series: dict[str, Series]) -> None:
     series["voltage"] = Series(voltage.time, voltage.value * measured)
 
 
-def _covered(voltage: Series, axis: Integers, notes: list[str]) -> Flags:
+def _covered(voltage: Series, axis: Integers, findings: list[Finding]) -> Flags:
     """Return which output samples lie where the input is known."""
     keep: Flags = axis >= voltage.time[0] if voltage.time.size else np.zeros(axis.size, bool)
     if not keep.all():
-        notes.append(f"{int((~keep).sum())} samples before the first voltage were left out")
+        text = f"{int((~keep).sum())} samples before the first voltage were left out"
+        findings.append(found("no_voltage_yet", text))
     beat = rhythm(voltage.time)
     if beat.regular:
         limit = beat.gap()
@@ -129,10 +121,8 @@ def _covered(voltage: Series, axis: Integers, notes: list[str]) -> Flags:
         age = axis - voltage.time[np.maximum(index, 0)]
         stale = keep & (age > limit)
         if stale.any():
-            notes.append(
-                f"{int(stale.sum())} samples were left out: no voltage came for more than "
-                f"{limit * 1e-9:g} s"
-            )
+            text = f"{int(stale.sum())} samples were left out: no voltage came for more than "
+            findings.append(found("voltage_missing", f"{text}{limit * 1e-9:g} s", "warning"))
         keep &= ~stale
     return keep
 
@@ -143,7 +133,7 @@ def _count_starts(
     hardware: Hardware,
     keep: Flags,
     axis_name: str,
-    notes: list[str],
+    findings: list[Finding],
 ) -> Flags:
     """Unwrap the counter in place; return which kept samples begin a segment by a reset."""
     flags = np.zeros(keep.size, bool)
@@ -155,7 +145,7 @@ def _count_starts(
         if raw.dtype.kind == "f":
             raw = np.rint(raw).astype(np.int64)
         unwrapped = unwrap(raw, bits, _expected(series, hardware))
-        notes += unwrapped.notes
+        findings += unwrapped.findings
         series["count"] = Series(counted.time, unwrapped.count)
         flags[unwrapped.resets] = True
     # A reset at a sample that is left out begins a segment at the next that is kept.
@@ -184,7 +174,7 @@ def _gaps(
     held: str,
     voltage: Series,
     values: Array,
-    notes: list[str],
+    findings: list[Finding],
 ) -> Flags:
     """Return where segments begin because samples are missing; bridge the voltage over a few."""
     beat = rhythm(axis)
@@ -199,23 +189,21 @@ def _gaps(
     if alike and bridged.any():
         _bridge(values, voltage.value, missing, bridged, held)
     if bridged.any():
-        notes.append(
-            f"{int(missing[bridged].sum())} samples missing in {int(bridged.sum())} places"
-            + ("; their voltage was interpolated" if alike else "; the voltage there is known")
-        )
+        text = f"{int(missing[bridged].sum())} samples missing in {int(bridged.sum())} places"
+        text += "; their voltage was interpolated" if alike else "; the voltage there is known"
+        findings.append(found("samples_missing", text, samples=int(missing[bridged].sum())))
     if cut.any():
         lost = int(missing[cut].sum())
         longest = steps[cut].max() * 1e-9
-        notes.append(
-            f"{int(cut.sum())} gaps of up to {longest:.3g} s"
-            + (f" ({lost} samples missing)" if beat.regular else "")
-            + "; a new segment behind each"
-        )
+        text = f"{int(cut.sum())} gaps of up to {longest:.3g} s"
+        text += f" ({lost} samples missing)" if beat.regular else ""
+        findings.append(found("gaps", f"{text}; a new segment behind each", gaps=int(cut.sum())))
     if not beat.regular:
-        notes.append(
+        text = (
             f"the sampling is irregular: median {beat.interval * 1e-6:.4g} ms, "
             f"from {steps.min() * 1e-6:.4g} to {steps.max() * 1e-6:.4g} ms"
         )
+        findings.append(found("irregular_sampling", text))
     return np.concatenate([[True], cut])
 
 
@@ -228,7 +216,7 @@ def _bridge(values: Array, voltage: Array, missing: Integers, which: Flags, held
 
 
 def _on_axis(
-    name: str, series: Series, axis: Integers, keep: Flags, notes: list[str]
+    name: str, series: Series, axis: Integers, keep: Flags, findings: list[Finding]
 ) -> NDArray[Any] | None:
     """Return a signal at the axis's instants, NaN where it is not known."""
     if series.time.size == keep.size and np.array_equal(series.time[keep], axis):
@@ -243,19 +231,21 @@ def _on_axis(
         apart = sound.time[after] - sound.time[after - 1]
         exact = np.isin(axis, sound.time)
         values[(apart > 3 * rhythm(sound.time).interval) & ~exact] = np.nan
-        notes.append(f"{name}: interpolated to the instants of the main output")
+        text = f"{name}: interpolated to the instants of the main output"
+        findings.append(found("interpolated", text))
     if name == "count":
         return values
     if not np.isfinite(values).all():
         values = np.where(np.isfinite(values), values, np.nan)
         if np.isnan(values).all():
             return None
-        notes.append(f"{name}: {int(np.isnan(values).sum())} values missing")
+        text = f"{name}: {int(np.isnan(values).sum())} values missing"
+        findings.append(found("values_missing", text))
     return values
 
 
 def _without_stubs(
-    axis: Integers, columns: dict[str, Any], starts: Flags, notes: list[str]
+    axis: Integers, columns: dict[str, Any], starts: Flags, findings: list[Finding]
 ) -> tuple[Integers, dict[str, Any], Flags]:
     """Leave out segments of a single sample: they tell nothing."""
     edges = np.append(np.flatnonzero(starts), axis.size)
@@ -263,6 +253,7 @@ def _without_stubs(
     if not short.any():
         return axis, columns, starts
     keep = np.repeat(~short, np.diff(edges))
-    notes.append(f"{int(short.sum())} single samples between gaps were left out")
+    text = f"{int(short.sum())} single samples between gaps were left out"
+    findings.append(found("single_samples", text))
     kept = {name: None if v is None else v[keep] for name, v in columns.items()}
     return axis[keep], kept, starts[keep]

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from smp_motor_ident.bag.decode import collect
 from smp_motor_ident.bag.source import recordings
-from smp_motor_ident.bag.table import collect
 from smp_motor_ident.bag.types import Types
 from smp_motor_ident.errors import BagError
 
@@ -33,29 +33,12 @@ class Columns:
 
 
 def read_columns(path: Path, wanted: Mapping[str, Sequence[str]]) -> dict[str, Columns]:
-    """Read fields of topics.
-
-    Parameters
-    ----------
-    path : Path
-        One bag.
-    wanted : mapping of str to sequence of str
-        Field paths by topic.
-
-    Returns
-    -------
-    dict of str to Columns
-        By topic.
-
-    Raises
-    ------
-    BagError
-        When the bag cannot be read, or a topic has no message in it.
-    """
+    """Read fields of topics of one bag; a topic without a message is an error."""
     asked = {topic: list(fields) for topic, fields in wanted.items()}
     found = {}
     for recording in recordings([path]):
         for topic, table in collect(recording, asked, Types(()), None).items():
+            assert table.log is not None
             clock = table.log if table.stamp is None else table.stamp
             if clock.size == 0:
                 raise BagError(f"{recording.name}: has no message on {topic}")

@@ -7,6 +7,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from smp_motor_ident.bag.storage import found
+from smp_motor_ident.finding import Finding
+
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
@@ -19,50 +22,39 @@ class Unwrapped:
 
     count: Integers
     resets: Integers
-    notes: list[str] = field(default_factory=list)
+    findings: list[Finding] = field(default_factory=list)
 
 
 def unwrap(count: Integers, bits: int | None, expected: Array | None = None) -> Unwrapped:
     """Undo the wrap-around of a counter, and find where it was reset.
 
-    Parameters
-    ----------
-    count : ndarray of int64, shape (n,)
-        As the hardware reports it.
-    bits : int or None
-        Width of the counter; 0 where it does not wrap.  None: not known; then it is told by
-        jumps of one power of two.
-    expected : ndarray, shape (n - 1,), or None
-        Counts from sample to sample by a measured speed, where that is known: it decides
-        between wrap and reset, and helps a narrow counter that turns more than half of its
-        range between two samples.
-
-    Returns
-    -------
-    Unwrapped
-        Starting at the first raw count; at a reset the raw count is taken on.
+    A width of None is found by jumps of one power of two; 0 never wraps.  ``expected`` counts from
+    sample to sample, by a measured speed, decide between wrap and reset, and help a narrow
+    counter that turns more than half of its range between two samples.
     """
     if count.size < 2:
         return Unwrapped(count, np.zeros(0, np.int64))
-    notes = []
+    findings = []
     steps = np.diff(count)  # modulo 2^64, as is right for a counter of that width
     guess = np.zeros(steps.size) if expected is None else np.nan_to_num(expected)
-    if bits is None and (found := _width(steps, guess)):
-        bits = found
-        notes.append(f"the encoder wraps at 2^{bits} counts by what it shows; wrap undone")
+    if bits is None and (width := _width(steps, guess)):
+        bits = width
+        text = f"the encoder wraps at 2^{bits} counts by what it shows; wrap undone"
+        findings.append(found("counter_wraps", text, bits=bits))
     if bits:
         near = np.rint(guess).astype(np.int64)
         shift = np.int64(64 - bits)
         steps = near + (((steps - near) << shift) >> shift)
     resets = _resets(count, steps, guess, expected is not None) + 1
     if resets.size:
-        notes.append(f"the encoder's counter was reset {resets.size} times; a new segment each")
+        text = f"the encoder's counter was reset {resets.size} times; a new segment each"
+        findings.append(found("counter_reset", text, "warning", times=resets.size))
         steps = steps.copy()
         steps[resets - 1] = np.diff(count)[resets - 1]
     whole = np.concatenate([count[:1], count[:1] + np.cumsum(steps)])
     for begin, end in zip(resets, [*resets[1:], count.size]):
         whole[begin:end] += count[begin] - whole[begin]
-    return Unwrapped(whole, resets, notes)
+    return Unwrapped(whole, resets, findings)
 
 
 def _usual(steps: Integers, guess: Array) -> float:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from smp_motor_ident.bag.storage import found
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.record import Record
 
@@ -29,7 +30,7 @@ def join_records(records: list[Record]) -> Record:
                 )
     offsets = np.cumsum([0.0, *(r.duration + BETWEEN for r in records)])[:-1]
     lengths = np.cumsum([0, *(len(r) for r in records)])[:-1].tolist()
-    notes = [f"{r.source}: {note}" for r in records for note in r.notes]
+    findings = [replace(f, message=f"{r.source}: {f.message}") for r in records for f in r.findings]
     columns: dict[str, Any] = {}
     for name in ("voltage", "current", "velocity", "position", "count"):
         parts = [getattr(r, name) for r in records]
@@ -37,7 +38,8 @@ def join_records(records: list[Record]) -> Record:
             continue
         if any(part is None for part in parts):
             if name == "count":
-                notes.append("count: not in all recordings, left out")
+                text = "count: not in all recordings, left out"
+                findings.append(found("count_left_out", text, "warning"))
                 continue
             parts = [np.full(len(r), np.nan) if p is None else p for r, p in zip(records, parts)]
         columns[name] = np.concatenate(parts)
@@ -50,6 +52,6 @@ def join_records(records: list[Record]) -> Record:
         count=columns.pop("count", None),
         starts=tuple(s + n for r, n in zip(records, lengths) for s in r.starts),
         source=", ".join(dict.fromkeys(r.source for r in records)),
-        notes=tuple(dict.fromkeys(notes)),
+        findings=tuple(f for k, f in enumerate(findings) if f not in findings[:k]),
         **columns,
     )

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident.bag.storage import Batch, gather
+from smp_motor_ident.bag.storage import Batch, Channel, gather
 from smp_motor_ident.bag.template import (
     DecodeError,
     Number,
@@ -51,8 +51,8 @@ class Decoder:
 
     Parameters
     ----------
-    name : str
-        Message type.
+    channel : Channel
+        Type and encoding.
     candidates : sequence of Definitions
         What that type may be; the first that fits a message is used from then on.
     paths : sequence of str
@@ -61,8 +61,11 @@ class Decoder:
 
     KEPT = 64
 
-    def __init__(self, name: str, candidates: Sequence[Definitions], paths: Sequence[str]) -> None:
-        self.name = name
+    def __init__(
+        self, channel: Channel, candidates: Sequence[Definitions], paths: Sequence[str]
+    ) -> None:
+        self.name = channel.type
+        self._encoding = channel.encoding
         self.paths = tuple(paths)
         self._steps = [parse_path(path) for path in paths]
         self._candidates = list(candidates)
@@ -71,23 +74,7 @@ class Decoder:
         self.reason = ""
 
     def decode(self, batch: Batch) -> Decoded:
-        """Decode a batch.
-
-        Parameters
-        ----------
-        batch : Batch
-            Messages of this decoder's channel.
-
-        Returns
-        -------
-        Decoded
-            Columns; messages that are no such messages are missing and counted.
-
-        Raises
-        ------
-        BagError
-            When a path does not exist in the type.
-        """
+        """Decode a batch; messages that are no such messages are missing and counted."""
         rows: list[NDArray[np.int64]] = []
         columns: list[list[NDArray[Any] | None]] = []
         left: NDArray[np.int64] = np.arange(len(batch))
@@ -111,7 +98,7 @@ class Decoder:
         template = None
         for definitions in self._candidates:
             try:
-                template = take_apart(data, self.name, definitions)
+                template = take_apart(data, self.name, definitions, self._encoding)
             except DecodeError as error:
                 self.reason = self.reason or str(error)
                 continue

@@ -14,13 +14,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import yaml
-
+from smp_motor_control.parameter_file import read_yaml
 from smp_motor_ident.bag.template import parse_path
 from smp_motor_ident.bag.units import check_unit
-from smp_motor_ident.errors import BagError
+from smp_motor_ident.errors import BagError, ParameterError
 
-SIGNALS = ("voltage", "current", "velocity", "position", "count", "supply", "time")
+SIGNALS = ("voltage", "current", "velocity", "position", "count", "supply", "direction", "time")
 HARDWARE = (
     "gear_ratio",
     "counts_per_revolution",
@@ -34,6 +33,7 @@ _CHOICES = {
     "shaft": ("wheel", "motor"),
 }
 _SECONDS = ("gap", "sample_time", "velocity_window")
+_SCALES = ("wheel_radius", "pwm_full_scale")
 DEFAULT_MOTOR = "motor"
 """Name of the motor where a mapping has only one and does not name it."""
 
@@ -43,11 +43,11 @@ _SPEC = re.compile(
     rf"""(?P<source>"[^"]*"|.+?)
     (?P<scale>(?:\s*[*/]\s*-?{_NUMBER})*)
     (?P<offset>(?:\s*[+-]\s*{_PRODUCT})?)
-    (?:\s*:\s*(?P<unit>[A-Za-zµ%]+(?:/[a-z]+)?))?
+    (?:\s*:\s*(?P<unit>[A-Za-zµ°%]+(?:/[a-z]+)?))?
     (?:\s*@\s*(?P<shaft>\w+))?\s*""",
     re.VERBOSE,
 )
-_TOPIC = re.compile(r"(?P<topic>/[\w/]+)\.(?P<field>.+)")
+_TOPIC = re.compile(r"(?P<topic>/[\w/-]+)\.(?P<field>.+)")
 
 
 @dataclass(frozen=True)
@@ -57,13 +57,13 @@ class Signal:
     Attributes
     ----------
     topic : str
-        Empty for a column of a CSV file.
+        Empty for a column of a file; ``/STEM`` where several files are one recording.
     field : str
         Path of the field, or name of the column.
     scale, offset : float
         Applied in this order, before the unit.
     unit : str
-        One that `smp_motor_ident.bag.units` knows.
+        One that `smp_motor_ident.bag.units` knows; empty where the file may say it.
     shaft : {'', 'wheel', 'motor'}
         Where velocity and position are measured; empty for the motor's choice.
     """
@@ -98,6 +98,10 @@ class MotorMap:
         [s]; of a file that has no time; 0 where it has.
     velocity_window : float
         [s]; over which the velocity is known to be averaged.
+    wheel_radius : float
+        [m]; for velocities and positions of the rim.
+    pwm_full_scale : float
+        What a voltage in ``pwm`` is at 100 %; it is never guessed.
     own : bool
         Whether these are our own messages, of which nothing has to be guessed.
     """
@@ -110,6 +114,8 @@ class MotorMap:
     gap: float = 0.0
     sample_time: float = 0.0
     velocity_window: float = 0.0
+    wheel_radius: float = 0.0
+    pwm_full_scale: float = 0.0
     own: bool = False
 
 
@@ -211,11 +217,9 @@ def load(path: str | os.PathLike[str]) -> SignalMap:
     """
     path = Path(path)
     try:
-        document = yaml.safe_load(path.read_text("utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise BagError(f"{path}: cannot be read ({error})") from None
-    except yaml.YAMLError as error:
-        raise BagError(f"{path}: no YAML ({' '.join(str(error).split())})") from None
+        document = read_yaml(path)
+    except ParameterError as error:
+        raise BagError(str(error)) from None
     mapping = from_document(document, str(path))
     files = tuple(str(path.parent / name) for name in mapping.msg_files)
     return replace(mapping, msg_files=files)
@@ -295,12 +299,12 @@ def _motor(entry: Any, where: str, defaults: MotorMap | None = None) -> MotorMap
             signals[key] = _signal(key, value, place)
         elif key in HARDWARE:
             hardware[key] = _positive(value, place, zero=key == "encoder_bits")
-        elif key in _SECONDS:
-            options[key] = _positive(value, place, zero=True)
+        elif key in (*_SECONDS, *_SCALES):
+            options[key] = _positive(value, place, zero=key in _SECONDS)
         elif key in _CHOICES:
             options[key] = _choice(key, value, place)
         else:
-            known = ", ".join((*SIGNALS, *HARDWARE, *_CHOICES, *_SECONDS))
+            known = ", ".join((*SIGNALS, *HARDWARE, *_CHOICES, *_SECONDS, *_SCALES))
             raise BagError(f"{place} is no key of a mapping; use {known}")
     if (bits := hardware.get("encoder_bits", 0)) != int(bits) or bits > 64:
         raise BagError(f"{where}: encoder_bits is {bits}; it must be a whole number from 0 to 64")
@@ -362,7 +366,7 @@ def _signal(name: str, value: Any, place: str) -> Signal:
     if signal.topic:
         parse_path(signal.field)
     try:
-        return replace(signal, unit=check_unit(name, signal.unit))
+        return replace(signal, unit=check_unit(name, signal.unit) if signal.unit else "")
     except BagError as error:
         raise BagError(f"{place}: {error}") from None
 

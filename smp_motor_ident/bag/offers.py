@@ -9,10 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from smp_motor_ident.bag.csv_file import CsvFile
+from smp_motor_ident.bag.decode import Progress
 from smp_motor_ident.bag.source import Recording, recordings
-from smp_motor_ident.bag.storage import decompress_messages
-from smp_motor_ident.bag.table import Progress
 from smp_motor_ident.bag.template import (
     DecodeError,
     Number,
@@ -21,7 +19,9 @@ from smp_motor_ident.bag.template import (
     take_apart,
 )
 from smp_motor_ident.bag.types import Types
+from smp_motor_ident.bag.unpack import decompress_messages
 from smp_motor_ident.errors import BagError
+from smp_motor_ident.finding import Finding
 
 _LISTED = 12
 """Elements of an array without names that are listed."""
@@ -90,7 +90,7 @@ class Listing:
         Items for ``--map``; empty where nothing fits or nothing is needed.
     needs_mapping : bool
         False where the recording holds our own messages.
-    notes : list of str
+    findings : list of Finding
         What is missing or damaged.
     """
 
@@ -98,7 +98,7 @@ class Listing:
     offers: list[Offer]
     suggestion: list[str]
     needs_mapping: bool
-    notes: list[str]
+    findings: list[Finding]
 
 
 def list_topics(
@@ -129,13 +129,12 @@ def list_topics(
     listings = []
     for recording in recordings(paths):
         if recording.is_table:
-            names = CsvFile(recording.files[0]).names
-            offers = [Offer("", "", fields=names)]
+            offers = [Offer(c.topic, c.type, fields=list(c.fields)) for c in recording.channels()]
         else:
             offers = _offers(recording, types, progress)
         needed = all(offer.type != _OWN for offer in offers)
         suggestion = suggest(offers) if needed else []
-        listings.append(Listing(recording.name, offers, suggestion, needed, recording.notes))
+        listings.append(Listing(recording.name, offers, suggestion, needed, recording.findings))
     return listings
 
 
@@ -149,7 +148,7 @@ def _offers(recording: Recording, types: Types, progress: Progress | None) -> li
         topic = batch.channel.topic
         offer = found.setdefault(topic, Offer(topic, batch.channel.type))
         if not offer.count:
-            plain, _ = decompress_messages(batch.take(np.arange(1)))
+            plain, _ = decompress_messages(batch.take(np.arange(1)), recording.budget)
             offer.fields, offer.remark = _fields(types, plain) if len(plain) else ([], "damaged")
         offer.count += len(batch)
         first, last = spans.get(topic, (2**63 - 1, -(2**63)))
@@ -165,7 +164,7 @@ def _offers(recording: Recording, types: Types, progress: Progress | None) -> li
 
 def _fields(types: Types, batch: Any) -> tuple[list[str], str]:
     """Return the numeric fields of a batch's first message, or why they cannot be told."""
-    if batch.channel.encoding != "cdr":
+    if batch.channel.encoding not in ("cdr", "ros1"):
         return [], f"encoded as {batch.channel.encoding}"
     try:
         candidates = types.candidates(batch.channel)
@@ -174,7 +173,9 @@ def _fields(types: Types, batch: Any) -> tuple[list[str], str]:
     reason = ""
     for definitions in candidates:
         try:
-            template = take_apart(batch.message(0), batch.channel.type, definitions)
+            template = take_apart(
+                batch.message(0), batch.channel.type, definitions, batch.channel.encoding
+            )
         except DecodeError as error:
             reason = str(error)
             continue

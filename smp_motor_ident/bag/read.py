@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -11,15 +12,15 @@ import numpy as np
 
 from smp_motor_ident.bag import mapping as mappings
 from smp_motor_ident.bag.assemble import assemble
-from smp_motor_ident.bag.csv_file import read_table
+from smp_motor_ident.bag.decode import Progress, collect
 from smp_motor_ident.bag.join import join_records
 from smp_motor_ident.bag.mapping import MotorMap, Signal, SignalMap
 from smp_motor_ident.bag.source import Recording, recordings
-from smp_motor_ident.bag.storage import Channel
-from smp_motor_ident.bag.table import Progress, Table, collect
+from smp_motor_ident.bag.storage import Channel, Table, found
+from smp_motor_ident.bag.tables import add_time_columns, resolved, self_described, timed
 from smp_motor_ident.bag.types import Types
-from smp_motor_ident.bag.units import FACTORS
 from smp_motor_ident.errors import BagError
+from smp_motor_ident.finding import Finding
 from smp_motor_ident.record import Hardware, Record
 
 STATE, DESCRIPTION = "smp_interfaces/msg/MotorState", "smp_interfaces/msg/MotorDescription"
@@ -40,7 +41,8 @@ def read_experiments(
     Parameters
     ----------
     paths : path or sequence of paths
-        Bags (folders, bare ``.mcap`` or ``.db3`` files), folders of bags, or CSV files.
+        Bags (folders or bare files), folders of bags, or tables of any format of
+        `smp_motor_ident.bag.readers`.
     mapping : SignalMap, dict, path of a YAML file, list of command-line items, or None
         Which topics, fields or columns are which signals; not needed for recordings of
         our own messages.
@@ -56,36 +58,37 @@ def read_experiments(
     ------
     BagError
         When a path cannot be read, or holds no motor; the message says which.  Of a folder
-        with several recordings those that cannot be read become notes of the others.
+        with several recordings those that cannot be read become findings of the others.
     """
     asked = mappings.of(mapping)
     types = Types(asked.msg_files)
-    found: dict[str, list[Record]] = {}
+    read: dict[str, list[Record]] = {}
     failures: list[BagError] = []
-    every = recordings(paths)
+    topics = {s.topic for motor in asked.motors.values() for s in motor.signals.values()}
+    every = recordings(paths, topics)
     total, before = max(sum(r.size() for r in every), 1), 0
     for recording in every:
         part = recording.size() / total
         report = None if progress is None else _scaled(progress, before / total, part)
         try:
             for record in _read(recording, asked, types, report):
-                found.setdefault(record.wheel, []).append(record)
+                read.setdefault(record.wheel, []).append(record)
         except BagError as error:
             if not recording.one_of_many:
                 raise
             failures.append(error)
         before += recording.size()
-    if failures and not found:
+    if failures and not read:
         raise failures[0]
     if failures:
-        notes = tuple(f"not read: {error}" for error in failures)
-        found = {
-            wheel: [replace(record, notes=(*record.notes, *notes)) for record in records]
-            for wheel, records in found.items()
+        missing = tuple(found("not_read", f"not read: {error}", "warning") for error in failures)
+        read = {
+            wheel: [replace(record, findings=(*record.findings, *missing)) for record in records]
+            for wheel, records in read.items()
         }
     if progress is not None:
         progress(1.0, every[-1].name)
-    return found
+    return read
 
 
 def read_records(
@@ -120,61 +123,34 @@ def _read(
     recording: Recording, asked: SignalMap, types: Types, progress: Progress | None
 ) -> list[Record]:
     """Return a recording's records; an error tells also what was found amiss before."""
-    reader = _read_csv if recording.is_table else _read_bag
     try:
-        return reader(recording, asked, types, progress)
+        return _records(recording, asked, types, progress)
     except BagError as error:
-        amiss = [note for note in recording.notes if note not in str(error)]
+        amiss = [f.message for f in recording.findings if f.message not in str(error)]
         raise BagError("; ".join([str(error), *amiss])) from None
+    except _SPOILT as error:
+        reason = (str(error).splitlines() or [""])[0][:200]
+        raise BagError(
+            f"{recording.files[0]}: is damaged in a way that cannot be read "
+            f"({type(error).__name__}: {reason})"
+        ) from None
+
+
+_SPOILT = (
+    ArithmeticError, AttributeError, LookupError, MemoryError, OSError, RecursionError,
+    TypeError, ValueError, struct.error,
+)  # fmt: skip
+"""What spoilt bytes lead readers to: the user is told of the file, not of the code."""
 
 
 def _scaled(progress: Progress, begin: float, part: float) -> Progress:
     return lambda fraction, name: progress(begin + fraction * part, name)
 
 
-def _read_csv(
+def _records(
     recording: Recording, asked: SignalMap, types: Types, progress: Progress | None
 ) -> list[Record]:
-    """Return the records of a CSV file."""
-    path = recording.files[0]
-    if not asked.has_signals:
-        raise BagError(
-            f"{path}: a CSV file needs a mapping, such as voltage=u velocity=y:deg/s time=t"
-        )
-    if progress is not None:
-        progress(0.0, recording.name)
-    records = []
-    for wheel, plan in asked.motors.items():
-        signals = {name: _as_column(signal) for name, signal in plan.signals.items()}
-        plan = replace(plan, signals=signals)
-        time: tuple[str, float] | float = plan.sample_time
-        if "time" in signals:
-            time = (
-                signals["time"].field,
-                FACTORS["time"][signals["time"].unit] * signals["time"].scale,
-            )
-        elif not time:
-            raise BagError(
-                f"{path}: which column is the time? map time=COLUMN or sample_time=SECONDS"
-            )
-        names = [signal.field for name, signal in signals.items() if name != "time"]
-        table = read_table(path, names, time)
-        hardware = _hardware(plan.hardware)
-        records.append(assemble(wheel, plan, hardware, {"": table}, recording.name))
-    return records
-
-
-def _as_column(signal: Signal) -> Signal:
-    """Return a signal of a CSV file whose column looks like a topic and a field."""
-    if not signal.topic:
-        return signal
-    return replace(signal, topic="", field=f"{signal.topic}.{signal.field}")
-
-
-def _read_bag(
-    recording: Recording, asked: SignalMap, types: Types, progress: Progress | None
-) -> list[Record]:
-    """Return the records of a bag."""
+    """Return the records of a bag or of tables."""
     channels = recording.channels()
     plans = _plans(recording, asked, channels)
     wanted: dict[str, list[str]] = {}
@@ -185,17 +161,19 @@ def _read_bag(
                 fields.append(signal.field)
     descriptions = [c.topic for c in channels if c.type == DESCRIPTION]
     wanted.update({topic: list(mappings.HARDWARE) for topic in descriptions})
+    if recording.is_table:
+        add_time_columns(recording, plans, channels, wanted)
     tables = collect(recording, wanted, types, progress)
     records: list[Record] = []
     failures: list[BagError] = []
     for wheel in list(plans):
         plan = plans.pop(wheel)
-        notes: list[str] = []
-        description = _description(wheel, plan, descriptions, tables, notes)
+        description, findings = _description(wheel, plan, descriptions, tables)
         plan = replace(plan, hardware={**description, **plan.hardware})
         try:
-            record = assemble(wheel, plan, _hardware(plan.hardware), tables, recording.name)
-            records.append(replace(record, notes=(*notes, *record.notes)))
+            mine = timed(recording, plan, channels, tables) if recording.is_table else tables
+            record = assemble(wheel, plan, _hardware(plan.hardware), mine, recording.name)
+            records.append(replace(record, findings=(*findings, *record.findings)))
         except BagError as error:
             if not plan.own:
                 raise
@@ -205,15 +183,18 @@ def _read_bag(
             del tables[topic]  # its memory is needed for the next
     if failures and not records:
         raise failures[0]
-    shared = (*recording.notes, *(f"not read: {error}" for error in failures))
-    return [replace(record, notes=(*shared, *record.notes)) for record in records]
+    missing = [found("not_read", f"not read: {error}", "warning") for error in failures]
+    shared = (*recording.findings, *missing)
+    return [replace(record, findings=(*shared, *record.findings)) for record in records]
 
 
 def _plans(recording: Recording, asked: SignalMap, channels: list[Channel]) -> dict[str, MotorMap]:
     """Return the signals of every wheel, mapped by the user or told by our own messages."""
     topics = {channel.topic for channel in channels}
     if asked.has_signals:
-        plans = {wheel: plan for wheel, plan in asked.motors.items() if plan.signals}
+        plans = {
+            wheel: resolved(plan, channels) for wheel, plan in asked.motors.items() if plan.signals
+        }
         for wheel, plan in plans.items():
             for name, signal in plan.signals.items():
                 if signal.topic not in topics:
@@ -223,6 +204,8 @@ def _plans(recording: Recording, asked: SignalMap, channels: list[Channel]) -> d
                         f"{', '.join(sorted(topics)) or 'no topics at all'}"
                     )
         return plans
+    if recording.is_table:
+        return {mappings.DEFAULT_MOTOR: self_described(recording, channels, asked.defaults)}
     states = sorted(channel.topic for channel in channels if channel.type == STATE)
     if not states:
         raise BagError(
@@ -236,9 +219,7 @@ def _plans(recording: Recording, asked: SignalMap, channels: list[Channel]) -> d
         names = {topic: topic.rpartition("/")[0][1:] or topic[1:] for topic in states}
     plans = {}
     for topic, wheel in names.items():
-        signals = {
-            name: Signal(topic, path, unit=_UNITS[name]) for name, path in _OWN_FIELDS.items()
-        }
+        signals = {name: Signal(topic, path) for name, path in _OWN_FIELDS.items()}
         given = asked.motors.get(wheel, asked.defaults)
         plans[wheel] = replace(
             given,
@@ -250,34 +231,30 @@ def _plans(recording: Recording, asked: SignalMap, channels: list[Channel]) -> d
     return plans
 
 
-_UNITS = {name: next(iter(FACTORS[name])) for name in _OWN_FIELDS}
-
-
 def _description(
     wheel: str,
     plan: MotorMap,
     topics: list[str],
     tables: Mapping[str, Table],
-    notes: list[str],
-) -> dict[str, float]:
-    """Return the last description of a wheel."""
+) -> tuple[dict[str, float], list[Finding]]:
+    """Return the last description of a wheel, and what was found about it."""
     spaces = {signal.topic.rpartition("/")[0] for signal in plan.signals.values()}
     mine = [topic for topic in topics if topic.rpartition("/")[0] in spaces]
     for topic in mine:
         table = tables[topic]
-        if table.log.size:
+        if table.log is not None and table.log.size:
             last = {name: float(column[-1]) for name, column in table.columns.items()}
             changed = [n for n, c in table.columns.items() if np.unique(c[c == c]).size > 1]
-            if changed:
-                notes.append(f"{topic}: {', '.join(changed)} changed meanwhile; the last is used")
-            return last
+            text = f"{topic}: {', '.join(changed)} changed meanwhile; the last is used"
+            return last, [found("description_changed", text, "warning")] if changed else []
     if "gear_ratio" not in plan.hardware:
         own = any(signal.field == "encoder_count" for signal in plan.signals.values())
-        notes.append(
+        text = (
             f"{wheel}: {'no motor_description' if own else 'no gear_ratio'}; a gear ratio of 1 "
             "is assumed, so that its parameters are those of the shaft that was measured"
         )
-    return {}
+        return {}, [found("gear_ratio_assumed", text)]
+    return {}, []
 
 
 def _hardware(known: Mapping[str, float]) -> Hardware:

@@ -10,8 +10,10 @@ from pathlib import Path
 import yaml
 
 from smp_motor_ident.bag.source import recordings
-from smp_motor_ident.bag.storage import Batch, Channel, decompress_messages
+from smp_motor_ident.bag.storage import Batch, Channel
+from smp_motor_ident.bag.unpack import decompress_messages
 from smp_motor_ident.errors import BagError
+from smp_motor_ident.finding import Finding
 
 Entry = tuple[int, int, Batch, int]
 
@@ -23,11 +25,6 @@ class Replay:
     ----------
     path : Path
         A bag's folder or a bare file.
-
-    Raises
-    ------
-    BagError
-        When it is no bag, or several.
     """
 
     def __init__(self, path: Path) -> None:
@@ -42,37 +39,25 @@ class Replay:
         self.channels = list({(c.topic, c.type): c for c in channels}.values())
 
     @property
-    def notes(self) -> list[str]:
+    def findings(self) -> list[Finding]:
         """What was found missing or damaged while reading."""
-        return self._recording.notes
+        return self._recording.findings
 
     def messages(
         self, wanted: Callable[[Channel], bool] = lambda _: True
     ) -> Iterator[tuple[Channel, int, bytes]]:
-        """Read the messages in the order of their log times, a few chunks at a time.
+        """Yield channel, log time [ns] and data in the order of the log times, chunk by chunk.
 
-        Parameters
-        ----------
-        wanted : callable
-            Says of a channel whether its messages are asked for.
-
-        Yields
-        ------
-        channel : Channel
-            Topic and type.
-        log_time : int
-            [ns].  Where chunks overlap by more than one, a late message comes late.
-        data : bytes
-            The serialized message.
+        Where chunks overlap by more than one, a late message comes late.
         """
         waiting: list[Entry] = []
         number = count()
-        self._recording.notes.clear()
+        self._recording.findings.clear()
         # Batches of one chunk come together, channel by channel.
         for _, group in groupby(self._recording.batches(wanted), key=lambda item: item[0]):
             fresh: list[Entry] = []
             for _, packed in group:
-                batch, _ = decompress_messages(packed)
+                batch, _ = decompress_messages(packed, self._recording.budget)
                 fresh += [
                     (t, next(number), batch, k) for k, t in enumerate(batch.log_time.tolist())
                 ]
@@ -93,17 +78,9 @@ def _message(entry: Entry) -> tuple[Channel, int, bytes]:
 
 
 def offered(channel: Channel) -> tuple[bool, bool]:
-    """Return what the publishers of a recorded topic offered, the strongest of them.
+    """Return whether a topic's publishers offered reliable and transient local messages.
 
-    Parameters
-    ----------
-    channel : Channel
-        With the profiles of any metadata version.
-
-    Returns
-    -------
-    reliable, transient_local : bool
-        Reliable and volatile where nothing is known.
+    Reliable and volatile where nothing is known.
     """
     try:
         profiles = yaml.safe_load(channel.qos) if channel.qos else []

@@ -1,4 +1,4 @@
-"""From paths to recordings: folders, split bags, bare files, compressed files, CSV."""
+"""From paths to recordings: folders, split bags, bare files, tables alone and together."""
 
 from __future__ import annotations
 
@@ -6,26 +6,39 @@ import os
 import re
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
-import lz4.frame
 import yaml
-import zstandard
 
-from smp_motor_ident.bag import mcap_file, sqlite_file
-from smp_motor_ident.bag.storage import LZ4_MAGIC, ZSTD_MAGIC, Batch, Channel, Storage
+from smp_motor_ident.bag.readers import BAGS, PACKED, TABLES, is_table, open_source
+from smp_motor_ident.bag.storage import (
+    TABLE,
+    Batch,
+    Channel,
+    Messages,
+    Source,
+    Table,
+    Tables,
+    damaged,
+    found,
+)
+from smp_motor_ident.bag.unpack import Budget
 from smp_motor_ident.errors import BagError
+from smp_motor_ident.finding import Finding
 
 _SPLIT = re.compile(r"(.+?)_\d+$")
-_SUFFIXES = (".mcap", ".db3", ".zstd", ".zst", ".lz4")
+_BAG_NAME = re.compile(rf"({'|'.join(map(re.escape, BAGS))})(\.\w+)?$")
+_NAMED_ONLY = (".json", ".txt", ".log", ".dat")
+"""Tables that a folder may hold for other reasons: read only when named."""
+_DAMAGE = (ValueError, AttributeError, OSError, RecursionError, MemoryError)
 
 
 @dataclass
 class Recording:
-    """One experiment: a bag with its files in order, or a CSV file.
+    """One experiment: a bag with its files in order, or tables.
 
     Attributes
     ----------
@@ -37,7 +50,7 @@ class Recording:
         Messages by topic as metadata.yaml counts them.
     distribution : str
         ROS distribution that wrote it, where known.
-    notes : list of str
+    findings : list of Finding
         What was found amiss, grows while the files are read.
     one_of_many : bool
         Whether it was found in a folder with others, so that nobody asked for it by name.
@@ -47,34 +60,50 @@ class Recording:
     files: list[Path]
     promised: dict[str, int] | None = None
     distribution: str = ""
-    notes: list[str] = field(default_factory=list)
+    findings: list[Finding] = field(default_factory=list)
     one_of_many: bool = False
-    _storages: dict[Path, Storage | None] = field(default_factory=dict, repr=False)
+    _sources: dict[Path, Messages | Tables | None] = field(default_factory=dict, repr=False)
     _folder: tempfile.TemporaryDirectory[str] | None = field(default=None, repr=False)
+    _budget: Budget | None = field(default=None, repr=False)
 
     @property
     def is_table(self) -> bool:
-        """Whether it is a CSV file."""
-        return self.files[0].suffix.lower() in (".csv", ".tsv", ".txt")
+        """Whether it holds columns instead of messages."""
+        return is_table(self.files[0])
+
+    @property
+    def budget(self) -> Budget:
+        """Bytes that may be unpacked of it."""
+        self._budget = self._budget or Budget(self.name, self.size())
+        return self._budget
 
     def size(self) -> int:
         """Return the bytes of all files."""
         return sum(file.stat().st_size for file in self.files)
 
     def channels(self) -> list[Channel]:
-        """Return the channels of all files.
-
-        Returns
-        -------
-        list of Channel
-            One per topic, type and file.
-        """
-        found: list[Channel] = []
+        """Return the channels of all files, one per topic, type and file."""
+        every: list[Channel] = []
         for path in self.files:
-            if (storage := self._storage(path)) is not None:
-                found += storage.channels()
-                self._note(*storage.problems)
-        return found
+            if (source := self._source(path)) is not None:
+                every += [replace(c, topic=self._topic(path, c)) for c in source.channels()]
+                self._note(*source.problems)
+        return every
+
+    def _topic(self, path: Path, channel: Channel) -> str:
+        """Return a channel's topic: of one table among several it begins with the file's name."""
+        if channel.encoding != TABLE or len(self.files) == 1:
+            return channel.topic
+        return f"/{path.stem}" + (f"/{channel.topic}" if channel.topic else "")
+
+    def table(self, topic: str, fields: Sequence[str]) -> Table:
+        """Return columns of a table."""
+        for path in self.files:
+            source = self._source(path)
+            for channel in source.channels() if source is not None else []:
+                if self._topic(path, channel) == topic:
+                    return cast(Tables, source).table(channel.topic, fields)
+        raise BagError(f"{self.name}: has no {topic or 'table'}")
 
     def batches(self, wanted: Callable[[Channel], bool]) -> Iterator[tuple[float, Batch]]:
         """Read all files, and note every message that is missing."""
@@ -83,16 +112,16 @@ class Recording:
         total, before = max(self.size(), 1), 0
         for path in self.files:
             size = path.stat().st_size
-            storage = self._storage(path)
-            if storage is not None:
+            source = cast("Messages | None", self._source(path))
+            if source is not None:
                 mine: Counter[str] = Counter()
-                for fraction, batch in storage.batches(wanted):
+                for fraction, batch in source.batches(wanted):
                     mine[batch.channel.topic] += len(batch)
                     yield (before + fraction * size) / total, batch
-                asked = {c.topic for c in storage.channels() if wanted(c)}
+                asked = {c.topic for c in source.channels() if wanted(c)}
                 seen |= asked
-                self._note(*storage.problems)
-                for topic, count in (storage.promised() or {}).items():
+                self._note(*source.problems)
+                for topic, count in (source.promised() or {}).items():
                     if topic in asked and mine[topic] < count:
                         self._lost(path.name, topic, mine[topic], count)
                 counts += mine
@@ -101,114 +130,41 @@ class Recording:
             if topic in seen and counts[topic] < count:
                 self._lost("metadata.yaml", topic, counts[topic], count)
 
-    def _note(self, *notes: str) -> None:
-        self.notes += [note for note in dict.fromkeys(notes) if note not in self.notes]
+    def _note(self, *findings: Finding) -> None:
+        self.findings += [f for f in findings if f not in self.findings]
 
     def _lost(self, who: str, topic: str, have: int, promised: int) -> None:
-        self._note(
+        text = (
             f"{self.name}: {topic}: {have} of {promised} messages could be read "
             f"({who} counts {promised}; {promised - have} are lost)"
         )
+        self._note(found("messages_lost", text, "warning", read=have, counted=promised))
 
-    def _storage(self, path: Path) -> Storage | None:
-        """Open a file; where others remain, one that cannot be read becomes a note."""
-        if path not in self._storages:
+    def _source(self, path: Path) -> Messages | Tables | None:
+        """Open a file; where others remain, one that cannot be read becomes a finding."""
+        if path not in self._sources:
             self._folder = self._folder or tempfile.TemporaryDirectory(prefix="smp_bag_")
             try:
-                self._storages[path] = open_storage(path, Path(self._folder.name))
+                source: Source = open_source(path, Path(self._folder.name), self.budget)
+                if is_table(path) is not self.is_table:
+                    raise BagError(f"{path}: is of another kind than the other files")
+                self._sources[path] = cast("Messages | Tables", source)
             except BagError as error:
-                if len(self.files) == 1:
+                if len(self.files) == 1 or self.is_table:
                     raise
-                self._storages[path] = None
-                self._note(str(error))
-        return self._storages[path]
+                self._sources[path] = None
+                self._note(damaged(str(error)))
+        return self._sources[path]
 
 
-def open_storage(path: Path, folder: Path) -> Storage:
-    """Open a file by what it begins with, whatever it is called."""
-    head = _head(path)
-    problems: list[str] = []
-    plain = path
-    if head[:4] in (ZSTD_MAGIC, LZ4_MAGIC):
-        plain = folder / path.name.removesuffix(path.suffix)
-        problems = _unpack(path, plain, head[:4] == ZSTD_MAGIC)
-        head = _head(plain)
-    try:
-        if head.startswith(mcap_file.MAGIC):
-            storage: Storage = mcap_file.McapFile(plain, path.name)
-        elif head.startswith(sqlite_file.MAGIC):
-            storage = sqlite_file.SqliteFile(plain, path.name)
-        else:
-            raise BagError(f"{path}: {_what(path, head)}")
-    except BagError as error:
-        raise BagError("; ".join([str(error), *problems])) from None
-    storage.problems[:0] = problems
-    return storage
+def recordings(paths: Any, topics: Collection[str] = ()) -> list[Recording]:
+    """Find the recordings behind paths, in the order given, folders by name.
 
-
-def _head(path: Path) -> bytes:
-    try:
-        with path.open("rb") as file:
-            return file.read(16)
-    except OSError as error:
-        raise BagError(f"{path}: cannot be read ({error.strerror})") from None
-
-
-def _what(path: Path, head: bytes) -> str:
-    if not head:
-        return "is empty"
-    if head.startswith(b"#ROSBAG V"):
-        return "is a ROS 1 bag; convert it with rosbags-convert first"
-    if mcap_file.MAGIC.startswith(head) or sqlite_file.MAGIC.startswith(head):
-        return f"is cut off after {path.stat().st_size} bytes; nothing of it can be read"
-    return "is neither an MCAP nor a SQLite bag"
-
-
-def _unpack(path: Path, plain: Path, zstd: bool) -> list[str]:
-    """Decompress a file block by block; return what is amiss."""
-
-    def begin() -> Any:
-        if zstd:
-            return zstandard.ZstdDecompressor().decompressobj()
-        return lz4.frame.LZ4FrameDecompressor()
-
-    engine = begin()
-    try:
-        with path.open("rb") as packed, plain.open("wb") as out:
-            while block := packed.read(1 << 16):
-                while block:
-                    if engine.eof:  # another frame follows
-                        engine = begin()
-                    out.write(engine.decompress(block))
-                    block = engine.unused_data if engine.eof else b""
-    except (zstandard.ZstdError, EOFError, RuntimeError, MemoryError) as error:
-        return [f"{path.name}: its compression is damaged ({error})"]
-    except OSError as error:
-        raise BagError(f"{path}: cannot be unpacked ({error.strerror})") from None
-    return [] if engine.eof else [f"{path.name}: its compression is cut off"]
-
-
-def recordings(paths: Any) -> list[Recording]:
-    """Find the recordings behind paths.
-
-    Parameters
-    ----------
-    paths : path or iterable of paths
-        A bag's folder, a folder of bags, a bare ``.mcap`` or ``.db3``, or a CSV file.
-
-    Returns
-    -------
-    list of Recording
-        In the order given, folders by name.
-
-    Raises
-    ------
-    BagError
-        When a path does not exist or holds no recording.
+    Tables whose names are among ``topics`` (``/STEM``) are one recording, on one clock.
     """
     if isinstance(paths, (str, os.PathLike)):
         paths = [paths]
-    found: list[Recording] = []
+    every: list[Recording] = []
     for path in map(Path, paths):
         if not path.exists():
             raise BagError(f"{path}: does not exist")
@@ -219,11 +175,23 @@ def recordings(paths: Any) -> list[Recording]:
         for recording in inside:
             recording.one_of_many = len(inside) > 1
         if not inside:
-            raise BagError(f"{path}: holds no bag (.mcap, .db3) and no CSV file")
-        found += inside
-    if not found:
+            raise BagError(f"{path}: holds no bag ({', '.join(BAGS)}) and no table such as .csv")
+        every += inside
+    if not every:
         raise BagError("no bag is given")
-    return found
+    return _joined(every, topics)
+
+
+def _joined(every: list[Recording], topics: Collection[str]) -> list[Recording]:
+    """Put together the tables that a mapping names as topics; others are then not asked for."""
+    parts = [r for r in every if len(r.files) == 1 and f"/{r.files[0].stem}" in topics]
+    if len(parts) < 2 or not all(part.is_table for part in parts):
+        return every
+    stems = [part.files[0].stem for part in parts]
+    if len(set(stems)) < len(stems):
+        raise BagError(f"{parts[0].files[0]}: several files of that name are to be joined")
+    whole = Recording("+".join(stems), [part.files[0] for part in parts])
+    return [whole, *(r for r in every if r not in parts and not r.is_table)]
 
 
 def _of_folder(path: Path) -> list[Recording]:
@@ -236,29 +204,31 @@ def _of_folder(path: Path) -> list[Recording]:
         split = _SPLIT.match(_stem(file))
         groups.setdefault(split[1] if split else _stem(file), []).append(file)
     name = path.resolve().name
-    found = [
+    text = f"{name}: has no metadata.yaml; all its files are read"
+    every = [
         Recording(
             name if len(groups) == 1 else f"{name}/{key}",
             sorted(files, key=_order),
-            notes=[f"{name}: has no metadata.yaml; all its files are read"],
+            findings=[] if files[0].suffix == ".bag" else [found("no_metadata", text)],
         )
         for key, files in groups.items()
     ]
-    found += [Recording(p.name, [p]) for p in here if p.suffix.lower() in (".csv", ".tsv")]
+    tables = [s for s in TABLES if s not in _NAMED_ONLY]
+    every += [Recording(p.name, [p]) for p in here if p.suffix.lower() in tables]
     for folder in sorted(p for p in path.iterdir() if p.is_dir() and not p.name.startswith(".")):
-        found += _of_folder(folder)
-    return found
+        every += _of_folder(folder)
+    return every
 
 
 def _storages(files: Iterable[Path]) -> list[Path]:
     """Return the bag files; not a plain one beside its own compressed form, or the reverse."""
-    storages = [p for p in files if p.suffix in _SUFFIXES and re.search(r"\.(mcap|db3)", p.name)]
-    plain = {p.name for p in storages if p.suffix in (".mcap", ".db3")}
+    storages = [p for p in files if _BAG_NAME.search(p.name) and p.suffix in (*BAGS, *PACKED)]
+    plain = {p.name for p in storages if p.suffix in BAGS}
     return [p for p in storages if p.name in plain or p.name.removesuffix(p.suffix) not in plain]
 
 
 def _stem(path: Path) -> str:
-    return re.sub(r"\.(mcap|db3)(\.\w+)?$", "", path.name)
+    return _BAG_NAME.sub("", path.name)
 
 
 def _order(path: Path) -> tuple[str, int]:
@@ -277,16 +247,18 @@ def _bag(path: Path) -> Recording:
         listed = [Path(str(file)).name for file in information["relative_file_paths"]]
         bag.promised = _promise(information)
         bag.distribution = str(information.get("ros_distro") or "")
-    except (yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError, OSError) as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        bag.notes.append(f"{name}: metadata.yaml is damaged ({reason}); all files are read")
+    except (yaml.YAMLError, LookupError, TypeError, ArithmeticError, *_DAMAGE) as error:
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        bag.findings.append(
+            damaged(f"{name}: metadata.yaml is damaged ({reason}); all files are read")
+        )
         bag.promised, listed = None, []
     there = _storages(sorted(path.iterdir()))
     for file in listed:
         options = [file, file.removesuffix(Path(file).suffix), f"{file}.zstd", f"{file}.lz4"]
         match = next((path / o for o in options if o and (path / o).is_file()), None)
         if match is None:
-            bag.notes.append(f"{name}: {file} is missing, which metadata.yaml lists")
+            bag.findings.append(damaged(f"{name}: {file} is missing, which metadata.yaml lists"))
         elif match not in bag.files:
             bag.files.append(match)
     extra = sorted((f for f in there if f not in bag.files), key=_order)
@@ -294,10 +266,12 @@ def _bag(path: Path) -> Recording:
     extra = [file for file in extra if _stem(file) not in stems]
     if extra and listed:
         names = ", ".join(file.name for file in extra)
-        bag.notes.append(f"{name}: {names} is not listed in metadata.yaml and is read too")
+        text = f"{name}: {names} is not listed in metadata.yaml and is read too"
+        bag.findings.append(found("unlisted_files", text))
     bag.files += extra
     if not bag.files:
-        raise BagError(f"{path}: " + (bag.notes[-1] if bag.notes else "holds no .mcap or .db3"))
+        reason = bag.findings[-1].message if bag.findings else "holds no .mcap or .db3"
+        raise BagError(f"{path}: {reason}")
     return bag
 
 

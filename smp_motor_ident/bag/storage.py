@@ -1,30 +1,39 @@
-"""What every storage format gives: channels, and batches of raw messages for bulk decoding."""
+"""What every format gives: channels, and batches of raw messages or tables of columns."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-import lz4.frame
 import numpy as np
-import zstandard
 from numpy.typing import NDArray
 
-from smp_motor_ident.errors import BagError
+from smp_motor_ident.finding import Finding, Severity
 
+Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 Integers = NDArray[np.int64]
 
-ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
-LZ4_MAGIC = b"\x04\x22\x4d\x18"
+TABLE = "table"
+"""Encoding of a channel whose file holds columns of numbers instead of messages."""
+
+
+def found(code: str, message: str, severity: Severity = "note", **evidence: float) -> Finding:
+    """Return what was found while reading."""
+    return Finding(code, severity, message, evidence)
+
+
+def damaged(message: str) -> Finding:
+    """Return that part of a recording is lost."""
+    return Finding("damaged_recording", "warning", message)
 
 
 @dataclass(frozen=True)
 class Channel:
-    """One stream of messages in a file: a topic, its type and how the type is defined there."""
+    """One stream of samples in a file: a topic, its type and how the type is defined there."""
 
     id: int
     topic: str
@@ -35,6 +44,10 @@ class Channel:
     qos: str = ""
     numbered: bool = False
     """Whether the messages' sequence is the publisher's own count, so that a gap is a loss."""
+    fields: tuple[str, ...] = ()
+    """Names of the columns of a table."""
+    units: Mapping[str, str] = field(default_factory=dict, hash=False)
+    """What the file says of its columns' units."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,34 +70,12 @@ class Batch:
         return int(self.offset.size)
 
     def message(self, k: int) -> bytes:
-        """Return the bytes of message ``k``.
-
-        Parameters
-        ----------
-        k : int
-            Index in the batch.
-
-        Returns
-        -------
-        bytes
-            Of the serialized message.
-        """
+        """Return the bytes of message ``k``."""
         begin = int(self.offset[k])
         return self.data[begin : begin + int(self.length[k])].tobytes()
 
     def take(self, which: NDArray[Any]) -> Batch:
-        """Return the chosen messages, sharing the data.
-
-        Parameters
-        ----------
-        which : ndarray
-            Indices or a mask.
-
-        Returns
-        -------
-        Batch
-            Of the same channel.
-        """
+        """Return the chosen messages (indices or a mask), sharing the data."""
         return Batch(
             self.channel,
             self.data,
@@ -95,18 +86,54 @@ class Batch:
         )
 
 
-class Storage(Protocol):
-    """A file of messages.
+@dataclass(eq=False)
+class Table:
+    """Samples of one topic, or rows of a file, in the order of the file.
 
-    ``problems`` fills while the file is read: one sentence for everything that was lost.
+    Attributes
+    ----------
+    log : ndarray of int64, shape (n,), [ns], or None
+        When the recorder got them; None where the file has no time but in its columns.
+        Where ``clocked``, the file's own column of time.
+    stamp : ndarray of int64, shape (n,), [ns], or None
+        What their header says.
+    columns : dict of str to ndarray, shape (n,)
+        By field path, in the type of the message.
+    present : dict of str to ndarray of bool
+        For columns that some messages lacked.
+    number : ndarray of int64, shape (n,), or None
+        The publisher's own count, where the recorder kept it for every message.
+    findings : list of Finding
+        What was found amiss.
+    clocked : bool
+        Whether ``log`` is the file's own time of each sample.
+    exact : set of str
+        Columns of whole nanoseconds, whatever unit is mapped: they were written as dates.
     """
 
+    log: Integers | None
+    stamp: Integers | None
+    columns: dict[str, NDArray[Any]]
+    present: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
+    number: Integers | None = None
+    findings: list[Finding] = field(default_factory=list)
+    clocked: bool = False
+    exact: frozenset[str] = frozenset()
+
+
+class Source(Protocol):
+    """One opened file; ``problems`` fills while it is read: everything that was lost."""
+
     path: Path
-    problems: list[str]
+    problems: list[Finding]
 
     def channels(self) -> list[Channel]:
         """Return the channels, reading the whole file where it has no index."""
         ...
+
+
+class Messages(Source, Protocol):
+    """A file of serialized messages."""
 
     def promised(self) -> dict[str, int] | None:
         """Return the number of messages by topic where the file itself tells it."""
@@ -117,23 +144,16 @@ class Storage(Protocol):
         ...
 
 
+class Tables(Source, Protocol):
+    """A file of columns; its channels have the encoding `TABLE` and name their fields."""
+
+    def table(self, topic: str, fields: Sequence[str]) -> Table:
+        """Return columns of a topic; ``log`` is None where the time is a column, too."""
+        ...
+
+
 def gather(data: Bytes, at: Integers, dtype: str) -> NDArray[Any]:
-    """Return the numbers that begin at the given bytes, aligned or not.
-
-    Parameters
-    ----------
-    data : ndarray of uint8
-        The bytes.
-    at : ndarray of int64
-        Position of each number's first byte; all must fit.
-    dtype : str
-        Such as ``<f8``.
-
-    Returns
-    -------
-    ndarray, shape of ``at``
-        Of type ``dtype``.
-    """
+    """Return the numbers that begin at the given bytes, aligned or not; all must fit."""
     kind = np.dtype(dtype)
     # A view in which every byte begins a number: one indexing reads them all.
     every: NDArray[Any] = np.ndarray(
@@ -147,64 +167,8 @@ def message_type(name: str) -> str:
     return re.sub(r"^(\w+)/(\w+)$", r"\1/msg/\2", name)
 
 
-def decompress(data: bytes, compression: str, size: int) -> bytes:
-    """Decompress a block, or what can be had of one that is cut off."""
-    if compression in ("", "none"):
-        return data
-    try:
-        if compression == "zstd":
-            if size:
-                try:
-                    return zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
-                except zstandard.ZstdError:
-                    pass  # cut off: take what comes
-            return zstandard.ZstdDecompressor().decompressobj().decompress(data)
-        if compression == "lz4":
-            raw: bytes = lz4.frame.LZ4FrameDecompressor().decompress(data)
-            return raw
-    except (zstandard.ZstdError, RuntimeError):
-        return b""
-    raise BagError(f"compression {compression!r} is not supported; use zstd or lz4")
-
-
-def decompress_messages(batch: Batch) -> tuple[Batch, int]:
-    """Decompress messages that were compressed one by one."""
-    sound = batch.length >= 4
-    if not sound.any():
-        return batch, 0
-    first = gather(batch.data, np.where(sound, batch.offset, batch.offset[sound][0]), "<u4")
-    zstd = sound & (first == int.from_bytes(ZSTD_MAGIC, "little"))
-    lz4ed = sound & (first == int.from_bytes(LZ4_MAGIC, "little"))
-    if not (zstd.any() or lz4ed.any()):
-        return batch, 0
-    blobs = []
-    for k in range(len(batch)):
-        kind = "zstd" if zstd[k] else "lz4" if lz4ed[k] else ""
-        blobs.append(decompress(batch.message(k), kind, 0))
-    kept = np.array([bool(blob) for blob in blobs])
-    joined = join(batch.channel, [b for b in blobs if b], batch.log_time[kept])
-    if batch.sequence is not None:
-        joined = replace(joined, sequence=batch.sequence[kept])
-    return joined, int((~kept).sum())
-
-
 def join(channel: Channel, blobs: list[bytes], log_time: Integers) -> Batch:
-    """Return a batch of messages that are given as bytes.
-
-    Parameters
-    ----------
-    channel : Channel
-        Their channel.
-    blobs : list of bytes
-        The messages.
-    log_time : ndarray of int64
-        One for each.
-
-    Returns
-    -------
-    Batch
-        With the messages side by side.
-    """
+    """Return a batch of messages that are given as bytes."""
     length = np.fromiter(map(len, blobs), np.int64, len(blobs))
     data = np.frombuffer(b"".join(blobs), np.uint8)
     return Batch(channel, data, np.cumsum(length) - length, length, log_time)

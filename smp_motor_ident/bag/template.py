@@ -1,7 +1,7 @@
 """One message taken apart: where its numbers, strings and lengths stand.
 
 CDR puts a field behind everything that precedes it, aligned to its size from the byte
-after the four of the encapsulation.
+after the four of the encapsulation.  ROS 1 puts it there unaligned, and has no such four bytes.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ _KINDS = {
     "float32": "f4",
     "float64": "f8",
 }
+_MOST_ELEMENTS = 100_000
 _STEP = re.compile(r"(\w+)((?:\[[^\]]*\])*)")
 
 
@@ -94,24 +95,29 @@ def parse_path(path: str) -> list[str | int]:
 class _Parser:
     """Takes one message apart."""
 
-    def __init__(self, data: bytes, definitions: Definitions) -> None:
-        if len(data) < 4 or data[0] != 0 or data[1] > 1:
+    def __init__(self, data: bytes, definitions: Definitions, ros1: bool) -> None:
+        if not ros1 and (len(data) < 4 or data[0] != 0 or data[1] > 1):
             raise DecodeError(f"its first bytes are {data[:4].hex()}, not those of CDR")
-        self.data, self.definitions, self.position = data, definitions, 4
-        self.order = "<" if data[1] else ">"
+        self.data, self.definitions, self.position = data, definitions, 0 if ros1 else 4
+        self.ros1 = ros1
+        self.order = "<" if ros1 or data[1] else ">"
         self.lengths: list[int] = []
+        self.left = _MOST_ELEMENTS
 
     def parse(self, name: str) -> Template:
         root = self.message(name)
         rest = len(self.data) - self.position
-        if not 0 <= rest <= 3:  # writers may pad to a multiple of four
+        if not 0 <= rest <= (0 if self.ros1 else 3):  # writers may pad to a multiple of four
             raise DecodeError(f"{rest} bytes are left behind its last field")
         return Template(root, self.lengths, self.order)
 
     def message(self, name: str) -> dict[str, Any]:
         fields = self.definitions[name]
-        if not fields:  # ROS gives an empty message one byte
+        if not fields and not self.ros1:  # ROS 2 gives an empty message one byte
             self.take(1, 1)
+        self.left -= 1
+        if self.left < 0:
+            raise DecodeError(f"it has more than {_MOST_ELEMENTS} parts")
         return {key: self.value(description) for key, description in fields}
 
     def value(self, description: Any) -> Any:
@@ -131,11 +137,14 @@ class _Parser:
 
     def take(self, size: int, alignment: int) -> int:
         """Return where the next bytes begin, and go behind them."""
-        begin = self.position + (-(self.position - 4)) % alignment
+        begin = self._aligned(alignment)
         if begin + size > len(self.data):
             raise DecodeError(f"it ends at byte {len(self.data)}, inside a field")
         self.position = begin + size
         return begin
+
+    def _aligned(self, alignment: int) -> int:
+        return self.position + (0 if self.ros1 else -(self.position - 4) % alignment)
 
     def length(self) -> int:
         begin = self.take(4, 4)
@@ -145,10 +154,11 @@ class _Parser:
         )
 
     def text(self) -> Text:
-        begin = self.position + (-(self.position - 4)) % 4
+        begin = self._aligned(4)
         size = self.length()
         at = self.take(size, 1)
-        value = self.data[at : at + max(size - 1, 0)].decode("utf-8", "replace")
+        end = size if self.ros1 else max(size - 1, 0)  # CDR ends a string with a zero
+        value = self.data[at : at + end].decode("utf-8", "replace")
         return Text(value, begin, at + size)
 
     def numbers(self, name: str, count: int | None) -> Number:
@@ -161,9 +171,12 @@ class _Parser:
         return Number(begin, self.order + _KINDS[name], count)
 
 
-def take_apart(data: bytes, name: str, definitions: Definitions) -> Template:
-    """Return where everything in a message stands."""
-    return _Parser(data, definitions).parse(name)
+def take_apart(data: bytes, name: str, definitions: Definitions, encoding: str) -> Template:
+    """Return where everything in a message stands; the encoding is ``cdr`` or ``ros1``."""
+    try:
+        return _Parser(data, definitions, encoding == "ros1").parse(name)
+    except RecursionError:
+        raise DecodeError("its type is nested too deeply") from None
 
 
 def names_beside(parent: Mapping[str, Any]) -> dict[str, list[Text]]:

@@ -15,9 +15,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from smp_motor_ident.bag.clock import SAME_CLOCK, fit_clock, mean_held
+from smp_motor_ident.bag.decode import collect
 from smp_motor_ident.bag.source import Recording, recordings
-from smp_motor_ident.bag.table import Table, collect
-from smp_motor_ident.bag.timing import SAME_CLOCK, fit_clock, mean_held
+from smp_motor_ident.bag.storage import Table
 from smp_motor_ident.bag.types import Types
 from smp_motor_ident.errors import BagError
 
@@ -78,22 +79,9 @@ class TransportDelay:
 
 
 def measure_delay(path: Path) -> dict[str, TransportDelay]:
-    """Measure the delay of every wheel's loop from a bag with its commands.
+    """Measure the delay of every wheel's loop from a bag with motor_state and motor_command.
 
-    Parameters
-    ----------
-    path : Path
-        A bag with ``motor_state`` and ``motor_command`` of running wheels.
-
-    Returns
-    -------
-    dict of str to TransportDelay
-        By wheel; wheels without enough commands that answer a sample are left out.
-
-    Raises
-    ------
-    BagError
-        When the bag cannot be read, or holds no such wheel.
+    Wheels without enough commands that answer a sample are left out; none at all is an error.
     """
     found: dict[str, TransportDelay] = {}
     for recording in recordings([path]):
@@ -129,6 +117,7 @@ def _delay(state: Table, command: Table) -> TransportDelay | None:
     answers = np.isin(command.stamp, state.stamp)
     if np.count_nonzero(answers) < LEAST_ANSWERS:
         return None
+    assert state.log is not None and command.log is not None
     stamp, log = command.stamp[answers], command.log[answers]
     offset = fit_clock(state.stamp, state.log)
     # On another clock the fastest state stands for no latency at all.

@@ -31,6 +31,7 @@ _STORES = (
     Stores.ROS2_FOXY,
     Stores.ROS2_DASHING,
 )
+_SPOILT = (TypesysError, BagError, ValueError, LookupError, TypeError, RecursionError)
 _LINE = "=" * 80 + "\n"
 
 
@@ -78,11 +79,6 @@ class Types:
     ----------
     files : iterable of path
         ``.msg`` files, or folders of them, that the user gives.
-
-    Raises
-    ------
-    BagError
-        When one of these does not exist or cannot be parsed.
     """
 
     def __init__(self, files: Iterable[str | os.PathLike[str]] = ()) -> None:
@@ -100,7 +96,7 @@ class Types:
         package = folder.parent.name if folder.name == "msg" else folder.name
         try:
             self._given.update(_parse(file.read_text(), f"{package}/msg/{file.stem}", "ros2msg"))
-        except (TypesysError, OSError, UnicodeDecodeError) as error:
+        except (TypesysError, OSError, ValueError, RecursionError) as error:
             raise BagError(f"{file}: not a message definition ({_line(error)})") from None
 
     def candidates(self, channel: Channel) -> list[Definitions]:
@@ -108,28 +104,13 @@ class Types:
 
         Several distributions changed messages without changing their name; where a bag
         does not define its types, the one that fits the bytes is right.
-
-        Parameters
-        ----------
-        channel : Channel
-            With the definition that its file holds.
-
-        Returns
-        -------
-        list of Definitions
-            Each with the channel's type and everything it consists of.
-
-        Raises
-        ------
-        BagError
-            When nothing defines the type.
         """
         name, reasons, found = channel.type, [], []
         if channel.definition:
             try:
                 own = _parse(channel.definition, name, channel.definition_format)
                 found.append(self._closed(name, [own, self._given, *map(_store, _STORES)]))
-            except (TypesysError, BagError) as error:
+            except _SPOILT as error:
                 reasons.append(f"the bag's own definition cannot be used: {_line(error)}")
         given: list[Mapping[str, Fields]] = [self._named(name), self._given]
         known = [[_Ament(), _store(_STORES[0])], *([_store(s), _Ament()] for s in _STORES[1:])]
@@ -185,25 +166,7 @@ def _msg_text(name: str) -> str | None:
 
 
 def definition(name: str) -> tuple[str, str]:
-    """Return what a bag stores about a message type, as rosbag2 writes it.
-
-    Parameters
-    ----------
-    name : str
-        Full name such as ``std_msgs/msg/Float64``.
-
-    Returns
-    -------
-    text : str
-        Its definition followed by those of all messages in it.
-    type_hash : str
-        REP-2011 hash, ``RIHS01_`` and 64 hexadecimal digits.
-
-    Raises
-    ------
-    BagError
-        When neither ROS nor rosbags knows the type.
-    """
+    """Return definition and REP-2011 hash of a message type, as rosbag2 writes them."""
     name = message_type(name)
     types = Types()
     closed = types.candidates(Channel(0, name, name))[0]

@@ -25,11 +25,18 @@ FACTORS: dict[str, dict[str, float]] = {
     "position": {"rad": 1.0, "deg": math.pi / 180, "rev": _TURN, "mrad": 1e-3},
     "count": {"ticks": 1.0},
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0},
+    "direction": {"": 1.0},
 }
 """By signal: unit to factor; the first of each is assumed where none is given."""
 
+_METRES = {
+    "velocity": {"m/s": 1.0, "mm/s": 1e-3, "cm/s": 1e-2, "km/h": 1 / 3.6, "ft/s": 0.3048},
+    "position": {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "ft": 0.3048},
+}
+"""Units of the rim, which need the wheel's radius."""
 _COUNTS = {"velocity": "ticks/s", "position": "ticks"}
 _DUTY = {"duty": 1.0, "%": 1e-2}
+_PWM = "pwm"
 _ALIASES = {
     "count": "ticks",
     "counts": "ticks",
@@ -37,23 +44,40 @@ _ALIASES = {
     "counts/s": "ticks/s",
     "volt": "V",
     "volts": "V",
+    "ampere": "A",
+    "amperes": "A",
+    "amps": "A",
     "percent": "%",
     "rps": "rev/s",
+    "rev/min": "rpm",
+    "u/min": "rpm",
+    "1/min": "rpm",
     "turns": "rev",
     "turn": "rev",
     "degree": "deg",
     "degrees": "deg",
+    "°": "deg",
+    "°/s": "deg/s",
     "dps": "deg/s",
     "µs": "us",
     "sec": "s",
+    "seconds": "s",
+    "msec": "ms",
+    "usec": "us",
+    "kph": "km/h",
+    "mps": "m/s",
 }
 
 
+def _known(signal: str) -> list[str]:
+    known = [*FACTORS[signal], *_METRES.get(signal, {})]
+    known += [_COUNTS[signal]] if signal in _COUNTS else []
+    return known + ([*_DUTY, _PWM] if signal == "voltage" else [])
+
+
 def check_unit(signal: str, unit: str) -> str:
-    """Return the unit under its usual name."""
-    known = [*FACTORS[signal], *([_COUNTS[signal]] if signal in _COUNTS else [])]
-    if signal == "voltage":
-        known += _DUTY
+    """Return the unit under its usual name, the first of the signal's where none is given."""
+    known = _known(signal)
     if not unit:
         return known[0]
     unit = unit.strip()
@@ -64,16 +88,40 @@ def check_unit(signal: str, unit: str) -> str:
     raise BagError(f"{signal} cannot be in {unit!r}; use one of {', '.join(known)}")
 
 
+def written_unit(text: str) -> str | None:
+    """Return the unit that a file writes beside a column's name; None where it is none."""
+    if text.strip() in ("", "-", "1", "."):
+        return ""
+    for signal in FACTORS:
+        try:
+            return check_unit(signal, text)
+        except BagError:
+            continue
+    return None
+
+
 def factor(
-    signal: str, unit: str, *, counts_per_revolution: float | None, supply_voltage: float | None
+    signal: str,
+    unit: str,
+    *,
+    counts_per_revolution: float | None = None,
+    supply_voltage: float | None = None,
+    wheel_radius: float = 0.0,
+    pwm_full_scale: float = 0.0,
 ) -> float:
-    """Return what a value in the unit must be multiplied by."""
+    """Return what a value in the unit must be multiplied by; BagError names what is missing."""
     if unit in FACTORS[signal]:
         return FACTORS[signal][unit]
-    if unit in _DUTY:
+    if unit in _METRES.get(signal, {}):
+        if not wheel_radius:
+            raise BagError(f"a {signal} in {unit!r} needs wheel_radius")
+        return _METRES[signal][unit] / wheel_radius
+    if unit == _PWM and not pwm_full_scale:
+        raise BagError("a voltage in 'pwm' needs pwm_full_scale, the value that is 100 %")
+    if unit in (*_DUTY, _PWM):
         if supply_voltage is None:
             raise BagError(f"a voltage in {unit!r} needs supply_voltage or a supply signal")
-        return _DUTY[unit] * supply_voltage
+        return (_DUTY[unit] if unit in _DUTY else 1 / pwm_full_scale) * supply_voltage
     if counts_per_revolution is None:
         raise BagError(f"a {signal} in {unit!r} needs counts_per_revolution")
     return _TURN / counts_per_revolution

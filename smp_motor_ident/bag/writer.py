@@ -24,8 +24,8 @@ from mcap import records
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 
-from smp_motor_ident.bag.mcap_file import MAGIC, NUMBERED
 from smp_motor_ident.bag.metadata import DEFAULT_QOS, document, topic_entry
+from smp_motor_ident.bag.readers.mcap import MAGIC, NUMBERED
 from smp_motor_ident.bag.types import definition
 from smp_motor_ident.errors import BagError
 

@@ -1,44 +1,43 @@
-"""tune --apply: new gains into running wheel nodes, on trial.
-
-What needs ROS is done by the node ``gain_setter`` in a process of its own; see its requests.
-"""
+"""tune --apply: new gains into running wheel nodes, on trial."""
 
 from __future__ import annotations
 
-import json
+import argparse
 import math
-import subprocess
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import yaml
-
-from smp_motor_ident.cli.processes import ProcessError, Processes
+from smp_motor_control.parameter_file import flat, read_parameters
+from smp_motor_ident.cli.processes import connect
 from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.tune import Design
 from smp_motor_ident.tune.writing import parameters
 
 
-def apply(wanted: Mapping[str, Mapping[str, Any]], watch: float) -> bool:
+def apply(wanted: Mapping[str, Mapping[str, Any]], arguments: argparse.Namespace) -> int:
     """Set the gains of running wheels, watch them, and take them back if a loop misbehaves."""
     limits = [values.get("u_clamp_max", math.inf) for values in wanted.values()]
     supply = max((limit for limit in limits if math.isfinite(limit)), default=12.0)
-    with tempfile.TemporaryDirectory() as logs, Processes(Path(logs)) as processes:
-        setter = processes.start("gain_setter", "gain_setter", pipes=True)
-        names = {wheel: list(values) for wheel, values in wanted.items()}
-        old = _ask(setter, processes, do="read", wheels=names)["values"]
-        new = _changes(old, wanted)
+    with connect("tune", arguments.ros_arguments) as robot:
+        from smp_motor_control.nodes.gain_trial import try_gains
+        from smp_motor_control.nodes.robot_client import controller
+
+        found = robot.get_parameters({controller(w): list(new) for w, new in wanted.items()})
+        new = _changes({wheel: found[controller(wheel)] for wheel in wanted}, wanted)
         if not any(new.values()):
             print("the running gains are these already: nothing to set")
-            return True
-        answer = _ask(setter, processes, do="apply", values=new, watch=watch, supply=supply)
-    if answer["kept"]:
-        print(f"kept: no loop misbehaved within {watch:g} s")
-    else:
-        print(f"taken back after {answer['after']:.2f} s: {answer['reason']}")
-    return bool(answer["kept"])
+            return 0
+        outcome = try_gains(
+            robot, new, arguments.watch, supply, lambda text: print(text, flush=True)
+        )
+    if not outcome.reason:
+        print(f"kept: no loop misbehaved within {arguments.watch:g} s")
+        return 0
+    print(f"taken back after {outcome.after:.2f} s: {outcome.reason}")
+    for wheel in outcome.missing:
+        print(f"{wheel} did not return: if it drives on it does so with the new gains")
+    return 1
 
 
 def from_designs(designs: Mapping[str, Design]) -> dict[str, dict[str, Any]]:
@@ -48,41 +47,13 @@ def from_designs(designs: Mapping[str, Design]) -> dict[str, dict[str, Any]]:
 
 def from_file(path: Path) -> dict[str, dict[str, Any]]:
     """Read the parameters of wheel nodes from a ROS parameter file."""
-    try:
-        document = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ParameterError(f"{path}: cannot be read ({error.strerror})") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ParameterError(f"{path}: is not YAML: {' '.join(str(error).split())}") from None
     found = {}
-    for node, entry in document.items() if isinstance(document, Mapping) else ():
-        wheel, _, name = str(node).strip("/").rpartition("/")
-        if name == "wheel_pid" and wheel and isinstance(entry, Mapping):
-            found[wheel] = flat(entry.get("ros__parameters") or {})
+    for node, values in read_parameters(path).items():
+        *_, wheel, name = ("", "", *node.split("/"))
+        if name == "wheel_pid" and wheel:
+            found[wheel] = values
     if not found:
         raise ParameterError(f"{path}: holds no /<wheel>/wheel_pid; give a file that tune wrote")
-    return found
-
-
-def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return nested parameters by their ROS names.
-
-    Parameters
-    ----------
-    tree : mapping
-        As in a parameter file.
-    prefix : str
-        Before every name.
-
-    Returns
-    -------
-    dict
-        Such as ``{"model.delay": 0.0}``.
-    """
-    found: dict[str, Any] = {}
-    for name, value in tree.items():
-        inner = isinstance(value, Mapping)
-        found.update(flat(value, f"{prefix}{name}.") if inner else {prefix + name: value})
     return found
 
 
@@ -105,20 +76,3 @@ def _changes(
 
 def _text(value: Any) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
-
-
-def _ask(setter: subprocess.Popen[bytes], processes: Processes, **request: Any) -> dict[str, Any]:
-    assert setter.stdin is not None
-    assert setter.stdout is not None
-    try:
-        setter.stdin.write(json.dumps(request).encode() + b"\n")
-        setter.stdin.flush()
-        line = setter.stdout.readline()
-    except BrokenPipeError:
-        line = b""
-    if not line:
-        raise ProcessError(f"gain_setter ended: {processes.last_words('gain_setter')}")
-    answer: dict[str, Any] = json.loads(line)
-    if "error" in answer:
-        raise ProcessError(str(answer["error"]))
-    return answer

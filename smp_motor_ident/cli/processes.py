@@ -13,13 +13,15 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import IO
+from typing import IO, Any
 
+from smp_motor_control.entry import wrong_domain
 from smp_motor_control.errors import SmpError
 from smp_motor_ident.cli import interruption
+from smp_motor_ident.errors import ParameterError
 
 _PR_SET_PDEATHSIG = 1
 _LIBC = ctypes.CDLL(None, use_errno=True)
@@ -29,6 +31,38 @@ class ProcessError(SmpError):
     """A node ended by itself, or does not do what it should."""
 
     exit_code = 1
+
+
+def connect(name: str, ros_arguments: Sequence[str] = ()) -> Any:
+    """Return the client of a running robot, for a ``with`` block; imports ROS only now.
+
+    Parameters
+    ----------
+    name : str
+        Of its node.
+    ros_arguments : sequence of str
+        Such as those that name the robot's namespace.
+
+    Returns
+    -------
+    smp_motor_control.nodes.robot_client.RobotClient
+        Not yet connected.
+
+    Raises
+    ------
+    ParameterError
+        When there is no ROS in this shell, or its domain is impossible.
+    """
+    if wrong := wrong_domain():
+        raise ParameterError(wrong)
+    try:
+        from smp_motor_control.nodes.robot_client import RobotClient
+    except ImportError as error:
+        raise ParameterError(
+            f"a running robot needs ROS, and {error.name or error} is not there; source the "
+            "workspace, or setup.bash of the repository"
+        ) from None
+    return RobotClient(ros_arguments, name)
 
 
 def free_domain(first: int = 215, last: int = 232) -> int:
@@ -93,13 +127,10 @@ class Processes:
     ----------
     logs : Path
         Folder for one ``NAME.log`` each.
-    environment : mapping of str to str
-        Added to this process's environment.
     """
 
-    def __init__(self, logs: Path, environment: Mapping[str, str] | None = None) -> None:
+    def __init__(self, logs: Path) -> None:
         self._logs = logs
-        self._environment = {**os.environ, **(environment or {}), "PYTHONUNBUFFERED": "1"}
         self._running: dict[str, subprocess.Popen[bytes]] = {}
 
     def __enter__(self) -> Processes:
@@ -121,9 +152,7 @@ class Processes:
             for number, handler in kept.items():
                 signal.signal(number, handler)
 
-    def start(
-        self, name: str, node: str, *arguments: str, pipes: bool = False, priority: int = 0
-    ) -> subprocess.Popen[bytes]:
+    def start(self, name: str, node: str, *arguments: str, priority: int = 0) -> None:
         """Start a node.
 
         Parameters
@@ -134,30 +163,22 @@ class Processes:
             Name of its executable.
         *arguments : str
             Passed on to it.
-        pipes : bool
-            Whether its standard input and output are pipes rather than the log.
         priority : int
             Real-time priority, if the system grants it; so a busy machine does not slow the
             simulated robot down. 0 for none.
-
-        Returns
-        -------
-        subprocess.Popen
-            The running process.
         """
         self._logs.mkdir(parents=True, exist_ok=True)
         parent = os.getpid()
         with (self._logs / f"{name}.log").open("wb") as log, interruption.held():
-            process = self._running[name] = subprocess.Popen(
+            self._running[name] = subprocess.Popen(
                 [*_command(node), *arguments],
-                stdin=subprocess.PIPE if pipes else subprocess.DEVNULL,
-                stdout=subprocess.PIPE if pipes else log,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
                 stderr=log,
-                env=self._environment,
+                env={**os.environ, "PYTHONUNBUFFERED": "1"},
                 start_new_session=True,
                 preexec_fn=lambda: _prepare(parent, priority),
             )
-        return process
 
     def check(self, but: str = "") -> None:
         """Look whether all still run."""
@@ -218,9 +239,6 @@ class Processes:
                 break
         for process in group:
             _signal(process, signal.SIGKILL)  # what a node may have left in its group
-            for pipe in (process.stdin, process.stdout):
-                if pipe is not None:
-                    pipe.close()
 
 
 def _command(node: str) -> list[str]:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,7 +11,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from smp_motor_ident.cli.processes import ProcessError, Processes
+from smp_motor_ident.cli.processes import connect
 from smp_motor_ident.errors import DesignError, ParameterError
 from smp_motor_ident.report.document import check_free, write_together
 from smp_motor_ident.tune.arrays import Array
@@ -40,25 +38,13 @@ def tune_by_relay(arguments: argparse.Namespace, files: Sequence[Path]) -> int:
             f"a bias of {bias:g} V"
         )
     check_free(files, arguments.force)
-    values = {
-        "bias": bias,
-        "amplitude": amplitude,
-        "hysteresis": arguments.relay_hysteresis,
-        "seconds": arguments.relay_seconds,
-    }
-    print(f"{wheel} turns at {bias:g} V, then switches by {amplitude:g} V around it")
-    options = [text for name, value in values.items() for text in (f"--{name}", str(value))]
-    with tempfile.TemporaryDirectory() as logs, Processes(Path(logs)) as processes:
-        test = processes.start("relay_test", "relay_test", wheel, *options, pipes=True)
-        assert test.stdout is not None
-        line = test.stdout.readline()
-        if not line:
-            raise ProcessError(f"relay_test ended: {processes.last_words('relay_test')}")
-        answer = json.loads(line)
-        processes.wait("relay_test", 30.0)
-    if "error" in answer:
-        raise ProcessError(answer["error"])
-    gain, period = read_oscillation(*evenly(answer))
+    print(f"{wheel} turns at {bias:g} V, then switches by {amplitude:g} V around it", flush=True)
+    with connect("tune", arguments.ros_arguments) as robot:
+        from smp_motor_control.nodes.relay_test import Relay, oscillate
+
+        relay = Relay(bias, amplitude, arguments.relay_hysteresis)
+        seen = oscillate(robot, wheel, relay, arguments.relay_seconds)
+    gain, period = read_oscillation(*evenly(vars(seen)))
     rule, structure = arguments.rule or "tyreus_luyben", arguments.structure or "pi"
     ruled = by_rule(rule, structure, gain, period)
     told = (
@@ -76,7 +62,7 @@ def tune_by_relay(arguments: argparse.Namespace, files: Sequence[Path]) -> int:
             "u_clamp_max": float(supply),
             "antiwindup_strategy": "back_calculation",
         }
-        tree = {f"/{wheel}/wheel_pid": {"ros__parameters": parameters}}
+        tree = {f"/**/{wheel}/wheel_pid": {"ros__parameters": parameters}}
         text = f"# Tuned by relay feedback. {told}\n" + yaml.safe_dump(tree, sort_keys=False)
         write_together({files[0]: text}, arguments.force)
         print(f"written: {files[0]}")
@@ -93,16 +79,14 @@ def evenly(answer: Mapping[str, Any]) -> tuple[Array, Array, float]:
     time = time[kept]
     lasted = np.diff(time)
     grid = np.arange(time[0], time[-1], step)
-    if answer["applied"] is None:
-        turned = np.array(answer["voltage"])[kept][:-1] * lasted
-    else:
-        turned = np.array(answer["applied"])[kept][1:] * lasted
+    applied, angle = (np.array(answer[name])[kept] for name in ("applied", "angle"))
+    if not np.isfinite(applied).all():  # the hardware does not tell it
+        applied = np.concatenate([[0.0], np.array(answer["voltage"])[kept][:-1]])
+    turned = applied[1:] * lasted
     # Means over intervals, long and short, are exact as integrals at their ends.
     volt_seconds = np.concatenate([[0.0], np.cumsum(turned)])
-    if answer["angle"] is None:
+    if not np.isfinite(angle).all():
         angle = np.concatenate([[0.0], np.cumsum(np.array(answer["speed"])[kept][1:] * lasted)])
-    else:
-        angle = np.array(answer["angle"])[kept]
     voltage, speed = (np.diff(np.interp(grid, time, x)) / step for x in (volt_seconds, angle))
     return voltage, speed, step
 

@@ -8,10 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
-from smp_motor_ident.cli import identify, tune
-from smp_motor_ident.cli.conductor import Conductor
+from smp_motor_ident.cli import applying, identify, tune
 from smp_motor_ident.cli.processes import ProcessError, Processes
 from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.report.document import read_identification
@@ -42,13 +39,14 @@ class Robot:
     """A robot whose nodes run, and where its results go."""
 
     processes: Processes
-    conductor: Conductor
+    client: Any
     wheels: tuple[str, ...]
     folder: Path
+    ros_arguments: tuple[str, ...] = ()
 
     def wheel_nodes(self) -> list[str]:
-        """Return the full names of the wheels' controllers."""
-        return [f"/{wheel}/wheel_pid" for wheel in self.wheels]
+        """Return the names of the wheels' controllers."""
+        return [f"{wheel}/wheel_pid" for wheel in self.wheels]
 
     def switch(self, transition: str) -> None:
         """Let every wheel's controller go through a lifecycle transition.
@@ -58,8 +56,7 @@ class Robot:
         transition : str
             ``configure``, ``activate`` or ``deactivate``.
         """
-        for node in self.wheel_nodes():
-            self.conductor.ask("change_state", node=node, transition=transition)
+        self.client.change_states(self.wheel_nodes(), transition)
 
 
 TOPICS = "/(.*/)?(motor_.*|pid_state|wheel_setpoints|cmd_vel|odom|joint_states|diagnostics)"
@@ -82,9 +79,10 @@ def record(robot: Robot, name: str) -> Path:
         Where it is written.
     """
     bag = robot.folder / name
-    robot.processes.start("record", "record", "--output", str(bag), "--regex", TOPICS)
-    topics = [f"/{wheel}/motor_state" for wheel in robot.wheels]
-    robot.conductor.ask("wait_for_listener", node="record", topics=topics, timeout=20.0)
+    arguments = ("--output", str(bag), "--regex", TOPICS, *robot.ros_arguments)
+    robot.processes.start("record", "record", *arguments)
+    topics = [f"{wheel}/motor_state" for wheel in robot.wheels]
+    robot.client.wait_for_listener("record", topics, timeout=20.0)
     return bag
 
 
@@ -98,7 +96,7 @@ def excite(robot: Robot, plan: Sequence[Excitation]) -> None:
             "duration": float(part.duration),
         }
         arguments = [a for n, v in parameters.items() for a in ("-p", f"{n}:={v}")]
-        robot.processes.start("excite", "excite", "--ros-args", *arguments)
+        robot.processes.start("excite", "excite", *robot.ros_arguments, "--ros-args", *arguments)
         robot.processes.wait("excite", part.duration + 20.0)
 
 
@@ -111,7 +109,7 @@ def identify_wheels(bag: Path, output: Path, *options: str) -> dict[str, Estimat
 def tune_wheels(identified: Path, output: Path, *options: str) -> dict[str, dict[str, Any]]:
     """Run ``tune`` on an identification."""
     _succeed("tune", tune.main([str(identified), "--output", str(output), *options]))
-    return read_parameters(output)
+    return applying.from_file(output)
 
 
 def _succeed(tool: str, code: int) -> None:
@@ -119,28 +117,6 @@ def _succeed(tool: str, code: int) -> None:
         raise KeyboardInterrupt
     if code != 0:
         raise ProcessError(f"{tool} ended with exit code {code}, see above")
-
-
-def read_parameters(path: Path) -> dict[str, dict[str, Any]]:
-    """Read a ROS parameter file."""
-    try:
-        document = yaml.safe_load(path.read_text(encoding="utf-8"))
-        return {
-            "/" + node.strip("/"): dict(_flat(entry["ros__parameters"]))
-            for node, entry in document.items()
-        }
-    except (OSError, yaml.YAMLError, KeyError, TypeError, AttributeError) as error:
-        raise ParameterError(f"{path}: is no ROS parameter file ({error})") from None
-
-
-def _flat(tree: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
-    pairs: list[tuple[str, Any]] = []
-    for name, value in tree.items():
-        if isinstance(value, Mapping):
-            pairs += _flat(value, f"{prefix}{name}.")
-        else:
-            pairs.append((prefix + name, value))
-    return pairs
 
 
 def set_gains(robot: Robot, gains: Mapping[str, Mapping[str, Any]]) -> None:
@@ -151,10 +127,9 @@ def set_gains(robot: Robot, gains: Mapping[str, Mapping[str, Any]]) -> None:
     robot : Robot
         That runs.
     gains : mapping of str to mapping
-        Parameters by full node name.
+        Parameters by wheel.
     """
-    for node, parameters in gains.items():
-        robot.conductor.ask("set_parameters", node=node, parameters=dict(parameters))
+    robot.client.set_parameters({f"{wheel}/wheel_pid": dict(p) for wheel, p in gains.items()})
 
 
 def config(name: str) -> Path:

@@ -40,8 +40,8 @@ def list_topics(paths: Sequence[str], msg_files: Sequence[str], program: str) ->
         out.print(listing.name, style="bold")
         for offer in listing.offers:
             _print_offer(out, offer)
-        for text in listing.notes:
-            out.print(f"note: {text}", soft_wrap=True)
+        for finding in listing.findings:
+            out.print(f"{finding.severity}: {finding.message}", soft_wrap=True)
         if not listing.needs_mapping:
             out.print("no mapping is needed: the wheels are described by our own messages")
         elif listing.suggestion:

@@ -94,7 +94,7 @@ def _work(arguments: argparse.Namespace) -> int:
         write_together(dict(zip(files, (text, document, figure), strict=True)), arguments.force)
         print(f"written: {files[0]}, beside it {files[1].name} and {files[2].name}")
     if arguments.apply:
-        return 0 if applying.apply(applying.from_designs(wheels.designs), arguments.watch) else 1
+        return applying.apply(applying.from_designs(wheels.designs), arguments)
     return 0
 
 
@@ -115,7 +115,7 @@ def _apply_file(arguments: argparse.Namespace) -> int:
     """Set the gains of a file, as they are."""
     if arguments.source is not None or arguments.output is not None or not arguments.apply:
         raise ParameterError("--gains goes with --apply alone, without a source and --output")
-    return 0 if applying.apply(applying.from_file(arguments.gains), arguments.watch) else 1
+    return applying.apply(applying.from_file(arguments.gains), arguments)
 
 
 def _files(arguments: argparse.Namespace) -> list[Path]:

@@ -85,7 +85,7 @@ def show(
                 f"{error / std:+.1f}" if std else "",
                 quantity.unit,
             )
-        mine = gains[f"/{wheel}/wheel_pid"]
+        mine = gains[wheel]
         told = ", ".join(f"{n} {mine[n]:.4g}" for n in GAINS if mine.get(n))
         driven = table("", "manoeuvre", "from", "to", "rise", "settling", "overshoot")
         for one in answers[wheel]:

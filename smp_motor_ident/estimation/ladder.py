@@ -119,7 +119,7 @@ def _friction_shows(data: Experiments, fit: Fit, surely_small: bool) -> bool:
     found = max(float(step[i]), 0.0)
     if not np.isfinite(found) or (found / std) ** 2 > 0.5 * np.log(fit.samples):
         return True
-    return surely_small and found + 2 * std > LITTLE * float(np.abs(data.section_value).max())
+    return surely_small and found + 2 * std > LITTLE * float(np.abs(data.hold_value).max())
 
 
 def _may_rub(data: Experiments, fit: Fit, options: Options) -> bool:
@@ -130,7 +130,7 @@ def _may_rub(data: Experiments, fit: Fit, options: Options) -> bool:
     """
     if one_level(data, fit) or _friction_shows(data, fit, True):
         return True
-    little = LITTLE * float(np.abs(data.section_value).max())
+    little = LITTLE * float(np.abs(data.hold_value).max())
     z, initials = rubbing(data, fit, little)
     held = {**fit.structure.held, "vc_plus": little}
     rubs = fit.structure.with_(friction="symmetric", held=held)
@@ -337,7 +337,7 @@ def _without_friction(data: Experiments, best: Fit, options: Options, rungs: lis
     plain = descent.refine(data, smooth, best, best.z, options)
     if plain.deviance < best.deviance:  # then friction has led astray
         z = plain.z.copy()
-        z[models.VC_PLUS] = 1e-3 * np.abs(data.section_value).max()
+        z[models.VC_PLUS] = 1e-3 * np.abs(data.hold_value).max()
         again = descent.refine(data, s, plain, s.complete(z), options)
         best = min(best, again, key=lambda f: f.deviance)
     # Friction that the data do not show stays where a little would explain them as well:

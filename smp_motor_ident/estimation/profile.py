@@ -90,13 +90,13 @@ def one_level(data: Experiments, fit: Fit) -> bool:
     speed = np.abs(simulate(data, settled)[:, 0])
     index = np.zeros(data.size, dtype=np.int64)
     for g, (a, b) in enumerate(zip(data.starts[:-1], data.starts[1:], strict=True)):
-        first = int(data.section_start[g])
-        last = data.section_end.size
-        last = int(data.section_start[g + 1]) if g + 2 < data.starts.size else last
-        ends = data.section_end[first:last]
+        first = int(data.hold_start[g])
+        last = data.hold_end.size
+        last = int(data.hold_start[g + 1]) if g + 2 < data.starts.size else last
+        ends = data.hold_end[first:last]
         within = np.searchsorted(ends, data.time[a:b] - 1e-9)
         index[a:b] = first + np.minimum(within, last - first - 1)
-    driven = np.abs(data.section_value[index][speed > REST.value * speed.max()])
+    driven = np.abs(data.hold_value[index][speed > REST.value * speed.max()])
     level = float(np.median(driven)) if driven.size else 0.0
     return bool(np.all(np.abs(driven - level) <= SAME_LEVEL.value * level))
 
@@ -121,7 +121,7 @@ def _range(data: Experiments, fit: Fit, coordinate: int) -> tuple[float, float]:
     if coordinate == models.A2:
         return float(fit.z[models.A2] - FARTHEST), float(fit.z[models.A2] + FARTHEST)
     if coordinate == models.VC_PLUS:
-        return 0.0, MOST_FRICTION * float(np.abs(data.section_value).max())
+        return 0.0, MOST_FRICTION * float(np.abs(data.hold_value).max())
     return (1e-9 if coordinate == models.WINDOW else 0.0), float(np.ptp(data.time))
 
 
@@ -182,7 +182,7 @@ def rubbing(data: Experiments, near: Fit, value: float) -> tuple[Array, list[Arr
     At one level of voltage these answer exactly alike: all of the response scales.  A segment
     may also have begun at rest.
     """
-    full = float(np.abs(data.section_value).max())
+    full = float(np.abs(data.hold_value).max())
     scale = (full - value) / max(full - near.z[models.VC_PLUS], 1e-9)
     z = near.z.copy()
     z[[models.A0, models.A1, models.A2]] += np.log(scale)
@@ -190,7 +190,7 @@ def rubbing(data: Experiments, near: Fit, value: float) -> tuple[Array, list[Arr
     moving = near.initial.copy()
     sign = np.sign(near.initial[:, 1])
     moving[:, 0] = scale * (moving[:, 0] - sign * near.z[models.VC_PLUS]) + sign * value
-    before = np.abs(data.section_value[data.section_start[: len(moving)]])
+    before = np.abs(data.hold_value[data.hold_start[: len(moving)]])
     at_rest = before < max(value, near.z[models.VC_PLUS])
     if not np.any(at_rest & near.initial[:, :2].any(axis=1)):
         return z, [moving]

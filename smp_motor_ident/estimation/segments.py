@@ -18,6 +18,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2, t
+from scipy.stats import f as f_distribution
 
 from smp_motor_ident.diagnosis.limits import HOMOGENEITY, SEGMENT_INFORMATION, SEGMENTS
 from smp_motor_ident.estimation.fit import Fit
@@ -58,10 +59,16 @@ def heterogeneous(data: Experiments, fit: Fit) -> tuple[Fit, dict[str, float]]:
     middle, step, cov, free = found
     parts, size = step.shape
     expected = np.einsum("bii->i", cov) / parts
-    drift = np.square(middle @ step) / np.square(middle).sum() / expected
-    ratio = step.var(axis=0, ddof=1) * (parts - 1) / expected
-    each = HOMOGENEITY.value / (2 * size)  # Bonferroni
-    changed = (ratio > chi2.isf(each, parts - 1)) | (drift > chi2.isf(each, 1))
+    square = float(np.square(middle).sum())
+    scatter = np.square(step - step.mean(axis=0)).sum(axis=0)
+    drift = np.square(middle @ step) / square
+    own = (scatter - drift) / (parts - 2)  # a drift is judged by its own scatter as well
+    each = HOMOGENEITY.value / (3 * size)  # Bonferroni: three tests of each coordinate
+    changed = (
+        (scatter / expected > chi2.isf(each, parts - 1))
+        | (drift / expected > chi2.isf(each, 1))
+        | (drift / np.maximum(own, 1e-300) > f_distribution.isf(each, 1, parts - 2))
+    )
     if not changed.any():
         return fit, {}
     step, cov = step[:, changed], cov[np.ix_(np.arange(parts), changed, changed)]
@@ -155,13 +162,13 @@ def _parted(data: Experiments, fit: Fit, parts: int) -> Experiments:
     gather(data, fit.structure, fit.z, fit.initial, fit.gain, fit.noise, predicted=predicted,
            differentiate=False)  # fmt: skip
     for n, (begin, g) in enumerate(zip(starts[:-1], owner, strict=True)):
-        a = int(data.section_start[g])
-        last = int(data.section_start[g + 1]) if g + 2 < data.starts.size else data.section_end.size
-        first[n] = a + np.searchsorted(data.section_end[a:last], data.time[begin] - 1e-12)
+        a = int(data.hold_start[g])
+        last = int(data.hold_start[g + 1]) if g + 2 < data.starts.size else data.hold_end.size
+        first[n] = a + np.searchsorted(data.hold_end[a:last], data.time[begin] - 1e-12)
         if begin == data.starts[g]:
             initial[n] = fit.initial[g]
             continue
-        voltage = data.section_value[min(int(first[n]), last - 1)]
+        voltage = data.hold_value[min(int(first[n]), last - 1)]
         initial[n] = (
             voltage - fit.z[models.LOAD],
             predicted[begin, 0],
@@ -170,5 +177,5 @@ def _parted(data: Experiments, fit: Fit, parts: int) -> Experiments:
         )
         if data.kind != rc.ANGLE or not np.isfinite(data.output[begin]):
             initial[n, 2] = predicted[begin, 1] if data.kind == rc.ANGLE else 0.0
-    return replace(data, starts=starts, section_start=np.append(first, data.section_start[-1]),
+    return replace(data, starts=starts, hold_start=np.append(first, data.hold_start[-1]),
                    initial=initial)  # fmt: skip

@@ -1,4 +1,4 @@
-"""What `record` and `play` share: arguments beside those of ROS, message classes by name."""
+"""What `record` and `play` share: patterns of topics, message classes by name."""
 
 from __future__ import annotations
 
@@ -7,23 +7,6 @@ import re
 from typing import Any
 
 from smp_motor_control.errors import SmpError
-
-
-def split_arguments(argv: list[str]) -> tuple[list[str], list[str]]:
-    """Return our own arguments, and those between ``--ros-args`` and ``--``."""
-    own: list[str] = []
-    ros: list[str] = []
-    inside = False
-    for argument in argv:
-        if argument == "--ros-args":
-            inside = True
-        if inside:
-            ros.append(argument)
-        else:
-            own.append(argument)
-        if argument == "--":
-            inside = False
-    return own, ros
 
 
 def message_class(type_name: str) -> Any | None:

@@ -19,9 +19,10 @@ from rosgraph_msgs.msg import Clock
 
 from smp_motor_control.errors import SmpError
 from smp_motor_control.nodes import runtime
+from smp_motor_control.ros_arguments import split_arguments
 from smp_motor_ident.bag.replay import Replay, offered
 from smp_motor_ident.bag.storage import Channel
-from smp_motor_ident.nodes.bag_arguments import message_class, pattern, split_arguments
+from smp_motor_ident.nodes.bag_arguments import message_class, pattern
 
 DEPTH = 1000
 FIND_EACH_OTHER = 1.0
@@ -189,7 +190,7 @@ class Player(Node):
         """Stop the thread and tell what was sent."""
         self._ended.set()
         self._thread.join(timeout=1.0)
-        for note in self._replay.notes:
+        for note in (f.message for f in self._replay.findings):
             print(f"play: {note}", file=sys.stderr, flush=True)
         for name, count in sorted(self.sent.items()):
             print(f"{count:9d}  {name}", flush=True)

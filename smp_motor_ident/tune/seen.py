@@ -19,11 +19,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import expm
 
 from smp_motor_control.motor.model import MotorModel
-from smp_motor_control.observer import ObserverNoise
-from smp_motor_control.observer_gain import steady_gain
+from smp_motor_control.observer import ObserverNoise, prediction, steady_gain
 from smp_motor_ident.tune.arrays import Array, Complex
 
 SPEED = 1
@@ -70,26 +68,9 @@ def seen_by_observer(
     model: MotorModel, sample_time: float, quantum: float, noise: ObserverNoise, loop_delay: float
 ) -> Seen:
     """Return the steady-state observer of a model as a filter."""
-    K, tau, tp = model.dc_gain, model.time_constant, model.time_constant_product
-    gain = steady_gain(model, quantum, noise, sample_time)
-    if tp:
-        drift = np.array(
-            [
-                [0.0, 1.0, 0.0, 0.0],
-                [0.0, 0.0, 1.0, 0.0],
-                [0.0, -1 / tp, -tau / tp, -K / tp],
-                [0.0, 0.0, 0.0, 0.0],
-            ]
-        )
-        entry, correct = np.array([0.0, 0.0, K / tp, 0.0]), np.array(gain[:4])
-    else:
-        drift = np.array([[0.0, 1.0, 0.0], [0.0, -1 / tau, -K / tau], [0.0, 0.0, 0.0]])
-        entry, correct = np.array([0.0, K / tau, 0.0]), np.array([gain[0], gain[1], gain[3]])
-    size = entry.size
-    block = np.zeros((size + 1, size + 1))
-    block[:size, :size], block[:size, size] = drift, entry
-    step = expm(block * sample_time)
-    F, G = step[:size, :size], step[:size, size]
+    correct = np.array(steady_gain(model, quantum, noise, sample_time)[:4])
+    (F,), (G,) = prediction(model, np.array([sample_time]))
+    size = correct.size
     # Rows: what the innovation is made of.
     innovation = np.concatenate([[1.0], -F[0, 1:]])
     advance = np.zeros((size, size))

@@ -59,12 +59,13 @@ def test_stamp_from_the_future_does_not_hold_any_longer() -> None:
 
 
 @pytest.mark.parametrize("bad", [(math.nan, 0.0), (0.0, math.inf), (-math.inf, math.nan)])
-def test_command_that_is_not_finite_keeps_the_one_before_and_its_clock(bad: tuple) -> None:
+def test_command_that_is_not_finite_is_no_sign_of_life(bad: tuple) -> None:
     command = BodyCommand(0.5)
     command.receive(1.0, 0.5, 0.0, 10.0)
-    assert command.receive(*bad, 0.0, 10.4) is Verdict.NOT_FINITE
-    assert command.at(10.8) == (1.0, 0.5)
-    assert command.at(10.91) == (0.0, 0.0)
+    for k in range(1, 11):
+        assert command.receive(*bad, 0.0, 10.0 + 0.1 * k) is Verdict.NOT_FINITE
+        expected = (1.0, 0.5) if k <= 5 else (0.0, 0.0)
+        assert command.at(10.0 + 0.1 * k - 0.01) == expected
 
 
 def test_reset_forgets_the_command() -> None:

@@ -6,12 +6,13 @@ import math
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 from smp_motor_control.encoder import DifferencedSpeed, Encoder
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.motor.friction import Motor, MotorParameters
 from smp_motor_control.motor.model import MotorModel
-from smp_motor_control.observer import ObserverNoise, SpeedObserver
+from smp_motor_control.observer import ObserverNoise, SpeedObserver, prediction, steady_gain
 
 # Table 1 of the paper, motors 1 (oscillating poles) and 2 (real poles), and one without L.
 MOTORS = {
@@ -254,3 +255,49 @@ def test_impossible_model_is_refused_by_name(name: str, value: float) -> None:
     numbers = {"dc_gain": 25.0, "time_constant": 0.05, name: value}
     with pytest.raises(ParameterError, match=name):
         MotorModel(**numbers)
+
+
+@pytest.mark.parametrize("electrical", [2e-4, 1e-3, 1e-2])
+def test_gain_is_that_of_the_recursion_run_in_fine_steps(electrical: float) -> None:
+    # The covariance carried step by step through fiftieths of L/R, in which the exponential of
+    # Van Loan's block matrix is harmless, and corrected every 20 ms, until it repeats.
+    dt, tau, gain, quantum, noise = 0.02, 0.1, 20.0, 2.0 * math.pi / 500.0, ObserverNoise()
+    tp = tau * electrical
+    drift = np.zeros((4, 4))
+    drift[0, 1] = drift[1, 2] = 1.0
+    drift[2] = [0.0, -1.0 / tp, -tau / tp, -gain / tp]
+    sources = np.diag([0.0, 0.0, noise.voltage * gain / tp, noise.load]) ** 2
+    pieces = math.ceil(50.0 * dt / electrical)
+    block = np.block([[-drift, sources], [np.zeros((4, 4)), drift.T]]) * dt / pieces
+    piece = expm(block)
+    short = piece[4:, 4:].T
+    F, Q = np.eye(4), np.zeros((4, 4))
+    for _ in range(pieces):
+        Q = short @ Q @ short.T + short @ piece[:4, 4:]
+        F = short @ F
+    P, R = np.diag([1.0, 1e2, 1e6, 1.0]), (noise.count * quantum) ** 2
+    for _ in range(400):
+        K = P[:, 0] / (P[0, 0] + R)
+        P = F @ (P - np.outer(K, P[0])) @ F.T + Q
+    K = P[:, 0] / (P[0, 0] + R)
+    model = MotorModel(dc_gain=gain, time_constant=tau, time_constant_product=tp)
+    # Rounding of 5,000 products, the squared entries of which span ten decades.
+    assert steady_gain(model, quantum, noise, dt)[:4] == pytest.approx(K, rel=1e-6)
+
+
+def test_gain_stabilises_the_observer_of_any_motor_at_any_rate() -> None:
+    rng = np.random.default_rng(5)
+    for _ in range(100):
+        electrical, tau = 10.0 ** rng.uniform(-9, -2), 10.0 ** rng.uniform(-3, 1)
+        model = MotorModel(
+            dc_gain=10.0 ** rng.uniform(-1, 3),
+            time_constant=tau + electrical,
+            time_constant_product=tau * electrical,
+        )
+        dt = 10.0 ** rng.uniform(-4, 0)
+        gain = steady_gain(model, 2.0 * math.pi / 500.0, ObserverNoise(), dt)
+        (F,), _ = prediction(model, np.array([dt]))
+        # In time constants, so that the eigenvalues are not those of a badly scaled matrix.
+        scale = np.array([1.0, 1.0 / tau, 1.0 / (tau * electrical), 1.0 / (tau * model.dc_gain)])
+        error = (F - np.outer(F @ np.array(gain[:4]), [1.0, 0.0, 0.0, 0.0])) * scale
+        assert np.abs(np.linalg.eigvals(error / scale[:, None])).max() < 1.0

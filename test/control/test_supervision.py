@@ -7,14 +7,8 @@ import math
 import pytest
 
 from smp_motor_control.errors import ParameterError
-from smp_motor_control.wheel.supervision import (
-    Fault,
-    FaultDetector,
-    FaultLimits,
-    FeedbackClock,
-    Latch,
-    Verdict,
-)
+from smp_motor_control.wheel.faults import Fault, FaultDetector, FaultLimits, Recovery
+from smp_motor_control.wheel.freshness import FeedbackClock, Verdict
 
 MS = 1_000_000
 START = 1_700_000_000 * 1_000_000_000
@@ -137,33 +131,87 @@ def test_current_above_its_limit_counts_only_after_its_time():
     assert detector.found is Fault.OVER_CURRENT
 
 
-def test_fault_is_released_by_a_zero_set_point_or_after_a_pause_that_doubles():
-    latch = Latch(first_pause=2.0)
-    latch.set(Fault.STALL, 100.0)
-    assert not latch.may_release(0.0, 100.1)
-    assert latch.may_release(0.0, 100.6)
-    now, pauses = 200.0, []
-    for _ in range(6):
-        latch.set(Fault.STALL, now)
+def test_fault_is_released_three_times_ever_later_and_then_by_a_reset_alone():
+    recovery, now, pauses = Recovery(first_pause=2.0), 100.0, []
+    for _ in range(3):
+        recovery.set(Fault.RUNAWAY, now)
         begin = now
-        while not latch.may_release(1.0, now):
+        while not recovery.may_release(1.0, now):
             now += 0.01
         pauses.append(now - begin)
-    assert pauses == pytest.approx([2.0, 4.0, 8.0, 16.0, 30.0, 30.0], abs=0.02)
+    assert pauses == pytest.approx([2.0, 4.0, 8.0], abs=0.02)
+    recovery.set(Fault.RUNAWAY, now)
+    assert recovery.latched
+    assert not recovery.may_release(1.0, now + 1e6) and not recovery.may_release(0.0, now + 1e6)
+    recovery.reset()
+    assert recovery.fault is None and not recovery.cautious
+
+
+def test_zero_set_point_releases_when_it_has_stood_for_half_a_second():
+    recovery = Recovery(first_pause=0.0)
+    recovery.set(Fault.STALL, 100.0)
+    assert not recovery.may_release(0.0, 100.1)
+    assert not recovery.may_release(1.0, 1e6)
+    assert recovery.may_release(0.0, 100.6)
+
+
+def test_try_is_limited_to_a_small_voltage_until_the_wheel_turns_as_driven():
+    recovery = Recovery()
+    recovery.set(Fault.RUNAWAY, 0.0)
+    recovery.may_release(1.0, 10.0)
+    most = 1.05 * LIMITS.stall_voltage
+    assert recovery.limited(12.0, 0.0, 0.01, LIMITS) == most
+    for _ in range(50):
+        assert recovery.limited(-12.0, 0.5, 0.01, LIMITS) == -most
+    trusted = [recovery.limited(12.0, 0.5, 0.01, LIMITS) for _ in range(201)]
+    # Six tenths of a second of turning as driven, then two seconds until it is forgotten.
+    assert trusted[:59] == [most] * 59 and trusted[61:199] == [12.0] * 138
+    assert not recovery.cautious and recovery.failures == 0
 
 
 def test_wheel_that_gave_no_counts_is_released_by_counts():
     for fault, released in ((Fault.DEAD_ENCODER, True), (Fault.RUNAWAY, False)):
-        latch = Latch(first_pause=0.0)
-        latch.set(fault, 0.0)
-        assert latch.may_release(1.0, 0.1, turns=True) is released
+        recovery = Recovery(first_pause=0.0)
+        recovery.set(fault, 0.0)
+        assert recovery.may_release(1.0, 0.1, turns=True) is released
 
 
-def test_without_a_pause_only_a_zero_set_point_releases():
-    latch = Latch(first_pause=0.0)
-    latch.set(Fault.RUNAWAY, 0.0)
-    assert not latch.may_release(1.0, 1e6)
-    assert latch.may_release(0.0, 1e6)
+def follow(speed, reference=2.0, saturated=False, kv=math.nan) -> tuple[float, Fault | None]:
+    """Step at 200 Hz under 12 V for two seconds; return when a fault shows, and which."""
+    detector = FaultDetector(LIMITS)
+    detector.volts_per_speed = kv
+    for k in range(400):
+        t = 0.005 * (k + 1)
+        fault = detector.follow(0.005, reference, speed(t), 12.0, saturated)
+        if fault:
+            return t, fault
+    return math.inf, None
+
+
+@pytest.mark.parametrize(
+    ("speed", "options", "fault"),
+    [
+        (lambda t: 0.0, {}, Fault.NOT_FOLLOWING),
+        (lambda t: 0.3, {}, Fault.NOT_FOLLOWING),
+        (lambda t: 4.0, {}, Fault.NOT_FOLLOWING),
+        (lambda t: -1.0, {}, Fault.WRONG_WAY),
+        (lambda t: 1.0 + t, {"reference": 0.0}, Fault.NOT_FOLLOWING),
+        (lambda t: 1.5, {}, None),
+        (lambda t: 2.0 + 2.0 * (-1.0) ** round(200 * t), {}, None),  # noise of an encoder
+        (lambda t: 2.0 * (1.0 - math.exp(-t / 1.5)), {}, None),  # a heavy robot
+        (lambda t: -2.0 + 6.0 * t if t < 0.66 else 2.0, {}, None),  # it reverses
+        (lambda t: 4.6, {"reference": 10.0, "saturated": True}, None),
+        (lambda t: 4.6, {"reference": 10.0, "saturated": True, "kv": 2.55}, None),
+        (lambda t: 1.0, {"reference": 10.0, "saturated": True, "kv": 2.55}, Fault.NOT_FOLLOWING),
+        (lambda t: 1.0, {"reference": 10.0, "saturated": True}, Fault.NOT_FOLLOWING),
+    ],
+)
+def test_wheel_that_does_not_follow_is_found_within_half_a_second_and_no_other(
+    speed, options, fault
+):
+    instant, found = follow(speed, **options)
+    assert found is fault
+    assert instant <= 0.5 or fault is None
 
 
 def test_limits_out_of_range_are_refused():

@@ -141,13 +141,13 @@ def test_relay_feedback_bears_lost_samples():
     # One sample of twenty is a straight line between its neighbours, a twelfth of a period apart.
     assert (gain, period) == pytest.approx(whole, rel=0.05)
     # Without the voltage that acted, the one that was asked for tells nearly the same.
-    asked = read_oscillation(*evenly({**answer, "applied": None}))
+    asked = read_oscillation(*evenly({**answer, "applied": [np.nan] * kept.sum()}))
     assert asked == pytest.approx(whole, rel=0.05)
 
 
 def test_relay_without_samples_is_told():
     with pytest.raises(DesignError, match="only 1 samples"):
-        evenly({"time": [0.0], "voltage": [0.0], "applied": None, "speed": [0.0], "angle": None})
+        evenly({key: [0.0] for key in ("time", "voltage", "applied", "speed", "angle")})
 
 
 def test_relay_that_does_not_oscillate_is_told():

@@ -254,11 +254,11 @@ def test_settings_change_as_a_whole_or_not_at_all(context):
     node.destroy_node()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", ["SIGINT", "SIGTERM", "SIGQUIT", "SIGHUP"])
 def test_signal_ends_a_node_cleanly_within_two_seconds(process, eventually, number):
     node = process(sys.executable, "-c", PROGRAM.format(work="pass"))
     eventually(lambda: "ready" in node.output, 20.0)
-    node.send_signal(number)
+    node.send_signal(getattr(signal, number))
     assert node.wait(2.0) == 0
     assert "stopped" in node.output
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import signal
 import sys
 import threading
 import time
@@ -115,11 +116,12 @@ def robot(process, eventually, tmp_path):
     gains.write_text(yaml.safe_dump(tree))
     plant = ("-p", f"motors_file:={MOTORS}", "-p", "command_timeout:=2.0")
     started = [process("motor_plant", "--ros-args", *plant)]
-    for wheel in WHEELS:
-        ros = ("--ros-args", "-r", f"__ns:=/{wheel}", "--params-file", gains)
-        started.append(process("wheel_pid", *ros))
+    ros = ("--ros-args", "--params-file", gains)
+    pids = {w: process("wheel_pid", *ros, "-r", f"__ns:=/{w}") for w in WHEELS}
+    started.extend(pids.values())
     rclpy.init()
     one = Robot()
+    one.processes = pids
     try:
         eventually(
             one.at_speed,
@@ -151,7 +153,7 @@ def test_apply_changes_four_running_wheels_without_a_stop(process, robot, tmp_pa
     assert "kept" in output
     assert "1 -> " in output  # the difference was shown: p was 1
     for wheel in WHEELS:
-        wanted = yaml.safe_load(gains.read_text())[f"/{wheel}/wheel_pid"]["ros__parameters"]
+        wanted = yaml.safe_load(gains.read_text())[f"/**/{wheel}/wheel_pid"]["ros__parameters"]
         assert wanted["p"] != 1.0
         assert robot.gain(wheel) == wanted["p"]
     # A stop would show as standstill; a bumpless change leaves the speed within the noise of
@@ -179,6 +181,37 @@ def test_bad_gains_are_taken_back_within_two_seconds(process, robot, eventually,
         eventually(robot.at_speed, deadline=20.0, message="did not drive on")
 
 
+def test_a_wheel_that_stops_in_the_trial_is_settled_when_it_returns(
+    process, robot, eventually, tmp_path
+):
+    gains = tmp_path / "other.yaml"
+    tree = {f"/{wheel}/wheel_pid": {"ros__parameters": {"p": 1.1}} for wheel in WHEELS}
+    gains.write_text(yaml.safe_dump(tree))
+    tune = process(
+        sys.executable, "-m", "smp_motor_ident.cli.tune", "--gains", gains, "--apply", "--watch", 20
+    )
+    eventually(lambda: robot.gain("front_left") == 1.1, deadline=60.0, message=tune.output)
+    robot.processes["rear_left"].send_signal(signal.SIGSTOP)
+    eventually(lambda: "rear_left does not answer" in tune.output, 30.0, message=tune.output)
+    robot.processes["rear_left"].send_signal(signal.SIGCONT)
+    assert tune.wait(60.0) == 1
+    assert "rear_left is back and has its old gains" in tune.output
+    assert [robot.gain(wheel) for wheel in WHEELS] == [1.0] * len(WHEELS)
+
+
+def test_a_killed_tool_leaves_the_gains_as_they_were(process, robot, eventually, tmp_path):
+    gains = tmp_path / "other.yaml"
+    tree = {f"/{wheel}/wheel_pid": {"ros__parameters": {"p": 1.1}} for wheel in WHEELS}
+    gains.write_text(yaml.safe_dump(tree))
+    tune = process(
+        sys.executable, "-m", "smp_motor_ident.cli.tune", "--gains", gains, "--apply", "--watch", 60
+    )
+    eventually(lambda: robot.gain("rear_right") == 1.1, deadline=60.0, message=tune.output)
+    tune.send_signal(signal.SIGKILL)
+    for wheel in WHEELS:
+        eventually(lambda wheel=wheel: robot.gain(wheel) == 1.0, deadline=10.0, message=wheel)
+
+
 def test_apply_without_running_wheels_says_so(process, ros_domain):
     code, output = run_tune(process, "--gains", ROOT / "config" / "gains.yaml", "--apply")
     assert code == 1
@@ -197,7 +230,7 @@ def test_relay_on_a_running_wheel_gives_gains_without_a_model(process, robot, ev
     output = tmp_path / "relay.yaml"
     code, told = run_tune(process, "--relay", "rear_right", "--supply", "12", "--output", output)
     assert code == 0, told
-    gains = yaml.safe_load(output.read_text())["/rear_right/wheel_pid"]["ros__parameters"]
+    gains = yaml.safe_load(output.read_text())["/**/rear_right/wheel_pid"]["ros__parameters"]
     share, integral, _ = RULES["tyreus_luyben", "pi"]
     ultimate, period = gains["p"] / share, gains["p"] / gains["i"] / integral
     # Whatever a busy machine adds to the delay moves the period, and the ultimate gain with it: it

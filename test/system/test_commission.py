@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -41,6 +42,26 @@ def test_it_identifies_tunes_and_sets_the_gains_of_the_running_robot(
         robot.send_setpoint(1.0)
         robot.spin_for(0.02)
     assert robot.velocity("front_left") == pytest.approx(1.0, abs=0.1)
+
+
+def test_a_killed_commission_leaves_the_controllers_as_they_were(
+    process: Process, robot: WheelRobot, eventually: Callable[..., None]
+) -> None:
+    process("motor_plant")
+    process("wheel_pid", "--ros-args", "-r", "__ns:=/rear_left")
+    eventually(lambda: robot.states["rear_left"], 30.0, robot.spin, "no robot")
+    tool = process("commission", "--output", "r", "--wheel", "rear_left", "--yes")
+    eventually(
+        lambda: abs(robot.states["rear_left"][-1].voltage) > 1.0, 60.0, robot.spin, tool.output
+    )
+    tool.send_signal(signal.SIGKILL)
+
+    def follows() -> bool:
+        robot.send_setpoint(1.0)
+        robot.spin()
+        return abs(robot.velocity("rear_left") - 1.0) < 0.1
+
+    eventually(follows, 15.0, robot.spin, "the controller is not active again")
 
 
 def test_nothing_moves_without_a_word(

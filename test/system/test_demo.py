@@ -17,7 +17,7 @@ import pytest
 from smp_motor_control import WHEELS
 from smp_motor_control.motor.file import load_motors
 from smp_motor_ident.bag import read_records
-from smp_motor_ident.cli.steps import read_parameters
+from smp_motor_ident.cli.applying import from_file
 
 LIMIT = 150.0
 """What the demo may take [s] on two cores that are its own."""
@@ -63,8 +63,8 @@ def test_the_demo_shows_everything_and_leaves_nothing_running(
     assert (result / "identification" / "report.html").stat().st_size > 100_000
     assert set(load_motors(result / "identification" / "motors.yaml")) == set(WHEELS)
     assert set(read_records([str(result / "excitation")])) == set(WHEELS)
-    gains = read_parameters(result / "gains.yaml")
-    assert set(gains) == {f"/{wheel}/wheel_pid" for wheel in WHEELS}
+    gains = from_file(result / "gains.yaml")
+    assert set(gains) == set(WHEELS)
     motors = json.loads((result / "identification" / "identification.json").read_text())["motors"]
     assert all(motors[wheel]["identifiable"] for wheel in WHEELS)
     for wheel in WHEELS:

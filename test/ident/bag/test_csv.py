@@ -92,7 +92,7 @@ def test_several_files_are_several_experiments_of_several_motors(tmp_path: Path)
     ("text", "mapping", "reason"),
     [
         ("", MAP, "is empty"),
-        ("0.0,1.0,2.0\n0.1,1.0,2.0\n", MAP, "names of its columns"),
+        ("0.0,1.0,2.0\n0.1,1.0,2.0\n", MAP, "it has c1, c2, c3"),
         ("t,u,y\n", MAP, "no rows"),
         ("t,u,y\n0,1,2\n1,1,abc\n", MAP, "line 3, column 'y': 'abc' is no number"),
         (table(), ["voltage=u velocity=speed time=t"], "no column 'speed'; it has t, u, y"),

@@ -304,9 +304,9 @@ def test_a_message_that_changed_between_distributions_is_read_by_what_fits(
     [
         ("a.mcap", b"", "is empty"),
         ("a.mcap", b"\x89MCAP", "cut off"),
-        ("a.mcap", b"hello world, this is no bag", "neither an MCAP nor a SQLite"),
+        ("a.mcap", b"hello world, this is no bag", "no recording of a known format"),
         ("a.db3", b"SQLite format 3\0", "not a readable bag"),
-        ("a.bag", b"#ROSBAG V2.0\n", "ROS 1"),
+        ("a.bag", b"#ROSBAG V1.2\n", "ROS 1 bag of version 'V1.2'"),
         ("a.db3.zstd", b"\x28\xb5\x2f\xfd\x00", "compression is cut off"),
         ("a.db3", b"SQLite format 3\0" + bytes(4080), "not a readable bag"),
     ],

@@ -14,10 +14,10 @@ from smp_motor_ident.errors import BagError
 @pytest.mark.parametrize(
     ("text", "signal"),
     [
-        ("voltage=/pwm.data*12/255", Signal("/pwm", "data", 12 / 255, 0.0, "V")),
-        ("voltage=/a/b_c.d.e[3].f", Signal("/a/b_c", "d.e[3].f", 1.0, 0.0, "V")),
-        ("voltage=/pwm.data*-12/255", Signal("/pwm", "data", -12 / 255, 0.0, "V")),
-        ("voltage=/x.data-127*12/128", Signal("/x", "data", 1.0, -127 * 12 / 128, "V")),
+        ("voltage=/pwm.data*12/255", Signal("/pwm", "data", 12 / 255, 0.0)),
+        ("voltage=/a/b_c.d.e[3].f", Signal("/a/b_c", "d.e[3].f", 1.0, 0.0)),
+        ("voltage=/pwm.data*-12/255", Signal("/pwm", "data", -12 / 255, 0.0)),
+        ("voltage=/x.data-127*12/128", Signal("/x", "data", 1.0, -127 * 12 / 128)),
         ("voltage=/x.data*2e-3 + .5:mV", Signal("/x", "data", 2e-3, 0.5, "mV")),
         ("voltage=/x.data:%", Signal("/x", "data", 1.0, 0.0, "%")),
         (
@@ -26,9 +26,9 @@ from smp_motor_ident.errors import BagError
         ),
         ("velocity=y:deg/s", Signal("", "y", 1.0, 0.0, "deg/s")),
         ("velocity=Motor_Speed(RPM):rpm", Signal("", "Motor_Speed(RPM)", 1.0, 0.0, "rpm")),
-        ('velocity="left-wheel speed"*2', Signal("", "left-wheel speed", 2.0, 0.0, "rad/s")),
-        ('velocity="a:b*c"', Signal("", "a:b*c", 1.0, 0.0, "rad/s")),
-        ("velocity=/plot/juggler/column", Signal("", "/plot/juggler/column", 1.0, 0.0, "rad/s")),
+        ('velocity="left-wheel speed"*2', Signal("", "left-wheel speed", 2.0, 0.0)),
+        ('velocity="a:b*c"', Signal("", "a:b*c", 1.0, 0.0)),
+        ("velocity=/plot/juggler/column", Signal("", "/plot/juggler/column", 1.0, 0.0)),
         ("count=/enc.ticks:counts", Signal("/enc", "ticks", 1.0, 0.0, "ticks")),
         ("time=Timestamp(ms):ms", Signal("", "Timestamp(ms)", 1.0, 0.0, "ms")),
     ],
@@ -56,7 +56,7 @@ def test_the_same_is_written_in_yaml_and_on_the_command_line(tmp_path: Path) -> 
         "types: [msgs]\n"
         "motors:\n"
         "  left:\n"
-        "    voltage: {topic: /pwm, field: data, scale: 12/255, unit: V}\n"
+        "    voltage: {topic: /pwm, field: data, scale: 12/255}\n"
         "    velocity: /joint_states.velocity[left]:rpm\n"
         "    gear_ratio: 65.5\n"
     )

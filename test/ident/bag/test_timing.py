@@ -13,8 +13,8 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from smp_motor_ident.bag import BagWriter, join_records, read_records
+from smp_motor_ident.bag.clock import fit_clock, mean_held
 from smp_motor_ident.bag.counter import unwrap
-from smp_motor_ident.bag.timing import fit_clock, mean_held
 from smp_motor_ident.errors import BagError
 
 # Without shrinking, which takes minutes where an example is a whole bag.
@@ -100,7 +100,7 @@ def test_a_counter_that_wraps_at_any_width_is_unwrapped(bits: int, seed: int, to
     assert found.resets.size == 0
     wrapped = bool((raw != truth - truth[0] + raw[0]).any())
     if not told:
-        assert bool(found.notes) == wrapped
+        assert bool(found.findings) == wrapped
 
 
 @pytest.mark.parametrize("bits", [16, 32])

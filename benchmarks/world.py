@@ -1,0 +1,146 @@
+"""Recordings with the effects of real drives: right, told why, refused, or silently wrong.
+
+An independent simulator (`world_motor`) records random motors with one of the effects of
+`world_effects` in one of three strengths; every estimate is held against the truth.  ``right``:
+no number off by more than 5 of its standard deviations and 2 %, and nothing called unreliable.
+``cause``: called unreliable, with the effect named; ``other``: with another cause, or none.
+``silent``: off by more than that without a word.
+
+Usage: python benchmarks/world.py [--motors 3] [--seed S] [--effects NAME,...] [--processes 2]
+       [--rich] [--list]
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+import traceback
+from collections import Counter
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+sys.path[:0] = [str(Path(__file__).resolve().parents[1]), str(Path(__file__).resolve().parent)]
+
+import numpy as np  # noqa: E402
+from world_effects import EFFECTS, Case  # noqa: E402
+from world_record import case, measure  # noqa: E402
+
+FAR = 5.0  # standard deviations
+SHARE = 0.02  # of the truth
+OUTCOMES = ("right", "cause", "other", "refused", "silent", "crash")
+
+
+def truth(c: Case) -> dict[str, tuple[float, float]]:
+    """Return what each number may be: lowest and highest."""
+    out = {}
+    for name, value in c.motor.truth().items():
+        low, high = c.widen.get(name, (1.0, 1.0))
+        out[name] = (low * value, high * value)
+    return out
+
+
+def errors(estimate, c: Case) -> dict[str, float]:
+    """Return by how many stated deviations each wrong number is off."""
+    wrong = {}
+    true = truth(c)
+    if not estimate.value("time_constant_product"):
+        # A first-order answer may count L/R to the lag or to the delay.
+        low, high = true["time_constant"]
+        true["time_constant"] = (low - c.motor.L / c.motor.R, high)
+    for name, q in {**estimate.combinations, **estimate.parameters}.items():
+        if name not in true or q.value is None or q.std is None or q.status != "estimated":
+            continue
+        low, high = true[name]
+        off = max(low - q.value, q.value - high, 0.0)
+        floor = SHARE * max(abs(low), abs(high))
+        if name == "static_voltage":
+            floor = max(floor, 0.005 * c.amplitude)
+        if name == "coulomb_friction":
+            floor = max(floor, 0.005 * c.amplitude * c.motor.K / c.motor.R)
+        if name == "viscous_friction":
+            floor = max(floor, SHARE * c.motor.K**2 / c.motor.R)
+        if off > floor and off > FAR * q.std:
+            wrong[name] = off / max(q.std, 1e-300)
+    return wrong
+
+
+def judge(job: tuple[int, int, int, bool]) -> tuple[int, str, str]:
+    """Simulate and estimate one case; return effect, outcome and words."""
+    number, level, seed, rich = job
+    from smp_motor_ident.errors import SmpError
+    from smp_motor_ident.estimate import estimate
+    from smp_motor_ident.record import Hardware, Record
+
+    effect = EFFECTS[number]
+    rng = np.random.default_rng(seed)
+    c = case(effect, level, rng, rich)
+    about = (
+        f"{effect.name}[{level}] seed {seed}: {c.kind} {c.rate:g} Hz n {c.samples} {c.signals} "
+        f"turn {c.turn:g} {'current ' if c.current else ''}tau {c.tau:.3g}"
+    )
+    try:
+        made = measure(c, rng)
+        counted = c.signals.startswith("counts")
+        record = Record(
+            "motor", **made, source="world",
+            hardware=Hardware(c.motor.gear, c.turn if counted else None, 0, c.motor.supply, None),
+        )  # fmt: skip
+        e = estimate(record)
+    except SmpError as refusal:
+        return number, "right" if effect.expect == "refuse" else "refused", f"{about}: {refusal}"
+    except Exception:  # a benchmark wants to go on
+        return number, "crash", f"{about}: {traceback.format_exc(limit=-3)}"
+    wrong = errors(e, c)
+    codes = [f.code for f in e.findings if f.severity == "unreliable"]
+    words = ", ".join(f"{n} {x:.0f} std" for n, x in wrong.items()) or "fine"
+    words = f"{about}: {e.model}; {words}; {codes or ''}"
+    if e.unreliable:
+        named = bool(set(codes) & set(effect.causes))
+        return number, "cause" if named else "other", words
+    if wrong or effect.expect == "refuse":
+        return number, "silent", words
+    return number, "right", words
+
+
+def main() -> None:
+    """Run and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--motors", type=int, default=3, help="an effect")
+    parser.add_argument("--seed", type=int, default=None)
+    parser.add_argument("--effects", default="")
+    parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--rich", action="store_true", help="only excitation that tells much")
+    parser.add_argument("--list", action="store_true", help="print every case")
+    args = parser.parse_args()
+    seed = args.seed if args.seed is not None else int(time.time())
+    words = [w.strip().lower() for w in args.effects.split(",") if w.strip()]
+    chosen = [
+        k for k, e in enumerate(EFFECTS) if not words or any(w in e.name.lower() for w in words)
+    ]
+    jobs = [
+        (k, n % 3, seed * 1000 + 97 * k + n, args.rich) for k in chosen for n in range(args.motors)
+    ]
+    begin = time.time()
+    counts: dict[int, Counter[str]] = {k: Counter() for k in chosen}
+    lines = []
+    with ProcessPoolExecutor(args.processes) as pool:
+        for number, outcome, about in pool.map(judge, jobs, chunksize=1):
+            counts[number][outcome] += 1
+            lines.append((outcome, about))
+    if args.list:
+        for outcome, about in lines:
+            print(f"{outcome:8} {about}")
+    print(f"\nseed {seed}, {args.motors} motors an effect, {time.time() - begin:.0f} s\n")
+    print("| effect | " + " | ".join(OUTCOMES) + " |\n|" + " --- |" * (1 + len(OUTCOMES)))
+    total: Counter[str] = Counter()
+    for k in chosen:
+        total += counts[k]
+        print(f"| {EFFECTS[k].name} | " + " | ".join(str(counts[k][o]) for o in OUTCOMES) + " |")
+    print("| all | " + " | ".join(str(total[o]) for o in OUTCOMES) + " |")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,33 @@
+"""Arguments of a program beside those of ROS."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+
+def split_arguments(argv: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return a program's own arguments, and those from ``--ros-args`` to ``--``.
+
+    Parameters
+    ----------
+    argv : sequence of str
+        Without the program's name.
+
+    Returns
+    -------
+    own, ros : list of str
+        The second one with ``--ros-args``, empty where there are none.
+
+    Examples
+    --------
+    >>> split_arguments(["bag", "--ros-args", "-r", "__ns:=/robot1", "--", "--force"])
+    (['bag', '--force'], ['--ros-args', '-r', '__ns:=/robot1', '--'])
+    """
+    own: list[str] = []
+    ros: list[str] = []
+    inside = False
+    for argument in argv:
+        inside = inside or argument == "--ros-args"
+        (ros if inside else own).append(argument)
+        inside = inside and argument != "--"
+    return own, ros

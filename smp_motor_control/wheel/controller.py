@@ -1,0 +1,423 @@
+"""One wheel's controller: events and the time in; voltage, state and what was refused out.
+
+It knows no clock and no ROS.  ``now`` is seconds on a clock that never jumps.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from statistics import median
+from typing import Protocol
+
+from smp_motor_control.encoder import Encoder
+from smp_motor_control.errors import ParameterError
+from smp_motor_control.motor.parameters import Gearbox
+from smp_motor_control.pid import PidOutput
+from smp_motor_control.wheel.acceptance import Circumstances, check
+from smp_motor_control.wheel.faults import Fault, FaultDetector, FaultLimits, Recovery
+from smp_motor_control.wheel.freshness import FeedbackClock, Verdict
+from smp_motor_control.wheel.loop import LoopSettings, WheelLoop
+
+_LARGEST_SETPOINT = 1e4
+_LEARNING = 20
+_AT_REST = 0.05
+_FRESH, _FIRST, _LATE = Verdict.FRESH, Verdict.FIRST, Verdict.LATE
+
+
+class State(Enum):
+    """What a wheel's controller is doing."""
+
+    INACTIVE = "not active"
+    WAITING = "waiting for a set-point"
+    DRIVING = "driving"
+    TIMED_OUT = "set-point timed out: braked, then 0 V"
+    NO_FEEDBACK = "no feedback: 0 V"
+    LATE_FEEDBACK = "feedback is late: 0 V"
+    BAD_FEEDBACK = "feedback is not a number or implausible: left out"
+    NOT_OURS = "not yours: another node drives this wheel: 0 V"
+    FAULT = "fault: 0 V"
+
+
+class Sample(Protocol):
+    """What the controller reads of a ``MotorState``."""
+
+    voltage: float
+    current: float
+    velocity: float
+    encoder_count: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class WheelSettings:
+    """Everything that shapes a wheel's controller.
+
+    Attributes
+    ----------
+    loop : LoopSettings
+        Of the speed loop.
+    faults : FaultLimits
+        When the wheel misbehaves.
+    setpoint_timeout : float
+        Silence of set-points after which the wheel is braked [s].
+    feedback_timeout : float
+        Silence or age of feedback after which the voltage is zero [s].
+    fault_retry : float
+        Pause before the first try of a wheel at fault [s].
+    implausible_velocity : float
+        Feedback beyond it is left out [rad/s, wheel].
+    """
+
+    loop: LoopSettings = field(default_factory=LoopSettings)
+    faults: FaultLimits = field(default_factory=FaultLimits)
+    setpoint_timeout: float = 0.5
+    feedback_timeout: float = 0.2
+    fault_retry: float = 2.0
+    implausible_velocity: float = 1000.0
+
+
+class WheelController:
+    """Decides the voltage of one wheel.
+
+    Parameters
+    ----------
+    settings : WheelSettings
+        Changed later with :meth:`configure`.
+
+    Attributes
+    ----------
+    state : State
+        What it is doing.
+    active : bool
+        Whether it answers feedback.
+    output : float
+        Voltage that was last asked for [V].
+    setpoint : float or None
+        As it holds now [rad/s]; None where there is none.
+    answer : PidOutput or None
+        Parts of the last answer; None where that was not the loop's.
+    target, measurement : float
+        Set-point and speed of that answer [rad/s, wheel].
+    refused : Counter of str
+        What was left out, and how often.
+    owner : str
+        Another node that owns the wheel by its lease; empty where nobody else does.
+    advice : str
+        Why the gains do not suit the interval of the feedback; empty where they do.
+    loop, clock, recovery : WheelLoop, FeedbackClock, Recovery
+        Its parts.
+    """
+
+    def __init__(self, settings: WheelSettings) -> None:
+        self.loop = WheelLoop(settings.loop)
+        self.recovery = Recovery()
+        self.clock = FeedbackClock(math.inf, math.inf)
+        self.refused: Counter[str] = Counter()
+        self.state = State.INACTIVE
+        self.active = False
+        self.answer: PidOutput | None = None
+        self.owner = ""
+        self.steps = 0
+        self.advice = ""
+        self._wheel = Circumstances()
+        self._intervals: list[float] = []
+        self.target = self.measurement = 0.0
+        self.supply = math.inf
+        self._detector = FaultDetector(settings.faults)
+        self.configure(settings)
+        self._forget(-math.inf)
+
+    # Settings ------------------------------------------------------------------------------
+
+    def check(self, settings: WheelSettings) -> None:
+        """Refuse a change of settings with which this wheel should not be driven.
+
+        Parameters
+        ----------
+        settings : WheelSettings
+            Each value valid by itself.
+
+        Raises
+        ------
+        ParameterError
+            See :func:`~smp_motor_control.wheel.acceptance.check`.
+        """
+        if settings.loop != self.settings.loop:
+            check(settings.loop, self._wheel)
+
+    def configure(self, settings: WheelSettings) -> None:
+        """Change the settings while running, without a jump of the voltage.
+
+        Parameters
+        ----------
+        settings : WheelSettings
+            Valid by construction.
+
+        Raises
+        ------
+        ParameterError
+            When the clamps leave nothing within the supply; nothing has changed.
+        """
+        self.loop.configure(settings.loop.within(self.supply))
+        self.settings = settings
+        self.advice = ""
+        self._detector.limits = settings.faults
+        gains = settings.loop.gains
+        self._detector.volts_per_speed = gains.feedforward_velocity
+        self._detector.static_voltage = gains.feedforward_static
+        self.recovery.first_pause = settings.fault_retry
+        if self.recovery.fault is Fault.COMPUTATION:
+            self.recovery.reset()
+        self.clock.max_age = self.clock.max_gap = settings.feedback_timeout
+
+    def set_hardware(
+        self, gearbox: Gearbox, encoder: Encoder, supply: float, resistance: float = math.nan
+    ) -> None:
+        """Learn what is between motor and wheel.
+
+        Parameters
+        ----------
+        gearbox, encoder : Gearbox, Encoder
+            Of the wheel.
+        supply : float
+            [V].
+        resistance : float
+            Of the armature [ohm]; NaN where unknown.
+
+        Raises
+        ------
+        ParameterError
+            When the supply is not positive or excludes the clamps; nothing has changed.
+        """
+        if not 0.0 < supply < math.inf:
+            raise ParameterError(f"supply_voltage is {supply!r} V; it must be positive")
+        self.settings.loop.within(supply)
+        self.supply = supply
+        self.loop.set_hardware(gearbox, encoder, 1.5 * supply)
+        self._wheel = replace(self._wheel, supply=supply, gearbox=gearbox, encoder=encoder)
+        self.configure(self.settings)
+        self._detector.resistance = resistance
+
+    # Life ----------------------------------------------------------------------------------
+
+    def activate(self, now: float) -> None:
+        """Answer feedback from now on; the wheel waits for its first set-point."""
+        self.reset(now)
+        self.active = True
+        self.state = State.WAITING
+
+    def deactivate(self) -> None:
+        """Fall silent; the caller sends a last zero."""
+        self.active = False
+        self.output = 0.0
+        self.answer = None
+        self.state = State.INACTIVE
+
+    def reset(self, now: float) -> None:
+        """Begin as before the first set-point, without faults: a person has looked at it."""
+        self._forget(now)
+        self.recovery.reset()
+        self._detector.reset()
+
+    def _forget(self, now: float) -> None:
+        self.setpoint: float | None = None
+        self._setpoint_at = -math.inf
+        self._feedback_at = now
+        self._late_at = self._bad_at = -math.inf
+        self._expired = False
+        self._resume = True
+        self.output = 0.0
+        self.answer = None
+        self.clock.reset()
+        self.loop.reset_speed()
+
+    # Events --------------------------------------------------------------------------------
+
+    def take_setpoint(self, value: float, now: float, age: float = 0.0) -> None:
+        """Take in a set-point; one that is no number does not count as a sign of life.
+
+        Parameters
+        ----------
+        value : float
+            [rad/s].
+        now : float
+            [s].
+        age : float
+            Time since its stamp [s].
+        """
+        if not -_LARGEST_SETPOINT <= value <= _LARGEST_SETPOINT:
+            self.refuse("set-point that is not a number or absurd")
+        elif age > self.settings.setpoint_timeout:
+            self.refuse("set-point that is out of date by its stamp")
+        else:
+            self.setpoint = value
+            self._setpoint_at = now
+
+    def take_feedback(self, sample: Sample, stamp: int, arrival: int, now: float) -> float | None:
+        """Take in a sample and answer it.
+
+        Parameters
+        ----------
+        sample : Sample
+            As the hardware reports it.
+        stamp, arrival : int
+            On the stamps' clock [ns].
+        now : float
+            [s].
+
+        Returns
+        -------
+        float or None
+            Voltage to command [V]; None where nothing is to be sent.
+        """
+        self.answer = None
+        verdict = self.clock.accept(stamp, arrival)
+        if verdict is not _FRESH:
+            return self._not_fresh(verdict, now)
+        velocity, voltage, dt = sample.velocity, sample.voltage, self.clock.dt
+        limit = self.settings.implausible_velocity
+        if not -limit <= velocity <= limit:
+            self._bad_at = now
+            self.refuse("feedback velocity that is not a number or implausible")
+            return None
+        if voltage - voltage != 0.0:
+            voltage = self.output
+        try:
+            measurement = self.loop.speed(dt, velocity, sample.encoder_count, voltage)
+            if not -limit <= measurement <= limit:
+                if measurement == measurement:
+                    self._bad_at = now
+                    self.refuse("feedback count that jumps")
+                    self.loop.reset_speed()
+                return None
+            self._feedback_at = now
+            if not self.active:
+                return None
+            return self._drive(sample.current, measurement, dt, now)
+        except (ArithmeticError, ValueError) as error:  # of parameters that no check foresaw
+            self.refuse(f"computation: {type(error).__name__}")
+            self.loop.renew_speed()
+            return self._trip(Fault.COMPUTATION, now) if self.active else None
+
+    def tick(self, now: float) -> float | None:
+        """Look for feedback that has ceased.
+
+        Parameters
+        ----------
+        now : float
+            [s].
+
+        Returns
+        -------
+        float or None
+            0 V while there is none; None where nothing is to be sent.
+        """
+        if self.clock.dt and len(self._intervals) < _LEARNING:
+            self._learn(self.clock.dt)
+        since = now - self.settings.feedback_timeout
+        if not self.active or self._feedback_at >= since:
+            return None
+        self._resume = True
+        if self._late_at >= since:
+            return self._zero(State.LATE_FEEDBACK)
+        return self._zero(State.BAD_FEEDBACK if self._bad_at >= since else State.NO_FEEDBACK)
+
+    def _learn(self, dt: float) -> None:
+        """Judge the gains once more when the usual interval of the feedback is known."""
+        self._intervals.append(dt)
+        if len(self._intervals) == _LEARNING:
+            self._wheel = replace(self._wheel, sample_time=median(self._intervals))
+            try:
+                check(self.settings.loop, self._wheel)
+            except ParameterError as error:
+                self.advice = str(error)
+
+    def refuse(self, what: str) -> None:
+        """Count something that was left out."""
+        self.refused[what] += 1
+
+    # Decisions -----------------------------------------------------------------------------
+
+    def _zero(self, state: State | None = None) -> float:
+        if state is not None:
+            self.state = state
+        self.output = 0.0
+        return 0.0
+
+    def _not_fresh(self, verdict: Verdict, now: float) -> float | None:
+        if verdict is _FIRST:
+            self.loop.reset_speed()
+        elif verdict is _LATE:
+            self._late_at = now
+        else:
+            return None
+        self._resume = True
+        if not self.active:
+            return None
+        return self._zero(State.LATE_FEEDBACK if verdict is _LATE else None)
+
+    def _drive(self, current: float, measurement: float, dt: float, now: float) -> float:
+        setpoint = self._present_setpoint(measurement, now)
+        recovery = self.recovery
+        if recovery.fault is not None:
+            turns = abs(measurement) > self.settings.faults.stall_velocity
+            if not recovery.may_release(setpoint or 0.0, now, turns):
+                return self._zero(State.FAULT)
+        if setpoint is None:
+            self._resume = True
+            waiting = self._setpoint_at == -math.inf
+            return self._zero(State.WAITING if waiting else State.TIMED_OUT)
+        if self.owner:
+            self._resume = True
+            return self._zero(State.NOT_OURS)
+        if recovery.cautious and setpoint == 0.0:
+            self._resume = True
+            return self._zero(State.DRIVING)
+        loop, detector = self.loop, self._detector
+        if self._resume:
+            self._resume = False
+            loop.start(measurement)
+            detector.reset()
+            self.output = 0.0
+        fault = detector.step(dt, self.output, measurement, current)
+        if fault is not None:
+            return self._trip(fault, now)
+        out = loop.step(setpoint, measurement, dt)
+        voltage = out.output
+        if voltage - voltage != 0.0:
+            self.refuse("output that is not a number")
+            return self._zero()
+        if recovery.cautious:
+            voltage = recovery.limited(voltage, measurement, dt, self.settings.faults)
+        saturated = voltage != out.unsaturated
+        fault = detector.follow(dt, loop.reference.velocity, measurement, voltage, saturated)
+        if fault is not None:
+            return self._trip(fault, now)
+        self.output, self.answer = voltage, out
+        self.target, self.measurement = setpoint, measurement
+        self.steps += 1
+        self.state = State.TIMED_OUT if self._expired else State.DRIVING
+        return voltage
+
+    def _present_setpoint(self, measurement: float, now: float) -> float | None:
+        """Return what the wheel is to do now; None when it is to be left alone."""
+        if self.setpoint is None:
+            return None
+        settings = self.settings
+        silent = now - self._setpoint_at - settings.setpoint_timeout
+        self._expired = silent > 0.0
+        if not self._expired:
+            return self.setpoint
+        stopped = self.loop.reference.velocity == 0.0 and abs(measurement) < _AT_REST
+        if stopped or silent > 1.0 + 2.0 * settings.loop.transition_time:
+            self.setpoint = None
+            return None
+        return 0.0
+
+    def _trip(self, fault: Fault, now: float) -> float:
+        self.recovery.set(fault, now)
+        self._resume = True
+        self.answer = None
+        return self._zero(State.FAULT)

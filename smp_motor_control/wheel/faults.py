@@ -1,0 +1,358 @@
+"""Which motor misbehaves, and how often and how gently it may be tried again.
+
+Pure logic on numbers; times are seconds on a steady clock.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import Enum
+
+from smp_motor_control.errors import ParameterError
+
+MOST_TRIES = 3
+"""How often a wheel at fault is tried again before only a person may reset it."""
+
+PROVEN_AFTER = 2.0
+"""Time of turning as driven after which a fault is over, and its tries are forgotten [s]."""
+
+TRUSTED_AFTER = 0.6
+"""Time of turning as driven after which a try may use the full voltage [s]: what does not follow
+is found before."""
+
+_ZERO_RELEASES = 0.5
+"""Time for which a set-point of zero must stand before it releases a wheel [s]."""
+
+_CAUTION = 1.05
+"""Largest voltage of a try, in the voltage at which the wheel must turn."""
+
+_SLOWEST = 0.3
+"""Error that is never a fault [rad/s]: one count at 1 kHz is 0.19 at the wheel of the paper."""
+
+_IMPROVING = 0.95
+"""Of its error a wheel that accelerates keeps less than this from one window to the next."""
+
+_SATURATED = 0.7
+"""Tolerated share of a set-point that the voltage may not suffice for, where that is unknown."""
+
+_GOOD = 0.1
+"""Share of the speed within which a wheel follows well enough to learn its volts per speed."""
+
+
+class Fault(Enum):
+    """What can be wrong with a wheel that is being driven."""
+
+    STALL = "no counts under voltage: stall (or dead encoder)"
+    DEAD_ENCODER = "no counts under voltage: dead encoder (or stall)"
+    NO_MOTION = "no counts under voltage: stall or dead encoder"
+    RUNAWAY = "runaway: the wheel turns against its voltage (wrong sign of motor or encoder?)"
+    WRONG_WAY = "runaway: the wheel turns against its set-point (wrong sign of motor or encoder?)"
+    NOT_FOLLOWING = "the wheel does not follow its set-point"
+    OVER_CURRENT = "over-current"
+    COMPUTATION = "the controller cannot compute with these parameters"
+
+
+@dataclass(frozen=True, kw_only=True)
+class FaultLimits:
+    """When a motor misbehaves.
+
+    Attributes
+    ----------
+    current_limit : float
+        [A]; 0 for none.
+    current_time : float
+        Time [s] above the limit before it counts.
+    stall_voltage : float
+        Least voltage [V] at which the wheel must turn.
+    stall_velocity : float
+        Least speed [rad/s, wheel] that counts as turning.
+    stall_time : float
+        Time [s] without turning before it counts; 0 switches the detection off.
+    runaway_time : float
+        Time [s] of turning the wrong way, without slowing down, before it counts; 0: off.
+    tracking_tolerance : float
+        Share of the reference by which the speed may be off for long.
+    tracking_time : float
+        Time [s] of being off by more, without coming nearer, before it counts; 0: off.
+
+    Raises
+    ------
+    ParameterError
+        When a value is negative or not finite.
+    """
+
+    current_limit: float = 0.0
+    current_time: float = 0.1
+    stall_voltage: float = 4.0
+    stall_velocity: float = 0.02
+    stall_time: float = 0.5
+    runaway_time: float = 0.2
+    tracking_tolerance: float = 0.5
+    tracking_time: float = 0.45
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not 0.0 <= value < math.inf:
+                raise ParameterError(f"{name} is {value!r}; it must be zero or positive")
+
+
+class FaultDetector:
+    """Watches voltage, speed and current of a driven motor.
+
+    Parameters
+    ----------
+    limits : FaultLimits
+        When it misbehaves.
+    resistance : float
+        Armature resistance [ohm], NaN where unknown; tells a stall from a dead encoder.
+
+    Attributes
+    ----------
+    volts_per_speed, static_voltage : float
+        Of the wheel [V s/rad], [V], where a model says; NaN and 0 where it is to be learnt.
+    """
+
+    def __init__(self, limits: FaultLimits, resistance: float = math.nan) -> None:
+        self.limits = limits
+        self.resistance = resistance
+        self.volts_per_speed, self.static_voltage = math.nan, 0.0
+        self._learnt = math.nan
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget what led here."""
+        self._still = self._wrong = self._hot = 0.0
+        self._wrong_speed = 0.0
+        self._begin_window(math.nan)
+
+    def step(self, dt: float, voltage: float, velocity: float, current: float) -> Fault | None:
+        """Take in one sample.
+
+        Parameters
+        ----------
+        dt : float
+            Interval that ends with it [s].
+        voltage : float
+            That was asked for during the interval [V].
+        velocity : float
+            Of the wheel [rad/s].
+        current : float
+            [A]; NaN where not measured.
+
+        Returns
+        -------
+        Fault or None
+            The first that has lasted for its time.
+        """
+        limits = self.limits
+        if limits.current_limit > 0.0 and abs(current) > limits.current_limit:
+            self._hot += dt
+            if self._hot >= limits.current_time:
+                return Fault.OVER_CURRENT
+        else:
+            self._hot = 0.0
+        driven = abs(voltage) >= limits.stall_voltage
+        if driven and abs(velocity) < limits.stall_velocity:
+            self._still += dt
+            if self._still >= limits.stall_time > 0.0:
+                return self._no_motion(voltage, current)
+        else:
+            self._still = 0.0
+        return self._runaway(dt, voltage, velocity)
+
+    def _runaway(self, dt: float, voltage: float, velocity: float) -> Fault | None:
+        """Braking turns against the voltage too, but it slows down."""
+        limits = self.limits
+        against = voltage * velocity < 0.0 and abs(velocity) >= limits.stall_velocity
+        if not against or abs(voltage) < 0.5 * limits.stall_voltage:
+            self._wrong = 0.0
+            return None
+        if self._wrong == 0.0 or abs(velocity) < 0.8 * self._wrong_speed:
+            self._wrong = 0.0
+            self._wrong_speed = abs(velocity)
+        self._wrong += dt
+        return Fault.RUNAWAY if self._wrong >= limits.runaway_time > 0.0 else None
+
+    def _no_motion(self, voltage: float, current: float) -> Fault:
+        if math.isnan(current) or math.isnan(self.resistance):
+            return Fault.NO_MOTION
+        # At standstill all voltage drives current, R i = v.  A turning motor takes less, but one
+        # whose friction eats all of its torque not much less: the name tells the other cause too.
+        if abs(current) * self.resistance > 0.85 * abs(voltage):
+            return Fault.STALL
+        return Fault.DEAD_ENCODER
+
+    def _begin_window(self, before: float) -> None:
+        self._before, self._elapsed, self._saturated = before, 0.0, True
+        self._reference = self._speed = self._voltage = 0.0
+
+    def follow(
+        self, dt: float, reference: float, velocity: float, voltage: float, saturated: bool
+    ) -> Fault | None:
+        """Compare speed and reference, each by its mean over a third of the tracking time.
+
+        Two windows in succession must be off, the second no less than the first, so that
+        neither noise nor a wheel that still accelerates is taken for a fault.
+
+        Parameters
+        ----------
+        dt : float
+            Interval that ends with the sample [s].
+        reference, velocity : float
+            Of the wheel [rad/s].
+        voltage : float
+            Answer to the sample [V].
+        saturated : bool
+            Whether the loop asked for more.
+
+        Returns
+        -------
+        Fault or None
+            ``WRONG_WAY`` or ``NOT_FOLLOWING``; a wheel that stands still is :meth:`step`'s.
+        """
+        self._reference += reference * dt
+        self._speed += velocity * dt
+        self._voltage += voltage * dt
+        self._saturated = self._saturated and saturated
+        self._elapsed = elapsed = self._elapsed + dt
+        if 3.0 * elapsed < self.limits.tracking_time:
+            return None
+        asked, speed, before = self._reference / elapsed, self._speed / elapsed, self._before
+        share = self.limits.tracking_tolerance
+        if self._saturated:
+            reachable = self._reachable(abs(self._voltage) / elapsed)
+            share = max(share, _SATURATED) if reachable == math.inf else share
+            asked = max(min(asked, reachable), -reachable)
+        elif abs(asked - speed) < _GOOD * abs(speed) > _GOOD * _SLOWEST:
+            self._learnt = abs(self._voltage / self._speed)
+        error = abs(asked - speed)
+        off = error > share * abs(asked) + _SLOWEST and self.limits.tracking_time > 0.0
+        self._begin_window(error if off else math.nan)
+        stalled = self._still > 0.0 and self.limits.stall_time > 0.0
+        if stalled or not (off and error > _IMPROVING * before):  # NaN: the one before was good
+            return None
+        return Fault.WRONG_WAY if asked * speed < 0.0 else Fault.NOT_FOLLOWING
+
+    def _reachable(self, voltage: float) -> float:
+        """Return the speed for which a voltage suffices; infinite where that is not known."""
+        if self.volts_per_speed > 0.0:
+            return max(voltage - self.static_voltage, 0.0) / self.volts_per_speed
+        return voltage / self._learnt if self._learnt > 0.0 else math.inf
+
+
+_SILENT = (Fault.STALL, Fault.DEAD_ENCODER, Fault.NO_MOTION)
+
+
+class Recovery:
+    """Holds a wheel at fault, lets it be tried a few times, and then waits for a person.
+
+    A try begins when the set-point has been zero for half a second, when a wheel that gave
+    no counts is seen to turn, or after a pause that doubles every time.  It is limited to a
+    small voltage until the wheel has turned as driven for :data:`TRUSTED_AFTER`, and drives
+    nothing at a set-point of zero.  After :data:`MOST_TRIES` the wheel is latched.
+
+    Parameters
+    ----------
+    first_pause : float
+        [s]; 0 waits for a zero set-point for ever.
+
+    Attributes
+    ----------
+    fault : Fault or None
+        What holds the wheel.
+    cautious : bool
+        Whether the voltage is limited, as the fault may still be there.
+    failures : int
+        Faults since the wheel was last proven sound.
+    """
+
+    def __init__(self, first_pause: float = 2.0) -> None:
+        self.first_pause = first_pause
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin anew, as after a person has looked at the wheel."""
+        self.fault: Fault | None = None
+        self.cautious = False
+        self.failures = 0
+        self._since = self._good = 0.0
+
+    @property
+    def latched(self) -> bool:
+        """Whether only :meth:`reset` lets the wheel go."""
+        return self.fault is not None and self.failures > MOST_TRIES
+
+    def set(self, fault: Fault, now: float) -> None:
+        """Hold the wheel.
+
+        Parameters
+        ----------
+        fault : Fault
+            Why.
+        now : float
+            [s].
+        """
+        self.fault, self._since = fault, now
+        self.cautious = True
+        self.failures += 1
+        self._good = 0.0
+
+    def may_release(self, setpoint: float, now: float, turns: bool = False) -> bool:
+        """Tell whether the wheel may be tried again, and let go of it if so.
+
+        Parameters
+        ----------
+        setpoint : float
+            Present one [rad/s].
+        now : float
+            [s].
+        turns : bool
+            Whether feedback shows the wheel turning.
+
+        Returns
+        -------
+        bool
+            Whether it has let go.
+        """
+        if self.failures > MOST_TRIES:
+            return False
+        waited = now - self._since
+        pause = self.first_pause * 2.0 ** (self.failures - 1)
+        alive = turns and self.fault in _SILENT
+        rested = setpoint == 0.0 and waited > _ZERO_RELEASES
+        if alive or rested or (pause > 0.0 and waited > pause):
+            self.fault = None
+            return True
+        return False
+
+    def limited(self, voltage: float, velocity: float, dt: float, limits: FaultLimits) -> float:
+        """Return the voltage of a try, and learn from how the wheel turns.
+
+        Parameters
+        ----------
+        voltage : float
+            What the loop asks for [V].
+        velocity : float
+            Of the wheel [rad/s].
+        dt : float
+            Interval that ends with the sample [s].
+        limits : FaultLimits
+            With the voltage at which the wheel must turn.
+
+        Returns
+        -------
+        float
+            [V].
+        """
+        if voltage * velocity > 0.0 and abs(velocity) > limits.stall_velocity:
+            self._good += dt
+        elif self._good < TRUSTED_AFTER:
+            self._good = 0.0
+        trusted = self._good >= TRUSTED_AFTER
+        if self._good >= PROVEN_AFTER:
+            self.reset()
+        if trusted:
+            return voltage
+        most = _CAUTION * limits.stall_voltage
+        return min(max(voltage, -most), most)

@@ -1,0 +1,105 @@
+"""Is this feedback new, and how long is it since the sample before.
+
+Pure logic on numbers; times are seconds on a steady clock unless they are stamps.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+
+CLOCK_JUMP = 1.0
+"""Stamps that are off by more than this [s] tell of a clock that jumped, not of a delay."""
+
+
+class Verdict(Enum):
+    """What a feedback sample is, by its stamp."""
+
+    FRESH = "fresh"
+    FIRST = "first after a start, a gap or a clock jump"
+    DUPLICATE = "duplicate"
+    REORDERED = "older than the one before"
+    LATE = "late"
+
+
+class FeedbackClock:
+    """Tells the interval between feedback samples, and which of them to leave out.
+
+    The stamps' clock and the computer's may differ by a constant: an offset beyond
+    :data:`CLOCK_JUMP` is learnt at the start and after every jump, and lateness is counted
+    from there.
+
+    Parameters
+    ----------
+    max_age : float
+        Largest time from stamp to arrival [s].
+    max_gap : float
+        Largest interval over which a loop may step [s].
+
+    Attributes
+    ----------
+    dt : float
+        Interval that ends with the last fresh sample [s].
+    age : float
+        From stamp to arrival of the last sample, less the offset of the clocks [s].
+    counts : dict of Verdict to int
+        How many samples were what.
+    jumps : int
+        How often the stamps' clock jumped.
+    offset : float
+        Learnt difference of the clocks [s].
+    """
+
+    def __init__(self, max_age: float, max_gap: float) -> None:
+        self.max_age = max_age
+        self.max_gap = max_gap
+        self.counts = dict.fromkeys(Verdict, 0)
+        self.jumps = 0
+        self.offset = 0.0
+        self.dt = 0.0
+        self.age = 0.0
+        self._last: int | None = None
+
+    def reset(self) -> None:
+        """Take the next sample as a first one."""
+        self._last = None
+
+    def accept(self, stamp: int, now: int) -> Verdict:
+        """Judge a sample.
+
+        Parameters
+        ----------
+        stamp : int
+            Its stamp [ns]; 0 stands for the time of arrival.
+        now : int
+            Time of arrival on the same clock, as far as the clocks agree [ns].
+
+        Returns
+        -------
+        Verdict
+            Only ``FRESH`` samples have a ``dt``; ``FIRST`` ones start a new sequence.
+        """
+        verdict = self._judge(stamp or now, now)
+        self.counts[verdict] += 1
+        return verdict
+
+    def _judge(self, stamp: int, now: int) -> Verdict:
+        raw_age = (now - stamp) * 1e-9
+        age = raw_age - self.offset
+        last = self._last
+        step = 0.0 if last is None else (stamp - last) * 1e-9
+        if step < -CLOCK_JUMP or not -CLOCK_JUMP < age < CLOCK_JUMP:
+            self.jumps += last is not None
+            self.offset = raw_age if abs(raw_age) > CLOCK_JUMP else 0.0
+            self.age = raw_age - self.offset
+            self._last = stamp
+            return Verdict.FIRST
+        self.age = age
+        if last is not None and step <= 0.0:
+            return Verdict.DUPLICATE if step == 0.0 else Verdict.REORDERED
+        self._last = stamp
+        if age > self.max_age:
+            return Verdict.LATE
+        if last is None or step > self.max_gap:
+            return Verdict.FIRST
+        self.dt = step
+        return Verdict.FRESH

@@ -1,0 +1,142 @@
+"""From messages to columns of numbers by topic."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smp_motor_ident.bag.layout import Decoder
+from smp_motor_ident.bag.source import Recording
+from smp_motor_ident.bag.storage import Batch, Channel, Integers, Table, damaged
+from smp_motor_ident.bag.types import Definitions, Types
+from smp_motor_ident.bag.unpack import Budget, decompress_messages
+from smp_motor_ident.errors import BagError
+
+Progress = Callable[[float, str], None]
+STAMP = ("header.stamp.sec", "header.stamp.nanosec")
+
+
+class _Collector:
+    """Grows one topic's columns batch by batch."""
+
+    def __init__(self, topic: str, paths: list[str], types: Types, budget: Budget) -> None:
+        self.topic, self.paths, self.types, self.budget = topic, paths, types, budget
+        self._decoders: dict[tuple[str, str, str], Decoder] = {}
+        self._log: list[Integers] = []
+        self._number: list[Integers | None] = []
+        self._columns: dict[str, list[NDArray[Any] | None]] = {}
+        self._present: dict[str, list[NDArray[np.bool_] | None]] = {}
+        self.packed = 0
+
+    def add(self, batch: Batch) -> None:
+        batch, lost = decompress_messages(batch, self.budget)
+        self.packed += lost
+        if not len(batch):
+            return
+        decoder = self._decoder(batch.channel)
+        decoded = decoder.decode(batch)
+        if not decoded.rows.size:
+            return
+        self._log.append(batch.log_time[decoded.rows])
+        numbers = batch.sequence
+        self._number.append(None if numbers is None else numbers[decoded.rows])
+        names = decoder.paths
+        for name in {*self.paths, *STAMP}:
+            k = names.index(name) if name in names else -1
+            column = decoded.columns[k] if k >= 0 else None
+            self._columns.setdefault(name, []).append(column)
+            there = decoded.present[k] if k >= 0 else None
+            self._present.setdefault(name, []).append(there)
+
+    def _decoder(self, channel: Channel) -> Decoder:
+        key = (channel.type, channel.definition_format, channel.definition)
+        if key not in self._decoders:
+            if channel.encoding not in ("cdr", "ros1"):
+                raise BagError(
+                    f"{self.topic}: its messages are encoded as {channel.encoding!r}; "
+                    "only 'cdr' and 'ros1' can be read"
+                )
+            candidates = self.types.candidates(channel)
+            paths = list(self.paths)
+            if _has_stamp(candidates[0], channel.type):
+                paths += [name for name in STAMP if name not in paths]
+            self._decoders[key] = Decoder(channel, candidates, paths)
+        return self._decoders[key]
+
+    def table(self) -> Table:
+        """Return what was collected, and forget it."""
+        sizes = [part.size for part in self._log]
+        log = np.concatenate(self._log) if self._log else np.zeros(0, np.int64)
+        self._log.clear()
+        numbers = [part for part in self._number if part is not None and part.all()]
+        number = np.concatenate(numbers) if 0 < len(numbers) == len(self._number) else None
+        columns: dict[str, NDArray[Any]] = {}
+        present: dict[str, NDArray[np.bool_]] = {}
+        for name in list(self._columns):
+            parts, flags = self._columns.pop(name), self._present.pop(name)
+            if all(part is None for part in parts):
+                continue
+            if any(p is None or f is not None for p, f in zip(parts, flags)):
+                present[name] = np.concatenate(
+                    [
+                        np.full(n, p is not None) if f is None else f
+                        for n, p, f in zip(sizes, parts, flags)
+                    ]
+                )
+            columns[name] = np.concatenate(
+                [np.zeros(n) if p is None else p for n, p in zip(sizes, parts)]
+            )
+        table = Table(log, _stamps(columns), columns, present, number)
+        for decoder in self._decoders.values():
+            if decoder.undecodable:
+                text = f"{decoder.undecodable} messages are no {decoder.name} ({decoder.reason})"
+                table.findings.append(damaged(f"{self.topic}: {text} and were left out"))
+        if self.packed:
+            text = f"{self.topic}: {self.packed} messages could not be decompressed"
+            table.findings.append(damaged(text))
+        return table
+
+
+def _has_stamp(definitions: Definitions, name: str) -> bool:
+    fields = dict(definitions[name])
+    header = fields.get("header")
+    return header is not None and header[1] == "std_msgs/msg/Header"
+
+
+def _stamps(columns: dict[str, NDArray[Any]]) -> Integers | None:
+    """Take the header's stamps out of the columns."""
+    seconds, rest = (columns.pop(name, None) for name in STAMP)
+    if seconds is None or rest is None:
+        return None
+    stamp: Integers = seconds.astype(np.int64)
+    stamp *= 1_000_000_000
+    stamp += rest
+    return stamp
+
+
+def collect(
+    recording: Recording,
+    wanted: Mapping[str, list[str]],
+    types: Types,
+    progress: Progress | None = None,
+) -> dict[str, Table]:
+    """Read the wanted fields by topic in one pass over a recording's files.
+
+    Topics without messages give empty tables; a field or type that does not exist is an error.
+    """
+    if recording.is_table:
+        return {topic: recording.table(topic, fields) for topic, fields in wanted.items()}
+    collectors = {
+        topic: _Collector(topic, paths, types, recording.budget) for topic, paths in wanted.items()
+    }
+    for fraction, batch in recording.batches(lambda channel: channel.topic in collectors):
+        try:
+            collectors[batch.channel.topic].add(batch)
+        except BagError as error:
+            raise BagError(f"{recording.name}: {error}") from None
+        if progress is not None:
+            progress(fraction, recording.name)
+    return {topic: collector.table() for topic, collector in collectors.items()}

@@ -1,0 +1,77 @@
+"""Formats of recordings: one file each, one line each in the registry."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from smp_motor_ident.bag.readers import csv, json, mat, mcap, ros1, sqlite, wpilog, xlsx
+from smp_motor_ident.bag.readers.format import Format
+from smp_motor_ident.bag.storage import Messages, Tables, damaged
+from smp_motor_ident.bag.unpack import MAGIC, Budget, unpack_file
+from smp_motor_ident.errors import BagError
+
+FORMATS: tuple[Format, ...] = (
+    mcap.FORMAT,
+    sqlite.FORMAT,
+    ros1.FORMAT,
+    wpilog.FORMAT,
+    mat.FORMAT_5,
+    mat.FORMAT_73,
+    xlsx.FORMAT,
+    json.FORMAT,
+    csv.FORMAT,
+)
+BAGS = tuple(s for f in FORMATS if not f.tables for s in f.suffixes)
+TABLES = tuple(s for f in FORMATS if f.tables for s in f.suffixes)
+PACKED = (".zstd", ".zst", ".lz4")
+
+
+def open_source(path: Path, folder: Path, budget: Budget) -> Messages | Tables:
+    """Open a file by what it begins with, else by its name; ``folder`` is for unpacked copies."""
+    head, plain, problem = _head(path), path, ""
+    if kind := MAGIC.get(head[:4]):
+        plain = folder / path.name.removesuffix(path.suffix)
+        problem = unpack_file(path, plain, kind, budget)
+        head = _head(plain)
+    form = recognise(head, plain)
+    try:
+        if form is None:
+            raise BagError(f"{path}: {_what(path, head)}")
+        source: Messages | Tables = form.open(plain, path.name, budget)
+    except BagError as error:
+        raise BagError("; ".join(filter(None, [str(error), problem]))) from None
+    if problem:
+        source.problems.insert(0, damaged(problem))
+    return source
+
+
+def is_table(path: Path) -> bool:
+    """Return whether a file holds columns instead of messages."""
+    form = recognise(_head(path), path)
+    return form is not None and form.tables
+
+
+def recognise(head: bytes, path: Path) -> Format | None:
+    """Return the format of a file that begins with ``head``."""
+    for form in FORMATS:
+        if form.magic and head.startswith(form.magic):
+            return form
+    suffix = path.suffix.lower()
+    return next((f for f in FORMATS if not f.magic and suffix in f.suffixes), None)
+
+
+def _head(path: Path) -> bytes:
+    try:
+        with path.open("rb") as file:
+            return file.read(24)
+    except OSError as error:
+        raise BagError(f"{path}: cannot be read ({error.strerror})") from None
+
+
+def _what(path: Path, head: bytes) -> str:
+    if not head:
+        return "is empty"
+    if any(form.magic.startswith(head) for form in FORMATS if form.magic):
+        return f"is cut off after {path.stat().st_size} bytes; nothing of it can be read"
+    names = ", ".join(form.name for form in FORMATS)
+    return f"is no recording of a known format ({names})"

@@ -1,0 +1,67 @@
+"""What files of named columns have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smp_motor_ident.bag.storage import TABLE, Channel, Table
+from smp_motor_ident.errors import BagError
+from smp_motor_ident.finding import Finding
+
+
+class ColumnFile:
+    """A file of columns, one table of the topic ``""``.
+
+    Parameters
+    ----------
+    path : Path
+        Of the file.
+    name : str
+        For messages.
+    columns : mapping of str to ndarray
+        By name.
+    units : mapping of str to str
+        What the file says of them.
+    dates : collection of str
+        Columns of nanoseconds that the file writes as dates.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        name: str,
+        columns: Mapping[str, NDArray[Any]],
+        units: Mapping[str, str] | None = None,
+        dates: Collection[str] = (),
+    ) -> None:
+        self.path = path
+        self.name = name
+        self.problems: list[Finding] = []
+        if not columns:
+            raise BagError(f"{name}: holds no column of numbers")
+        self._columns = columns
+        self._units = units or {}
+        self._dates = dates
+
+    def channels(self) -> list[Channel]:
+        """Return the one table."""
+        return [Channel(0, "", "", TABLE, fields=tuple(self._columns), units=self._units)]
+
+    def table(self, topic: str, fields: Sequence[str]) -> Table:
+        """Return columns; all must have the same length."""
+        for name in fields:
+            if name not in self._columns:
+                have = ", ".join(self._columns)
+                raise BagError(f"{self.path}: has no column {name!r}; it has {have}")
+        columns = {name: self._columns[name] for name in fields}
+        sizes = {name: column.size for name, column in columns.items()}
+        if len(set(sizes.values())) > 1:
+            lengths = ", ".join(f"{name} {size}" for name, size in sizes.items())
+            raise BagError(f"{self.path}: its columns differ in length: {lengths}")
+        exact = frozenset(n for n in fields if n in self._dates)
+        return Table(None, None, {n: np.asarray(c) for n, c in columns.items()}, exact=exact)

@@ -1,0 +1,207 @@
+"""Rows of cells as spreadsheets and loggers write them: names, units, numbers, times."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from datetime import date, datetime, time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smp_motor_ident.bag.storage import found
+from smp_motor_ident.bag.units import written_unit
+from smp_motor_ident.diagnosis.limits import STRAY_ROWS
+from smp_motor_ident.errors import BagError
+from smp_motor_ident.finding import Finding
+
+Row = Sequence[Any]
+_MISSING = ("", "nan", "na", "n/a", "null", "none", "-", "inf", "-inf", "#n/a")
+_WORDS = {"true": 1, "false": 0, "on": 1, "off": 0, "fwd": 1, "forward": 1, "cw": 1}
+_WORDS.update({"rev": -1, "reverse": -1, "backward": -1, "ccw": -1})
+_ISO = re.compile(
+    r"(?:(\d{4}-\d\d-\d\d)[T ])?(\d\d?:\d\d:\d\d(?:[.,]\d{1,9})?) ?(Z|[+-]\d\d:?\d\d)?"
+)
+_BRACKETS = re.compile(r"\s*[\[(]([^\])]*)[\])]\s*$")
+_SEEN = 60
+"""Rows that are looked at to tell names from numbers."""
+
+
+@dataclass
+class Grid:
+    """Where the numbers of a table begin, and what its columns are called."""
+
+    names: list[str]
+    units: dict[str, str]
+    first: int
+    findings: list[Finding] = field(default_factory=list)
+
+
+def head(rows: Sequence[Row], where: str) -> Grid:
+    """Tell the row of names, and of units, from those of numbers."""
+    seen = rows[:_SEEN]
+    first = next(
+        (
+            k
+            for k, row in enumerate(seen)
+            if _is_data(row) and all(map(_is_data, seen[k + 1 : k + 2]))
+        ),
+        None,
+    )
+    if first is None:
+        raise BagError(f"{where}: has no rows of numbers")
+    width = len(seen[first])
+    above = [row for row in seen[:first] if sum(not _empty(c) for c in row) > width / 2]
+    if not above:
+        names = [f"c{k}" for k in range(1, width + 1)]
+        text = f"{where}: has no row of names; its columns are called {names[0]} to {names[-1]}"
+        return Grid(names, {}, first, [found("no_column_names", text)])
+    named, given = above[-1], [""] * width
+    if len(above) > 1 and all(_empty(c) or written_unit(_bare(c)) is not None for c in above[-1]):
+        named, given = above[-2], [_bare(c) for c in above[-1]]
+    names, units = [], {}
+    for k in range(width):
+        text = str(named[k]).strip() if k < len(named) and not _empty(named[k]) else f"c{k + 1}"
+        text = text if text not in names else f"{text}_{k + 1}"
+        names.append(text)
+        bracket = _BRACKETS.search(text)
+        unit = written_unit(given[k] if k < len(given) else "") or (
+            written_unit(bracket[1]) if bracket else None
+        )
+        if unit:
+            units[text] = unit
+    return Grid(names, units, first)
+
+
+def _empty(cell: Any) -> bool:
+    return cell is None or not str(cell).strip()
+
+
+def _bare(cell: Any) -> str:
+    return str(cell).strip().strip("[]()")
+
+
+def _is_data(row: Row) -> bool:
+    """Return whether at least half of a row's cells are numbers."""
+    cells = [cell for cell in row if not _empty(cell)]
+    good = sum(_sound(cell) for cell in cells)
+    return bool(cells) and good >= len(cells) / 2
+
+
+def _sound(cell: Any) -> bool:
+    try:
+        number(cell)
+    except ValueError:
+        return False
+    return not isinstance(cell, str) or cell.strip().lower() not in _WORDS
+
+
+def number(cell: Any) -> float:
+    """Return a cell's number, NaN where it is empty; ValueError where it is something else."""
+    if cell is None:
+        return np.nan
+    if isinstance(cell, (int, float)):
+        return float(cell)
+    text = str(cell).strip()
+    try:
+        return float(text)
+    except ValueError:
+        lower = text.lower()
+        if lower in _MISSING:
+            return np.nan
+        if lower in _WORDS:
+            return float(_WORDS[lower])
+        if text.count(",") == 1:
+            return float(text.replace(",", "."))
+        return nanoseconds(cell) * 1e-9
+
+
+def nanoseconds(cell: Any) -> int:
+    """Return the nanoseconds of an ISO 8601 time, since 1970 or since midnight."""
+    if isinstance(cell, (datetime, date, time)):
+        cell = cell.isoformat()
+    match = _ISO.fullmatch(str(cell).strip())
+    if match is None:
+        raise ValueError(f"{cell!r} is neither number nor time")
+    day, clock, zone = (
+        match[1] or "1970-01-01",
+        match[2].replace(",", ".").zfill(8),
+        match[3] or "Z",
+    )
+    clock = clock if clock[2] == ":" else f"0{clock}"
+    stamp = int(np.datetime64(f"{day}T{clock}", "ns").astype(np.int64))
+    if zone != "Z":
+        hours, minutes = int(zone[1:3]), int(zone[-2:])
+        stamp -= (1 if zone[0] == "+" else -1) * (hours * 60 + minutes) * 60_000_000_000
+    return stamp
+
+
+def columns(
+    rows: Sequence[Row],
+    use: Sequence[int],
+    names: Sequence[str],
+    where: str,
+    lines: Sequence[int],
+) -> tuple[list[NDArray[Any]], list[Finding], set[str]]:
+    """Return columns as numbers, what was found, and the names of those that are dates [ns].
+
+    Rows that are no rows of numbers, such as a name in their midst, are left out with a finding;
+    ``lines`` are the rows' for messages.
+    """
+    kept: list[list[float]] = []
+    stray: list[tuple[int, str]] = []
+    sound_rows: list[Row] = []
+    for k, row in enumerate(rows):
+        if all(_empty(cell) for cell in row):
+            continue
+        try:
+            kept.append([number(row[j]) if j < len(row) else np.nan for j in use])
+            sound_rows.append(row)
+        except (ValueError, OverflowError):
+            stray.append((k, _culprit(row, use, names)))
+    if stray and len(stray) > STRAY_ROWS.value * (len(kept) + len(stray)):
+        k, what = stray[0]
+        raise BagError(f"{where}: line {lines[k]}, {what}")
+    findings = []
+    if stray:
+        text = f"{where}: {len(stray)} rows that are no numbers were left out, the first in line "
+        findings.append(found("stray_rows", f"{text}{lines[stray[0][0]]}", "warning"))
+    values = np.array(kept, np.float64).reshape(len(kept), len(use))
+    result, dates = [], set()
+    for n, j in enumerate(use):
+        column: NDArray[Any] = values[:, n]
+        whole = _whole(sound_rows, j, column)
+        if whole is not None:
+            column = whole[0]
+            if whole[1]:
+                dates.add(names[n])
+        result.append(column)
+    return result, findings, dates
+
+
+def _whole(rows: Sequence[Row], j: int, column: NDArray[Any]) -> tuple[NDArray[Any], bool] | None:
+    """Return a column exactly, as integers, where float64 would round it; and whether of times."""
+    if not column.size or not np.isfinite(column).all():
+        return None
+    first = rows[0][j]
+    timed = not isinstance(first, (int, float)) and _ISO.fullmatch(str(first).strip())
+    try:
+        if timed or isinstance(first, (datetime, date, time)):
+            return np.array([nanoseconds(row[j]) for row in rows], np.int64), True
+        if np.abs(column).max() >= 2.0**53:
+            return np.array([int(row[j]) for row in rows], np.int64), False
+    except (ValueError, OverflowError, TypeError):
+        pass
+    return None
+
+
+def _culprit(row: Row, use: Sequence[int], names: Sequence[str]) -> str:
+    """Return which cell is no number."""
+    for name, j in zip(names, use):
+        try:
+            number(row[j] if j < len(row) else None)
+        except (ValueError, OverflowError):
+            return f"column {name!r}: {str(row[j])[:40]!r} is no number"
+    return "is no row of numbers"

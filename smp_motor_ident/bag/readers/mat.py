@@ -1,0 +1,161 @@
+"""MATLAB files: version 5 by scipy, version 7.3 by h5py where it is installed.
+
+Vectors and the columns of matrices become columns of one table per length, fields of structures
+by their path.  The layout that is checked before scipy may trust it is that of MathWorks' "MAT-File
+Format", section 1: elements of type and size, compressed ones by zlib.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+import zlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import scipy.io
+
+from smp_motor_ident.bag.readers.columns import ColumnFile
+from smp_motor_ident.bag.readers.format import Format
+from smp_motor_ident.bag.unpack import Budget
+from smp_motor_ident.errors import BagError
+
+_COMPRESSED, _MATRIX = 15, 14
+_DEEPEST = 16
+_WIDEST = 64
+"""Columns of a matrix that are taken as signals; a wider one is something else."""
+
+
+class _MatFile(ColumnFile):
+    """One file of version 5."""
+
+    def __init__(self, path: Path, name: str, budget: Budget) -> None:
+        data = _unpacked(path.read_bytes(), name, budget)
+        try:
+            content = scipy.io.loadmat(
+                cast(Any, io.BytesIO(data)), simplify_cells=True, chars_as_strings=False
+            )
+        except Exception as error:  # scipy's reader raises whatever its bytes lead it to
+            raise BagError(f"{name}: no readable MATLAB file ({_line(error)})") from None
+        visible = {key: value for key, value in content.items() if not key.startswith("__")}
+        super().__init__(path, name, dict(_columns("", visible, 0)))
+
+
+class _MatFile73(ColumnFile):
+    """One file of version 7.3, which is HDF5."""
+
+    def __init__(self, path: Path, name: str, budget: Budget) -> None:
+        try:
+            import h5py
+        except ImportError:
+            raise BagError(
+                f"{name}: is a MATLAB file of version 7.3, which needs h5py (pip install h5py); "
+                "or save it in MATLAB with -v7"
+            ) from None
+        found: dict[str, Any] = {}
+
+        def take(key: str, item: Any) -> None:
+            if isinstance(item, h5py.Dataset) and item.dtype.kind in "fiub" and "#" not in key:
+                budget.take(item.nbytes)
+                found[key.replace("/", ".")] = np.asarray(item).T  # MATLAB counts columns first
+
+        try:
+            with h5py.File(path, "r") as file:
+                file.visititems(take)
+        except (OSError, RuntimeError, ValueError, KeyError) as error:
+            raise BagError(f"{name}: no readable MATLAB file ({_line(error)})") from None
+        super().__init__(path, name, dict(_columns("", found, 0)))
+
+
+def _columns(prefix: str, value: Any, depth: int) -> Iterator[tuple[str, np.ndarray[Any, Any]]]:
+    """Yield the vectors of a structure by their paths."""
+    if isinstance(value, Mapping):
+        for key, inner in value.items():
+            if depth < _DEEPEST:
+                yield from _columns(f"{prefix}.{key}" if prefix else str(key), inner, depth + 1)
+        return
+    if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiub" or value.size < 2:
+        return
+    value = np.squeeze(value)
+    if value.ndim == 1:
+        yield prefix, value
+    elif value.ndim == 2:
+        rows = value if value.shape[0] >= value.shape[1] else value.T
+        if rows.shape[1] <= _WIDEST:
+            for k in range(rows.shape[1]):
+                yield f"{prefix}[{k}]", rows[:, k]
+
+
+def _unpacked(data: bytes, name: str, budget: Budget) -> bytes:
+    """Return the file with its elements unpacked, each within what holds it."""
+    if len(data) < 128 or data[126:128] not in (b"IM", b"MI"):
+        raise BagError(f"{name}: is cut off or no MATLAB file of version 5")
+    order = "<" if data[126:128] == b"IM" else ">"
+    parts, at = [data[:128]], 128
+    while at + 8 <= len(data):
+        kind, size = struct.unpack_from(order + "II", data, at)
+        if at + 8 + size > len(data):
+            raise BagError(f"{name}: is cut off at byte {at} of {len(data)}; save it again")
+        body = data[at + 8 : at + 8 + size]
+        if kind == _COMPRESSED:
+            body = _inflated(body, name, budget)
+        else:
+            body = data[at : at + 8] + body
+        _check(body, order, name, 0)
+        parts.append(body)
+        at += 8 + size
+    return b"".join(parts)
+
+
+def _inflated(body: bytes, name: str, budget: Budget) -> bytes:
+    engine, parts = zlib.decompressobj(), []
+    try:
+        while body and not engine.eof:
+            parts.append(engine.decompress(body, 1 << 20))
+            budget.take(len(parts[-1]))
+            body = engine.unconsumed_tail
+    except zlib.error as error:
+        raise BagError(f"{name}: a variable is damaged ({error})") from None
+    return b"".join(parts)
+
+
+def _check(body: bytes, order: str, name: str, depth: int) -> None:
+    """Refuse an element that says it is longer than what holds it, or has more cells."""
+    at = 0
+    while at + 8 <= len(body):
+        kind, size = struct.unpack_from(order + "II", body, at)
+        if kind >> 16:  # a small element: type and size share four bytes
+            at += 8
+            continue
+        if at + 8 + size > len(body) or depth > _DEEPEST:
+            raise BagError(f"{name}: a variable is damaged (an element of {size} bytes)")
+        inside = body[at + 8 : at + 8 + size]
+        if kind == _MATRIX and size:
+            _check_size(inside, order, name)
+            _check(inside, order, name, depth + 1)
+        at += 8 + size + -size % 8
+
+
+def _check_size(inside: bytes, order: str, name: str) -> None:
+    """Refuse a matrix with more elements than bytes: dimensions are its second element."""
+    if len(inside) < 32:
+        return
+    _, size = struct.unpack_from(order + "II", inside, 16)
+    count = min(size // 4, (len(inside) - 24) // 4, 32)
+    product = 1.0
+    for dimension in struct.unpack_from(f"{order}{count}i", inside, 24):
+        product *= max(dimension, 0)
+    if product > len(inside):
+        raise BagError(
+            f"{name}: a variable is damaged ({product:g} elements in {len(inside)} bytes)"
+        )
+
+
+def _line(error: BaseException) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0][:200]
+
+
+FORMAT_5 = Format("MATLAB", (".mat",), b"MATLAB 5.0 MAT", _MatFile)
+FORMAT_73 = Format("MATLAB 7.3", (".mat",), b"MATLAB 7.3 MAT", _MatFile73)

@@ -1,0 +1,260 @@
+"""SQLite bags of every rosbag2 schema, whole or cut off."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from urllib.parse import quote
+
+import numpy as np
+
+from smp_motor_ident.bag.readers.format import Format
+from smp_motor_ident.bag.salvage import salvage
+from smp_motor_ident.bag.storage import (
+    Batch,
+    Bytes,
+    Channel,
+    Integers,
+    damaged,
+    join,
+    message_type,
+)
+from smp_motor_ident.bag.unpack import Budget
+from smp_motor_ident.errors import BagError
+from smp_motor_ident.finding import Finding
+
+MAGIC = b"SQLite format 3\0"
+_ROWS = 8192
+_BLOCK = 1 << 25
+
+
+class _SqliteFile:
+    """One ``.db3`` file, which is not changed; its name where ``path`` is a temporary copy."""
+
+    def __init__(self, path: Path, name: str, budget: Budget) -> None:
+        self.path = path
+        self.name = name
+        self.problems: list[Finding] = []
+        self._budget = budget
+        self._folder: tempfile.TemporaryDirectory[str] | None = None
+        self._cut_off = False
+        self._path_read = self._with_journal()
+        self._database = self._connect(self._path_read)
+        try:
+            self._channels = self._read_channels()
+        except (sqlite3.Error, UnicodeDecodeError, TypeError) as error:
+            reasons = "; ".join([" ".join(str(error).split()), *(p.message for p in self.problems)])
+            raise BagError(f"{self.name}: not a readable bag ({reasons})") from None
+
+    def _amiss(self, text: str) -> None:
+        self.problems.append(damaged(text))
+
+    def _with_journal(self) -> Path:
+        """Return the file, or where a journal lies beside it a copy of both.
+
+        A recorder that died leaves its last messages there, and SQLite must write to
+        bring them home.
+        """
+        journals = [
+            journal
+            for suffix in ("-wal", "-journal")
+            if (journal := self.path.with_name(self.path.name + suffix)).is_file()
+            and journal.stat().st_size
+        ]
+        if not journals:
+            return self.path
+        self._folder = tempfile.TemporaryDirectory(prefix="smp_bag_")
+        copy = Path(self._folder.name) / self.path.name
+        for original in (self.path, *journals):
+            shutil.copyfile(original, copy.with_name(original.name))
+        self._amiss(
+            f"{self.name}: was not closed; its journal {journals[0].name} was applied to a copy"
+        )
+        return copy
+
+    def _connect(self, path: Path) -> sqlite3.Connection:
+        mode = "immutable=1" if self._folder is None else "mode=rw"
+        database = sqlite3.connect(f"file:{quote(str(path.resolve()))}?{mode}", uri=True)
+        if hasattr(database, "setlimit"):  # limit 0 is that of a blob's length
+            database.setlimit(0, path.stat().st_size + (1 << 20))
+        database.text_factory = lambda text: text.decode("utf-8", "replace")
+        size = path.stat().st_size
+        with path.open("rb") as file:
+            head = file.read(100)
+        page = int.from_bytes(head[16:18], "big")
+        page = 65536 if page == 1 else page
+        pages = int.from_bytes(head[28:32], "big")
+        if self._folder is None and size < pages * page:
+            self._amiss(f"{self.name}: cut off at byte {size} of {pages * page} that it had")
+            self._cut_off = True
+            # With this, SQLite reads a file that is shorter than its head says.
+            database.execute("PRAGMA writable_schema=ON")
+        return database
+
+    def _read_channels(self) -> list[Channel]:
+        columns = {row[1] for row in self._database.execute("PRAGMA table_info(topics)")}
+        if not {"id", "name", "type"} <= columns:
+            raise sqlite3.DatabaseError("it has no table of topics")
+        definitions: dict[str, tuple[str, str]] = {}
+        if self._database.execute("PRAGMA table_info(message_definitions)").fetchall():
+            query = "SELECT topic_type, encoded_message_definition, encoding"
+            try:
+                rows = self._database.execute(f"{query} FROM message_definitions").fetchall()
+            except sqlite3.DatabaseError as error:
+                rows = []
+                self._amiss(f"{self.name}: its definitions cannot be read ({error})")
+            for kind, text, encoding in rows:
+                definitions[message_type(kind)] = (text, encoding)
+        optional = [
+            name if name in columns else "''"
+            for name in ("serialization_format", "offered_qos_profiles")
+        ]
+        query = f"SELECT id, name, type, {', '.join(optional)} FROM topics ORDER BY id"
+        return [
+            Channel(
+                key,
+                topic,
+                message_type(kind),
+                encoding or "cdr",
+                *definitions.get(message_type(kind), ("", "")),
+                qos=qos,
+            )
+            for key, topic, kind, encoding, qos in self._database.execute(query)
+        ]
+
+    def channels(self) -> list[Channel]:
+        """Return the topics of the file."""
+        return self._channels
+
+    def promised(self) -> dict[str, int] | None:
+        """Return None: the file holds no count besides its messages."""
+        return None
+
+    def batches(self, wanted: Callable[[Channel], bool]) -> Iterator[tuple[float, Batch]]:
+        """Read the messages in the order in which they were written."""
+        asked = {channel.id: channel for channel in self._channels if wanted(channel)}
+        if not asked:
+            return
+        last, total = -(2**63), self._last_row()
+        try:
+            if self._cut_off:
+                raise sqlite3.DatabaseError("cut off")
+            for last, batches in self._reads(asked):
+                for batch in batches:
+                    yield min(1.0, last / total) if total > 0 else 1.0, batch
+        except sqlite3.DatabaseError as error:
+            if not self._cut_off:
+                self._amiss(f"{self.name}: damaged behind message {last} ({error})")
+            yield from self._salvaged(asked, last)
+
+    def _reads(self, asked: dict[int, Channel]) -> Iterator[tuple[int, list[Batch]]]:
+        """Yield the last row that is read, and some rows by topic."""
+        ids = ",".join(str(key) for key in asked)
+        among = "" if len(asked) == len(self._channels) else f"AND topic_id IN ({ids}) "
+        source = (
+            "FROM (SELECT id, topic_id, timestamp, data FROM messages "
+            f"WHERE id > ? {among}ORDER BY id LIMIT {_ROWS})"
+        )
+        last = -(2**63)
+        while (read := self._in_bulk(source, last)) is not None:
+            last, topic, batch = read
+            yield last, self._by_topic(topic, batch, asked)
+        query = f"SELECT id, topic_id, timestamp, data {source}"
+        while rows := self._rows(query, last):
+            last = rows[-1][0]
+            yield last, list(self._split(rows, asked))
+
+    def _rows(self, query: str, last: int) -> list[tuple[int, int, int, bytes]]:
+        """Return the next rows; spoilt pages may give the same bytes to many of them."""
+        rows, size = [], 0
+        for row in self._database.execute(query, (last,)):
+            rows.append(row)
+            size += len(row[3]) if isinstance(row[3], (bytes, str)) else 0
+            if size > _BLOCK:
+                break
+        self._budget.take(size)
+        return rows
+
+    def _in_bulk(self, source: str, last: int) -> tuple[int, Integers, Batch] | None:
+        """Let SQLite put rows together in one blob; None where that cannot be trusted.
+
+        One row of Python objects per message takes three times as long.  Numbers come
+        as characters: topic and length as one code point each, times as decimal digits.
+        """
+        query = (
+            "SELECT max(id), group_concat(data, ''), group_concat(timestamp), "
+            f"group_concat(char(topic_id + 1, length(data) + 1), '') {source}"
+        )
+        text, self._database.text_factory = self._database.text_factory, bytes
+        try:
+            last, data, times, codes = self._database.execute(query, (last,)).fetchone()
+            points = np.frombuffer(codes.decode("utf-8").encode("utf-32-le"), np.uint32)
+        except (sqlite3.Error, UnicodeDecodeError, AttributeError):
+            return None
+        finally:
+            self._database.text_factory = text
+        pairs = points.astype(np.int64) - 1
+        topic, length = pairs[0::2], pairs[1::2]
+        digits, rest = divmod(len(times) + 1, topic.size)
+        if topic.size != length.size or len(data) != length.sum() or rest:
+            return None
+        table = np.frombuffer(times + b",", np.uint8).reshape(topic.size, digits).T
+        if (table[-1] != ord(",")).any() or (table[:-1] < ord("0")).any():
+            return None
+        log = np.zeros(topic.size, np.int64)
+        for column in table[:-1]:
+            log = log * 10 + (column - 48)
+        raw: Bytes = np.frombuffer(data, np.uint8)
+        channel = self._channels[0]  # told apart by the caller
+        return last, topic, Batch(channel, raw, np.cumsum(length) - length, length, log)
+
+    def _salvaged(self, asked: dict[int, Channel], last: int) -> Iterator[tuple[float, Batch]]:
+        """Yield what single pages still hold behind the last row that the tree gave."""
+        for fraction, rows in salvage(self._path_read):
+            wanted = [row for row in rows if row[0] > last and row[1] in asked]
+            self._budget.take(sum(len(row[3]) for row in wanted))
+            if wanted:
+                for batch in self._split(wanted, asked):
+                    yield fraction, batch
+
+    def _last_row(self) -> int:
+        try:
+            row = self._database.execute("SELECT max(id) FROM messages").fetchone()
+        except sqlite3.DatabaseError:
+            return 0
+        return int(row[0] or 0)
+
+    def _split(
+        self, rows: list[tuple[int, int, int, bytes]], asked: dict[int, Channel]
+    ) -> Iterator[Batch]:
+        """Yield rows as batches, topic by topic."""
+        _, keys, times, blobs = zip(*rows)
+        every = next(iter(asked.values()))
+        try:
+            joined = join(every, list(blobs), np.array(times, np.int64))
+        except (TypeError, OverflowError):
+            sound = [r for r in rows if isinstance(r[3], bytes) and isinstance(r[2], int)]
+            self._amiss(
+                f"{self.name}: {len(rows) - len(sound)} messages without data were left out"
+            )
+            if sound:
+                yield from self._split(sound, asked)
+            return
+        yield from self._by_topic(np.array(keys, np.int64), joined, asked)
+
+    @staticmethod
+    def _by_topic(topic: Integers, batch: Batch, asked: dict[int, Channel]) -> list[Batch]:
+        """Return the messages of each topic."""
+        parts = []
+        for key, channel in asked.items():
+            which = np.flatnonzero(topic == key)
+            if which.size:
+                parts.append(replace(batch.take(which), channel=channel))
+        return parts
+
+
+FORMAT = Format("SQLite bag", (".db3",), MAGIC, _SqliteFile, tables=False)

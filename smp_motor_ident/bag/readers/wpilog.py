@@ -1,0 +1,117 @@
+"""WPILib data logs (``.wpilog``): entries by name, each with its own times.
+
+The format is that of github.com/wpilibsuite/allwpilib, ``wpiutil/doc/datalog.adoc``, version 1.0:
+records of entry, payload size and microseconds, each of as many bytes as the record's first
+byte says; entry 0 holds control records that start and finish entries.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from smp_motor_ident.bag.readers.format import Format
+from smp_motor_ident.bag.storage import TABLE, Channel, Table, damaged
+from smp_motor_ident.bag.unpack import Budget
+from smp_motor_ident.errors import BagError
+from smp_motor_ident.finding import Finding
+
+MAGIC = b"WPILOG"
+_KINDS = {"double": "<f8", "float": "<f4", "int64": "<i8", "boolean": "u1"}
+
+
+@dataclass
+class _Entry:
+    """One entry: its type, and where its records are."""
+
+    name: str
+    kind: str
+    times: list[int] = field(default_factory=list)
+    begins: list[int] = field(default_factory=list)
+    sizes: list[int] = field(default_factory=list)
+
+
+class _Wpilog:
+    """One ``.wpilog`` file."""
+
+    def __init__(self, path: Path, name: str, budget: Budget) -> None:
+        self.path = path
+        self.name = name
+        self.problems: list[Finding] = []
+        self._data = path.read_bytes()
+        self._entries: dict[str, _Entry] = {}
+        if len(self._data) < 12 or self._data[7] != 1:
+            raise BagError(f"{name}: is no data log of version 1")
+        self._walk(12 + int.from_bytes(self._data[8:12], "little"))
+
+    def _walk(self, at: int) -> None:
+        """Note where every record of a number is."""
+        data, active, end = self._data, dict[int, _Entry](), len(self._data)
+        while at < end:
+            sizes = data[at]
+            a = at + 2 + (sizes & 3)
+            b = a + 1 + (sizes >> 2 & 3)
+            c = b + 1 + (sizes >> 4 & 7)
+            size = int.from_bytes(data[a:b], "little")
+            if c + size > end:
+                self.problems.append(damaged(f"{self.name}: cut off at byte {at} of {end}"))
+                return
+            key = int.from_bytes(data[at + 1 : a], "little")
+            if key == 0:
+                self._control(data[c : c + size], active)
+            elif (entry := active.get(key)) is not None:
+                entry.times.append(int.from_bytes(data[b:c], "little"))
+                entry.begins.append(c)
+                entry.sizes.append(size)
+            at = c + size
+
+    def _control(self, body: bytes, active: dict[int, _Entry]) -> None:
+        """Start or finish an entry."""
+        key = int.from_bytes(body[1:5], "little")
+        if body[:1] == b"\1":
+            active.pop(key, None)
+        elif body[:1] == b"\0":
+            texts, at = [], 5
+            for _ in range(2):
+                size = int.from_bytes(body[at : at + 4], "little")
+                texts.append(body[at + 4 : at + 4 + size].decode("utf-8", "replace"))
+                at += 4 + size
+            if texts[1].removesuffix("[]") in _KINDS:
+                active[key] = self._entries.setdefault(texts[0], _Entry(texts[0], texts[1]))
+
+    def channels(self) -> list[Channel]:
+        """Return the entries of numbers."""
+        return [
+            Channel(k, name, entry.kind, TABLE, fields=self._fields(entry))
+            for k, (name, entry) in enumerate(sorted(self._entries.items()))
+        ]
+
+    @staticmethod
+    def _fields(entry: _Entry) -> tuple[str, ...]:
+        if not entry.kind.endswith("[]"):
+            return ("value",)
+        width = np.dtype(_KINDS[entry.kind[:-2]]).itemsize
+        return tuple(f"value[{k}]" for k in range(min(max(entry.sizes, default=0) // width, 64)))
+
+    def table(self, topic: str, fields: Sequence[str]) -> Table:
+        """Return an entry's values; those of a wrong length are left out."""
+        entry = self._entries[topic]
+        kind = np.dtype(_KINDS[entry.kind.removesuffix("[]")])
+        index = [int(f[6:-1]) if f.startswith("value[") else 0 for f in fields]
+        least = kind.itemsize * (max(index) + 1)
+        size, begin = np.array(entry.sizes, np.int64), np.array(entry.begins, np.int64)
+        sound = size >= least if entry.kind.endswith("[]") else size == least
+        log = 1000 * np.array(entry.times, np.uint64).astype(np.int64)
+        raw = np.frombuffer(self._data, np.uint8)
+        bytes_of = begin[sound, None] + np.arange(kind.itemsize)
+        columns = {
+            name: raw[bytes_of + k * kind.itemsize].copy().view(kind)[:, 0]
+            for name, k in zip(fields, index)
+        }
+        return Table(log[sound], None, columns)
+
+
+FORMAT = Format("WPILib data log", (".wpilog",), MAGIC, _Wpilog)

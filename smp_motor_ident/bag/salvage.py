@@ -1,0 +1,122 @@
+"""Messages out of the pages of a SQLite file whose tree is broken.
+
+A tree that was cut off cannot be walked from its root, since a page near the root may be among
+the lost ones; yet every leaf page holds whole rows by itself.  The layout of pages, cells and
+records is that of https://www.sqlite.org/fileformat2.html, sections 1.6 and 2.1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+Row = tuple[int, int, int, bytes]
+"""id, topic_id, timestamp, data: a row of the bag's table of messages."""
+
+_LEAF = 0x0D
+_INTEGER_SIZE = {1: 1, 2: 2, 3: 3, 4: 4, 5: 6, 6: 8, 8: 0, 9: 0}
+
+
+def _varint(data: bytes, at: int) -> tuple[int, int]:
+    """Return a number of one to nine bytes, and where the next begins."""
+    value = 0
+    for k in range(8):
+        byte = data[at + k]
+        value = value << 7 | byte & 0x7F
+        if byte < 0x80:
+            return value, at + k + 1
+    return value << 8 | data[at + 8], at + 9
+
+
+def _integer(data: bytes, at: int, kind: int) -> int:
+    if kind in (8, 9):
+        return kind - 8
+    return int.from_bytes(data[at : at + _INTEGER_SIZE[kind]], "big", signed=True)
+
+
+class _Pages:
+    """Access to the pages of a file."""
+
+    def __init__(self, file: BinaryIO, head: bytes, length: int) -> None:
+        self.length = length
+        size = int.from_bytes(head[16:18], "big")
+        self.size = 65536 if size == 1 else size
+        self.usable = self.size - head[20]
+        self._file = file
+
+    def read(self, number: int) -> bytes:
+        self._file.seek((number - 1) * self.size)
+        page = self._file.read(self.size)
+        if len(page) < self.size:
+            raise IndexError("the page is cut off")
+        return page
+
+    def payload(self, page: bytes, at: int, size: int) -> bytes:
+        """Return a cell's content, which may go on in overflow pages."""
+        if size > self.length:
+            raise IndexError("the row is longer than the file")
+        most = self.usable - 35
+        if size <= most:
+            return page[at : at + size]
+        least = (self.usable - 12) * 32 // 255 - 23
+        local = least + (size - least) % (self.usable - 4)
+        local = local if local <= most else least
+        parts = [page[at : at + local]]
+        following = int.from_bytes(page[at + local : at + local + 4], "big")
+        left = size - local
+        while left > 0:
+            if not following:
+                raise IndexError("the chain of pages is broken")
+            more = self.read(following)
+            following = int.from_bytes(more[:4], "big")
+            parts.append(more[4 : 4 + min(left, self.usable - 4)])
+            left -= len(parts[-1])
+        return b"".join(parts)
+
+
+def _row(pages: _Pages, page: bytes, at: int) -> Row | None:
+    """Return the message in a cell, or None where it is something else."""
+    size, at = _varint(page, at)
+    key, at = _varint(page, at)
+    record = pages.payload(page, at, size)
+    head, position = _varint(record, 0)
+    kinds = []
+    while position < head:
+        kind, position = _varint(record, position)
+        kinds.append(kind)
+    if len(kinds) != 4 or kinds[0] != 0 or kinds[3] < 12 or kinds[3] % 2:
+        return None
+    if kinds[1] not in _INTEGER_SIZE or kinds[2] not in _INTEGER_SIZE:
+        return None
+    topic = _integer(record, head, kinds[1])
+    at = head + _INTEGER_SIZE[kinds[1]]
+    stamp = _integer(record, at, kinds[2])
+    at += _INTEGER_SIZE[kinds[2]]
+    length = (kinds[3] - 12) // 2
+    data = record[at : at + length]
+    return (key, topic, stamp, data) if len(data) == length else None
+
+
+def salvage(path: Path) -> Iterator[tuple[float, list[Row]]]:
+    """Read the messages of every whole leaf page, in the order of the file."""
+    count = path.stat().st_size
+    with path.open("rb") as file:
+        pages = _Pages(file, file.read(100), count)
+        if pages.size < 512 or pages.usable < 480:
+            return
+        for number in range(2, count // pages.size + 1):
+            page = pages.read(number)
+            if page[0] != _LEAF:
+                continue
+            rows = []
+            for k in range(int.from_bytes(page[3:5], "big")):
+                at = int.from_bytes(page[8 + 2 * k : 10 + 2 * k], "big")
+                try:
+                    row = _row(pages, page, at)
+                except IndexError:
+                    continue
+                if row is not None:
+                    rows.append(row)
+            if rows:
+                yield number * pages.size / count, rows

@@ -1,0 +1,165 @@
+"""Files of columns as recordings: which column is which signal, and which is the time."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from smp_motor_ident.bag.mapping import MotorMap, Signal
+from smp_motor_ident.bag.source import Recording
+from smp_motor_ident.bag.storage import TABLE, Channel, Integers, Table, found
+from smp_motor_ident.bag.units import FACTORS, check_unit
+from smp_motor_ident.errors import BagError
+
+TIME_NAMES = (
+    r"time|stamp|^t$|zeit|temps|tiempo|tempo|(?:^|\W|_)tid(?:$|\W|_)|czas|čas|время|时间|時間"
+)
+"""What a column of time is called, in the languages of those who log motors."""
+
+_EPOCHS = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
+"""A number of time beyond each is of today in that unit since 1970."""
+
+_MOTIONS = ("velocity", "position", "count")
+
+
+def resolved(plan: MotorMap, channels: list[Channel]) -> MotorMap:
+    """Return a plan whose signals name topics and fields as the files do."""
+    tables = [channel for channel in channels if channel.encoding == TABLE]
+    if not tables:
+        return plan
+    signals = {name: _resolved(name, signal, tables) for name, signal in plan.signals.items()}
+    return replace(plan, signals=signals)
+
+
+def _resolved(name: str, signal: Signal, tables: list[Channel]) -> Signal:
+    """Find a signal's column: of a topic, of the only table, or an entry that is one signal."""
+    whole = f"{signal.topic}.{signal.field}" if signal.topic else signal.field
+    entry = re.fullmatch(r"(.+?)((?:\[\d+\])?)", whole)
+    choices = [(signal.topic, signal.field), ("", whole)]
+    choices += [(entry[1], "value" + entry[2])] if entry else []
+    every = choices + [(c.topic, signal.field) for c in tables if not signal.topic]
+    for topic, field in every:
+        for channel in tables:
+            if channel.topic == topic and field in channel.fields:
+                return replace(
+                    signal, topic=topic, field=field, unit=_unit(name, signal, channel, field)
+                )
+    if len(tables) == 1:  # the table says which columns it has
+        return replace(signal, topic=tables[0].topic, field=whole)
+    return signal
+
+
+def _unit(name: str, signal: Signal, channel: Channel, field: str) -> str:
+    """Return a signal's unit: as mapped, else as the file writes it."""
+    written = channel.units.get(field, "")
+    if signal.unit or not written or (signal.scale, signal.offset) != (1.0, 0.0):
+        return signal.unit
+    try:
+        return check_unit(name, written)
+    except BagError:
+        return ""
+
+
+def self_described(recording: Recording, channels: list[Channel], defaults: MotorMap) -> MotorMap:
+    """Return the plan of a table whose columns and units are named as the signals are."""
+    for channel in channels:
+        named = {name for name in ("time", "voltage", *_MOTIONS) if name in channel.fields}
+        if {"time", "voltage"} < named and any(name in channel.units for name in _MOTIONS):
+            signals = {name: Signal(channel.topic, name) for name in named}
+            return resolved(replace(defaults, signals=signals), channels)
+    raise BagError(
+        f"{recording.files[0]}: a table needs a mapping, such as "
+        "voltage=u velocity=y:deg/s time=t (identify --topics suggests one)"
+    )
+
+
+def add_time_columns(
+    recording: Recording,
+    plans: Mapping[str, MotorMap],
+    channels: list[Channel],
+    wanted: dict[str, list[str]],
+) -> None:
+    """Ask for the column of time of every table that is wanted."""
+    for plan in plans.values():
+        for topic in {signal.topic for signal in plan.signals.values()}:
+            signal = _time_signal(recording, plan, topic, channels)
+            if signal is not None and signal.field not in wanted[topic]:
+                wanted[topic].append(signal.field)
+
+
+def _time_signal(
+    recording: Recording, plan: MotorMap, topic: str, channels: list[Channel]
+) -> Signal | None:
+    """Return the column of time of a table; None where it needs none."""
+    channel = next((c for c in channels if c.topic == topic), None)
+    if channel is None or set(channel.fields) <= {"value"} or channel.fields[:1] == ("value[0]",):
+        return None  # an entry with times of its own
+    mapped = plan.signals.get("time")
+    if mapped is not None and (mapped.topic == topic or mapped.field in channel.fields):
+        return replace(mapped, topic=topic, unit=_unit("time", mapped, channel, mapped.field))
+    if plan.sample_time:
+        return None
+    likely = [name for name in channel.fields if re.search(TIME_NAMES, name, re.IGNORECASE)]
+    if mapped is not None and likely:
+        signal = Signal(topic, likely[0])
+        return replace(signal, unit=_unit("time", signal, channel, likely[0]))
+    hint = f"time={likely[0]}" if likely else "time=COLUMN"
+    raise BagError(
+        f"{recording.files[0]}: which column is the time? map {hint} or sample_time=SECONDS"
+    )
+
+
+def timed(
+    recording: Recording, plan: MotorMap, channels: list[Channel], tables: Mapping[str, Table]
+) -> dict[str, Table]:
+    """Return a plan's tables with their times in nanoseconds; rows without one are left out."""
+    result = {}
+    for topic in dict.fromkeys(signal.topic for signal in plan.signals.values()):
+        table = tables[topic]
+        findings = list(table.findings)
+        log = table.log
+        if log is None:
+            signal = _time_signal(recording, plan, topic, channels)
+            size = next(iter(table.columns.values())).size
+            if signal is None:
+                log = np.rint(np.arange(size) * (plan.sample_time * 1e9)).astype(np.int64)
+            else:
+                log, unit = _nanoseconds(table, signal)
+                if unit and unit != signal.unit:
+                    text = f"{recording.name}: {signal.field} is taken for {unit} since 1970"
+                    findings.append(found("time_unit", text))
+        sound = log > _NEVER
+        columns = table.columns
+        if not sound.all():
+            text = f"{recording.name}: {int((~sound).sum())} rows without time were left out"
+            findings.append(found("rows_without_time", text, "warning"))
+            log, columns = log[sound], {name: c[sound] for name, c in columns.items()}
+        if not log.size:
+            raise BagError(f"{recording.files[0]}: has no rows with a time")
+        result[topic] = Table(log, None, columns, findings=findings, clocked=True)
+    return result
+
+
+_NEVER = -(2**62)
+
+
+def _nanoseconds(table: Table, signal: Signal) -> tuple[Integers, str]:
+    """Return the times of a table, `_NEVER` where there is none; and a unit that was inferred."""
+    column = table.columns[signal.field]
+    if signal.field in table.exact:
+        return column.astype(np.int64), ""
+    unit = signal.unit
+    if not unit:
+        size = np.nanmedian(np.abs(column.astype(np.float64))) if column.size else 0.0
+        unit = next((name for least, name in _EPOCHS if size > least), "")
+    factor = FACTORS["time"][unit or "s"] * signal.scale * 1e9
+    if column.dtype.kind in "iu" and factor == round(factor):
+        return column.astype(np.int64) * round(factor), unit
+    values = column.astype(np.float64) * factor
+    sound = np.isfinite(values) & (np.abs(values) < -float(_NEVER))
+    log = np.full(values.size, _NEVER, np.int64)
+    log[sound] = np.rint(values[sound]).astype(np.int64)
+    return log, unit

@@ -1,0 +1,157 @@
+"""Decompression that cannot be made to fill the memory.
+
+A few bytes of zstd, lz4 or bz2 may stand for gigabytes.  Everything is unpacked in small pieces,
+and all pieces of a recording together may not exceed what its size makes believable; the
+environment variable ``SMP_BAG_UNPACKED`` (bytes, or such as ``8G``) raises that limit.
+"""
+
+from __future__ import annotations
+
+import bz2
+import os
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import lz4.frame
+import numpy as np
+import zstandard
+
+from smp_motor_ident.bag.storage import Batch, gather, join
+from smp_motor_ident.diagnosis.limits import UNPACKED_LEAST, UNPACKED_RATIO
+from smp_motor_ident.errors import BagError
+
+VARIABLE = "SMP_BAG_UNPACKED"
+MAGIC = {b"\x28\xb5\x2f\xfd": "zstd", b"\x04\x22\x4d\x18": "lz4"}
+_FED = 1024
+"""Bytes fed at once: the largest block of zstd, 128 KiB, may be packed in four bytes."""
+_PIECE = 1 << 20
+_DAMAGE = (zstandard.ZstdError, RuntimeError, EOFError, OSError, ValueError)
+_ZSTD = zstandard.ZstdDecompressor()
+
+
+class Budget:
+    """Bytes that may still be unpacked of one recording.
+
+    Parameters
+    ----------
+    name : str
+        Of the recording.
+    packed : int
+        Its bytes as they are.
+    """
+
+    def __init__(self, name: str, packed: int) -> None:
+        self.name = name
+        self.limit = _asked() or int(max(UNPACKED_LEAST.value, UNPACKED_RATIO.value * packed))
+        self.left = self.limit
+
+    def take(self, size: int) -> None:
+        """Count bytes; too many are an error that says how to allow them."""
+        self.left -= size
+        if self.left < 0:
+            raise BagError(
+                f"{self.name}: unpacks to more than {self.limit / 1e6:.0f} MB, which a file of its "
+                f"size is not expected to hold; {VARIABLE}=8G in the environment allows 8 GB"
+            )
+
+
+def _asked() -> int:
+    """Return the limit that the user set, 0 where there is none."""
+    text = os.environ.get(VARIABLE, "").strip().upper()
+    if not text:
+        return 0
+    factor = {"K": 1 << 10, "M": 1 << 20, "G": 1 << 30}.get(text[-1], 1)
+    try:
+        return int(float(text.rstrip("KMG")) * factor)
+    except (ValueError, OverflowError):
+        raise BagError(f"{VARIABLE} is {text!r}; give bytes, or such as 512M or 8G") from None
+
+
+def pieces(blocks: Iterable[bytes], kind: str) -> Iterator[bytes]:
+    """Unpack all frames of a stream; EOFError where it is cut off."""
+    engine: Any = None
+    for block in blocks:
+        for k in range(0, len(block), _FED):
+            rest = block[k : k + _FED]
+            while rest:
+                if engine is None or engine.eof:  # another frame follows
+                    engine = _engine(kind)
+                if kind == "zstd":
+                    yield engine.decompress(rest)
+                else:
+                    yield engine.decompress(rest, _PIECE)
+                    while not (engine.eof or engine.needs_input):
+                        yield engine.decompress(b"", _PIECE)
+                rest = engine.unused_data if engine.eof else b""
+    if engine is None or not engine.eof:
+        raise EOFError("cut off")
+
+
+def _engine(kind: str) -> Any:
+    if kind == "zstd":
+        return _ZSTD.decompressobj()
+    return lz4.frame.LZ4FrameDecompressor() if kind == "lz4" else bz2.BZ2Decompressor()
+
+
+def decompress(data: bytes, compression: str, size: int, budget: Budget) -> bytes:
+    """Decompress a block, or what can be had of one that is cut off."""
+    if compression in ("", "none"):
+        return data
+    if compression not in ("zstd", "lz4", "bz2"):
+        raise BagError(f"compression {compression!r} is not supported; use zstd, lz4 or bz2")
+    parts: list[bytes] = []
+    try:
+        if compression == "zstd":
+            whole = zstandard.get_frame_parameters(data).content_size
+            if whole == size or (size == 0 and 0 < whole <= 1 << 20):
+                budget.take(whole)
+                try:
+                    return _ZSTD.decompress(data)
+                except zstandard.ZstdError:
+                    budget.left += whole  # cut off: take what comes
+        for piece in pieces([data], compression):
+            budget.take(len(piece))
+            parts.append(piece)
+    except _DAMAGE:
+        pass  # what came before the damage is whole
+    return b"".join(parts)
+
+
+def unpack_file(path: Path, plain: Path, kind: str, budget: Budget) -> str:
+    """Decompress a file; return what is amiss with it."""
+    try:
+        with path.open("rb") as packed, plain.open("wb") as out:
+            for piece in pieces(iter(lambda: packed.read(1 << 16), b""), kind):
+                budget.take(len(piece))
+                out.write(piece)
+    except EOFError:
+        return f"{path.name}: its compression is cut off"
+    except (zstandard.ZstdError, RuntimeError, ValueError) as error:
+        return f"{path.name}: its compression is damaged ({error})"
+    except OSError as error:
+        raise BagError(f"{path}: cannot be unpacked ({error.strerror})") from None
+    return ""
+
+
+def decompress_messages(batch: Batch, budget: Budget) -> tuple[Batch, int]:
+    """Decompress messages that were compressed one by one; return how many were lost, too."""
+    sound = batch.length >= 4
+    if not sound.any():
+        return batch, 0
+    first = gather(batch.data, np.where(sound, batch.offset, batch.offset[sound][0]), "<u4")
+    packed = {
+        kind: sound & (first == int.from_bytes(magic, "little")) for magic, kind in MAGIC.items()
+    }
+    if not any(which.any() for which in packed.values()):
+        return batch, 0
+    blobs = []
+    for k in range(len(batch)):
+        kind = next((kind for kind, which in packed.items() if which[k]), "")
+        blobs.append(decompress(batch.message(k), kind, 0, budget))
+    kept = np.array([bool(blob) for blob in blobs])
+    joined = join(batch.channel, [b for b in blobs if b], batch.log_time[kept])
+    if batch.sequence is not None:
+        joined = replace(joined, sequence=batch.sequence[kept])
+    return joined, int((~kept).sum())

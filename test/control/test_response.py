@@ -1,0 +1,98 @@
+"""The exact response against the matrix exponential, from oscillation to a pole long decayed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from smp_motor_control.errors import ParameterError
+from smp_motor_control.motor.response import (
+    FreeResponse,
+    flexible_shaft,
+    frequency_response,
+    zero_order_hold,
+)
+
+GAIN, TAU = 20.0, 0.05
+# tp / tau^2: oscillating, a double root, real roots, and L/R of 50 us and 50 ns.
+SHARES = (30.0, 1.0, 0.25, 0.2, 1e-3, 1e-6)
+
+
+def by_exponential(tau: float, tp: float, t: float) -> np.ndarray:
+    """Transition of speed, acceleration, angle and voltage, as one exponential in pieces."""
+    A = np.zeros((4, 4))
+    A[0, 1], A[2, 0] = 1.0, 1.0
+    A[1] = [-1.0 / tp, -tau / tp, 0.0, GAIN / tp]
+    # Short enough that the largest entry of A t, scaled, loses no digits; then multiplied.
+    pieces = 2 ** max(int(np.ceil(np.log2(max(t * tau / tp, 1.0)))), 0)
+    return np.linalg.matrix_power(expm(A * t / pieces), pieces)
+
+
+@pytest.mark.parametrize("share", SHARES)
+@pytest.mark.parametrize("interval", [1e-4, 1e-3, 0.02])
+def test_held_response_is_the_matrix_exponential(share: float, interval: float) -> None:
+    tp = share * TAU**2
+    held = zero_order_hold(GAIN, TAU, tp, interval)
+    truth = by_exponential(TAU, tp, interval)
+    size = np.array([1.0, 1.0 / TAU])  # of speed and acceleration
+    # Rounding: 1e-16 of each entry, times up to 2^20 products of the pieces of the truth.
+    tolerance = 1e-9
+    scaled = (held.transition[0] - truth[:2, :2]) / size[:, None] * size
+    assert np.abs(scaled).max() < tolerance
+    assert np.abs((held.forced[0] - truth[:2, 3]) / size).max() < tolerance * GAIN
+    assert held.angle_transition[0] * size == pytest.approx(truth[2, :2] * size, abs=1e-11)
+    assert held.angle_forced[0] == pytest.approx(truth[2, 3], abs=1e-10)
+
+
+@pytest.mark.parametrize("share", [*SHARES, 0.0])
+def test_scalar_and_batched_response_are_the_same(share: float) -> None:
+    times = np.geomspace(1e-5, 3.0, 30)
+    held = zero_order_hold(GAIN, TAU, share * TAU**2, times)
+    free = FreeResponse(TAU, share * TAU**2)
+    for k, t in enumerate(times):
+        g, h, g_rate, h_rate = free.after(t)
+        assert held.transition[k].ravel() == pytest.approx([g, h, g_rate, h_rate], rel=1e-12)
+
+
+def test_a_decayed_pole_leaves_the_motor_of_first_order() -> None:
+    # L/R of 1 ns beside 50 ms: the two differ by its share, 2e-8.
+    second = zero_order_hold(GAIN, TAU, 1e-9 * TAU, 0.05)
+    first = zero_order_hold(GAIN, TAU, 0.0, 0.05)
+    assert second.forced == pytest.approx(first.forced, rel=1e-7)
+    assert second.angle_forced == pytest.approx(first.angle_forced, rel=1e-7)
+    for values in second:
+        assert np.all(np.isfinite(values))
+
+
+def test_frequency_response_is_the_transform_of_the_held_one() -> None:
+    tp, T, omega = 0.2 * TAU**2, 1e-3, np.array([3.0, 30.0])
+    held = zero_order_hold(GAIN, TAU, tp, T)
+    z = np.exp(1j * omega * T)
+    sampled = [np.linalg.solve(x * np.eye(2) - held.transition[0], held.forced[0])[0] for x in z]
+    # The hold delays by half a sample and dampens by (w T)^2 / 24 = 4e-5; aliases are below that.
+    hold = (1.0 - np.exp(-1j * omega * T)) / (1j * omega * T)
+    response = frequency_response(GAIN, TAU, tp, omega)[0]
+    assert response * hold == pytest.approx(np.array(sampled), rel=1e-4)
+
+
+def test_a_flexible_shaft_resonates_where_its_two_inertias_say() -> None:
+    motor, load, stiffness = (2.0, 1e-3, 0.03, 1e-5, 1e-6), 4e-5, 2.0
+    A, _ = flexible_shaft(motor, load, stiffness)
+    ringing = np.abs(np.linalg.eigvals(A).imag).max()
+    # Back-EMF and friction shift it by the square of their damping, a few percent.
+    assert ringing == pytest.approx(np.sqrt(stiffness * (1 / 1e-5 + 1 / load)), rel=0.02)
+
+
+@pytest.mark.parametrize("inductance", [0.0, 1e-3])
+def test_a_stiff_shaft_is_one_inertia(inductance: float) -> None:
+    motor, load = (2.0, inductance, 0.03, 1e-5, 1e-6), 4e-5
+    A, B = flexible_shaft(motor, load, 1e9, 1.0)
+    speed = -2 if inductance == 0.0 else 2
+    gain = -np.linalg.solve(A, B)[1 if inductance == 0.0 else speed]
+    assert gain == pytest.approx(0.03 / (0.03**2 + 2.0 * 1e-6), rel=1e-6)
+
+
+def test_a_shaft_without_stiffness_is_refused() -> None:
+    with pytest.raises(ParameterError, match="stiffness"):
+        flexible_shaft((2.0, 1e-3, 0.03, 1e-5, 1e-6), 4e-5, 0.0)

@@ -1,0 +1,227 @@
+"""Formats besides bags of ROS 2, each from a file that something else than its reader wrote."""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import openpyxl
+import pytest
+import scipy.io
+from rosbags.rosbag1 import Writer
+from rosbags.typesys import Stores, get_typestore
+
+from smp_motor_ident.bag import list_topics, read_records
+from smp_motor_ident.bag.readers import FORMATS
+from smp_motor_ident.errors import BagError
+
+N = 200
+TIME = 0.01 * np.arange(N)
+RNG = np.random.default_rng(3)
+VOLTAGE = RNG.uniform(-6, 6, N)
+SPEED = np.cumsum(RNG.normal(0, 1, N))
+MAP = ["voltage=u velocity=y time=t"]
+
+
+def assert_motor(record: Any, n: int = N, speed: np.ndarray = SPEED) -> None:
+    """Assert that a record holds the signals: a command that holds from its instant on."""
+    assert len(record) == n
+    np.testing.assert_allclose(record.time, TIME[:n], atol=1e-9)  # whole nanoseconds
+    # Excel keeps 16 digits.
+    np.testing.assert_allclose(record.voltage[1:], VOLTAGE[: n - 1], rtol=1e-15)
+    np.testing.assert_allclose(record.velocity, speed[:n], rtol=1e-15)  # one factor of a unit
+
+
+def test_every_format_is_registered_once() -> None:
+    names = [form.name for form in FORMATS]
+    assert len(names) == len(set(names)) >= 9
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_vectors_of_a_matlab_file_are_columns(tmp_path: Path, compressed: bool) -> None:
+    path = tmp_path / "log.mat"
+    content = {"t": TIME, "u": VOLTAGE[:, None], "y": SPEED, "note": "a motor", "fs": 100.0}
+    scipy.io.savemat(path, content, do_compression=compressed)
+    assert_motor(read_records(path, MAP)["motor"])
+
+
+def test_fields_of_a_matlab_structure_and_columns_of_a_matrix_have_paths(tmp_path: Path) -> None:
+    path = tmp_path / "log.mat"
+    log = {"time": TIME, "signals": {"values": np.stack([VOLTAGE, SPEED], axis=1)}}
+    scipy.io.savemat(path, {"log": log}, do_compression=True)
+    mapping = ["voltage=log.signals.values[0] velocity=log.signals.values[1]:rad/s time=log.time"]
+    assert_motor(read_records(path, mapping)["motor"])
+
+
+def test_a_matlab_file_of_another_version_or_cut_off_is_one_line(tmp_path: Path) -> None:
+    hdf = tmp_path / "new.mat"
+    hdf.write_bytes(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(512) + b"\x89HDF\r\n\x1a\n")
+    with pytest.raises(BagError, match=r"h5py|no readable MATLAB"):
+        read_records(hdf, MAP)
+    whole = io.BytesIO()
+    scipy.io.savemat(whole, {"t": TIME, "u": VOLTAGE, "y": SPEED}, do_compression=True)
+    (tmp_path / "cut.mat").write_bytes(whole.getvalue()[:700])
+    with pytest.raises(BagError, match=r"cut\.mat: .*cut off"):
+        read_records(tmp_path / "cut.mat", MAP)
+
+
+def data_log(extra: bytes = b"") -> bytes:
+    """Return a data log by the published layout: records of few and of many bytes."""
+
+    def text(value: str) -> bytes:
+        return struct.pack("<I", len(value)) + value.encode()
+
+    def record(entry: int, stamp: int, payload: bytes, wide: bool) -> bytes:
+        if wide:
+            return struct.pack("<BIIQ", 0x7F, entry, len(payload), stamp) + payload
+        return struct.pack("<BBBI", 0x30, entry, len(payload), stamp) + payload
+
+    parts = [b"WPILOG", struct.pack("<HI", 0x0100, len(extra)), extra]
+    for entry, (name, kind) in enumerate(
+        [("/drive/left volts", "double"), ("NT:left/speed", "double[]"), ("message", "string")], 1
+    ):
+        start = struct.pack("<BI", 0, entry) + text(name) + text(kind) + text("")
+        parts.append(record(0, 0, start, wide=False))
+    for k in range(N):
+        stamp = round(1e6 * TIME[k])
+        parts.append(record(1, stamp, struct.pack("<d", VOLTAGE[k]), wide=k % 2 == 0))
+        parts.append(record(2, stamp, struct.pack("<dd", 7.0, SPEED[k]), wide=False))
+        parts.append(record(3, stamp, b"hello", wide=True))
+    return b"".join(parts)
+
+
+def test_entries_of_a_wpilib_data_log_are_signals_with_their_own_times(tmp_path: Path) -> None:
+    path = tmp_path / "robot.wpilog"
+    path.write_bytes(data_log(b"extra header"))
+    mapping = ['voltage="/drive/left volts"', 'velocity="NT:left/speed[1]"']
+    assert_motor(read_records(path, mapping)["motor"])
+    assert [offer.topic for offer in list_topics(path)[0].offers] == [
+        "/drive/left volts",
+        "NT:left/speed",
+    ]
+
+
+def test_of_a_data_log_that_is_cut_off_the_rest_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "robot.wpilog"
+    whole = data_log()
+    path.write_bytes(whole[: len(whole) // 2])
+    mapping = ['voltage="/drive/left volts" velocity="NT:left/speed[1]"']
+    record = read_records(path, mapping)["motor"]
+    assert 80 < len(record) < 120
+    np.testing.assert_array_equal(record.velocity, SPEED[: len(record)])
+    assert [f.code for f in record.findings if f.severity == "warning"] == ["damaged_recording"]
+
+
+def test_a_sysid_file_describes_itself(tmp_path: Path) -> None:
+    rows = np.stack([TIME, VOLTAGE, np.zeros(N), SPEED], axis=1)
+    document = {
+        "sysid": True,
+        "test": "Simple",
+        "units": "Rotations",
+        "unitsPerRotation": 1.0,
+        "slow-forward": rows[:100].tolist(),
+        "fast-backward": np.add(rows[100:], (10.0, 0, 0, 0)).tolist(),
+    }
+    path = tmp_path / "sysid.json"
+    path.write_text(json.dumps(document))
+    record = read_records(path)["motor"]
+    np.testing.assert_allclose(record.velocity, 2 * np.pi * SPEED)  # a rotation is two pi
+    assert record.starts == (0, 100)
+
+
+@pytest.mark.parametrize("form", ["rows", "columns", "lines", "nested"])
+def test_json_logs_of_any_shape_are_read(tmp_path: Path, form: str) -> None:
+    rows = [
+        {"t": t, "u": u, "y": y, "state": "run"}
+        for t, u, y in zip(TIME.tolist(), VOLTAGE.tolist(), SPEED.tolist())
+    ]
+    path, mapping = tmp_path / "log.json", MAP
+    if form == "rows":
+        path.write_text(json.dumps(rows))
+    elif form == "columns":
+        columns = {"t": TIME.tolist(), "u": VOLTAGE.tolist(), "y": SPEED.tolist()}
+        path.write_text(json.dumps(columns))
+    elif form == "lines":
+        path = tmp_path / "log.jsonl"
+        path.write_text("\n".join(map(json.dumps, rows)) + '\n{"t": 2.0, "u"')
+    else:
+        nested = [{"at": r["t"], "motor": {"u": r["u"], "w": [0, r["y"]]}} for r in rows]
+        path.write_text(json.dumps({"rig": 1, "log": nested}))
+        mapping = ["voltage=log.motor.u velocity=log.motor.w[1] time=log.at"]
+    record = read_records(path, mapping)["motor"]
+    assert_motor(record)
+    assert any(f.code == "damaged_recording" for f in record.findings) is (form == "lines")
+
+
+def test_messages_of_several_kinds_in_one_jsonl_are_told_apart(tmp_path: Path) -> None:
+    path = tmp_path / "log.jsonl"
+    lines = []
+    for t, u, y in zip(TIME.tolist(), VOLTAGE.tolist(), SPEED.tolist()):
+        lines += [json.dumps({"t": t, "cmd": u}), json.dumps({"t": t + 0.005, "rpm": y})]
+    path.write_text("\n".join(lines))
+    record = read_records(path, ["voltage=cmd velocity=rpm:rpm time=t"])["motor"]
+    assert record.velocity is not None and len(record) >= N - 1
+    seen = record.velocity[np.isfinite(record.velocity)] * 60 / (2 * np.pi)
+    np.testing.assert_allclose(seen, SPEED[-seen.size :], rtol=1e-12)
+
+
+def test_a_workbook_is_read_with_names_and_units(tmp_path: Path) -> None:
+    book = openpyxl.Workbook()
+    sheet = book.active
+    sheet.append(["measured on Monday"])
+    sheet.append(["t", "u", "y", "remark"])
+    sheet.append(["ms", "V", "rad/s", None])
+    for t, u, y in zip(TIME, VOLTAGE, SPEED):
+        sheet.append([1e3 * t, u, y, "ok"])
+    book.save(tmp_path / "log.xlsx")
+    assert_motor(read_records(tmp_path / "log.xlsx", MAP)["motor"])
+
+
+def ros1_bag(path: Path, compression: Any = None) -> Path:
+    """Write a bag of ROS 1 by rosbags."""
+    store = get_typestore(Stores.ROS1_NOETIC)
+    number, joints = "std_msgs/msg/Float64", "sensor_msgs/msg/JointState"
+    header, stamp = store.types["std_msgs/msg/Header"], store.types["builtin_interfaces/msg/Time"]
+    writer = Writer(path)
+    writer.chunk_threshold = 4096
+    if compression is not None:
+        writer.set_compression(compression)
+    with writer as bag:
+        pwm = bag.add_connection("/pwm", number, typestore=store)
+        state = bag.add_connection("/joint_states", joints, typestore=store)
+        for k in range(N):
+            at = 1_600_000_000_000_000_000 + round(1e9 * TIME[k])
+            message: Any = store.types[number](float(VOLTAGE[k]))
+            bag.write(pwm, at, store.serialize_ros1(message, number))
+            message = store.types[joints](
+                header(k, stamp(*divmod(at, 10**9)), "base"),
+                ["left", "right"],
+                np.zeros(2),
+                np.array([0.0, SPEED[k]]),
+                np.zeros(0),
+            )
+            bag.write(state, at, store.serialize_ros1(message, joints))
+    return path
+
+
+ROS1 = ["voltage=/pwm.data velocity=/joint_states.velocity[right] clock=log"]
+
+
+@pytest.mark.parametrize("compression", [None, "BZ2", "LZ4"])
+def test_a_bag_of_ros_1_is_read_as_it_is(tmp_path: Path, compression: str | None) -> None:
+    kind = None if compression is None else Writer.CompressionFormat[compression]
+    assert_motor(read_records(ros1_bag(tmp_path / "old.bag", kind), ROS1)["motor"])
+
+
+def test_of_a_bag_of_ros_1_that_is_cut_off_the_rest_is_read(tmp_path: Path) -> None:
+    path = ros1_bag(tmp_path / "old.bag")
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) * 2 // 5])
+    record = read_records(path, ROS1)["motor"]
+    assert N // 4 < len(record) < N
+    np.testing.assert_array_equal(record.velocity, SPEED[: len(record)])
+    assert any(f.code == "damaged_recording" for f in record.findings)
