@@ -80,3 +80,9 @@ SMOOTHER = Limit(
     "cost: stamps are kept unless the motion is evidently smoother on the beat that they keep",
     "test/ident/bag/test_beat.py",
 )
+EXPLAINS = Limit(
+    1e-6,
+    "1",
+    "significance: with a thousand pairs of fields tried, one in a thousand listings is wrong",
+    "test/ident/bag/test_propose.py",
+)
