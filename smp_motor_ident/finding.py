@@ -45,13 +45,6 @@ class Finding:
             "advice": self.advice,
         }
 
-    @classmethod
-    def from_document(cls, document: Mapping[str, Any]) -> Finding:
-        """Read an entry of ``identification.json``."""
-        return cls(
-            **{name: document[name] for name in cls.__dataclass_fields__ if name in document}
-        )
-
 
 def gravest(findings: Iterable[Finding]) -> Severity | None:
     """Return the gravest severity among findings, None where there is none."""

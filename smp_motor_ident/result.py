@@ -83,12 +83,26 @@ class Candidate:
     reason: str = ""
 
 
+@dataclass(frozen=True, eq=False)
+class Correlation:
+    """Correlation over lags [samples], with the band that all of them stay in by chance."""
+
+    lag: Array
+    value: Array
+    band: float
+
+
 @dataclass(frozen=True)
 class ResidualTests:
-    """Whiteness of the residuals and their independence from the input (95 % bands)."""
+    """Whiteness of the residuals and their independence from the input (95 % bands).
+
+    The curves are what the verdicts are of; they are for the report and stay out of the JSON.
+    """
 
     white: bool | None = None
     independent_of_input: bool | None = None
+    autocorrelation: Correlation | None = field(default=None, compare=False, repr=False)
+    cross_correlation: Correlation | None = field(default=None, compare=False, repr=False)
 
 
 @dataclass(frozen=True)
@@ -120,8 +134,6 @@ class Estimate:
     candidates: tuple[Candidate, ...] = ()
     residuals: ResidualTests = ResidualTests()
     findings: tuple[Finding, ...] = ()
-    warnings: tuple[str, ...] = ()
-    advice: tuple[str, ...] = ()
     samples: int = 0
     duration: float = 0.0
     sample_time: float = 0.0
@@ -132,6 +144,16 @@ class Estimate:
     def unidentifiable(self) -> tuple[str, ...]:
         """Parameters that the data cannot tell."""
         return tuple(n for n, q in self.parameters.items() if q.status == "unidentifiable")
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Messages of the findings that are more than notes."""
+        return tuple(dict.fromkeys(f.message for f in self.findings if f.severity != "note"))
+
+    @property
+    def advice(self) -> tuple[str, ...]:
+        """What the findings advise to do."""
+        return tuple(dict.fromkeys(f.advice for f in self.findings if f.advice))
 
     @property
     def unreliable(self) -> bool:
@@ -251,51 +273,6 @@ class Estimate:
             },
         }
 
-    @classmethod
-    def from_document(cls, wheel: str, document: Mapping[str, Any]) -> Estimate:
-        """Read a motor's entry of ``identification.json``.
-
-        Parameters
-        ----------
-        wheel : str
-            Key of the entry.
-        document : mapping
-            As written by :meth:`to_document`; keys beyond the contract may be missing.
-
-        Returns
-        -------
-        Estimate
-            The same estimate.
-
-        Raises
-        ------
-        KeyError
-            When a key of the contract is missing.
-        """
-        covariance = document.get("covariance", {"names": [], "matrix": []})
-        names = tuple(covariance["names"])
-        matrix = np.array(covariance["matrix"], dtype=np.float64).reshape(len(names), len(names))
-        fit = document.get("fit_percent", {})
-        return cls(
-            wheel=wheel,
-            model=document["model"],
-            parameters={n: _quantity_from(q) for n, q in document["parameters"].items()},
-            combinations={n: _quantity_from(q) for n, q in document["combinations"].items()},
-            names=names,
-            covariance=matrix,
-            fit_percent=FitPercent(fit.get("estimation"), fit.get("validation")),
-            candidates=tuple(Candidate(**c) for c in document.get("candidates", [])),
-            residuals=ResidualTests(**document.get("residuals", {})),
-            findings=tuple(Finding.from_document(f) for f in document.get("findings", ())),
-            warnings=tuple(document.get("warnings", ())),
-            advice=tuple(document.get("advice", ())),
-            samples=document.get("samples", 0),
-            duration=document.get("duration") or 0.0,
-            sample_time=document.get("sample_time") or 0.0,
-            sources=tuple(document.get("sources", ())),
-            hardware=Hardware(**document.get("hardware", {})),
-        )
-
 
 def _number(value: float | None) -> float | None:
     return None if value is None or not math.isfinite(value) else float(value)
@@ -310,14 +287,3 @@ def _quantity_to_document(quantity: Quantity) -> dict[str, Any]:
         "unit": quantity.unit,
         "status": quantity.status,
     }
-
-
-def _quantity_from(document: Mapping[str, Any]) -> Quantity:
-    interval = document.get("ci95")
-    return Quantity(
-        value=document["value"],
-        std=document.get("std"),
-        ci95=None if interval is None else (interval[0], interval[1]),
-        unit=document.get("unit", ""),
-        status=document.get("status", "estimated"),
-    )

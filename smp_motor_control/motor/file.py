@@ -2,7 +2,7 @@
 
 ::
 
-    /motor_plant:
+    /**/motor_plant:
       ros__parameters:
         motors:
           front_left:
@@ -20,11 +20,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from smp_motor_control.encoder import Encoder
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.motor.friction import Gearbox, MotorParameters
+from smp_motor_control.parameter_file import read_yaml
 
 PHYSICAL = (
     "resistance",
@@ -82,17 +81,6 @@ class MotorEntry:
         return not math.isnan(self.resistance)
 
 
-class _Loader(yaml.SafeLoader):
-    """YAML with the numbers of ROS: ``1e-6`` is one, not text."""
-
-
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]+\Z"),
-    list("-+0123456789."),
-)
-
-
 def load_motors(path: str | Path, wheels: Iterable[str] | None = None) -> dict[str, MotorEntry]:
     """Read the motors of a ROS parameter file.
 
@@ -114,15 +102,7 @@ def load_motors(path: str | Path, wheels: Iterable[str] | None = None) -> dict[s
         When the file cannot be read, lacks a motor or a key, or has an unknown or
         impossible one; the message names the file, the motor and the value.
     """
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-        document = yaml.load(text, Loader=_Loader)
-    except OSError as error:
-        raise ParameterError(f"{path}: cannot be read: {error.strerror}") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        line = " ".join(str(error).split())
-        raise ParameterError(f"{path}: is not YAML: {line}") from None
-    motors = _find_motors(document, str(path))
+    motors = _find_motors(read_yaml(path), str(path))
     return parse_motors(motors, str(path), wheels)
 
 
@@ -143,7 +123,7 @@ def _find_motors(document: Any, source: str) -> Mapping[str, Any]:
                 return motors
         pending.extend(level.values())
     raise ParameterError(
-        f"{source}: has no motors; expected /motor_plant: ros__parameters: motors: front_left: ..."
+        f"{source}: has no motors; expected NODE: ros__parameters: motors: front_left: ..."
     )
 
 
@@ -256,6 +236,10 @@ def _with_hardware(
 def _number(value: Any, where: str) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise ParameterError(f"{where} is {value!r}; it must be a number")
-    if not math.isfinite(value):
-        raise ParameterError(f"{where} is {value!r}; it must be finite")
-    return float(value)
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
+    if not math.isfinite(number):
+        raise ParameterError(f"{where} is {value!r:.40}; it must be finite")
+    return number

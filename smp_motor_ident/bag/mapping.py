@@ -14,11 +14,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import yaml
-
+from smp_motor_control.parameter_file import read_yaml
 from smp_motor_ident.bag.template import parse_path
 from smp_motor_ident.bag.units import check_unit
-from smp_motor_ident.errors import BagError
+from smp_motor_ident.errors import BagError, ParameterError
 
 SIGNALS = ("voltage", "current", "velocity", "position", "count", "supply", "direction", "time")
 HARDWARE = (
@@ -218,13 +217,9 @@ def load(path: str | os.PathLike[str]) -> SignalMap:
     """
     path = Path(path)
     try:
-        document = yaml.safe_load(path.read_text("utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise BagError(f"{path}: cannot be read ({error})") from None
-    except (yaml.YAMLError, ValueError) as error:
-        raise BagError(f"{path}: no YAML ({' '.join(str(error).split())})") from None
-    except RecursionError:
-        raise BagError(f"{path}: is nested too deeply") from None
+        document = read_yaml(path)
+    except ParameterError as error:
+        raise BagError(str(error)) from None
     mapping = from_document(document, str(path))
     files = tuple(str(path.parent / name) for name in mapping.msg_files)
     return replace(mapping, msg_files=files)

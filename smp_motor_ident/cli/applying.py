@@ -8,8 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import yaml
-
+from smp_motor_control.parameter_file import flat, read_parameters
 from smp_motor_ident.cli.processes import connect
 from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.tune import Design
@@ -48,41 +47,13 @@ def from_designs(designs: Mapping[str, Design]) -> dict[str, dict[str, Any]]:
 
 def from_file(path: Path) -> dict[str, dict[str, Any]]:
     """Read the parameters of wheel nodes from a ROS parameter file."""
-    try:
-        document = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ParameterError(f"{path}: cannot be read ({error.strerror})") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ParameterError(f"{path}: is not YAML: {' '.join(str(error).split())}") from None
     found = {}
-    for node, entry in document.items() if isinstance(document, Mapping) else ():
-        *_, wheel, name = ("", "", *str(node).split("/"))
-        if name == "wheel_pid" and wheel and isinstance(entry, Mapping):
-            found[wheel] = flat(entry.get("ros__parameters") or {})
+    for node, values in read_parameters(path).items():
+        *_, wheel, name = ("", "", *node.split("/"))
+        if name == "wheel_pid" and wheel:
+            found[wheel] = values
     if not found:
         raise ParameterError(f"{path}: holds no /<wheel>/wheel_pid; give a file that tune wrote")
-    return found
-
-
-def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return nested parameters by their ROS names.
-
-    Parameters
-    ----------
-    tree : mapping
-        As in a parameter file.
-    prefix : str
-        Before every name.
-
-    Returns
-    -------
-    dict
-        Such as ``{"model.delay": 0.0}``.
-    """
-    found: dict[str, Any] = {}
-    for name, value in tree.items():
-        inner = isinstance(value, Mapping)
-        found.update(flat(value, f"{prefix}{name}.") if inner else {prefix + name: value})
     return found
 
 

@@ -3,19 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import shutil
-import sys
 from collections.abc import Sequence
-from pathlib import Path
 
-from smp_motor_control import WHEELS
-from smp_motor_ident.cli import steps
-from smp_motor_ident.cli.frame import Parser, run
-from smp_motor_ident.cli.processes import ProcessError, Processes, connect
-from smp_motor_ident.errors import ParameterError
+from smp_motor_ident.cli.frame import Parser, number, run
 
 NAME = "commission"
-SIGNALS = ("sine", "square", "fourier")
 
 DESCRIPTION = """\
 Excite the wheels of the running robot, record them, identify the motors, design gains and, with
@@ -30,116 +22,16 @@ def parser() -> argparse.ArgumentParser:
     add = made.add_argument
     add("--output", "-o", metavar="DIR", required=True, help="new folder for bag and results")
     add("--wheel", action="append", metavar="NAME", help="only this wheel; default: all four")
-    add("--amplitude", type=float, default=6.0, help="largest voltage [V]; default 6")
-    add("--duration", type=float, default=15.0, help="of each of three signals [s]; default 15")
+    add("--amplitude", type=number(0), default=6.0, help="largest voltage [V]; default 6")
+    add("--duration", type=number(0), default=15.0, help="of each of three signals [s]; default 15")
     add("--apply", action="store_true", help="set the gains in the running controllers")
     add("--yes", "-y", action="store_true", help="do not ask before the wheels move")
     return made
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the tool.
-
-    Parameters
-    ----------
-    argv : sequence of str or None
-        Arguments; None takes those of the process.
-
-    Returns
-    -------
-    int
-        0 done, 1 the data do not support the answer, 2 wrong usage.
-    """
-    return run(parser(), work, argv)
-
-
-def work(arguments: argparse.Namespace) -> int:
-    """Do what the arguments say."""
-    folder, wheels, plan = _checked(arguments)
-    try:
-        return _commission(arguments, folder, wheels, plan)
-    finally:
-        if folder.is_dir() and not (folder / "excitation").exists():
-            shutil.rmtree(folder)  # nothing but logs of what did not begin
-
-
-def _commission(
-    arguments: argparse.Namespace,
-    folder: Path,
-    wheels: tuple[str, ...],
-    plan: Sequence[steps.Excitation],
-) -> int:
-    ros = tuple(arguments.ros_arguments)
-    # The client leaves last: who excites has ended when the controllers are given back.
-    with connect(NAME, ros) as client, Processes(folder / "logs") as processes:
-        robot = steps.Robot(processes, client, wheels, folder, ros)
-        rates = client.wait_for_wheels(wheels, timeout=10.0)
-        print("; ".join(f"{wheel} reports at {rate:.0f} Hz" for wheel, rate in rates.items()))
-        _confirm(arguments, wheels)
-        with client.paused(wheels):
-            bag = _excited(robot, plan)
-            results = folder / "identification"
-            steps.identify_wheels(bag, results)
-            gains = steps.tune_wheels(results, folder / "gains.yaml")
-            if arguments.apply:
-                steps.set_gains(robot, gains)
-                print("gains set in the running controllers")
-    print(f"report: {results / 'report.html'}")
-    if not arguments.apply:
-        print(f"to use the gains: tune {results} --apply, or --params-file {folder / 'gains.yaml'}")
-    return 0
-
-
-def _checked(
-    arguments: argparse.Namespace,
-) -> tuple[Path, tuple[str, ...], list[steps.Excitation]]:
-    """Return folder, wheels and signals, or refuse before anything starts."""
-    folder = Path(arguments.output)
-    if folder.exists():
-        raise ParameterError(f"{folder}: exists already; choose another --output")
-    wheels = tuple(dict.fromkeys(arguments.wheel or WHEELS))
-    for wheel in wheels:
-        if wheel not in WHEELS:
-            raise ParameterError(f"--wheel {wheel}: is none of {', '.join(WHEELS)}")
-    for name in ("amplitude", "duration"):
-        value = getattr(arguments, name)
-        if not 0 < value < float("inf"):
-            raise ParameterError(f"--{name} is {value}; it must be positive")
-    shares = {"sine": 0.75, "square": 0.75, "fourier": 1.0}
-    plan = [
-        steps.Excitation(signal, arguments.duration, shares[signal] * arguments.amplitude)
-        for signal in SIGNALS
-    ]
-    return folder, wheels, plan
-
-
-def _confirm(arguments: argparse.Namespace, wheels: Sequence[str]) -> None:
-    """Ask before anything moves."""
-    if arguments.yes:
-        return
-    if not sys.stdin.isatty():
-        raise ParameterError("the wheels would move: say --yes, or run this in a terminal")
-    seconds = len(SIGNALS) * arguments.duration
-    print(
-        f"{', '.join(wheels)} will turn both ways for {seconds:.0f} s at up to "
-        f"{arguments.amplitude:g} V. Is the robot on blocks and clear of people? [y/N] ",
-        end="",
-        flush=True,
-    )
-    if sys.stdin.readline().strip().lower() not in ("y", "yes"):
-        raise ProcessError("nothing was moved")
-
-
-def _excited(robot: steps.Robot, plan: Sequence[steps.Excitation]) -> Path:
-    """Return the recording of excited wheels; whatever happens, nobody moves them afterwards."""
-    try:
-        bag = steps.record(robot, "excitation")
-        for part in plan:
-            print(f"exciting: {part.signal}, {part.amplitude:g} V, {part.duration:g} s")
-            steps.excite(robot, [part])
-        return bag
-    finally:
-        robot.processes.stop("excite", "record")
+    """Run the tool; return its exit code."""
+    return run(parser(), "commissioning", argv)
 
 
 if __name__ == "__main__":

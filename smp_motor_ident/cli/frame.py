@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import os
+import shlex
 import sys
 import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import NoReturn
-
-from rich.console import Console
-from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from typing import Any, NoReturn
 
 from smp_motor_control.errors import SmpError
 from smp_motor_control.ros_arguments import split_arguments
@@ -22,24 +21,50 @@ from smp_motor_ident.cli.interruption import interruptible
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
 
+PATIENCE = 2.0
+"""Where progress goes to no terminal, a step is named when it has taken so long [s]."""
+
+
+Work = Callable[[argparse.Namespace], int | None]
+"""From the parsed arguments to an exit code; None is 0."""
+
 
 class Parser(argparse.ArgumentParser):
     """An argument parser whose complaint is one line."""
 
     def error(self, message: str) -> NoReturn:
-        """End with exit code 2.
-
-        Parameters
-        ----------
-        message : str
-            What is wrong with the arguments.
-        """
+        """End with exit code 2."""
         self.exit(2, f"{self.prog}: {message}; '{self.prog} --help' shows the usage\n")
+
+
+class _Output:
+    """Standard output that lets a tool finish its work when the reader (head, less) has gone."""
+
+    def __init__(self, stream: Any) -> None:
+        self._stream = stream
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def _guarded(self, call: Callable[..., Any], *given: Any) -> Any:
+        try:
+            return call(*given)
+        except BrokenPipeError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
+
+    def write(self, text: str) -> int:
+        """Write, or drop what nobody reads."""
+        self._guarded(self._stream.write, text)
+        return len(text)
+
+    def flush(self) -> None:
+        """Flush, or drop what nobody reads."""
+        self._guarded(self._stream.flush)
 
 
 def run(
     parser: argparse.ArgumentParser,
-    work: Callable[[argparse.Namespace], int | None],
+    work: Work | str,
     argv: Sequence[str] | None,
 ) -> int:
     """Parse, do the work, and turn whatever happens into a line and an exit code.
@@ -48,8 +73,10 @@ def run(
     ----------
     parser : argparse.ArgumentParser
         Of the tool.
-    work : callable
-        From the parsed arguments to an exit code; None is 0.
+    work : callable or str
+        From the parsed arguments to an exit code; None is 0.  A str is the module of this
+        package whose ``work`` that is, imported after the arguments are understood, so that
+        ``--help`` does not wait for what computes.
     argv : sequence of str or None
         Arguments; None takes those of the process.
 
@@ -58,32 +85,42 @@ def run(
     int
         0 done, 1 the data do not support the answer, 2 wrong usage or unreadable input.
     """
+    before = sys.stdout
+    sys.stdout = _Output(before or open(os.devnull, "w"))  # noqa: SIM115  (closed by the shell: None)
     try:
-        own, ros = split_arguments(sys.argv[1:] if argv is None else argv)
+        given = sys.argv[1:] if argv is None else argv
+        own, ros = split_arguments(given)
         arguments = parser.parse_args(own)
-        arguments.ros_arguments = ros
-    except SystemExit as end:
-        return int(end.code or 0)
-    try:
+        arguments.command, arguments.ros_arguments = shlex.join((parser.prog, *given)), ros
         with interruptible(), warnings.catch_warnings():
             # Numerics that fail are dealt with where they occur; standard error is for the user.
             warnings.simplefilter("ignore", RuntimeWarning)
-            code = work(arguments) or 0
+            code = _loaded(work)(arguments) or 0
         sys.stdout.flush()
         return code
+    except SystemExit as end:  # of the parser, which has said why
+        sys.stdout.flush()
+        return int(end.code or 0)
     except SmpError as error:
         return _fail(parser.prog, str(error), error.exit_code)
     except KeyboardInterrupt:
         return _fail(parser.prog, "interrupted", INTERRUPTED)
-    except BrokenPipeError:
-        # The reader of our output (head, less) has gone; nobody is left to tell.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
+    except OSError as error:
+        return _fail(parser.prog, f"{error.filename or 'output'}: {error.strerror or error}", 2)
     except Exception as error:
         if os.environ.get("SMP_DEBUG"):
             raise
-        told = f"{type(error).__name__}: {error}".replace("\n", " ")
-        return _fail(parser.prog, f"a defect of this tool: {told} (SMP_DEBUG=1 shows where)", 2)
+        text = f"{type(error).__name__}: {error}".replace("\n", " ")
+        return _fail(parser.prog, f"a defect of this tool: {text} (SMP_DEBUG=1 shows where)", 2)
+    finally:
+        sys.stdout = before
+
+
+def _loaded(work: Work | str) -> Work:
+    if not isinstance(work, str):
+        return work
+    found: Work = importlib.import_module(f"smp_motor_ident.cli.{work}").work
+    return found
 
 
 def _fail(program: str, message: str, code: int) -> int:
@@ -91,40 +128,67 @@ def _fail(program: str, message: str, code: int) -> int:
     return code
 
 
+def number(low: float, high: float = float("inf")) -> Callable[[str], float]:
+    """Return an argument type that takes a finite number between two others, without them."""
+
+    def read(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
+        if not low < value < high:
+            beyond = f"above {low:g}" if high == float("inf") else f"between {low:g} and {high:g}"
+            raise argparse.ArgumentTypeError(f"{text} is not {beyond}")
+        return value
+
+    return read
+
+
 @contextmanager
-def progress(program: str, quiet: bool = False) -> Iterator[Callable[[str], None]]:
-    """Show what takes time: a moving line on a terminal, a line per slow step elsewhere."""
-    console = Console(stderr=True)
+def progress(program: str, quiet: bool = False) -> Iterator[Callable[..., None]]:
+    """Show what takes time: a moving line on a terminal, a line per slow step elsewhere.
+
+    What is yielded takes a text and, where it is known, the share of the work that is done,
+    from which the time left follows.
+    """
     if quiet:
-        yield lambda text: None
-    elif console.is_terminal:
-        columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
-        with Progress(*columns, console=console, transient=True) as line:
-            task = line.add_task("")
-            yield lambda text: line.update(task, description=text)
+        yield lambda text, share=None: None
+    elif sys.stderr.isatty():
+        from rich import progress as bars
+        from rich.console import Console
+
+        columns = (
+            bars.SpinnerColumn(),
+            bars.TextColumn("{task.description}"),
+            bars.TimeElapsedColumn(),
+            bars.TextColumn("left"),
+            bars.TimeRemainingColumn(),
+        )
+        with bars.Progress(*columns, console=Console(stderr=True), transient=True) as line:
+            task = line.add_task("", total=1.0)
+            yield lambda text, share=None: line.update(task, description=text, completed=share)
     else:
         with _lines(program) as say:
             yield say
 
 
 @contextmanager
-def _lines(program: str, patience: float = 2.0) -> Iterator[Callable[[str], None]]:
-    """Print each step that is still going on after `patience` seconds, once."""
-    begun: list[tuple[str, float]] = []
-    told: set[int] = set()
+def _lines(program: str) -> Iterator[Callable[..., None]]:
+    """Print each step that is still going on after :data:`PATIENCE`, once."""
+    steps: list[tuple[str, float]] = []
     over = threading.Event()
 
     def watch() -> None:
+        printed = 0
         while not over.wait(0.25):
-            k = len(begun) - 1
-            if k >= 0 and k not in told and time.monotonic() - begun[k][1] > patience:
-                told.add(k)
-                print(f"{program}: {begun[k][0]} ...", file=sys.stderr, flush=True)
+            if len(steps) > printed and time.monotonic() - steps[-1][1] > PATIENCE:
+                printed = len(steps)
+                print(f"{program}: {steps[-1][0]} ...", file=sys.stderr, flush=True)
 
     watcher = threading.Thread(target=watch, daemon=True)
     watcher.start()
     try:
-        yield lambda text: begun.append((text, time.monotonic()))
+        yield lambda text, share=None: steps.append((text, time.monotonic()))
     finally:
         over.set()
         watcher.join()

@@ -18,6 +18,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Any
 
+from smp_motor_control.entry import wrong_domain
 from smp_motor_control.errors import SmpError
 from smp_motor_ident.cli import interruption
 from smp_motor_ident.errors import ParameterError
@@ -50,8 +51,10 @@ def connect(name: str, ros_arguments: Sequence[str] = ()) -> Any:
     Raises
     ------
     ParameterError
-        When there is no ROS in this shell.
+        When there is no ROS in this shell, or its domain is impossible.
     """
+    if wrong := wrong_domain():
+        raise ParameterError(wrong)
     try:
         from smp_motor_control.nodes.robot_client import RobotClient
     except ImportError as error:

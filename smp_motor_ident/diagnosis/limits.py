@@ -1,7 +1,8 @@
 """Every threshold of a decision about data and estimates, with its unit and its reason.
 
-``docs/limits.md`` is this table, printed.  A limit's reason is a significance level, a cost or
-a physical limit; that some record came out right is none.
+``docs/limits.md`` is this table, printed: ``python scripts/limits.py > docs/limits.md``.
+A limit's reason is a significance level, a cost or a physical limit; that some record came out
+right is none.
 """
 
 from __future__ import annotations
@@ -85,4 +86,163 @@ EXPLAINS = Limit(
     "1",
     "significance: with a thousand pairs of fields tried, one in a thousand listings is wrong",
     "test/ident/bag/test_propose.py",
+
+
+# Assessment of a fit.
+
+FIT_EXPLAINS = Limit(
+    70.0,
+    "% of the speed",
+    "below it a third of the motion comes from elsewhere; no interval of a "
+    "model that lacks a third of what happens means anything",
+    "test_findings.py",
+)
+FIT_HOLDS = Limit(
+    15.0,
+    "% of the speed",
+    "held-out data that are fitted so much worse are of another motor or "
+    "load; chance alone changes a fit by parts of a percent",
+    "test_findings.py",
+)
+FIT_INDEPENDENT = Limit(
+    95.0,
+    "% of the speed",
+    "what follows the voltage in the last twentieth of the motion changes "
+    "the gain by less than that",
+    "test_findings.py",
+)
+UNEXPLAINED = Limit(
+    9.0,
+    "ratio of variances",
+    "an encoder's rounding has a variance of a twelfth of a count; three "
+    "times its deviation is beyond any counter",
+    "test_findings.py",
+)
+RINGING = Limit(
+    1.5,
+    "rad per sample",
+    "at pi a ringing cannot be told from a slower one; at half of that "
+    "sampling between two swings still shows both",
+    "test_findings.py",
+)
+SETTLED = Limit(
+    0.5,
+    "standard deviations",
+    "a further step of this size changes an interval's coverage by less than 5 %",
+    "test_findings.py",
+)
+STEADY = Limit(
+    4.0,
+    "time constants",
+    "98 % of a step are over",
+    "test_estimate.py",
+)
+SQUARE_LEVEL = Limit(
+    0.03,
+    "share of the level",
+    "what a voltmeter scatters around a level",
+    "test_estimate.py",
+)
+FRICTION_SHOWN = Limit(
+    0.5,
+    "relative standard deviation",
+    "beyond it zero lies inside the 95 % interval",
+    "test_findings.py",
+)
+FEWEST = Limit(
+    40,
+    "samples",
+    "ten for each of gain, lag, friction and initial state",
+    "test_screening.py",
+)
+MOST_LOST = Limit(
+    0.3,
+    "share of the samples",
+    "beyond it the sensor, not the transport, is at fault",
+    "test_screening.py",
+)
+METER = Limit(
+    0.01,
+    "share of the supply or of a level",
+    "what a voltmeter scatters",
+    "test_screening.py",
+)
+OFFSET_SURE = Limit(
+    6.0,
+    "standard deviations",
+    "of an offset of the current, with errors of neighbouring runs that "
+    "hang together allowed for; chance exceeds it once in 5e8",
+    "test_screening.py",
+)
+LARGEST_OFFSET = Limit(
+    0.2,
+    "share of the largest current",
+    "a sensor so far from its zero is not calibrated",
+    "test_screening.py",
+)
+RESIDUAL_LEVEL = Limit(
+    0.05,
+    "probability",
+    "that any of the lags of clean residuals leaves its band",
+    "test_findings.py",
+)
+
+# Adequacy of the model.
+
+EFFECT_LEVEL = Limit(
+    0.01,
+    "probability",
+    "that a clean record shows any of the effects, shared among all that are tried (Bonferroni)",
+    "test_adequacy.py",
+)
+EFFECT_BLOCKS = Limit(
+    6,
+    "degrees of freedom",
+    "with fewer stretches of data that show an effect its covariance, and "
+    "so the test's level, is not known",
+    "test_adequacy.py",
+)
+EFFECT_OWN = Limit(
+    1e-6,
+    "share of the sum of squares",
+    "an effect that the model's own coordinates imitate to a "
+    "thousandth is one of them; less is rounding of the differences",
+    "test_adequacy.py",
+)
+IMPLIED_BIAS = Limit(
+    1.96,
+    "standard deviations",
+    "the half-width of the 95 % interval that is stated",
+    "test_adequacy.py",
+)
+
+
+# Tuning: what may be designed on, and how far gains may go.
+
+FRICTION_KNOWN = Limit(
+    0.02,
+    "share of the supply",
+    "an error of the friction's feed-forward by this changes the speed by as much of its largest "
+    "value as the band in which a change counts as settled",
+    "test/ident/test_tune_truth.py",
+)
+FRICTION_RANGE = Limit(
+    0.5,
+    "share of the supply",
+    "with half of the supply unknown the speed that the motor reaches is not known to a factor 2",
+    "test/ident/test_tune_truth.py",
+)
+UNRELIABLE_SPREAD = Limit(
+    0.1,
+    "relative standard deviation",
+    "least that numbers of an unreliable estimate are drawn with; more where the fit on held-out "
+    "data leaves more of the motion unexplained",
+    "test/ident/test_tune_truth.py",
+)
+SPEED_NOISE = Limit(
+    2.5e-3,
+    "share of the top speed, rms",
+    "four times this is 2 % of half the top speed: with more, counts shake the wheel out of the "
+    "band in which the specification calls a change settled",
+    "test/ident/test_tune_methods.py",
 )

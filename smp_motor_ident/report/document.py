@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import shutil
@@ -11,6 +10,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+import msgspec
+import numpy as np
 import yaml
 
 from smp_motor_ident.errors import BagError, ParameterError
@@ -18,6 +19,7 @@ from smp_motor_ident.result import Estimate, Quantity
 
 SCHEMA = 1
 PHYSICAL = ("resistance", "inductance", "motor_constant", "inertia", "viscous_friction")
+POSITIVE = ("resistance", "inductance", "motor_constant", "inertia", "dc_gain")
 COMBINATIONS = ("dc_gain", "time_constant", "time_constant_product", "static_voltage")
 
 
@@ -59,18 +61,70 @@ def read_identification(path: Path) -> dict[str, Estimate]:
     if path.is_dir():
         path = path / "identification.json"
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
+        document = msgspec.json.decode(path.read_bytes())
     except OSError as error:
         raise BagError(f"{path}: cannot be read ({error.strerror})") from None
-    except ValueError as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise BagError(f"{path}: is not JSON ({error}); give a file that identify wrote") from None
     if not isinstance(document, dict) or document.get("schema") != SCHEMA:
         raise BagError(f"{path}: is not an identification of schema {SCHEMA}; run identify again")
+    motors = document.get("motors")
+    if not isinstance(motors, dict) or not motors:
+        raise BagError(f"{path}: is damaged (it holds no motors); run identify again")
+    return {wheel: _motor(wheel, entry, path) for wheel, entry in motors.items()}
+
+
+def _motor(wheel: str, entry: Any, path: Path) -> Estimate:
+    """Return one motor of a document; its values are checked against the types of Estimate."""
     try:
-        motors = document["motors"]
-        return {wheel: Estimate.from_document(wheel, entry) for wheel, entry in motors.items()}
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise BagError(f"{path}: is damaged ({error!r}); run identify again") from None
+        given = {k: v for k, v in msgspec.convert(entry, dict[str, Any]).items() if v is not None}
+        given["wheel"] = wheel
+        covariance = msgspec.convert(given.pop("covariance", {}), dict[str, Any])
+        given |= {"names": covariance.get("names", []), "covariance": covariance.get("matrix", [])}
+        for group in (given.get("parameters", {}), given.get("combinations", {})):
+            for quantity in msgspec.convert(group, dict[str, dict[str, Any]]).values():
+                quantity["ci95"] = _interval(quantity.get("ci95"))
+        estimate = msgspec.convert(given, Estimate, dec_hook=_matrix)
+        _check(estimate)
+        return estimate
+    except (msgspec.ValidationError, ValueError) as error:
+        raise BagError(f"{path}: is damaged ({wheel}: {error}); run identify again") from None
+
+
+def _interval(bounds: Any) -> Any:
+    """Return an interval whose missing ends, which JSON cannot say, are infinite."""
+    if not isinstance(bounds, list) or len(bounds) != 2:
+        return bounds
+    low, high = bounds
+    return [-math.inf if low is None else low, math.inf if high is None else high]
+
+
+def _matrix(kind: Any, value: Any) -> Any:
+    return np.array(msgspec.convert(value, list[list[float]]), dtype=np.float64)
+
+
+def _check(estimate: Estimate) -> None:
+    """Refuse what has the right types and is impossible all the same."""
+    size = len(estimate.names)
+    shape = estimate.covariance.shape if size else (0, 0)
+    if shape != (size, size) or len(set(estimate.names)) != size:
+        raise ValueError(f"the covariance is not one of its {size} names")
+    if size and (np.diag(estimate.covariance) < 0).any():
+        raise ValueError("a variance is negative")
+    for name, quantity in (*estimate.parameters.items(), *estimate.combinations.items()):
+        if quantity.std is not None and quantity.std < 0:
+            raise ValueError(f"{name}: its standard deviation is negative")
+        if quantity.value is None and quantity.status != "unidentifiable":
+            raise ValueError(f"{name}: it is {quantity.status} and has no value")
+        if name in POSITIVE and quantity.value is not None and quantity.value <= 0:
+            raise ValueError(f"{name} is {quantity.value}; it must be positive")
+    hardware = estimate.hardware
+    for name in ("gear_ratio", "counts_per_revolution", "supply_voltage", "resistance"):
+        value = getattr(hardware, name)
+        if value is not None and value <= 0:
+            raise ValueError(f"{name} is {value}; it must be positive")
+    if not (0 <= hardware.encoder_bits <= 64 and estimate.sample_time >= 0):
+        raise ValueError("encoder_bits or sample_time is impossible")
 
 
 def _known(quantity: Quantity | None) -> bool:
@@ -118,7 +172,7 @@ def motors_yaml(estimates: Mapping[str, Estimate], provenance: Iterable[str] = (
         YAML.
     """
     motors = {wheel: motor_entry(estimate) for wheel, estimate in estimates.items()}
-    tree = {"/motor_plant": {"ros__parameters": {"motors": motors}}}
+    tree = {"/**/motor_plant": {"ros__parameters": {"motors": motors}}}
     head = "".join(f"# {line}\n" for line in provenance)
     return head + yaml.safe_dump(tree, sort_keys=False)
 

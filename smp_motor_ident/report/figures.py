@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.axes import Axes
 
-from smp_motor_ident.report.series import Comparison, Correlation, correlations, thin
+from smp_motor_ident.report.series import Comparison, thin
 from smp_motor_ident.report.theme import COLOR, canvas, note, styled, to_svg
 from smp_motor_ident.report.words import label, scaled
-from smp_motor_ident.result import Estimate, Quantity
+from smp_motor_ident.result import Correlation, Estimate, Quantity, ResidualTests
 
 
 @styled
@@ -121,33 +121,31 @@ def _liveliest(parts: Sequence[Comparison], seconds: float = 2.0) -> Comparison:
 
 
 @styled
-def residuals(wheel: str, parts: Sequence[Comparison]) -> str:
+def residuals(wheel: str, tests: ResidualTests) -> str:
     """Draw the correlation of the residuals with themselves and with the voltage.
 
     Parameters
     ----------
     wheel : str
         Name of the wheel.
-    parts : sequence of Comparison
-        Validation is preferred to estimation.
+    tests : ResidualTests
+        The curves that the verdict is of.
 
     Returns
     -------
     str
         SVG.
     """
-    held_out = [p for p in parts if p.role == "validation"] or list(parts)
-    auto, cross = correlations(held_out)
     figure, (top, bottom) = canvas(4.7, 3.7, nrows=2)
-    _stems(top, auto, "Difference with its own past")
-    _stems(bottom, cross, "Difference with the voltage")
+    _stems(top, tests.autocorrelation, "Residual autocorrelation")
+    _stems(bottom, tests.cross_correlation, "Residual and voltage")
     bottom.set_xlabel("lag [samples]")
     return to_svg(figure, f"residual-{wheel}", f"Residual correlations of {label(wheel)}")
 
 
-def _stems(axes: Axes, correlation: Correlation, title: str) -> None:
+def _stems(axes: Axes, correlation: Correlation | None, title: str) -> None:
     axes.set_title(title)
-    if correlation.lag.size == 0:
+    if correlation is None:
         note(axes, "too few samples to tell")
         return
     outside = np.abs(correlation.value) > correlation.band

@@ -15,6 +15,9 @@ from smp_motor_ident.report.alike import same_response
 from smp_motor_ident.report.series import Comparison
 from smp_motor_ident.result import Candidate, Estimate, Quantity
 
+POOR_FIT = 80.0
+"""Below, a fifth of the motion is unexplained [%]: a loop designed on it meets another motor."""
+
 
 @dataclass(frozen=True)
 class Report:
@@ -95,7 +98,7 @@ def render(report: Report) -> str:
 
 def _without(estimate: Estimate, notes: Sequence[str]) -> Estimate:
     """Leave out the warnings that are told as notes on the reading."""
-    return replace(estimate, warnings=tuple(w for w in estimate.warnings if w not in notes))
+    return replace(estimate, findings=tuple(f for f in estimate.findings if f.message not in notes))
 
 
 def _motor(estimate: Estimate, parts: Sequence[Comparison]) -> dict[str, object]:
@@ -106,12 +109,13 @@ def _motor(estimate: Estimate, parts: Sequence[Comparison]) -> dict[str, object]
         drawn = {
             "speed": figures.speed(wheel, parts),
             "detail": figures.detail(wheel, parts),
-            "residuals": figures.residuals(wheel, parts),
+            "residuals": figures.residuals(wheel, estimate.residuals),
         }
     drawn["certainty"] = figures.certainty(estimate)
     drawn["matrix"] = figures.correlation_matrix(estimate)
     return {
         "estimate": estimate,
+        "findings": words.findings(estimate),
         "verdict": _verdict(estimate),
         "headline": [
             _headline(name, words.scaled(estimate.combinations[name]))
@@ -179,10 +183,13 @@ def _verdict(estimate: Estimate) -> tuple[str, str]:
     """Return a class (good, fair, poor) and one sentence about how far to trust the model."""
     fit = estimate.fit_percent.validation
     if fit is None:
-        return "fair", "No data was held out, so nothing shows yet how the model does elsewhere."
-    told = f"It explains {fit:.1f} % of the speed in data that it was not fitted to"
-    if estimate.warnings:
-        return "fair", f"{told}; read the warnings below before you rely on it."
-    if fit < 80.0:
-        return "poor", f"{told}: too little to build a controller on."
-    return "good", f"{told}."
+        text = "No data was held out, so nothing shows yet how the model does elsewhere"
+    else:
+        text = f"It explains {fit:.1f} % of the speed in data that it was not fitted to"
+    if estimate.unreliable:
+        return "poor", f"Unreliable: numbers may be off by more than their intervals. {text}."
+    if fit is not None and fit < POOR_FIT:
+        return "poor", f"{text}: too little to build a controller on."
+    if fit is None or any(f.severity == "warning" for f in words.findings(estimate)):
+        return "fair", f"{text}; read the warnings before you rely on it."
+    return "good", f"{text}."

@@ -6,7 +6,8 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 
-from smp_motor_ident.result import Quantity
+from smp_motor_ident.finding import SEVERITIES, Finding
+from smp_motor_ident.result import Estimate, Quantity
 
 EXPLAINED: Mapping[str, tuple[str, str, str]] = {
     "resistance": ("R", "Resistance", "of the armature winding"),
@@ -169,3 +170,12 @@ def status(quantity: Quantity) -> str:
     """
     words = {"estimated": "estimated", "fixed": "given", "unidentifiable": "cannot be told"}
     return words[quantity.status]
+
+
+def findings(estimate: Estimate) -> list[Finding]:
+    """Return what was found, the gravest first; warnings and advice of older files too."""
+    found = list(estimate.findings)
+    known = {text for f in found for text in (f.message, f.advice)}
+    found += [Finding("", "warning", text) for text in estimate.warnings if text not in known]
+    found += [Finding("", "note", text) for text in estimate.advice if text not in known]
+    return sorted(found, key=lambda f: -SEVERITIES.index(f.severity))

@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
+from subprocess import PIPE
 
 import numpy as np
 import pytest
 from scipy.signal import cont2discrete, lfilter
 
 from smp_motor_control.motor.file import load_motors
-from smp_motor_ident.cli.identify import OUTPUTS, main
+from smp_motor_ident.cli import identification
+from smp_motor_ident.cli.identification import OUTPUTS
+from smp_motor_ident.cli.identify import main
+from smp_motor_ident.finding import Finding
+from smp_motor_ident.result import Estimate, Quantity
 
 GAIN, LAG, STEP = 25.0, 0.06, 0.01
 MAP = ("--map", "time=t", "voltage=u", "velocity=w")
@@ -164,6 +171,67 @@ def test_the_executable_complains_without_a_traceback(
     assert len(lines) == 1
     assert "not_a_bag.mcap" in lines[0]
     assert not (tmp_path / "result").exists()
+
+
+def found(severity: str) -> Estimate:
+    """What an estimation returns whose data show a dead zone."""
+    finding = Finding("dead_zone", severity, "a dead zone of 1 V", {}, "record a slow ramp")  # type: ignore[arg-type]
+    known = {"dc_gain": Quantity(25.0, 0.1, (24.8, 25.2), "rad/s/V")}
+    return Estimate("motor", "first_order", {}, known, findings=(finding,))
+
+
+@pytest.mark.parametrize(
+    ("severity", "options", "code"),
+    [
+        ("note", (), 0),
+        ("warning", (), 0),
+        ("unreliable", (), 1),
+        ("unreliable", ("--accept-unreliable",), 0),
+    ],
+)
+def test_an_unreliable_answer_is_written_and_ends_with_one_unless_accepted(
+    severity: str,
+    options: tuple[str, ...],
+    code: int,
+    recording: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(identification, "estimate", lambda *_, **__: found(severity))
+    output = tmp_path / "result"
+    assert main([str(recording), *MAP, "--output", str(output), "--quiet", *options]) == code
+    said = capsys.readouterr().err
+    assert ("record a slow ramp" in said) == (code == 1)
+    (motor,) = json.loads((output / "identification.json").read_text())["motors"].values()
+    assert motor["findings"][0]["severity"] == severity
+    page = (output / "report.html").read_text()
+    assert "a dead zone of 1 V" in page
+    assert "record a slow ramp" in page
+
+
+def test_a_reader_that_has_gone_does_not_change_the_answer(recording: Path, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "smp_motor_ident.cli.identify", str(recording), *MAP]
+    tool = subprocess.Popen(
+        [*command, "--output", str(tmp_path / "result")], stdout=subprocess.PIPE, stderr=PIPE
+    )
+    assert tool.stdout is not None
+    tool.stdout.close()
+    assert tool.wait(120.0) == 0
+    assert tool.stderr is not None
+    assert b"Error" not in tool.stderr.read()
+    assert (tmp_path / "result" / "report.html").is_file()
+
+
+@pytest.mark.parametrize("tool", ["identify", "commission", "demo"])
+def test_help_loads_nothing_that_computes(tool: str) -> None:
+    # What takes the time is known; a time would depend on what else this machine does.
+    program = (
+        f"import sys\nfrom smp_motor_ident.cli.{tool} import main\nassert main(['--help']) == 0\n"
+        "slow = {'numpy', 'scipy', 'numba', 'rosbags', 'matplotlib', 'yaml', 'rich', 'jinja2'}\n"
+        "assert not slow & set(sys.modules), slow & set(sys.modules)\n"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True, stdout=subprocess.DEVNULL)
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="recordings of real motors are not here")

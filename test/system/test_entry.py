@@ -38,6 +38,17 @@ def test_ctrl_c_while_importing_ends_an_executable_without_a_traceback(
     assert "Traceback" not in started.output
 
 
+@pytest.mark.parametrize("domain", ["9999", "-1", "first"])
+@pytest.mark.parametrize("executable", ["wheel_pid", "record", "commission"])
+def test_an_impossible_domain_is_named(process, executable, domain):
+    arguments = ("--output", "r", "--yes") if executable == "commission" else ()
+    started = process(executable, *arguments, env={"ROS_DOMAIN_ID": domain})
+    assert started.wait(30.0) == 2
+    (line,) = started.output.strip().splitlines()
+    assert domain in line
+    assert "0 to 232" in line
+
+
 def test_linear_algebra_stays_on_one_thread():
     """A second is waited for in a busy loop: at real-time priority that may never end."""
     environment = {k: v for k, v in os.environ.items() if not k.endswith("_NUM_THREADS")}

@@ -1,0 +1,122 @@
+"""YAML files that people write: ROS parameters and mappings, bounded before anything walks them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from smp_motor_control.errors import ParameterError
+
+MOST_BYTES = 1_000_000
+"""Parsing takes some 10 s per megabyte; a robot's parameter file has a few kilobytes."""
+
+MOST_NODES = 100_000
+"""Aliases count each time they are met, so that ten lines cannot stand for 10^9 values."""
+
+MOST_LEVELS = 32
+"""ROS parameters nest by their dots; nobody writes a name of 32 parts."""
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML with the numbers of ROS: ``1e-6`` is one, not text."""
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]+\Z"),
+    list("-+0123456789."),
+)
+
+
+def read_yaml(path: str | Path) -> Any:
+    """Read a YAML file of bounded size and depth.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+
+    Returns
+    -------
+    dict, list or scalar
+        What it holds.
+
+    Raises
+    ------
+    ParameterError
+        When it cannot be read, is not YAML, or is larger or deeper than any parameter file.
+    """
+    try:
+        with Path(path).open("rb") as file:
+            data = file.read(MOST_BYTES + 1)
+        if len(data) > MOST_BYTES:
+            raise ParameterError(f"{path}: is larger than {MOST_BYTES:,} bytes; no parameter file")
+        document = yaml.load(data.decode("utf-8"), Loader=_Loader)
+    except OSError as error:
+        raise ParameterError(f"{path}: cannot be read: {error.strerror}") from None
+    except (yaml.YAMLError, ValueError, TypeError) as error:
+        if isinstance(error, ParameterError):
+            raise
+        raise ParameterError(f"{path}: is not YAML: {' '.join(str(error).split())}") from None
+    except RecursionError:
+        raise ParameterError(f"{path}: is nested more than {MOST_LEVELS} levels deep") from None
+    _check_size(document, path)
+    return document
+
+
+def _check_size(document: Any, path: str | Path) -> None:
+    pending, nodes = [(document, 0)], 0
+    while pending:
+        value, level = pending.pop()
+        nodes += 1
+        if level > MOST_LEVELS:
+            raise ParameterError(f"{path}: is nested more than {MOST_LEVELS} levels deep")
+        if nodes > MOST_NODES:
+            raise ParameterError(f"{path}: holds more than {MOST_NODES:,} values")
+        if isinstance(value, Mapping):
+            pending.extend((inner, level + 1) for inner in value.values())
+        elif isinstance(value, list):
+            pending.extend((inner, level + 1) for inner in value)
+
+
+def read_parameters(path: str | Path) -> dict[str, dict[str, Any]]:
+    """Read a ROS parameter file.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+
+    Returns
+    -------
+    dict of str to dict
+        Parameters by their ROS names (``model.delay``), by the node's full name.
+
+    Raises
+    ------
+    ParameterError
+        As :func:`read_yaml`, and when the file is no parameter file.
+    """
+    document = read_yaml(path)
+    if not isinstance(document, Mapping) or not document:
+        raise ParameterError(f"{path}: is no ROS parameter file: expected node names with values")
+    found = {}
+    for node, entry in document.items():
+        parameters = entry.get("ros__parameters") if isinstance(entry, Mapping) else None
+        if not isinstance(parameters, Mapping):
+            raise ParameterError(f"{path}: {node}: is no ROS parameter file: no ros__parameters")
+        found["/" + str(node).strip("/")] = flat(parameters)
+    return found
+
+
+def flat(tree: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:
+    """Return nested parameters by their ROS names, such as ``{"model.delay": 0.0}``."""
+    found: dict[str, Any] = {}
+    for name, value in tree.items():
+        inner = isinstance(value, Mapping)
+        found.update(flat(value, f"{prefix}{name}.") if inner else {f"{prefix}{name}": value})
+    return found

@@ -1,0 +1,234 @@
+"""What ``identify`` does: read, estimate the wheels side by side, write, and say what came out."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime, timezone
+from functools import partial
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+
+from smp_motor_ident import bag
+from smp_motor_ident.cli.frame import progress
+from smp_motor_ident.cli.identify import NAME
+from smp_motor_ident.cli.tables import console, estimate_table
+from smp_motor_ident.cli.topics import list_topics
+from smp_motor_ident.cli.workers import in_parallel
+from smp_motor_ident.diagnosis.identifiability import what_next
+from smp_motor_ident.diagnosis.validation import split
+from smp_motor_ident.errors import (
+    BagError,
+    InsufficientExcitationError,
+    ParameterError,
+    SmpError,
+)
+from smp_motor_ident.estimate import estimate
+from smp_motor_ident.estimation.predict import simulate
+from smp_motor_ident.record import Record
+from smp_motor_ident.report import words
+from smp_motor_ident.report.document import (
+    check_free,
+    identification_document,
+    motors_yaml,
+    write_together,
+)
+from smp_motor_ident.report.series import Comparison, Role
+from smp_motor_ident.result import UNITS, Estimate
+
+OUTPUTS = ("identification.json", "motors.yaml", "report.html")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came out for one wheel: an estimate with its curves, or the reason why there is none."""
+
+    estimate: Estimate | None = None
+    comparisons: tuple[Comparison, ...] = ()
+    failure: SmpError | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def exit_code(self) -> int:
+        """0 where there is an estimate and it is reliable."""
+        if self.failure is not None:
+            return self.failure.exit_code
+        return int(self.estimate is not None and self.estimate.unreliable)
+
+
+def work(arguments: argparse.Namespace) -> int:
+    """Do what the arguments say."""
+    mapping = signal_map(arguments)
+    if arguments.topics:
+        return list_topics(arguments.bags, arguments.msg, NAME)
+    if not arguments.output:
+        raise ParameterError("--output DIR is missing: where shall the results go?")
+    fixed = fixed_parameters(arguments.fix)
+    paths = [Path(arguments.output) / name for name in OUTPUTS]
+    check_free(paths, arguments.force)
+    with progress(NAME, arguments.quiet) as say:
+        say("reading")
+        records = _read(arguments.bags, mapping, arguments.wheel)
+        kept = _read(arguments.validate, mapping, list(records)) if arguments.validate else {}
+        jobs = {
+            wheel: partial(identify_wheel, group, kept.get(wheel, ()), arguments.model, fixed)
+            for wheel, group in records.items()
+        }
+        outcomes = in_parallel(jobs, say)
+        if any(outcome.estimate for outcome in outcomes.values()):
+            say("writing the report")
+            contents = _contents(outcomes, arguments)
+            write_together(dict(zip(paths, contents, strict=True)), arguments.force)
+    return _conclude(outcomes, paths, arguments)
+
+
+def fixed_parameters(items: Sequence[str]) -> dict[str, float]:
+    """Read ``--fix`` arguments."""
+    fixed = {}
+    for item in items:
+        name, _, text = item.partition("=")
+        if name not in UNITS:
+            raise ParameterError(f"--fix {item}: {name!r} is none of {', '.join(UNITS)}")
+        try:
+            value = float(text)
+        except ValueError:
+            raise ParameterError(f"--fix {item}: {text!r} is not a number") from None
+        if not 0 <= value < float("inf"):
+            raise ParameterError(f"--fix {item}: must be zero or positive, in {UNITS[name]}")
+        fixed[name] = value
+    return fixed
+
+
+def signal_map(arguments: argparse.Namespace) -> bag.SignalMap | None:
+    """Return the mapping that the arguments ask for."""
+    items = [item for group in arguments.map for item in group]
+    if items and arguments.mapping:
+        raise ParameterError("--map and --mapping exclude each other; write all into the file")
+    if arguments.mapping:
+        loaded = bag.load(arguments.mapping)
+        return replace(loaded, msg_files=(*loaded.msg_files, *arguments.msg))
+    return bag.parse(items, arguments.msg) if items or arguments.msg else None
+
+
+def _read(
+    paths: Sequence[str], mapping: bag.SignalMap | None, wheels: Sequence[str]
+) -> dict[str, list[Record]]:
+    """Read the wheels that are asked for, or all."""
+    found = bag.read_experiments(list(paths), mapping)
+    for wheel in wheels:
+        if wheel not in found:
+            raise BagError(f"{', '.join(paths)}: has no wheel {wheel!r}; it has {', '.join(found)}")
+    return {wheel: found[wheel] for wheel in wheels} if wheels else found
+
+
+def identify_wheel(
+    records: Sequence[Record],
+    kept: Sequence[Record],
+    model: str,
+    fixed: Mapping[str, float],
+    say: Callable[[str], None],
+) -> Outcome:
+    """Estimate one motor; a refusal is an outcome too, with its reason."""
+    try:
+        found = estimate(records, model, fixed=fixed, validation=list(kept) or None, progress=say)
+    except ParameterError:
+        raise
+    except SmpError as error:
+        return Outcome(failure=error)
+    except np.linalg.LinAlgError as error:
+        # One wheel's numerics must not take the others' results with them.
+        return Outcome(
+            failure=InsufficientExcitationError(
+                f"{records[0].source}: {records[0].wheel}: the estimate broke down ({error}); "
+                "record a longer excitation with several frequencies, in both directions"
+            )
+        )
+    notes = dict.fromkeys(note for record in (*records, *kept) for note in record.notes)
+    fitted, held_out = (records, kept) if kept else split(records)
+    curves: list[tuple[Record, Role]] = [(record, "estimation") for record in fitted]
+    curves += [(record, "validation") for record in held_out]
+    return Outcome(found, tuple(_compare(found, *curve) for curve in curves), notes=tuple(notes))
+
+
+def _compare(found: Estimate, record: Record, role: Role) -> Comparison:
+    measured, simulated = simulate(found, record)
+    return Comparison(role, record.source, record.time, record.voltage, measured, simulated)
+
+
+def _contents(outcomes: Mapping[str, Outcome], arguments: argparse.Namespace) -> list[str]:
+    """Return the three files' texts, in the order of :data:`OUTPUTS`."""
+    from smp_motor_ident.report.html import Report, render
+
+    now = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
+    provenance = {
+        "Recordings": ", ".join(Path(path).name for path in arguments.bags),
+        "Judged by": ", ".join(Path(path).name for path in arguments.validate)
+        or "parts of the same recordings that were held out",
+        "Command": arguments.command,
+        "Date": now,
+        "Versions": ", ".join(
+            f"{name} {metadata.version(name)}" for name in ("smp_motor_control", "numpy", "numba")
+        ),
+    }
+    estimates = {wheel: one.estimate for wheel, one in outcomes.items() if one.estimate}
+    report = Report(
+        estimates,
+        {wheel: one.comparisons for wheel, one in outcomes.items()},
+        {wheel: str(one.failure) for wheel, one in outcomes.items() if one.failure},
+        {wheel: one.notes for wheel, one in outcomes.items()},
+        provenance,
+    )
+    document = identification_document(estimates)
+    head = [f"Identified {now} by {NAME} from {provenance['Recordings']}.", "SI, motor shaft."]
+    return [
+        json.dumps(document, indent=2, allow_nan=False) + "\n",
+        motors_yaml(estimates, head),
+        render(report),
+    ]
+
+
+def _conclude(
+    outcomes: Mapping[str, Outcome], paths: Sequence[Path], arguments: argparse.Namespace
+) -> int:
+    """Print what came out; return the exit code."""
+    estimates = {wheel: one.estimate for wheel, one in outcomes.items() if one.estimate}
+    if not arguments.quiet:
+        for found in estimates.values():
+            _print(found, arguments)
+        if estimates:
+            console().print(f"written: {', '.join(map(str, paths))}", soft_wrap=True)
+    code = 0
+    for wheel, one in outcomes.items():
+        if one.failure:
+            print(f"{NAME}: {one.failure}", file=sys.stderr)
+        elif one.exit_code and not arguments.accept_unreliable:
+            print(f"{NAME}: {wheel}: {_what_is_unreliable(estimates[wheel])}", file=sys.stderr)
+        else:
+            continue
+        code = max(code, one.exit_code)
+    return code
+
+
+def _print(found: Estimate, arguments: argparse.Namespace) -> None:
+    out = console()
+    out.print(estimate_table(found))
+    for finding in words.findings(found):
+        out.print(f"{finding.severity}: {finding.message}", soft_wrap=True)
+        if finding.advice:
+            out.print(f"advice: {finding.advice}", soft_wrap=True)
+    if arguments.what_next:
+        out.print(f"next: {what_next(found, arguments.accuracy).words}", soft_wrap=True)
+    out.print()
+
+
+def _what_is_unreliable(found: Estimate) -> str:
+    """Return the gravest findings and what to record next, in one line."""
+    grave = [f for f in found.findings if f.severity in ("unreliable", "refused")]
+    advice = dict.fromkeys(f.advice for f in grave if f.advice)
+    parts = [*(f.message.rstrip(".") for f in grave), *(text.rstrip(".") for text in advice)]
+    return f"unreliable: {'; '.join(parts)}. --accept-unreliable takes it as it is"

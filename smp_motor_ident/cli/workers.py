@@ -1,0 +1,80 @@
+"""Independent pieces of work side by side, in as many processes as there are cores."""
+
+from __future__ import annotations
+
+import ctypes
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from typing import Any, TypeVar
+
+from smp_motor_ident.errors import BagError
+
+Result = TypeVar("Result")
+Say = Callable[..., None]
+
+_PR_SET_PDEATHSIG = 1
+_JOBS: dict[str, Callable[[Say], Any]] = {}
+
+
+def in_parallel(jobs: Mapping[str, Callable[[Say], Result]], say: Say) -> dict[str, Result]:
+    """Do every job, each in a process that is forked and so has what is loaded already.
+
+    Parameters
+    ----------
+    jobs : mapping of str to callable
+        By name; each takes what it may tell its progress to.
+    say : callable
+        Takes a text and the share of the work that is done.
+
+    Returns
+    -------
+    dict of str to object
+        What the jobs returned, in their order.
+
+    Raises
+    ------
+    Exception
+        The first that a job raised; the others are ended.
+    """
+    cores = min(len(os.sched_getaffinity(0)), len(jobs))
+    if cores < 2:
+        return {name: job(_named(say, name)) for name, job in jobs.items()}
+    say(f"estimating {', '.join(jobs)}")
+    _JOBS.update(jobs)
+    fork = multiprocessing.get_context("fork")
+    pool = ProcessPoolExecutor(cores, mp_context=fork, initializer=_end_with_parent)
+    try:
+        futures: dict[Future[Result], str] = {pool.submit(_do, name): name for name in jobs}
+        done: dict[str, Result] = {}
+        for future in as_completed(futures):
+            done[futures[future]] = future.result()
+            left = [name for name in jobs if name not in done]
+            say(f"estimating {', '.join(left)}", len(done) / len(jobs))
+        return {name: done[name] for name in jobs}
+    except BrokenProcessPool:
+        raise BagError("a worker process was ended from outside, perhaps for its memory") from None
+    finally:
+        _JOBS.clear()
+        for worker in multiprocessing.active_children():
+            worker.terminate()
+        pool.shutdown(cancel_futures=True)
+
+
+def _named(say: Say, name: str) -> Say:
+    return lambda text: say(f"{name}: {text}")
+
+
+def _do(name: str) -> Any:
+    return _JOBS[name](lambda text: None)
+
+
+def _end_with_parent() -> None:
+    """Leave Ctrl-C to the parent, and end when it does, however that ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
