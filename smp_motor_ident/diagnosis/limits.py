@@ -86,7 +86,7 @@ EXPLAINS = Limit(
     "1",
     "significance: with a thousand pairs of fields tried, one in a thousand listings is wrong",
     "test/ident/bag/test_propose.py",
-
+)
 
 # Assessment of a fit.
 
