@@ -180,6 +180,25 @@ LARGEST_OFFSET = Limit(
     "a sensor so far from its zero is not calibrated",
     "test_screening.py",
 )
+SIGN_SURE = Limit(
+    4.0,
+    "standard deviations",
+    "of the correlation of two signals that have no part in each other; the largest of twelve "
+    "lags exceeds it by chance once in 2000 records of a standing motor",
+    "test_screening.py",
+)
+SAME_MOTOR = Limit(
+    0.01,
+    "probability",
+    "that records of one motor differ by so much by chance in any quantity",
+    "test_records.py",
+)
+SIGN_ALIKE = Limit(
+    0.5,
+    "correlation",
+    "a quarter of the motion follows the voltage: it turns, however slowly the voltage changes",
+    "test_screening.py",
+)
 RESIDUAL_LEVEL = Limit(
     0.05,
     "probability",
