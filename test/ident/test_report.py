@@ -152,7 +152,7 @@ def test_document_reads_back_as_the_same_estimates(tmp_path: Path) -> None:
 def test_motors_file_has_parameters_where_known_and_combinations_where_not() -> None:
     wheels = {"front_left": estimate(), "rear_left": estimate("rear_left", current=False)}
     text = motors_yaml(wheels, ["from a bag"])
-    motors = yaml.safe_load(text)["/motor_plant"]["ros__parameters"]["motors"]
+    motors = yaml.safe_load(text)["/**/motor_plant"]["ros__parameters"]["motors"]
     assert text.startswith("# from a bag\n")
     assert motors["front_left"]["inertia"] == PHYSICAL["inertia"][0]
     assert "dc_gain" not in motors["front_left"]
