@@ -153,6 +153,7 @@ def estimate(
         samples=data.size,
         duration=float(sum(r.duration for r in group)),
         sample_time=data.step,
+        largest_voltage=max(float(np.abs(r.voltage).max()) for r in group),
         sources=tuple(dict.fromkeys(r.source for r in group if r.source)),
         hardware=group[0].hardware,
     )

@@ -139,6 +139,7 @@ class Estimate:
     samples: int = 0
     duration: float = 0.0
     sample_time: float = 0.0
+    largest_voltage: float = 0.0
     sources: tuple[str, ...] = ()
     hardware: Hardware = Hardware()
 
@@ -265,6 +266,7 @@ class Estimate:
             "samples": self.samples,
             "duration": _number(self.duration),
             "sample_time": _number(self.sample_time),
+            "largest_voltage": _number(self.largest_voltage),
             "sources": list(self.sources),
             "hardware": {
                 "gear_ratio": _number(hardware.gear_ratio),
