@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -89,6 +89,12 @@ class ResidualTests:
 
     white: bool | None = None
     independent_of_input: bool | None = None
+    autocorrelation: tuple[float, ...] = ()
+    """At lags 1, 2, ...; white where all stay within ``band``."""
+    cross_correlation: tuple[float, ...] = ()
+    """With the voltage, at lags 0, 1, ...; independent where all stay within ``cross_band``."""
+    band: float | None = None
+    cross_band: float | None = None
 
 
 @dataclass(frozen=True)
@@ -231,10 +237,7 @@ class Estimate:
                 }
                 for c in self.candidates
             ],
-            "residuals": {
-                "white": self.residuals.white,
-                "independent_of_input": self.residuals.independent_of_input,
-            },
+            "residuals": asdict(self.residuals),
             "findings": [f.to_document() for f in self.findings],
             "warnings": list(self.warnings),
             "advice": list(self.advice),

@@ -199,7 +199,7 @@ def _conclude(
     estimates = {wheel: one.estimate for wheel, one in outcomes.items() if one.estimate}
     if not arguments.quiet:
         for found in estimates.values():
-            _print(found, arguments)
+            _print(found, outcomes[found.wheel].notes, arguments)
         if estimates:
             console().print(f"written: {', '.join(map(str, paths))}", soft_wrap=True)
     code = 0
@@ -214,10 +214,10 @@ def _conclude(
     return code
 
 
-def _print(found: Estimate, arguments: argparse.Namespace) -> None:
+def _print(found: Estimate, notes: Sequence[str], arguments: argparse.Namespace) -> None:
     out = console()
     out.print(estimate_table(found))
-    for finding in words.findings(found):
+    for finding in words.findings(found, notes):
         out.print(f"{finding.severity}: {finding.message}", soft_wrap=True)
         if finding.advice:
             out.print(f"advice: {finding.advice}", soft_wrap=True)

@@ -207,6 +207,10 @@ def residual_tests(data: Experiments, fit: Fit, lags: int = 25) -> ResidualTests
     return ResidualTests(
         white=bool(np.abs(auto).max() < band),
         independent_of_input=bool(np.abs(cross).max() < band * widen),
+        autocorrelation=tuple(map(float, auto)),
+        cross_correlation=tuple(map(float, cross)),
+        band=float(band),
+        cross_band=float(band * widen),
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 
 from smp_motor_ident.finding import SEVERITIES, Finding
@@ -172,10 +172,12 @@ def status(quantity: Quantity) -> str:
     return words[quantity.status]
 
 
-def findings(estimate: Estimate) -> list[Finding]:
-    """Return what was found, the gravest first; warnings and advice of older files too."""
+def findings(estimate: Estimate, notes: Collection[str] = ()) -> list[Finding]:
+    """Return what was found, the gravest first; warnings and advice that are no findings too."""
     found = list(estimate.findings)
     known = {text for f in found for text in (f.message, f.advice)}
-    found += [Finding("", "warning", text) for text in estimate.warnings if text not in known]
-    found += [Finding("", "note", text) for text in estimate.advice if text not in known]
+    for text in dict.fromkeys((*estimate.warnings, *notes, *estimate.advice)):
+        if text not in known:
+            plain = text in notes or text in estimate.advice
+            found.append(Finding("", "note" if plain else "warning", text))
     return sorted(found, key=lambda f: -SEVERITIES.index(f.severity))
