@@ -95,10 +95,9 @@ def judge(job: tuple[int, int, int, bool]) -> tuple[int, str, str]:
         return number, "crash", f"{about}: {traceback.format_exc(limit=-3)}"
     wrong = errors(e, c)
     codes = [f.code for f in e.findings if f.severity == "unreliable"]
-    unreliable = e.unreliable or any(w.startswith("doubtful") for w in e.warnings)
     words = ", ".join(f"{n} {x:.0f} std" for n, x in wrong.items()) or "fine"
     words = f"{about}: {e.model}; {words}; {codes or ''}"
-    if unreliable:
+    if e.unreliable:
         named = bool(set(codes) & set(effect.causes))
         return number, "cause" if named else "other", words
     if wrong or effect.expect == "refuse":

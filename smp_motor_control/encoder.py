@@ -49,18 +49,7 @@ class Encoder:
         return 2 * math.pi / self.counts_per_revolution
 
     def count(self, angle: float) -> int:
-        """Return what the counter shows at a motor angle.
-
-        Parameters
-        ----------
-        angle : float
-            Of the motor shaft [rad].
-
-        Returns
-        -------
-        int
-            Whole counts, wrapped to the counter's width.
-        """
+        """Return what the counter shows at a motor angle."""
         return wrap(math.floor(angle * self.counts_per_revolution / (2 * math.pi)), self.bits)
 
 
@@ -78,26 +67,7 @@ def wrap(count: int, bits: int) -> int:
 
 
 def unwrap(counts: ArrayLike, bits: int) -> NDArray[np.int64]:
-    """Return total counts from what a wrapping counter showed.
-
-    Parameters
-    ----------
-    counts : array_like of int, shape (n,)
-        As the hardware reports them, signed or unsigned.
-    bits : int
-        Width of the counter; 0 never wraps.
-
-    Returns
-    -------
-    ndarray of int64, shape (n,)
-        Starts at ``counts[0]``; correct while the motor moves less than half the
-        counter's range from one sample to the next.
-
-    Raises
-    ------
-    ParameterError
-        When ``bits`` is out of range.
-    """
+    """Return total counts from what a wrapping counter showed."""
     _check_bits(bits)
     shown = np.asarray(counts, dtype=np.int64)
     if bits == 0 or shown.size == 0:

@@ -92,20 +92,7 @@ class SteadyGain(NamedTuple):
 
 
 def prediction(model: MotorModel, intervals: Array) -> tuple[Array, Array]:
-    """Return the exact transition of ``(angle, w, w', d)`` and the effect of the voltage.
-
-    Parameters
-    ----------
-    model : MotorModel
-        The identified motor, without its friction and its delay.
-    intervals : ndarray, shape (n,)
-        [s].
-
-    Returns
-    -------
-    F : ndarray, shape (n, 4, 4)
-    G : ndarray, shape (n, 4)
-    """
+    """Return the exact transition of ``(angle, w, w', d)`` and the effect of the voltage."""
     held = zero_order_hold(
         model.dc_gain, model.time_constant, model.time_constant_product, intervals
     )

@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident.diagnosis import validation as validate
-from smp_motor_ident.diagnosis.advice import advise, doubts
+from smp_motor_ident.diagnosis.adequacy import adequacy, stated
+from smp_motor_ident.diagnosis.advice import advise, assess
+from smp_motor_ident.diagnosis.residuals import residual_tests
 from smp_motor_ident.diagnosis.screening import screen
 from smp_motor_ident.errors import InsufficientExcitationError, ParameterError, SignalError
 from smp_motor_ident.estimation import ladder
@@ -24,7 +26,7 @@ from smp_motor_ident.estimation.quantisation import widened
 from smp_motor_ident.estimation.thinning import thinned
 from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments, prepare
-from smp_motor_ident.likelihood.sections import between_samples
+from smp_motor_ident.likelihood.hold import between_samples
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import MODELS, PHYSICAL, Structure
 from smp_motor_ident.record import Record
@@ -98,8 +100,7 @@ def estimate(
     say = progress or (lambda _: None)
     known = _checked(model, fixed, loss, group)
     _check_bounds(bounds or {}, model, group)
-    warnings = screen(group)
-    warnings += [note for r in group for note in r.notes]
+    findings = screen(group)
     use_current = _has_current(group) and model in ("auto", "electromechanical")
     base = _structure(model, use_current, known, group)
     hold, first = _hold(group, base, LOSSES[loss], say)
@@ -123,7 +124,13 @@ def estimate(
     _refuse_offset(group, chosen)
     say("validating")
     held = _validation(group, validation, chosen, options, hold)
-    tests = validate.residual_tests(final, chosen)
+    percent = FitPercent(fitted, held)
+    tests = residual_tests(final, chosen)
+    findings += [
+        *assess(final, chosen, percent, tests),
+        *adequacy(final, chosen, stated(chosen, result), group[0].hardware.gear_ratio, tests),
+        *advise(chosen, result, known),
+    ]
     return Estimate(
         wheel=group[0].wheel,
         model=_name(chosen.structure),
@@ -131,13 +138,10 @@ def estimate(
         combinations=result.combinations,
         names=result.names,
         covariance=result.covariance,
-        fit_percent=FitPercent(fitted, held),
+        fit_percent=percent,
         candidates=_candidates(rungs, chosen, group, data),
         residuals=tests,
-        warnings=tuple(
-            dict.fromkeys(warnings + doubts(chosen, result, fitted, held, tests, final))
-        ),
-        advice=tuple(advise(chosen, result, known)),
+        findings=tuple(findings),
         samples=data.size,
         duration=float(sum(r.duration for r in group)),
         sample_time=data.step,
@@ -232,7 +236,7 @@ def _hold(
     if plain.kind != rc.ANGLE or thinned(plain) is not plain:
         return "held", None  # how the command ran within so short an interval does not show
     others = {h: prepare(group, base.current, hold=h) for h in ("switched", "middle")}
-    others = {h: d for h, d in others.items() if d.section_end.size > plain.section_end.size}
+    others = {h: d for h, d in others.items() if d.hold_end.size > plain.hold_end.size}
     if not others:
         return "held", None
     say("how the command was held between samples")
@@ -354,7 +358,7 @@ def _validation(
         if not kept:
             return None
         data = _for_final(prepare(fitted, fit.structure.current, hold=hold), fit)
-        if np.ptp(data.section_value) == 0 or all(np.ptp(r.voltage) == 0 for r in kept):
+        if np.ptp(data.hold_value) == 0 or all(np.ptp(r.voltage) == 0 for r in kept):
             return None
         start = Fit(**{**vars(fit), "initial": data.initial})
         value = validate.held_out(kept, refine(data, fit.structure, start, fit.z, options), hold)

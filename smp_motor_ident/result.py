@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -83,18 +83,26 @@ class Candidate:
     reason: str = ""
 
 
+@dataclass(frozen=True, eq=False)
+class Correlation:
+    """Correlation over lags [samples], with the band that all of them stay in by chance."""
+
+    lag: Array
+    value: Array
+    band: float
+
+
 @dataclass(frozen=True)
 class ResidualTests:
-    """Whiteness of the residuals and their independence from the input (95 % bands)."""
+    """Whiteness of the residuals and their independence from the input (95 % bands).
+
+    The curves are what the verdicts are of; they are for the report and stay out of the JSON.
+    """
 
     white: bool | None = None
     independent_of_input: bool | None = None
-    autocorrelation: tuple[float, ...] = ()
-    """At lags 1, 2, ...; white where all stay within ``band``."""
-    cross_correlation: tuple[float, ...] = ()
-    """With the voltage, at lags 0, 1, ...; independent where all stay within ``cross_band``."""
-    band: float | None = None
-    cross_band: float | None = None
+    autocorrelation: Correlation | None = field(default=None, compare=False, repr=False)
+    cross_correlation: Correlation | None = field(default=None, compare=False, repr=False)
 
 
 @dataclass(frozen=True)
@@ -126,8 +134,6 @@ class Estimate:
     candidates: tuple[Candidate, ...] = ()
     residuals: ResidualTests = ResidualTests()
     findings: tuple[Finding, ...] = ()
-    warnings: tuple[str, ...] = ()
-    advice: tuple[str, ...] = ()
     samples: int = 0
     duration: float = 0.0
     sample_time: float = 0.0
@@ -138,6 +144,16 @@ class Estimate:
     def unidentifiable(self) -> tuple[str, ...]:
         """Parameters that the data cannot tell."""
         return tuple(n for n, q in self.parameters.items() if q.status == "unidentifiable")
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Messages of the findings that are more than notes."""
+        return tuple(dict.fromkeys(f.message for f in self.findings if f.severity != "note"))
+
+    @property
+    def advice(self) -> tuple[str, ...]:
+        """What the findings advise to do."""
+        return tuple(dict.fromkeys(f.advice for f in self.findings if f.advice))
 
     @property
     def unreliable(self) -> bool:
@@ -237,7 +253,10 @@ class Estimate:
                 }
                 for c in self.candidates
             ],
-            "residuals": asdict(self.residuals),
+            "residuals": {
+                "white": self.residuals.white,
+                "independent_of_input": self.residuals.independent_of_input,
+            },
             "findings": [f.to_document() for f in self.findings],
             "warnings": list(self.warnings),
             "advice": list(self.advice),

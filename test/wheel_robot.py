@@ -18,6 +18,7 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
+from std_srvs.srv import Trigger
 
 from smp_interfaces.msg import MotorCommand, MotorState, PidState
 from smp_motor_control import WHEELS
@@ -187,6 +188,12 @@ class WheelRobot:
         number = getattr(Transition, f"TRANSITION_{name.upper()}")
         request = ChangeState.Request(transition=Transition(id=number))
         return bool(self._call(client, request).success)
+
+    def trigger(self, node: str, service: str) -> str:
+        """Call a ``std_srvs/Trigger`` of a node; return what it answers."""
+        client = self.node.create_client(Trigger, f"/{node}/{service}")
+        assert client.wait_for_service(10.0)
+        return str(self._call(client, Trigger.Request()).message)
 
     def _call(self, client: object, request: object) -> object:
         future = client.call_async(request)

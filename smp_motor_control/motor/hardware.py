@@ -165,20 +165,7 @@ class DrivenMotor:
         self._last_velocity = 0.0
 
     def command(self, time: float, voltage: float) -> bool:
-        """Take a command; what is not finite counts as 0 V.
-
-        Parameters
-        ----------
-        time : float
-            Instant of its arrival [s].
-        voltage : float
-            Requested armature voltage [V]; limited to the supply.
-
-        Returns
-        -------
-        bool
-            Whether it was a number.
-        """
+        """Take a command; what is not finite counts as 0 V."""
         finite = math.isfinite(voltage)
         if self.settings.latch:
             self._latched = voltage if finite else 0.0
@@ -187,20 +174,7 @@ class DrivenMotor:
         return finite
 
     def load(self, time: float, wheel_torque: float) -> bool:
-        """Put a load on the wheel from now on; what is not finite is ignored.
-
-        Parameters
-        ----------
-        time : float
-            Instant [s].
-        wheel_torque : float
-            [N m] at the wheel; positive brakes positive speed.
-
-        Returns
-        -------
-        bool
-            Whether it was a number.
-        """
+        """Put a load on the wheel from now on; what is not finite is ignored."""
         if not math.isfinite(wheel_torque):
             return False
         self.advance(time)
@@ -208,13 +182,7 @@ class DrivenMotor:
         return True
 
     def advance(self, time: float) -> None:
-        """Integrate up to an instant, through commands and their expiry.
-
-        Parameters
-        ----------
-        time : float
-            [s]; the past is ignored.
-        """
+        """Integrate up to an instant, through commands and their expiry."""
         while self._now < time:
             until = min(time, self._expiry)
             if self._pending and self._pending[0][0] < until:
@@ -249,18 +217,7 @@ class DrivenMotor:
         self._now = until
 
     def sample(self, time: float) -> Sample:
-        """Integrate up to an instant and report what the sensors show there.
-
-        Parameters
-        ----------
-        time : float
-            [s], later than the sample before.
-
-        Returns
-        -------
-        Sample
-            The voltage is the mean since the sample before.
-        """
+        """Integrate up to an instant and report what the sensors show there."""
         self.advance(time)
         elapsed = time - self._sampled
         if elapsed > 0:

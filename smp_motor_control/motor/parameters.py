@@ -159,33 +159,11 @@ class Gearbox:
         check_range("gear ratio", self.ratio, 1e-6, 1e6)
 
     def to_motor(self, wheel: Motion) -> Motion:
-        """Return the motor's angle [rad], speed [rad/s] or acceleration of a wheel's.
-
-        Parameters
-        ----------
-        wheel : float or ndarray
-            Angle, speed or acceleration of the wheel.
-
-        Returns
-        -------
-        float or ndarray
-            ``ratio`` times as much.
-        """
+        """Return the motor's angle [rad], speed [rad/s] or acceleration of a wheel's."""
         return wheel * self.ratio
 
     def to_wheel(self, motor: Motion) -> Motion:
-        """Return the wheel's angle [rad], speed [rad/s] or acceleration of a motor's.
-
-        Parameters
-        ----------
-        motor : float or ndarray
-            Angle, speed or acceleration of the motor.
-
-        Returns
-        -------
-        float or ndarray
-            ``1 / ratio`` times as much.
-        """
+        """Return the wheel's angle [rad], speed [rad/s] or acceleration of a motor's."""
         return motor / self.ratio
 
     def torque_to_motor(self, wheel_torque: float) -> float:

@@ -1,7 +1,7 @@
 """Sends a bounded test voltage to one wheel or to all, for a bounded time, and then zero.
 
 Ends by itself with exit code 0; sends zero to every wheel whatever the reason of leaving.
-The wheels' controllers should be inactive meanwhile: two senders of commands disturb each other.
+A wheel that another node drives is refused: deactivate its controller, or let it rest.
 """
 
 from __future__ import annotations
@@ -12,13 +12,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 
 from rclpy.node import Node
-from rclpy.publisher import Publisher
 
-from smp_interfaces.msg import MotorCommand
 from smp_motor_control import WHEELS
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.excitation import SIGNALS, Bounded, Excitation
 from smp_motor_control.nodes import runtime
+from smp_motor_control.nodes.motor_writer import MotorWriter
 from smp_motor_control.nodes.settings import Parameters, described
 
 _OTHERS = 0.5
@@ -30,7 +29,10 @@ class Settings:
     """Parameters of the node."""
 
     signal: str = described("fourier", f"One of {', '.join(SIGNALS)}.", read_only=True)
-    wheels: tuple[str, ...] = described(("all",), "Wheels to excite, or all.", read_only=True)
+    wheel_names: tuple[str, ...] = described(WHEELS, "Wheels of the robot.", read_only=True)
+    wheels: tuple[str, ...] = described(
+        ("all",), "Wheels to excite, or all of wheel_names.", read_only=True
+    )
     amplitude: float = described(
         6.0, "Largest voltage of either sign [V].", minimum=0.0, read_only=True
     )
@@ -75,14 +77,11 @@ class Settings:
                 f"amplitude is {self.amplitude:g} V; it must not exceed max_voltage, "
                 f"{self.max_voltage:g} V"
             )
-        for wheel in self.wheels:
-            if wheel != "all" and wheel not in WHEELS:
-                raise ParameterError(f"wheels has {wheel!r}; known are all, {', '.join(WHEELS)}")
         self.signal_of(0)
 
     def chosen(self) -> tuple[str, ...]:
         """Return the wheels to excite."""
-        return WHEELS if "all" in self.wheels else tuple(dict.fromkeys(self.wheels))
+        return self.wheel_names if "all" in self.wheels else tuple(dict.fromkeys(self.wheels))
 
     def signal_of(self, wheel: int) -> Excitation:
         """Return the bounded signal of the n-th wheel."""
@@ -103,16 +102,11 @@ class Excite(Node):
         super().__init__("excite")
         settings = Parameters(self, Settings).settings
         self._settings = settings
-        self._outputs: list[tuple[Publisher, Excitation, MotorCommand]] = []
+        self._outputs: list[tuple[MotorWriter, Excitation]] = []
         for k, wheel in enumerate(settings.chosen()):
-            publisher = self.create_publisher(
-                MotorCommand, f"{wheel}/motor_command", runtime.STREAM_PUBLISHER
-            )
-            message = MotorCommand()
-            message.header.frame_id = f"{wheel}_wheel_joint"
             signal = settings.signal_of(k)
             signal(0.0)  # Prepared now, not in the first period.
-            self._outputs.append((publisher, signal, message))
+            self._outputs.append((MotorWriter(self, f"{wheel}/"), signal))
         self._begin: float | None = None
         self._all_heard = math.inf
         self._created = time.monotonic()
@@ -132,13 +126,17 @@ class Excite(Node):
             runtime.finish(0)
             return
         stamp = self.get_clock().now().to_msg()
-        for publisher, signal, message in self._outputs:
-            message.header.stamp = stamp
-            message.voltage = signal(elapsed)
-            publisher.publish(message)
+        for writer, signal in self._outputs:
+            if writer.owner:
+                raise ParameterError(
+                    f"{writer.publisher.topic_name}: not yours, {writer.owner} drives this wheel; "
+                    "deactivate it first"
+                )
+            writer.send(signal(elapsed), stamp)
 
     def _heard(self, now: float) -> bool:
-        silent = [p.topic_name for p, *_ in self._outputs if not p.get_subscription_count()]
+        publishers = [writer.publisher for writer, _ in self._outputs]
+        silent = [p.topic_name for p in publishers if not p.get_subscription_count()]
         if silent and now - self._created > self._settings.wait:
             raise ParameterError(
                 f"nobody listens on {', '.join(silent)}; is the driver or motor_plant running?"
@@ -150,19 +148,12 @@ class Excite(Node):
         self._all_heard = min(self._all_heard, now)
         waited = now - self._all_heard
         known = all(
-            p.get_subscription_count() >= self.count_subscribers(p.topic_name)
-            for p, *_ in self._outputs
+            p.get_subscription_count() >= self.count_subscribers(p.topic_name) for p in publishers
         )
         return waited > _OTHERS and (known or waited > 4 * _OTHERS)
 
     def _announce(self) -> None:
         settings = self._settings
-        for publisher, *_ in self._outputs:
-            others = self.count_publishers(publisher.topic_name) - 1
-            if others > 0:
-                self.get_logger().warning(
-                    f"{others} other sender(s) on {publisher.topic_name}; deactivate wheel_pid"
-                )
         self.get_logger().info(
             f"{settings.signal} of {settings.amplitude:g} V for {settings.duration:g} s "
             f"on {', '.join(settings.chosen())}"
@@ -176,13 +167,8 @@ class Excite(Node):
 
     def on_stop(self) -> None:
         """Send zero to every wheel before the process ends."""
-        stamp = self.get_clock().now().to_msg()
-        for publisher, _, message in self._outputs:
-            message.header.stamp = stamp
-            message.voltage = 0.0
-            publisher.publish(message)
-        for publisher, _, message in self._outputs[-1:]:
-            runtime.send_last(publisher, message)
+        for writer, _ in self._outputs:
+            writer.stop()
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -1,7 +1,8 @@
 """Simulates the motors of a robot behind the topics of its hardware.
 
-Subscribes ``<wheel>/motor_command`` and ``<wheel>/load_torque`` (``std_msgs/Float64``, [N m] at
-the wheel, positive against forward turning); publishes ``<wheel>/motor_state`` and, once,
+Subscribes ``<wheel>/motor_command``, of one writer at a time, and ``<wheel>/load_torque``
+(``std_msgs/Float64``, [N m] at the wheel, positive against forward turning); publishes
+``<wheel>/motor_state``, ``<wheel>/motor_owner`` on every change and, once,
 ``<wheel>/motor_description``.  Physics runs on the steady clock over the real intervals;
 only the stamps are ROS time.
 """
@@ -18,7 +19,7 @@ from typing import Any
 
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
-from std_msgs.msg import Float64
+from std_msgs.msg import Float64, String
 
 from smp_interfaces.msg import MotorCommand, MotorDescription, MotorState
 from smp_motor_control.errors import ParameterError
@@ -26,6 +27,7 @@ from smp_motor_control.motor.file import MotorEntry, load_motors, nest, parse_mo
 from smp_motor_control.motor.hardware import DrivenMotor, DriveSettings, Supply
 from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.settings import Parameters, described, given_parameters, nested
+from smp_motor_control.wheel.lease import Lease
 
 _FIXED = ParameterDescriptor(description="As in a motor file.", read_only=True)
 _DRIVE = {
@@ -75,6 +77,9 @@ class Wheel:
         self.name = name
         self.motor = motor
         self.rejected = 0
+        self.lease = Lease(motor.settings.command_timeout)
+        self._owner = "?"
+        self._owners = node.create_publisher(String, f"{name}/motor_owner", runtime.LATCHED)
         self.state = MotorState()
         self.state.header.frame_id = f"{name}_wheel_joint"
         self.publisher = node.create_publisher(
@@ -107,7 +112,10 @@ class Wheel:
         )
 
     def _command(self, message: MotorCommand) -> None:
-        if not self.motor.command(time.monotonic(), message.voltage):
+        now = time.monotonic()
+        if not self.lease.take(message.header.frame_id, message.voltage, now):
+            return
+        if not self.motor.command(now, message.voltage):
             self.rejected += 1
 
     def _load(self, message: Float64) -> None:
@@ -125,6 +133,10 @@ class Wheel:
         state.encoder_count = sample.encoder_count
         state.duty_cycle = sample.duty
         self.publisher.publish(state)
+        owner = self.lease.owner(now)
+        if owner != self._owner:
+            self._owner = owner
+            self._owners.publish(String(data=owner))
 
 
 class MotorPlant(Node):
@@ -174,6 +186,7 @@ class MotorPlant(Node):
         self._supply.resistance = settings.supply_resistance
         for wheel in self._wheels:
             wheel.motor.settings = settings.drive
+            wheel.lease.timeout = Lease(settings.drive.command_timeout).timeout
 
     def _tick(self) -> None:
         stamp = self.get_clock().now().to_msg()
@@ -195,7 +208,15 @@ class MotorPlant(Node):
                 "none or timed out" if wheel.motor.timed_out else "fresh"
             )
             values[f"{wheel.name} refused messages"] = wheel.rejected
+            values[f"{wheel.name} owner"] = wheel.lease.owner(time.monotonic()) or "none"
+            values[f"{wheel.name} refused writers"] = wheel.lease.refused or "none"
         refused = [wheel.name for wheel in self._wheels if wheel.rejected]
+        rivals = {w.name: sorted(w.lease.refused) for w in self._wheels if w.lease.refused}
+        if rivals:
+            listed = "; ".join(f"{wheel}: {', '.join(names)}" for wheel, names in rivals.items())
+            level, message = runtime.WARN, f"not yours, refused on {listed}"
+            for wheel in self._wheels:
+                wheel.lease.refused = {}
         if refused:
             level, message = runtime.WARN, f"refused messages that are no numbers: {refused}"
         return level, message, values

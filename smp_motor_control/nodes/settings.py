@@ -19,6 +19,7 @@ a refused one leaves the node as it was and the service call says why.
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Generic, TypeVar
@@ -159,6 +160,8 @@ class Parameters(Generic[S]):
         Called with the new settings after every change, not at the start.
     also_known : iterable of str
         Names or, with a final dot, prefixes of given parameters that the node reads itself.
+    check : callable
+        Called with new settings before they take effect; raises ParameterError to refuse them.
 
     Attributes
     ----------
@@ -168,7 +171,8 @@ class Parameters(Generic[S]):
     Raises
     ------
     ParameterError
-        When a given value is refused, or a given name is not a parameter of the node.
+        When a given value is refused.  A given name that is not a parameter of the node is
+        warned of, with the nearest that is.
     """
 
     def __init__(
@@ -177,19 +181,22 @@ class Parameters(Generic[S]):
         settings: type[S],
         changed: Callable[[S], None] | None = None,
         also_known: Iterable[str] = (),
+        check: Callable[[S], None] = lambda settings: None,
     ) -> None:
         self._type = settings
         self._entries = _entries(settings)
         self._changed = changed
         self._node = node
         given = given_parameters(node)
-        self._refuse_unknown(given, tuple(also_known))
+        self._check = check
+        self._warn_of_unknown(given, tuple(also_known))
         values = {
             name: coerce(name, given.get(name, entry.default), entry.default)
             for name, entry in self._entries.items()
         }
         self._values = values
         self.settings = self._build(values)
+        check(self.settings)
         for name, entry in self._entries.items():
             value = values[name]
             # Given values were validated above; the override would be checked again, worse.
@@ -202,14 +209,14 @@ class Parameters(Generic[S]):
         node.add_on_set_parameters_callback(self._validate)
         node.add_post_set_parameters_callback(self._replace)
 
-    def _refuse_unknown(self, given: Iterable[str], also_known: tuple[str, ...]) -> None:
+    def _warn_of_unknown(self, given: Iterable[str], also_known: tuple[str, ...]) -> None:
         prefixes = tuple(name for name in also_known if name.endswith("."))
         known = {*self._entries, *also_known, *_OF_EVERY_NODE}
         for name in given:
             if name not in known and not name.startswith(("qos_overrides.", *prefixes)):
-                raise ParameterError(
-                    f"unknown parameter {name!r}; known are {', '.join(sorted(self._entries))}"
-                )
+                nearest = difflib.get_close_matches(name, self._entries, 1, 0.0)
+                hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
+                self._node.get_logger().warning(f"unknown parameter {name!r} is ignored{hint}")
 
     def _build(self, values: Mapping[str, Any]) -> S:
         top: dict[str, Any] = {}
@@ -221,9 +228,12 @@ class Parameters(Generic[S]):
             else:
                 inner.setdefault(entry.path[0], {})[entry.path[1]] = values[name]
         defaults = {field.name: field.default for field in dataclasses.fields(self._type)}  # type: ignore[arg-type]
-        for name, parts in inner.items():
-            top[name] = dataclasses.replace(defaults[name], **parts)
-        return self._type(**top)
+        try:
+            for name, parts in inner.items():
+                top[name] = dataclasses.replace(defaults[name], **parts)
+            return self._type(**top)
+        except ArithmeticError as error:
+            raise ParameterError(f"the values cannot be computed with: {error}") from error
 
     def _with(self, parameters: Iterable[Parameter]) -> dict[str, Any]:
         mine = (p for p in parameters if p.name in self._entries)
@@ -232,7 +242,7 @@ class Parameters(Generic[S]):
 
     def _validate(self, parameters: list[Parameter]) -> SetParametersResult:
         try:
-            self._build(self._with(parameters))
+            self._check(self._build(self._with(parameters)))
         except ParameterError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)

@@ -14,14 +14,16 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
-from smp_interfaces.msg import MotorCommand, MotorDescription, MotorState, PidState
+from smp_interfaces.msg import MotorDescription, MotorState, PidState
 from smp_motor_control.encoder import Encoder
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.motor.parameters import Gearbox
 from smp_motor_control.nodes import runtime
+from smp_motor_control.nodes.motor_writer import MotorWriter
 from smp_motor_control.nodes.settings import Parameters
-from smp_motor_control.nodes.wheel_report import WheelReport
+from smp_motor_control.nodes.wheel_report import WheelReport, pid_state
 from smp_motor_control.nodes.wheel_settings import Settings
+from smp_motor_control.wheel.acceptance import check
 from smp_motor_control.wheel.controller import WheelController
 
 _WATCH_PERIOD = 0.02
@@ -35,7 +37,8 @@ class WheelPid(LifecycleNode):
     def __init__(self) -> None:
         super().__init__("wheel_pid")
         runtime.refuse_impossible_transitions(self)
-        self._given = Parameters(self, Settings, self._change)
+        self._wheel: WheelController | None = None
+        self._given = Parameters(self, Settings, self._change, check=self._check)
         self.settings = settings = self._given.settings
         self._joint = settings.joint_name or f"{runtime.wheel_of(self)}_wheel_joint"
         if self._joint == "_wheel_joint":
@@ -49,18 +52,16 @@ class WheelPid(LifecycleNode):
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Create topics, the reset service and diagnostics."""
-        self._command, self._pid_state = MotorCommand(), PidState()
-        self._command.header.frame_id = self._pid_state.header.frame_id = self._joint
-        sent, heard = runtime.STREAM_PUBLISHER, runtime.STREAM_SUBSCRIBER
-        self._publisher = self.create_publisher(MotorCommand, "motor_command", sent)
-        self._state_publisher = self.create_publisher(PidState, "pid_state", sent)
+        heard = runtime.STREAM_SUBSCRIBER
+        self._writer = MotorWriter(self)
+        self._shown = self.create_publisher(PidState, "pid_state", runtime.STREAM_PUBLISHER)
         listen = self.create_subscription
         self._entities = [
-            (self.destroy_publisher, self._publisher),
-            (self.destroy_publisher, self._state_publisher),
+            (MotorWriter.destroy, self._writer),
+            (self.destroy_publisher, self._shown),
             (self.destroy_subscription, listen(MotorState, "motor_state", self._hear, heard)),
             (self.destroy_subscription,
-             listen(JointState, "/wheel_setpoints", self._ask, heard)),
+             listen(JointState, runtime.robot_topic(self, "wheel_setpoints"), self._ask, heard)),
             (self.destroy_subscription,
              listen(MotorDescription, "motor_description", self._describe, runtime.LATCHED)),
             (self.destroy_service, self.create_service(Trigger, "~/reset", self._reset)),
@@ -99,10 +100,15 @@ class WheelPid(LifecycleNode):
         """Send a zero command, as before the process ends."""
         if self._wheel.active:
             self._wheel.deactivate()
-            self._command.voltage = 0.0
-            self._command.header.stamp = self.get_clock().now().to_msg()
-            runtime.send_last(self._publisher, self._command)
+            self._writer.stop()
             self._report.update()
+
+    def _check(self, settings: Settings) -> None:
+        """Refuse a change whose loop would not run well on this wheel."""
+        if self._wheel is None:
+            check(settings.wheel.loop)
+        else:
+            self._wheel.check(settings.wheel)
 
     def _change(self, settings: Settings) -> None:
         self.settings = settings
@@ -139,42 +145,25 @@ class WheelPid(LifecycleNode):
 
     def _hear(self, message: MotorState) -> None:
         wheel, stamp = self._wheel, message.header.stamp
+        wheel.owner = self._writer.owner
         nanoseconds = stamp.sec * 1_000_000_000 + stamp.nanosec
         voltage = wheel.take_feedback(message, nanoseconds, self._now(), time.monotonic())
         if voltage is not None:
-            self._send(voltage, stamp)
+            self._writer.send(voltage, stamp)
             if self._watched and wheel.answer is not None:
-                self._show(stamp)
+                self._shown.publish(pid_state(wheel, self._joint, stamp))
         self._report.update()
-
-    def _send(self, voltage: float, stamp: Any) -> None:
-        command = self._command
-        command.header.stamp = stamp
-        command.voltage = voltage
-        self._publisher.publish(command)
-
-    def _show(self, stamp: Any) -> None:
-        state, wheel, out = self._pid_state, self._wheel, self._wheel.answer
-        state.header.stamp = stamp
-        state.setpoint, state.reference = wheel.target, wheel.loop.reference.velocity
-        state.measurement = wheel.measurement
-        state.error = state.reference - state.measurement
-        state.output, state.unsaturated = wheel.output, out.unsaturated
-        state.p_term, state.i_term, state.d_term = out.p_term, out.i_term, out.d_term
-        state.feedforward, state.saturated = out.feedforward, wheel.output != out.unsaturated
-        state.dt, state.age = wheel.clock.dt, wheel.clock.age
-        self._state_publisher.publish(state)
 
     def _watch(self) -> None:
         """Look for lost feedback, and now and then for what changes seldom."""
         self._watches += 1
         if self._watches % _SELDOM == 0:
-            self._watched = self._state_publisher.get_subscription_count() > 0
+            self._watched = self._shown.get_subscription_count() > 0
             simulated = self.get_clock().ros_time_is_active
             self._now = self._ros_now if simulated else time.time_ns
         voltage = self._wheel.tick(time.monotonic())
         if voltage is not None:
-            self._send(voltage, self.get_clock().now().to_msg())
+            self._writer.send(voltage)
         self._report.update()
 
     def _ros_now(self) -> int:

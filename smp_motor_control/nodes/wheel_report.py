@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 from rclpy.node import Node
 
+from smp_interfaces.msg import PidState
 from smp_motor_control.nodes import runtime
 from smp_motor_control.wheel.controller import State, WheelController
 from smp_motor_control.wheel.freshness import Verdict
@@ -66,6 +68,9 @@ class WheelReport:
         if listed:
             message = f"{message}; in the last second: {listed}"
             level = max(level, runtime.WARN)
+        advice = [self._wheel.advice] if self._wheel.advice else []
+        if advice:
+            level = max(level, runtime.WARN)
         if self._diagnostics.due:
             self._reported = totals
             runtime.collect_garbage()
@@ -80,4 +85,26 @@ class WheelReport:
             "offset of the feedback's clock [s]": clock.offset,
             "faults since the wheel was sound": wheel.recovery.failures,
         }
-        return level, "; ".join([message, *self.timekeeping]), {**values, **totals}
+        return level, "; ".join([message, *self.timekeeping, *advice]), {**values, **totals}
+
+
+def pid_state(wheel: WheelController, joint: str, stamp: Any) -> PidState:
+    """Return what the controller has just computed, as a message."""
+    out, reference = wheel.answer, wheel.loop.reference.velocity
+    state = PidState(
+        setpoint=wheel.target,
+        reference=reference,
+        measurement=wheel.measurement,
+        error=reference - wheel.measurement,
+        p_term=out.p_term,
+        i_term=out.i_term,
+        d_term=out.d_term,
+        feedforward=out.feedforward,
+        unsaturated=out.unsaturated,
+        output=wheel.output,
+        saturated=wheel.output != out.unsaturated,
+        dt=wheel.clock.dt,
+        age=wheel.clock.age,
+    )
+    state.header.stamp, state.header.frame_id = stamp, joint
+    return state

@@ -38,20 +38,6 @@ def peak_voltage(
     """Return the largest voltage that any motor needs along a minimum-jerk transition.
 
     ``v = a0 w + a1 w' + a2 w'' + static_voltage sign(w)``.
-
-    Parameters
-    ----------
-    models : sequence of VoltageModel
-        One for each motor.
-    start, target : sequence of float
-        Motor speeds at rest before and after [rad/s].
-    duration : float
-        [s].
-
-    Returns
-    -------
-    float
-        [V].
     """
     s = np.linspace(0.0, 1.0, 501)
     shape = s**3 * (10.0 - 15.0 * s + 6.0 * s**2)

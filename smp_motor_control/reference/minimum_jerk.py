@@ -78,23 +78,7 @@ class ProfileLimits:
     def from_parameters(
         cls, max_velocity: float, max_acceleration: float, max_jerk: float
     ) -> ProfileLimits:
-        """Return the limits that ROS parameters mean, where 0 is no limit.
-
-        Parameters
-        ----------
-        max_velocity, max_acceleration, max_jerk : float
-            [rad/s], [rad/s^2], [rad/s^3]; 0 for none.
-
-        Returns
-        -------
-        ProfileLimits
-            With infinity in place of 0.
-
-        Raises
-        ------
-        ParameterError
-            When a value is NaN or negative.
-        """
+        """Return the limits that ROS parameters mean, where 0 is no limit."""
         return cls(
             velocity=max_velocity or math.inf,
             acceleration=max_acceleration or math.inf,
@@ -139,18 +123,7 @@ class MinimumJerk:
         )
 
     def at(self, t: float) -> Reference:
-        """Return the reference at an instant.
-
-        Parameters
-        ----------
-        t : float
-            Time since the start of the transition [s].
-
-        Returns
-        -------
-        Reference
-            The start before it, the target at rest after its end.
-        """
+        """Return the reference at an instant."""
         if t >= self.duration:
             return Reference(self.target, 0.0, 0.0)
         if t <= 0.0:
@@ -208,18 +181,7 @@ class Limited:
         return Reference(v + length * (a + length * j / 2.0), a + length * j, j)
 
     def at(self, t: float) -> Reference:
-        """Return the reference at an instant.
-
-        Parameters
-        ----------
-        t : float
-            Time since the start of the transition [s], not negative.
-
-        Returns
-        -------
-        Reference
-            The target at rest after its end.
-        """
+        """Return the reference at an instant."""
         begin = 0.0
         for end, v, a, j in self._legs:
             if t < end:

@@ -36,13 +36,7 @@ class ReferencePath:
         self.start(0.0)
 
     def start(self, velocity: float) -> None:
-        """Rest at a velocity.
-
-        Parameters
-        ----------
-        velocity : float
-            [rad/s].
-        """
+        """Rest at a velocity."""
         self.profile.reset(velocity)
         self.now = self.following = self.profile.now
         self._from = velocity
@@ -77,24 +71,7 @@ class ReferencePath:
         return self.now
 
     def ago(self, delay: float, doubt: float, measurement: float) -> tuple[float, float]:
-        """Return what a measurement is to be compared with.
-
-        Parameters
-        ----------
-        delay : float
-            By which the measurement is late [s].
-        doubt : float
-            By which that may be wrong [s].
-        measurement : float
-            [rad/s].
-
-        Returns
-        -------
-        nominal : float
-            The reference of that long ago [rad/s].
-        nearest : float
-            Of the references that the delay allows the one nearest to the measurement [rad/s].
-        """
+        """Return what a measurement is to be compared with."""
         past, then = self._past, self._elapsed - delay
         while len(past) > 2 and past[1][0] <= then - doubt:
             past.popleft()
@@ -110,20 +87,6 @@ class ReferencePath:
         The controller adds ``fv r_d + fa x`` for the reference ``r_d`` that it compares with;
         with the x below that is the mean of ``fv r + fa (r' + r'' a2 / a1)`` over the interval for
         which the voltage is held, so that a model that gets it is with the reference at its end.
-
-        Parameters
-        ----------
-        compared : float
-            From :meth:`ago` [rad/s].
-        gains : PidGains
-            With the feed-forward.
-        model : MotorModel or None
-            For the term of the jerk, and friction on the way through zero.
-
-        Returns
-        -------
-        float
-            [rad/s^2].
         """
         now, following, dt = self.now, self.following, self.usual
         gained = following.acceleration - now.acceleration

@@ -85,22 +85,7 @@ class Profile:
     def configure(
         self, limits: ProfileLimits, transition_time: float, drive: Drive | None = None
     ) -> None:
-        """Change limits and duration from the next change of the target on.
-
-        Parameters
-        ----------
-        limits : ProfileLimits
-            New limits.
-        transition_time : float
-            [s].
-        drive : Drive or None
-            The motor and its voltage.
-
-        Raises
-        ------
-        ParameterError
-            When ``transition_time`` is negative or not finite.
-        """
+        """Change limits and duration from the next change of the target on."""
         if not 0.0 <= transition_time < math.inf:
             raise ParameterError(
                 f"transition_time is {transition_time} s: must be finite and not negative"
@@ -132,21 +117,7 @@ class Profile:
         return 0.0 if self._transition is None else self._transition.duration
 
     def set_target(self, velocity: float, sample_time: float = 0.005) -> None:
-        """Head for a velocity from wherever the reference is now.
-
-        Parameters
-        ----------
-        velocity : float
-            [rad/s]; the target that is in force already changes nothing.
-        sample_time : float
-            Interval over which the voltage is held [s], of which a transition as fast as the
-            voltage allows is made up.
-
-        Raises
-        ------
-        ParameterError
-            When it is not finite; the old target stays.
-        """
+        """Head for a velocity from wherever the reference is now."""
         if not math.isfinite(velocity):
             raise ParameterError(f"target velocity is {velocity}: must be finite")
         most = min(self.limits.velocity, _FASTEST)
@@ -228,18 +199,7 @@ class Profile:
         return self.now
 
     def ahead(self, lead: float) -> Reference:
-        """Return where the reference will be if the target stays.
-
-        Parameters
-        ----------
-        lead : float
-            [s] from now, not negative.
-
-        Returns
-        -------
-        Reference
-            For a feed-forward that makes up for delay and for holding the output.
-        """
+        """Return where the reference will be if the target stays."""
         if self._transition is None:
             return self.now
         return self._clip(self._transition.at(self._elapsed + lead))

@@ -56,18 +56,7 @@ class Drive:
         check_range("time_constant_product of the drive", product, 0.0, most, "s^2")
 
     def needed(self, reference: Reference) -> float:
-        """Return u, the speed that the voltage of an instant would hold for ever.
-
-        Parameters
-        ----------
-        reference : Reference
-            Speed, acceleration and jerk.
-
-        Returns
-        -------
-        float
-            [rad/s], with its sign.
-        """
+        """Return u, the speed that the voltage of an instant would hold for ever."""
         bend = self.time_constant_product * reference.jerk
         return reference.velocity + self.time_constant * reference.acceleration + bend
 
@@ -162,18 +151,7 @@ class VoltageLimited:
             state = motor.after(state, u, length)
 
     def at(self, t: float) -> Reference:
-        """Return the reference at an instant.
-
-        Parameters
-        ----------
-        t : float
-            Time since the start of the transition [s], not negative.
-
-        Returns
-        -------
-        Reference
-            The target at rest after its end.
-        """
+        """Return the reference at an instant."""
         begin, motor = 0.0, self._motor
         for end, state, u in self._legs:
             if t < end * (1.0 - 1e-12):

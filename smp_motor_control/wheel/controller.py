@@ -7,19 +7,22 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
+from statistics import median
 from typing import Protocol
 
 from smp_motor_control.encoder import Encoder
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.motor.parameters import Gearbox
 from smp_motor_control.pid import PidOutput
+from smp_motor_control.wheel.acceptance import Circumstances, check
 from smp_motor_control.wheel.faults import Fault, FaultDetector, FaultLimits, Recovery
 from smp_motor_control.wheel.freshness import FeedbackClock, Verdict
 from smp_motor_control.wheel.loop import LoopSettings, WheelLoop
 
 _LARGEST_SETPOINT = 1e4
+_LEARNING = 20
 _AT_REST = 0.05
 _FRESH, _FIRST, _LATE = Verdict.FRESH, Verdict.FIRST, Verdict.LATE
 
@@ -101,6 +104,8 @@ class WheelController:
         What was left out, and how often.
     owner : str
         Another node that owns the wheel by its lease; empty where nobody else does.
+    advice : str
+        Why the gains do not suit the interval of the feedback; empty where they do.
     loop, clock, recovery : WheelLoop, FeedbackClock, Recovery
         Its parts.
     """
@@ -115,6 +120,9 @@ class WheelController:
         self.answer: PidOutput | None = None
         self.owner = ""
         self.steps = 0
+        self.advice = ""
+        self._wheel = Circumstances()
+        self._intervals: list[float] = []
         self.target = self.measurement = 0.0
         self.supply = math.inf
         self._detector = FaultDetector(settings.faults)
@@ -122,6 +130,22 @@ class WheelController:
         self._forget(-math.inf)
 
     # Settings ------------------------------------------------------------------------------
+
+    def check(self, settings: WheelSettings) -> None:
+        """Refuse a change of settings with which this wheel should not be driven.
+
+        Parameters
+        ----------
+        settings : WheelSettings
+            Each value valid by itself.
+
+        Raises
+        ------
+        ParameterError
+            See :func:`~smp_motor_control.wheel.acceptance.check`.
+        """
+        if settings.loop != self.settings.loop:
+            check(settings.loop, self._wheel)
 
     def configure(self, settings: WheelSettings) -> None:
         """Change the settings while running, without a jump of the voltage.
@@ -138,8 +162,11 @@ class WheelController:
         """
         self.loop.configure(settings.loop.within(self.supply))
         self.settings = settings
+        self.advice = ""
         self._detector.limits = settings.faults
-        self._detector.reachable = self.loop.settings.reachable
+        gains = settings.loop.gains
+        self._detector.volts_per_speed = gains.feedforward_velocity
+        self._detector.static_voltage = gains.feedforward_static
         self.recovery.first_pause = settings.fault_retry
         if self.recovery.fault is Fault.COMPUTATION:
             self.recovery.reset()
@@ -169,6 +196,7 @@ class WheelController:
         self.settings.loop.within(supply)
         self.supply = supply
         self.loop.set_hardware(gearbox, encoder, 1.5 * supply)
+        self._wheel = replace(self._wheel, supply=supply, gearbox=gearbox, encoder=encoder)
         self.configure(self.settings)
         self._detector.resistance = resistance
 
@@ -286,6 +314,8 @@ class WheelController:
         float or None
             0 V while there is none; None where nothing is to be sent.
         """
+        if self.clock.dt and len(self._intervals) < _LEARNING:
+            self._learn(self.clock.dt)
         since = now - self.settings.feedback_timeout
         if not self.active or self._feedback_at >= since:
             return None
@@ -293,6 +323,16 @@ class WheelController:
         if self._late_at >= since:
             return self._zero(State.LATE_FEEDBACK)
         return self._zero(State.BAD_FEEDBACK if self._bad_at >= since else State.NO_FEEDBACK)
+
+    def _learn(self, dt: float) -> None:
+        """Judge the gains once more when the usual interval of the feedback is known."""
+        self._intervals.append(dt)
+        if len(self._intervals) == _LEARNING:
+            self._wheel = replace(self._wheel, sample_time=median(self._intervals))
+            try:
+                check(self.settings.loop, self._wheel)
+            except ParameterError as error:
+                self.advice = str(error)
 
     def refuse(self, what: str) -> None:
         """Count something that was left out."""
@@ -352,7 +392,7 @@ class WheelController:
         if recovery.cautious:
             voltage = recovery.limited(voltage, measurement, dt, self.settings.faults)
         saturated = voltage != out.unsaturated
-        fault = detector.follow(dt, loop.reference.velocity, measurement, saturated)
+        fault = detector.follow(dt, loop.reference.velocity, measurement, voltage, saturated)
         if fault is not None:
             return self._trip(fault, now)
         self.output, self.answer = voltage, out

@@ -17,8 +17,9 @@ MOST_TRIES = 3
 PROVEN_AFTER = 2.0
 """Time of turning as driven after which a fault is over, and its tries are forgotten [s]."""
 
-TRUSTED_AFTER = 0.2
-"""Time of turning as driven after which a try may use the full voltage [s]."""
+TRUSTED_AFTER = 0.6
+"""Time of turning as driven after which a try may use the full voltage [s]: what does not follow
+is found before."""
 
 _ZERO_RELEASES = 0.5
 """Time for which a set-point of zero must stand before it releases a wheel [s]."""
@@ -33,7 +34,10 @@ _IMPROVING = 0.95
 """Of its error a wheel that accelerates keeps less than this from one window to the next."""
 
 _SATURATED = 0.7
-"""Tolerated share of a set-point that the voltage may not suffice for, where no model says."""
+"""Tolerated share of a set-point that the voltage may not suffice for, where that is unknown."""
+
+_GOOD = 0.1
+"""Share of the speed within which a wheel follows well enough to learn its volts per speed."""
 
 
 class Fault(Enum):
@@ -105,14 +109,15 @@ class FaultDetector:
 
     Attributes
     ----------
-    reachable : float
-        Speed that the supply suffices for [rad/s, wheel]; infinite where no model says.
+    volts_per_speed, static_voltage : float
+        Of the wheel [V s/rad], [V], where a model says; NaN and 0 where it is to be learnt.
     """
 
     def __init__(self, limits: FaultLimits, resistance: float = math.nan) -> None:
         self.limits = limits
         self.resistance = resistance
-        self.reachable = math.inf
+        self.volts_per_speed, self.static_voltage = math.nan, 0.0
+        self._learnt = math.nan
         self.reset()
 
     def reset(self) -> None:
@@ -179,10 +184,12 @@ class FaultDetector:
         return Fault.DEAD_ENCODER
 
     def _begin_window(self, before: float) -> None:
-        self._before, self._sum, self._speeds, self._elapsed = before, 0.0, 0.0, 0.0
-        self._saturated = True
+        self._before, self._elapsed, self._saturated = before, 0.0, True
+        self._reference = self._speed = self._voltage = 0.0
 
-    def follow(self, dt: float, reference: float, velocity: float, saturated: bool) -> Fault | None:
+    def follow(
+        self, dt: float, reference: float, velocity: float, voltage: float, saturated: bool
+    ) -> Fault | None:
         """Compare speed and reference, each by its mean over a third of the tracking time.
 
         Two windows in succession must be off, the second no less than the first, so that
@@ -194,30 +201,44 @@ class FaultDetector:
             Interval that ends with the sample [s].
         reference, velocity : float
             Of the wheel [rad/s].
+        voltage : float
+            Answer to the sample [V].
         saturated : bool
-            Whether the voltage was at its limit.
+            Whether the loop asked for more.
 
         Returns
         -------
         Fault or None
-            ``WRONG_WAY`` or ``NOT_FOLLOWING``.
+            ``WRONG_WAY`` or ``NOT_FOLLOWING``; a wheel that stands still is :meth:`step`'s.
         """
-        self._sum += reference * dt
-        self._speeds += velocity * dt
+        self._reference += reference * dt
+        self._speed += velocity * dt
+        self._voltage += voltage * dt
         self._saturated = self._saturated and saturated
         self._elapsed = elapsed = self._elapsed + dt
         if 3.0 * elapsed < self.limits.tracking_time:
             return None
-        asked, speed = self._sum / elapsed, self._speeds / elapsed
-        unknown = self._saturated and self.reachable == math.inf
-        asked = max(min(asked, self.reachable), -self.reachable)
-        share = max(self.limits.tracking_tolerance, _SATURATED if unknown else 0.0)
-        error, before = abs(asked - speed), self._before
+        asked, speed, before = self._reference / elapsed, self._speed / elapsed, self._before
+        share = self.limits.tracking_tolerance
+        if self._saturated:
+            reachable = self._reachable(abs(self._voltage) / elapsed)
+            share = max(share, _SATURATED) if reachable == math.inf else share
+            asked = max(min(asked, reachable), -reachable)
+        elif abs(asked - speed) < _GOOD * abs(speed) > _GOOD * _SLOWEST:
+            self._learnt = abs(self._voltage / self._speed)
+        error = abs(asked - speed)
         off = error > share * abs(asked) + _SLOWEST and self.limits.tracking_time > 0.0
         self._begin_window(error if off else math.nan)
-        if not (off and error > _IMPROVING * before):  # NaN where the window before was good
+        stalled = self._still > 0.0 and self.limits.stall_time > 0.0
+        if stalled or not (off and error > _IMPROVING * before):  # NaN: the one before was good
             return None
         return Fault.WRONG_WAY if asked * speed < 0.0 else Fault.NOT_FOLLOWING
+
+    def _reachable(self, voltage: float) -> float:
+        """Return the speed for which a voltage suffices; infinite where that is not known."""
+        if self.volts_per_speed > 0.0:
+            return max(voltage - self.static_voltage, 0.0) / self.volts_per_speed
+        return voltage / self._learnt if self._learnt > 0.0 else math.inf
 
 
 _SILENT = (Fault.STALL, Fault.DEAD_ENCODER, Fault.NO_MOTION)

@@ -114,15 +114,6 @@ class LoopSettings:
         )
         return replace(self, gains=gains)
 
-    @property
-    def reachable(self) -> float:
-        """Speed for which the voltage suffices by the feed-forward [rad/s]; infinite if unknown."""
-        gains = self.gains
-        if gains.feedforward_velocity <= 0.0:
-            return math.inf
-        most = min(gains.u_clamp_max, -gains.u_clamp_min) - gains.feedforward_static
-        return max(most, 0.0) / gains.feedforward_velocity
-
 
 class WheelLoop:
     """Speed loop of one wheel, one step per feedback sample.

@@ -51,7 +51,6 @@ class Outcome:
     estimate: Estimate | None = None
     comparisons: tuple[Comparison, ...] = ()
     failure: SmpError | None = None
-    notes: tuple[str, ...] = ()
 
     @property
     def exit_code(self) -> int:
@@ -148,11 +147,10 @@ def identify_wheel(
                 "record a longer excitation with several frequencies, in both directions"
             )
         )
-    notes = dict.fromkeys(note for record in (*records, *kept) for note in record.notes)
     fitted, held_out = (records, kept) if kept else split(records)
     curves: list[tuple[Record, Role]] = [(record, "estimation") for record in fitted]
     curves += [(record, "validation") for record in held_out]
-    return Outcome(found, tuple(_compare(found, *curve) for curve in curves), notes=tuple(notes))
+    return Outcome(found, tuple(_compare(found, *curve) for curve in curves))
 
 
 def _compare(found: Estimate, record: Record, role: Role) -> Comparison:
@@ -180,7 +178,6 @@ def _contents(outcomes: Mapping[str, Outcome], arguments: argparse.Namespace) ->
         estimates,
         {wheel: one.comparisons for wheel, one in outcomes.items()},
         {wheel: str(one.failure) for wheel, one in outcomes.items() if one.failure},
-        {wheel: one.notes for wheel, one in outcomes.items()},
         provenance,
     )
     document = identification_document(estimates)
@@ -199,7 +196,7 @@ def _conclude(
     estimates = {wheel: one.estimate for wheel, one in outcomes.items() if one.estimate}
     if not arguments.quiet:
         for found in estimates.values():
-            _print(found, outcomes[found.wheel].notes, arguments)
+            _print(found, arguments)
         if estimates:
             console().print(f"written: {', '.join(map(str, paths))}", soft_wrap=True)
     code = 0
@@ -214,10 +211,10 @@ def _conclude(
     return code
 
 
-def _print(found: Estimate, notes: Sequence[str], arguments: argparse.Namespace) -> None:
+def _print(found: Estimate, arguments: argparse.Namespace) -> None:
     out = console()
     out.print(estimate_table(found))
-    for finding in words.findings(found, notes):
+    for finding in words.findings(found):
         out.print(f"{finding.severity}: {finding.message}", soft_wrap=True)
         if finding.advice:
             out.print(f"advice: {finding.advice}", soft_wrap=True)

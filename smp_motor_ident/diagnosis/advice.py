@@ -1,4 +1,4 @@
-"""What the result means in words: doubts about it, and what to record to know more."""
+"""What is found about a result, and what to record or measure to know more."""
 
 from __future__ import annotations
 
@@ -6,97 +6,188 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from smp_motor_ident.diagnosis.limits import (
+    FIT_EXPLAINS,
+    FIT_HOLDS,
+    FIT_INDEPENDENT,
+    FRICTION_SHOWN,
+    RINGING,
+    SETTLED,
+    SQUARE_LEVEL,
+    STEADY,
+    UNEXPLAINED,
+)
 from smp_motor_ident.estimation import replay
 from smp_motor_ident.estimation.answer import Answer
 from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import PHYSICAL
-from smp_motor_ident.result import ResidualTests
-
-TOO_FAST = 1.5  # radians a sample; at pi a ringing cannot be told from a slower one
-STEADY = 4.0  # time constants after which a motor's speed is steady
-UNEXPLAINED = 9.0  # residual variance over that of the counter that no counter makes
+from smp_motor_ident.result import FitPercent, ResidualTests
 
 
-def doubts(
-    fit: Fit,
-    result: Answer,
-    estimation: float,
-    validation: float | None,
-    tests: ResidualTests,
-    data: Experiments,
-) -> list[str]:
-    """Return warnings about an estimate.
+def assess(data: Experiments, fit: Fit, percent: FitPercent, tests: ResidualTests) -> list[Finding]:
+    """Return what speaks against an estimate, or must be known to read it.
 
     Parameters
     ----------
-    fit, result : Fit, Answer
-        The estimate.
-    estimation, validation : float
-        Fit percent.
-    tests : ResidualTests
-        Of the innovations.
     data : Experiments
         What was fitted.
+    fit : Fit
+        The estimate.
+    percent : FitPercent
+        On the data and on held-out data.
+    tests : ResidualTests
+        Of the innovations.
 
     Returns
     -------
-    list of str
+    list of Finding
         Empty where nothing speaks against the result.
     """
-    out = []
-    s = fit.structure
-    if not fit.converged and _unsettled(data, fit):
-        out.append("doubtful: the fit did not settle; record a longer or stronger excitation")
-    if estimation < 70:
-        out.append(f"doubtful: the model explains only {estimation:.0f} % of the speed")
-    if validation is not None and validation < estimation - 15:
-        out.append(
-            f"doubtful: held-out data fit {validation:.0f} % against {estimation:.0f} %; the "
-            "motor or its load changed, or the excitation was too poor"
+    return [
+        *_descent(data, fit),
+        *_fit(percent, tests),
+        *_resolution(data, fit, tests),
+        *_sensors(fit),
+        *_torque_noise(data, fit),
+    ]
+
+
+def _descent(data: Experiments, fit: Fit) -> list[Finding]:
+    if fit.converged or not _unsettled(data, fit):
+        return []
+    return [
+        Finding(
+            "not_converged",
+            "unreliable",
+            "the fit did not settle",
+            advice="record a longer or stronger excitation",
         )
-    own = data.quantum**2 / 12
-    beyond = 0 < UNEXPLAINED * own < fit.noise[0, 0] and fit.ratio == 0
-    if data.kind == rc.ANGLE and beyond and tests.white is False:
+    ]
+
+
+def _fit(percent: FitPercent, tests: ResidualTests) -> list[Finding]:
+    out = []
+    estimation, validation = percent.estimation or 0.0, percent.validation
+    if estimation < FIT_EXPLAINS.value:
         out.append(
-            f"doubtful: the motion leaves the model by {np.sqrt(fit.noise[0, 0] / own):.0f} times "
-            "the counter's resolution, and not at random; sample faster, or look for what else "
-            "drives it"
+            Finding(
+                "poor_fit",
+                "unreliable",
+                f"the model explains only {estimation:.0f} % of the speed",
+                {"fit_percent": estimation, "limit": FIT_EXPLAINS.value},
+                "look for what else drives the motor; record what the driver really puts out",
+            )
+        )
+    if validation is not None and validation < estimation - FIT_HOLDS.value:
+        out.append(
+            Finding(
+                "validation",
+                "unreliable",
+                f"held-out data fit {validation:.0f} % against {estimation:.0f} %; the "
+                "motor or its load changed, or the excitation was too poor",
+                {"estimation": estimation, "validation": validation},
+                "record 20 s or more of one excitation under one load",
+            )
+        )
+    if tests.independent_of_input is False and estimation < FIT_INDEPENDENT.value:
+        out.append(
+            Finding(
+                "residual_follows_voltage",
+                "warning",
+                "the residuals still follow the voltage: the motor does what the model does not",
+                {"fit_percent": estimation},
+            )
+        )
+    return out
+
+
+def _resolution(data: Experiments, fit: Fit, tests: ResidualTests) -> list[Finding]:
+    out = []
+    own = data.quantum**2 / 12
+    beyond = 0 < UNEXPLAINED.value * own < fit.noise[0, 0] and fit.ratio == 0
+    if data.kind == rc.ANGLE and beyond and tests.white is False:
+        times = float(np.sqrt(fit.noise[0, 0] / own))
+        out.append(
+            Finding(
+                "beyond_resolution",
+                "unreliable",
+                f"the motion leaves the model by {times:.0f} times the counter's resolution, and "
+                "not at random",
+                {"times": times, "limit": float(np.sqrt(UNEXPLAINED.value))},
+                "sample faster, or look for what else drives it",
+            )
         )
     ring = _ring(fit)
-    if ring * data.step > TOO_FAST:
+    if ring * data.step > RINGING.value:
         out.append(
-            f"doubtful: the answer rings at {ring / (2 * np.pi):.3g} Hz, which sampling at "
-            f"{1 / data.step:.4g} Hz hardly shows; sample faster"
+            Finding(
+                "ringing",
+                "unreliable",
+                f"the answer rings at {ring / (2 * np.pi):.3g} Hz, which sampling at "
+                f"{1 / data.step:.4g} Hz hardly shows",
+                {"radians_a_sample": ring * data.step, "limit": RINGING.value},
+                "sample faster",
+            )
         )
-    if tests.independent_of_input is False and estimation < 95:
-        far = "doubtful: " if estimation < 90 else ""
-        out.append(
-            f"{far}the residuals still follow the voltage: the motor does what the model does not"
-        )
+    return out
+
+
+def _sensors(fit: Fit) -> list[Finding]:
+    out = []
+    s = fit.structure
     if s.offset and s.current:
-        offset = fit.z[models.OFFSET]
+        offset = float(fit.z[models.OFFSET])
         out.append(
-            f"current has an offset of {1e3 * offset:.3g} mA, removed; zero the sensor at rest"
+            Finding(
+                "current_offset",
+                "warning",
+                f"current has an offset of {1e3 * offset:.3g} mA, removed",
+                {"offset": offset},
+                "zero the current sensor at rest",
+            )
         )
     if s.window or "window" in s.held:
-        window = fit.z[models.WINDOW]
+        window = float(fit.z[models.WINDOW])
         out.append(
-            f"the speed is averaged over {1e3 * window:.3g} ms: {1e3 * window / 2:.3g} ms of what "
-            "looks like a delay is that filter, not the motor"
-        )
-    if fit.ratio > 0 and data.kind == rc.ANGLE:
-        if not s.current and _plain_square(data, fit):
-            out.append(
-                "doubtful: a plain square tells friction from gain at its reversals alone, and a "
-                "load that fluctuates hides them; add a sine, a Fourier wave, or the current"
+            Finding(
+                "averaged_speed",
+                "warning",
+                f"the speed is averaged over {1e3 * window:.3g} ms: {1e3 * window / 2:.3g} ms of "
+                "what looks like a delay is that filter, not the motor",
+                {"window": window},
             )
-        out.append(
-            "the motion scatters beyond the counter's resolution (a load that fluctuates, or a "
-            "command that switches between samples); the estimate allows for it"
         )
+    return out
+
+
+def _torque_noise(data: Experiments, fit: Fit) -> list[Finding]:
+    if fit.ratio <= 0 or data.kind != rc.ANGLE:
+        return []
+    out = []
+    if not fit.structure.current and _plain_square(data, fit):
+        out.append(
+            Finding(
+                "plain_square",
+                "unreliable",
+                "a plain square tells friction from gain at its reversals alone, and a load that "
+                "fluctuates hides them",
+                {},
+                "add a sine, a Fourier wave, or the current",
+            )
+        )
+    out.append(
+        Finding(
+            "torque_noise",
+            "warning",
+            "the motion scatters beyond the counter's resolution (a load that fluctuates, or a "
+            "command that switches between samples)",
+            {"intensity": float(fit.ratio)},
+        )
+    )
     return out
 
 
@@ -105,18 +196,18 @@ def _plain_square(data: Experiments, fit: Fit) -> bool:
 
     Rest before and after it does not count; two levels in quick succession are another matter.
     """
-    value = data.section_value
+    value = data.hold_value
     driven = value[np.abs(value) > 0.05 * np.abs(value).max()]
     there, back = driven[driven > 0], -driven[driven < 0]
     if not there.size or not back.size:
         return False
     level = np.where(driven > 0, np.median(there), np.median(back))
-    turns = data.section_end[:-1][np.diff(np.sign(value)) != 0]
+    turns = data.hold_end[:-1][np.diff(np.sign(value)) != 0]
     lag = float(np.exp(fit.z[models.A1] - fit.z[models.A0]))
     return bool(
-        np.mean(np.abs(np.abs(driven) - level) < 0.03 * level) > 0.95
+        np.mean(np.abs(np.abs(driven) - level) < SQUARE_LEVEL.value * level) > 0.95
         and turns.size > 1
-        and np.median(np.diff(turns)) > STEADY * lag
+        and np.median(np.diff(turns)) > STEADY.value * lag
     )
 
 
@@ -135,11 +226,12 @@ def _unsettled(data: Experiments, fit: Fit) -> bool:
     """
     _, step, _ = replay.promise(data, fit, fit.structure)
     free = np.array(fit.structure.free())
-    told = (free != models.TE) | fit.structure.current
-    return bool(np.any(np.abs(step) > 0.5 * np.sqrt(np.diag(fit.covariance())), where=told))
+    reported = (free != models.TE) | fit.structure.current
+    deviation = np.sqrt(np.diag(fit.covariance()))
+    return bool(np.any(np.abs(step) > SETTLED.value * deviation, where=reported))
 
 
-def advise(fit: Fit, result: Answer, known: Mapping[str, float]) -> list[str]:
+def advise(fit: Fit, result: Answer, known: Mapping[str, float]) -> list[Finding]:
     """Return what to record or measure to know what is not known.
 
     Parameters
@@ -151,39 +243,65 @@ def advise(fit: Fit, result: Answer, known: Mapping[str, float]) -> list[str]:
 
     Returns
     -------
-    list of str
-        One sentence each.
+    list of Finding
+        Notes, each with its advice.
     """
     missing = [n for n in PHYSICAL if result.parameters[n].status == "unidentifiable"]
     out = []
     s = fit.structure
     if missing and not s.current:
-        words = ", ".join(missing)
         out.append(
-            f"voltage and speed alone cannot separate {words}: any of a family of motors answers "
-            "the same; record the motor current too, the combinations are what is known"
-        )
-        if "resistance" not in known:
-            out.append(
-                "with the resistance measured by ohmmeter one unknown less remains, yet not all "
-                "can be separated without current"
+            _note(
+                "not_separable",
+                f"voltage and speed alone cannot separate {', '.join(missing)}: any of a family "
+                "of motors answers the same",
+                "record the motor current too; the combinations are what is known"
+                + (
+                    ""
+                    if "resistance" in known
+                    else "; with the resistance measured by ohmmeter one unknown less remains, yet "
+                    "not all can be separated without current"
+                ),
             )
+        )
     if missing and s.current:
         if "inductance" in missing:
             out.append(
-                "inductance does not show at this rate: sample faster or excite at higher frequency"
+                _note(
+                    "inductance_hidden",
+                    "inductance does not show at this rate",
+                    "sample faster or excite at higher frequency",
+                )
             )
-        others = [n for n in missing if n != "inductance"]
+        others = ", ".join(n for n in missing if n != "inductance")
         if others:
             out.append(
-                f"{', '.join(others)}: excite harder, longer, over more frequencies and in "
-                "both directions"
+                _note(
+                    "weak_excitation",
+                    f"{others} cannot be told from these data",
+                    f"{others}: excite harder, longer, over more frequencies and in both "
+                    "directions",
+                )
             )
-    free = s.free()
-    if models.VC_PLUS in free and s.friction != "none":
-        cov = fit.covariance()
-        i = free.index(models.VC_PLUS)
-        std = float(np.sqrt(cov[i, i]))
-        if std > 0.5 * abs(fit.z[models.VC_PLUS]) and std > 0.05:
-            out.append("static friction hardly shows: drive both directions, slowly through zero")
-    return out
+    return [*out, *_friction(fit)]
+
+
+def _friction(fit: Fit) -> list[Finding]:
+    free = fit.structure.free()
+    if models.VC_PLUS not in free or fit.structure.friction == "none":
+        return []
+    i = free.index(models.VC_PLUS)
+    std = float(np.sqrt(fit.covariance()[i, i]))
+    if std <= FRICTION_SHOWN.value * abs(fit.z[models.VC_PLUS]) or std <= 0.05:
+        return []
+    return [
+        _note(
+            "friction_hidden",
+            "static friction hardly shows",
+            "drive both directions, slowly through zero",
+        )
+    ]
+
+
+def _note(code: str, message: str, advice: str) -> Finding:
+    return Finding(code, "note", message, {}, advice)

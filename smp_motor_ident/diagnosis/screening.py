@@ -7,21 +7,24 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from smp_motor_ident.diagnosis.limits import (
+    FEWEST,
+    LARGEST_OFFSET,
+    METER,
+    MOST_LOST,
+    OFFSET_SURE,
+)
 from smp_motor_ident.errors import InsufficientExcitationError, SignalError
+from smp_motor_ident.finding import Finding
 from smp_motor_ident.record import Record
 
 Array = NDArray[np.float64]
 
-FEWEST = 40
-MOST_LOST = 0.3
 RUNS = 2_000  # runs of samples in which signals are averaged before they are compared
 RUN_COLOUR = 20.0  # by which neighbouring runs' errors hang together, at most
-SURE = 6.0  # standard deviations of an offset
-LARGEST_OFFSET = 0.2  # of the largest current otherwise
-METER = 0.01  # of the supply, or of a level: what a voltmeter may scatter
 
 
-def screen(records: Sequence[Record]) -> list[str]:
+def screen(records: Sequence[Record]) -> list[Finding]:
     """Refuse records that cannot lead to a right answer; name the reason and the remedy.
 
     Parameters
@@ -31,8 +34,8 @@ def screen(records: Sequence[Record]) -> list[str]:
 
     Returns
     -------
-    list of str
-        Warnings about what can be lived with.
+    list of Finding
+        Warnings about what can be lived with, and what was said while reading.
 
     Raises
     ------
@@ -42,7 +45,7 @@ def screen(records: Sequence[Record]) -> list[str]:
     InsufficientExcitationError
         When the voltage or the motion does not suffice.
     """
-    warnings: list[str] = []
+    warnings: list[Finding] = []
     where = _where(records)
     _length(records, where)
     for record in records:
@@ -56,7 +59,8 @@ def screen(records: Sequence[Record]) -> list[str]:
     _signs(records, where)
     for record in records:
         _offset(record)
-    return list(dict.fromkeys(warnings))
+    notes = dict.fromkeys(note for record in records for note in record.notes)
+    return [*warnings, *(Finding("reading", "warning", note) for note in notes)]
 
 
 def _where(records: Sequence[Record]) -> str:
@@ -66,15 +70,15 @@ def _where(records: Sequence[Record]) -> str:
 
 def _length(records: Sequence[Record], where: str) -> None:
     samples = sum(len(r) for r in records)
-    if samples < FEWEST:
+    if samples < FEWEST.value:
         duration = sum(r.duration for r in records)
         raise InsufficientExcitationError(
             f"{where}: too short, {samples} samples in {duration:.3g} s; record at least "
-            f"{FEWEST} samples, better 20 s or more with the voltage changing all the time"
+            f"{FEWEST.value:.0f} samples, better 20 s or more with a changing voltage"
         )
 
 
-def _lost(record: Record) -> list[str]:
+def _lost(record: Record) -> list[Finding]:
     where = _where([record])
     out = []
     for name in ("velocity", "position"):
@@ -82,24 +86,29 @@ def _lost(record: Record) -> list[str]:
         if values is None or (record.count is not None and record.hardware.counts_per_revolution):
             continue
         lost = float(np.mean(~np.isfinite(values)))
-        if lost > MOST_LOST and (name == "velocity" or record.velocity is None):
+        if lost > MOST_LOST.value and (name == "velocity" or record.velocity is None):
             raise SignalError(
                 f"{where}: {name} is NaN in {lost:.0%} of the samples; "
                 "repair the sensor or its connection and record again"
             )
         if lost > 0:
-            out.append(f"{name} is NaN in {lost:.1%} of the samples; they were left out")
+            out.append(_left_out(name, lost))
     if record.current is not None:
         lost = float(np.mean(~np.isfinite(record.current)))
         if 0 < lost < 1:
-            out.append(f"current is NaN in {lost:.1%} of the samples; they were left out")
+            out.append(_left_out("current", lost))
     return out
+
+
+def _left_out(name: str, lost: float) -> Finding:
+    message = f"{name} is NaN in {lost:.1%} of the samples; they were left out"
+    return Finding("samples_lost", "warning", message, {"signal": name, "share": lost})
 
 
 def _excitation(records: Sequence[Record], where: str) -> None:
     largest = max(float(np.abs(r.voltage).max()) for r in records)
     supply = max(r.hardware.supply_voltage or 0.0 for r in records)
-    if largest <= METER * supply:
+    if largest <= METER.value * supply:
         raise InsufficientExcitationError(
             f"{where}: no excitation, the voltage stays within {largest:.3g} V of 0 V; drive the "
             "motor with a sine, square or Fourier voltage while recording"
@@ -107,11 +116,11 @@ def _excitation(records: Sequence[Record], where: str) -> None:
     # What a voltmeter scatters around a level is no excitation; a step is, for it is no scatter.
     levels = [float(np.mean(r.voltage)) for r in records]
     still = [
-        float(np.std(r.voltage)) < METER * abs(level)
-        and float(np.ptp(r.voltage)) < 10 * METER * abs(level)
+        float(np.std(r.voltage)) < METER.value * abs(level)
+        and float(np.ptp(r.voltage)) < 10 * METER.value * abs(level)
         for r, level in zip(records, levels, strict=True)
     ]
-    if all(still) and float(np.ptp(levels)) < METER * abs(levels[0]):
+    if all(still) and float(np.ptp(levels)) < METER.value * abs(levels[0]):
         raise InsufficientExcitationError(
             f"{where}: the voltage is constant at {levels[0]:.4g} V; a constant "
             "input cannot tell dynamics: record a square or Fourier voltage in both directions"
@@ -302,7 +311,7 @@ def _offset(record: Record) -> None:
 
     Friction and load have no part in this: the electric equation does not know them.
     """
-    if record.current is None or np.isfinite(record.current).sum() < FEWEST:
+    if record.current is None or np.isfinite(record.current).sum() < FEWEST.value:
         return
     speed = measured_speed(record)
     there = np.isfinite(record.current) & np.isfinite(speed)
@@ -318,7 +327,9 @@ def _offset(record: Record) -> None:
     normal = np.linalg.inv(np.einsum("ni,nj->ij", columns, columns))
     std = float(np.sqrt(normal[2, 2] * rest.var() * RUN_COLOUR))
     offset, largest = float(answer[2]), float(np.nanmax(np.abs(record.current)))
-    if abs(offset) > max(SURE * std, LARGEST_OFFSET * max(largest - abs(offset), 1e-12)):
+    if abs(offset) > max(
+        OFFSET_SURE.value * std, LARGEST_OFFSET.value * max(largest - abs(offset), 1e-12)
+    ):
         raise SignalError(
             f"{_where([record])}: current has an offset of {offset:.2g} A where it reaches "
             f"{largest:.3g} A; zero the current sensor at rest and record again"

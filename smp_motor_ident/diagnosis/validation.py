@@ -1,4 +1,4 @@
-"""Validation: fit on held-out data, tests of the residuals, comparison of wheels."""
+"""Validation: fit on held-out data, comparison of wheels."""
 
 from __future__ import annotations
 
@@ -7,19 +7,17 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri
 
 from smp_motor_ident.estimation import replay
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments, prepare
 from smp_motor_ident.record import Record
-from smp_motor_ident.result import Estimate, ResidualTests
+from smp_motor_ident.result import Estimate
 
 Array = NDArray[np.float64]
 
 COARSE = 0.02  # of the speed's scatter: what a counter's resolution may add to it
-MOST = 200_000  # samples beyond which the tests of residuals learn nothing new
 
 
 def percent(measured: Array, predicted: Array) -> float:
@@ -160,70 +158,6 @@ def split(records: Sequence[Record], share: float = 0.7) -> tuple[list[Record], 
         fitted.append(record.slice(0, cut))
         kept_records.append(record.slice(cut, len(record)))
     return fitted, kept_records
-
-
-def residual_tests(data: Experiments, fit: Fit, lags: int = 25) -> ResidualTests:
-    """Test the innovations for whiteness and for independence from the input.
-
-    Autocorrelations (cross-correlations with the voltage) at up to ``lags`` lags stay, with
-    95 % confidence for all of them together, inside ``+- z / sqrt(n)``.
-
-    Parameters
-    ----------
-    data : Experiments
-        What was fitted.
-    fit : Fit
-        With its innovation gain.
-    lags : int
-        How many.
-
-    Returns
-    -------
-    ResidualTests
-        Of the mechanical output.
-    """
-    residual = data.output - replay.outputs(data, fit, gain=True)
-    voltage = np.interp(data.time, data.section_end, data.section_value)
-    if len(data.starts) > 2:
-        voltage = np.concatenate(
-            [
-                np.interp(data.time[a:b], *_input_of(data, g))
-                for g, (a, b) in enumerate(zip(data.starts[:-1], data.starts[1:]))
-            ]
-        )
-    ok = np.isfinite(residual)
-    e = np.where(ok, residual - residual[ok].mean(), 0.0)[:MOST]
-    u = (voltage - voltage.mean())[:MOST]
-    n = int(ok[:MOST].sum())
-    if n < 4 * lags or e.std() == 0 or u.std() == 0:
-        return ResidualTests()
-    band = ndtri(1 - 0.025 / lags) / np.sqrt(n)
-    auto = _lagged(e, e, lags)
-    own = _lagged(u, u, lags)
-    # The input's own colour widens the band of the cross-correlation where e is not white.
-    cross = _lagged(e, u, lags) / np.sqrt(auto[0] * own[0])
-    auto, own = auto[1:] / auto[0], own[1:] / own[0]
-    widen = np.sqrt(max(1.0, 1 + 2 * float((auto * own).sum())))
-    return ResidualTests(
-        white=bool(np.abs(auto).max() < band),
-        independent_of_input=bool(np.abs(cross).max() < band * widen),
-        autocorrelation=tuple(map(float, auto)),
-        cross_correlation=tuple(map(float, cross)),
-        band=float(band),
-        cross_band=float(band * widen),
-    )
-
-
-def _lagged(a: Array, b: Array, lags: int) -> Array:
-    """Return the inner products of a and b, b delayed by 0 to ``lags`` samples."""
-    n = len(a)
-    return np.array([np.einsum("i,i->", a[k:], b[: n - k]) for k in range(lags + 1)])
-
-
-def _input_of(data: Experiments, g: int) -> tuple[Array, Array]:
-    first = int(data.section_start[g])
-    last = int(data.section_start[g + 1]) if g + 2 < len(data.starts) else len(data.section_end)
-    return data.section_end[first:last], data.section_value[first:last]
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident.estimation.fitted import Fit, Prior
-from smp_motor_ident.likelihood.elimination import damped_step
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.noise import deviance, gain_for, proper, renewed
+from smp_motor_ident.likelihood.normal_equations import damped_step
 from smp_motor_ident.likelihood.passes import Pass, evaluate, own_columns
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import Structure, to_internal
@@ -96,7 +96,7 @@ class _Descent:
 
     def within(self, tolerance: float, size: float) -> bool:
         """Tell whether a step is so small that another pass would not tell more."""
-        own = self.here.local_promise
+        own = self.here.local_decrease
         return self.matrix.shape[1] > 0 and size < tolerance and 0 <= own < tolerance**2
 
     def settled(self) -> bool:

@@ -186,9 +186,7 @@ def _at_rest(data: Experiments, structure: Structure, fit: Fit, options: Options
     if structure.friction == "none":
         return fit
     first = np.abs(fit.initial[:, 1])
-    slow = (first > 0) & (
-        first < 0.05 * np.exp(-fit.z[models.A0]) * np.abs(data.section_value).max()
-    )
+    slow = (first > 0) & (first < 0.05 * np.exp(-fit.z[models.A0]) * np.abs(data.hold_value).max())
     if not slow.any():
         return fit
     initial = fit.initial.copy()

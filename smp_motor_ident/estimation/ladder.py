@@ -118,7 +118,7 @@ def _friction_shows(data: Experiments, fit: Fit, surely_small: bool) -> bool:
     found = max(float(step[i]), 0.0)
     if not np.isfinite(found) or (found / std) ** 2 > 0.5 * np.log(fit.samples):
         return True
-    return surely_small and found + 2 * std > LITTLE * float(np.abs(data.section_value).max())
+    return surely_small and found + 2 * std > LITTLE * float(np.abs(data.hold_value).max())
 
 
 def _of_kind(data: Experiments, fit: Fit) -> Experiments:
@@ -316,14 +316,14 @@ def _without_friction(data: Experiments, best: Fit, options: Options, rungs: lis
     plain = descent.refine(data, smooth, best, best.z, options)
     if plain.deviance < best.deviance:  # then friction has led astray
         z = plain.z.copy()
-        z[models.VC_PLUS] = 1e-3 * np.abs(data.section_value).max()
+        z[models.VC_PLUS] = 1e-3 * np.abs(data.hold_value).max()
         again = descent.refine(data, s, plain, s.complete(z), options)
         best = min(best, again, key=lambda f: f.deviance)
     cov = best.covariance()
     i = s.free().index(models.VC_PLUS)
     most = best.z[models.VC_PLUS] + 2 * float(np.sqrt(cov[i, i]))
     # Friction that the data do not tell stays: leaving it out would make the gain certain.
-    if most < LITTLE * np.abs(data.section_value).max() or plain.deviance < best.deviance:
+    if most < LITTLE * np.abs(data.hold_value).max() or plain.deviance < best.deviance:
         # A descent that did not settle is no reason to believe in none.
         gained = (plain.deviance - best.deviance) / inflation(best)
         if gained <= float(np.log(best.samples)):

@@ -47,15 +47,15 @@ def resample(data: Experiments, g: int, most: int = 8_000) -> Uniform | None:
     if data.plain and ok.all() and np.abs(steps - data.step).max() < 1e-6 * data.step:
         there = data.current[a:b] if data.current.size else None
         if there is None or np.isfinite(there).all():
-            return Uniform(data.step, data.section_value[a:b], y, there)
+            return Uniform(data.step, data.hold_value[a:b], y, there)
     step = float(np.median(steps))
     grid = np.arange(t[0], t[-1] + 0.5 * step, step)
     grid = grid[grid <= t[-1] + 1e-9 * step]
-    last = int(data.section_start[g + 1]) if g + 2 < len(data.starts) else len(data.section_end)
-    first = int(data.section_start[g])
-    ends = data.section_end[first:last]
+    last = int(data.hold_start[g + 1]) if g + 2 < len(data.starts) else len(data.hold_end)
+    first = int(data.hold_start[g])
+    ends = data.hold_end[first:last]
     last = first + int(np.searchsorted(ends, t[-1])) + 1
-    ends, values = data.section_end[first:last], data.section_value[first:last]
+    ends, values = data.hold_end[first:last], data.hold_value[first:last]
     charge = np.concatenate([[0.0], np.cumsum(values[1:] * np.diff(ends))])
     mean = np.diff(np.interp(grid, ends, charge)) / step
     voltage = np.concatenate([[values[0]], mean])

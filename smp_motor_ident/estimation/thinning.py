@@ -66,13 +66,13 @@ def _every(data: Experiments, k: int) -> Experiments:
     ends: list[Array] = []
     values: list[Array] = []
     starts, first = [0], []
-    largest = JUMP * float(np.ptp(data.section_value))
+    largest = JUMP * float(np.ptp(data.hold_value))
     for g, (a, b) in enumerate(zip(data.starts[:-1], data.starts[1:], strict=True)):
         samples = np.arange(a, b, k)
         keep.append(samples)
         starts.append(starts[-1] + len(samples))
-        begin = int(data.section_start[g])
-        last = len(data.section_end) if g + 2 == len(data.starts) else data.section_start[g + 1]
+        begin = int(data.hold_start[g])
+        last = len(data.hold_end) if g + 2 == len(data.starts) else data.hold_start[g + 1]
         end, value = _merged(data, begin, int(last), data.time[samples], largest)
         first.append(sum(len(e) for e in ends))
         ends.append(end)
@@ -83,9 +83,9 @@ def _every(data: Experiments, k: int) -> Experiments:
         time=data.time[index],
         output=data.output[index],
         starts=np.array(starts, dtype=np.int64),
-        section_end=np.concatenate(ends),
-        section_value=np.concatenate(values),
-        section_start=np.array(first, dtype=np.int64),
+        hold_end=np.concatenate(ends),
+        hold_value=np.concatenate(values),
+        hold_start=np.array(first, dtype=np.int64),
         step=data.step * k,
     )
 
@@ -94,7 +94,7 @@ def _merged(
     data: Experiments, begin: int, last: int, time: Array, largest: float
 ) -> tuple[Array, Array]:
     """Return a segment's input, constant between samples and jumps."""
-    end, value = data.section_end[begin:last], data.section_value[begin:last]
+    end, value = data.hold_end[begin:last], data.hold_value[begin:last]
     jumps = end[:-1][np.abs(np.diff(value)) > largest]
     inside = jumps[(jumps > time[0]) & (jumps < time[-1])]
     edges = np.union1d(time, inside)

@@ -30,7 +30,7 @@ def along_friction(part: Experiments, structure: Structure, best: Fit, options: 
     """
     if structure.current or models.VC_PLUS not in structure.free():
         return best
-    full = float(np.abs(part.section_value).max())
+    full = float(np.abs(part.hold_value).max())
     for share in (0.01, 0.025, 0.06):
         z = best.z.copy()
         z[models.VC_PLUS] = share * full

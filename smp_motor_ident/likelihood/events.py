@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident._compile import compiled, inlined
-from smp_motor_ident.likelihood.internal import BE, STUCK, VC_MINUS, VC_PLUS
-from smp_motor_ident.likelihood.lanes import (
+from smp_motor_ident.likelihood.propagator import BE, TE, TM, K, speed_at
+from smp_motor_ident.likelihood.sensitivities import (
     LANES,
     SLOTS,
     SW,
@@ -25,10 +25,11 @@ from smp_motor_ident.likelihood.lanes import (
     stay,
     turn,
 )
-from smp_motor_ident.likelihood.propagator import speed_at
+from smp_motor_ident.model.structures import VC_MINUS, VC_PLUS
 
 Array = NDArray[np.float64]
 
+STUCK = 0.0  # direction of motion of a motor at rest
 EVENTS = 32  # most in one interval
 
 
@@ -37,7 +38,7 @@ def _zero_crossing(  # noqa: C901 - one search, branches for how it starts
     h: float, par: Array, x: Array, sign: float, v: float, f: float
 ) -> float:
     """Return when within (0, h) the sliding speed reaches zero, or -1."""
-    te, tm, k, be = par[0], par[1], par[2], par[3]
+    te, tm, k, be = par[TE], par[TM], par[K], par[BE]
     w1, a1 = speed_at(h, te, tm, k, be, x[0], x[1], v, f)
     hi = h
     rounding = 1e-12 * (abs(x[1]) + abs(v - f) / (k + be))
@@ -94,7 +95,7 @@ def keeps_turning(m: Array, par: Array, x: Array, sign: float, v: float, f: floa
     end = m[WHOLE + 2] * q + m[WHOLE + 3] * w + m[WHOLE + 7] * v - m[WHOLE + 10] * f
     if sign * end < 0.0 or sign * w <= 0.0:
         return False
-    if par[0] == 0.0:
+    if par[TE] == 0.0:
         return True
     drive = m[WHOLE] * q + m[WHOLE + 1] * w + m[WHOLE + 6] * v - m[WHOLE + 9] * f
     return not (sign * (q - par[BE] * w - f) < 0.0 and sign * (drive - par[BE] * end - f) > 0.0)
@@ -103,7 +104,7 @@ def keeps_turning(m: Array, par: Array, x: Array, sign: float, v: float, f: floa
 @compiled
 def _breakaway(h: float, v: float, load: float, par: Array, x: Array) -> tuple[float, float]:
     """Return when within h the stuck motor breaks loose (h: it does not), and which way."""
-    drive = x[0] - load if par[0] > 0.0 else v - load
+    drive = x[0] - load if par[TE] > 0.0 else v - load
     end = v - load
     if end > par[VC_PLUS]:
         limit, direction = par[VC_PLUS], 1.0
@@ -112,9 +113,9 @@ def _breakaway(h: float, v: float, load: float, par: Array, x: Array) -> tuple[f
     else:
         return h, STUCK
     wait = 0.0
-    if par[0] > 0.0 and (limit - drive) * (end - drive) > 0.0:
+    if par[TE] > 0.0 and (limit - drive) * (end - drive) > 0.0:
         ratio = (limit - end) / (drive - end)
-        wait = -par[0] * math.log(ratio) if ratio > 0.0 else h
+        wait = -par[TE] * math.log(ratio) if ratio > 0.0 else h
     return (wait, direction) if wait < h else (h, STUCK)
 
 
@@ -122,7 +123,7 @@ def _breakaway(h: float, v: float, load: float, par: Array, x: Array) -> tuple[f
 def _stop(load: float, f: float, v: float, par: Array, x: Array, m: Array) -> float:
     """Put the speed to zero, let the columns jump, and return the direction from there."""
     x[1] = 0.0
-    net = (x[0] if par[0] > 0.0 else v) - load
+    net = (x[0] if par[TE] > 0.0 else v) - load
     before = net - (f - load)
     direction, after = STUCK, 0.0
     if net > par[VC_PLUS]:
@@ -148,28 +149,7 @@ def advance(
     marks: Array,
     scratch: Array,
 ) -> float:
-    """Advance by h at constant v under friction, through all events; return the direction.
-
-    Parameters
-    ----------
-    h, v : float
-        Length of the interval [s] and voltage.
-    direction : float
-        1, -1 or STUCK.
-    load : float
-        Constant load [V].
-    par : ndarray, shape (11,)
-        Internal parameters.
-    x : ndarray, shape (3,)
-        State; updated.
-    m, cache, marks, scratch : ndarray
-        Of `lanes`; updated.
-
-    Returns
-    -------
-    float
-        Direction afterwards.
-    """
+    """Advance by h at constant v under friction, through all events; return the direction."""
     left = h
     for _ in range(EVENTS):
         if direction == STUCK:

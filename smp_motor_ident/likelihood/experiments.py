@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident.likelihood import recursion as rc
-from smp_motor_ident.likelihood.sections import sections_of
+from smp_motor_ident.likelihood.hold import held_intervals
 from smp_motor_ident.record import Record
 
 Array = NDArray[np.float64]
@@ -33,7 +33,7 @@ class Experiments:
         As in `recursion.run`; ``current`` of shape (0,) where there is none.
     starts : ndarray of int, shape (g + 1,)
         Segment boundaries.
-    section_end, section_value, section_start : ndarray
+    hold_end, hold_value, hold_start : ndarray
         The input.
     kind : int
         SPEED, ANGLE or MEAN_SPEED.
@@ -49,9 +49,9 @@ class Experiments:
     output: Array
     current: Array
     starts: Integers
-    section_end: Array
-    section_value: Array
-    section_start: Integers
+    hold_end: Array
+    hold_value: Array
+    hold_start: Integers
     kind: int
     step: float
     quantum: float
@@ -60,7 +60,7 @@ class Experiments:
     @property
     def plain(self) -> bool:
         """Whether the input changes at the samples, one value for each."""
-        where = [a.__array_interface__["data"][0] for a in (self.section_end, self.time)]
+        where = [a.__array_interface__["data"][0] for a in (self.hold_end, self.time)]
         return bool(where[0] == where[1])
 
     @cached_property
@@ -83,16 +83,6 @@ class Experiments:
         """Return all up to ``duration`` seconds after the first voltage, of all segments together.
 
         A standstill before the first voltage teaches nothing, so it does not count.
-
-        Parameters
-        ----------
-        duration : float
-            [s].
-
-        Returns
-        -------
-        Experiments
-            Views of the same arrays.
         """
         left = duration + self._lead
         for g in range(len(self.starts) - 1):
@@ -108,13 +98,13 @@ class Experiments:
     @cached_property
     def _lead(self) -> float:
         """Return how long [s] it takes until a twentieth of the largest voltage is exceeded."""
-        level = np.abs(self.section_value)
+        level = np.abs(self.hold_value)
         first = int(np.argmax(level > 0.05 * level.max()))
         before = 0.0
         for g in range(len(self.starts) - 1):
             begin, last = self.time[self.starts[g]], self.time[self.starts[g + 1] - 1]
-            if g + 2 == len(self.starts) or first < self.section_start[g + 1]:
-                return before + max(float(self.section_end[first] - begin), 0.0)
+            if g + 2 == len(self.starts) or first < self.hold_start[g + 1]:
+                return before + max(float(self.hold_end[first] - begin), 0.0)
             before += float(last - begin)
         return before
 
@@ -126,9 +116,9 @@ class Experiments:
             self.output[:end],
             self.current[:end],
             starts,
-            self.section_end,
-            self.section_value,
-            self.section_start[: segments + 1],
+            self.hold_end,
+            self.hold_value,
+            self.hold_start[: segments + 1],
             self.kind,
             self.step,
             self.quantum,
@@ -227,18 +217,18 @@ def prepare(
     outputs = [output_of(r, kind) for r in records]
     if len({k for _, k, _ in outputs}) > 1:
         outputs = [output_of(r, "speed") for r in records]
-    starts, ends, values, section_start = [], [], [], []
+    starts, ends, values, hold_start = [], [], [], []
     offset = sections = 0
     for record in records:
-        end, value, index = sections_of(record, hold)
+        end, value, index = held_intervals(record, hold)
         starts += [offset + s for s in record.starts]
-        section_start += [sections + int(index[s]) for s in record.starts]
+        hold_start += [sections + int(index[s]) for s in record.starts]
         ends.append(end)
         values.append(value)
         offset += len(record)
         sections += len(end)
     starts.append(offset)
-    section_start.append(sections)
+    hold_start.append(sections)
     time = _join([r.time for r in records])
     output = _join([o for o, _, _ in outputs])
     current = (
@@ -255,7 +245,7 @@ def prepare(
         bounds,
         _join(ends),
         _join(values),
-        np.array(section_start, dtype=np.int64),
+        np.array(hold_start, dtype=np.int64),
         outputs[0][1],
         float(np.median(steps)),
         outputs[0][2],

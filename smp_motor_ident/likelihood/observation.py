@@ -8,14 +8,57 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident._compile import inlined
-from smp_motor_ident.likelihood.internal import ANGLE, CURRENT_OFFSET, MEAN_SPEED, WINDOW, R
-from smp_motor_ident.likelihood.lanes import D0, D1, LANES, SLOPE, SQ, ST, SW
-from smp_motor_ident.likelihood.window import recall, remember
+from smp_motor_ident._compile import compiled, inlined
+from smp_motor_ident.likelihood.sensitivities import D0, D1, LANES, SLOPE, SQ, ST, SW
+from smp_motor_ident.model.structures import LN_R, OFFSET, WINDOW
 
 Array = NDArray[np.float64]
 
-ON_OFFSET, ON_R = SLOPE + CURRENT_OFFSET * LANES, SLOPE + R * LANES
+
+@compiled
+def remember(ring: Array, k: int, t: float, x: Array, m: Array) -> None:
+    """Keep time, angle, speed and the sensitivities of both."""
+    row = ring[k % ring.shape[0]]
+    p = (ring.shape[1] - 3) // 2
+    row[0] = t
+    row[1] = x[2]
+    row[2] = x[1]
+    for j in range(p):
+        row[3 + j] = m[ST + j]
+        row[3 + p + j] = m[SW + j]
+
+
+@compiled
+def recall(ring: Array, k: int, first: int, t: float, p: int, past: Array) -> float:
+    """Put the angle at time t and its sensitivities into `past`; return the speed there."""
+    n = ring.shape[0]
+    oldest = max(first, k - n + 1)
+    a = ring[oldest % n]
+    if t <= a[0]:  # before the record: the speed it began with
+        for j in range(p):
+            past[1 + j] = a[3 + j] + (t - a[0]) * a[3 + p + j]
+        past[0] = a[1] + (t - a[0]) * a[2]
+        return float(a[2])
+    i = k
+    while i > oldest and ring[(i - 1) % n][0] > t:
+        i -= 1
+    a, b = ring[(i - 1) % n], ring[i % n]
+    h = b[0] - a[0]
+    u = (t - a[0]) / h
+    h00 = (1 + 2 * u) * (1 - u) * (1 - u)
+    h10 = u * (1 - u) * (1 - u) * h
+    h01 = u * u * (3 - 2 * u)
+    h11 = u * u * (u - 1) * h
+    past[0] = h00 * a[1] + h10 * a[2] + h01 * b[1] + h11 * b[2]
+    for j in range(p):
+        past[1 + j] = h00 * a[3 + j] + h10 * a[3 + p + j] + h01 * b[3 + j] + h11 * b[3 + p + j]
+    d = 6 * u * (1 - u) / h
+    return float(d * (b[1] - a[1]) + (1 - u) * (1 - 3 * u) * a[2] + u * (3 * u - 2) * b[2])
+
+
+SPEED, ANGLE, MEAN_SPEED = range(3)  # what the mechanical output is
+
+ON_OFFSET, ON_R = SLOPE + OFFSET * LANES, SLOPE + LN_R * LANES
 ON_WINDOW = SLOPE + WINDOW * LANES
 
 
@@ -47,23 +90,15 @@ def observe(
 @inlined
 def observe_current(par: Array, x: Array, m: Array) -> float:
     """Return the current; put its derivative into D1."""
-    amps = x[0] / par[R]
+    amps = x[0] / par[LN_R]
     for j in range(LANES):
-        m[D1 + j] = m[SQ + j] / par[R] + m[ON_OFFSET + j] - amps * m[ON_R + j]
-    return float(amps + par[CURRENT_OFFSET])
+        m[D1 + j] = m[SQ + j] / par[LN_R] + m[ON_OFFSET + j] - amps * m[ON_R + j]
+    return float(amps + par[OFFSET])
 
 
 @inlined
 def note(row: Array, speed: float, y0: float, y1: float) -> None:
-    """Put into a row what it has room for: the output; speed, output (and current).
-
-    Parameters
-    ----------
-    row : ndarray, shape (1,), (2,) or (3,)
-        Overwritten.
-    speed, y0, y1 : float
-        Speed, output, current.
-    """
+    """Put into a row what it has room for: the output; speed, output (and current)."""
     if row.shape[0] == 1:
         row[0] = y0
         return

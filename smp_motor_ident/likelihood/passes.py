@@ -13,11 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident.likelihood import recursion
-from smp_motor_ident.likelihood.cascade import run_sliding
-from smp_motor_ident.likelihood.elimination import eliminate
 from smp_motor_ident.likelihood.experiments import Experiments
+from smp_motor_ident.likelihood.linear_pass import run_sliding, squares_sliding
 from smp_motor_ident.likelihood.noise import whitening
-from smp_motor_ident.likelihood.sliding import squares_sliding
+from smp_motor_ident.likelihood.normal_equations import eliminate
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import Structure, to_internal
 
@@ -61,7 +60,7 @@ class Pass:
         Of the common columns.
     local_step, local_gain : ndarray, shapes (g, l) and (g, l, f)
         Step of the own columns, and by how much it is less per common step.
-    local_promise : float
+    local_decrease : float
         By how much the own steps alone lower the objective.
     spread : ndarray, shape (6,)
         As in `Sums`.
@@ -74,27 +73,16 @@ class Pass:
     gradient: Array
     local_step: Array
     local_gain: Array
-    local_promise: float
+    local_decrease: float
     spread: Array
     scores: Array
 
     def scaled(self, factor: float) -> Pass:
-        """Return the same under residuals that weigh otherwise.
-
-        Parameters
-        ----------
-        factor : float
-            Inverse variance over what it was.
-
-        Returns
-        -------
-        Pass
-            Steps are as they were.
-        """
+        """Return the same under residuals that weigh otherwise."""
         return replace(
             self,
             objective=self.objective * factor,
-            local_promise=self.local_promise * factor,
+            local_decrease=self.local_decrease * factor,
             normal=self.normal * factor,
             gradient=self.gradient * factor,
             scores=self.scores * factor,
@@ -102,20 +90,7 @@ class Pass:
 
 
 def own_columns(data: Experiments, structure: Structure) -> tuple[int, ...]:
-    """Return which of (q, w, angle, load) each segment has to itself.
-
-    Parameters
-    ----------
-    data : Experiments
-        Prepared records.
-    structure : Structure
-        What is free.
-
-    Returns
-    -------
-    tuple of int
-        Columns of `Experiments.initial`.
-    """
+    """Return which of (q, w, angle, load) each segment has to itself."""
     angle = (2,) if data.kind == recursion.ANGLE else ()
     own = (1,) if structure.order == 1 else (0, 1)
     return own + angle + ((3,) if structure.own_load else ())
@@ -178,7 +153,7 @@ def gather(
             spread[0], spread[3] = squares_sliding(
                 data.time,
                 data.starts,
-                data.section_value,
+                data.hold_value,
                 data.output,
                 angle,
                 par,
@@ -188,13 +163,13 @@ def gather(
             used = 0
         else:
             used = run_sliding(
-                data.time, data.starts, data.section_value, data.output, angle, par, slope,
+                data.time, data.starts, data.hold_value, data.output, angle, par, slope,
                 initial, own, data.jittered, 1 / math.sqrt(noise[0, 0]), normal, gradient, cost,
                 spread, length, scores, owner,
             )  # fmt: skip
     else:
         used = recursion.run(
-            data.time, data.starts, data.section_end, data.section_value, data.section_start,
+            data.time, data.starts, data.hold_end, data.hold_value, data.hold_start,
             data.output, data.current, data.kind, structure.friction != "none", par, slope,
             initial, own, gain, whitening(noise), huber, normal, gradient, cost, spread,
             length, scores, owner, _ring(data, par, p),
@@ -268,11 +243,11 @@ def evaluate(
         score += row * miss
         total += miss * miss
     away = (initial - start)[:, list(own)]
-    prior, promise = eliminate(sums.normal, sums.gradient, away, data.size, common, score, step,
+    prior, decrease = eliminate(sums.normal, sums.gradient, away, data.size, common, score, step,
                                local_gain, sums.scores, sums.owner)  # fmt: skip
     total += prior
     if not math.isfinite(total + float(common.sum()) + float(score.sum()) + float(step.sum())):
         return Pass(math.inf, np.zeros((f, f)), np.zeros(f), np.zeros_like(step),
                     np.zeros_like(local_gain), 0.0, np.full(6, np.nan),
                     np.zeros((0, f)))  # fmt: skip
-    return Pass(total, common, score, step, local_gain, promise, sums.spread, sums.scores[:, :f])
+    return Pass(total, common, score, step, local_gain, decrease, sums.spread, sums.scores[:, :f])

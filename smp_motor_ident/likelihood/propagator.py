@@ -14,6 +14,9 @@ A propagator over ``h`` seconds is a row of 12 numbers,
 
 followed by its derivatives with respect to ``ln te, ln tm, K, be``, 12 numbers each.
 Derivation: docs/derivations.md, sections 2 and 3.
+
+Jittered stamps: over a narrow range of h a polynomial through eight Chebyshev points gives the
+entries to rounding.
 """
 
 from __future__ import annotations
@@ -27,6 +30,8 @@ from smp_motor_ident._compile import compiled
 
 Array = NDArray[np.float64]
 
+# Internal parameters of the recursion; those after the first four are the coordinates' own.
+TE, TM, K, BE = range(4)
 ROW = 12
 WIDTH = 5 * ROW
 
@@ -147,17 +152,7 @@ def second_order(row: Array, h: float, te: float, tm: float, k: float, be: float
 
 @compiled
 def first_order(row: Array, h: float, tm: float, k: float, be: float) -> None:
-    """Fill a propagator row of the first-order motor (``te = 0``; the state q is unused).
-
-    Parameters
-    ----------
-    row : ndarray, shape (60,)
-        Overwritten.
-    h : float
-        Length of the interval [s].
-    tm, k, be : float
-        As in `second_order`.
-    """
+    """Fill a propagator row of the first-order motor (``te = 0``; the state q is unused)."""
     for n in range(WIDTH):
         row[n] = 0.0
     r = (k + be) / tm
@@ -206,3 +201,57 @@ def speed_at(
     y = s / tm * dq + (c - s * half) * dw
     x = (c + s * half) * dq - s * k / te * dw
     return w_end + y, (x - be * y) / tm
+
+
+NODES = 8
+POINTS = np.cos(np.pi * (2 * np.arange(NODES) + 1) / (2 * NODES))
+INVERSE = np.ascontiguousarray(np.linalg.inv(np.vander(POINTS, increasing=True)))
+WIDEST = 0.2  # of the usual interval: half the range of lengths
+NARROWEST = 0.02
+SMALL = 0.1  # rate times half the range: (SMALL/2)^8 2/8! = 2e-15 is the error of the polynomial
+
+
+@compiled
+def half_range(step: float, te: float, tm: float, k: float, be: float) -> float:
+    """Return half the range of lengths that a table may span, 0 where none is worth it."""
+    # The norm of the dynamics in its symmetric scaling bounds both rates.
+    rate = (k + be) / tm
+    if te > 0.0:
+        rate = 1 / te + be / tm + np.sqrt(k / (te * tm))
+    half = min(WIDEST * step, SMALL / rate)
+    return half if half >= NARROWEST * step else 0.0
+
+
+@compiled
+def expand(values: Array, table: Array) -> None:
+    """Turn values at the points into coefficients of powers."""
+    width = table.shape[0] // NODES
+    table[:] = 0.0
+    for k in range(NODES):
+        for j in range(NODES):
+            factor = INVERSE[k, j]
+            for n in range(width):
+                table[k * width + n] += factor * values[j * width + n]
+
+
+@compiled
+def evaluate(table: Array, u: float, out: Array, at: int) -> None:
+    """Evaluate the polynomials.
+
+    Parameters
+    ----------
+    table : ndarray, shape (NODES * n,)
+        Of `expand`.
+    u : float
+        Where, -1 to 1.
+    out : ndarray
+        Overwritten from ``at`` on.
+    at : int
+        First entry.
+    """
+    width = table.shape[0] // NODES
+    c1, c2, c3, c4 = table[width:], table[2 * width :], table[3 * width :], table[4 * width :]
+    c5, c6, c7 = table[5 * width :], table[6 * width :], table[7 * width :]
+    for n in range(width):
+        high = c4[n] + u * (c5[n] + u * (c6[n] + u * c7[n]))
+        out[at + n] = table[n] + u * (c1[n] + u * (c2[n] + u * (c3[n] + u * high)))

@@ -12,19 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident._compile import compiled, inlined
-from smp_motor_ident.likelihood.events import advance, keeps_turning
-from smp_motor_ident.likelihood.internal import (
+from smp_motor_ident.likelihood.events import STUCK, advance, keeps_turning
+from smp_motor_ident.likelihood.normal_equations import ROOM, TILE, robust, sum_up
+from smp_motor_ident.likelihood.observation import (
     ANGLE,
-    DELAY,
-    LOAD,
     MEAN_SPEED,
     SPEED,
-    STUCK,
-    VC_MINUS,
-    VC_PLUS,
-    WINDOW,
+    note,
+    observe,
+    observe_current,
 )
-from smp_motor_ident.likelihood.lanes import (
+from smp_motor_ident.likelihood.propagator import TE, TM
+from smp_motor_ident.likelihood.sensitivities import (
     ACTIVE,
     D0,
     D1,
@@ -39,8 +38,7 @@ from smp_motor_ident.likelihood.lanes import (
     tabulate,
     turn,
 )
-from smp_motor_ident.likelihood.observation import note, observe, observe_current
-from smp_motor_ident.likelihood.sums import ROOM, TILE, robust, sum_up
+from smp_motor_ident.model.structures import DELAY, LOAD, VC_MINUS, VC_PLUS, WINDOW
 
 __all__ = ["ANGLE", "MEAN_SPEED", "SPEED", "WINDOW", "run"]
 
@@ -89,15 +87,15 @@ def _switch(
 ) -> None:
     """Let the columns feel that a later switch of the input comes later."""
     dv = v - new
-    if par[0] > 0.0:
+    if par[TE] > 0.0:
         for j in range(LANES):
-            m[SQ + j] += dv / par[0] * m[ON_DELAY + j]
+            m[SQ + j] += dv / par[TE] * m[ON_DELAY + j]
         return
     if friction and direction == STUCK:  # it starts, if at all, just now
         net = new - load
         dv = -max(0.0, net - par[VC_PLUS]) - min(0.0, net + par[VC_MINUS])
     for j in range(LANES):
-        m[SW + j] += dv / par[1] * m[ON_DELAY + j]
+        m[SW + j] += dv / par[TM] * m[ON_DELAY + j]
 
 
 @inlined
@@ -119,9 +117,9 @@ def _correct(
 def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between its steps
     time: Array,
     starts: Integers,
-    section_end: Array,
-    section_value: Array,
-    section_start: Integers,
+    hold_end: Array,
+    hold_value: Array,
+    hold_start: Integers,
     output: Array,
     current: Array,
     kind: int,
@@ -152,9 +150,9 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
         Sampling instants [s].
     starts : ndarray of int, shape (g + 1,)
         First sample of each segment, and n.
-    section_end, section_value : ndarray, shape (m,)
+    hold_end, hold_value : ndarray, shape (m,)
         Instants [s] until which the input was held at the values [V].
-    section_start : ndarray of int, shape (g,)
+    hold_start : ndarray of int, shape (g,)
         First section of each segment; it also holds what came before.
     output, current : ndarray, shape (n,)
         Mechanical output (NaN where lost); current [A], shape (0,) where it is not used.
@@ -219,8 +217,8 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
             if local[j] < 3 and not (at_rest and local[j] == 1):
                 m[local[j] * LANES + n_common + j] = 1.0
         load = par[LOAD] + initial[g, 3]
-        section = section_start[g]
-        limit = section_start[g + 1] - 1 if g + 2 < starts.shape[0] else section_end.shape[0] - 1
+        section = hold_start[g]
+        limit = hold_start[g + 1] - 1 if g + 2 < starts.shape[0] else hold_end.shape[0] - 1
         now = time[first]
         direction = 1.0
         if friction:
@@ -230,16 +228,16 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
         block_segment[block] = g
         blocks[block] = 0.0
         filled = count = 0
-        while section < limit and section_end[section] + delay <= now:
+        while section < limit and hold_end[section] + delay <= now:
             section += 1
         for k in range(first, last):
             target = time[k]
             while now < target:
                 end = target
-                change = section_end[section] + delay
+                change = hold_end[section] + delay
                 if section < limit and change < target - 1e-9 * (target - now):
                     end = change
-                v = section_value[section]
+                v = hold_value[section]
                 h = end - now
                 if h > 0.0:
                     slack = 1e-9 * h + 1e-15 * abs(target)
@@ -251,7 +249,7 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
                 if section < limit and change <= target + 1e-9 * (target - time[k - 1]):
                     section += 1
                     if late:
-                        _switch(v, section_value[section], load, direction, friction, par, m)
+                        _switch(v, hold_value[section], load, direction, friction, par, m)
             y0 = observe(kind, k, first, target, par, x, m, ring, past, columns)
             y1 = observe_current(par, x, m) if has_current else 0.0
             if predicted.shape[0] > 0:

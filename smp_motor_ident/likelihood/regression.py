@@ -24,24 +24,7 @@ KNEE = 0.02  # of the largest speed, below which friction counts in part
 
 @compiled
 def filtered(x: Array, cutoff: float, step: float, order: int) -> Array:
-    """Return F^n s^k x for k = 0 to n, F being a low pass of first order.
-
-    Parameters
-    ----------
-    x : ndarray, shape (n,)
-        Signal, taken to have been 0 before.
-    cutoff : float
-        c [rad/s].
-    step : float
-        Sampling interval [s].
-    order : int
-        n, 1 to 3.
-
-    Returns
-    -------
-    ndarray, shape (order + 1, n)
-        By k.
-    """
+    """Return F^n s^k x for k = 0 to n, F being a low pass of first order."""
     c = math.tan(min(cutoff * step / 2, 1.2)) * 2 / step
     g = c * step / 2
     b, a = g / (1 + g), (1 - g) / (1 + g)
@@ -66,18 +49,7 @@ def filtered(x: Array, cutoff: float, step: float, order: int) -> Array:
 
 @compiled
 def friction_sign(speed: Array) -> Array:
-    """Return the sign of a speed, smooth around zero.
-
-    Parameters
-    ----------
-    speed : ndarray, shape (n,)
-        [rad/s].
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        Between -1 and 1.
-    """
+    """Return the sign of a speed, smooth around zero."""
     level = 1e-12
     for i in range(speed.shape[0]):
         level = max(level, KNEE * abs(speed[i]))
@@ -139,19 +111,7 @@ def small_solve(a: Array, b: Array) -> None:
 def instrumental(
     columns: Array, tools: Array, right: Array, begin: int, end: int, sums: Array
 ) -> None:
-    """Add ``tools columns'`` and ``tools right`` to the sums of an instrumental regression.
-
-    Parameters
-    ----------
-    columns, tools : ndarray, shape (m, n)
-        Regressors and instruments; the same array for least squares.
-    right : ndarray, shape (n,)
-        What is explained.
-    begin, end : int
-        Samples that count.
-    sums : ndarray, shape (m, m + 3)
-        Added to: products, right side, squares of the columns, squares of the tools.
-    """
+    """Add ``tools columns'`` and ``tools right`` to the sums of an instrumental regression."""
     m = columns.shape[0]
     for a in range(m):
         tool, own = tools[a, begin:end], columns[a, begin:end]
@@ -173,18 +133,7 @@ def instrumental(
 
 @compiled
 def solved(sums: Array) -> Array:
-    """Return the solution of an instrumental regression.
-
-    Parameters
-    ----------
-    sums : ndarray, shape (m, m + 3)
-        Of `instrumental`.
-
-    Returns
-    -------
-    ndarray, shape (m,)
-        Coefficients.
-    """
+    """Return the solution of an instrumental regression."""
     m = sums.shape[0]
     a, b = np.empty((m, m)), np.empty(m)
     for i in range(m):
@@ -250,30 +199,7 @@ def search(
     angle: bool,
     friction: bool,
 ) -> Array:
-    """Return coefficients by least squares and then by instruments, for several cut-offs.
-
-    Parameters
-    ----------
-    voltage, output : ndarray, shape (n,)
-        On even grids, one after the other: means over the intervals, values at their ends.
-    bounds : ndarray of int, shape (g + 1,)
-        Where each grid begins.
-    steps : ndarray, shape (g,)
-        Their intervals [s].
-    cutoffs : ndarray, shape (c,)
-        [rad/s].
-    order : int
-        1 or 2.
-    angle : bool
-        Whether the output is the angle.
-    friction : bool
-        Whether Coulomb friction is among the columns.
-
-    Returns
-    -------
-    ndarray, shape (k, order + 2)
-        a0, a1 (, a2), volts of friction (0 without), of what could be a motor.
-    """
+    """Return coefficients by least squares and then by instruments, for several cut-offs."""
     m = order + (2 if friction else 1)
     n = order + (1 if angle else 0)
     found = np.zeros((2 * cutoffs.shape[0], order + 2))

@@ -4,7 +4,7 @@ Keeps a window of every wheel's ``motor_state``, estimates from it in a thread b
 callbacks, and publishes ``MotorParameters``.  Before a window has seen enough (time, motion,
 levels and changes of voltage, both directions) the message has no numbers and its ``status``
 begins with ``collecting`` and says what is missing; else it begins with ``valid`` or, with the
-estimator's warnings, ``doubtful``, or ``refused`` with the reason.
+reason, ``unreliable``, or ``refused`` with the reason.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from builtin_interfaces.msg import Time
 from rclpy.node import Node
 
 from smp_interfaces.msg import MotorDescription, MotorParameters, MotorState
-from smp_motor_control import WHEELS
+from smp_motor_control import WHEELS, joint_of
 from smp_motor_control.errors import ParameterError, SmpError
 from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.settings import Parameters, described, nested
@@ -67,16 +67,16 @@ class Wheel:
 
     def __init__(self, node: Node, name: str, length: float) -> None:
         self.window = Window(name, length)
-        self.joint_name = f"{name}_wheel_joint"
+        self.joint_name = joint_of(name)
         self.stamp = Time()
         self.status = "collecting: no motor_state yet"
         self.running: Future[Estimate] | None = None
         self.publisher = node.create_publisher(
-            MotorParameters, f"/{name}/motor_parameters", runtime.LATCHED
+            MotorParameters, f"{name}/motor_parameters", runtime.LATCHED
         )
-        topic = f"/{name}/motor_state"
+        topic = f"{name}/motor_state"
         node.create_subscription(MotorState, topic, self._on_state, runtime.STREAM_SUBSCRIBER)
-        topic = f"/{name}/motor_description"
+        topic = f"{name}/motor_description"
         node.create_subscription(MotorDescription, topic, self._on_description, runtime.LATCHED)
 
     def _on_state(self, message: MotorState) -> None:
@@ -162,8 +162,8 @@ class Identifier(Node):
             error = future.exception()
             if error is None:
                 found = future.result()
-                told = "; ".join(found.warnings)
-                wheel.tell(f"doubtful: {told}" if told else "valid", found)
+                why = "; ".join(f.message for f in found.findings if f.severity == "unreliable")
+                wheel.tell(f"unreliable: {why}" if why else "valid", found)
             elif isinstance(error, SmpError):
                 wheel.tell(f"refused: {error}")
             else:

@@ -74,29 +74,30 @@ def fit_charts(wheel: str, parts: Sequence[Comparison]) -> list[Chart]:
 def residual_charts(wheel: str, tests: ResidualTests) -> list[Chart]:
     """Return the correlations that the residual tests have judged, with the tests' own bands."""
     charts = []
-    for kind, values, first, band in (
-        ("autocorrelation", tests.autocorrelation, 1, tests.band),
-        ("correlation with the voltage", tests.cross_correlation, 0, tests.cross_band),
+    for kind, found in (
+        ("autocorrelation", tests.autocorrelation),
+        ("correlation with the voltage", tests.cross_correlation),
     ):
-        if not values or band is None:
+        if found is None:
             continue
-        value = np.array(values)
-        outside = np.abs(value) >= band
-        lag = np.arange(first, first + value.size, dtype=np.float64)
+        outside = np.abs(found.value) > found.band
         charts.append(
             Chart(
                 name=f"{kind.split()[0]}-{wheel}",
                 title=f"Residual {kind}",
                 x_label="lag [samples]",
                 y_label="correlation",
-                x=lag,
+                x=found.lag,
                 curves=(
-                    Curve("within the band", np.where(outside, np.nan, value), "good", "bars"),
-                    Curve("outside", np.where(outside, value, np.nan), "bad", "bars"),
+                    Curve(
+                        "within the band", np.where(outside, np.nan, found.value), "good", "bars"
+                    ),
+                    Curve("outside", np.where(outside, found.value, np.nan), "bad", "bars"),
                 ),
-                lines=(-band, 0.0, band),
+                lines=(-found.band, 0.0, found.band),
                 height=220,
-                summary=f"{np.sum(outside)} of {value.size} lags lie outside ±{band:.3g}.",
+                summary=f"{np.sum(outside)} of {found.lag.size} lags lie outside "
+                f"±{found.band:.3g}.",
             )
         )
     return charts

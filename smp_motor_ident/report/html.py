@@ -36,8 +36,6 @@ class Report:
         Measured and simulated speed by wheel.
     failures : mapping of str to str
         Wheels that could not be identified, each with the reason.
-    notes : mapping of str to sequence of str
-        What was repaired or assumed while reading, by wheel.
     provenance : mapping of str to str
         How the page came about: command, sources, date, versions.
     """
@@ -45,7 +43,6 @@ class Report:
     estimates: Mapping[str, Estimate]
     comparisons: Mapping[str, Sequence[Comparison]] = field(default_factory=dict)
     failures: Mapping[str, str] = field(default_factory=dict)
-    notes: Mapping[str, Sequence[str]] = field(default_factory=dict)
     provenance: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -87,7 +84,7 @@ def render(report: Report) -> str:
     )
     environment.filters |= {"label": words.label, "number": words.number}
     motors = {
-        wheel: _motor(estimate, report.comparisons.get(wheel, ()), report.notes.get(wheel, ()))
+        wheel: _motor(estimate, report.comparisons.get(wheel, ()))
         for wheel, estimate in report.estimates.items()
     }
     charts = [chart for motor in motors.values() for chart in motor["charts"]]
@@ -109,9 +106,9 @@ def _text(name: str) -> str:
     return resources.files("smp_motor_ident.report").joinpath(name).read_text("utf-8")
 
 
-def _motor(estimate: Estimate, parts: Sequence[Comparison], notes: Sequence[str]) -> dict[str, Any]:
+def _motor(estimate: Estimate, parts: Sequence[Comparison]) -> dict[str, Any]:
     """Return what the template shows of one motor."""
-    wheel, found = estimate.wheel, words.findings(estimate, notes)
+    wheel, found = estimate.wheel, words.findings(estimate)
     fit = figures.fit_charts(wheel, parts) if parts else []
     residuals = figures.residual_charts(wheel, estimate.residuals)
     frequency = figures.frequency_charts(wheel, parts) if parts else []

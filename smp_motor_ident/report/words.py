@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 
 from smp_motor_ident.finding import SEVERITIES, Finding
@@ -172,12 +172,6 @@ def status(quantity: Quantity) -> str:
     return words[quantity.status]
 
 
-def findings(estimate: Estimate, notes: Collection[str] = ()) -> list[Finding]:
-    """Return what was found, the gravest first; warnings and advice that are no findings too."""
-    found = list(estimate.findings)
-    known = {text for f in found for text in (f.message, f.advice)}
-    for text in dict.fromkeys((*estimate.warnings, *notes, *estimate.advice)):
-        if text not in known:
-            plain = text in notes or text in estimate.advice
-            found.append(Finding("", "note" if plain else "warning", text))
-    return sorted(found, key=lambda f: -SEVERITIES.index(f.severity))
+def findings(estimate: Estimate) -> list[Finding]:
+    """Return what was found, the gravest first."""
+    return sorted(estimate.findings, key=lambda f: -SEVERITIES.index(f.severity))

@@ -66,7 +66,7 @@ def gains_yaml(designs: Mapping[str, Design], provenance: Iterable[str]) -> str:
         YAML.
     """
     tree = {
-        f"/{wheel}/wheel_pid": {"ros__parameters": parameters(design)}
+        f"/**/{wheel}/wheel_pid": {"ros__parameters": parameters(design)}
         for wheel, design in designs.items()
     }
     head = "".join(f"# {line}\n" for line in provenance)

@@ -164,8 +164,8 @@ def test_try_is_limited_to_a_small_voltage_until_the_wheel_turns_as_driven():
     for _ in range(50):
         assert recovery.limited(-12.0, 0.5, 0.01, LIMITS) == -most
     trusted = [recovery.limited(12.0, 0.5, 0.01, LIMITS) for _ in range(201)]
-    # A fifth of a second of turning as driven, then two seconds until it is forgotten.
-    assert trusted[:19] == [most] * 19 and trusted[21:] == [12.0] * 180
+    # Six tenths of a second of turning as driven, then two seconds until it is forgotten.
+    assert trusted[:59] == [most] * 59 and trusted[61:199] == [12.0] * 138
     assert not recovery.cautious and recovery.failures == 0
 
 
@@ -176,13 +176,13 @@ def test_wheel_that_gave_no_counts_is_released_by_counts():
         assert recovery.may_release(1.0, 0.1, turns=True) is released
 
 
-def follow(speed, reference=2.0, saturated=False, reachable=math.inf) -> tuple[float, Fault | None]:
-    """Step at 200 Hz for two seconds; return when a fault shows, and which."""
+def follow(speed, reference=2.0, saturated=False, kv=math.nan) -> tuple[float, Fault | None]:
+    """Step at 200 Hz under 12 V for two seconds; return when a fault shows, and which."""
     detector = FaultDetector(LIMITS)
-    detector.reachable = reachable
+    detector.volts_per_speed = kv
     for k in range(400):
         t = 0.005 * (k + 1)
-        fault = detector.follow(0.005, reference, speed(t), saturated)
+        fault = detector.follow(0.005, reference, speed(t), 12.0, saturated)
         if fault:
             return t, fault
     return math.inf, None
@@ -201,8 +201,8 @@ def follow(speed, reference=2.0, saturated=False, reachable=math.inf) -> tuple[f
         (lambda t: 2.0 * (1.0 - math.exp(-t / 1.5)), {}, None),  # a heavy robot
         (lambda t: -2.0 + 6.0 * t if t < 0.66 else 2.0, {}, None),  # it reverses
         (lambda t: 4.6, {"reference": 10.0, "saturated": True}, None),
-        (lambda t: 4.6, {"reference": 10.0, "reachable": 4.7}, None),
-        (lambda t: 1.0, {"reference": 10.0, "reachable": 4.7}, Fault.NOT_FOLLOWING),
+        (lambda t: 4.6, {"reference": 10.0, "saturated": True, "kv": 2.55}, None),
+        (lambda t: 1.0, {"reference": 10.0, "saturated": True, "kv": 2.55}, Fault.NOT_FOLLOWING),
         (lambda t: 1.0, {"reference": 10.0, "saturated": True}, Fault.NOT_FOLLOWING),
     ],
 )

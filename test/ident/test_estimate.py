@@ -68,12 +68,12 @@ def test_little_torque_noise_is_not_taken_for_much(wheel, noise):
 
 
 def _told_of_a_plain_square(wheel: str, voltage: np.ndarray) -> bool:
-    told = motors.record(wheel, current=False, torque_noise=0.01, voltage=voltage, seconds=25.0)
-    return any("a plain square" in w for w in estimate(told).warnings)
+    made = motors.record(wheel, current=False, torque_noise=0.01, voltage=voltage, seconds=25.0)
+    return any(f.code == "plain_square" for f in estimate(made).findings)
 
 
 @pytest.mark.parametrize("wheel", WHEELS)
-def test_a_plain_square_under_a_load_that_fluctuates_is_doubtful(wheel):
+def test_a_plain_square_under_a_load_that_fluctuates_is_unreliable(wheel):
     t = np.arange(4000) / 200.0
     square = np.where(np.sin(2 * np.pi * 0.9173 * t + 0.2) > 0, 10.0, -9.0)
     square += 0.02 * np.random.default_rng(1).standard_normal(t.size)  # as it was measured

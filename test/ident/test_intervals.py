@@ -48,10 +48,10 @@ def test_thinning_keeps_the_charge_and_the_jumps_of_the_input():
     thin = thinned(data)
     assert data.kind == rc.ANGLE
     assert thin.size < data.size / 4
-    charge = [float(np.sum(d.section_value[1:] * np.diff(d.section_end))) for d in (data, thin)]
+    charge = [float(np.sum(d.hold_value[1:] * np.diff(d.hold_end))) for d in (data, thin)]
     # The last sample that is kept ends a few samples, of 10 V each, before the last one.
     assert abs(charge[0] - charge[1]) <= 10.0 * (data.time[-1] - thin.time[-1]) + 1e-9
-    levels = [set(np.round(d.section_value, 9)) for d in (data, thin)]
+    levels = [set(np.round(d.hold_value, 9)) for d in (data, thin)]
     assert levels[0] == levels[1]
 
 

@@ -14,9 +14,9 @@ from smp_motor_ident.estimation import replay
 from smp_motor_ident.estimation.cold import cold_fit
 from smp_motor_ident.estimation.descent import Options, first_noise
 from smp_motor_ident.estimation.fit import solve
-from smp_motor_ident.likelihood.elimination import cholesky_solve, damped_step, eliminate
 from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.likelihood.noise import proper, renewed, whitening
+from smp_motor_ident.likelihood.normal_equations import cholesky_solve, damped_step, eliminate
 from smp_motor_ident.likelihood.passes import gather
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import Structure

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.linalg import expm, solve_discrete_are
 
-from smp_motor_ident.likelihood.kalman import steady_gain
+from smp_motor_control.motor.response import zero_order_hold
+from smp_motor_ident.likelihood.noise import steady_gain
 from smp_motor_ident.likelihood.propagator import WIDTH, first_order, second_order
 
 # ln te, ln tm, K, be: overdamped, critical to rounding, oscillating, very stiff.
@@ -69,3 +70,28 @@ def test_steady_gain_solves_the_riccati_equation():
     # The noise over a step is gathered by quadrature, good to 1e-7 at this step.
     np.testing.assert_allclose(gain, p @ c.T @ np.linalg.inv(s), rtol=1e-6)
     np.testing.assert_allclose(innovation, s, rtol=1e-6)
+
+
+def test_compiled_propagation_is_the_response_of_the_running_motor():
+    rng = np.random.default_rng(4)
+    for _ in range(200):
+        electrical, mechanical = 10.0 ** rng.uniform(-4, -1.5), 10.0 ** rng.uniform(-2.5, 0)
+        a0, share = 10.0 ** rng.uniform(-3, 0), rng.uniform(0, 0.8)
+        h = 10.0 ** rng.uniform(-3.5, -1.5)
+        te, be, tm = electrical, share * a0, mechanical * a0
+        row = np.zeros(WIDTH)
+        second_order(row, h, te, tm, a0 - be, be)
+        tau, tp = (tm + te * be) / a0, te * tm / a0
+        held = zero_order_hold(1.0 / a0, tau, tp, h)
+        # q = tm w' + be w + F turns the states (q, w) into (w, w').
+        turn = np.array([[0.0, 1.0], [1.0 / tm, -be / tm]])
+        transition = np.linalg.inv(turn) @ held.transition[0] @ turn
+        size = np.array([1.0, 1.0 / a0])  # of q and w under one volt
+        # Rounding alone: 1e-16 over the smallest h/tau, 3e-4 and squared.
+        same = dict(rtol=1e-7, atol=1e-9)
+        np.testing.assert_allclose(row[:4].reshape(2, 2) / size[:, None] * size,
+                                   transition / size[:, None] * size, **same)  # fmt: skip
+        angle = held.angle_transition[0] @ turn
+        np.testing.assert_allclose(row[4:6] * size / h * a0, angle * size / h * a0, **same)
+        assert row[7] * a0 == pytest.approx(held.forced[0, 0] * a0, rel=1e-6, abs=1e-9)
+        assert row[8] == pytest.approx(held.angle_forced[0], rel=1e-6, abs=1e-9 * h / a0)

@@ -44,4 +44,4 @@ def test_ten_steps_in_one_fit_tell_the_speed_filter_from_a_delay():
     # The log's speed is a position difference over 32 samples of 1 ms.
     assert result.value("averaging_window") == pytest.approx(0.032, abs=0.004)
     assert result.value("delay") < 0.004
-    assert any("averaged" in w for w in result.warnings)
+    assert any(f.code == "averaged_speed" for f in result.findings)

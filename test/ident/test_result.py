@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from smp_motor_ident.finding import Finding
 from smp_motor_ident.record import Hardware
 from smp_motor_ident.result import Candidate, Estimate, FitPercent, Quantity, ResidualTests
 
@@ -26,8 +27,7 @@ def an_estimate() -> Estimate:
         fit_percent=FitPercent(97.2, 96.8),
         candidates=(Candidate("first_order", 97.2, -1.0, True, "simplest not rejected"),),
         residuals=ResidualTests(True, None),
-        warnings=("w",),
-        advice=("record current",),
+        findings=(Finding("a", "warning", "w", {"size": 1.0}, "record current"),),
         samples=600,
         duration=6.0,
         sample_time=0.01,

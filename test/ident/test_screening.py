@@ -99,14 +99,14 @@ def test_a_voltmeter_that_scatters_around_a_level_is_a_constant_input():
 
 def test_a_small_offset_of_the_current_is_removed_and_said():
     result = estimate(replace(GOOD, current=GOOD.current + 0.05))
-    assert any("offset" in w for w in result.warnings)
+    assert any(f.code == "current_offset" for f in result.findings)
     assert result.value("resistance") == pytest.approx(3.2843, rel=2e-3)  # 5 of its std
 
 
 def test_gaps_of_nan_are_left_out_and_said():
     amps = np.where(np.arange(N) % 300 < 60, np.nan, GOOD.current)
     result = estimate(replace(GOOD, current=amps))
-    assert any("NaN" in w for w in result.warnings)
+    assert any(f.code == "samples_lost" for f in result.findings)
     assert result.value("resistance") == pytest.approx(3.2843, rel=2e-3)
 
 

@@ -34,7 +34,7 @@ def test_excite_is_bounded_ends_by_itself_and_ends_at_zero(process, robot, event
     assert one[20:60] != two[20:60]
     assert not robot.commands["front_right"]
 
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT):
         robot.commands["front_left"].clear()
         excite = process("excite", "--ros-args", "-p", "signal:=square", "-p", "duration:=60.0")
         eventually(lambda: len(robot.commands["front_left"]) > 20, 20.0, robot.spin)
@@ -42,6 +42,21 @@ def test_excite_is_bounded_ends_by_itself_and_ends_at_zero(process, robot, event
         assert excite.wait(2.0) == 0
         last = robot.commands["front_left"]
         eventually(lambda c=last: c[-1].voltage == 0.0, 3.0, robot.spin, "no zero command")
+
+
+def test_excite_leaves_a_wheel_that_another_drives_alone(process, robot, eventually):
+    process("motor_plant", "--ros-args", "-p", "rate:=100.0")
+    process("wheel_pid", "--ros-args", "-r", "__ns:=/front_left", "-p", "p:=5.0")
+    robot.setpoint = 1.0
+    eventually(lambda: robot.velocity("front_left") > 0.3, 30.0, robot.spin)
+    excite = process("excite", "--ros-args", "-p", "signal:=square")
+    eventually(lambda: excite.returncode is not None, 20.0, robot.spin, excite.output)
+    assert excite.returncode == 2 and "not yours, /front_left/wheel_pid#" in excite.output
+    assert robot.velocity("front_left") > 0.3
+    robot.setpoint = None
+    excite = process("excite", "--ros-args", "-p", "signal:=square", "-p", "duration:=2.0")
+    eventually(lambda: excite.returncode is not None, 20.0, robot.spin, excite.output)
+    assert excite.returncode == 0, "a controller at rest does not hold its wheel"
 
 
 @pytest.mark.parametrize(

@@ -44,7 +44,7 @@ def test_it_demands_motion_before_it_names_a_number_and_then_names_the_right_one
     process("excite", "--ros-args", *excite)
     eventually(lambda: told[-1].names, 60.0, robot.spin, "no estimate")
     found = told[-1]
-    assert found.status.split(":")[0] in ("valid", "doubtful")
+    assert found.status.split(":")[0] in ("valid", "unreliable")
     assert found.joint_name == "front_left_wheel_joint"
     k = found.names.index("dc_gain")
     error = abs(found.values[k] - TRUE_GAIN)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_msgs.msg import String
 from wheel_robot import WheelRobot
 
 from smp_interfaces.msg import MotorCommand, MotorDescription
@@ -88,9 +89,40 @@ def test_bad_motor_file_ends_the_plant_with_one_line(process, tmp_path, change, 
     assert words in plant.output and len(plant.output.strip().splitlines()) == 1
 
 
-def test_unknown_parameter_and_unreadable_file_end_the_plant_with_one_line(process):
+def test_wheel_obeys_one_writer_until_that_one_rests(process, robot, eventually):
+    process("motor_plant", "--ros-args", "-p", "rate:=100.0")
+    front = robot.states["front_left"]
+    eventually(lambda: len(front) > 20, 20.0, robot.spin, "no feedback")
+    owners: list[str] = []
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    robot.node.create_subscription(
+        String, "/front_left/motor_owner", lambda m: owners.append(m.data), latched
+    )
+    send = robot.node.create_publisher(MotorCommand, "/front_left/motor_command", 10)
+    eventually(lambda: send.get_subscription_count() and owners, 10.0, robot.spin)
+
+    def command(**voltages: float) -> None:
+        end = time.monotonic() + 0.6
+        while time.monotonic() < end:
+            for name, voltage in voltages.items():
+                message = MotorCommand(voltage=voltage)
+                message.header.frame_id = name
+                send.publish(message)
+            robot.spin()
+
+    command(first=6.0)
+    command(first=6.0, second=-6.0, third=0.0)
+    # All six tenths of a second at 6 V, to half a step of the PWM.
+    assert min(m.voltage for m in front[-20:]) > 5.98
+    assert owners[-1] == "first"
+    eventually(lambda: robot.named("motor_plant", "not yours"), 3.0, robot.spin)
+    command(first=0.0, second=-6.0)
+    assert owners[-1] == "second" and front[-1].voltage == pytest.approx(-6.0, abs=0.013)
+    eventually(lambda: owners[-1] == "", 3.0, robot.spin, "the lease does not end")
+
+
+def test_bad_parameter_and_unreadable_file_end_the_plant_with_one_line(process):
     for given, words in (
-        (["-p", "speed:=1.0"], "unknown parameter 'speed'"),
         (["-p", "rate:=fast"], "rate is 'fast'"),
         (["-p", "motors_file:=/nowhere.yaml"], "/nowhere.yaml: cannot be read"),
         (["--params-file", "/nowhere.yaml"], "/nowhere.yaml"),

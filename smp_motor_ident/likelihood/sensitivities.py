@@ -14,8 +14,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident._compile import compiled, inlined
-from smp_motor_ident.likelihood.interpolation import NODES, POINTS, evaluate, expand, half_range
-from smp_motor_ident.likelihood.propagator import ROW, WIDTH, first_order, second_order
+from smp_motor_ident.likelihood.propagator import (
+    BE,
+    NODES,
+    POINTS,
+    ROW,
+    TE,
+    TM,
+    WIDTH,
+    K,
+    evaluate,
+    expand,
+    first_order,
+    half_range,
+    second_order,
+)
+from smp_motor_ident.model.structures import LOAD, VC_MINUS, VC_PLUS
 
 Array = NDArray[np.float64]
 
@@ -46,10 +60,10 @@ def _aligned(size: int) -> Array:
 @compiled
 def fill(h: float, par: Array, m: Array, cache: Array, slot: int, scratch: Array) -> None:
     """Put the propagator over h into a slot, with its derivative by each column."""
-    if par[0] == 0.0:
-        first_order(scratch, h, par[1], par[2], par[3])
+    if par[TE] == 0.0:
+        first_order(scratch, h, par[TM], par[K], par[BE])
     else:
-        second_order(scratch, h, par[0], par[1], par[2], par[3])
+        second_order(scratch, h, par[TE], par[TM], par[K], par[BE])
     at = slot * SLOT
     for c in range(ROW):
         a, b = scratch[ROW + c], scratch[2 * ROW + c]
@@ -85,7 +99,7 @@ def tabulate(
     step: float, par: Array, m: Array, cache: Array, marks: Array, scratch: Array
 ) -> Array:
     """Return a table of the propagators around a usual interval."""
-    half = half_range(step, par[0], par[1], par[2], par[3])
+    half = half_range(step, par[TE], par[TM], par[K], par[BE])
     marks[MIDDLE], marks[HALF] = step, half
     if half == 0.0:
         return np.zeros(0)
@@ -175,10 +189,10 @@ def slide_state(m: Array, x: Array, v: float, f: float) -> None:
 @compiled
 def stay(h: float, par: Array, x: Array, m: Array, v: float) -> None:
     """Advance the stuck motor: the current relaxes towards v / R, nothing turns."""
-    if par[0] == 0.0:
+    if par[TE] == 0.0:
         return
-    e = math.exp(-h / par[0])
-    d = (x[0] - v) * e * h / par[0]
+    e = math.exp(-h / par[TE])
+    d = (x[0] - v) * e * h / par[TE]
     x[0] = v + (x[0] - v) * e
     for j in range(LANES):
         m[SQ + j] = e * m[SQ + j] + d * m[SLOPE + j]
@@ -195,30 +209,15 @@ def turn(m: Array, direction: float) -> None:
 def begin(
     slope: Array, local: NDArray[np.int64], friction: bool
 ) -> tuple[Array, Array, Array, Array]:
-    """Return the lanes, cache, marks and scratch of a run.
-
-    Parameters
-    ----------
-    slope : ndarray, shape (11, c)
-        Derivatives of the internal parameters by the common columns.
-    local : ndarray of int, shape (l,)
-        Own columns of each segment.
-    friction : bool
-        Whether Coulomb friction is in the model.
-
-    Returns
-    -------
-    m, cache, marks, scratch : ndarray
-        As elsewhere here.
-    """
+    """Return the lanes, cache, marks and scratch of a run."""
     m, cache, marks = _aligned(SIZE), _aligned(CACHE), np.full(MARKS, -1.0)
     n_common = slope.shape[1]
     marks[NEXT], marks[REACHED] = 0.0, 1.0 if n_common > 0 else 0.0
     for j in range(n_common):
         for i in range(11):
             m[SLOPE + LANES * i + j] = slope[i, j]
-        m[FORWARD + j] = slope[6, j] + (slope[4, j] if friction else 0.0)
-        m[BACKWARD + j] = slope[6, j] - (slope[5, j] if friction else 0.0)
+        m[FORWARD + j] = slope[LOAD, j] + (slope[VC_PLUS, j] if friction else 0.0)
+        m[BACKWARD + j] = slope[LOAD, j] - (slope[VC_MINUS, j] if friction else 0.0)
     for j in range(local.shape[0]):
         if local[j] == 3:
             m[FORWARD + n_common + j] = m[BACKWARD + n_common + j] = 1.0

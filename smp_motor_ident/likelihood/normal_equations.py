@@ -1,5 +1,6 @@
-"""Small dense algebra of a fit, compiled: at a few parameters numpy's calls cost more than it.
+"""The normal equations of a pass: gathered in tiles, own columns eliminated, damped step.
 
+At a few parameters numpy's calls cost more than plain compiled loops.
 Derivation: docs/derivations.md, sections 6 and 8.
 """
 
@@ -10,11 +11,50 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident._compile import compiled
+from smp_motor_ident._compile import compiled, inlined
+from smp_motor_ident.likelihood.sensitivities import LANES
 
 Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
+Integers = NDArray[np.int64]
+
+TILE = 64  # rows that are gathered before they are summed
+ROOM = LANES + 1  # of each: columns and residual
+
+
+@compiled
+def sum_up(
+    rows: Array, count: int, p: int, tile: Array, normal: Array, gradient: Array, scores: Array
+) -> None:
+    """Add the products of the gathered rows, each of the columns and then the residual."""
+    for n in range(count):  # turned, so that the sums below run along memory
+        for j in range(p):
+            tile[j, n] = rows[n * ROOM + j]
+        tile[p, n] = rows[n * ROOM + LANES]
+    tile[: p + 1, count:] = 0.0
+    residual = tile[p]
+    for j in range(p):
+        one = tile[j]
+        for i in range(j + 1):
+            other = tile[i]
+            total = 0.0
+            for n in range(TILE):
+                total += one[n] * other[n]
+            normal[j, i] += total
+        total = 0.0
+        for n in range(TILE):
+            total += one[n] * residual[n]
+        gradient[j] += total
+        scores[j] += total
+
+
+@inlined
+def robust(r: float, huber: float) -> tuple[float, float]:
+    """Return a residual's loss, and the root of the weight that it has left."""
+    if abs(r) > huber:
+        return huber * (2 * abs(r) - huber), math.sqrt(huber / abs(r))
+    return r * r, 1.0
+
 
 LOST = 1e-14  # of a column's information, below which what is left after elimination is rounding
 
@@ -63,7 +103,7 @@ def eliminate(  # noqa: C901 - plain loops
     it weighs a hundredth of a sample's information at most.
     """
     f, own = score.shape[0], away.shape[1]
-    total = promise = 0.0
+    total = decrease = 0.0
     small = np.empty((own, own))
     right = np.empty((own, f + 1))
     scale = np.empty(own)
@@ -93,7 +133,7 @@ def eliminate(  # noqa: C901 - plain loops
         cholesky_solve(small, right)
         for j in range(own):
             local_step[g, j] = right[j, f] / scale[j]
-            promise += gradient[g, f + j] * local_step[g, j]
+            decrease += gradient[g, f + j] * local_step[g, j]
             for i in range(f):
                 local_gain[g, j, i] = right[j, i] / scale[j]
             for i in range(f):
@@ -110,7 +150,7 @@ def eliminate(  # noqa: C901 - plain loops
             common[i, :] = 0.0
             common[:, i] = 0.0
             score[i] = 0.0
-    return total, promise
+    return total, decrease
 
 
 @compiled
@@ -123,26 +163,7 @@ def damped_step(  # noqa: C901 - plain loops
     lower: Array,
     upper: Array,
 ) -> tuple[Array, float]:
-    """Return the damped Gauss-Newton step; columns pushed against a bound stay.
-
-    Parameters
-    ----------
-    normal, gradient : ndarray, shapes (f, f) and (f,)
-        Of the common columns.
-    damping : float
-        Relative to the diagonal.
-    matrix : ndarray, shape (11, f)
-        Of the structure.
-    z, lower, upper : ndarray, shape (11,)
-        Coordinates and their bounds.
-
-    Returns
-    -------
-    step : ndarray, shape (f,)
-        At most 1.5 in any logarithm.
-    size : float
-        Its length in standard deviations.
-    """
+    """Return the damped Gauss-Newton step; columns pushed against a bound stay."""
     f = gradient.shape[0]
     step = np.zeros(f)
     frozen = np.zeros(f, dtype=np.bool_)

@@ -16,7 +16,7 @@ EDGE = 0.02
 """Part of an interval next to its ends in which a switch counts as one at the sample."""
 
 
-def sections_of(record: Record, hold: str) -> tuple[Array, Array, Integers]:
+def held_intervals(record: Record, hold: str) -> tuple[Array, Array, Integers]:
     """Return the input as it was held, as far as the mean voltages tell.
 
     ``voltage[k]`` is a mean.  Where the intervals before and after are steady and differ, a
@@ -54,18 +54,7 @@ def sections_of(record: Record, hold: str) -> tuple[Array, Array, Integers]:
 
 
 def between_samples(record: Record) -> bool:
-    """Tell whether the command switched between samples, on a clock of its own.
-
-    Parameters
-    ----------
-    record : Record
-        One motor's signals.
-
-    Returns
-    -------
-    bool
-        True where at least four two-level switches show it.
-    """
+    """Tell whether the command switched between samples, on a clock of its own."""
     return bool(_jumps(record)[0].size >= 4)
 
 

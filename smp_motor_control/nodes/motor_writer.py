@@ -1,0 +1,75 @@
+"""Sends one wheel's commands under the sender's name, and hears who else owns the wheel."""
+
+from __future__ import annotations
+
+import os
+import time
+from typing import Any
+
+from rclpy.node import Node
+from std_msgs.msg import String
+
+from smp_interfaces.msg import MotorCommand
+from smp_motor_control.nodes.conventions import LATCHED, STREAM_PUBLISHER, send_last
+
+_ZEROS = 3
+
+
+def full_name(node: Node) -> str:
+    """Return the name that a process takes wheels under: two of one node are two."""
+    return f"{node.get_fully_qualified_name()}#{os.getpid()}"
+
+
+class MotorWriter:
+    """The way of a node to a motor; see :class:`~smp_motor_control.wheel.lease.Lease`.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+        Who writes.
+    prefix : str
+        Of the topics, such as ``front_left/``.
+
+    Attributes
+    ----------
+    owner : str
+        Another writer that owns the wheel by what the driver says; empty where nobody else does.
+    publisher : rclpy.publisher.Publisher
+        Of ``motor_command``.
+    """
+
+    def __init__(self, node: Node, prefix: str = "") -> None:
+        self._node = node
+        self._name = full_name(node)
+        self._message = MotorCommand()
+        self._message.header.frame_id = self._name
+        self.publisher = node.create_publisher(
+            MotorCommand, f"{prefix}motor_command", STREAM_PUBLISHER
+        )
+        self._owners = node.create_subscription(
+            String, f"{prefix}motor_owner", self._heard, LATCHED
+        )
+        self.owner = ""
+
+    def _heard(self, message: String) -> None:
+        self.owner = "" if message.data == self._name else message.data
+
+    def send(self, voltage: float, stamp: Any = None) -> None:
+        """Command a voltage [V], stamped now unless it answers a sample."""
+        message = self._message
+        message.header.stamp = self._node.get_clock().now().to_msg() if stamp is None else stamp
+        message.voltage = voltage
+        self.publisher.publish(message)
+
+    def stop(self) -> None:
+        """Command zero so that it arrives: best-effort readers may lose one datagram."""
+        for _ in range(_ZEROS - 1):
+            self.send(0.0)
+            time.sleep(0.005)
+        self.send(0.0)
+        send_last(self.publisher, self._message)
+
+    def destroy(self) -> None:
+        """Give the topics back."""
+        self._node.destroy_publisher(self.publisher)
+        self._node.destroy_subscription(self._owners)

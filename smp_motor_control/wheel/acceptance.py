@@ -1,0 +1,249 @@
+"""Which settings a wheel may be given: those whose loop runs, and is stable on the motor's model.
+
+The loop is built from the settings and run for some hundred samples on the linear model of the
+motor, as the hardware shows it: the voltage acts one sample late, and the speed is the mean over
+a sample.  First without clamps, where an unstable loop grows; then as it would drive.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import expm
+
+from smp_motor_control.encoder import Encoder
+from smp_motor_control.errors import ParameterError
+from smp_motor_control.motor.model import MotorModel
+from smp_motor_control.motor.parameters import Gearbox
+from smp_motor_control.pid import PidGains
+from smp_motor_control.reference.profile import UNLIMITED
+from smp_motor_control.wheel.loop import LoopSettings, WheelLoop
+
+RATES = (0.001, 0.002, 0.005, 0.01)
+"""Sampling intervals of which one must do, where the hardware's is not known yet [s]."""
+
+SAMPLES = 250
+"""Length of a trial: at 200 Hz 1.25 s, ten to twenty time constants of the paper's motors."""
+
+LARGEST_GAIN = 1e5
+"""Of p, d and feed-forward [V s/rad, V s^2/rad]: a supply's 12 V for an error of 1e-4 rad/s, a
+thousandth of what any encoder resolves; of i, the same per millisecond."""
+
+GROSS = 2.0
+"""Speed in set-points that no stable loop reaches: an undamped one of second order swings to 2."""
+
+_GROWING = 1.02
+_FAR = 1e3
+_NOMINAL = MotorModel(dc_gain=25.0, time_constant=0.05)
+_NOMINAL_RATIO = 65.5
+_LARGEST = {
+    "p": LARGEST_GAIN,
+    "i": 1e3 * LARGEST_GAIN,
+    "d": LARGEST_GAIN,
+    "feedforward_static": LARGEST_GAIN,
+    "feedforward_velocity": LARGEST_GAIN,
+    "feedforward_acceleration": LARGEST_GAIN,
+    "setpoint_weight_p": 1.0,
+    "setpoint_weight_d": 1.0,
+}
+
+
+@dataclass(frozen=True)
+class Circumstances:
+    """What is known of the wheel that the settings are for.
+
+    Attributes
+    ----------
+    sample_time : float
+        Usual interval of feedback [s]; NaN before it is known.
+    supply : float
+        [V]; infinite where unknown.
+    gearbox : Gearbox or None
+        None where unknown.
+    encoder : Encoder or None
+        None where unknown.
+    """
+
+    sample_time: float = math.nan
+    supply: float = math.inf
+    gearbox: Gearbox | None = None
+    encoder: Encoder | None = None
+
+
+def check(settings: LoopSettings, wheel: Circumstances | None = None) -> None:
+    """Refuse settings that no wheel should be driven with.
+
+    Parameters
+    ----------
+    settings : LoopSettings
+        Each value valid by itself.
+    wheel : Circumstances, optional
+        Nothing is known without.
+
+    Raises
+    ------
+    ParameterError
+        When a gain has a sign that drives away from the set-point or an absurd magnitude, when
+        the loop cannot be built or computed, or when it is unstable on the motor's model.
+    """
+    wheel = wheel or Circumstances()
+    _check_signs(settings.gains)
+    settings = settings.within(wheel.supply)
+    known = _model_at_wheel(settings, wheel)
+    model, ratio = known or (_NOMINAL, _NOMINAL_RATIO)
+    given = wheel.sample_time
+    intervals = RATES if math.isnan(given) else (min(max(given, 1e-4), 1.0),)
+    try:
+        with np.errstate(all="ignore"):
+            plants = [_Plant(model, ratio, dt) for dt in intervals]
+            if known and not any(_is_stable(settings, plant) for plant in plants):
+                raise ParameterError(_unstable(settings, plants[0]))
+            swing = min(_swing(settings, plant, wheel) for plant in plants)
+    except ParameterError:
+        raise
+    except (ArithmeticError, ValueError) as error:  # LinAlgError is a ValueError
+        raise ParameterError(
+            f"the loop cannot be computed with these parameters: {error}; "
+            "look at those of model, observer and drive"
+        ) from error
+    if not math.isfinite(swing) or (known and swing > GROSS):
+        raise ParameterError(
+            f"the wheel would reach {swing:.3g} times its set-point on the motor's model; at most "
+            f"{GROSS:g} times is accepted: lower i, or set antiwindup_strategy"
+        )
+
+
+def _check_signs(gains: PidGains) -> None:
+    for name, largest in _LARGEST.items():
+        value = getattr(gains, name)
+        least = -largest if name == "d" else 0.0
+        if not least <= value <= largest:
+            beyond = value - largest if value > largest else least - value
+            raise ParameterError(
+                f"{name} is {value:g}; it must be in [{least:g}, {largest:g}], "
+                f"and is beyond by {beyond:g}"
+            )
+
+
+def _model_at_wheel(
+    settings: LoopSettings, wheel: Circumstances
+) -> tuple[MotorModel, float] | None:
+    """Return the motor's model and the gear ratio; None where they are not known."""
+    gains, model = settings.gains, settings.model
+    velocity, acceleration = gains.feedforward_velocity, gains.feedforward_acceleration
+    if model is not None:
+        if wheel.gearbox is not None:
+            return model, wheel.gearbox.ratio
+        return (model, velocity * model.dc_gain) if velocity > 0.0 else None
+    if velocity > 0.0 and acceleration > 0.0:
+        told = MotorModel(dc_gain=1.0 / velocity, time_constant=acceleration / velocity)
+        return replace(told, static_voltage=gains.feedforward_static), 1.0
+    return None
+
+
+class _Plant:
+    """A motor by its model: exact for a voltage that is held, which acts one sample late."""
+
+    def __init__(self, model: MotorModel, ratio: float, dt: float) -> None:
+        self.dt, self.ratio, self.static = dt, ratio, model.static_voltage
+        self.final = model.dc_gain / ratio
+        tau, tp = model.time_constant, model.time_constant_product
+        # A motor of first order gets an electrical time constant a thousandth of its own.
+        tp = max(tp, 1e-3 * tau * tau)
+        drift = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0],
+                          [0.0, -1.0 / tp, -tau / tp, self.final / tp], [0.0] * 4])  # fmt: skip
+        advance = expm(drift * dt)[:3]
+        if not np.all(np.isfinite(advance)):
+            raise ParameterError("the motor's model cannot be computed; look at model.*")
+        self._advance = tuple(tuple(float(x) for x in row) for row in advance)
+        self._late = max(1, 1 + math.ceil(min(model.delay / dt, SAMPLES) - 1e-9))
+        self.rest()
+
+    def rest(self) -> None:
+        self.angle = self.speed = self.rate = 0.0
+        self._held = [0.0] * self._late
+
+    def step(self, voltage: float, static: float) -> float:
+        """Take a command; return the mean speed until the next sample."""
+        self._held.append(voltage)
+        drive = self._held.pop(0)
+        if static:
+            drive -= math.copysign(min(static, abs(drive)), self.speed or drive)
+        before = self.angle
+        state = (self.angle, self.speed, self.rate, drive)
+        self.angle, self.speed, self.rate = (
+            a * state[0] + b * state[1] + c * state[2] + d * state[3]
+            for a, b, c, d in self._advance
+        )
+        return (self.angle - before) / self.dt
+
+
+def _is_stable(settings: LoopSettings, plant: _Plant) -> bool:
+    """Tell whether the loop without clamps comes to rest after a step of its set-point."""
+    open_clamps = replace(
+        settings.gains, u_clamp_min=-math.inf, u_clamp_max=math.inf, i_clamp_min=-math.inf,
+        i_clamp_max=math.inf, antiwindup_strategy="none", error_deadband=0.0,
+    )  # fmt: skip
+    loop = WheelLoop(
+        LoopSettings(gains=open_clamps, limits=UNLIMITED, reference_delay=settings.reference_delay)
+    )
+    loop.start(0.0)
+    plant.rest()
+    speed, errors = 0.0, []
+    for _ in range(SAMPLES):
+        speed = plant.step(loop.step(1.0, speed, plant.dt).output, 0.0)
+        if not -_FAR < speed < _FAR:
+            return False
+        errors.append(abs(1.0 - speed))
+    quarter = SAMPLES // 4
+    early, late = max(errors[quarter : 2 * quarter]), max(errors[-quarter:])
+    return late < max(_GROWING * early, 0.02)
+
+
+def _unstable(settings: LoopSettings, plant: _Plant) -> str:
+    gains = settings.gains
+    low, high = 0.0, 1.0
+    for _ in range(5):
+        share = 0.5 * (low + high)
+        fewer = replace(gains, p=share * gains.p, i=share * gains.i, d=share * gains.d)
+        if _is_stable(replace(settings, gains=fewer), plant):
+            low = share
+        else:
+            high = share
+    remedy = f"it is stable with {low:.2g} times these" if low else "lower them by far"
+    return (
+        f"p {gains.p:g}, i {gains.i:g}, d {gains.d:g}: the loop is unstable on the motor's model "
+        f"at intervals of {1e3 * plant.dt:.3g} ms; {remedy}"
+    )
+
+
+def _swing(settings: LoopSettings, plant: _Plant, wheel: Circumstances) -> float:
+    """Return the largest speed, in set-points, of the loop as it would drive the wheel."""
+    gearbox = Gearbox(plant.ratio) if plant.ratio > 0.0 else None
+    encoder = wheel.encoder or Encoder()
+    supply = wheel.supply if math.isfinite(wheel.supply) else 1e3
+    loop = WheelLoop(settings, gearbox, encoder, 1.5 * supply)
+    loop.start(0.0)
+    plant.rest()
+    dt = plant.dt
+    most = min(settings.gains.u_clamp_max, -settings.gains.u_clamp_min, 12.0)
+    target = max(0.2 * plant.final * max(most - plant.static, 0.0), 1e-9)
+    target = min(target, settings.limits.velocity or math.inf, 1e4)
+    speed = voltage = fastest = 0.0
+    for _ in range(SAMPLES):
+        count = math.floor(plant.angle * plant.ratio / encoder.angle_per_count)
+        measured = loop.speed(dt, speed, count, voltage)
+        out = 0.0
+        if measured == measured:
+            out = loop.step(target, measured, dt).output
+            if out - out != 0.0:
+                return math.nan
+        speed = plant.step(out, plant.static)
+        voltage = out
+        fastest = max(fastest, abs(plant.speed))
+        if not fastest < _FAR * target + _FAR:
+            return fastest / target
+    least = 2.0 * encoder.angle_per_count / (plant.ratio * dt)
+    return max(fastest - least, 0.0) / target

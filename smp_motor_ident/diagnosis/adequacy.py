@@ -1,0 +1,225 @@
+"""Whether the model suffices: its error regressed on what real drives do beside it.
+
+Model-error modelling: the innovations e are regressed on the sensitivities S of the model to
+its own coordinates, and on the responses Z of the model to an effect that it lacks,
+
+    e = S d + Z c,   c = (Z' M Z)^-1 Z' M e,   M = I - S (S' S)^-1 S',
+
+tested by a Wald statistic whose covariance allows for correlated errors (sums over blocks of
+samples).  What the effect did to the estimate is ``(S' S)^-1 S' Z c``: where that exceeds the
+interval of a stated number, the number is unreliable.
+
+References
+----------
+L. Ljung, System Identification, 2nd ed., section 16.6; C. Bester, T. Conley, C. Hansen,
+Inference with dependent data using cluster covariance estimators, J. Econometrics 165 (2011).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import fdtrc
+
+from smp_motor_ident.diagnosis.effects import Effect
+from smp_motor_ident.diagnosis.limits import (
+    EFFECT_BLOCKS,
+    EFFECT_LEVEL,
+    EFFECT_OWN,
+    IMPLIED_BIAS,
+)
+from smp_motor_ident.diagnosis.model_error import BLOCKS, Regression, regression
+from smp_motor_ident.estimation.answer import Answer
+from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.finding import Finding
+from smp_motor_ident.likelihood.experiments import Experiments
+from smp_motor_ident.model import structures as models
+from smp_motor_ident.result import Quantity, ResidualTests
+
+Array = NDArray[np.float64]
+Stated = tuple[str, Quantity, Array]
+"""Name, value and gradient by the free coordinates of a number that is stated."""
+
+ROUNDS = 3  # effects that are named at most
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """One effect held against the model's error.
+
+    Attributes
+    ----------
+    effect : Effect
+        What was tried.
+    p_value : float
+        Of no such effect.
+    gain : float
+        Deviance that the effect explains.
+    shift : ndarray, shape (f,)
+        What it did to the free coordinates.
+    columns : tuple of int
+        Of the regressors.
+    """
+
+    effect: Effect
+    p_value: float
+    gain: float
+    shift: Array
+    columns: tuple[int, ...]
+
+
+def adequacy(
+    data: Experiments,
+    fit: Fit,
+    numbers: Sequence[Stated],
+    gear: float,
+    tests: ResidualTests,
+) -> list[Finding]:
+    """Name what the model lacks, and whether that moves a stated number beyond its interval.
+
+    Parameters
+    ----------
+    data : Experiments
+        What was fitted.
+    fit : Fit
+        The estimate.
+    numbers : sequence of Stated
+        What is stated, see `stated`.
+    gear : float
+        Motor revolutions a wheel revolution.
+    tests : ResidualTests
+        Whether the innovations passed for white.
+
+    Returns
+    -------
+    list of Finding
+        Empty where nothing of what is known of real drives shows.
+    """
+    if not fit.structure.free() or data.size < 4 * BLOCKS:
+        return []
+    errors = regression(data, fit, gear)
+    if errors is None:
+        return []
+    out: list[Finding] = []
+    named: list[int] = []
+    for _ in range(ROUNDS):
+        evidence = _tried(_without(errors, named), tests.white is True)
+        level = EFFECT_LEVEL.value / max(len(evidence), 1)
+        shown = [e for e in evidence if e.p_value < level]
+        if not shown:
+            break
+        first = max(shown, key=lambda e: e.gain - 2 * len(e.columns))
+        out.append(_finding(first, shown, numbers))
+        named += first.columns
+    return out
+
+
+def _tried(errors: Regression, white: bool) -> list[Evidence]:
+    found = (_test(errors, effect, columns, white) for effect, columns in errors.members)
+    return [e for e in found if e is not None]
+
+
+def _test(
+    errors: Regression, effect: Effect, columns: tuple[int, ...], white: bool
+) -> Evidence | None:
+    """Return the Wald test of one effect; None where the data cannot tell."""
+    z, e = errors.regressors[:, columns], errors.residual
+    normal = z.T @ z
+    scale = np.sqrt(np.diag(normal))
+    if not np.all(scale > 0):
+        return None
+    if np.linalg.cond(normal / np.outer(scale, scale)) > 1e8:
+        return _test(errors, effect, columns[:1], white) if len(columns) > 1 else None
+    size = np.linalg.solve(normal, z.T @ e)
+    left = e - z @ size
+    n, q = e.size, len(columns)
+    variance = float(left @ left) / max(n - q, 1)
+    blocks = int(errors.block[-1]) + 1 if errors.block.size else 0
+    scores = np.stack([np.bincount(errors.block, z[:, j] * left, blocks) for j in range(q)], axis=1)
+    weights = np.stack([np.bincount(errors.block, z[:, j] ** 2, blocks) for j in range(q)])
+    told = float(np.min(weights.sum(axis=1) ** 2 / np.square(weights).sum(axis=1)))
+    if told - q < EFFECT_BLOCKS.value and not white:
+        return None  # what shows it lies in a few stretches: chance cannot be told
+    middle = scores.T @ scores * blocks / (blocks - 1)
+    least = variance * normal
+    moved = z.T @ e
+    robust = float(moved @ np.linalg.pinv(middle, hermitian=True) @ moved) / q
+    plain = float(moved @ np.linalg.solve(least, moved)) / q
+    freedom = max(told - q, 1.0)
+    p_robust = float(fdtrc(q, freedom, robust * freedom / (freedom + q - 1)))
+    p_plain = float(fdtrc(q, max(n - q, 1), plain))
+    p = p_plain if told - q < EFFECT_BLOCKS.value else max(p_robust, p_plain)
+    return Evidence(effect, p, plain * q, errors.shifts[:, columns] @ size, columns)
+
+
+def _without(errors: Regression, named: Sequence[int]) -> Regression:
+    """Return the regression with what was named projected out."""
+    if not named:
+        return errors
+    q, _ = np.linalg.qr(errors.regressors[:, named])
+    rest = errors.regressors - q @ (q.T @ errors.regressors)
+    before = np.square(errors.regressors).sum(axis=0)
+    kept = np.square(rest).sum(axis=0) > EFFECT_OWN.value * before
+    members = [
+        (effect, columns)
+        for effect, columns in errors.members
+        if all(kept[c] for c in columns) and not set(columns) & set(named)
+    ]
+    residual = errors.residual - q @ (q.T @ errors.residual)
+    return replace(errors, residual=residual, regressors=rest, members=members)
+
+
+def _finding(first: Evidence, shown: Sequence[Evidence], numbers: Sequence[Stated]) -> Finding:
+    worst, times, share = "", 0.0, 0.0
+    for name, quantity, row in numbers:
+        if quantity.value is None or not quantity.std:
+            continue
+        shift = abs(float(row @ first.shift))
+        if shift / quantity.std > times:
+            worst, times = name, shift / quantity.std
+            share = shift / max(abs(quantity.value), 1e-300)
+    also = [e.effect.cause for e in shown if e is not first and e.gain > 0.8 * first.gain]
+    words = " or ".join([first.effect.cause, *also[:2]])
+    evidence: dict[str, float | str | None] = {
+        "p_value": first.p_value,
+        "explained_deviance": first.gain,
+        "quantity": worst,
+        "shift_std": times,
+        "shift_share": share,
+        "alternatives": ", ".join(e.effect.code for e in shown if e is not first) or None,
+    }
+    if times < IMPLIED_BIAS.value:
+        message = f"the model's error shows {words}; it moves no stated number beyond its interval"
+        return Finding(first.effect.code, "note", message, evidence)
+    return Finding(
+        first.effect.code,
+        "unreliable",
+        f"the model's error shows {words}: it moves {worst} by {share:.2g} of its value, "
+        f"{times:.1f} standard deviations",
+        evidence,
+        first.effect.advice,
+    )
+
+
+def stated(fit: Fit, result: Answer) -> list[Stated]:
+    """Return the numbers that are stated, with their gradients by the free coordinates.
+
+    Parameters
+    ----------
+    fit, result : Fit, Answer
+        The estimate.
+
+    Returns
+    -------
+    list of Stated
+        Of those that are functions of the coordinates.
+    """
+    matrix = fit.structure.matrix()
+    _, rows = models.combinations(fit.z, fit.structure.order)
+    if fit.structure.current:
+        rows = {**rows, **models.physical(fit.z)[1]}
+    quantities = {**result.combinations, **result.parameters}
+    return [(n, q, rows[n] @ matrix) for n, q in quantities.items() if n in rows]

@@ -1,0 +1,246 @@
+"""What real drives do and the plain motor does not, each as regressors for the model's error.
+
+An effect adds ``sum c_j s_j(t)`` to the voltage, to the measured output, or to the measured
+current.  The ``s_j`` are made of the model's own free run, so they know nothing of the noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smp_motor_ident.likelihood import recursion as rc
+
+Array = NDArray[np.float64]
+Place = Literal["voltage", "output", "current"]
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """The model's free run, at the sections of the input or at the samples.
+
+    Attributes
+    ----------
+    share : ndarray
+        Position in the record, -1 to 1.
+    step : ndarray
+        Length of the section or sampling interval [s].
+    voltage, speed, angle, output : ndarray
+        [V], [rad/s], [rad], what is measured.
+    drop : ndarray
+        ``v - K w`` [V]: the winding's current by its resistance.
+    current : ndarray
+        [A], empty where none is measured.
+    top, fastest : float
+        Largest voltage and speed.
+    gear : float
+        Motor revolutions a wheel revolution.
+    kind : int
+        Of the output.
+    """
+
+    share: Array
+    step: Array
+    voltage: Array
+    speed: Array
+    angle: Array
+    output: Array
+    drop: Array
+    current: Array
+    top: float
+    fastest: float
+    gear: float
+    kind: int
+
+
+@dataclass(frozen=True)
+class Effect:
+    """One explanation of what a model leaves over."""
+
+    code: str
+    place: Place
+    cause: str
+    advice: str
+    regressors: Callable[[Motion], list[Array]]
+
+
+def _sign(x: Array) -> Array:
+    return np.asarray(np.sign(x))
+
+
+def _change(m: Motion) -> Array:
+    return np.diff(m.voltage, prepend=m.voltage[0])
+
+
+def _slope(values: Array, step: Array) -> Array:
+    out = np.zeros(values.size)
+    out[1:-1] = (values[2:] - values[:-2]) / np.maximum(step[1:-1] + step[2:], 1e-12)
+    return out
+
+
+def _late(m: Motion) -> list[Array]:
+    first = _slope(m.output, m.step)
+    return [first, _slope(first, m.step)]
+
+
+def _current_late(m: Motion) -> list[Array]:
+    first = _slope(m.current, m.step)
+    return [first, _slope(first, m.step)]
+
+
+def _angles(m: Motion) -> list[Array]:
+    if m.kind != rc.ANGLE:
+        return []
+    out = [np.sin(m.angle), np.cos(m.angle)]
+    if m.gear > 1.5:
+        out += [np.sin(m.angle / m.gear), np.cos(m.angle / m.gear)]
+    return out
+
+
+def _encoder(m: Motion) -> list[Array]:
+    return [np.sin(m.angle), np.cos(m.angle)] if m.kind == rc.ANGLE else []
+
+
+def _play(m: Motion) -> list[Array]:
+    return [np.tanh(50 * m.speed / m.fastest)] if m.kind == rc.ANGLE else []
+
+
+def _missed(m: Motion) -> list[Array]:
+    if m.kind != rc.ANGLE:
+        return []
+    fast = m.speed * np.maximum(np.abs(m.speed) / m.fastest - 0.5, 0)
+    return [np.cumsum(m.speed * np.abs(m.speed) * m.step), np.cumsum(fast * m.step)]
+
+
+def _held_back(m: Motion) -> list[Array]:
+    """A bridge that coasts: with a command of zero, or where the current would run back."""
+    off = np.abs(m.voltage) < 0.01 * m.top
+    back = (m.voltage * m.drop < 0) & ~off
+    return [np.where(off, m.speed, 0.0), np.where(back, m.drop, 0.0)]
+
+
+EFFECTS = (
+    Effect(
+        "dead_zone", "voltage", "a dead zone of the driver",
+        "declare the driver's dead zone, or record the voltage at the motor's terminals",
+        lambda m: [_sign(m.voltage)],
+    ),
+    Effect(
+        "clip", "voltage", "a command that is clipped at the supply",
+        "record the voltage at the motor's terminals, or stay below the supply's voltage",
+        lambda m: [_sign(m.voltage) * np.maximum(np.abs(m.voltage) - c * m.top, 0.0)
+                   for c in (0.65, 0.85)],
+    ),
+    Effect(
+        "coast", "voltage", "a driver that lets the motor coast (fast decay)",
+        "set the driver to brake (slow decay), or record the voltage at the terminals",
+        _held_back,
+    ),
+    Effect(
+        "supply_sag", "voltage", "a supply that sags under load",
+        "record the supply's voltage, or the voltage at the terminals",
+        lambda m: [m.drop * (m.voltage / m.top) ** 2, np.abs(m.voltage / m.top) * m.drop],
+    ),
+    Effect(
+        "brush_drop", "voltage", "a voltage drop over brushes or transistors",
+        "record the voltage at the terminals; drive slowly through zero",
+        lambda m: [np.tanh(20 * m.drop / m.top)],
+    ),
+    Effect(
+        "saturation", "voltage", "a field that weakens with the current",
+        "record with smaller steps of voltage",
+        lambda m: [np.abs(m.drop) * m.speed, np.abs(m.drop) * m.drop],
+    ),
+    Effect(
+        "asymmetry", "voltage", "a motor or driver that differs between the directions",
+        "estimate each direction by itself, from a record of one direction",
+        lambda m: [np.ones(m.speed.size), np.abs(m.speed), np.abs(m.voltage)],
+    ),
+    Effect(
+        "drag", "voltage", "a drag that grows with the square of the speed",
+        "record at the speeds at which the motor will run",
+        lambda m: [m.speed * np.abs(m.speed)],
+    ),
+    Effect(
+        "stribeck", "voltage", "friction that falls with speed (Stribeck)",
+        "record less of the slowest speeds, or slow ramps through zero to see it",
+        lambda m: [_sign(m.speed) * np.exp(-np.abs(m.speed) / (c * m.fastest))
+                   for c in (0.03, 0.15)],
+    ),
+    Effect(
+        "drift", "voltage", "a motor, load or supply that changed during the record",
+        "record after warming up, and shorter; or state the two halves apart",
+        lambda m: [m.share * m.voltage, m.share * m.speed, m.share * _sign(m.speed), m.share],
+    ),
+    Effect(
+        "position", "voltage", "a torque that depends on the angle (cogging, an unbalanced wheel)",
+        "lift the wheel, or record at higher speed and for more turns",
+        _angles,
+    ),
+    Effect(
+        "dynamics", "voltage", "linear dynamics that the model lacks (compliance, a filter, a "
+        "supply that recovers)", "sample faster; record the voltage at the terminals",
+        lambda m: [_lagged(m, c) for c in (0.3, 3.0)],
+    ),
+    Effect(
+        "slew", "voltage", "a driver that limits how fast the voltage rises",
+        "switch the driver's ramp off, or declare it",
+        lambda m: [_change(m) * np.abs(_change(m)), np.roll(_change(m), 1) * np.abs(_change(m))],
+    ),
+    Effect(
+        "lag", "output", "a speed or angle that is filtered, or comes late",
+        "declare the filter of the firmware, or record encoder counts with their stamps", _late,
+    ),
+    Effect(
+        "encoder_error", "output", "an encoder that is off once a turn",
+        "centre the encoder's disc, or average over whole turns", _encoder,
+    ),
+    Effect(
+        "backlash", "output", "backlash between motor and encoder",
+        "measure at the motor's shaft, or keep one direction under load", _play,
+    ),
+    Effect(
+        "missed_counts", "output", "counts that are lost at speed",
+        "let hardware count, or drive slower", _missed,
+    ),
+    Effect(
+        "current_lag", "current", "a current that is filtered, averaged, or late",
+        "declare the filter, or estimate without the current", _current_late,
+    ),
+    Effect(
+        "current_unsigned", "current", "a current without sign, or of another scale each way",
+        "estimate without the current, or give it its sign",
+        lambda m: [np.abs(m.current)],
+    ),
+    Effect(
+        "current_of_supply", "current", "the supply's current in place of the motor's",
+        "divide by the duty cycle, or estimate without the current",
+        lambda m: [m.current * np.abs(m.voltage) / m.top],
+    ),
+    Effect(
+        "current_offset", "current", "an offset of the current",
+        "zero the current sensor at rest",
+        lambda m: [np.ones(m.current.size)],
+    ),
+    Effect(
+        "current_nonlinear", "current", "a current sensor that bends or clips",
+        "widen the sensor's range",
+        lambda m: [m.current * np.abs(m.current)],
+    ),
+)  # fmt: skip
+"""Explanations in the order in which they are named where the data like them equally."""
+
+
+def _lagged(m: Motion, factor: float) -> Array:
+    """Return the voltage through a first-order lag that is faster or slower than the motor's."""
+    from scipy.signal import lfilter
+
+    speed, voltage = m.speed / m.fastest, m.voltage / m.top
+    # The motor's own lag [sections] from how its speed follows its voltage.
+    own = max(float(np.abs(voltage - speed).sum() / max(np.abs(np.diff(speed)).sum(), 1e-9)), 1.0)
+    a = float(np.exp(-1.0 / max(factor * own, 0.3)))
+    return np.asarray(lfilter([1 - a], [1, -a], m.voltage))

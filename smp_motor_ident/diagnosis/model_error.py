@@ -1,0 +1,239 @@
+"""The model's error and its responses to effects, the model's own coordinates projected out.
+
+Every column is a difference of two passes over the data, so it bends, sticks, is delayed and is
+corrected by the measurements as the model is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smp_motor_ident.diagnosis.effects import EFFECTS, Effect, Motion
+from smp_motor_ident.diagnosis.limits import EFFECT_OWN
+from smp_motor_ident.diagnosis.residuals import voltage_at_samples
+from smp_motor_ident.estimation import replay
+from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.likelihood import recursion as rc
+from smp_motor_ident.likelihood.experiments import Experiments
+from smp_motor_ident.likelihood.passes import own_columns
+from smp_motor_ident.model.structures import to_internal
+
+Array = NDArray[np.float64]
+
+BLOCKS = 40  # whose sums of scores give the covariance
+NUDGE = 1e-3  # of a signal's size: small against what bends, large against rounding
+SEGMENTS = 20  # beyond which only the angle's offset of each is projected out
+
+
+@dataclass(frozen=True, eq=False)
+class Regression:
+    """Residuals and regressors of one fit, the model's own coordinates projected out.
+
+    Attributes
+    ----------
+    residual : ndarray, shape (n,)
+        Of unit variance; the current's after the output's.
+    regressors : ndarray, shape (n, r)
+        Responses to effects.
+    shifts : ndarray, shape (f, r)
+        Change of the free coordinates for a unit of each.
+    block : ndarray of int, shape (n,)
+        Which stretch of time a row belongs to.
+    members : sequence of (Effect, columns)
+        Which columns are whose.
+    """
+
+    residual: Array
+    regressors: Array
+    shifts: Array
+    block: NDArray[np.int64]
+    members: Sequence[tuple[Effect, tuple[int, ...]]]
+
+
+def regression(data: Experiments, fit: Fit, gear: float) -> Regression | None:
+    """Return residuals and responses, whitened, the model's coordinates projected out.
+
+    Parameters
+    ----------
+    data : Experiments
+        What was fitted.
+    fit : Fit
+        The estimate.
+    gear : float
+        Motor revolutions a wheel revolution.
+
+    Returns
+    -------
+    Regression or None
+        None where there are too few samples.
+    """
+    base = _predicted(data, fit)
+    columns = [_stacked(data, fit, _measured(data) - base)]
+    columns += [_stacked(data, fit, c) for c in _own(data, fit, base)]
+    n_own = len(columns) - 1
+    members: list[tuple[Effect, tuple[int, ...]]] = []
+    sections, samples = _motions(data, fit, gear)
+    for effect in EFFECTS:
+        if effect.place == "current" and not data.current.size:
+            continue
+        made = [_response(data, fit, base, effect, s) for s in
+                effect.regressors(sections if effect.place == "voltage" else samples)]  # fmt: skip
+        if made:
+            first = len(columns) - 1 - n_own
+            members.append((effect, tuple(range(first, first + len(made)))))
+            columns += [_stacked(data, fit, c) for c in made]
+    table = np.column_stack(columns)
+    block = _blocks(data)
+    ok = np.isfinite(table).all(axis=1)
+    table, block = table[ok], block[ok]
+    if table.shape[0] < 4 * BLOCKS:
+        return None
+    return _projected(table, n_own, block, members, len(fit.structure.free()))
+
+
+def _projected(
+    table: Array,
+    n_own: int,
+    block: NDArray[np.int64],
+    members: Sequence[tuple[Effect, tuple[int, ...]]],
+    n_free: int,
+) -> Regression:
+    own, rest = table[:, 1 : 1 + n_own], table[:, [0, *range(1 + n_own, table.shape[1])]]
+    scale = np.sqrt(np.square(own).sum(axis=0))
+    own = own / np.where(scale > 0, scale, 1.0)
+    answer = np.linalg.lstsq(own.T @ own, own.T @ rest, rcond=1e-12)[0]
+    left = rest - own @ answer
+    before = np.square(rest).sum(axis=0)
+    kept = np.square(left).sum(axis=0) > EFFECT_OWN.value * before
+    answer = answer / np.where(scale > 0, scale, 1.0)[:, None]
+    usable = []
+    for effect, columns in members:
+        seen = tuple(c for c in columns if kept[c + 1])
+        if seen:
+            usable.append((effect, seen))
+    return Regression(left[:, 0], left[:, 1:], answer[:n_free, 1:], block, usable)
+
+
+def _predicted(data: Experiments, fit: Fit) -> Array:
+    """Return the one-step predictions of the output (and current) as columns."""
+    return replay.simulate(data, fit, gain=True)[:, 1:]
+
+
+def _measured(data: Experiments) -> Array:
+    if data.current.size:
+        return np.column_stack([data.output, data.current])
+    return data.output[:, None]
+
+
+def _stacked(data: Experiments, fit: Fit, columns: Array) -> Array:
+    """Return output and current below each other, in units of their innovations."""
+    parts = [columns[:, 0] / np.sqrt(fit.noise[0, 0])]
+    if columns.shape[1] > 1:
+        parts.append(columns[:, 1] / np.sqrt(fit.noise[1, 1]))
+    return np.concatenate(parts)
+
+
+def _blocks(data: Experiments) -> NDArray[np.int64]:
+    block = np.arange(data.size) * BLOCKS // data.size
+    return np.tile(block, 2 if data.current.size else 1)
+
+
+def _own(data: Experiments, fit: Fit, base: Array) -> list[Array]:
+    """Return the sensitivities to the free coordinates and to each segment's initial state."""
+    structure = fit.structure
+    deviation = np.sqrt(np.diag(fit.covariance()))
+    out = []
+    for j in range(len(structure.free())):
+        step = 0.3 * float(np.clip(deviation[j], 1e-7, 0.05))
+        z = fit.z + step * structure.matrix()[:, j]
+        out.append((_predicted(data, replace(fit, z=z)) - base) / step)
+    columns = own_columns(data, structure)
+    segments = len(data.starts) - 1
+    if segments > SEGMENTS:
+        columns = tuple(c for c in columns if c == 2)
+    size = {0: 1e-3, 1: 1e-3 * (1 + np.abs(fit.initial[:, 1]).max()), 2: 1e-3, 3: 1e-3}
+    for c in columns:
+        initial = fit.initial.copy()
+        initial[:, c] += size[c]
+        moved = (_predicted(data, replace(fit, initial=initial)) - base) / size[c]
+        for a, b in zip(data.starts[:-1], data.starts[1:]):
+            part = np.zeros_like(moved)
+            part[a:b] = moved[a:b]
+            out.append(part)
+    return out
+
+
+def _response(data: Experiments, fit: Fit, base: Array, effect: Effect, signal: Array) -> Array:
+    """Return what a unit of the effect changes in the predictions."""
+    if effect.place == "voltage":
+        size = float(np.sqrt(np.mean(np.square(signal))))
+        if size == 0.0 or not np.isfinite(size):
+            return np.zeros_like(base)
+        step = NUDGE * float(np.sqrt(np.mean(np.square(data.hold_value)))) / size
+        nudged = replace(data, hold_value=data.hold_value + step * signal)
+        return (_predicted(nudged, fit) - base) / step
+    out = np.zeros_like(base)
+    name, column = ("output", 0) if effect.place == "output" else ("current", 1)
+    out[:, column] = signal
+    if np.any(fit.gain != 0.0):  # the state follows a wrong measurement, too
+        step = NUDGE * float(np.sqrt(fit.noise[column, column] / max(np.mean(signal**2), 1e-300)))
+        nudged = replace(data, **{name: getattr(data, name) + step * signal})
+        out -= (_predicted(nudged, fit) - base) / step
+    return out
+
+
+def _motions(data: Experiments, fit: Fit, gear: float) -> tuple[Motion, Motion]:
+    """Return the free run at the sections' middles and at the samples."""
+    run = replay.simulate(data, fit)
+    speed = run[:, 0]
+    back = to_internal(fit.z, fit.structure.order)[0][2]
+    angle = data.output if data.kind == rc.ANGLE else np.zeros(data.size)
+    if np.isnan(angle).any():
+        known = np.flatnonzero(np.isfinite(angle))
+        angle = np.interp(np.arange(data.size), known, angle[known])
+    voltage = voltage_at_samples(data)
+    at_samples = _motion(data, gear, (data.time, voltage, speed, angle), back, np.diff(data.starts))
+    at_samples = replace(
+        at_samples, output=run[:, 1], current=run[:, 2] if data.current.size else np.zeros(0)
+    )
+    middle, w, theta = (np.empty(data.hold_end.size) for _ in range(3))
+    bounds = [*map(int, data.hold_start[: len(data.starts) - 1]), data.hold_end.size]
+    for g, (a, b) in enumerate(zip(data.starts[:-1], data.starts[1:])):
+        i, j = bounds[g], bounds[g + 1]
+        end = data.hold_end[i:j]
+        mid = end - np.diff(end, prepend=min(float(data.time[a]), float(end[0]))) / 2
+        middle[i:j] = mid
+        w[i:j] = np.interp(mid, data.time[a:b], speed[a:b])
+        theta[i:j] = np.interp(mid, data.time[a:b], angle[a:b])
+    at_sections = _motion(data, gear, (middle, data.hold_value, w, theta), back, np.diff(bounds))
+    return at_sections, at_samples
+
+
+def _motion(
+    data: Experiments,
+    gear: float,
+    signals: tuple[Array, Array, Array, Array],
+    back: float,
+    lengths: Array,
+) -> Motion:
+    time, voltage, speed, angle = signals
+    step = np.maximum(np.diff(time, prepend=time[0] - data.step), 0.0)
+    step[np.cumsum(lengths)[:-1]] = data.step
+    return Motion(
+        share=np.linspace(-1.0, 1.0, time.size, dtype=np.float64),
+        step=step,
+        voltage=voltage,
+        speed=speed,
+        angle=angle,
+        output=speed,
+        drop=voltage - back * speed,
+        current=np.zeros(0),
+        top=float(np.abs(voltage).max()) or 1.0,
+        fastest=float(np.abs(speed).max()) or 1.0,
+        gear=gear,
+        kind=data.kind,
+    )

@@ -1,0 +1,73 @@
+"""What is found about a result is a finding with a code; every threshold stands in one table."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import motors
+import numpy as np
+import pytest
+
+from smp_motor_ident.diagnosis import limits
+from smp_motor_ident.diagnosis.advice import _fit
+from smp_motor_ident.estimate import estimate
+from smp_motor_ident.result import FitPercent, ResidualTests
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_the_page_of_limits_is_the_table() -> None:
+    made = subprocess.run(
+        [sys.executable, ROOT / "scripts" / "limits.py"], capture_output=True, text=True, check=True
+    )
+    page = (ROOT / "docs" / "limits.md").read_text()
+    assert page == made.stdout, "python scripts/limits.py > docs/limits.md"
+
+
+def test_every_limit_names_a_test_that_exists() -> None:
+    names = {path.name for path in (ROOT / "test").rglob("test_*.py")}
+    for limit in vars(limits).values():
+        if isinstance(limit, limits.Limit):
+            assert set(re.findall(r"test_\w+\.py", limit.test)) <= names
+            assert limit.reason and limit.unit
+
+
+@pytest.mark.parametrize(
+    ("percent", "independent", "codes"),
+    [
+        (FitPercent(71.0, 70.0), True, []),
+        (FitPercent(69.0, 69.0), True, ["poor_fit"]),
+        (FitPercent(90.0, 74.0), True, ["validation"]),
+        (FitPercent(94.0, 94.0), False, ["residual_follows_voltage"]),
+        (FitPercent(96.0, 96.0), False, []),
+    ],
+)
+def test_a_fit_is_judged_by_what_it_explains_and_whether_that_holds(
+    percent: FitPercent, independent: bool, codes: list[str]
+) -> None:
+    found = _fit(percent, ResidualTests(True, independent))
+    assert [f.code for f in found] == codes
+
+
+def test_clean_data_have_no_finding_beyond_a_note() -> None:
+    result = estimate(motors.record("rear_left", seconds=8.0))
+    assert [f for f in result.findings if f.severity != "note"] == []
+
+
+def test_the_curves_are_what_the_verdict_is_of() -> None:
+    result = estimate(motors.record("rear_left", seconds=8.0))
+    curve = result.residuals.autocorrelation
+    assert curve is not None
+    inside = bool(np.all(np.abs(curve.value[1:]) < curve.band))
+    assert result.residuals.white == inside
+    assert curve.value[0] == pytest.approx(1.0, abs=1e-12)  # by definition, but for rounding
+
+
+def test_what_was_said_while_reading_is_a_finding() -> None:
+    result = estimate(replace(motors.record("rear_left"), notes=("a note of the reader",)))
+    assert "a note of the reader" in result.warnings
+    assert [f.code for f in result.findings if f.message == "a note of the reader"] == ["reading"]
