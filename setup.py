@@ -65,7 +65,7 @@ setup(
     maintainer_email="maintainers@smp-motor-control.invalid",
     python_requires=">=3.10,<3.14",
     packages=find_packages(include=[f"{NAME}*", "smp_motor_ident*"]),
-    package_data={"": ["py.typed", "*.jinja", "*.css"]},
+    package_data={"": ["py.typed", "*.jinja", "*.css", "*.js", "LICENSE"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml", "LICENSE", "README.md", "CHANGELOG.rst"]),
