@@ -59,15 +59,15 @@ def _work(arguments: argparse.Namespace) -> int:
     estimates = read_estimates(arguments.source)
     measured = {} if arguments.bag is None else measure_delay(arguments.bag)
     loops = {w: loop_for(one, arguments, measured.get(w)) for w, one in estimates.items()}
-    told_delays = tell_delays(loops, measured, arguments)
-    print("".join(f"{line}\n" for line in told_delays), end="")
-    told_sources: list[str] = []
+    delay_lines = tell_delays(loops, measured, arguments)
+    print("".join(f"{line}\n" for line in delay_lines), end="")
+    source_lines: list[str] = []
     targets = {n: getattr(arguments, n) for n in TARGETS if getattr(arguments, n) is not None}
     method = arguments.method
     with frame.progress("tune") as say:
         if arguments.speed_source == "auto":
             say("comparing the sources of speed")
-            loops, told_sources = _choose_sources(estimates, loops, targets)
+            loops, source_lines = _choose_sources(estimates, loops, targets)
         if arguments.compare:
             say("comparing the methods")
             method = _compare(estimates, loops, targets)
@@ -76,23 +76,23 @@ def _work(arguments: argparse.Namespace) -> int:
         wheels = design_wheels(
             estimates, loops, method, arguments.sets, together=not arguments.alone, **targets
         )
-    print("".join(f"{line}\n" for line in told_sources), end="")
+    print("".join(f"{line}\n" for line in source_lines), end="")
     show(wheels)
     if files:
         now = datetime.datetime.now(datetime.timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
         text = gains_yaml(
             wheels.designs,
-            [*provenance(wheels, arguments, estimates, now), *told_delays, *told_sources],
+            [*provenance(wheels, arguments, estimates, now), *delay_lines, *source_lines],
         )
         sources = sorted({s for e in estimates.values() for s in e.sources})
-        told = {
+        origin = {
             "date": now,
             "input": str(arguments.source),
             "sources": sources,
-            "delays": told_delays,
-            "speed_sources": told_sources,
+            "delays": delay_lines,
+            "speed_sources": source_lines,
         }
-        document = to_json(gains_document(wheels.designs, told, wheels.reason))
+        document = to_json(gains_document(wheels.designs, origin, wheels.reason))
         drawn = {w: curves(estimates[w], one) for w, one in wheels.designs.items()}
         figure = tuning_svg(drawn, METHODS[method].required.sensitivity)
         write_together(dict(zip(files, (text, document, figure), strict=True)), arguments.force)
