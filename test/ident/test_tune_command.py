@@ -140,3 +140,14 @@ def test_unknown_supply_is_asked_for(identified, capsys):
     assert main([str(identified)]) == 2
     assert "give --supply" in capsys.readouterr().err
     assert main([str(identified), "--supply", "12"]) == 0
+
+
+def test_names_in_the_arguments_are_those_that_there_are():
+    from smp_motor_ident.cli import tune_arguments as arguments
+    from smp_motor_ident.tune import METHODS
+    from smp_motor_ident.tune.exports import FORMATS
+    from smp_motor_ident.tune.loop import SPEED_SOURCES
+
+    assert tuple(METHODS) == arguments.METHODS
+    assert tuple(FORMATS) == arguments.FORMATS
+    assert arguments.SPEED_SOURCES == SPEED_SOURCES
