@@ -35,6 +35,8 @@ UNITS: Mapping[str, str] = {
     "static_voltage_reverse": "V",
     "load_voltage": "V",
     "averaging_window": "s",
+    "resonance_frequency": "rad/s",
+    "resonance_damping": "1",
 }
 """Unit of every quantity that a model may report, at the motor shaft."""
 
