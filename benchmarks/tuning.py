@@ -216,8 +216,8 @@ def try_design(outcome: Outcome, motor, one: Design, conditions, estimate) -> No
         )
     else:
         outcome.delay_margin = True
-    promise = METHODS[outcome.method].promise
-    outcome.promise = (
+    promise = METHODS[outcome.method].required
+    outcome.required = (
         m.phase >= 0.99 * promise.phase
         and m.gain >= 0.99 * promise.gain
         and m.sensitivity <= 1.01 * promise.sensitivity
@@ -361,7 +361,7 @@ def main() -> int:
     table(outcomes)
     known_and_unknown(arguments.rates)
     for o in outcomes:
-        held = o.stable and o.gain_margin and o.delay_margin and o.promise and o.draws_stable
+        held = o.stable and o.gain_margin and o.delay_margin and o.required and o.draws_stable
         if o.designed and not held:
             print(f"not held: {o}")
         elif not o.designed:

@@ -84,6 +84,11 @@ def wheel_of(node: Node) -> str:
     return str(node.get_namespace().rsplit("/", 1)[-1])
 
 
+def robot_topic(node: Node, name: str) -> str:
+    """Return a topic of the robot that a wheel's node belongs to: one namespace up."""
+    return f"{node.get_namespace().rpartition('/')[0]}/{name}"
+
+
 def share(path: str) -> Path:
     """Return a file of this package, installed or in its source tree.
 

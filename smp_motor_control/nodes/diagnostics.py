@@ -63,8 +63,12 @@ class Diagnostics:
     def publish(self) -> None:
         """Publish the present health now."""
         level, message, values = self._assess()
+        clock = self._node.get_clock()
+        if clock.ros_time_is_active and clock.now().nanoseconds == 0:
+            level = max(level, WARN)
+            message = f"use_sim_time is set, but nothing is heard on /clock; {message}"
         array = DiagnosticArray()
-        array.header.stamp = self._node.get_clock().now().to_msg()
+        array.header.stamp = clock.now().to_msg()
         array.status = [
             DiagnosticStatus(
                 level=level,

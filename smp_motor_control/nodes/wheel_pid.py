@@ -61,7 +61,7 @@ class WheelPid(LifecycleNode):
             (self.destroy_publisher, self._shown),
             (self.destroy_subscription, listen(MotorState, "motor_state", self._hear, heard)),
             (self.destroy_subscription,
-             listen(JointState, "/wheel_setpoints", self._ask, heard)),
+             listen(JointState, runtime.robot_topic(self, "wheel_setpoints"), self._ask, heard)),
             (self.destroy_subscription,
              listen(MotorDescription, "motor_description", self._describe, runtime.LATCHED)),
             (self.destroy_service, self.create_service(Trigger, "~/reset", self._reset)),

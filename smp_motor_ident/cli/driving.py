@@ -14,7 +14,7 @@ from smp_motor_control.encoder import unwrap
 from smp_motor_control.motor.friction import Gearbox
 from smp_motor_ident.bag.columns import Columns, read_columns
 from smp_motor_ident.record import Hardware
-from smp_motor_ident.tune.response import step_figures
+from smp_motor_ident.tune.simulation import step_figures
 
 Array = NDArray[np.float64]
 

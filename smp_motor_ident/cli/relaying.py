@@ -62,7 +62,7 @@ def tune_by_relay(arguments: argparse.Namespace, files: Sequence[Path]) -> int:
             "u_clamp_max": float(supply),
             "antiwindup_strategy": "back_calculation",
         }
-        tree = {f"/{wheel}/wheel_pid": {"ros__parameters": parameters}}
+        tree = {f"/**/{wheel}/wheel_pid": {"ros__parameters": parameters}}
         text = f"# Tuned by relay feedback. {told}\n" + yaml.safe_dump(tree, sort_keys=False)
         write_together({files[0]: text}, arguments.force)
         print(f"written: {files[0]}")

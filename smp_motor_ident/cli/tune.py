@@ -18,6 +18,7 @@ from smp_motor_ident.report.document import check_free, read_identification, wri
 from smp_motor_ident.report.tuning_figures import tuning_svg
 from smp_motor_ident.result import Estimate, Quantity
 from smp_motor_ident.tune import METHODS, Loop, compare, design_wheels, recommend
+from smp_motor_ident.tune.case import COMMON
 from smp_motor_ident.tune.curves import curves
 from smp_motor_ident.tune.source import choose_source
 from smp_motor_ident.tune.writing import gains_document, gains_yaml, to_json
@@ -90,7 +91,7 @@ def _work(arguments: argparse.Namespace) -> int:
         }
         document = to_json(gains_document(wheels.designs, told, wheels.reason))
         drawn = {w: curves(estimates[w], one) for w, one in wheels.designs.items()}
-        figure = tuning_svg(drawn, METHODS[method].promise.sensitivity)
+        figure = tuning_svg(drawn, METHODS[method].required.sensitivity)
         write_together(dict(zip(files, (text, document, figure), strict=True)), arguments.force)
         print(f"written: {files[0]}, beside it {files[1].name} and {files[2].name}")
     if arguments.apply:
@@ -102,7 +103,7 @@ def _choose_sources(
     estimates: Mapping[str, Estimate], loops: Mapping[str, Loop], targets: Mapping[str, Any]
 ) -> tuple[dict[str, Loop], list[str]]:
     """Return the loops with the speed source of each wheel, and a line of reasons for each."""
-    known = ("phase_margin", "maximum_sensitivity", "focus", "structure")
+    known = ("phase_margin", "maximum_sensitivity", "focus", "structure", "accept_unreliable")
     margins = {name: value for name, value in targets.items() if name in known}
     chosen, lines = {}, []
     for wheel, estimate in estimates.items():
@@ -160,7 +161,7 @@ def read_estimates(source: Path) -> dict[str, Estimate]:
 
 
 def _known(method: str) -> tuple[str, ...]:
-    return (*METHODS[method].targets, "max_velocity", "max_acceleration", "transition_time")
+    return (*METHODS[method].targets, *COMMON)
 
 
 def _compare(

@@ -26,6 +26,7 @@ TARGETS = (
     "max_velocity",
     "max_acceleration",
     "transition_time",
+    "accept_unreliable",
 )
 
 
@@ -57,7 +58,7 @@ def parser() -> argparse.ArgumentParser:
         "--speed-source", choices=("auto", *SPEED_SOURCES), default="auto",
         help="auto compares what each allows, and says why",
     )  # fmt: skip
-    loop.add_argument("--difference-window", type=int, default=1, help="[samples]")
+    loop.add_argument("--difference-window", type=int, help="[samples], 1; else as identified")
     loop.add_argument("--gear-ratio", type=float, help="else as identified")
     loop.add_argument("--counts-per-revolution", type=float, help="else as identified")
     loop.add_argument("--supply", type=float, help="[V]; else as identified")
@@ -94,6 +95,10 @@ def parser() -> argparse.ArgumentParser:
     relay.add_argument("--relay-hysteresis", type=float, default=0.05, help="[rad/s, wheel]")
     relay.add_argument("--relay-seconds", type=float, default=4.0)
     relay.add_argument("--rule", choices=("tyreus_luyben", "ziegler_nichols"))
+    p.add_argument(
+        "--accept-unreliable", action="store_true", default=None,
+        help="design on an identification that calls itself unreliable, as wide as it leaves",
+    )  # fmt: skip
     p.add_argument("--force", action="store_true", help="replace files that exist")
     return p
 
@@ -114,6 +119,7 @@ def loop_for(
         sample_time = 1.0 / arguments.rate
     else:
         sample_time = estimate.sample_time or 1.0 / DEFAULT_RATE
+    window = arguments.difference_window
     usual, longest = (None, None) if measured is None else measured.until_applied(sample_time)
     if arguments.delay is not None:
         usual = None  # it is the longest, which nothing measured may pass
@@ -127,7 +133,8 @@ def loop_for(
         ),
         supply_voltage=supply,
         speed_source="measured" if arguments.speed_source == "auto" else arguments.speed_source,
-        difference_window=arguments.difference_window,
+        difference_window=1 if window is None else window,
+        averaging_given=window is not None,
     )
 
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.estimation import replay
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.likelihood import recursion as rc
@@ -161,7 +162,7 @@ def what_next(
     accuracy : float
         Wanted relative standard deviation.
     supply : float, optional
-        Largest voltage [V]; by default that of the hardware, else 12 V.
+        Largest voltage [V]; by default that of the hardware, else the recording's largest.
     longest : float
         Longest acceptable recording [s].
     current_noise : float
@@ -171,8 +172,18 @@ def what_next(
     -------
     Proposal
         The shortest one that suffices, or the best one of length ``longest``.
+
+    Raises
+    ------
+    ParameterError
+        When nothing says how much voltage the motor may get.
     """
-    limit = supply or estimate.hardware.supply_voltage or 12.0
+    limit = supply or estimate.hardware.supply_voltage or estimate.largest_voltage
+    if not limit:
+        raise ParameterError(
+            f"{estimate.wheel}: neither the supply nor the voltage of the recording is known; "
+            "give the largest voltage that the motor may get"
+        )
     family, needs_current = _family(estimate, current_noise)
     step = estimate.sample_time or 0.005
     corner = 1 / (2 * np.pi * max(estimate.value("time_constant"), 4 * step))

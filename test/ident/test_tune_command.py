@@ -44,7 +44,7 @@ def test_parameter_file_holds_what_the_four_nodes_take(identified, capsys):
     output = identified / "gains.yaml"
     assert main([str(identified), "--output", str(output)]) == 0
     tree = yaml.safe_load(output.read_text())
-    assert list(tree) == [f"/{wheel}/wheel_pid" for wheel in WHEELS]
+    assert list(tree) == [f"/**/{wheel}/wheel_pid" for wheel in WHEELS]
     for node in tree.values():
         parameters = node["ros__parameters"]
         names = set(PidGains.__dataclass_fields__)

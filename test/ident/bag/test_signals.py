@@ -308,9 +308,7 @@ def test_messages_that_are_not_of_their_type_are_left_out_and_told(
     assert "2 messages are no smp_interfaces/msg/MotorState" in " ".join(record.notes)
 
 
-def test_what_a_bag_offers_is_listed_with_a_mapping_that_reads_it(
-    tmp_path: Path, corpus: SimpleNamespace
-) -> None:
+def test_what_a_bag_offers_is_listed(tmp_path: Path, corpus: SimpleNamespace) -> None:
     n = 30
     messages = in_order(
         floats(corpus, "/left/pwm", np.arange(n)),
@@ -325,11 +323,7 @@ def test_what_a_bag_offers_is_listed_with_a_mapping_that_reads_it(
     assert offers["/joint_states"].fields == ["velocity[left_wheel]", "velocity[right_wheel]"]
     assert offers["/temperature"].count == n
     assert offers["/temperature"].rate == pytest.approx(100.0)
-    assert "left.voltage=/left/pwm.data*12/255" in listing.suggestion
-    assert "right.velocity=/joint_states.velocity[right_wheel]" in listing.suggestion
-    records = read_records(path, listing.suggestion)
-    assert set(records) == {"left", "right"}
-    assert set(records["right"].velocity) == {2.0}
+    assert listing.suggestion == []  # no speed follows these voltages
 
 
 def test_our_own_messages_need_no_mapping(tmp_path: Path, corpus: SimpleNamespace) -> None:
