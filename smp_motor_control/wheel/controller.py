@@ -23,6 +23,9 @@ from smp_motor_control.wheel.loop import LoopSettings, WheelLoop
 
 _LARGEST_SETPOINT = 1e4
 _LEARNING = 20
+_EVIDENCE = 0.1
+"""Of a longer gap between samples no more counts against the wheel [s]: the driver may have
+switched off by its own time-out meanwhile."""
 _AT_REST = 0.05
 _FRESH, _FIRST, _LATE = Verdict.FRESH, Verdict.FIRST, Verdict.LATE
 
@@ -381,7 +384,8 @@ class WheelController:
             loop.start(measurement)
             detector.reset()
             self.output = 0.0
-        fault = detector.step(dt, self.output, measurement, current)
+        evidence = dt if dt < _EVIDENCE else _EVIDENCE
+        fault = detector.step(evidence, self.output, measurement, current)
         if fault is not None:
             return self._trip(fault, now)
         out = loop.step(setpoint, measurement, dt)
@@ -392,7 +396,8 @@ class WheelController:
         if recovery.cautious:
             voltage = recovery.limited(voltage, measurement, dt, self.settings.faults)
         saturated = voltage != out.unsaturated
-        fault = detector.follow(dt, loop.reference.velocity, measurement, voltage, saturated)
+        reference = loop.reference.velocity
+        fault = detector.follow(evidence, reference, measurement, voltage, saturated)
         if fault is not None:
             return self._trip(fault, now)
         self.output, self.answer = voltage, out
