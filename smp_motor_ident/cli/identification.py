@@ -148,7 +148,7 @@ def identify_wheel(
                 "record a longer excitation with several frequencies, in both directions"
             )
         )
-    notes = dict.fromkeys(note for record in (*records, *kept) for note in record.notes)
+    notes = dict.fromkeys(f.message for record in (*records, *kept) for f in record.findings)
     fitted, held_out = (records, kept) if kept else split(records)
     curves: list[tuple[Record, Role]] = [(record, "estimation") for record in fitted]
     curves += [(record, "validation") for record in held_out]
