@@ -51,7 +51,6 @@ class Outcome:
     estimate: Estimate | None = None
     comparisons: tuple[Comparison, ...] = ()
     failure: SmpError | None = None
-    notes: tuple[str, ...] = ()
 
     @property
     def exit_code(self) -> int:
@@ -148,11 +147,10 @@ def identify_wheel(
                 "record a longer excitation with several frequencies, in both directions"
             )
         )
-    notes = dict.fromkeys(f.message for record in (*records, *kept) for f in record.findings)
     fitted, held_out = (records, kept) if kept else split(records)
     curves: list[tuple[Record, Role]] = [(record, "estimation") for record in fitted]
     curves += [(record, "validation") for record in held_out]
-    return Outcome(found, tuple(_compare(found, *curve) for curve in curves), notes=tuple(notes))
+    return Outcome(found, tuple(_compare(found, *curve) for curve in curves))
 
 
 def _compare(found: Estimate, record: Record, role: Role) -> Comparison:
@@ -180,7 +178,6 @@ def _contents(outcomes: Mapping[str, Outcome], arguments: argparse.Namespace) ->
         estimates,
         {wheel: one.comparisons for wheel, one in outcomes.items()},
         {wheel: str(one.failure) for wheel, one in outcomes.items() if one.failure},
-        {wheel: one.notes for wheel, one in outcomes.items()},
         provenance,
     )
     document = identification_document(estimates)

@@ -32,8 +32,8 @@ from smp_motor_ident.diagnosis.limits import (
     IMPLIED_BIAS,
 )
 from smp_motor_ident.diagnosis.model_error import BLOCKS, Regression, regression
-from smp_motor_ident.estimation.answer import Answer
 from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.estimation.quantities import Answer
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model import structures as models

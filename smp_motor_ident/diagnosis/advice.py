@@ -19,8 +19,8 @@ from smp_motor_ident.diagnosis.limits import (
     UNEXPLAINED,
 )
 from smp_motor_ident.estimation import replay
-from smp_motor_ident.estimation.answer import Answer
 from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.estimation.quantities import Answer
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments

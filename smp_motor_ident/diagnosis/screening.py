@@ -122,11 +122,26 @@ def _excitation(records: Sequence[Record], where: str) -> None:
         and float(np.ptp(r.voltage)) < 10 * METER.value * abs(level)
         for r, level in zip(records, levels, strict=True)
     ]
-    if all(still) and float(np.ptp(levels)) < METER.value * abs(levels[0]):
+    if (
+        all(still)
+        and float(np.ptp(levels)) < METER.value * abs(levels[0])
+        and not any(_starts(r) for r in records)
+    ):
         raise InsufficientExcitationError(
             f"{where}: the voltage is constant at {levels[0]:.4g} V; a constant "
             "input cannot tell dynamics: record a square or Fourier voltage in both directions"
         )
+
+
+def _starts(record: Record) -> bool:
+    """Tell whether a speed rises under a constant voltage: a step before the first row."""
+    speed = measured_speed(record)
+    speed = np.abs(speed[np.isfinite(speed)])
+    tenth = max(speed.size // 10, 1)
+    steady = float(np.mean(speed[-tenth:]))
+    scatter = float(np.std(speed[-tenth:]))
+    first = float(np.mean(speed[: max(tenth // 10, 3)]))
+    return bool(speed.size >= FEWEST.value and steady - first > max(0.2 * steady, 6 * scatter))
 
 
 def measured_speed(record: Record) -> Array:

@@ -13,6 +13,7 @@ from smp_motor_ident.estimation.cold import cold_fit
 from smp_motor_ident.estimation.descent import Options
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.lateness import averaged, with_delay
+from smp_motor_ident.estimation.profile import RISE, one_level, rubbing
 from smp_motor_ident.estimation.thinning import thinned
 from smp_motor_ident.estimation.valley import shaken
 from smp_motor_ident.likelihood import recursion as rc
@@ -103,7 +104,7 @@ def _frictionless(
     if quick is None or not quick.converged or _friction_shows(head, quick, False):
         return []
     rungs = explore(data, plain, options, auto, say, quick if head is data else None)
-    if not rungs or _friction_shows(_of_kind(data, rungs[-1].fit), rungs[-1].fit, True):
+    if not rungs or _may_rub(_of_kind(data, rungs[-1].fit), rungs[-1].fit, options):
         return []
     reason = f"{rungs[-1].reason}; no Coulomb friction shows"
     return [*rungs[:-1], Rung(rungs[-1].fit, reason)]
@@ -119,6 +120,26 @@ def _friction_shows(data: Experiments, fit: Fit, surely_small: bool) -> bool:
     if not np.isfinite(found) or (found / std) ** 2 > 0.5 * np.log(fit.samples):
         return True
     return surely_small and found + 2 * std > LITTLE * float(np.abs(data.hold_value).max())
+
+
+def _may_rub(data: Experiments, fit: Fit, options: Options) -> bool:
+    """Tell whether a friction that is not little would explain the data as well.
+
+    The score at no friction does not tell: a motor that rests under a little friction is
+    driven by its offset under none.
+    """
+    if one_level(data, fit) or _friction_shows(data, fit, True):
+        return True
+    little = LITTLE * float(np.abs(data.hold_value).max())
+    z, initials = rubbing(data, fit, little)
+    held = {**fit.structure.held, "vc_plus": little}
+    rubs = fit.structure.with_(friction="symmetric", held=held)
+    other = min(
+        (descent.descend(data, rubs, rubs.complete(z), initial, fit.noise, fit.ratio, options, 12)
+         for initial in initials),
+        key=lambda f: f.deviance,
+    )  # fmt: skip
+    return other.deviance - fit.deviance < RISE * inflation(fit)
 
 
 def _of_kind(data: Experiments, fit: Fit) -> Experiments:
@@ -319,16 +340,13 @@ def _without_friction(data: Experiments, best: Fit, options: Options, rungs: lis
         z[models.VC_PLUS] = 1e-3 * np.abs(data.hold_value).max()
         again = descent.refine(data, s, plain, s.complete(z), options)
         best = min(best, again, key=lambda f: f.deviance)
-    cov = best.covariance()
-    i = s.free().index(models.VC_PLUS)
-    most = best.z[models.VC_PLUS] + 2 * float(np.sqrt(cov[i, i]))
-    # Friction that the data do not tell stays: leaving it out would make the gain certain.
-    if most < LITTLE * np.abs(data.hold_value).max() or plain.deviance < best.deviance:
-        # A descent that did not settle is no reason to believe in none.
-        gained = (plain.deviance - best.deviance) / inflation(best)
-        if gained <= float(np.log(best.samples)):
-            rungs.append(Rung(plain, "no Coulomb friction shows"))
-            return plain
+    # Friction that the data do not show stays where a little would explain them as well:
+    # leaving it out would make the gain certain.  A descent that did not settle is no reason
+    # to believe in none.
+    gained = (plain.deviance - best.deviance) / inflation(best)
+    if gained <= float(np.log(best.samples)) and not _may_rub(data, plain, options):
+        rungs.append(Rung(plain, "no Coulomb friction shows"))
+        return plain
     return best
 
 
