@@ -22,6 +22,7 @@ EXECUTABLES = (
     "tune",
     "commission",
     "demo",
+    "serial_driver",
 )
 
 
