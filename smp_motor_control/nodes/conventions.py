@@ -36,7 +36,7 @@ STREAM_PUBLISHER = QoSProfile(
 )
 """Commands, states, set-points: what is outdated by the next message.
 
-Who asks for a lease of a second or more is told within it that the process has died.
+Who asks for a lease of a second or more learns within it that the process has died.
 """
 
 STREAM_SUBSCRIBER = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)

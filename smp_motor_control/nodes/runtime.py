@@ -1,4 +1,4 @@
-"""What all nodes share: start, spin, stop with a zero command; and the door to the rest.
+"""What all nodes share: start, spin, stop with a zero command; and the way to the rest.
 
 A node's ``main`` is ``return run("name", lambda: TheNode(), argv)``.  The node may define
 ``on_stop()``, which :func:`run` calls before it destroys the node whatever the reason of
