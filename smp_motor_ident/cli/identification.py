@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from smp_motor_ident import bag
+from smp_motor_ident import bag, likelihood
 from smp_motor_ident.cli.frame import progress
 from smp_motor_ident.cli.identify import NAME
 from smp_motor_ident.cli.tables import console, estimate_table
@@ -40,6 +40,9 @@ from smp_motor_ident.report.document import (
 )
 from smp_motor_ident.report.series import Comparison, Role
 from smp_motor_ident.result import UNITS, Estimate
+
+COMPILED = Path(likelihood.__file__).parent / "__pycache__"
+"""Where numba keeps what it has compiled, unless NUMBA_CACHE_DIR says otherwise."""
 
 OUTPUTS = ("identification.json", "motors.yaml", "report.html")
 
@@ -71,6 +74,8 @@ def work(arguments: argparse.Namespace) -> int:
     paths = [Path(arguments.output) / name for name in OUTPUTS]
     check_free(paths, arguments.force)
     with progress(NAME, arguments.quiet) as say:
+        if not arguments.quiet and not any(COMPILED.glob("*.nbi")):
+            print(f"{NAME}: compiling for this machine, only this once ...", file=sys.stderr)
         say("reading")
         records = _read(arguments.bags, mapping, arguments.wheel)
         kept = _read(arguments.validate, mapping, list(records)) if arguments.validate else {}

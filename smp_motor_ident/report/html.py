@@ -221,7 +221,7 @@ def _alike(estimate: Estimate) -> list[tuple[str, str, str]]:
 
 
 def _ranked(candidates: Sequence[Candidate]) -> list[Candidate]:
-    """Order the rungs by their information criterion, those without one last."""
+    """Order the structures by their information criterion, those without one last."""
     return sorted(candidates, key=lambda c: (c.bic is None, c.bic or 0.0))
 
 

@@ -60,7 +60,7 @@ def model(name: str) -> str:
     Parameters
     ----------
     name : str
-        Rung of the ladder.
+        Of a candidate structure.
 
     Returns
     -------
@@ -168,7 +168,7 @@ def status(quantity: Quantity) -> str:
     str
         For the status column.
     """
-    words = {"estimated": "estimated", "fixed": "given", "unidentifiable": "cannot be told"}
+    words = {"estimated": "estimated", "fixed": "given", "unidentifiable": "not identifiable"}
     return words[quantity.status]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import yaml
 from browser import CHROMIUM, Browser
 from scipy.signal import lfilter
 
+from smp_motor_control.parameter_file import read_parameters
 from smp_motor_ident.errors import BagError, ParameterError
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.record import Hardware
@@ -145,7 +147,7 @@ def test_names_of_users_are_escaped(page: str) -> None:
 def test_page_tells_failures_warnings_and_unidentifiable_parameters(page: str) -> None:
     assert "voltage is constant; excite the motor" in page
     assert "look alike at 100 Hz" in page
-    assert page.count("cannot be told") >= len(PHYSICAL)
+    assert page.count("not identifiable") >= len(PHYSICAL)
 
 
 def test_every_colour_of_the_charts_is_a_variable_of_the_page(page: str) -> None:
@@ -229,6 +231,68 @@ def test_a_damaged_document_is_named_with_its_reason(
     path.write_text(text)
     with pytest.raises(BagError, match=reason) as error:
         read_identification(path)
+    assert str(path) in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("junk", [None, True, -1, 1e308, 10**400, "x", [], {}, [[]], {"a": {}}])
+def test_whatever_stands_anywhere_in_a_document_it_is_read_or_refused_in_a_line(
+    tmp_path: Path, junk: object
+) -> None:
+    whole = json.dumps(identification_document({"w": estimate()}))
+
+    def places(node: object, way: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
+        items = node.items() if isinstance(node, dict) else enumerate(node)  # type: ignore[call-overload]
+        for key, value in items:
+            yield (*way, key)
+            if isinstance(value, (dict, list)):
+                yield from places(value, (*way, key))
+
+    path = tmp_path / "identification.json"
+    for *way, last in places(json.loads(whole)):
+        document = node = json.loads(whole)
+        for key in way:
+            node = node[key]
+        node[last] = junk
+        path.write_text(json.dumps(document))
+        said = f"{path}: read"
+        try:
+            read_identification(path)
+        except BagError as error:
+            said = str(error)
+        assert said.startswith(f"{path}: ")
+        assert "\n" not in said
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"schema": 1, "motors": ' + '{"a":' * 100_000])
+def test_a_document_nested_without_end_is_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "identification.json").write_text(text)
+    with pytest.raises(BagError, match="is not JSON"):
+        read_identification(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("[" * 100_000, "nested"),
+        ("a: " * 3, "is not YAML"),
+        ("{" * 40 + "}" * 40, "nested|is not YAML"),
+        ("a: &a [x,x,x,x,x,x,x,x,x,x]\n" + "".join(
+            f"{chr(98 + k)}: &{chr(98 + k)} [{','.join([f'*{chr(97 + k)}'] * 10)}]\n"
+            for k in range(8)
+        ), "values"),
+        ("x" * 1_000_001, "larger"),
+        ("front_left: 3", "no ROS parameter file"),
+        ("\xff", "is not YAML"),
+    ],
+)  # fmt: skip
+def test_a_parameter_file_that_is_none_is_refused_in_a_line(
+    tmp_path: Path, text: str, reason: str
+) -> None:
+    path = tmp_path / "gains.yaml"
+    path.write_bytes(text.encode("latin-1"))
+    with pytest.raises(ParameterError, match=reason) as error:
+        read_parameters(path)
     assert str(path) in str(error.value)
     assert "\n" not in str(error.value)
 
