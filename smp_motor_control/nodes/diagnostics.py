@@ -20,16 +20,6 @@ OK, WARN, ERROR, STALE = (
 class Diagnostics:
     """Publishes a node's health on ``/diagnostics``, every second and at once on a change.
 
-    Parameters
-    ----------
-    node : rclpy.node.Node
-        Its full name is the status' name.
-    assess : callable
-        Returns ``(level, message, values)``: one of :data:`OK`, :data:`WARN`, :data:`ERROR`,
-        :data:`STALE`, a line for people, and a mapping of names to values.
-    hardware_id : str
-        Such as the joint's name.
-
     Attributes
     ----------
     due : bool

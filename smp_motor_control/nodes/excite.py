@@ -172,16 +172,5 @@ class Excite(Node):
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the node until the signal ends.
-
-    Parameters
-    ----------
-    argv : list of str, optional
-        Arguments; those of the process where None.
-
-    Returns
-    -------
-    int
-        Exit code.
-    """
+    """Run the node until the signal ends."""
     return runtime.run("excite", Excite, argv)

@@ -1,4 +1,4 @@
-"""What all nodes share: start, spin, stop with a zero command; and the door to the rest.
+"""What all nodes share: start, spin, stop with a zero command; and the entry point to the rest.
 
 A node's ``main`` is ``return run("name", lambda: TheNode(), argv)``.  The node may define
 ``on_stop()``, which :func:`run` calls before it destroys the node whatever the reason of
@@ -106,34 +106,12 @@ _stop = _Stop()
 
 
 def finish(exit_code: int = 0) -> None:
-    """End the node after the present callback, as a node that has done its work does.
-
-    Parameters
-    ----------
-    exit_code : int
-        Of the process.
-    """
+    """End the node after the present callback, as a node that has done its work does."""
     _stop.request(exit_code)
 
 
 def run(name: str, make: Callable[[], Node], argv: list[str] | None = None) -> int:
-    """Start a node, spin it until a signal, and stop it cleanly.
-
-    Parameters
-    ----------
-    name : str
-        Of the executable, for messages.
-    make : callable
-        Returns the node; called after ``rclpy.init``.
-    argv : list of str, optional
-        Arguments without the program's name; None takes those of the process.
-
-    Returns
-    -------
-    int
-        0 after a signal or :func:`finish`; 2 when the node refuses to start, with one line
-        on standard error; 1 after an unexpected exception.
-    """
+    """Start a node, spin it until a signal, and stop it cleanly."""
     global _stop
     _stop = stop = _Stop()
     # rclpy's own handlers would shut the context down, and with it the way to send a zero.

@@ -73,21 +73,7 @@ class Circumstances:
 
 
 def check(settings: LoopSettings, wheel: Circumstances | None = None) -> None:
-    """Refuse settings that no wheel should be driven with.
-
-    Parameters
-    ----------
-    settings : LoopSettings
-        Each value valid by itself.
-    wheel : Circumstances, optional
-        Nothing is known without.
-
-    Raises
-    ------
-    ParameterError
-        When a gain has a sign that drives away from the set-point or an absurd magnitude, when
-        the loop cannot be built or computed, or when it is unstable on the motor's model.
-    """
+    """Refuse settings that no wheel should be driven with."""
     wheel = wheel or Circumstances()
     _check_signs(settings.gains)
     settings = settings.within(wheel.supply)
@@ -138,8 +124,8 @@ def _model_at_wheel(
             return model, wheel.gearbox.ratio
         return (model, velocity * model.dc_gain) if velocity > 0.0 else None
     if velocity > 0.0 and acceleration > 0.0:
-        told = MotorModel(dc_gain=1.0 / velocity, time_constant=acceleration / velocity)
-        return replace(told, static_voltage=gains.feedforward_static), 1.0
+        implied = MotorModel(dc_gain=1.0 / velocity, time_constant=acceleration / velocity)
+        return replace(implied, static_voltage=gains.feedforward_static), 1.0
     return None
 
 

@@ -84,11 +84,6 @@ class WheelSettings:
 class WheelController:
     """Decides the voltage of one wheel.
 
-    Parameters
-    ----------
-    settings : WheelSettings
-        Changed later with :meth:`configure`.
-
     Attributes
     ----------
     state : State
@@ -135,34 +130,12 @@ class WheelController:
     # Settings ------------------------------------------------------------------------------
 
     def check(self, settings: WheelSettings) -> None:
-        """Refuse a change of settings with which this wheel should not be driven.
-
-        Parameters
-        ----------
-        settings : WheelSettings
-            Each value valid by itself.
-
-        Raises
-        ------
-        ParameterError
-            See :func:`~smp_motor_control.wheel.acceptance.check`.
-        """
+        """Refuse a change of settings with which this wheel should not be driven."""
         if settings.loop != self.settings.loop:
             check(settings.loop, self._wheel)
 
     def configure(self, settings: WheelSettings) -> None:
-        """Change the settings while running, without a jump of the voltage.
-
-        Parameters
-        ----------
-        settings : WheelSettings
-            Valid by construction.
-
-        Raises
-        ------
-        ParameterError
-            When the clamps leave nothing within the supply; nothing has changed.
-        """
+        """Change the settings while running, without a jump of the voltage."""
         self.loop.configure(settings.loop.within(self.supply))
         self.settings = settings
         self.advice = ""
@@ -178,22 +151,7 @@ class WheelController:
     def set_hardware(
         self, gearbox: Gearbox, encoder: Encoder, supply: float, resistance: float = math.nan
     ) -> None:
-        """Learn what is between motor and wheel.
-
-        Parameters
-        ----------
-        gearbox, encoder : Gearbox, Encoder
-            Of the wheel.
-        supply : float
-            [V].
-        resistance : float
-            Of the armature [ohm]; NaN where unknown.
-
-        Raises
-        ------
-        ParameterError
-            When the supply is not positive or excludes the clamps; nothing has changed.
-        """
+        """Learn what is between motor and wheel."""
         if not 0.0 < supply < math.inf:
             raise ParameterError(f"supply_voltage is {supply!r} V; it must be positive")
         self.settings.loop.within(supply)
@@ -239,17 +197,7 @@ class WheelController:
     # Events --------------------------------------------------------------------------------
 
     def take_setpoint(self, value: float, now: float, age: float = 0.0) -> None:
-        """Take in a set-point; one that is no number does not count as a sign of life.
-
-        Parameters
-        ----------
-        value : float
-            [rad/s].
-        now : float
-            [s].
-        age : float
-            Time since its stamp [s].
-        """
+        """Take in a set-point; one that is no number does not count as a sign of life."""
         if not -_LARGEST_SETPOINT <= value <= _LARGEST_SETPOINT:
             self.refuse("set-point that is not a number or absurd")
         elif age > self.settings.setpoint_timeout:
@@ -259,22 +207,7 @@ class WheelController:
             self._setpoint_at = now
 
     def take_feedback(self, sample: Sample, stamp: int, arrival: int, now: float) -> float | None:
-        """Take in a sample and answer it.
-
-        Parameters
-        ----------
-        sample : Sample
-            As the hardware reports it.
-        stamp, arrival : int
-            On the stamps' clock [ns].
-        now : float
-            [s].
-
-        Returns
-        -------
-        float or None
-            Voltage to command [V]; None where nothing is to be sent.
-        """
+        """Take in a sample, stamped and arrived at [ns]; return its answer [V] or None."""
         self.answer = None
         verdict = self.clock.accept(stamp, arrival)
         if verdict is not _FRESH:
@@ -305,18 +238,7 @@ class WheelController:
             return self._trip(Fault.COMPUTATION, now) if self.active else None
 
     def tick(self, now: float) -> float | None:
-        """Look for feedback that has ceased.
-
-        Parameters
-        ----------
-        now : float
-            [s].
-
-        Returns
-        -------
-        float or None
-            0 V while there is none; None where nothing is to be sent.
-        """
+        """Look for feedback that has ceased; return 0 V while there is none."""
         if self.clock.dt and len(self._intervals) < _LEARNING:
             self._learn(self.clock.dt)
         since = now - self.settings.feedback_timeout

@@ -26,13 +26,15 @@ def impossible(value: Array, *, steps_allowed: bool) -> NDArray[np.bool_]:
         return none
     x = value[sound]
     with np.errstate(over="ignore", invalid="ignore"):
-        away = np.abs(x - median_filter(x, 5, mode="nearest"))
         low, high = np.quantile(x, [0.01, 0.99])
         span = max(high - low, 1e-3 * max(abs(low), abs(high)))
+        step = np.abs(np.diff(x))
+        usual = float(np.quantile(step, 0.99))
+        if np.ptp(x) <= JUMP_SPAN.value * span and step.max() <= JUMP_STEP.value * usual:
+            return none
+        away = np.abs(x - median_filter(x, 5, mode="nearest"))
         bad = (away > JUMP_SPAN.value * span) & (span > 0)
         if not steps_allowed:
-            step = np.abs(np.diff(x))
-            usual = float(np.quantile(step, 0.99))
             both = np.zeros(x.size, bool)
             both[1:-1] = np.minimum(step[:-1], step[1:]) > JUMP_STEP.value * usual
             both[1:-1] &= np.diff(x)[:-1] * np.diff(x)[1:] < 0

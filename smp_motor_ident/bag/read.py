@@ -132,7 +132,8 @@ def read_recording(
 def one_line(recording: Recording) -> Iterator[None]:
     """Make one message of any error, which tells also what was found amiss before."""
     try:
-        yield
+        with np.errstate(all="ignore"):  # spoilt numbers may be of any size
+            yield
     except BagError as error:
         amiss = [f.message for f in recording.findings if f.message not in str(error)]
         raise BagError("; ".join([str(error), *amiss])) from None

@@ -116,7 +116,7 @@ def _answer(
     final = float(asked.fields["setpoint"][during[-1]])
     if abs(final - start) < LEAST_CHANGE:
         return None
-    told = step_figures(
+    figures = step_figures(
         time[inside] - begin, speed[inside] - start, np.zeros(inside.sum()), final - start
     )
-    return Answer(name, start, final, told.rise, told.settling, told.overshoot)
+    return Answer(name, start, final, figures.rise, figures.settling, figures.overshoot)

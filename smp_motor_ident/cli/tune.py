@@ -20,6 +20,7 @@ from smp_motor_ident.result import Estimate, Quantity
 from smp_motor_ident.tune import METHODS, Loop, compare, design_wheels, recommend
 from smp_motor_ident.tune.case import COMMON
 from smp_motor_ident.tune.curves import curves
+from smp_motor_ident.tune.exports import FORMATS, export
 from smp_motor_ident.tune.source import choose_source
 from smp_motor_ident.tune.writing import gains_document, gains_yaml, to_json
 
@@ -51,6 +52,8 @@ def _work(arguments: argparse.Namespace) -> int:
         raise ParameterError(
             f"--method is {arguments.method!r}; it must be one of {', '.join(METHODS)}"
         )
+    if arguments.export is not None:
+        return _export(arguments)
     files = _files(arguments)
     check_free(files, arguments.force)
     estimates = read_estimates(arguments.source)
@@ -110,6 +113,30 @@ def _choose_sources(
         chosen[wheel], why = choose_source(estimate, loops[wheel], **margins)
         lines.append(f"{wheel}: speed from {why}")
     return chosen, lines
+
+
+def _export(arguments: argparse.Namespace) -> int:
+    """Write, or print, gains for a loop that others run."""
+    target, output = FORMATS[arguments.export], arguments.output
+    if arguments.apply or arguments.compare:
+        raise ParameterError("--export goes without --apply and --compare")
+    if output is not None:
+        check_free([output], arguments.force)
+    arguments.rate = arguments.rate or target.rate
+    arguments.speed_source = "difference" if target.counts else "measured"
+    arguments.difference_window = arguments.difference_window or (1 if target.counts else None)
+    estimates = read_estimates(arguments.source)
+    loops = {wheel: loop_for(one, arguments) for wheel, one in estimates.items()}
+    targets = {n: getattr(arguments, n) for n in TARGETS if getattr(arguments, n) is not None}
+    with frame.progress("tune") as say:
+        say(f"designing for {target.title}")
+        text, _ = export(arguments.export, estimates, loops, **targets)
+    if output is None:
+        print(text, end="")
+    else:
+        write_together({output: text}, arguments.force)
+        print(f"written: {output}")
+    return 0
 
 
 def _apply_file(arguments: argparse.Namespace) -> int:

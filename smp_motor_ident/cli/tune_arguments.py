@@ -10,6 +10,7 @@ from smp_motor_ident.cli import frame
 from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune import METHODS, Loop
+from smp_motor_ident.tune.exports import FORMATS
 from smp_motor_ident.tune.loop import SPEED_SOURCES
 
 TARGETS = (
@@ -42,6 +43,10 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--output", type=Path, help="parameter file to write; gains.json and a figure go beside it"
     )
+    p.add_argument(
+        "--export", choices=tuple(FORMATS), metavar="FORMAT",
+        help="gains for a loop that others run, at its usual rate: " + ", ".join(FORMATS),
+    )  # fmt: skip
     p.add_argument("--method", default="margin", help=", ".join(METHODS))
     p.add_argument("--compare", action="store_true", help="show every method; take the recommended")
     loop = p.add_argument_group("the loop that will run")

@@ -72,8 +72,6 @@ def heterogeneous(data: Experiments, fit: Fit) -> tuple[Fit, dict[str, float]]:
     )
     if not changed.any():
         return fit, {}
-    step, cov = step[:, changed], cov[np.ix_(np.arange(parts), changed, changed)]
-    free = [i for i, c in zip(free, changed, strict=True) if c]
     ordered = len(data.starts) - 1 < FEWEST and parts >= ORDERED  # records are not a sequence
     between, freedom = _between(middle, step, cov.mean(axis=0), ordered)
     between = between * (t.ppf(0.975, freedom) / NORMAL_95) ** 2

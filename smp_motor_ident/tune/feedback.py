@@ -140,5 +140,9 @@ def spectral_radius(plant: Plant, feedback: Feedback) -> Array:
     ndarray, shape (n,)
         Below 1 where the loop is stable.
     """
-    eigenvalues = np.linalg.eigvals(closed_loop(plant, feedback))
+    A = closed_loop(plant, feedback)
+    if np.ndim(feedback.i) == 0 and feedback.i == 0.0:
+        # An integral that nothing feeds stays as it is, and belongs to no loop.
+        A = np.delete(np.delete(A, -2, axis=1), -2, axis=2)
+    eigenvalues = np.linalg.eigvals(A)
     return np.asarray(np.abs(eigenvalues).max(axis=1), dtype=np.float64)
