@@ -13,7 +13,7 @@ from smp_motor_ident.errors import BagError
 
 _LEAST = 50
 _SAMPLED = 5000
-"""Values that quantiles are taken of."""
+"""Values that quantiles and means are taken of."""
 
 
 def impossible(value: Array, *, steps_allowed: bool) -> NDArray[np.bool_]:
@@ -53,7 +53,8 @@ def is_unsigned(voltage: Series, current: Series) -> bool:
     and where it is negative cancel, but for an offset.
     """
     sound = np.isfinite(current.value)
-    time, amperes = current.time[sound], current.value[sound]
+    every = max(current.time.size // _SAMPLED, 1)
+    time, amperes = current.time[sound][::every], current.value[sound][::every]
     if time.size < _LEAST or voltage.time.size < 2:
         return False
     index = np.clip(np.searchsorted(voltage.time, time, "right") - 1, 0, voltage.time.size - 1)
