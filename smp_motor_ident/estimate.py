@@ -13,7 +13,7 @@ from smp_motor_ident.diagnosis.advice import advise, assess
 from smp_motor_ident.diagnosis.residuals import residual_tests
 from smp_motor_ident.diagnosis.screening import screen
 from smp_motor_ident.errors import InsufficientExcitationError, ParameterError, SignalError
-from smp_motor_ident.estimation import ladder
+from smp_motor_ident.estimation import flexible_shaft, ladder
 from smp_motor_ident.estimation.choice import Rung
 from smp_motor_ident.estimation.cold import cold_fit
 from smp_motor_ident.estimation.descent import Options, head, refine
@@ -101,6 +101,9 @@ def estimate(
     docs/derivations.md; Ljung, System Identification, 2nd ed., sections 7.4 and 9.
     """
     group = [records] if isinstance(records, Record) else list(records)
+    if model == flexible_shaft.NAME:
+        rigid = estimate(group, "second_order", fixed=fixed, loss=loss, progress=progress)
+        return flexible_shaft.flexible_shaft(group, rigid)
     say = progress or (lambda _: None)
     known = _checked(model, fixed, loss, group)
     _check_bounds(bounds or {}, model, group)

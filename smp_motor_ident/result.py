@@ -36,6 +36,8 @@ UNITS: Mapping[str, str] = {
     "load_voltage": "V",
     "steady_speed": "rad/s",
     "averaging_window": "s",
+    "resonance_frequency": "rad/s",
+    "resonance_damping": "1",
 }
 """Unit of every quantity that a model may report, at the motor shaft."""
 

@@ -21,7 +21,7 @@ from smp_motor_ident.bag.offers import Listing, Offer, offers_of
 from smp_motor_ident.bag.read import STATE, one_line, read_recording
 from smp_motor_ident.bag.source import Recording, recordings
 from smp_motor_ident.bag.storage import Array, found
-from smp_motor_ident.bag.tables import TIME_NAMES
+from smp_motor_ident.bag.tables import TIME_NAMES, time_unit
 from smp_motor_ident.bag.types import Types
 from smp_motor_ident.bag.units import check_unit
 from smp_motor_ident.diagnosis.limits import EXPLAINS
@@ -49,9 +49,6 @@ _HINTS = (
     ("voltage", r"pwm|throttle", ":pwm"),
     ("voltage", r"(?:^|_)m(?:illi)?v", ":mV"),
     ("current", r"(?:^|_)m(?:illi)?a(?:mp|$|_)", ":mA"),
-    ("time", r"ms|milli", ":ms"),
-    ("time", r"us|micro", ":us"),
-    ("time", r"ns|nano", ":ns"),
 )
 _SIDES = ("front", "rear", "back", "left", "right", "fl", "fr", "rl", "rr", "bl", "br")
 _MOST = 20_000
@@ -87,6 +84,8 @@ class _Candidate:
                 return f":{check_unit(self.role, written)}"
             except BagError:
                 pass
+        if self.role == "time":
+            return f":{unit}" if (unit := time_unit(self.path)) else ""
         hint = _hint(self.role, text)
         whole = self.value[np.isfinite(self.value)]
         if self.role == "voltage" and not hint and whole.size:

@@ -132,7 +132,8 @@ def read_recording(
 def one_line(recording: Recording) -> Iterator[None]:
     """Make one message of any error, which tells also what was found amiss before."""
     try:
-        yield
+        with np.errstate(all="ignore"):  # spoilt numbers may be of any size
+            yield
     except BagError as error:
         amiss = [f.message for f in recording.findings if f.message not in str(error)]
         raise BagError("; ".join([str(error), *amiss])) from None
@@ -148,7 +149,7 @@ _SPOILT = (
     ArithmeticError, AttributeError, LookupError, MemoryError, OSError, RecursionError,
     TypeError, ValueError, struct.error,
 )  # fmt: skip
-"""What spoilt bytes lead readers to: the user is told of the file, not of the code."""
+"""What spoilt bytes lead readers to: the message names the file, not the code."""
 
 
 def _scaled(progress: Progress, begin: float, part: float) -> Progress:
@@ -197,7 +198,7 @@ def _records(
 
 
 def _plans(recording: Recording, asked: SignalMap, channels: list[Channel]) -> dict[str, MotorMap]:
-    """Return the signals of every wheel, mapped by the user or told by our own messages."""
+    """Return the signals of every wheel, mapped by the user or given by our own messages."""
     topics = {channel.topic for channel in channels}
     if asked.has_signals:
         plans = {

@@ -61,8 +61,8 @@ def screen(records: Sequence[Record]) -> list[Finding]:
     _signs(records, where)
     for record in records:
         _offset(record)
-    notes = dict.fromkeys(note for record in records for note in record.notes)
-    return [*warnings, *(Finding("reading", "warning", note) for note in notes)]
+    read = [finding for record in records for finding in record.findings]
+    return [*warnings, *(f for k, f in enumerate(read) if f not in read[:k])]
 
 
 def _where(records: Sequence[Record]) -> str:

@@ -68,7 +68,7 @@ def test_four_wheels_at_a_kilohertz_are_recorded_without_a_lost_message(
         assert "lost" not in recorder.output
     records = read_records(bag)
     assert all(len(records[wheel]) == 2000 for wheel in WHEELS)
-    assert not any("missing" in note for note in records["front_left"].notes)
+    assert not any("missing" in f.message for f in records["front_left"].findings)
 
 
 def test_best_effort_messages_are_recorded_or_told_as_lost(
