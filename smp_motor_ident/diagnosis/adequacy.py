@@ -135,7 +135,7 @@ def _test(
         return _test(errors, effect, columns[:1], white) if len(columns) > 1 else None
     size = np.linalg.solve(normal, z.T @ e)
     left = e - z @ size
-    n, q = e.size, len(columns)
+    n, q = int(np.count_nonzero(e)), len(columns)  # rows without a measurement are zero
     variance = float(left @ left) / max(n - q, 1)
     blocks = int(errors.block[-1]) + 1 if errors.block.size else 0
     scores = np.stack([np.bincount(errors.block, z[:, j] * left, blocks) for j in range(q)], axis=1)

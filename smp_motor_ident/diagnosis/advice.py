@@ -12,8 +12,8 @@ from smp_motor_ident.diagnosis.limits import (
     FIT_HOLDS,
     FIT_INDEPENDENT,
     FRICTION_SHOWN,
+    IMPLIED_BIAS,
     RINGING,
-    SETTLED,
     SQUARE_LEVEL,
     STEADY,
     UNEXPLAINED,
@@ -224,7 +224,7 @@ def _ring(fit: Fit) -> float:
 
 
 def _unsettled(data: Experiments, fit: Fit) -> bool:
-    """Tell whether a further step would still move what is reported by half its uncertainty.
+    """Tell whether a further step would move what is reported beyond its interval.
 
     A descent may end at a kink, or along L/R beside the response, which nothing reports.  At a
     kink the linear step is long and yet leads uphill: only a way that lowers the sum of squares
@@ -234,12 +234,12 @@ def _unsettled(data: Experiments, fit: Fit) -> bool:
     free = np.array(fit.structure.free())
     reported = (free != models.TE) | fit.structure.current
     deviation = np.sqrt(np.diag(fit.covariance()))
-    if not np.any(np.abs(step) > SETTLED.value * deviation, where=reported):
+    if not np.any(np.abs(step) > IMPLIED_BIAS.value * deviation, where=reported):
         return False
     here = _least_squares(data, fit, fit.z)
     return any(
         _least_squares(data, fit, fit.z + share * fit.structure.matrix() @ step)
-        < here - SETTLED.value**2
+        < here - IMPLIED_BIAS.value**2
         for share in (1.0, 0.3, 0.1)
     )
 

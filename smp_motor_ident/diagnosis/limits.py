@@ -169,12 +169,6 @@ RINGING = Limit(
     "sampling between two swings still shows both",
     "test_findings.py",
 )
-SETTLED = Limit(
-    0.5,
-    "standard deviations",
-    "a further step of this size changes an interval's coverage by less than 5 %",
-    "test_findings.py",
-)
 STEADY = Limit(
     4.0,
     "time constants",
