@@ -117,7 +117,8 @@ class Campaign:
 
     def voltage(self) -> float:
         last = self.seen
-        return float(last[-1].voltage) if last else 0.0
+        # What acts at the instant; the mean voltage of a late sample holds the time before too.
+        return SUPPLY * float(last[-1].duty_cycle) if last else 0.0
 
     def drives(self) -> bool:
         return abs(self.true_speed() - self.speed) < 0.15 * abs(self.speed) + 0.05

@@ -4,14 +4,25 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from smp_motor_ident.bag.transport import TransportDelay
 from smp_motor_ident.cli import frame
 from smp_motor_ident.errors import ParameterError
-from smp_motor_ident.result import Estimate
-from smp_motor_ident.tune import METHODS, Loop
-from smp_motor_ident.tune.exports import FORMATS
-from smp_motor_ident.tune.loop import SPEED_SOURCES
+
+if TYPE_CHECKING:
+    from smp_motor_ident.bag.transport import TransportDelay
+    from smp_motor_ident.result import Estimate
+    from smp_motor_ident.tune import Loop
+
+# Names of what is loaded only after the arguments are understood; a test holds them to it.
+METHODS = (
+    "margin", "optimise", "pole_placement", "simc", "lambda", "amigo", "ziegler_nichols",
+    "tyreus_luyben", "relay",
+)  # fmt: skip
+FORMATS = (
+    "ros2_controllers", "linorobot2", "ros_arduino_bridge", "arduino_pid", "roboclaw", "wpilib",
+)  # fmt: skip
+SPEED_SOURCES = ("measured", "difference", "observer")
 
 TARGETS = (
     "phase_margin",
@@ -44,7 +55,7 @@ def parser() -> argparse.ArgumentParser:
         "--output", type=Path, help="parameter file to write; gains.json and a figure go beside it"
     )
     p.add_argument(
-        "--export", choices=tuple(FORMATS), metavar="FORMAT",
+        "--export", choices=FORMATS, metavar="FORMAT",
         help="gains for a loop that others run, at its usual rate: " + ", ".join(FORMATS),
     )  # fmt: skip
     p.add_argument("--method", default="margin", help=", ".join(METHODS))
@@ -112,6 +123,8 @@ def loop_for(
     estimate: Estimate, arguments: argparse.Namespace, measured: TransportDelay | None = None
 ) -> Loop:
     """Return the loop of one wheel: what the user says, else what the bag knew."""
+    from smp_motor_ident.tune import Loop
+
     hardware = estimate.hardware
     supply = _first(arguments.supply, hardware.supply_voltage)
     if supply is None:

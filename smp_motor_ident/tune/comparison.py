@@ -31,7 +31,7 @@ def compare(
     Returns
     -------
     dict of str to Design or DesignError
-        A method that cannot meet the demand is told by its error.
+        A method that cannot meet the demand is there as its error.
     """
     results: dict[str, Design | DesignError] = {}
     for name in METHODS if methods is None else methods:

@@ -91,12 +91,12 @@ def choose_source(estimate: Estimate, loop: Loop, **targets: Any) -> tuple[Loop,
             best = trial
     if best is None:
         return loop, "the reported speed: no source allows what is asked"
-    told = "; ".join(
+    compared = "; ".join(
         f"{t.name} allows i = {t.integral:.3g} V/rad at {1e3 * t.control_noise:.3g} mV of ripple"
         for t in (usual, longer, watched)
         if t is not None
     )
-    return best.loop, f"{best.name}: {told}"
+    return best.loop, f"{best.name}: {compared}"
 
 
 def _trial(estimate: Estimate, loop: Loop, targets: dict[str, Any]) -> Trial | None:

@@ -224,7 +224,7 @@ def _band(value: float, over: Sequence[float] | Array) -> Band:
 def _instants(problem: Problem, fb: Feedback, reference: Reference) -> Array:
     """Return the instants over which a change of set-point is simulated, until it is over."""
     T = problem.loop.sample_time
-    horizon = reference.transition_time + 8 * problem.reduced.time_constant
+    span = reference.transition_time + 8 * problem.reduced.time_constant
     if fb.i > 0:
-        horizon += 4 * (fb.p + 1 / problem.reduced.gain) / fb.i
-    return T * np.arange(min(max(int(horizon / T), 50), 20_000))
+        span += 4 * (fb.p + 1 / problem.reduced.gain) / fb.i
+    return T * np.arange(min(max(int(span / T), 50), 20_000))

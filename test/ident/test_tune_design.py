@@ -31,13 +31,13 @@ def combinations(row):
 def estimate(k=0, std=0.0, **more) -> Estimate:
     values = {**combinations(TABLE_1[k]), **more}
     covariance = np.diag([(std * x) ** 2 for x in values.values()])
-    told = {name: Quantity(value) for name, value in values.items()}
-    return Estimate("front_left", "second_order", {}, told, tuple(values), covariance)
+    known = {name: Quantity(value) for name, value in values.items()}
+    return Estimate("front_left", "second_order", {}, known, tuple(values), covariance)
 
 
 def of_parameters(row) -> Estimate:
-    told = {name: Quantity(value) for name, value in zip(PHYSICAL, row, strict=True)}
-    return Estimate("front_left", "electromechanical", told, {})
+    known = {name: Quantity(value) for name, value in zip(PHYSICAL, row, strict=True)}
+    return Estimate("front_left", "electromechanical", known, {})
 
 
 @pytest.mark.parametrize("k", range(4))

@@ -13,7 +13,8 @@ from smp_motor_control.motor.hardware import DriveSettings
 from smp_motor_control.motor.model import MotorModel
 from smp_motor_control.wheel.loop import LoopSettings
 from smp_motor_control.wheel.simulation import Timing, simulate_closed_loop
-from smp_motor_ident.cli.tune import main, read_estimates
+from smp_motor_ident.cli.tune import main
+from smp_motor_ident.cli.tuning import read_estimates
 from smp_motor_ident.tune import Loop, design
 from smp_motor_ident.tune.feedback import spectral_radius
 from smp_motor_ident.tune.motors import Motors, motors_of

@@ -64,8 +64,8 @@ class _Cost:
     def __init__(self, problem: Problem, start: Feedback) -> None:
         self.problem = problem
         T, model = problem.loop.sample_time, problem.reduced
-        horizon = 6 * (model.delay + model.time_constant)
-        self.time = T * np.arange(1, max(int(horizon / T), 40) + 1)
+        span = 6 * (model.delay + model.time_constant)
+        self.time = T * np.arange(1, max(int(span / T), 40) + 1)
         self.plants: dict[int, Plant] = {}
         speed = 0.3 * problem.loop.supply_voltage * model.gain
         self.step = np.full(self.time.size, speed)
