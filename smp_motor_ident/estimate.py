@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 from smp_motor_ident.diagnosis import validation as validate
 from smp_motor_ident.diagnosis.adequacy import adequacy, stated
 from smp_motor_ident.diagnosis.advice import advise, assess
+from smp_motor_ident.diagnosis.limits import CANDIDATE_WEIGHT
 from smp_motor_ident.diagnosis.residuals import residual_tests
 from smp_motor_ident.diagnosis.screening import screen
 from smp_motor_ident.errors import InsufficientExcitationError, ParameterError, SignalError
 from smp_motor_ident.estimation import flexible_shaft, ladder
+from smp_motor_ident.estimation.averaging import averaged, weights
 from smp_motor_ident.estimation.choice import Rung
 from smp_motor_ident.estimation.cold import cold_fit
 from smp_motor_ident.estimation.descent import Options, head, refine
@@ -40,6 +42,7 @@ Array = NDArray[np.float64]
 LOSSES = {"linear": np.inf, "huber": 2.0}
 FIXABLE = (*PHYSICAL, "delay", "averaging_window")
 WORST_FIT = 30.0
+LEAST_FIT = -100.0
 LARGEST_OFFSET = 0.1
 INSTANT = 0.01
 MANY = 400_000
@@ -129,6 +132,7 @@ def estimate(
     chosen, unseen = unseen_friction(final, blurred(final, chosen, _instants(group, hold)))
     chosen, change = heterogeneous(final, chosen)
     result = answer(chosen, known, unseen, _level(final))
+    result, alike = _covering(data, rungs, result, known)
     fitted = validate.speed_fit(group, final, chosen)
     _refuse(group, chosen, result, fitted)
     _refuse_offset(group, chosen)
@@ -140,7 +144,7 @@ def estimate(
         *assess(final, chosen, percent, tests),
         *adequacy(final, chosen, stated(chosen, result), group[0].hardware.gear_ratio, tests),
         *advise(chosen, result, known),
-        *_findings(result, change),
+        *_findings(result, change, alike),
     ]
     return Estimate(
         wheel=group[0].wheel,
@@ -169,8 +173,37 @@ def _level(data: Experiments) -> float:
     return float(np.copysign(np.median(np.abs(driven)), driven.sum()))
 
 
-def _findings(result: Answer, change: Mapping[str, float]) -> list[Finding]:
+def _covering(
+    data: Experiments, rungs: Sequence[Rung], result: Answer, known: Mapping[str, float]
+) -> tuple[Answer, dict[str, float]]:
+    """Return the answer over all structures that explain the data as well, and their weights."""
+    whole = [r for r in rungs[:-1] if r.whole and np.isfinite(r.fit.deviance)]
+    if not whole or result.level:
+        return result, {}
+    fits = [rungs[-1].fit, *(r.fit for r in whole)]
+    weight = weights(lambda fit: _for_final(data, fit), fits)
+    found = averaged(result, weight, [answer(f, known) for f in fits[1:]])
+    labels = [rungs[-1].label, *(r.label for r in whole)]
+    alike = {n: float(w) for n, w in zip(labels, weight, strict=True) if w > CANDIDATE_WEIGHT.value}
+    return found, alike if len(alike) > 1 else {}
+
+
+def _findings(
+    result: Answer, change: Mapping[str, float], alike: Mapping[str, float]
+) -> list[Finding]:
     out = []
+    if alike:
+        words = ", ".join(f"{name} ({100 * w:.0f} %)" for name, w in alike.items())
+        out.append(
+            Finding(
+                "structures_alike",
+                "note",
+                f"the data do not decide between {words}: values and intervals cover them all",
+                dict(alike),
+                "sample faster, and excite with sharp steps of several sizes: a delay, an averaged "
+                "speed and a second lag differ in the first samples after a step",
+            )
+        )
     if result.level:
         speed = result.combinations["steady_speed"]
         out.append(
@@ -421,6 +454,8 @@ def _candidates(
         last = n == len(rungs) - 1
         fit = chosen if last else rung.fit
         value = validate.speed_fit(group, _for_final(data, fit), fit)
+        if value < LEAST_FIT and not last:
+            value = float("nan")  # a descent that left the motor behind has no fit to speak of
         out.append(
             Candidate(
                 rung.label,

@@ -12,6 +12,8 @@ from smp_motor_ident.diagnosis.limits import JUMP_SPAN, JUMP_STEP, UNSIGNED_CURR
 from smp_motor_ident.errors import BagError
 
 _LEAST = 50
+_SAMPLED = 5000
+"""Values that quantiles and means are taken of."""
 
 
 def impossible(value: Array, *, steps_allowed: bool) -> NDArray[np.bool_]:
@@ -26,10 +28,11 @@ def impossible(value: Array, *, steps_allowed: bool) -> NDArray[np.bool_]:
         return none
     x = value[sound]
     with np.errstate(over="ignore", invalid="ignore"):
-        low, high = np.quantile(x, [0.01, 0.99])
+        some = x[:: max(x.size // _SAMPLED, 1)]
+        low, high = np.quantile(some, [0.01, 0.99])
         span = max(high - low, 1e-3 * max(abs(low), abs(high)))
         step = np.abs(np.diff(x))
-        usual = float(np.quantile(step, 0.99))
+        usual = float(np.quantile(step[:: max(x.size // _SAMPLED, 1)], 0.99))
         if np.ptp(x) <= JUMP_SPAN.value * span and step.max() <= JUMP_STEP.value * usual:
             return none
         away = np.abs(x - median_filter(x, 5, mode="nearest"))
@@ -50,7 +53,8 @@ def is_unsigned(voltage: Series, current: Series) -> bool:
     and where it is negative cancel, but for an offset.
     """
     sound = np.isfinite(current.value)
-    time, amperes = current.time[sound], current.value[sound]
+    every = max(current.time.size // _SAMPLED, 1)
+    time, amperes = current.time[sound][::every], current.value[sound][::every]
     if time.size < _LEAST or voltage.time.size < 2:
         return False
     index = np.clip(np.searchsorted(voltage.time, time, "right") - 1, 0, voltage.time.size - 1)

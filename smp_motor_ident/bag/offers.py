@@ -41,7 +41,7 @@ class Offer:
     fields : list of str
         Paths of its numbers, as a mapping takes them.
     remark : str
-        Why its fields cannot be told.
+        Why its fields are unknown.
     table : bool
         Whether it is of a file of columns.
     units : mapping of str to str
@@ -116,7 +116,7 @@ def offers_of(recording: Recording, types: Types, progress: Progress | None) -> 
 
 
 def _fields(types: Types, batch: Any) -> tuple[list[str], str]:
-    """Return the numeric fields of a batch's first message, or why they cannot be told."""
+    """Return the numeric fields of a batch's first message, or why they are unknown."""
     if batch.channel.encoding not in ("cdr", "ros1"):
         return [], f"encoded as {batch.channel.encoding}"
     try:

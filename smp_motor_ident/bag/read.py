@@ -149,7 +149,7 @@ _SPOILT = (
     ArithmeticError, AttributeError, LookupError, MemoryError, OSError, RecursionError,
     TypeError, ValueError, struct.error,
 )  # fmt: skip
-"""What spoilt bytes lead readers to: the user is told of the file, not of the code."""
+"""What spoilt bytes lead readers to: the message names the file, not the code."""
 
 
 def _scaled(progress: Progress, begin: float, part: float) -> Progress:
@@ -198,7 +198,7 @@ def _records(
 
 
 def _plans(recording: Recording, asked: SignalMap, channels: list[Channel]) -> dict[str, MotorMap]:
-    """Return the signals of every wheel, mapped by the user or told by our own messages."""
+    """Return the signals of every wheel, mapped by the user or given by our own messages."""
     topics = {channel.topic for channel in channels}
     if asked.has_signals:
         plans = {

@@ -74,7 +74,8 @@ def work(arguments: argparse.Namespace) -> int:
     paths = [Path(arguments.output) / name for name in OUTPUTS]
     check_free(paths, arguments.force)
     with progress(NAME, arguments.quiet) as say:
-        if not arguments.quiet and not any(COMPILED.glob("*.nbi")):
+        cold = not any(COMPILED.glob("*.nbi"))
+        if cold and not arguments.quiet:
             print(f"{NAME}: compiling for this machine, only this once ...", file=sys.stderr)
         say("reading")
         records = _read(arguments.bags, mapping, arguments.wheel)
@@ -83,7 +84,7 @@ def work(arguments: argparse.Namespace) -> int:
             wheel: partial(identify_wheel, group, kept.get(wheel, ()), arguments.model, fixed)
             for wheel, group in records.items()
         }
-        outcomes = in_parallel(jobs, say)
+        outcomes = in_parallel(jobs, say, cold)
         if any(outcome.estimate for outcome in outcomes.values()):
             say("writing the report")
             contents = _contents(outcomes, arguments)

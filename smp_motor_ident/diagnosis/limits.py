@@ -46,9 +46,9 @@ SEGMENTS = Limit(
     "test_segments.py: a motor that warms up",
 )
 SEGMENT_INFORMATION = Limit(
-    0.02,
+    0.25,
     "of the average part's",
-    "a part that knows a coordinate seven times worse than the others tells of its noise only",
+    "a part whose interval is more than twice the others' adds its noise, not the motor's change",
     "test_segments.py: parts without excitation do not count",
 )
 REST = Limit(
@@ -165,7 +165,7 @@ UNEXPLAINED = Limit(
 RINGING = Limit(
     1.5,
     "rad per sample",
-    "at pi a ringing cannot be told from a slower one; at half of that "
+    "at pi a ringing cannot be distinguished from a slower one; at half of that "
     "sampling between two swings still shows both",
     "test_findings.py",
 )
@@ -302,4 +302,10 @@ SPEED_NOISE = Limit(
     "four times this is 2 % of half the top speed: with more, counts shake the wheel out of the "
     "band in which the specification calls a change settled",
     "test/ident/test_tune_methods.py",
+)
+CANDIDATE_WEIGHT = Limit(
+    0.05,
+    "probability",
+    "a structure that explains the data best less often than that is rejected at the 5 % level",
+    "test_averaging.py: a lag that may be a delay",
 )

@@ -161,16 +161,20 @@ def _orders(
         if fitted is not None:
             tried.append(_no_worse(_of_kind(part, fitted), fitted, tried, options))
     tried = _from_richer(part, tried, options)
+    tried = _from_rivals(part, tried, options)
     least = min((f.deviance for f in tried), default=0.0)
     best: Fit | None = None
     for fitted in tried:
         if part is not data:
             if fitted.deviance > least + HOPELESS * inflation(fitted):
-                rungs.append(Rung(_projected(data, fitted), f"rejected on {part.size} samples"))
+                rungs.append(
+                    Rung(_projected(data, fitted), f"rejected on {part.size} samples", whole=False)
+                )
                 continue
             every = _of_kind(data, fitted)
             fitted = horizon.extend(every, fitted.structure, fitted, options)
             fitted = shaken(every, fitted.structure, fitted, options)
+            fitted = _no_worse(every, fitted, [r.fit for r in rungs if r.whole], options)
         if best is None:
             best = fitted
             rungs.append(Rung(fitted, "the simplest" if len(rungs) == 0 else "the simplest left"))
@@ -221,6 +225,41 @@ def _from_richer(data: Experiments, tried: list[Fit], options: Options) -> list[
             fit = min(fit, again, key=lambda f: f.deviance)
         out.append(fit)
     return out
+
+
+def _from_rivals(data: Experiments, tried: list[Fit], options: Options) -> list[Fit]:
+    """Start the likeliest from every rival's answer: what is late in one way may be in another."""
+    if len(tried) < 2:
+        return tried
+    best = min(range(len(tried)), key=lambda i: tried[i].deviance + _price(tried[i]))
+    out = list(tried)
+    for rival in tried:
+        winner = out[best]
+        if rival is winner or rival.kind != winner.kind:
+            continue
+        z = winner.structure.complete(_translated(rival, winner.structure, data.step))
+        again = descent.refine(_of_kind(data, winner), winner.structure, rival, z, options)
+        if again.deviance < winner.deviance:
+            out[best] = again
+    return out
+
+
+def _price(fit: Fit) -> float:
+    return size(fit.structure) * float(np.log(fit.samples))
+
+
+def _translated(rival: Fit, structure: Structure, step: float) -> models.Array:
+    """Return a rival's coordinates, what it is late by put into what the structure has."""
+    z, has = rival.z.copy(), rival.structure
+    late = z[models.DELAY] * has.delay
+    if has.order == 2 and structure.order == 1:
+        late += float(np.exp(z[models.A2] - z[models.A1]))
+    if structure.order == 2 and has.order == 1:
+        z[models.A2] = z[models.A1] + np.log(max(late, 0.1 * step))
+        z[models.TE] = z[models.A2] - z[models.A1]
+        late = 0.1 * step
+    z[models.DELAY] = max(late, 0.1 * step)
+    return z
 
 
 def _projected(data: Experiments, fit: Fit) -> Fit:

@@ -81,13 +81,13 @@ def profiled(data: Experiments, fit: Fit, options: Options) -> Fit:
 
 
 def one_level(data: Experiments, fit: Fit) -> bool:
-    """Tell whether the motor moves at one level of voltage only, either way.
+    """Tell whether the motor moves at one level of voltage only, along its motion.
 
     Then gain and friction trade exactly: with ``s = (v - F) / (v - F')`` the motor of s a0,
     s a1, s a2 and friction F' moves alike.
     """
     settled = fit if len(fit.initial) == len(data.initial) else replace(fit, initial=data.initial)
-    speed = np.abs(simulate(data, settled)[:, 0])
+    speed = simulate(data, settled)[:, 0]
     index = np.zeros(data.size, dtype=np.int64)
     for g, (a, b) in enumerate(zip(data.starts[:-1], data.starts[1:], strict=True)):
         first = int(data.hold_start[g])
@@ -96,7 +96,8 @@ def one_level(data: Experiments, fit: Fit) -> bool:
         ends = data.hold_end[first:last]
         within = np.searchsorted(ends, data.time[a:b] - 1e-9)
         index[a:b] = first + np.minimum(within, last - first - 1)
-    driven = np.abs(data.hold_value[index][speed > REST.value * speed.max()])
+    moving = np.abs(speed) > REST.value * np.abs(speed).max()
+    driven = (data.hold_value[index] * np.sign(speed))[moving]  # braking is another level
     level = float(np.median(driven)) if driven.size else 0.0
     return bool(np.all(np.abs(driven - level) <= SAME_LEVEL.value * level))
 

@@ -32,6 +32,7 @@ from smp_motor_ident.model import structures as models
 Array = NDArray[np.float64]
 
 FEWEST = 4  # parts of which a scatter can be taken
+ORDERED = 6  # parts of which a drift can be told from scatter
 LOOSE = 0.3  # e-folds, or of the value: a coordinate known worse from a part is left out
 COMPARED = [i for i in range(len(models.Z_NAMES)) if i != models.TE]
 
@@ -71,9 +72,8 @@ def heterogeneous(data: Experiments, fit: Fit) -> tuple[Fit, dict[str, float]]:
     )
     if not changed.any():
         return fit, {}
-    step, cov = step[:, changed], cov[np.ix_(np.arange(parts), changed, changed)]
-    free = [i for i, c in zip(free, changed, strict=True) if c]
-    between, freedom = _between(middle, step, cov.mean(axis=0), len(data.starts) - 1 < FEWEST)
+    ordered = len(data.starts) - 1 < FEWEST and parts >= ORDERED  # records are not a sequence
+    between, freedom = _between(middle, step, cov.mean(axis=0), ordered)
     between = between * (t.ppf(0.975, freedom) / NORMAL_95) ** 2
     added = np.zeros((len(fit.structure.free()),) * 2)
     added[np.ix_(free, free)] = between

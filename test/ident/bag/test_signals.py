@@ -337,8 +337,8 @@ def test_our_own_messages_need_no_mapping(tmp_path: Path, corpus: SimpleNamespac
     assert hardware.gear_ratio == corpus.RATIO
     assert hardware.counts_per_revolution == corpus.COUNTS
     assert (hardware.encoder_bits, hardware.supply_voltage, hardware.resistance) == (16, 12.0, None)
-    told = read_records(path, ["gear_ratio=10", "resistance=1.5"])["front_left"].hardware
-    assert (told.gear_ratio, told.resistance, told.encoder_bits) == (10.0, 1.5, 16)
+    given = read_records(path, ["gear_ratio=10", "resistance=1.5"])["front_left"].hardware
+    assert (given.gear_ratio, given.resistance, given.encoder_bits) == (10.0, 1.5, 16)
 
 
 def test_a_missing_description_is_told(tmp_path: Path, corpus: SimpleNamespace) -> None:

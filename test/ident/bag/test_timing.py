@@ -84,22 +84,22 @@ def test_shuffled_samples_are_sorted_and_that_is_told(
 @given(
     bits=st.sampled_from([8, 12, 16, 24, 31, 32, 48, 63, 64]),
     seed=st.integers(0, 2**32 - 1),
-    told=st.booleans(),
+    known=st.booleans(),
 )
-def test_a_counter_that_wraps_at_any_width_is_unwrapped(bits: int, seed: int, told: bool) -> None:
+def test_a_counter_that_wraps_at_any_width_is_unwrapped(bits: int, seed: int, known: bool) -> None:
     rng = np.random.default_rng(seed)
     # A motor's counts change smoothly, by at most a sixteenth of the range from sample to sample.
     speed = np.sin(np.arange(400) / rng.uniform(20, 60)) * 2.0 ** min(bits - 4, 40)
     truth = np.cumsum(speed.astype(np.int64)) + rng.integers(0, 2 ** min(bits - 1, 40))
     half = np.int64(64 - bits)
     raw = (truth << half) >> half
-    if not told and bits not in (16, 32):
+    if not known and bits not in (16, 32):
         return
-    found = unwrap(raw, bits if told else None)
+    found = unwrap(raw, bits if known else None)
     np.testing.assert_array_equal(found.count - found.count[0], truth - truth[0])
     assert found.resets.size == 0
     wrapped = bool((raw != truth - truth[0] + raw[0]).any())
-    if not told:
+    if not known:
         assert bool(found.findings) == wrapped
 
 
