@@ -1,8 +1,12 @@
 """Install rules of the ROS package (colcon builds it as ament_python)."""
 
+import os
 from glob import glob
+from pathlib import Path
 
 from setuptools import find_packages, setup
+from setuptools.command.build_py import build_py
+from setuptools.command.develop import develop
 
 NAME = "smp_motor_control"
 EXECUTABLES = (
@@ -18,7 +22,39 @@ EXECUTABLES = (
     "tune",
     "commission",
     "demo",
+    "serial_driver",
 )
+
+
+def require_messages() -> None:
+    """Refuse to install half of the repository: executables that would not find their messages."""
+    prefixes = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
+    found = any(Path(p, "share/smp_interfaces/package.xml").is_file() for p in prefixes if p)
+    if "COLCON" in os.environ and not found:
+        here = Path(__file__).resolve().parent
+        raise SystemExit(
+            "smp_interfaces is not built yet, and colcon does not look for it below this package; "
+            f"type: colcon build --base-paths {here} {here}/smp_interfaces"
+        )
+
+
+class BuildPy(build_py):
+    """As colcon build asks for."""
+
+    def run(self) -> None:
+        """Build what is whole."""
+        require_messages()
+        super().run()
+
+
+class Develop(develop):
+    """As colcon build --symlink-install asks for."""
+
+    def run(self) -> None:
+        """Link what is whole."""
+        require_messages()
+        super().run()
+
 
 setup(
     name=NAME,
@@ -29,14 +65,16 @@ setup(
     maintainer_email="maintainers@smp-motor-control.invalid",
     python_requires=">=3.10,<3.14",
     packages=find_packages(include=[f"{NAME}*", "smp_motor_ident*"]),
-    package_data={"": ["py.typed", "*.jinja", "*.css"]},
+    package_data={"": ["py.typed", "*.jinja", "*.css", "*.js", "LICENSE"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
-        (f"share/{NAME}", ["package.xml"]),
+        (f"share/{NAME}", ["package.xml", "LICENSE", "README.md", "CHANGELOG.rst"]),
         (f"share/{NAME}/launch", glob("launch/*.launch.py")),
         (f"share/{NAME}/config", glob("config/*")),
     ],
     install_requires=["setuptools"],
+    extras_require={"test": ["pytest", "hypothesis"]},  # by which colcon test runs pytest
+    cmdclass={"build_py": BuildPy, "develop": Develop},
     zip_safe=False,
     entry_points={
         "console_scripts": [f"{name} = {NAME}.entry:{name}" for name in EXECUTABLES],

@@ -15,9 +15,9 @@ import numpy as np
 from known_motors import CURRENT_NOISE, QUANTUM, TABLE_1, recording, table
 
 from smp_motor_ident.diagnosis.identifiability import structural
+from smp_motor_ident.diagnosis.limits import LOOSE_QUANTITY
 from smp_motor_ident.errors import SmpError
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.estimation.answer import LOOSE
 from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.likelihood.passes import NO_GAIN, evaluate
 from smp_motor_ident.model import structures as models
@@ -60,7 +60,7 @@ def theory(record, z, current: bool, known: tuple[str, ...]) -> tuple[bool, str]
     if known == ("resistance", "viscous_friction"):
         return False, "two roots"  # K^2 - a0 K + R b = 0
     std = least_certain(record, z, current, known)
-    return std < LOOSE, f"bound {std:.2g}"
+    return std < LOOSE_QUANTITY.value, f"bound {std:.2g}"
 
 
 def run(seconds: float = 12.0) -> Iterator[dict]:

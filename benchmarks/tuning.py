@@ -1,4 +1,4 @@
-"""Do the designed loops keep what they promise?  Every method, 4 + N motors, four rates.
+"""Do the designed loops keep the margins they require?  Every method, 4 + N motors, four rates.
 
     python benchmarks/tuning.py [--motors 200] [--jobs 2] [--rates 100 200] [--output FILE]
 
@@ -6,7 +6,7 @@ What was done already is read from FILE, a line of JSON for each motor and rate,
 again: the run may be ended and taken up.
 
 Each design is run by ``closed_loop``, which shares no code with the designer: counts, clamp and
-delay included.  A promised margin is confirmed by spending it: at 95 % of gain and delay margin
+delay included.  A margin is confirmed by spending it: at 95 % of gain and delay margin
 the simulated loop must still decay, at 105 % it must not.
 """
 
@@ -99,7 +99,7 @@ class Outcome:
     stable: bool = False
     gain_margin: bool = False
     delay_margin: bool = False
-    promise: bool = False
+    required: bool = False
     draws_stable: bool = False
     settling: float = np.nan
     overshoot: float = np.nan
@@ -216,11 +216,11 @@ def try_design(outcome: Outcome, motor, one: Design, conditions, estimate) -> No
         )
     else:
         outcome.delay_margin = True
-    promise = METHODS[outcome.method].promise
-    outcome.promise = (
-        m.phase >= 0.99 * promise.phase
-        and m.gain >= 0.99 * promise.gain
-        and m.sensitivity <= 1.01 * promise.sensitivity
+    required = METHODS[outcome.method].required
+    outcome.required = (
+        m.phase >= 0.99 * required.phase
+        and m.gain >= 0.99 * required.gain
+        and m.sensitivity <= 1.01 * required.sensitivity
     )
     outcome.load = load_step(motor, controller, conditions)
     draws = draw_motors(estimate, 5, np.random.default_rng(1))
@@ -262,14 +262,14 @@ def table(outcomes: list[Outcome]) -> None:
     """Print what came out."""
     head = "  ".join(
         f"{h:>9s}"
-        for h in ("designed", "stable", "gain mgn", "delay mgn", "promise", "draws", "ms/design")
+        for h in ("designed", "stable", "gain mgn", "delay mgn", "required", "draws", "ms/design")
     )
     for rate in sorted({o.rate for o in outcomes}):
         print(f"\n{rate:g} Hz{'':12s}{head}")
         for method in METHODS:
             of = [o for o in outcomes if o.rate == rate and o.method == method]
             done = [o for o in of if o.designed]
-            names = ("stable", "gain_margin", "delay_margin", "promise", "draws_stable")
+            names = ("stable", "gain_margin", "delay_margin", "required", "draws_stable")
             cells = [f"{len(done)}/{len(of)}"]
             cells += [f"{sum(getattr(o, n) for o in done)}" for n in names]
             cells.append(f"{1e3 * np.median([o.seconds for o in done]):.0f}" if done else "-")
@@ -282,11 +282,11 @@ def table(outcomes: list[Outcome]) -> None:
     )
     for rate in sorted({o.rate for o in outcomes}):
         for rule in ("simc", "ziegler_nichols"):
-            told = [o.faster[rule] for o in outcomes if o.rate == rate and o.faster]
+            found = [o.faster[rule] for o in outcomes if o.rate == rate and o.faster]
             for k, share in enumerate(SHARES):
-                row(rate, rule, f"{share:.0%}", np.array([t[k][0] for t in told]), 1.3,
-                    np.mean([t[k][1] >= 1.3 for t in told]))  # fmt: skip
-            row(rate, rule, "load", np.array([t[-1] for t in told]), 1.0, 1.0)
+                row(rate, rule, f"{share:.0%}", np.array([t[k][0] for t in found]), 1.3,
+                    np.mean([t[k][1] >= 1.3 for t in found]))  # fmt: skip
+            row(rate, rule, "load", np.array([t[-1] for t in found]), 1.0, 1.0)
 
 
 def row(rate, rule, name, ratios, enough, possible) -> None:
@@ -303,8 +303,8 @@ def known_and_unknown(rates) -> None:
     worst = 0.0
     for motor in TABLE_1.values():
         names = ("resistance", "inductance", "motor_constant", "inertia", "viscous_friction")
-        told = {name: Quantity(value) for name, value in zip(names, motor, strict=True)}
-        true = Estimate("motor", "electromechanical", told, {})
+        found = {name: Quantity(value) for name, value in zip(names, motor, strict=True)}
+        true = Estimate("motor", "electromechanical", found, {})
         # Only what voltage and speed tell; R, L, K, J and b stay unknown.
         known = replace(estimate_of(motor), covariance=np.zeros((3, 3)))
         for rate in rates:
@@ -361,7 +361,7 @@ def main() -> int:
     table(outcomes)
     known_and_unknown(arguments.rates)
     for o in outcomes:
-        held = o.stable and o.gain_margin and o.delay_margin and o.promise and o.draws_stable
+        held = o.stable and o.gain_margin and o.delay_margin and o.required and o.draws_stable
         if o.designed and not held:
             print(f"not held: {o}")
         elif not o.designed:

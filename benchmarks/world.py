@@ -1,4 +1,4 @@
-"""Recordings with the effects of real drives: right, told why, refused, or silently wrong.
+"""Recordings with the effects of real drives: right, named, refused, or silently wrong.
 
 An independent simulator (`world_motor`) records random motors with one of the effects of
 `world_effects` in one of three strengths; every estimate is held against the truth.  ``right``:
@@ -67,6 +67,12 @@ def errors(estimate, c: Case) -> dict[str, float]:
     return wrong
 
 
+def segments(time: np.ndarray) -> tuple[int, ...]:
+    """Return where the record begins anew: after gaps, as a reader of bags says."""
+    steps = np.diff(time)
+    return (0, *(int(k) + 1 for k in np.flatnonzero(steps > 10 * np.mean(steps))))
+
+
 def judge(job: tuple[int, int, int, bool]) -> tuple[int, str, str]:
     """Simulate and estimate one case; return effect, outcome and words."""
     number, level, seed, rich = job
@@ -85,7 +91,7 @@ def judge(job: tuple[int, int, int, bool]) -> tuple[int, str, str]:
         made = measure(c, rng)
         counted = c.signals.startswith("counts")
         record = Record(
-            "motor", **made, source="world",
+            "motor", **made, source="world", starts=segments(made["time"]),
             hardware=Hardware(c.motor.gear, c.turn if counted else None, 0, c.motor.supply, None),
         )  # fmt: skip
         e = estimate(record)

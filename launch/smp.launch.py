@@ -1,84 +1,98 @@
-"""Starts the robot: simulated motors or real ones, four wheel controllers, skid_steer.
+"""Starts a robot: simulated motors or real ones, a controller for each wheel, skid_steer.
 
-    ros2 launch smp_motor_control smp.launch.py                         # simulated
-    ros2 launch smp_motor_control smp.launch.py sim:=false gains:=gains.yaml
-    ros2 launch smp_motor_control smp.launch.py motors:=out/motors.yaml rate:=500.0
+    ros2 launch smp_motor_control smp.launch.py                                   # simulated
+    ros2 launch smp_motor_control smp.launch.py hardware:=external params_file:=gains.yaml
+    ros2 launch smp_motor_control smp.launch.py namespace:=robot1 left_wheels:=left \\
+        right_wheels:=right motors:=motors.yaml params_file:=gains.yaml
 
-With ``sim:=false`` something else must publish ``/<wheel>/motor_state``,
-``/<wheel>/motor_description`` and take ``/<wheel>/motor_command``.
+With ``hardware:=external`` something else must publish ``<wheel>/motor_state`` and
+``<wheel>/motor_description`` and take ``<wheel>/motor_command`` in the robot's namespace.
 """
 
-from launch.actions import DeclareLaunchArgument
-from launch.conditions import IfCondition
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
-from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
 from launch import LaunchDescription
-from smp_motor_control import WHEELS
+from smp_motor_control import LEFT, RIGHT
+from smp_motor_control.parameter_file import require_nodes
 
 PACKAGE = "smp_motor_control"
+CONFIG = [FindPackageShare(PACKAGE), "/config/"]
+
+ARGUMENTS = {
+    "namespace": ("", "Of the robot, such as robot1"),
+    "hardware": ("simulated", "simulated: motor_plant; external: your driver runs"),
+    "left_wheels": (",".join(LEFT), "Names of the left wheels"),
+    "right_wheels": (",".join(RIGHT), "Names of the right wheels"),
+    "params_file": ([*CONFIG, "gains.yaml"], "Parameters of the wheels: what tune writes"),
+    "body": ([*CONFIG, "skid_steer.yaml"], "Parameters of skid_steer"),
+    "motors": ([*CONFIG, "motors_paper.yaml"], "Motors of the simulation"),
+    "rate": ("200.0", "Samples per second of the simulation"),
+    "skid_steer": ("true", "Whether to start skid_steer"),
+    "use_stamped_vel": ("true", "Whether TwistStamped goes before Twist where both are published"),
+    "autostart": ("true", "Whether the wheels' controllers activate themselves"),
+    "use_sim_time": ("false", "Take the time from /clock"),
+    "log_level": ("info", "debug, info, warn, error"),
+}
+
+
+def start(context, *_) -> list:
+    """Return the nodes; what is wrong with the arguments stops the launch."""
+    given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
+    if given["hardware"] not in ("simulated", "external"):
+        raise RuntimeError(f"hardware is {given['hardware']!r}; it must be simulated or external")
+    sides = [
+        [name.strip() for name in given[side].split(",") if name.strip()]
+        for side in ("left_wheels", "right_wheels")
+    ]
+    robot = "/" + given["namespace"].strip("/") if given["namespace"].strip("/") else ""
+    wheels = [wheel for side in sides for wheel in side]
+    require_nodes(given["params_file"], [f"{robot}/{wheel}/wheel_pid" for wheel in wheels])
+    common = {"use_sim_time": is_true(given, "use_sim_time")}
+
+    def node(name: str, parameters: list, place: str = "", **more: object) -> Node:
+        return Node(
+            package=PACKAGE,
+            executable=name,
+            name=name,
+            namespace=f"{robot}{place}",
+            parameters=[*parameters, common],
+            arguments=["--ros-args", "--log-level", given["log_level"]],
+            output="screen",
+            **more,
+        )
+
+    autostart = {"autostart": is_true(given, "autostart")}
+    again = {"respawn": True, "respawn_delay": 0.5}
+    gains = [given["params_file"], autostart]
+    nodes = [node("wheel_pid", gains, f"/{wheel}", **again) for wheel in wheels]
+    if given["hardware"] == "simulated":
+        plant = {"motors_file": given["motors"], "rate": float(given["rate"])}
+        nodes.append(node("motor_plant", [plant]))
+    if is_true(given, "skid_steer"):
+        body = {
+            "left_wheel_names": sides[0],
+            "right_wheel_names": sides[1],
+            "use_stamped_vel": is_true(given, "use_stamped_vel"),
+        }
+        nodes.append(node("skid_steer", [given["body"], body]))
+    return nodes
+
+
+def is_true(given: dict, name: str) -> bool:
+    """Return a switch."""
+    value = given[name].lower()
+    if value not in ("true", "false"):
+        raise RuntimeError(f"{name} is {given[name]!r}; it must be true or false")
+    return value == "true"
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Return plant, wheels and skid_steer."""
-    share = [FindPackageShare(PACKAGE), "/config/"]
-    use_sim_time = {
-        "use_sim_time": ParameterValue(LaunchConfiguration("use_sim_time"), value_type=bool)
-    }
-    arguments = [
-        DeclareLaunchArgument("sim", default_value="true", description="Simulate the motors"),
-        DeclareLaunchArgument(
-            "motors",
-            default_value=[*share, "motors_paper.yaml"],
-            description="Motor file for the simulation",
-        ),
-        DeclareLaunchArgument(
-            "gains", default_value=[*share, "gains.yaml"], description="Parameters of wheel_pid"
-        ),
-        DeclareLaunchArgument(
-            "body",
-            default_value=[*share, "skid_steer.yaml"],
-            description="Parameters of skid_steer",
-        ),
-        DeclareLaunchArgument("rate", default_value="200.0", description="Samples per second"),
-        DeclareLaunchArgument("skid_steer", default_value="true", description="Start skid_steer"),
-        DeclareLaunchArgument("use_sim_time", default_value="false"),
+    """Return arguments and nodes."""
+    declared = [
+        DeclareLaunchArgument(name, default_value=default, description=description)
+        for name, (default, description) in ARGUMENTS.items()
     ]
-    plant = Node(
-        package=PACKAGE,
-        executable="motor_plant",
-        name="motor_plant",
-        parameters=[
-            {
-                "motors_file": LaunchConfiguration("motors"),
-                "rate": ParameterValue(LaunchConfiguration("rate"), value_type=float),
-            },
-            use_sim_time,
-        ],
-        condition=IfCondition(LaunchConfiguration("sim")),
-        output="screen",
-    )
-    wheels = [
-        Node(
-            package=PACKAGE,
-            executable="wheel_pid",
-            name="wheel_pid",
-            namespace=wheel,
-            parameters=[LaunchConfiguration("gains"), use_sim_time],
-            output="screen",
-            respawn=True,
-            respawn_delay=0.5,
-        )
-        for wheel in WHEELS
-    ]
-    body = Node(
-        package=PACKAGE,
-        executable="skid_steer",
-        name="skid_steer",
-        parameters=[LaunchConfiguration("body"), use_sim_time],
-        condition=IfCondition(LaunchConfiguration("skid_steer")),
-        output="screen",
-    )
-    return LaunchDescription([*arguments, plant, *wheels, body])
+    return LaunchDescription([*declared, OpaqueFunction(function=start)])

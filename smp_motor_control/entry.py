@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
 import os
 import sys
 from collections.abc import Callable
@@ -12,6 +12,14 @@ from collections.abc import Callable
 for _library in ("OPENBLAS", "MKL", "OMP"):
     os.environ.setdefault(f"{_library}_NUM_THREADS", "1")
 
+
+_PIP = {"yaml": "pyyaml", "mpl_toolkits": "matplotlib", "numba": "numba==0.61.2"}
+"""What pip calls a module otherwise."""
+
+_ROS = ("ament_index_python", "builtin_interfaces", "rcl_interfaces", "rpyutils")
+
+_OF_TOOLS = ("numpy", "scipy", "numba", "yaml", "rosbags", "mcap", "control", "msgspec", "rich")
+"""What a tool imports, some of it only while it works: looked for before it begins."""
 
 MOST_DOMAIN = 232
 """DDSI-RTPS 2.5, section 9.6.1.1: the ports of a higher domain lie beyond 65535."""
@@ -25,8 +33,23 @@ def _program(module: str, interrupted: int) -> Callable[[], int]:
             return importlib.import_module(module).main() or 0
         except KeyboardInterrupt:
             return interrupted
+        except ModuleNotFoundError as error:
+            if os.environ.get("SMP_DEBUG"):
+                raise
+            print(f"{module.rpartition('.')[2]}: {missing(error)}", file=sys.stderr)
+            return 2
 
     return run
+
+
+def missing(error: ModuleNotFoundError) -> str:
+    """Return what to do about a module that is not installed, in one line."""
+    name = (error.name or "").partition(".")[0]
+    if name == "smp_interfaces":
+        return "smp_interfaces is not built or not sourced; build both packages of the repository"
+    if name in ("rclpy", "launch", *_ROS) or name.endswith("_msgs"):
+        return f"{name} is not there; source ROS 2 Jazzy and the workspace, or setup.bash"
+    return f"the Python package {name} is not installed; type: pip install {_PIP.get(name, name)}"
 
 
 def node(name: str, package: str = "smp_motor_control") -> Callable[[], int]:
@@ -37,6 +60,10 @@ def node(name: str, package: str = "smp_motor_control") -> Callable[[], int]:
         if wrong := wrong_domain():
             print(f"{name}: {wrong}", file=sys.stderr)
             return 2
+        # Those of bags have arguments of their own, and their own help.
+        if name not in ("record", "play") and {"-h", "--help"} & set(sys.argv[1:]):
+            sys.argv[1:] = [f"{package}.nodes.{name}"]
+            return _program("smp_motor_control.nodes.usage", 0)()
         return program()
 
     return run
@@ -51,7 +78,16 @@ def wrong_domain() -> str:
 
 
 def _tool(name: str) -> Callable[[], int]:
-    return _program(f"smp_motor_ident.cli.{name}", 130)
+    program = _program(f"smp_motor_ident.cli.{name}", 130)
+
+    def run() -> int:
+        for module in _OF_TOOLS:
+            if importlib.util.find_spec(module) is None:
+                print(f"{name}: {missing(ModuleNotFoundError(name=module))}", file=sys.stderr)
+                return 2
+        return program()
+
+    return run
 
 
 wheel_pid = node("wheel_pid")
@@ -59,6 +95,7 @@ motor_plant = node("motor_plant")
 skid_steer = node("skid_steer")
 teleop_wheels = node("teleop_wheels")
 excite = node("excite")
+serial_driver = node("serial_driver")
 record = node("record", "smp_motor_ident")
 play = node("play", "smp_motor_ident")
 identifier = node("identifier", "smp_motor_ident")

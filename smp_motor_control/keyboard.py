@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from smp_motor_control import WHEELS
@@ -103,6 +103,8 @@ class Keyboard:
     ----------
     speeds : Speeds
         At the start.
+    wheel_names : sequence of str
+        In the order of the keys 1, 2, ...
 
     Attributes
     ----------
@@ -118,10 +120,11 @@ class Keyboard:
 
     SLOWEST, FASTEST = 0.1, 4.0
 
-    def __init__(self, speeds: Speeds) -> None:
+    def __init__(self, speeds: Speeds, wheel_names: Sequence[str] = WHEELS) -> None:
         self.speeds = speeds
+        self.wheel_names = tuple(wheel_names)
         self.body_mode = True
-        self.selected = set(WHEELS)
+        self.selected = set(self.wheel_names)
         self.scale = 1.0
         self.quitting = False
         self._held = ""
@@ -151,9 +154,9 @@ class Keyboard:
         elif key == "x":
             self.quitting = True
         elif not self.body_mode and key == "0":
-            self.selected = set(WHEELS)
-        elif not self.body_mode and key in ("1", "2", "3", "4"):
-            self.selected = {WHEELS[int(key) - 1]}
+            self.selected = set(self.wheel_names)
+        elif not self.body_mode and key in "123456789"[: len(self.wheel_names)]:
+            self.selected = {self.wheel_names[int(key) - 1]}
 
     def driving(self, now: float) -> bool:
         """Tell whether a motion key is held.
@@ -204,4 +207,4 @@ class Keyboard:
         """
         share = WHEEL_KEYS.get(self._held, 0.0) if self.driving(now) else 0.0
         speed = share * self.scale * self.speeds.wheel
-        return {wheel: speed if wheel in self.selected else 0.0 for wheel in WHEELS}
+        return {wheel: speed if wheel in self.selected else 0.0 for wheel in self.wheel_names}

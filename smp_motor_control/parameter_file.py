@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -120,3 +120,29 @@ def flat(tree: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:
         inner = isinstance(value, Mapping)
         found.update(flat(value, f"{prefix}{name}.") if inner else {f"{prefix}{name}": value})
     return found
+
+
+def require_nodes(path: str | Path, nodes: Iterable[str]) -> None:
+    """Refuse a parameter file that says nothing to a node: it would run on its defaults.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file; names in it may hold ``*`` for one part and ``**`` for any number.
+    nodes : iterable of str
+        Full names.
+
+    Raises
+    ------
+    ParameterError
+        As :func:`read_parameters`, and with the nodes that no name in the file fits.
+    """
+    names = list(read_parameters(path))
+    patterns = [
+        re.escape(name).replace(r"/\*\*", r"(/\w+)*").replace(r"\*", r"\w+") for name in names
+    ]
+    alone = [node for node in nodes if not any(re.fullmatch(one, node) for one in patterns)]
+    if alone:
+        raise ParameterError(
+            f"{path}: says nothing to {', '.join(alone)}; it has {', '.join(names)}"
+        )

@@ -21,7 +21,7 @@ OPTIONS: dict[str, Any] = {
 def _stamp() -> tuple[tuple[int, int], ...]:
     """Return what changes when a module does whose functions are compiled into each other."""
     here = Path(__file__)
-    folders = (here.parent / name for name in ("likelihood", "model", "tune"))
+    folders = (here.parent / name for name in ("likelihood", "model"))
     files = [here, *(file for folder in folders for file in sorted(folder.glob("*.py")))]
     return tuple((file.stat().st_mtime_ns, file.stat().st_size) for file in files)
 

@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 from smp_motor_ident.diagnosis import validation as validate
 from smp_motor_ident.diagnosis.adequacy import adequacy, stated
 from smp_motor_ident.diagnosis.advice import advise, assess
+from smp_motor_ident.diagnosis.limits import CANDIDATE_WEIGHT
 from smp_motor_ident.diagnosis.residuals import residual_tests
 from smp_motor_ident.diagnosis.screening import screen
 from smp_motor_ident.errors import InsufficientExcitationError, ParameterError, SignalError
-from smp_motor_ident.estimation import ladder
-from smp_motor_ident.estimation.answer import Answer, answer
+from smp_motor_ident.estimation import flexible_shaft, ladder
+from smp_motor_ident.estimation.averaging import averaged, weights
 from smp_motor_ident.estimation.choice import Rung
 from smp_motor_ident.estimation.cold import cold_fit
 from smp_motor_ident.estimation.descent import Options, head, refine
@@ -23,7 +24,11 @@ from smp_motor_ident.estimation.horizon import extend, grow
 from smp_motor_ident.estimation.nuisance import blurred, unseen_friction
 from smp_motor_ident.estimation.profile import profiled
 from smp_motor_ident.estimation.quantisation import widened
+from smp_motor_ident.estimation.quantities import Answer, answer
+from smp_motor_ident.estimation.segments import heterogeneous
+from smp_motor_ident.estimation.subset import excited
 from smp_motor_ident.estimation.thinning import thinned
+from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments, prepare
 from smp_motor_ident.likelihood.hold import between_samples
@@ -37,9 +42,11 @@ Array = NDArray[np.float64]
 LOSSES = {"linear": np.inf, "huber": 2.0}
 FIXABLE = (*PHYSICAL, "delay", "averaging_window")
 WORST_FIT = 30.0
+LEAST_FIT = -100.0
 LARGEST_OFFSET = 0.1
 INSTANT = 0.01
 MANY = 400_000
+MANY_TO_PROFILE = 20_000  # samples above which as few are followed as tell the same
 FAR = 100.0  # deviance on the head by which a way of holding the command is out
 
 
@@ -97,10 +104,14 @@ def estimate(
     docs/derivations.md; Ljung, System Identification, 2nd ed., sections 7.4 and 9.
     """
     group = [records] if isinstance(records, Record) else list(records)
+    if model == flexible_shaft.NAME:
+        rigid = estimate(group, "second_order", fixed=fixed, loss=loss, progress=progress)
+        return flexible_shaft.flexible_shaft(group, rigid)
     say = progress or (lambda _: None)
     known = _checked(model, fixed, loss, group)
     _check_bounds(bounds or {}, model, group)
     findings = screen(group)
+    group = [excited(r) for r in group]
     use_current = _has_current(group) and model in ("auto", "electromechanical")
     base = _structure(model, use_current, known, group)
     hold, first = _hold(group, base, LOSSES[loss], say)
@@ -116,9 +127,12 @@ def estimate(
         )
     chosen = _constrain(_for_final(data, rungs[-1].fit), rungs[-1].fit, options, known, bounds)
     final = _for_final(data, chosen)
-    chosen = profiled(final, widened(final, chosen), options)
+    few = thinned(final) if final.size > MANY_TO_PROFILE else final
+    chosen = profiled(few, widened(final, chosen), options)
     chosen, unseen = unseen_friction(final, blurred(final, chosen, _instants(group, hold)))
-    result = answer(chosen, known, unseen)
+    chosen, change = heterogeneous(final, chosen)
+    result = answer(chosen, known, unseen, _level(final))
+    result, alike = _covering(data, rungs, result, known)
     fitted = validate.speed_fit(group, final, chosen)
     _refuse(group, chosen, result, fitted)
     _refuse_offset(group, chosen)
@@ -130,6 +144,7 @@ def estimate(
         *assess(final, chosen, percent, tests),
         *adequacy(final, chosen, stated(chosen, result), group[0].hardware.gear_ratio, tests),
         *advise(chosen, result, known),
+        *_findings(result, change, alike),
     ]
     return Estimate(
         wheel=group[0].wheel,
@@ -145,9 +160,75 @@ def estimate(
         samples=data.size,
         duration=float(sum(r.duration for r in group)),
         sample_time=data.step,
+        largest_voltage=max(float(np.abs(r.voltage).max()) for r in group),
         sources=tuple(dict.fromkeys(r.source for r in group if r.source)),
         hardware=group[0].hardware,
     )
+
+
+def _level(data: Experiments) -> float:
+    """Return the voltage [V] at which the motor was driven longest."""
+    value = np.abs(data.hold_value)
+    driven = data.hold_value[value > 0.5 * value.max()]
+    return float(np.copysign(np.median(np.abs(driven)), driven.sum()))
+
+
+def _covering(
+    data: Experiments, rungs: Sequence[Rung], result: Answer, known: Mapping[str, float]
+) -> tuple[Answer, dict[str, float]]:
+    """Return the answer over all structures that explain the data as well, and their weights."""
+    whole = [r for r in rungs[:-1] if r.whole and np.isfinite(r.fit.deviance)]
+    if not whole or result.level:
+        return result, {}
+    fits = [rungs[-1].fit, *(r.fit for r in whole)]
+    weight = weights(lambda fit: _for_final(data, fit), fits)
+    found = averaged(result, weight, [answer(f, known) for f in fits[1:]])
+    labels = [rungs[-1].label, *(r.label for r in whole)]
+    alike = {n: float(w) for n, w in zip(labels, weight, strict=True) if w > CANDIDATE_WEIGHT.value}
+    return found, alike if len(alike) > 1 else {}
+
+
+def _findings(
+    result: Answer, change: Mapping[str, float], alike: Mapping[str, float]
+) -> list[Finding]:
+    out = []
+    if alike:
+        words = ", ".join(f"{name} ({100 * w:.0f} %)" for name, w in alike.items())
+        out.append(
+            Finding(
+                "structures_alike",
+                "note",
+                f"the data do not decide between {words}: values and intervals cover them all",
+                dict(alike),
+                "sample faster, and excite with sharp steps of several sizes: a delay, an averaged "
+                "speed and a second lag differ in the first samples after a step",
+            )
+        )
+    if result.level:
+        speed = result.combinations["steady_speed"]
+        out.append(
+            Finding(
+                "one_level",
+                "warning",
+                f"of gain and static voltage only the steady speed at {result.level:.3g} V is "
+                f"known, {speed.value:.4g} rad/s: every pair with this product "
+                "dc_gain (voltage - static_voltage) moves the motor alike",
+                {"voltage": result.level, "steady_speed": speed.value},
+                "record two levels of voltage, or a reversal, to know gain and friction apart",
+            )
+        )
+    if change:
+        out.append(
+            Finding(
+                "motor_changes",
+                "note",
+                "parts of the recordings differ by more than their noise (temperature, friction): "
+                "the intervals are those of another recording of this motor",
+                dict(change),
+                "let the motor warm up, or record on several days, to know how much it changes",
+            )
+        )
+    return out
 
 
 def _where(group: Sequence[Record]) -> str:
@@ -373,6 +454,8 @@ def _candidates(
         last = n == len(rungs) - 1
         fit = chosen if last else rung.fit
         value = validate.speed_fit(group, _for_final(data, fit), fit)
+        if value < LEAST_FIT and not last:
+            value = float("nan")  # a descent that left the motor behind has no fit to speak of
         out.append(
             Candidate(
                 rung.label,

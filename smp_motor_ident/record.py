@@ -132,11 +132,6 @@ class Record:
         return int(self.time.size)
 
     @property
-    def notes(self) -> tuple[str, ...]:
-        """The messages of the findings."""
-        return tuple(finding.message for finding in self.findings)
-
-    @property
     def duration(self) -> float:
         """Length of the record [s]."""
         return float(self.time[-1] - self.time[0])

@@ -34,7 +34,10 @@ UNITS: Mapping[str, str] = {
     "static_voltage": "V",
     "static_voltage_reverse": "V",
     "load_voltage": "V",
+    "steady_speed": "rad/s",
     "averaging_window": "s",
+    "resonance_frequency": "rad/s",
+    "resonance_damping": "1",
 }
 """Unit of every quantity that a model may report, at the motor shaft."""
 
@@ -50,7 +53,7 @@ class Quantity:
     std : float or None
         Standard deviation; None where value is None or the user fixed it.
     ci95 : tuple of float or None
-        95 % confidence interval.
+        95 % confidence interval; of an unidentifiable combination what the data leave open.
     unit : str
         SI unit.
     status : {'estimated', 'fixed', 'unidentifiable'}
@@ -117,7 +120,8 @@ class Estimate:
         Physical parameters at the motor shaft, with ``unidentifiable`` ones listed as such.
     combinations : mapping of str to Quantity
         What voltage and speed alone tell: ``dc_gain``, ``time_constant``,
-        ``time_constant_product``, ``static_voltage``, ``delay`` as far as the model has them.
+        ``time_constant_product``, ``static_voltage``, ``delay`` as far as the model has them;
+        ``steady_speed`` at one voltage (in the finding ``one_level``) where that alone is known.
     names : tuple of str
         Quantities that ``covariance`` is about, in its order.
     covariance : ndarray, shape (p, p)
@@ -137,6 +141,7 @@ class Estimate:
     samples: int = 0
     duration: float = 0.0
     sample_time: float = 0.0
+    largest_voltage: float = 0.0
     sources: tuple[str, ...] = ()
     hardware: Hardware = Hardware()
 
@@ -263,6 +268,7 @@ class Estimate:
             "samples": self.samples,
             "duration": _number(self.duration),
             "sample_time": _number(self.sample_time),
+            "largest_voltage": _number(self.largest_voltage),
             "sources": list(self.sources),
             "hardware": {
                 "gear_ratio": _number(hardware.gear_ratio),

@@ -16,6 +16,12 @@ from typing import IO
 
 import pytest
 
+# Where the workspace's setup was sourced (colcon test), its executables are not on PATH.
+for _prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
+    _bin = Path(_prefix, "lib", "smp_motor_control")
+    if _prefix and _bin.is_dir() and str(_bin) not in os.environ["PATH"].split(os.pathsep):
+        os.environ["PATH"] = f"{_bin}{os.pathsep}{os.environ['PATH']}"
+
 # DDS derives UDP ports from the domain; up to 101 they stay below those that Linux hands out.
 DOMAINS = range(1, 102)
 

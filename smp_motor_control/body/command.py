@@ -14,7 +14,7 @@ class Verdict(Enum):
     ACCEPTED = "accepted"
     ZERO_STAMP = "accepted; its stamp is zero, taken as now"
     STALE = "dropped: older than the time-out when it arrived"
-    NOT_FINITE = "not finite: the command before it is kept"
+    NOT_FINITE = "not finite: dropped"
 
 
 class BodyCommand:
@@ -29,8 +29,8 @@ class BodyCommand:
     -----
     Age is counted on a steady clock from the arrival, plus the age that the command had then
     by its stamp, so that a jump of the wall clock or a stamp from the future cannot keep
-    wheels turning.  A command that is not finite counts as a sign of life, as in
-    diff_drive_controller.
+    wheels turning.  A command that is not finite is no sign of life: the body brakes after the
+    ordinary time-out (diff_drive_controller drives on for as long as such messages come).
     """
 
     def __init__(self, timeout: float = 0.5) -> None:

@@ -1,4 +1,4 @@
-"""Kinematics of a body on four wheels that steers by skidding.
+"""Kinematics of a body on two sides of wheels that steers by skidding.
 
 ``left = (v - w B/2) / (r m_left)``, ``right = (v + w B/2) / (r m_right)`` with the effective
 separation ``B = wheel_separation * wheel_separation_multiplier``; angles counter-clockwise.
@@ -8,11 +8,9 @@ Odometry, speed limits, commands and heading are in modules of their own and off
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import NamedTuple
 
-from smp_motor_control import WHEELS
 from smp_motor_control.body.command import BodyCommand, Verdict
 from smp_motor_control.body.heading import HeadingHold
 from smp_motor_control.body.odometry import Odometry, PoseCovariance
@@ -20,8 +18,6 @@ from smp_motor_control.body.speed_limiter import RateLimiter, SpeedLimiter
 from smp_motor_control.errors import ParameterError
 
 __all__ = [
-    "LEFT",
-    "RIGHT",
     "BodyCommand",
     "HeadingHold",
     "Odometry",
@@ -32,9 +28,6 @@ __all__ = [
     "SpeedLimiter",
     "Verdict",
 ]
-
-LEFT = tuple(wheel for wheel in WHEELS if wheel.endswith("left"))
-RIGHT = tuple(wheel for wheel in WHEELS if wheel.endswith("right"))
 
 
 class SideSpeeds(NamedTuple):
@@ -151,9 +144,3 @@ class SkidSteer:
         """
         share = self.reachable_share(linear, angular)
         return self.wheel_speeds(linear * share, angular * share)
-
-
-def side_mean(values: Mapping[str, float], side: Sequence[str]) -> float:
-    """Return the mean over the wheels of a side that are known."""
-    known = [values[wheel] for wheel in side if math.isfinite(values.get(wheel, math.nan))]
-    return sum(known) / len(known) if known else math.nan

@@ -171,6 +171,30 @@ class Odometry:
         self.angular = sum(w for _, w in self._velocities) / count
         return True
 
+    def update_from_travel(
+        self, left: float, right: float, left_speed: float, right_speed: float
+    ) -> bool:
+        """Integrate how far both sides turned, and take their speeds as they are.
+
+        Parameters
+        ----------
+        left, right : float
+            Since the step before [rad].
+        left_speed, right_speed : float
+            Now [rad/s].
+
+        Returns
+        -------
+        bool
+            False where a number is not finite: nothing has changed.
+        """
+        if not math.isfinite(abs(left) + abs(right) + abs(left_speed) + abs(right_speed)):
+            return False
+        self._integrate(left * self._left, right * self._right)
+        left, right = left_speed * self._left, right_speed * self._right
+        self.linear, self.angular = (left + right) / 2.0, (right - left) / self._separation
+        return True
+
     def update_from_position(self, left: float, right: float, dt: float) -> bool:
         """Integrate the difference of wheel positions to those of the step before."""
         if not (LEAST_STEP <= dt < math.inf and math.isfinite(left) and math.isfinite(right)):

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 LONGEST_GUESS = 0.1
@@ -28,23 +29,38 @@ class WheelSample(NamedTuple):
 
 
 class SideTravel(NamedTuple):
-    """How far the wheels of both sides turned.
+    """How far the wheels of both sides turned, and how fast they turn.
 
     Attributes
     ----------
     left, right : float
-        Mean over the side's wheels [rad].
+        Mean over the side's wheels since it was last asked for [rad].
+    left_speed, right_speed : float
+        Mean over the side's wheels [rad/s]; of each its travel over a window, over the time
+        between the stamps of the window's ends.
     """
 
     left: float
     right: float
+    left_speed: float
+    right_speed: float
 
 
 @dataclass
 class _Wheel:
     latest: WheelSample
-    taken: WheelSample | None
     arrived: float
+    taken: WheelSample | None = None
+    past: deque[WheelSample] = field(default_factory=deque)
+
+    def speed(self, window: float) -> float:
+        """Return the mean speed since the last sample that is a window old, or the oldest."""
+        past, latest = self.past, self.latest
+        while len(past) > 1 and past[1].stamp <= latest.stamp - window:
+            past.popleft()
+        span = latest.stamp - past[0].stamp if past else 0.0
+        angle = latest.position - past[0].position if past else math.nan
+        return angle / span if span > 0.0 and math.isfinite(angle) else latest.velocity
 
 
 class WheelFeedback:
@@ -57,12 +73,19 @@ class WheelFeedback:
     max_speed : float
         Positions that would need a faster wheel are a counter that was reset, or a wheel
         that was replaced, not motion [rad/s].
+    window : float
+        Over which speeds are averaged [s].
     """
 
     def __init__(
-        self, left: Sequence[str], right: Sequence[str], max_speed: float = math.inf
+        self,
+        left: Sequence[str],
+        right: Sequence[str],
+        max_speed: float = math.inf,
+        window: float = 0.2,
     ) -> None:
         self.left, self.right, self.max_speed = tuple(left), tuple(right), max_speed
+        self.window = window
         self._wheels: dict[str, _Wheel] = {}
 
     def receive(self, wheel: str, sample: WheelSample, steady_now: float) -> None:
@@ -81,7 +104,7 @@ class WheelFeedback:
             return
         known = self._wheels.get(wheel)
         if known is None:
-            self._wheels[wheel] = _Wheel(sample, None, steady_now)
+            self._wheels[wheel] = _Wheel(sample, steady_now)
         elif sample.stamp != known.latest.stamp:  # a duplicate is no sign of life
             known.latest, known.arrived = sample, steady_now
 
@@ -135,19 +158,30 @@ class WheelFeedback:
         for wheel in silent:
             if wheel in self._wheels:
                 self._wheels[wheel].taken = None
+                self._wheels[wheel].past.clear()
         if not all(alive) or all(angle is None for angle in moved.values()):
             return None
-        left, right = (sum(moved[wheel] or 0.0 for wheel in side) / len(side) for side in alive)
-        return SideTravel(left, right)
+        travel = (sum(moved[wheel] or 0.0 for wheel in side) / len(side) for side in alive)
+        speeds = (
+            sum(self._wheels[wheel].speed(self.window) for wheel in side) / len(side)
+            for side in alive
+        )
+        return SideTravel(*travel, *speeds)
 
     def _moved(self, known: _Wheel) -> float | None:
         """Return the angle that a wheel turned since it was last asked, if it tells."""
         latest, taken = known.latest, known.taken
         known.taken = latest
         if taken is None or latest.stamp <= taken.stamp:
+            if taken is None or latest.stamp < taken.stamp:
+                known.past = deque([latest])
             return None  # the first reading, or one after time jumped, is no motion
         dt = latest.stamp - taken.stamp
         angle = latest.position - taken.position
         if not math.isfinite(angle):
             angle = latest.velocity * min(dt, LONGEST_GUESS)
-        return angle if abs(angle) <= self.max_speed * dt else None
+        if abs(angle) > self.max_speed * dt:
+            known.past = deque([latest])
+            return None
+        known.past.append(latest)
+        return angle

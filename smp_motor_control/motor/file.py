@@ -2,7 +2,7 @@
 
 ::
 
-    /motor_plant:
+    /**/motor_plant:
       ros__parameters:
         motors:
           front_left:
@@ -123,7 +123,7 @@ def _find_motors(document: Any, source: str) -> Mapping[str, Any]:
                 return motors
         pending.extend(level.values())
     raise ParameterError(
-        f"{source}: has no motors; expected /motor_plant: ros__parameters: motors: front_left: ..."
+        f"{source}: has no motors; expected NODE: ros__parameters: motors: front_left: ..."
     )
 
 

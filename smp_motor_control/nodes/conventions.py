@@ -36,7 +36,7 @@ STREAM_PUBLISHER = QoSProfile(
 )
 """Commands, states, set-points: what is outdated by the next message.
 
-Who asks for a lease of a second or more is told within it that the process has died.
+Who asks for a lease of a second or more learns within it that the process has died.
 """
 
 STREAM_SUBSCRIBER = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -60,22 +60,7 @@ def send_last(publisher: Publisher, message: Any, timeout: float = 0.3) -> None:
 
 
 def steady_timer(node: Node, period: float, callback: Callable[[], None]) -> Timer:
-    """Return a timer that neither simulated nor corrected time can stop.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-        Owner.
-    period : float
-        [s].
-    callback : callable
-        Called every period.
-
-    Returns
-    -------
-    rclpy.timer.Timer
-        Running.
-    """
+    """Return a timer that neither simulated nor corrected time can stop."""
     return node.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
 
@@ -84,24 +69,13 @@ def wheel_of(node: Node) -> str:
     return str(node.get_namespace().rsplit("/", 1)[-1])
 
 
+def robot_topic(node: Node, name: str) -> str:
+    """Return a topic of the robot that a wheel's node belongs to: one namespace up."""
+    return f"{node.get_namespace().rpartition('/')[0]}/{name}"
+
+
 def share(path: str) -> Path:
-    """Return a file of this package, installed or in its source tree.
-
-    Parameters
-    ----------
-    path : str
-        Such as ``config/motors_paper.yaml``.
-
-    Returns
-    -------
-    Path
-        Where it is.
-
-    Raises
-    ------
-    SmpError
-        When it is nowhere.
-    """
+    """Return a file of this package, installed or in its source tree."""
     places = [Path(__file__).resolve().parents[2]]
     with contextlib.suppress(PackageNotFoundError):
         places.insert(0, Path(get_package_share_directory("smp_motor_control")))
@@ -112,16 +86,5 @@ def share(path: str) -> Path:
 
 
 def seconds(stamp: Any) -> float:
-    """Return a ``builtin_interfaces/Time`` as seconds.
-
-    Parameters
-    ----------
-    stamp : builtin_interfaces.msg.Time
-        The stamp.
-
-    Returns
-    -------
-    float
-        [s]; good to some 0.1 us since 1970.
-    """
+    """Return a ``builtin_interfaces/Time`` as seconds."""
     return float(stamp.sec + 1e-9 * stamp.nanosec)

@@ -20,16 +20,6 @@ OK, WARN, ERROR, STALE = (
 class Diagnostics:
     """Publishes a node's health on ``/diagnostics``, every second and at once on a change.
 
-    Parameters
-    ----------
-    node : rclpy.node.Node
-        Its full name is the status' name.
-    assess : callable
-        Returns ``(level, message, values)``: one of :data:`OK`, :data:`WARN`, :data:`ERROR`,
-        :data:`STALE`, a line for people, and a mapping of names to values.
-    hardware_id : str
-        Such as the joint's name.
-
     Attributes
     ----------
     due : bool
@@ -63,8 +53,12 @@ class Diagnostics:
     def publish(self) -> None:
         """Publish the present health now."""
         level, message, values = self._assess()
+        clock = self._node.get_clock()
+        if clock.ros_time_is_active and clock.now().nanoseconds == 0:
+            level = max(level, WARN)
+            message = f"use_sim_time is set, but nothing is heard on /clock; {message}"
         array = DiagnosticArray()
-        array.header.stamp = self._node.get_clock().now().to_msg()
+        array.header.stamp = clock.now().to_msg()
         array.status = [
             DiagnosticStatus(
                 level=level,

@@ -29,7 +29,10 @@ class Settings:
     """Parameters of the node."""
 
     signal: str = described("fourier", f"One of {', '.join(SIGNALS)}.", read_only=True)
-    wheels: tuple[str, ...] = described(("all",), "Wheels to excite, or all.", read_only=True)
+    wheel_names: tuple[str, ...] = described(WHEELS, "Wheels of the robot.", read_only=True)
+    wheels: tuple[str, ...] = described(
+        ("all",), "Wheels to excite, or all of wheel_names.", read_only=True
+    )
     amplitude: float = described(
         6.0, "Largest voltage of either sign [V].", minimum=0.0, read_only=True
     )
@@ -74,14 +77,11 @@ class Settings:
                 f"amplitude is {self.amplitude:g} V; it must not exceed max_voltage, "
                 f"{self.max_voltage:g} V"
             )
-        for wheel in self.wheels:
-            if wheel != "all" and wheel not in WHEELS:
-                raise ParameterError(f"wheels has {wheel!r}; known are all, {', '.join(WHEELS)}")
         self.signal_of(0)
 
     def chosen(self) -> tuple[str, ...]:
         """Return the wheels to excite."""
-        return WHEELS if "all" in self.wheels else tuple(dict.fromkeys(self.wheels))
+        return self.wheel_names if "all" in self.wheels else tuple(dict.fromkeys(self.wheels))
 
     def signal_of(self, wheel: int) -> Excitation:
         """Return the bounded signal of the n-th wheel."""
@@ -172,16 +172,5 @@ class Excite(Node):
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the node until the signal ends.
-
-    Parameters
-    ----------
-    argv : list of str, optional
-        Arguments; those of the process where None.
-
-    Returns
-    -------
-    int
-        Exit code.
-    """
+    """Run the node until the signal ends."""
     return runtime.run("excite", Excite, argv)

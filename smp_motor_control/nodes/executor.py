@@ -121,18 +121,7 @@ class LeanExecutor(SingleThreadedExecutor):
         )
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
-        """Wait for work and do all that is ready.
-
-        Parameters
-        ----------
-        timeout_sec : float, optional
-            Longest wait [s]; with one, the stock executor does the work.
-
-        Raises
-        ------
-        ExternalShutdownException
-            When the context was shut down.
-        """
+        """Wait for work and do all that is ready."""
         if timeout_sec is not None:
             super().spin_once(timeout_sec)
             return
@@ -257,17 +246,6 @@ class LeanExecutor(SingleThreadedExecutor):
             self._tasks = [t for t in self._tasks if not (t[0].done() or t[0].cancelled())]
 
     def shutdown(self, timeout_sec: float | None = None) -> bool:
-        """Stop, and let go of all entities.
-
-        Parameters
-        ----------
-        timeout_sec : float, optional
-            Longest wait for callbacks that run [s].
-
-        Returns
-        -------
-        bool
-            Whether all had ended.
-        """
+        """Stop, and let go of all entities."""
         self._release()
         return bool(super().shutdown(timeout_sec))

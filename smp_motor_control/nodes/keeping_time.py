@@ -14,20 +14,6 @@ def keep_time(node: Node, priority: int, affinity: tuple[int, ...]) -> list[str]
 
     Freezes what is allocated so far out of the garbage collector's sight and turns the
     collector off; :func:`collect_garbage` is then to be called where it does no harm.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-        For its log.
-    priority : int
-        SCHED_FIFO priority of all threads of the process, 1 to 99; 0 leaves the scheduler alone.
-    affinity : tuple of int
-        Processors to run on; empty for all.
-
-    Returns
-    -------
-    list of str
-        What was refused, a line each.
     """
     refused = []
     if priority > 0:

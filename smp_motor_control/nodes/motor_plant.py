@@ -223,16 +223,5 @@ class MotorPlant(Node):
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the node until a signal.
-
-    Parameters
-    ----------
-    argv : list of str, optional
-        Arguments; those of the process where None.
-
-    Returns
-    -------
-    int
-        Exit code.
-    """
+    """Run the node until a signal."""
     return runtime.run("motor_plant", MotorPlant, argv)

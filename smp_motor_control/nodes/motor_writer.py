@@ -23,13 +23,6 @@ def full_name(node: Node) -> str:
 class MotorWriter:
     """The way of a node to a motor; see :class:`~smp_motor_control.wheel.lease.Lease`.
 
-    Parameters
-    ----------
-    node : rclpy.node.Node
-        Who writes.
-    prefix : str
-        Of the topics, such as ``front_left/``.
-
     Attributes
     ----------
     owner : str

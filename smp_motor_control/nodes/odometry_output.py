@@ -12,7 +12,7 @@ from rclpy.node import Node
 from rclpy.time import Time
 from sensor_msgs.msg import JointState
 
-from smp_motor_control import WHEELS
+from smp_motor_control import joint_of
 from smp_motor_control.body.odometry import Odometry
 from smp_motor_control.body.wheel_travel import WheelSample
 
@@ -29,6 +29,8 @@ STILL = 1e-6
 class FrameSettings(Protocol):
     """The parameters of the node that are about its output."""
 
+    left_wheel_names: tuple[str, ...]
+    right_wheel_names: tuple[str, ...]
     odom_frame_id: str
     base_frame_id: str
     tf_frame_prefix_enable: bool
@@ -59,6 +61,7 @@ class OdometryOutput:
         prefix = frame_prefix(
             settings.tf_frame_prefix_enable, settings.tf_frame_prefix, node.get_namespace()
         )
+        self._wheels = (*settings.left_wheel_names, *settings.right_wheel_names)
         self._span = settings.velocity_rolling_window_size / settings.publish_rate
         self._odometry = OdometryMessage()
         self._odometry.header.frame_id = prefix + settings.odom_frame_id
@@ -110,11 +113,11 @@ class OdometryOutput:
 
     def publish_joints(self, wheels: Mapping[str, WheelSample], stamp: float) -> None:
         """Publish the wheels that were heard."""
-        heard = [w for w in WHEELS if w in wheels and math.isfinite(wheels[w].position)]
+        heard = [w for w in self._wheels if w in wheels and math.isfinite(wheels[w].position)]
         if not heard:
             return
         message = JointState(
-            name=[f"{wheel}_wheel_joint" for wheel in heard],
+            name=[joint_of(wheel) for wheel in heard],
             position=[wheels[wheel].position for wheel in heard],
             velocity=[wheels[wheel].velocity for wheel in heard],
         )

@@ -9,8 +9,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from smp_interfaces.msg import MotorCommand, MotorState
+from smp_interfaces.msg import MotorState
 from smp_motor_control.nodes import runtime
+from smp_motor_control.nodes.motor_writer import MotorWriter
 from smp_motor_control.nodes.robot_client import PATIENCE, RobotClient, RobotError
 
 SETTLE = 1.5
@@ -66,9 +67,7 @@ class _Test:
         self.centre: float | None = None
         self.output = relay.bias
         self.seen = Oscillation()
-        self.command = client.node.create_publisher(
-            MotorCommand, f"{wheel}/motor_command", runtime.STREAM_PUBLISHER
-        )
+        self.writer = MotorWriter(client.node, f"{wheel}/")
 
     def answer(self, message: MotorState) -> None:
         speed, relay, seen = message.velocity, self.relay, self.seen
@@ -83,13 +82,7 @@ class _Test:
         seen.voltage.append(self.output)
         seen.applied.append(message.voltage)
         seen.angle.append(message.position)
-        self.send(self.output)
-
-    def send(self, voltage: float) -> MotorCommand:
-        message = MotorCommand(voltage=voltage)
-        message.header.stamp = self.client.node.get_clock().now().to_msg()
-        self.command.publish(message)
-        return message
+        self.writer.send(self.output)
 
     def run(self, duration: float) -> Oscillation:
         seen = self.seen
@@ -112,8 +105,8 @@ class _Test:
         between = sum(abs(abs(v) - amplitude) > 0.1 * amplitude for v in applied)
         if between > MOST_BETWEEN * len(applied):
             raise RobotError(
-                f"{self.command.topic_name}: what acts on the wheel is not what the relay asks "
-                "for; does someone else command it?"
+                f"{self.writer.publisher.topic_name}: what acts on the wheel is not what the relay "
+                f"asks for; {self.writer.owner or 'someone else'} commands it"
             )
         time = [t - seen.time[first] for t in seen.time[first:]]
         turned = [a - seen.angle[first] for a in seen.angle[first:]]
@@ -151,5 +144,5 @@ def oscillate(client: RobotClient, wheel: str, relay: Relay, duration: float) ->
         try:
             return test.run(duration)
         finally:
-            runtime.send_last(test.command, test.send(0.0))
-            client.node.destroy_publisher(test.command)
+            test.writer.stop()
+            test.writer.destroy()

@@ -8,6 +8,7 @@ when the block ends; :mod:`smp_motor_control.nodes.guard` does it where the tool
 from __future__ import annotations
 
 import contextlib
+import re
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -132,6 +133,13 @@ class RobotClient:
         finally:
             for subscription in made:
                 self.node.destroy_subscription(subscription)
+
+    def find_wheels(self) -> list[str]:
+        """Return the wheels whose hardware reports in the robot's namespace, after a second."""
+        self.spin(STANDSTILL)
+        pattern = re.compile(re.escape(self._full("")) + r"(\w+)/motor_state")
+        topics = [name for name, _ in self.node.get_topic_names_and_types()]
+        return [found[1] for name in sorted(topics) if (found := pattern.fullmatch(name))]
 
     def wait_for_wheels(self, wheels: Sequence[str], timeout: float) -> dict[str, float]:
         """Wait until every wheel has reported for half a second; return their rates [Hz]."""

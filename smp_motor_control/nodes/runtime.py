@@ -1,4 +1,4 @@
-"""What all nodes share: start, spin, stop with a zero command; and the door to the rest.
+"""What all nodes share: start, spin, stop with a zero command; and the entry point to the rest.
 
 A node's ``main`` is ``return run("name", lambda: TheNode(), argv)``.  The node may define
 ``on_stop()``, which :func:`run` calls before it destroys the node whatever the reason of
@@ -28,6 +28,7 @@ from smp_motor_control.nodes.conventions import (
     LATCHED,
     STREAM_PUBLISHER,
     STREAM_SUBSCRIBER,
+    robot_topic,
     seconds,
     send_last,
     share,
@@ -51,6 +52,7 @@ __all__ = [
     "finish",
     "keep_time",
     "refuse_impossible_transitions",
+    "robot_topic",
     "run",
     "seconds",
     "send_last",
@@ -92,11 +94,14 @@ class _Stop:
         threading.Thread(target=self._read_signals, args=(inlet,), daemon=True).start()
 
     def _read_signals(self, inlet: int) -> None:
+        asked = False
         while number := os.read(inlet, 1):
             if number[0] not in _SIGNALS:  # such as SIGCONT, handled by a node itself
                 continue
-            if self.requested.is_set():
+            # Who asks twice does not want to wait; a terminal that closes just says it twice.
+            if asked and number[0] != signal.SIGHUP:
                 os._exit(1)
+            asked = True
             self.request()
 
 
@@ -104,34 +109,12 @@ _stop = _Stop()
 
 
 def finish(exit_code: int = 0) -> None:
-    """End the node after the present callback, as a node that has done its work does.
-
-    Parameters
-    ----------
-    exit_code : int
-        Of the process.
-    """
+    """End the node after the present callback, as a node that has done its work does."""
     _stop.request(exit_code)
 
 
 def run(name: str, make: Callable[[], Node], argv: list[str] | None = None) -> int:
-    """Start a node, spin it until a signal, and stop it cleanly.
-
-    Parameters
-    ----------
-    name : str
-        Of the executable, for messages.
-    make : callable
-        Returns the node; called after ``rclpy.init``.
-    argv : list of str, optional
-        Arguments without the program's name; None takes those of the process.
-
-    Returns
-    -------
-    int
-        0 after a signal or :func:`finish`; 2 when the node refuses to start, with one line
-        on standard error; 1 after an unexpected exception.
-    """
+    """Start a node, spin it until a signal, and stop it cleanly."""
     global _stop
     _stop = stop = _Stop()
     # rclpy's own handlers would shut the context down, and with it the way to send a zero.

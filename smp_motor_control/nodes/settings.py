@@ -49,48 +49,14 @@ def described(
     read_only: bool = False,
     name: str = "",
 ) -> Any:
-    """Return a dataclass field that becomes a ROS parameter.
-
-    Parameters
-    ----------
-    default : bool, int, float, str or tuple of one of them
-        Its type is the parameter's; a whole number is taken for a float too.
-    description : str
-        One sentence with the unit.
-    minimum, maximum : float, optional
-        Range of a number, both ends allowed.
-    read_only : bool
-        Whether it can be set only at the start.
-    name : str
-        Of the parameter, where it is not the field's.
-
-    Returns
-    -------
-    dataclasses.Field
-        For the body of a dataclass.
-    """
+    """Return a dataclass field that becomes a ROS parameter."""
     limits = {"minimum": minimum, "maximum": maximum}
     metadata = {"description": description, "read_only": read_only, "name": name, **limits}
     return dataclasses.field(default=default, metadata=metadata)
 
 
 def nested(default: Any, descriptions: Mapping[str, str], *, prefix: str = "") -> Any:
-    """Return a dataclass field whose own fields become ROS parameters.
-
-    Parameters
-    ----------
-    default : dataclass instance
-        Frozen; it is rebuilt, and so validated, from the parameters.
-    descriptions : mapping of str to str
-        One sentence for each of its fields; fields without one are no parameters.
-    prefix : str
-        Before the names of the parameters, such as ``model.``.
-
-    Returns
-    -------
-    dataclasses.Field
-        For the body of a dataclass.
-    """
+    """Return a dataclass field whose own fields become ROS parameters."""
     metadata = {"descriptions": descriptions, "prefix": prefix}
     return dataclasses.field(default=default, metadata=metadata)
 
@@ -150,29 +116,10 @@ def _check_range(name: str, value: Any, entry: _Entry) -> None:
 class Parameters(Generic[S]):
     """Declares a node's parameters and keeps the settings made of them.
 
-    Parameters
-    ----------
-    node : rclpy.node.Node
-        Owner of the parameters.
-    settings : type
-        Frozen dataclass with fields of :func:`described` and :func:`nested`.
-    changed : callable, optional
-        Called with the new settings after every change, not at the start.
-    also_known : iterable of str
-        Names or, with a final dot, prefixes of given parameters that the node reads itself.
-    check : callable
-        Called with new settings before they take effect; raises ParameterError to refuse them.
-
     Attributes
     ----------
     settings : object
         The present settings.
-
-    Raises
-    ------
-    ParameterError
-        When a given value is refused.  A given name that is not a parameter of the node is
-        warned of, with the nearest that is.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""skid_steer: velocity commands of the body to set-points of four wheels, and odometry back."""
+"""skid_steer: velocity commands of the body to set-points of its wheels, and odometry back."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from rclpy.node import Node
 from sensor_msgs.msg import Imu, JointState
 
 from smp_interfaces.msg import MotorState
-from smp_motor_control.body.kinematics import LEFT, RIGHT, BodyCommand, Odometry, Verdict
+from smp_motor_control import joint_of
+from smp_motor_control.body.kinematics import BodyCommand, Odometry, Verdict
 from smp_motor_control.body.odometry import LEAST_STEP
 from smp_motor_control.body.wheel_travel import WheelFeedback, WheelSample
 from smp_motor_control.nodes import runtime
@@ -23,6 +24,14 @@ IMPLAUSIBLE = 4.0
 """Wheels that seem to turn this many times faster than they can have had their counter reset."""
 FASTEST = 250.0
 """What is plausible without a limit [rad/s]."""
+REPORTED = 1.5
+"""A command that was refused is reported for so long [s], one report at least."""
+LOOK = 0.2
+"""Interval at which the publishers of cmd_vel are looked at [s]."""
+STALL = 3.0
+"""A step so many periods late comes before what was heard meanwhile: that is taken in first."""
+
+_TWISTS = {"geometry_msgs/msg/TwistStamped": TwistStamped, "geometry_msgs/msg/Twist": Twist}
 
 
 class SkidSteerNode(Node):
@@ -34,7 +43,9 @@ class SkidSteerNode(Node):
         settings = self._current.settings
         robot = settings.robot()
         self._command = BodyCommand()
-        self._feedback = WheelFeedback(LEFT, RIGHT)
+        self._left, self._right = settings.left_wheel_names, settings.right_wheel_names
+        window = settings.velocity_rolling_window_size / settings.publish_rate
+        self._feedback = WheelFeedback(self._left, self._right, window=window)
         self._odometry = Odometry(
             robot.effective_separation,
             robot.left_radius,
@@ -44,29 +55,52 @@ class SkidSteerNode(Node):
         self._configure(settings)
         self._given = [(0.0, 0.0), (0.0, 0.0)]  # (linear, angular) of the last two steps
         self._share = 1.0
-        self._refused = ""
+        self._late = False
+        self._refused, self._refused_at = "", -math.inf
         self._yaw, self._yaw_time, self._imu_stamp = math.nan, -math.inf, -math.inf
-        self._last_tick = time.monotonic()
+        self._last_tick, self._last_stamp = time.monotonic(), self._now()
         self._connect(settings)
 
     def _connect(self, settings: Settings) -> None:
-        self._setpoint = JointState(name=[f"{wheel}_wheel_joint" for wheel in (*LEFT, *RIGHT)])
+        wheels = (*self._left, *self._right)
+        self._setpoint = JointState(name=[joint_of(wheel) for wheel in wheels])
         self._setpoints = self.create_publisher(
             JointState, "wheel_setpoints", runtime.STREAM_PUBLISHER
         )
         self._output = OdometryOutput(self, settings)
         best_effort = runtime.STREAM_SUBSCRIBER
-        if settings.use_stamped_vel:
-            self.create_subscription(TwistStamped, "cmd_vel", self._on_stamped, best_effort)
-        else:
-            self.create_subscription(Twist, "cmd_vel", self._on_twist, best_effort)
-        for wheel in (*LEFT, *RIGHT):
+        self._preferred = TwistStamped if settings.use_stamped_vel else Twist
+        self._unheard = ""
+        self._listen_to(self._preferred)
+        self._look = runtime.steady_timer(self, LOOK, self._follow_type)
+        for wheel in wheels:
             self.create_subscription(
                 MotorState, f"{wheel}/motor_state", partial(self._on_state, wheel), best_effort
             )
         self.create_subscription(Imu, "imu", self._on_imu, best_effort)
         self._timer = runtime.steady_timer(self, 1.0 / settings.publish_rate, self._tick)
         self._diagnostics = runtime.Diagnostics(self, self._assess)
+
+    def _listen_to(self, kind: type) -> None:
+        take = self._on_stamped if kind is TwistStamped else self._on_twist
+        self._kind = kind
+        self._cmd_vel = self.create_subscription(kind, "cmd_vel", take, runtime.STREAM_SUBSCRIBER)
+
+    def _follow_type(self) -> None:
+        """Listen to the type of command that is published: a process can have one by topic."""
+        if self._cmd_vel is None:
+            self._listen_to(self._kind)
+            return
+        infos = self.get_publishers_info_by_topic(self._cmd_vel.topic_name)
+        there = {_TWISTS[info.topic_type] for info in infos if info.topic_type in _TWISTS}
+        others = there - {self._kind}
+        if others and (self._kind not in there or self._preferred in others):
+            # The middleware lets the old type go with this round; the new one comes with the next.
+            self.destroy_subscription(self._cmd_vel)
+            self._cmd_vel, self._kind = None, others.pop()
+            self.get_logger().info(f"cmd_vel is taken as {self._kind.__name__}")
+            others = there - {self._kind}
+        self._unheard = others.pop().__name__ if others else ""
 
     def _configure(self, settings: Settings) -> None:
         robot = settings.robot()
@@ -95,7 +129,8 @@ class SkidSteerNode(Node):
 
     def _on_command(self, twist: Twist, age: float | None) -> None:
         verdict = self._command.receive(twist.linear.x, twist.angular.z, age, time.monotonic())
-        self._refused = verdict.value if verdict in (Verdict.STALE, Verdict.NOT_FINITE) else ""
+        if verdict in (Verdict.STALE, Verdict.NOT_FINITE):
+            self._refused, self._refused_at = verdict.value, time.monotonic()
         if verdict is Verdict.ZERO_STAMP:
             self.get_logger().warning(f"cmd_vel {verdict.value}", once=True)
         elif verdict is Verdict.STALE:
@@ -128,21 +163,25 @@ class SkidSteerNode(Node):
         self._imu_stamp, self._yaw_time = stamp, now
 
     def _tick(self) -> None:
-        now = time.monotonic()
+        now, stamp = time.monotonic(), self._now()
         settings = self._current.settings
-        dt = min(max(now - self._last_tick, LEAST_STEP), 5.0 / settings.publish_rate)
-        self._last_tick = now
+        late = now - self._last_tick > STALL / settings.publish_rate
+        self._late, self._last_tick = late and not self._late, now
+        if self._late:
+            return
+        # Simulated time, where it is used, runs slower, faster or not at all.
+        dt = min(max(stamp - self._last_stamp, 0.0), 5.0 / settings.publish_rate)
+        jumped, self._last_stamp = stamp < self._last_stamp, stamp
+        if dt < LEAST_STEP and not jumped:
+            return
         asked = self._command.at(now)
         if asked is not None:
-            self._drive(asked, dt, now)
-        stamp = self._now()
+            self._drive(asked, max(dt, LEAST_STEP), now)
         if settings.open_loop:
             updated = asked is not None and self._odometry.update_open_loop(*self._given[0], dt)
         else:
             travel = self._feedback.take(now, settings.feedback_timeout)
-            updated = travel is not None and self._odometry.update_from_velocity(
-                travel.left / dt, travel.right / dt, dt
-            )
+            updated = travel is not None and self._odometry.update_from_travel(*travel)
         if updated:
             self._output.publish(self._odometry, stamp)
         self._output.publish_joints(self._feedback.latest, stamp)
@@ -170,7 +209,7 @@ class SkidSteerNode(Node):
 
     def _set_wheels(self, left: float, right: float) -> None:
         self._setpoint.header.stamp = self.get_clock().now().to_msg()
-        self._setpoint.velocity = [left] * len(LEFT) + [right] * len(RIGHT)
+        self._setpoint.velocity = [left] * len(self._left) + [right] * len(self._right)
         self._setpoints.publish(self._setpoint)
 
     def _assess(self) -> tuple[bytes, str, dict[str, object]]:
@@ -188,6 +227,8 @@ class SkidSteerNode(Node):
             return max(level for level, _ in problems), "; ".join(t for _, t in problems), values
         if asked is None:
             return runtime.OK, "waiting for the first cmd_vel", values
+        if self._command.timed_out(now):
+            return runtime.OK, "idle: no cmd_vel", values
         if self._share < 1.0:
             share = 100.0 * self._share
             return runtime.OK, f"driving at {share:.0f} % of cmd_vel: wheels at their limit", values
@@ -204,9 +245,12 @@ class SkidSteerNode(Node):
                 for wheel, age in silent.items()
             )
             problems.append((runtime.ERROR, f"no feedback from {wheels}"))
-        if self._refused:
+        if now - self._refused_at < REPORTED:
             problems.append((runtime.WARN, f"cmd_vel {self._refused}"))
-        if commanded and self._command.timed_out(now):
+        if self._unheard:
+            text = f"cmd_vel is also published as {self._unheard}, which is not heard"
+            problems.append((runtime.WARN, text))
+        if commanded and self._command.timed_out(now) and any(self._given[0]):
             problems.append((runtime.WARN, "cmd_vel timed out, braking"))
         if settings.heading_hold and now - self._yaw_time > settings.imu_timeout:
             problems.append((runtime.WARN, "heading is not held: no imu"))

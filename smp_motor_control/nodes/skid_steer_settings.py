@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
+from smp_motor_control import LEFT, RIGHT
 from smp_motor_control.body.kinematics import HeadingHold, SkidSteer, SpeedLimiter
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.nodes.settings import described, nested
@@ -19,6 +22,19 @@ _LIMITS = {
     "min_jerk": "Lowest jerk; NaN takes the negative of max_jerk.",
     "max_jerk": "Highest jerk [m/s^3] or [rad/s^3]; NaN for no limit.",
 }
+
+
+def check_wheels(left: Sequence[str], right: Sequence[str]) -> None:
+    """Refuse wheels that cannot be a body's."""
+    for side, names in (("left", left), ("right", right)):
+        if not any(names):
+            raise ParameterError(f"{side}_wheel_names is empty; a side has at least one wheel")
+    both = (*left, *right)
+    for name in both:
+        if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
+            raise ParameterError(f"wheel name {name!r}: letters, digits and _ only, as in a topic")
+    if len(set(both)) < len(both):
+        raise ParameterError(f"a wheel is named twice in {', '.join(both)}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,6 +59,12 @@ class AxisLimits:
 class Settings:
     """Parameters of the node, validated together."""
 
+    left_wheel_names: tuple[str, ...] = described(
+        LEFT, "Wheels of the left side: their namespaces.", read_only=True
+    )
+    right_wheel_names: tuple[str, ...] = described(
+        RIGHT, "Wheels of the right side: their namespaces.", read_only=True
+    )
     wheel_separation: float = described(0.4, "Between left and right wheels [m].")
     wheel_radius: float = described(0.1, "Radius of the wheels [m].")
     wheel_separation_multiplier: float = described(
@@ -64,7 +86,9 @@ class Settings:
         0.5, "Age of a command at which the body brakes [s]; 0: never.", minimum=0.0
     )
     use_stamped_vel: bool = described(
-        True, "Commands are TwistStamped (true) or Twist (false).", read_only=True
+        True,
+        "Which of two publishers is followed: TwistStamped (true) or Twist (false).",
+        read_only=True,
     )
     feedback_timeout: float = described(
         0.5, "Silence of a wheel that is reported [s].", minimum=0.01
@@ -98,6 +122,7 @@ class Settings:
     angular: AxisLimits = nested(AxisLimits(), _LIMITS, prefix="angular.z.")  # noqa: RUF009
 
     def __post_init__(self) -> None:
+        check_wheels(self.left_wheel_names, self.right_wheel_names)
         self.robot()
         self.hold()
         for name, axis in (("linear.x", self.linear), ("angular.z", self.angular)):

@@ -10,8 +10,8 @@ from geometry_msgs.msg import Twist, TwistStamped
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
-from smp_motor_control import WHEELS
-from smp_motor_control.errors import SmpError
+from smp_motor_control import WHEELS, joint_of
+from smp_motor_control.errors import ParameterError, SmpError
 from smp_motor_control.keyboard import Keyboard, Speeds, keys_of
 from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.settings import Parameters, described
@@ -23,8 +23,8 @@ teleop_wheels: hold a key to drive; the wheels stop {timeout:g} s after it is re
   body mode                      wheel mode
     q  w  e    arc  ahead  arc     w or up     selected wheels forward
     a     d    turn on the spot    s or down   selected wheels backward
-    z  s  c    arc  back   arc     1 2 3 4     select front left, front right,
-    or the arrow keys                          rear left, rear right;  0  all
+    z  s  c    arc  back   arc     0           select all
+    or the arrow keys              {wheels}
 
   + -  faster, slower   m  body or wheel mode   space  stop   x or Ctrl-C  quit
 
@@ -52,8 +52,14 @@ class Settings:
     )
     frame_id: str = described("base_link", "Frame of a stamped command.", read_only=True)
 
+    wheel_names: tuple[str, ...] = described(
+        WHEELS, "Wheels that the keys 1, 2, ... select.", read_only=True
+    )
+
     def __post_init__(self) -> None:
         self.speeds()
+        if not 1 <= len(self.wheel_names) <= 9:
+            raise ParameterError(f"wheel_names has {len(self.wheel_names)} names; 1 to 9 have keys")
 
     def speeds(self) -> Speeds:
         """Return what held keys ask for."""
@@ -73,12 +79,13 @@ class TeleopWheels(Node):
         super().__init__("teleop_wheels")
         parameters = Parameters(self, Settings, self._configure)
         self._settings = parameters.settings
-        self._keyboard = Keyboard(self._settings.speeds())
+        self._wheels = self._settings.wheel_names
+        self._keyboard = Keyboard(self._settings.speeds(), self._wheels)
         stamped = self._settings.use_stamped_vel
         self._twist = TwistStamped() if stamped else Twist()
         if stamped:
             self._twist.header.frame_id = self._settings.frame_id
-        self._setpoint = JointState(name=[f"{wheel}_wheel_joint" for wheel in WHEELS])
+        self._setpoint = JointState(name=[joint_of(wheel) for wheel in self._wheels])
         qos = runtime.STREAM_PUBLISHER
         self._twists = self.create_publisher(type(self._twist), "cmd_vel", qos)
         self._setpoints = self.create_publisher(JointState, "wheel_setpoints", qos)
@@ -92,7 +99,8 @@ class TeleopWheels(Node):
         self._keyboard.speeds = settings.speeds()
 
     def _show_help(self) -> None:
-        self._terminal.write(HELP.format(timeout=self._settings.key_timeout))
+        wheels = "  ".join(f"{k} {wheel}" for k, wheel in enumerate(self._wheels, start=1))
+        self._terminal.write(HELP.format(timeout=self._settings.key_timeout, wheels=wheels))
 
     def _tick(self) -> None:
         keyboard, now = self._keyboard, time.monotonic()
@@ -115,8 +123,8 @@ class TeleopWheels(Node):
             linear, angular = self._keyboard.body(now) if mine else (0.0, 0.0)
             self._send_twist(linear, angular)
         else:
-            wheels = self._keyboard.wheels(now) if mine else dict.fromkeys(WHEELS, 0.0)
-            self._send_wheels([wheels[wheel] for wheel in WHEELS])
+            wheels = self._keyboard.wheels(now) if mine else dict.fromkeys(self._wheels, 0.0)
+            self._send_wheels([wheels[wheel] for wheel in self._wheels])
 
     def _send_twist(self, linear: float, angular: float) -> None:
         twist = self._twist
@@ -144,7 +152,9 @@ class TeleopWheels(Node):
             )
         else:
             takers = self._setpoints.get_subscription_count()
-            chosen = "all" if len(keyboard.selected) == len(WHEELS) else min(keyboard.selected)
+            chosen = (
+                "all" if len(keyboard.selected) == len(self._wheels) else min(keyboard.selected)
+            )
             line = f"wheel mode  {keyboard.scale * speeds.wheel:.2f} rad/s  {chosen}  | {state}"
             if self._setpoints.get_subscription_count() and self._others():
                 line += "  (skid_steer commands the wheels too: use body mode)"
@@ -157,7 +167,7 @@ class TeleopWheels(Node):
         """Command zero now to all that was driven from here."""
         self._keyboard.press(" ", time.monotonic())
         if self._quiet_from[False]:
-            self._send_wheels([0.0] * len(WHEELS))
+            self._send_wheels([0.0] * len(self._wheels))
         if self._quiet_from[True]:
             self._send_twist(0.0, 0.0)
             runtime.send_last(self._twists, self._twist)

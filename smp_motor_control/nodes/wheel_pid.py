@@ -23,8 +23,7 @@ from smp_motor_control.nodes.motor_writer import MotorWriter
 from smp_motor_control.nodes.settings import Parameters
 from smp_motor_control.nodes.wheel_report import WheelReport, pid_state
 from smp_motor_control.nodes.wheel_settings import Settings
-from smp_motor_control.wheel.acceptance import check
-from smp_motor_control.wheel.controller import WheelController
+from smp_motor_control.wheel.controller import WheelController, WheelSettings
 
 _WATCH_PERIOD = 0.02
 _SELDOM = 10
@@ -37,17 +36,18 @@ class WheelPid(LifecycleNode):
     def __init__(self) -> None:
         super().__init__("wheel_pid")
         runtime.refuse_impossible_transitions(self)
-        self._wheel: WheelController | None = None
-        self._given = Parameters(self, Settings, self._change, check=self._check)
-        self.settings = settings = self._given.settings
+        self._wheel = wheel = WheelController(WheelSettings())
+        check = lambda settings: wheel.check(settings.wheel)  # noqa: E731
+        self._given = Parameters(self, Settings, self._change, check=check)
+        settings = self._given.settings
         self._joint = settings.joint_name or f"{runtime.wheel_of(self)}_wheel_joint"
         if self._joint == "_wheel_joint":
             raise ParameterError(
                 "wheel_pid needs joint_name, or a wheel's namespace: -r __ns:=/front_left"
             )
-        self._wheel = WheelController(settings.wheel)
+        self._change(settings)
         self._entities: list[Any] = []
-        self._index = self._watches = 0
+        self._watches = 0
         self._now, self._watched = time.time_ns, False
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -61,7 +61,7 @@ class WheelPid(LifecycleNode):
             (self.destroy_publisher, self._shown),
             (self.destroy_subscription, listen(MotorState, "motor_state", self._hear, heard)),
             (self.destroy_subscription,
-             listen(JointState, "/wheel_setpoints", self._ask, heard)),
+             listen(JointState, runtime.robot_topic(self, "wheel_setpoints"), self._ask, heard)),
             (self.destroy_subscription,
              listen(MotorDescription, "motor_description", self._describe, runtime.LATCHED)),
             (self.destroy_service, self.create_service(Trigger, "~/reset", self._reset)),
@@ -103,13 +103,6 @@ class WheelPid(LifecycleNode):
             self._writer.stop()
             self._report.update()
 
-    def _check(self, settings: Settings) -> None:
-        """Refuse a change whose loop would not run well on this wheel."""
-        if self._wheel is None:
-            check(settings.wheel.loop)
-        else:
-            self._wheel.check(settings.wheel)
-
     def _change(self, settings: Settings) -> None:
         self.settings = settings
         self._wheel.configure(settings.wheel)
@@ -130,11 +123,9 @@ class WheelPid(LifecycleNode):
         return response
 
     def _ask(self, message: JointState) -> None:
-        names, index = message.name, self._index
-        if index >= len(names) or names[index] != self._joint:
-            if self._joint not in names:
-                return
-            self._index = index = names.index(self._joint)
+        if self._joint not in message.name:
+            return
+        index = message.name.index(self._joint)
         if index >= len(message.velocity):
             self._wheel.refuse("set-point without a velocity")
             return
@@ -145,14 +136,14 @@ class WheelPid(LifecycleNode):
 
     def _hear(self, message: MotorState) -> None:
         wheel, stamp = self._wheel, message.header.stamp
-        wheel.owner = self._writer.owner
         nanoseconds = stamp.sec * 1_000_000_000 + stamp.nanosec
         voltage = wheel.take_feedback(message, nanoseconds, self._now(), time.monotonic())
         if voltage is not None:
             self._writer.send(voltage, stamp)
             if self._watched and wheel.answer is not None:
                 self._shown.publish(pid_state(wheel, self._joint, stamp))
-        self._report.update()
+        if wheel.state is not self._report.shown:
+            self._report.update()
 
     def _watch(self) -> None:
         """Look for lost feedback, and now and then for what changes seldom."""
@@ -161,6 +152,7 @@ class WheelPid(LifecycleNode):
             self._watched = self._shown.get_subscription_count() > 0
             simulated = self.get_clock().ros_time_is_active
             self._now = self._ros_now if simulated else time.time_ns
+        self._wheel.owner = self._writer.owner
         voltage = self._wheel.tick(time.monotonic())
         if voltage is not None:
             self._writer.send(voltage)

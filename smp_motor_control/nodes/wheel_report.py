@@ -28,7 +28,7 @@ class WheelReport:
         self.timekeeping: list[str] = []
         self._wheel = wheel
         self._reported: dict[str, int] = {}
-        self._shown: State | None = None
+        self.shown: State | None = None
         self._log = node.get_logger()
         self._diagnostics = runtime.Diagnostics(node, self._assess, joint)
 
@@ -38,9 +38,9 @@ class WheelReport:
 
     def update(self) -> None:
         """Publish at once where the state is a new one."""
-        if self._wheel.state is not self._shown:
-            self._shown = self._wheel.state
-            if self._shown is State.FAULT:
+        if self._wheel.state is not self.shown:
+            self.shown = self._wheel.state
+            if self.shown is State.FAULT:
                 self._log.error(f"{self._state()[1]}; 0 V")
             self._diagnostics.publish()
 

@@ -81,7 +81,7 @@ class Settings:
         maximum=60.0,
     )  # fmt: skip
     feedback_timeout: float = described(
-        0.2, "Silence or lateness of feedback after which the voltage is zero [s].",
+        0.2, "Silence or age of feedback after which the voltage is zero [s].",
         minimum=0.005, maximum=10.0,
     )  # fmt: skip
     gains: PidGains = nested(_NO_GAINS_GIVEN, _GAINS)  # noqa: RUF009

@@ -24,8 +24,8 @@ from smp_motor_control.wheel.loop import LoopSettings, WheelLoop
 RATES = (0.001, 0.002, 0.005, 0.01)
 """Sampling intervals of which one must do, where the hardware's is not known yet [s]."""
 
-SAMPLES = 250
-"""Length of a trial: at 200 Hz 1.25 s, ten to twenty time constants of the paper's motors."""
+SAMPLES, MOST_SAMPLES = 250, 1500
+"""Length of a trial: four time constants and delays of the motor, but between these."""
 
 LARGEST_GAIN = 1e5
 """Of p, d and feed-forward [V s/rad, V s^2/rad]: a supply's 12 V for an error of 1e-4 rad/s, a
@@ -73,21 +73,7 @@ class Circumstances:
 
 
 def check(settings: LoopSettings, wheel: Circumstances | None = None) -> None:
-    """Refuse settings that no wheel should be driven with.
-
-    Parameters
-    ----------
-    settings : LoopSettings
-        Each value valid by itself.
-    wheel : Circumstances, optional
-        Nothing is known without.
-
-    Raises
-    ------
-    ParameterError
-        When a gain has a sign that drives away from the set-point or an absurd magnitude, when
-        the loop cannot be built or computed, or when it is unstable on the motor's model.
-    """
+    """Refuse settings that no wheel should be driven with."""
     wheel = wheel or Circumstances()
     _check_signs(settings.gains)
     settings = settings.within(wheel.supply)
@@ -138,8 +124,8 @@ def _model_at_wheel(
             return model, wheel.gearbox.ratio
         return (model, velocity * model.dc_gain) if velocity > 0.0 else None
     if velocity > 0.0 and acceleration > 0.0:
-        told = MotorModel(dc_gain=1.0 / velocity, time_constant=acceleration / velocity)
-        return replace(told, static_voltage=gains.feedforward_static), 1.0
+        implied = MotorModel(dc_gain=1.0 / velocity, time_constant=acceleration / velocity)
+        return replace(implied, static_voltage=gains.feedforward_static), 1.0
     return None
 
 
@@ -158,7 +144,8 @@ class _Plant:
         if not np.all(np.isfinite(advance)):
             raise ParameterError("the motor's model cannot be computed; look at model.*")
         self._advance = tuple(tuple(float(x) for x in row) for row in advance)
-        self._late = max(1, 1 + math.ceil(min(model.delay / dt, SAMPLES) - 1e-9))
+        self.samples = round(min(max(4.0 * (tau + model.delay) / dt, SAMPLES), MOST_SAMPLES))
+        self._late = max(1, 1 + math.ceil(min(model.delay / dt, MOST_SAMPLES) - 1e-9))
         self.rest()
 
     def rest(self) -> None:
@@ -192,12 +179,12 @@ def _is_stable(settings: LoopSettings, plant: _Plant) -> bool:
     loop.start(0.0)
     plant.rest()
     speed, errors = 0.0, []
-    for _ in range(SAMPLES):
+    for _ in range(plant.samples):
         speed = plant.step(loop.step(1.0, speed, plant.dt).output, 0.0)
         if not -_FAR < speed < _FAR:
             return False
         errors.append(abs(1.0 - speed))
-    quarter = SAMPLES // 4
+    quarter = plant.samples // 4
     early, late = max(errors[quarter : 2 * quarter]), max(errors[-quarter:])
     return late < max(_GROWING * early, 0.02)
 
@@ -232,7 +219,7 @@ def _swing(settings: LoopSettings, plant: _Plant, wheel: Circumstances) -> float
     target = max(0.2 * plant.final * max(most - plant.static, 0.0), 1e-9)
     target = min(target, settings.limits.velocity or math.inf, 1e4)
     speed = voltage = fastest = 0.0
-    for _ in range(SAMPLES):
+    for _ in range(plant.samples):
         count = math.floor(plant.angle * plant.ratio / encoder.angle_per_count)
         measured = loop.speed(dt, speed, count, voltage)
         out = 0.0
@@ -245,5 +232,4 @@ def _swing(settings: LoopSettings, plant: _Plant, wheel: Circumstances) -> float
         fastest = max(fastest, abs(plant.speed))
         if not fastest < _FAR * target + _FAR:
             return fastest / target
-    least = 2.0 * encoder.angle_per_count / (plant.ratio * dt)
-    return max(fastest - least, 0.0) / target
+    return fastest / target

@@ -23,6 +23,9 @@ from smp_motor_control.wheel.loop import LoopSettings, WheelLoop
 
 _LARGEST_SETPOINT = 1e4
 _LEARNING = 20
+_EVIDENCE = 0.1
+"""Of a longer gap between samples no more counts against the wheel [s]: the driver may have
+switched off by its own time-out meanwhile."""
 _AT_REST = 0.05
 _FRESH, _FIRST, _LATE = Verdict.FRESH, Verdict.FIRST, Verdict.LATE
 
@@ -81,11 +84,6 @@ class WheelSettings:
 class WheelController:
     """Decides the voltage of one wheel.
 
-    Parameters
-    ----------
-    settings : WheelSettings
-        Changed later with :meth:`configure`.
-
     Attributes
     ----------
     state : State
@@ -132,34 +130,12 @@ class WheelController:
     # Settings ------------------------------------------------------------------------------
 
     def check(self, settings: WheelSettings) -> None:
-        """Refuse a change of settings with which this wheel should not be driven.
-
-        Parameters
-        ----------
-        settings : WheelSettings
-            Each value valid by itself.
-
-        Raises
-        ------
-        ParameterError
-            See :func:`~smp_motor_control.wheel.acceptance.check`.
-        """
+        """Refuse a change of settings with which this wheel should not be driven."""
         if settings.loop != self.settings.loop:
             check(settings.loop, self._wheel)
 
     def configure(self, settings: WheelSettings) -> None:
-        """Change the settings while running, without a jump of the voltage.
-
-        Parameters
-        ----------
-        settings : WheelSettings
-            Valid by construction.
-
-        Raises
-        ------
-        ParameterError
-            When the clamps leave nothing within the supply; nothing has changed.
-        """
+        """Change the settings while running, without a jump of the voltage."""
         self.loop.configure(settings.loop.within(self.supply))
         self.settings = settings
         self.advice = ""
@@ -175,22 +151,7 @@ class WheelController:
     def set_hardware(
         self, gearbox: Gearbox, encoder: Encoder, supply: float, resistance: float = math.nan
     ) -> None:
-        """Learn what is between motor and wheel.
-
-        Parameters
-        ----------
-        gearbox, encoder : Gearbox, Encoder
-            Of the wheel.
-        supply : float
-            [V].
-        resistance : float
-            Of the armature [ohm]; NaN where unknown.
-
-        Raises
-        ------
-        ParameterError
-            When the supply is not positive or excludes the clamps; nothing has changed.
-        """
+        """Learn what is between motor and wheel."""
         if not 0.0 < supply < math.inf:
             raise ParameterError(f"supply_voltage is {supply!r} V; it must be positive")
         self.settings.loop.within(supply)
@@ -236,17 +197,7 @@ class WheelController:
     # Events --------------------------------------------------------------------------------
 
     def take_setpoint(self, value: float, now: float, age: float = 0.0) -> None:
-        """Take in a set-point; one that is no number does not count as a sign of life.
-
-        Parameters
-        ----------
-        value : float
-            [rad/s].
-        now : float
-            [s].
-        age : float
-            Time since its stamp [s].
-        """
+        """Take in a set-point; one that is no number does not count as a sign of life."""
         if not -_LARGEST_SETPOINT <= value <= _LARGEST_SETPOINT:
             self.refuse("set-point that is not a number or absurd")
         elif age > self.settings.setpoint_timeout:
@@ -256,22 +207,7 @@ class WheelController:
             self._setpoint_at = now
 
     def take_feedback(self, sample: Sample, stamp: int, arrival: int, now: float) -> float | None:
-        """Take in a sample and answer it.
-
-        Parameters
-        ----------
-        sample : Sample
-            As the hardware reports it.
-        stamp, arrival : int
-            On the stamps' clock [ns].
-        now : float
-            [s].
-
-        Returns
-        -------
-        float or None
-            Voltage to command [V]; None where nothing is to be sent.
-        """
+        """Take in a sample, stamped and arrived at [ns]; return its answer [V] or None."""
         self.answer = None
         verdict = self.clock.accept(stamp, arrival)
         if verdict is not _FRESH:
@@ -302,18 +238,7 @@ class WheelController:
             return self._trip(Fault.COMPUTATION, now) if self.active else None
 
     def tick(self, now: float) -> float | None:
-        """Look for feedback that has ceased.
-
-        Parameters
-        ----------
-        now : float
-            [s].
-
-        Returns
-        -------
-        float or None
-            0 V while there is none; None where nothing is to be sent.
-        """
+        """Look for feedback that has ceased; return 0 V while there is none."""
         if self.clock.dt and len(self._intervals) < _LEARNING:
             self._learn(self.clock.dt)
         since = now - self.settings.feedback_timeout
@@ -381,7 +306,8 @@ class WheelController:
             loop.start(measurement)
             detector.reset()
             self.output = 0.0
-        fault = detector.step(dt, self.output, measurement, current)
+        evidence = dt if dt < _EVIDENCE else _EVIDENCE
+        fault = detector.step(evidence, self.output, measurement, current)
         if fault is not None:
             return self._trip(fault, now)
         out = loop.step(setpoint, measurement, dt)
@@ -392,7 +318,8 @@ class WheelController:
         if recovery.cautious:
             voltage = recovery.limited(voltage, measurement, dt, self.settings.faults)
         saturated = voltage != out.unsaturated
-        fault = detector.follow(dt, loop.reference.velocity, measurement, voltage, saturated)
+        reference = loop.reference.velocity
+        fault = detector.follow(evidence, reference, measurement, voltage, saturated)
         if fault is not None:
             return self._trip(fault, now)
         self.output, self.answer = voltage, out

@@ -75,11 +75,6 @@ class FaultLimits:
         Share of the reference by which the speed may be off for long.
     tracking_time : float
         Time [s] of being off by more, without coming nearer, before it counts; 0: off.
-
-    Raises
-    ------
-    ParameterError
-        When a value is negative or not finite.
     """
 
     current_limit: float = 0.0
@@ -99,13 +94,6 @@ class FaultLimits:
 
 class FaultDetector:
     """Watches voltage, speed and current of a driven motor.
-
-    Parameters
-    ----------
-    limits : FaultLimits
-        When it misbehaves.
-    resistance : float
-        Armature resistance [ohm], NaN where unknown; tells a stall from a dead encoder.
 
     Attributes
     ----------
@@ -127,24 +115,7 @@ class FaultDetector:
         self._begin_window(math.nan)
 
     def step(self, dt: float, voltage: float, velocity: float, current: float) -> Fault | None:
-        """Take in one sample.
-
-        Parameters
-        ----------
-        dt : float
-            Interval that ends with it [s].
-        voltage : float
-            That was asked for during the interval [V].
-        velocity : float
-            Of the wheel [rad/s].
-        current : float
-            [A]; NaN where not measured.
-
-        Returns
-        -------
-        Fault or None
-            The first that has lasted for its time.
-        """
+        """Take in one sample."""
         limits = self.limits
         if limits.current_limit > 0.0 and abs(current) > limits.current_limit:
             self._hot += dt
@@ -194,22 +165,6 @@ class FaultDetector:
 
         Two windows in succession must be off, the second no less than the first, so that
         neither noise nor a wheel that still accelerates is taken for a fault.
-
-        Parameters
-        ----------
-        dt : float
-            Interval that ends with the sample [s].
-        reference, velocity : float
-            Of the wheel [rad/s].
-        voltage : float
-            Answer to the sample [V].
-        saturated : bool
-            Whether the loop asked for more.
-
-        Returns
-        -------
-        Fault or None
-            ``WRONG_WAY`` or ``NOT_FOLLOWING``; a wheel that stands still is :meth:`step`'s.
         """
         self._reference += reference * dt
         self._speed += velocity * dt
@@ -252,11 +207,6 @@ class Recovery:
     small voltage until the wheel has turned as driven for :data:`TRUSTED_AFTER`, and drives
     nothing at a set-point of zero.  After :data:`MOST_TRIES` the wheel is latched.
 
-    Parameters
-    ----------
-    first_pause : float
-        [s]; 0 waits for a zero set-point for ever.
-
     Attributes
     ----------
     fault : Fault or None
@@ -284,37 +234,14 @@ class Recovery:
         return self.fault is not None and self.failures > MOST_TRIES
 
     def set(self, fault: Fault, now: float) -> None:
-        """Hold the wheel.
-
-        Parameters
-        ----------
-        fault : Fault
-            Why.
-        now : float
-            [s].
-        """
+        """Hold the wheel."""
         self.fault, self._since = fault, now
         self.cautious = True
         self.failures += 1
         self._good = 0.0
 
     def may_release(self, setpoint: float, now: float, turns: bool = False) -> bool:
-        """Tell whether the wheel may be tried again, and let go of it if so.
-
-        Parameters
-        ----------
-        setpoint : float
-            Present one [rad/s].
-        now : float
-            [s].
-        turns : bool
-            Whether feedback shows the wheel turning.
-
-        Returns
-        -------
-        bool
-            Whether it has let go.
-        """
+        """Tell whether the wheel may be tried again, and let go of it if so."""
         if self.failures > MOST_TRIES:
             return False
         waited = now - self._since
@@ -327,24 +254,7 @@ class Recovery:
         return False
 
     def limited(self, voltage: float, velocity: float, dt: float, limits: FaultLimits) -> float:
-        """Return the voltage of a try, and learn from how the wheel turns.
-
-        Parameters
-        ----------
-        voltage : float
-            What the loop asks for [V].
-        velocity : float
-            Of the wheel [rad/s].
-        dt : float
-            Interval that ends with the sample [s].
-        limits : FaultLimits
-            With the voltage at which the wheel must turn.
-
-        Returns
-        -------
-        float
-            [V].
-        """
+        """Return the voltage of a try, and learn from how the wheel turns."""
         if voltage * velocity > 0.0 and abs(velocity) > limits.stall_velocity:
             self._good += dt
         elif self._good < TRUSTED_AFTER:

@@ -25,15 +25,8 @@ class FeedbackClock:
     """Tells the interval between feedback samples, and which of them to leave out.
 
     The stamps' clock and the computer's may differ by a constant: an offset beyond
-    :data:`CLOCK_JUMP` is learnt at the start and after every jump, and lateness is counted
+    :data:`CLOCK_JUMP` is learnt at the start and after every jump, and ages are counted
     from there.
-
-    Parameters
-    ----------
-    max_age : float
-        Largest time from stamp to arrival [s].
-    max_gap : float
-        Largest interval over which a loop may step [s].
 
     Attributes
     ----------
@@ -64,20 +57,7 @@ class FeedbackClock:
         self._last = None
 
     def accept(self, stamp: int, now: int) -> Verdict:
-        """Judge a sample.
-
-        Parameters
-        ----------
-        stamp : int
-            Its stamp [ns]; 0 stands for the time of arrival.
-        now : int
-            Time of arrival on the same clock, as far as the clocks agree [ns].
-
-        Returns
-        -------
-        Verdict
-            Only ``FRESH`` samples have a ``dt``; ``FIRST`` ones start a new sequence.
-        """
+        """Judge a sample by its stamp and its arrival [ns]; a stamp of 0 stands for the arrival."""
         verdict = self._judge(stamp or now, now)
         self.counts[verdict] += 1
         return verdict

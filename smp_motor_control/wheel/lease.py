@@ -15,11 +15,6 @@ class Lease:
     owner.  Zero commands renew nothing, so that a writer which rests, ends or dies gives the
     wheel back by itself after ``timeout``; until then all others are refused.
 
-    Parameters
-    ----------
-    timeout : float
-        After which commands expire, and the lease with them [s].
-
     Attributes
     ----------
     refused : dict of str to int
@@ -41,22 +36,7 @@ class Lease:
         self._until = -math.inf
 
     def take(self, writer: str, voltage: float, now: float) -> bool:
-        """Judge a command.
-
-        Parameters
-        ----------
-        writer : str
-            Who sent it; empty for all that do not say.
-        voltage : float
-            [V]; what is not finite counts as zero.
-        now : float
-            [s].
-
-        Returns
-        -------
-        bool
-            Whether the wheel is to obey.
-        """
+        """Judge a command."""
         if writer != self._owner and now < self._until:
             self.refused[writer] = self.refused.get(writer, 0) + 1
             return False
@@ -65,16 +45,5 @@ class Lease:
         return True
 
     def owner(self, now: float) -> str:
-        """Return who owns the wheel; empty where nobody does, or nobody that says its name.
-
-        Parameters
-        ----------
-        now : float
-            [s].
-
-        Returns
-        -------
-        str
-            Name of the writer.
-        """
+        """Return who owns the wheel; empty where nobody does, or nobody that says its name."""
         return self._owner if now < self._until else ""

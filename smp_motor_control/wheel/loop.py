@@ -55,11 +55,6 @@ class LoopSettings:
     drive : Drive or None
         Motor and voltage that changes of set-point keep to, in wheel rad/s; see
         :class:`~smp_motor_control.reference.profile.Profile`.
-
-    Raises
-    ------
-    ParameterError
-        When a value is out of range, or the observer lacks its model.
     """
 
     gains: PidGains = field(default_factory=PidGains)
@@ -90,23 +85,7 @@ class LoopSettings:
             )
 
     def within(self, supply_voltage: float) -> LoopSettings:
-        """Return the same with the output limited to what a supply can give.
-
-        Parameters
-        ----------
-        supply_voltage : float
-            [V]; infinite where unknown.
-
-        Returns
-        -------
-        LoopSettings
-            With both output clamps within the supply.
-
-        Raises
-        ------
-        ParameterError
-            When a clamp leaves nothing within the supply.
-        """
+        """Return the same with the output limited to what a supply can give."""
         gains = replace(
             self.gains,
             u_clamp_min=max(self.gains.u_clamp_min, -supply_voltage),
@@ -117,15 +96,6 @@ class LoopSettings:
 
 class WheelLoop:
     """Speed loop of one wheel, one step per feedback sample.
-
-    Parameters
-    ----------
-    settings : LoopSettings
-        Changed later with :meth:`configure`.
-    gearbox, encoder : Gearbox, Encoder, optional
-        Of the wheel; without, only the reported speed can be fed back.
-    max_load : float
-        Loads beyond this voltage contradict the observer's model [V].
 
     Attributes
     ----------
@@ -157,31 +127,17 @@ class WheelLoop:
     def set_hardware(
         self, gearbox: Gearbox | None, encoder: Encoder | None, max_load: float = math.inf
     ) -> None:
-        """Tell what is between motor and wheel.
-
-        Parameters
-        ----------
-        gearbox : Gearbox or None
-            None where unknown.
-        encoder : Encoder or None
-            None where unknown.
-        max_load : float
-            [V], see the class.
-        """
+        """Tell what is between motor and wheel."""
         self._gearbox, self._encoder, self._max_load = gearbox, encoder, max_load
         self.renew_speed()
 
     def configure(self, settings: LoopSettings) -> None:
-        """Change settings while running, without a jump of the output.
-
-        Parameters
-        ----------
-        settings : LoopSettings
-            Valid by construction.
-        """
+        """Change settings while running, without a jump of the output."""
         old, self.settings = self.settings, settings
         self.pid.set_gains(settings.gains)
         self.profile.configure(settings.limits, settings.transition_time, settings.drive)
+        if bool(old.reference_delay) != bool(settings.reference_delay):
+            self._path.start(self.reference.velocity)  # its past is older than that
         shaped = ("speed_source", "difference_window", "model", "noise")
         if any(getattr(old, name) != getattr(settings, name) for name in shaped):
             self.renew_speed()
@@ -209,24 +165,7 @@ class WheelLoop:
             self._observer.reset()
 
     def speed(self, dt: float, velocity: float, count: int, voltage: float) -> float:
-        """Return the wheel's speed after one more sample.
-
-        Parameters
-        ----------
-        dt : float
-            Interval that ends with it [s], positive.
-        velocity : float
-            As the hardware reports it [rad/s, wheel].
-        count : int
-            As the counter shows it [counts, motor].
-        voltage : float
-            Mean over the interval [V].
-
-        Returns
-        -------
-        float
-            [rad/s, wheel]; NaN while the source has too few samples.
-        """
+        """Return the wheel's speed after one more sample."""
         return self._speed_of(dt, velocity, count, voltage)
 
     def _measured(self, dt: float, velocity: float, count: int, voltage: float) -> float:
@@ -266,31 +205,12 @@ class WheelLoop:
         return self._gearbox.to_wheel(speed)
 
     def start(self, measurement: float) -> None:
-        """Close the loop on a wheel that turns at ``measurement``, without a jump.
-
-        Parameters
-        ----------
-        measurement : float
-            [rad/s, wheel].
-        """
+        """Close the loop on a wheel that turns at ``measurement``, without a jump."""
         self.pid.reset()
         self._path.start(measurement)
 
     def step(self, setpoint: float, measurement: float, dt: float) -> PidOutput:
-        """Advance reference and controller by one sample.
-
-        Parameters
-        ----------
-        setpoint, measurement : float
-            [rad/s, wheel].
-        dt : float
-            [s], positive.
-
-        Returns
-        -------
-        PidOutput
-            Volts and their parts.
-        """
+        """Advance reference and controller by one sample."""
         settings, profile = self.settings, self.profile
         if settings.reference_delay:
             path = self._path

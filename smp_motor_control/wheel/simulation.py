@@ -37,11 +37,6 @@ class Timing:
         From a sample to the arrival of the command that answers it [s].
     jitter : float
         Standard deviation of the intervals between samples [s].
-
-    Raises
-    ------
-    ParameterError
-        When a value is out of range.
     """
 
     sample_time: float = 0.005
@@ -139,32 +134,7 @@ def simulate_open_loop(
     supply: Supply | None = None,
     seed: int = 0,
 ) -> Run:
-    """Drive a motor with a voltage.
-
-    Parameters
-    ----------
-    entry : MotorEntry
-        Motor and hardware.
-    voltage : callable
-        Command [V] of time [s].
-    duration : float
-        [s].
-    timing : Timing, optional
-        Of samples and commands; 200 Hz without delay by default.
-    drive : DriveSettings, optional
-        Of driver and sensors; ideal by default.
-    load : callable, optional
-        Torque at the wheel [N m] of time [s].
-    supply : Supply, optional
-        A stiff one by default.
-    seed : int
-        Of all noise.
-
-    Returns
-    -------
-    Run
-        What happened.
-    """
+    """Drive a motor with a voltage."""
     timing = timing or Timing()
     plant = DrivenMotor(entry, drive or _ideal(), supply, seed=seed)
     tape = _Tape()
@@ -189,34 +159,7 @@ def simulate_closed_loop(
     supply: Supply | None = None,
     seed: int = 0,
 ) -> Run:
-    """Let a wheel's loop follow set-points.
-
-    Parameters
-    ----------
-    entry : MotorEntry
-        Motor and hardware.
-    settings : LoopSettings
-        Of the loop; the supply limits its output further.
-    setpoint : callable
-        [rad/s, wheel] of time [s].
-    duration : float
-        [s].
-    timing : Timing, optional
-        Of samples and commands; 200 Hz without delay by default.
-    drive : DriveSettings, optional
-        Of driver and sensors; ideal by default.
-    load : callable, optional
-        Torque at the wheel [N m] of time [s].
-    supply : Supply, optional
-        A stiff one by default.
-    seed : int
-        Of all noise.
-
-    Returns
-    -------
-    Run
-        What happened.
-    """
+    """Let a wheel's loop follow set-points."""
     timing = timing or Timing()
     plant = DrivenMotor(entry, drive or _ideal(), supply, seed=seed)
     loop = WheelLoop(

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from smp_motor_control.motor.friction import Gearbox
 from smp_motor_ident.bag.axis import Series, on_one_axis
+from smp_motor_ident.bag.beat import find_beat, roughness
+from smp_motor_ident.bag.checks import impossible, is_unsigned, signed
 from smp_motor_ident.bag.clock import (
     SAME_CLOCK,
     epochs,
@@ -23,6 +25,7 @@ from smp_motor_ident.bag.counter import unwrap_angle
 from smp_motor_ident.bag.mapping import MotorMap, Signal
 from smp_motor_ident.bag.storage import Table, found
 from smp_motor_ident.bag.units import FACTORS, check_unit, factor
+from smp_motor_ident.diagnosis.limits import SMOOTHER
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.finding import Finding, Severity
 from smp_motor_ident.record import Hardware, Record
@@ -31,6 +34,7 @@ Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 _OUTPUTS = ("count", "position", "velocity")
+_MOTION = ("velocity", "position")
 _SECOND = 1_000_000_000
 
 
@@ -76,14 +80,74 @@ def assemble(
         missing = "voltage" if axis_name else "velocity, position or count"
         raise BagError(f"{motor.where}: the mapping gives no {missing}")
     times = _clock(motor)
+    if plan.clock == "auto":
+        times = {topic: _on_beat(motor, topic, time) for topic, time in times.items()}
     series = {
         name: _series(motor, name, signal, times[signal.topic])
         for name, signal in plan.signals.items()
         if name != "time"
     }
+    _check(motor, series)
     if plan.signals["voltage"].topic == plan.signals[axis_name].topic:
         _drop_lost(motor, series, axis_name)
     return on_one_axis(wheel, plan, hardware, series, axis_name, source, motor.findings)
+
+
+def _on_beat(motor: _Motor, topic: str, time: Integers) -> Integers:
+    """Return arrival times on the beat of their sender; other times as they are."""
+    table = motor.tables[topic]
+    if time is not table.log:
+        return time
+    together = np.diff(time) == 0
+    if together.any():
+        alike = [np.diff(column)[together] == 0 for column in table.columns.values()]
+        if np.mean(np.all(alike, axis=0)) > 0.5:
+            return time  # rows that are there twice, not samples that came at once
+    beat = find_beat(time)
+    if beat is None:
+        return time
+    if table.clocked and not beat.repeated:
+        # Stamps of one's own may be the samples' instants: the smoother motion is the true one.
+        signal = next((s for n, s in motor.plan.signals.items() if n in _MOTION), None)
+        if rhythm(time).regular or signal is None or signal.topic != topic:
+            return time
+        motion = table.columns[signal.field].astype(np.float64)
+        if roughness(beat.time, motion) > SMOOTHER.value * roughness(time, motion):
+            return time
+    text = (
+        f"{topic or 'time'}: arrival times put back on their beat of {beat.period * 1e-6:.5g} ms "
+        f"(median latency {beat.latency * 1e-6:.3g} ms)"
+    )
+    motor.tell("arrival_beat", text, period=beat.period * 1e-9, latency=beat.latency * 1e-9)
+    return beat.time
+
+
+def _check(motor: _Motor, series: dict[str, Series]) -> None:
+    """Leave out values that cannot be, and a current without sign; give a size its direction."""
+    if "direction" in series:
+        direction = series.pop("direction")
+        series["voltage"] = signed(series["voltage"], direction, motor.where)
+        speed = series.get("velocity")
+        backward = np.any(series["voltage"].value < 0)
+        if speed is not None and backward and not np.any(speed.value < 0):
+            text = "velocity: never negative although the voltage is; it has no sign"
+            motor.tell("unsigned_velocity", text, "unreliable")
+    for name, signal in series.items():
+        if signal.value.dtype.kind != "f":
+            continue
+        bad = impossible(signal.value, steps_allowed=name in ("voltage", "supply", "current"))
+        if bad.any():
+            worst = float(np.abs(signal.value[bad]).max())
+            text = f"{name}: {int(bad.sum())} values that jump impossibly (up to {worst:.4g})"
+            motor.tell("impossible_jump", f"{text} were left out", "warning", values=int(bad.sum()))
+            signal.value = np.where(bad, np.nan, signal.value)
+    if "current" in series and is_unsigned(series["voltage"], series["current"]):
+        del series["current"]
+        text = (
+            "current: it is positive in both directions, so that it is the supply's or has lost "
+            "its sign; it was left out"
+        )
+        motor.tell("unsigned_current", text, "warning")
 
 
 def _clock(motor: _Motor) -> dict[str, Integers]:

@@ -1,16 +1,15 @@
-"""What a recording offers, and a first guess of how it maps to motors."""
+"""What a recording offers: topics and the numbers in them."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from smp_motor_ident.bag.decode import Progress
-from smp_motor_ident.bag.source import Recording, recordings
+from smp_motor_ident.bag.source import Recording
 from smp_motor_ident.bag.template import (
     DecodeError,
     Number,
@@ -26,46 +25,27 @@ from smp_motor_ident.finding import Finding
 _LISTED = 12
 """Elements of an array without names that are listed."""
 
-_ROLES = {
-    # What a field or its topic is called, the most telling first.
-    "voltage": r"volt|pwm|duty|(?:^|\W|_)(?:cmd|command|effort|u|input)(?:$|\W|_)",
-    "current": r"current|amp(?:s|ere)?(?:$|\W|_)",
-    "count": r"tick|count|encoder|(?:^|\W|_)enc(?:$|\W|_)",
-    "velocity": r"rpm|velocit|speed|omega|(?:^|\W|_)(?:vel|w|y)(?:$|\W|_)",
-    "position": r"position|angle|theta|(?:^|\W|_)pos(?:$|\W|_)",
-}
-_HINTS = (
-    ("velocity", r"rpm", ":rpm"),
-    ("velocity", r"deg", ":deg/s"),
-    ("position", r"deg", ":deg"),
-    ("voltage", r"duty", ":duty"),
-    ("voltage", r"pwm", "*12/255"),
-    ("voltage", r"(?:^|_)m(?:illi)?v", ":mV"),
-    ("current", r"(?:^|_)m(?:illi)?a(?:mp|$|_)", ":mA"),
-    ("time", r"ms|milli", ":ms"),
-    ("time", r"us|micro", ":us"),
-    ("time", r"ns|nano", ":ns"),
-)
-_SIDES = ("front", "rear", "back", "left", "right", "fl", "fr", "rl", "rr", "bl", "br")
-_OWN = "smp_interfaces/msg/MotorState"
-
 
 @dataclass
 class Offer:
-    """One topic, or the columns of a CSV file.
+    """One topic, or the columns of a table.
 
     Attributes
     ----------
     topic, type : str
-        Empty for a CSV file.
+        Empty for the only table of a file.
     count : int
-        Messages that can be read; rows of a CSV file are not counted (0).
+        Messages that can be read; rows of a table are not counted (0).
     rate : float
         [Hz], mean over the recording; 0 for less than two messages.
     fields : list of str
         Paths of its numbers, as a mapping takes them.
     remark : str
-        Why its fields cannot be told.
+        Why its fields are unknown.
+    table : bool
+        Whether it is of a file of columns.
+    units : mapping of str to str
+        What the file says of its columns' units.
     """
 
     topic: str
@@ -74,6 +54,8 @@ class Offer:
     rate: float = 0.0
     fields: list[str] = field(default_factory=list)
     remark: str = ""
+    table: bool = False
+    units: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass
@@ -87,7 +69,9 @@ class Listing:
     offers : list of Offer
         By topic.
     suggestion : list of str
-        Items for ``--map``; empty where nothing fits or nothing is needed.
+        Items for ``--map``, tried on the recording; empty where nothing fits or is needed.
+    asked : list of str
+        What the user must add to them, such as the full scale of a PWM.
     needs_mapping : bool
         False where the recording holds our own messages.
     findings : list of Finding
@@ -97,49 +81,18 @@ class Listing:
     name: str
     offers: list[Offer]
     suggestion: list[str]
+    asked: list[str]
     needs_mapping: bool
     findings: list[Finding]
 
 
-def list_topics(
-    paths: Any, msg_files: Iterable[str] = (), *, progress: Progress | None = None
-) -> list[Listing]:
-    """List what recordings offer, and suggest how to map it.
-
-    Parameters
-    ----------
-    paths : path or sequence of paths
-        As for `smp_motor_ident.bag.read_records`.
-    msg_files : iterable of str
-        ``.msg`` files for types that the bag does not define.
-    progress : callable, optional
-        ``progress(fraction, name)``.
-
-    Returns
-    -------
-    list of Listing
-        One per recording.
-
-    Raises
-    ------
-    BagError
-        When a path cannot be read.
-    """
-    types = Types(msg_files)
-    listings = []
-    for recording in recordings(paths):
-        if recording.is_table:
-            offers = [Offer(c.topic, c.type, fields=list(c.fields)) for c in recording.channels()]
-        else:
-            offers = _offers(recording, types, progress)
-        needed = all(offer.type != _OWN for offer in offers)
-        suggestion = suggest(offers) if needed else []
-        listings.append(Listing(recording.name, offers, suggestion, needed, recording.findings))
-    return listings
-
-
-def _offers(recording: Recording, types: Types, progress: Progress | None) -> list[Offer]:
-    """Return the topics of a bag with their fields, by its first messages."""
+def offers_of(recording: Recording, types: Types, progress: Progress | None) -> list[Offer]:
+    """Return the topics of a recording with their fields, by its first messages."""
+    if recording.is_table:
+        return [
+            Offer(c.topic, c.type, fields=list(c.fields), table=True, units=c.units)
+            for c in recording.channels()
+        ]
     found: dict[str, Offer] = {}
     spans: dict[str, tuple[int, int]] = {}
     for channel in recording.channels():
@@ -163,7 +116,7 @@ def _offers(recording: Recording, types: Types, progress: Progress | None) -> li
 
 
 def _fields(types: Types, batch: Any) -> tuple[list[str], str]:
-    """Return the numeric fields of a batch's first message, or why they cannot be told."""
+    """Return the numeric fields of a batch's first message, or why they are unknown."""
     if batch.channel.encoding not in ("cdr", "ros1"):
         return [], f"encoded as {batch.channel.encoding}"
     try:
@@ -208,52 +161,3 @@ def _paths(path: str, value: Any, parent: dict[str, Any]) -> Iterator[str]:
         for k, key in enumerate(keys):
             inner = value[k] if isinstance(value, list) else Number(0, "")
             yield from _paths(f"{path}[{key}]", inner, parent)
-
-
-def suggest(offers: list[Offer]) -> list[str]:
-    """Guess which fields are voltage and motion of which wheel, by their names."""
-    wheels: dict[str, dict[str, str]] = {}
-    time = ""
-    for offer in offers:
-        for path in offer.fields:
-            source = f"{offer.topic}.{path}" if offer.topic else _quoted(path)
-            if not offer.topic and re.search(r"time|stamp|^t$", path, re.IGNORECASE):
-                time = time or source + _hint("time", path)
-                continue
-            role = _role(offer.topic, path)
-            if role:
-                wheels.setdefault(_wheel(source), {}).setdefault(role, source + _hint(role, source))
-    items = []
-    motions = ("count", "position", "velocity")
-    for wheel, roles in sorted(wheels.items()):
-        if "voltage" in roles and any(role in roles for role in motions):
-            prefix = f"{wheel}." if wheel else ""
-            items += [f"{prefix}{role}={roles[role]}" for role in _ROLES if role in roles]
-    return [*items, f"time={time}"] if items and time else items
-
-
-def _quoted(column: str) -> str:
-    return column if re.fullmatch(r"[\w()\[\]]+", column) else f'"{column}"'
-
-
-def _role(topic: str, path: str) -> str:
-    """Return what a field is by its own name, or else by its topic's."""
-    for text in (path.partition("[")[0], topic):
-        for role, pattern in _ROLES.items():
-            if re.search(pattern, text, re.IGNORECASE):
-                return role
-    return ""
-
-
-def _hint(role: str, source: str) -> str:
-    for wanted, pattern, text in _HINTS:
-        if wanted == role and re.search(pattern, source, re.IGNORECASE):
-            return text
-    return ""
-
-
-def _wheel(source: str) -> str:
-    """Return the side of the robot that a name tells."""
-    words = re.split(r"[^a-z]+", source.lower())
-    sides = [side for side in _SIDES if side in words]
-    return "_".join(sides)

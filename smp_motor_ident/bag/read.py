@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -71,7 +72,7 @@ def read_experiments(
         part = recording.size() / total
         report = None if progress is None else _scaled(progress, before / total, part)
         try:
-            for record in _read(recording, asked, types, report):
+            for record in read_recording(recording, asked, types, report):
                 read.setdefault(record.wheel, []).append(record)
         except BagError as error:
             if not recording.one_of_many:
@@ -119,12 +120,20 @@ def read_records(
     return {wheel: join_records(records) for wheel, records in experiments.items()}
 
 
-def _read(
+def read_recording(
     recording: Recording, asked: SignalMap, types: Types, progress: Progress | None
 ) -> list[Record]:
-    """Return a recording's records; an error tells also what was found amiss before."""
-    try:
+    """Return a recording's records."""
+    with one_line(recording):
         return _records(recording, asked, types, progress)
+
+
+@contextmanager
+def one_line(recording: Recording) -> Iterator[None]:
+    """Make one message of any error, which tells also what was found amiss before."""
+    try:
+        with np.errstate(all="ignore"):  # spoilt numbers may be of any size
+            yield
     except BagError as error:
         amiss = [f.message for f in recording.findings if f.message not in str(error)]
         raise BagError("; ".join([str(error), *amiss])) from None
@@ -140,7 +149,7 @@ _SPOILT = (
     ArithmeticError, AttributeError, LookupError, MemoryError, OSError, RecursionError,
     TypeError, ValueError, struct.error,
 )  # fmt: skip
-"""What spoilt bytes lead readers to: the user is told of the file, not of the code."""
+"""What spoilt bytes lead readers to: the message names the file, not the code."""
 
 
 def _scaled(progress: Progress, begin: float, part: float) -> Progress:
@@ -189,7 +198,7 @@ def _records(
 
 
 def _plans(recording: Recording, asked: SignalMap, channels: list[Channel]) -> dict[str, MotorMap]:
-    """Return the signals of every wheel, mapped by the user or told by our own messages."""
+    """Return the signals of every wheel, mapped by the user or given by our own messages."""
     topics = {channel.topic for channel in channels}
     if asked.has_signals:
         plans = {

@@ -25,6 +25,14 @@ _EPOCHS = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
 _MOTIONS = ("velocity", "position", "count")
 
 
+def time_unit(name: str) -> str:
+    """Return the unit that the name of a column of time ends in, such as ``t_ms``."""
+    for unit, pattern in (("ms", r"ms|milli"), ("us", r"us|micro"), ("ns", r"ns|nano")):
+        if re.search(rf"(?:^|[^a-z])(?:{pattern})(?:[^a-z]|$)|millis|micros", name.lower()):
+            return "us" if "micros" in name.lower() else unit
+    return ""
+
+
 def resolved(plan: MotorMap, channels: list[Channel]) -> MotorMap:
     """Return a plan whose signals name topics and fields as the files do."""
     tables = [channel for channel in channels if channel.encoding == TABLE]
@@ -105,7 +113,8 @@ def _time_signal(
     likely = [name for name in channel.fields if re.search(TIME_NAMES, name, re.IGNORECASE)]
     if mapped is not None and likely:
         signal = Signal(topic, likely[0])
-        return replace(signal, unit=_unit("time", signal, channel, likely[0]))
+        unit = _unit("time", signal, channel, likely[0]) or time_unit(likely[0])
+        return replace(signal, unit=unit)
     hint = f"time={likely[0]}" if likely else "time=COLUMN"
     raise BagError(
         f"{recording.files[0]}: which column is the time? map {hint} or sample_time=SECONDS"

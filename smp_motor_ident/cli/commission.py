@@ -21,7 +21,7 @@ def parser() -> argparse.ArgumentParser:
     made = Parser(prog=NAME, description=DESCRIPTION)
     add = made.add_argument
     add("--output", "-o", metavar="DIR", required=True, help="new folder for bag and results")
-    add("--wheel", action="append", metavar="NAME", help="only this wheel; default: all four")
+    add("--wheel", action="append", metavar="NAME", help="only this; default: all that report")
     add("--amplitude", type=number(0), default=6.0, help="largest voltage [V]; default 6")
     add("--duration", type=number(0), default=15.0, help="of each of three signals [s]; default 15")
     add("--apply", action="store_true", help="set the gains in the running controllers")

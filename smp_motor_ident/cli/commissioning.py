@@ -36,6 +36,7 @@ def _commission(
     ros = tuple(arguments.ros_arguments)
     # The client leaves last: who excites has ended when the controllers are given back.
     with connect(NAME, ros) as client, Processes(folder / "logs") as processes:
+        wheels = wheels or tuple(client.find_wheels()) or WHEELS
         robot = steps.Robot(processes, client, wheels, folder, ros)
         rates = client.wait_for_wheels(wheels, timeout=10.0)
         print("; ".join(f"{wheel} reports at {rate:.0f} Hz" for wheel, rate in rates.items()))
@@ -61,10 +62,7 @@ def _checked(
     folder = Path(arguments.output)
     if folder.exists():
         raise ParameterError(f"{folder}: exists already; choose another --output")
-    wheels = tuple(dict.fromkeys(arguments.wheel or WHEELS))
-    for wheel in wheels:
-        if wheel not in WHEELS:
-            raise ParameterError(f"--wheel {wheel}: is none of {', '.join(WHEELS)}")
+    wheels = tuple(dict.fromkeys(arguments.wheel or ()))
     shares = {"sine": 0.75, "square": 0.75, "fourier": 1.0}
     plan = [
         steps.Excitation(signal, arguments.duration, shares[signal] * arguments.amplitude)

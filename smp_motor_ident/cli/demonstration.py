@@ -144,7 +144,7 @@ def drive(
     gains : mapping of str to mapping
         Parameters by wheel.
     say : callable
-        Told what goes on.
+        Takes what goes on, in words.
 
     Returns
     -------

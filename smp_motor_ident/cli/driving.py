@@ -14,7 +14,7 @@ from smp_motor_control.encoder import unwrap
 from smp_motor_control.motor.friction import Gearbox
 from smp_motor_ident.bag.columns import Columns, read_columns
 from smp_motor_ident.record import Hardware
-from smp_motor_ident.tune.response import step_figures
+from smp_motor_ident.tune.simulation import step_figures
 
 Array = NDArray[np.float64]
 
@@ -116,7 +116,7 @@ def _answer(
     final = float(asked.fields["setpoint"][during[-1]])
     if abs(final - start) < LEAST_CHANGE:
         return None
-    told = step_figures(
+    figures = step_figures(
         time[inside] - begin, speed[inside] - start, np.zeros(inside.sum()), final - start
     )
-    return Answer(name, start, final, told.rise, told.settling, told.overshoot)
+    return Answer(name, start, final, figures.rise, figures.settling, figures.overshoot)

@@ -107,6 +107,8 @@ def run(
         return _fail(parser.prog, "interrupted", INTERRUPTED)
     except OSError as error:
         return _fail(parser.prog, f"{error.filename or 'output'}: {error.strerror or error}", 2)
+    except ModuleNotFoundError:
+        raise  # the entry point says how to install it
     except Exception as error:
         if os.environ.get("SMP_DEBUG"):
             raise

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from smp_motor_ident import bag
+from smp_motor_ident import bag, likelihood
 from smp_motor_ident.cli.frame import progress
 from smp_motor_ident.cli.identify import NAME
 from smp_motor_ident.cli.tables import console, estimate_table
@@ -41,6 +41,9 @@ from smp_motor_ident.report.document import (
 from smp_motor_ident.report.series import Comparison, Role
 from smp_motor_ident.result import UNITS, Estimate
 
+COMPILED = Path(likelihood.__file__).parent / "__pycache__"
+"""Where numba keeps what it has compiled, unless NUMBA_CACHE_DIR says otherwise."""
+
 OUTPUTS = ("identification.json", "motors.yaml", "report.html")
 
 
@@ -51,7 +54,6 @@ class Outcome:
     estimate: Estimate | None = None
     comparisons: tuple[Comparison, ...] = ()
     failure: SmpError | None = None
-    notes: tuple[str, ...] = ()
 
     @property
     def exit_code(self) -> int:
@@ -72,6 +74,9 @@ def work(arguments: argparse.Namespace) -> int:
     paths = [Path(arguments.output) / name for name in OUTPUTS]
     check_free(paths, arguments.force)
     with progress(NAME, arguments.quiet) as say:
+        cold = not any(COMPILED.glob("*.nbi"))
+        if cold and not arguments.quiet:
+            print(f"{NAME}: compiling for this machine, only this once ...", file=sys.stderr)
         say("reading")
         records = _read(arguments.bags, mapping, arguments.wheel)
         kept = _read(arguments.validate, mapping, list(records)) if arguments.validate else {}
@@ -79,7 +84,7 @@ def work(arguments: argparse.Namespace) -> int:
             wheel: partial(identify_wheel, group, kept.get(wheel, ()), arguments.model, fixed)
             for wheel, group in records.items()
         }
-        outcomes = in_parallel(jobs, say)
+        outcomes = in_parallel(jobs, say, cold)
         if any(outcome.estimate for outcome in outcomes.values()):
             say("writing the report")
             contents = _contents(outcomes, arguments)
@@ -148,11 +153,10 @@ def identify_wheel(
                 "record a longer excitation with several frequencies, in both directions"
             )
         )
-    notes = dict.fromkeys(note for record in (*records, *kept) for note in record.notes)
     fitted, held_out = (records, kept) if kept else split(records)
     curves: list[tuple[Record, Role]] = [(record, "estimation") for record in fitted]
     curves += [(record, "validation") for record in held_out]
-    return Outcome(found, tuple(_compare(found, *curve) for curve in curves), notes=tuple(notes))
+    return Outcome(found, tuple(_compare(found, *curve) for curve in curves))
 
 
 def _compare(found: Estimate, record: Record, role: Role) -> Comparison:
@@ -180,7 +184,6 @@ def _contents(outcomes: Mapping[str, Outcome], arguments: argparse.Namespace) ->
         estimates,
         {wheel: one.comparisons for wheel, one in outcomes.items()},
         {wheel: str(one.failure) for wheel, one in outcomes.items() if one.failure},
-        {wheel: one.notes for wheel, one in outcomes.items()},
         provenance,
     )
     document = identification_document(estimates)

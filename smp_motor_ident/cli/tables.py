@@ -53,12 +53,12 @@ def table(title: str, *columns: str, left: int = 1) -> Table:
 def estimate_table(estimate: Estimate) -> Table:
     """Return what is known of one motor."""
     fit = estimate.fit_percent
-    told = [f"{words.label(estimate.wheel)}: {words.model(estimate.model)}"]
+    title = [f"{words.label(estimate.wheel)}: {words.model(estimate.model)}"]
     if fit.estimation is not None:
-        told.append(f"fit {fit.estimation:.2f} %")
+        title.append(f"fit {fit.estimation:.2f} %")
     if fit.validation is not None:
-        told.append(f"held out {fit.validation:.2f} %")
-    made = table(", ".join(told), "quantity", "value", "std", "95 % interval", "unit", "status")
+        title.append(f"held out {fit.validation:.2f} %")
+    made = table(", ".join(title), "quantity", "value", "std", "95 % interval", "unit", "status")
     made.columns[4].justify = made.columns[5].justify = "left"
     for name, quantity in {**estimate.combinations, **estimate.parameters}.items():
         made.add_row(*quantity_cells(name, quantity))

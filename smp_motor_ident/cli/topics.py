@@ -47,8 +47,13 @@ def list_topics(paths: Sequence[str], msg_files: Sequence[str], program: str) ->
         elif listing.suggestion:
             given = " ".join(shlex.quote(item) for item in listing.suggestion)
             out.print(f"suggestion: --map {given}", soft_wrap=True)
+            for text in listing.asked:
+                out.print(f"  to be added: {text}", soft_wrap=True)
         else:
-            out.print("no field looks like voltage and speed of a motor; see docs/mapping.md")
+            out.print(
+                "no field that is called a voltage explains one that is called a motion; "
+                "see docs/mapping.md"
+            )
     return 0
 
 

@@ -1,26 +1,13 @@
-"""tune: identification.json (or motors.yaml) in, gains for the four wheel nodes out."""
+"""tune: identification.json (or motors.yaml) in, gains for the wheel nodes or other loops out."""
 
 from __future__ import annotations
 
 import argparse
-import datetime
 import sys
-from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Any
+from collections.abc import Sequence
 
-from smp_motor_ident.bag.transport import measure_delay
-from smp_motor_ident.cli import applying, frame, relaying
-from smp_motor_ident.cli.tune_arguments import TARGETS, loop_for, parser
-from smp_motor_ident.cli.tune_words import HEAD, provenance, row, show, tell_delays
-from smp_motor_ident.errors import ParameterError
-from smp_motor_ident.report.document import check_free, read_identification, write_together
-from smp_motor_ident.report.tuning_figures import tuning_svg
-from smp_motor_ident.result import Estimate, Quantity
-from smp_motor_ident.tune import METHODS, Loop, compare, design_wheels, recommend
-from smp_motor_ident.tune.curves import curves
-from smp_motor_ident.tune.source import choose_source
-from smp_motor_ident.tune.writing import gains_document, gains_yaml, to_json
+from smp_motor_ident.cli import frame
+from smp_motor_ident.cli.tune_arguments import parser
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -40,148 +27,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _work(arguments: argparse.Namespace) -> int:
-    if arguments.relay is not None:
-        return relaying.tune_by_relay(arguments, _files(arguments)[:1])
-    if arguments.gains is not None:
-        return _apply_file(arguments)
-    if arguments.source is None:
-        raise ParameterError("nothing to tune; give identification.json, its folder or motors.yaml")
-    if arguments.method not in METHODS:
-        raise ParameterError(
-            f"--method is {arguments.method!r}; it must be one of {', '.join(METHODS)}"
-        )
-    files = _files(arguments)
-    check_free(files, arguments.force)
-    estimates = read_estimates(arguments.source)
-    measured = {} if arguments.bag is None else measure_delay(arguments.bag)
-    loops = {w: loop_for(one, arguments, measured.get(w)) for w, one in estimates.items()}
-    told_delays = tell_delays(loops, measured, arguments)
-    print("".join(f"{line}\n" for line in told_delays), end="")
-    told_sources: list[str] = []
-    targets = {n: getattr(arguments, n) for n in TARGETS if getattr(arguments, n) is not None}
-    method = arguments.method
-    with frame.progress("tune") as say:
-        if arguments.speed_source == "auto":
-            say("comparing the sources of speed")
-            loops, told_sources = _choose_sources(estimates, loops, targets)
-        if arguments.compare:
-            say("comparing the methods")
-            method = _compare(estimates, loops, targets)
-            targets = {k: v for k, v in targets.items() if k in _known(method)}
-        say("designing")
-        wheels = design_wheels(
-            estimates, loops, method, arguments.sets, together=not arguments.alone, **targets
-        )
-    print("".join(f"{line}\n" for line in told_sources), end="")
-    show(wheels)
-    if files:
-        now = datetime.datetime.now(datetime.timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
-        text = gains_yaml(
-            wheels.designs,
-            [*provenance(wheels, arguments, estimates, now), *told_delays, *told_sources],
-        )
-        sources = sorted({s for e in estimates.values() for s in e.sources})
-        told = {
-            "date": now,
-            "input": str(arguments.source),
-            "sources": sources,
-            "delays": told_delays,
-            "speed_sources": told_sources,
-        }
-        document = to_json(gains_document(wheels.designs, told, wheels.reason))
-        drawn = {w: curves(estimates[w], one) for w, one in wheels.designs.items()}
-        figure = tuning_svg(drawn, METHODS[method].promise.sensitivity)
-        write_together(dict(zip(files, (text, document, figure), strict=True)), arguments.force)
-        print(f"written: {files[0]}, beside it {files[1].name} and {files[2].name}")
-    if arguments.apply:
-        return applying.apply(applying.from_designs(wheels.designs), arguments)
-    return 0
+    # What computes is loaded after the arguments are understood.
+    from smp_motor_ident.cli.tuning import work
 
-
-def _choose_sources(
-    estimates: Mapping[str, Estimate], loops: Mapping[str, Loop], targets: Mapping[str, Any]
-) -> tuple[dict[str, Loop], list[str]]:
-    """Return the loops with the speed source of each wheel, and a line of reasons for each."""
-    known = ("phase_margin", "maximum_sensitivity", "focus", "structure")
-    margins = {name: value for name, value in targets.items() if name in known}
-    chosen, lines = {}, []
-    for wheel, estimate in estimates.items():
-        chosen[wheel], why = choose_source(estimate, loops[wheel], **margins)
-        lines.append(f"{wheel}: speed from {why}")
-    return chosen, lines
-
-
-def _apply_file(arguments: argparse.Namespace) -> int:
-    """Set the gains of a file, as they are."""
-    if arguments.source is not None or arguments.output is not None or not arguments.apply:
-        raise ParameterError("--gains goes with --apply alone, without a source and --output")
-    return applying.apply(applying.from_file(arguments.gains), arguments)
-
-
-def _files(arguments: argparse.Namespace) -> list[Path]:
-    output: Path | None = arguments.output
-    if output is None:
-        return []
-    if output.suffix not in (".yaml", ".yml"):
-        raise ParameterError(f"--output {output}: must end in .yaml, as ROS parameter files do")
-    return [output, output.with_suffix(".json"), output.with_suffix(".svg")]
-
-
-def read_estimates(source: Path) -> dict[str, Estimate]:
-    """Read what is to be tuned."""
-    if source.suffix not in (".yaml", ".yml"):
-        return read_identification(source)
-    from smp_motor_control.motor.file import load_motors
-    from smp_motor_ident.record import Hardware
-
-    estimates = {}
-    for wheel, entry in load_motors(source).items():
-        m = entry.parameters
-        held = {
-            "dc_gain": m.dc_gain,
-            "time_constant": m.time_constant,
-            "time_constant_product": m.time_constant_product,
-            "static_voltage": m.static_voltage,
-            "delay": entry.delay,
-        }
-        estimates[wheel] = Estimate(
-            wheel=wheel,
-            model="motor file",
-            parameters={},
-            combinations={name: Quantity(value, status="fixed") for name, value in held.items()},
-            sources=(source.name,),
-            hardware=Hardware(
-                gear_ratio=entry.gearbox.ratio,
-                counts_per_revolution=entry.encoder.counts_per_revolution,
-                supply_voltage=entry.supply_voltage,
-            ),
-        )
-    return estimates
-
-
-def _known(method: str) -> tuple[str, ...]:
-    return (*METHODS[method].targets, "max_velocity", "max_acceleration", "transition_time")
-
-
-def _compare(
-    estimates: Mapping[str, Estimate], loops: Mapping[str, Loop], targets: Mapping[str, Any]
-) -> str:
-    """Print the methods side by side for each wheel; return the one that most recommend."""
-    votes: dict[str, int] = {}
-    reason: dict[str, str] = {}
-    for wheel, estimate in estimates.items():
-        results = compare(estimate, loops[wheel], **targets)
-        name, why = recommend(results)
-        votes[name] = votes.get(name, 0) + 1
-        reason.setdefault(name, why)
-        print(f"\n{wheel}")
-        print(HEAD)
-        for method, result in results.items():
-            mark = "*" if method == name else " "
-            print(f"{mark} {method:16s} {row(result)}")
-    chosen = max(votes, key=lambda n: votes[n])
-    print(f"\n* recommended: {chosen}. {reason[chosen]}\n")
-    return chosen
+    return work(arguments)
 
 
 if __name__ == "__main__":

@@ -4,13 +4,25 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from smp_motor_ident.bag.transport import TransportDelay
 from smp_motor_ident.cli import frame
 from smp_motor_ident.errors import ParameterError
-from smp_motor_ident.result import Estimate
-from smp_motor_ident.tune import METHODS, Loop
-from smp_motor_ident.tune.loop import SPEED_SOURCES
+
+if TYPE_CHECKING:
+    from smp_motor_ident.bag.transport import TransportDelay
+    from smp_motor_ident.result import Estimate
+    from smp_motor_ident.tune import Loop
+
+# Names of what is loaded only after the arguments are understood; a test holds them to it.
+METHODS = (
+    "margin", "optimise", "pole_placement", "simc", "lambda", "amigo", "ziegler_nichols",
+    "tyreus_luyben", "relay",
+)  # fmt: skip
+FORMATS = (
+    "ros2_controllers", "linorobot2", "ros_arduino_bridge", "arduino_pid", "roboclaw", "wpilib",
+)  # fmt: skip
+SPEED_SOURCES = ("measured", "difference", "observer")
 
 TARGETS = (
     "phase_margin",
@@ -26,6 +38,7 @@ TARGETS = (
     "max_velocity",
     "max_acceleration",
     "transition_time",
+    "accept_unreliable",
 )
 
 
@@ -41,6 +54,10 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--output", type=Path, help="parameter file to write; gains.json and a figure go beside it"
     )
+    p.add_argument(
+        "--export", choices=FORMATS, metavar="FORMAT",
+        help="gains for a loop that others run, at its usual rate: " + ", ".join(FORMATS),
+    )  # fmt: skip
     p.add_argument("--method", default="margin", help=", ".join(METHODS))
     p.add_argument("--compare", action="store_true", help="show every method; take the recommended")
     loop = p.add_argument_group("the loop that will run")
@@ -57,7 +74,7 @@ def parser() -> argparse.ArgumentParser:
         "--speed-source", choices=("auto", *SPEED_SOURCES), default="auto",
         help="auto compares what each allows, and says why",
     )  # fmt: skip
-    loop.add_argument("--difference-window", type=int, default=1, help="[samples]")
+    loop.add_argument("--difference-window", type=int, help="[samples], 1; else as identified")
     loop.add_argument("--gear-ratio", type=float, help="else as identified")
     loop.add_argument("--counts-per-revolution", type=float, help="else as identified")
     loop.add_argument("--supply", type=float, help="[V]; else as identified")
@@ -94,6 +111,10 @@ def parser() -> argparse.ArgumentParser:
     relay.add_argument("--relay-hysteresis", type=float, default=0.05, help="[rad/s, wheel]")
     relay.add_argument("--relay-seconds", type=float, default=4.0)
     relay.add_argument("--rule", choices=("tyreus_luyben", "ziegler_nichols"))
+    p.add_argument(
+        "--accept-unreliable", action="store_true", default=None,
+        help="design on an identification that calls itself unreliable, as wide as it leaves",
+    )  # fmt: skip
     p.add_argument("--force", action="store_true", help="replace files that exist")
     return p
 
@@ -102,6 +123,8 @@ def loop_for(
     estimate: Estimate, arguments: argparse.Namespace, measured: TransportDelay | None = None
 ) -> Loop:
     """Return the loop of one wheel: what the user says, else what the bag knew."""
+    from smp_motor_ident.tune import Loop
+
     hardware = estimate.hardware
     supply = _first(arguments.supply, hardware.supply_voltage)
     if supply is None:
@@ -114,6 +137,7 @@ def loop_for(
         sample_time = 1.0 / arguments.rate
     else:
         sample_time = estimate.sample_time or 1.0 / DEFAULT_RATE
+    window = arguments.difference_window
     usual, longest = (None, None) if measured is None else measured.until_applied(sample_time)
     if arguments.delay is not None:
         usual = None  # it is the longest, which nothing measured may pass
@@ -127,7 +151,8 @@ def loop_for(
         ),
         supply_voltage=supply,
         speed_source="measured" if arguments.speed_source == "auto" else arguments.speed_source,
-        difference_window=arguments.difference_window,
+        difference_window=1 if window is None else window,
+        averaging_given=window is not None,
     )
 
 

@@ -34,7 +34,7 @@ def tell_delays(
 
 HEAD = (
     f"  {'method':16s} {'p':>7} {'i':>7} {'d':>7} {'PM':>4} {'GM':>5} {'Ms':>5} {'settle':>7} "
-    f"{'over':>5} {'load':>6} {'volts':>6} {'ripple':>6}"
+    f"{'over':>5} {'load':>6} {'volts':>6} {'noise':>6}"
 )
 """Of a table of designs."""
 
@@ -47,7 +47,7 @@ def row(result: Design | DesignError) -> str:
     return (
         f"{g.p:7.3f} {g.i:7.2f} {g.d:7.4f} {m.phase:4.0f} {m.gain:5.2f} {m.sensitivity:5.2f} "
         f"{1e3 * f.settling:5.0f}ms {f.overshoot:4.1f}% {f.load_integral:6.3f} "
-        f"{f.peak_voltage:5.2f}V {1e3 * f.ripple:4.0f}mV"
+        f"{f.peak_voltage:5.2f}V {1e3 * f.control_noise:4.0f}mV"
     )
 
 

@@ -86,7 +86,7 @@ def show(
                 quantity.unit,
             )
         mine = gains[wheel]
-        told = ", ".join(f"{n} {mine[n]:.4g}" for n in GAINS if mine.get(n))
+        text = ", ".join(f"{n} {mine[n]:.4g}" for n in GAINS if mine.get(n))
         driven = table("", "manoeuvre", "from", "to", "rise", "settling", "overshoot")
         for one in answers[wheel]:
             times = (f"{1e3 * seconds:.0f} ms" for seconds in (one.rise, one.settling))
@@ -95,7 +95,7 @@ def show(
                 one.segment, f"{one.before:+.2f}", f"{one.after:+.2f} rad/s", *times, overshoot
             )
         out.print(made)
-        out.print(f"gains (volts, wheel rad/s): {told}", soft_wrap=True)
+        out.print(f"gains (volts, wheel rad/s): {text}", soft_wrap=True)
         out.print(driven)
 
 

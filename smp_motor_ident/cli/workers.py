@@ -20,7 +20,9 @@ _PR_SET_PDEATHSIG = 1
 _JOBS: dict[str, Callable[[Say], Any]] = {}
 
 
-def in_parallel(jobs: Mapping[str, Callable[[Say], Result]], say: Say) -> dict[str, Result]:
+def in_parallel(
+    jobs: Mapping[str, Callable[[Say], Result]], say: Say, cold: bool = False
+) -> dict[str, Result]:
     """Do every job, each in a process that is forked and so has what is loaded already.
 
     Parameters
@@ -29,6 +31,8 @@ def in_parallel(jobs: Mapping[str, Callable[[Say], Result]], say: Say) -> dict[s
         By name; each takes what it may tell its progress to.
     say : callable
         Takes a text and the share of the work that is done.
+    cold : bool
+        Nothing is compiled yet: the first job is done alone, so that only one process compiles.
 
     Returns
     -------
@@ -41,6 +45,10 @@ def in_parallel(jobs: Mapping[str, Callable[[Say], Result]], say: Say) -> dict[s
         The first that a job raised; the others are ended.
     """
     cores = min(len(os.sched_getaffinity(0)), len(jobs))
+    if cold and cores > 1:
+        first, *others = jobs
+        done = {first: jobs[first](_named(say, first))}
+        return done | in_parallel({name: jobs[name] for name in others}, say)
     if cores < 2:
         return {name: job(_named(say, name)) for name, job in jobs.items()}
     say(f"estimating {', '.join(jobs)}")
@@ -49,7 +57,7 @@ def in_parallel(jobs: Mapping[str, Callable[[Say], Result]], say: Say) -> dict[s
     pool = ProcessPoolExecutor(cores, mp_context=fork, initializer=_end_with_parent)
     try:
         futures: dict[Future[Result], str] = {pool.submit(_do, name): name for name in jobs}
-        done: dict[str, Result] = {}
+        done = {}
         for future in as_completed(futures):
             done[futures[future]] = future.result()
             left = [name for name in jobs if name not in done]

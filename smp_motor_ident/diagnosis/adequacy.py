@@ -32,8 +32,8 @@ from smp_motor_ident.diagnosis.limits import (
     IMPLIED_BIAS,
 )
 from smp_motor_ident.diagnosis.model_error import BLOCKS, Regression, regression
-from smp_motor_ident.estimation.answer import Answer
 from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.estimation.quantities import Answer
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model import structures as models
@@ -135,23 +135,23 @@ def _test(
         return _test(errors, effect, columns[:1], white) if len(columns) > 1 else None
     size = np.linalg.solve(normal, z.T @ e)
     left = e - z @ size
-    n, q = e.size, len(columns)
+    n, q = int(np.count_nonzero(e)), len(columns)  # rows without a measurement are zero
     variance = float(left @ left) / max(n - q, 1)
     blocks = int(errors.block[-1]) + 1 if errors.block.size else 0
     scores = np.stack([np.bincount(errors.block, z[:, j] * left, blocks) for j in range(q)], axis=1)
     weights = np.stack([np.bincount(errors.block, z[:, j] ** 2, blocks) for j in range(q)])
-    told = float(np.min(weights.sum(axis=1) ** 2 / np.square(weights).sum(axis=1)))
-    if told - q < EFFECT_BLOCKS.value and not white:
-        return None  # what shows it lies in a few stretches: chance cannot be told
+    stretches = float(np.min(weights.sum(axis=1) ** 2 / np.square(weights).sum(axis=1)))
+    if stretches - q < EFFECT_BLOCKS.value and not white:
+        return None  # what shows it lies in a few stretches: chance cannot be excluded
     middle = scores.T @ scores * blocks / (blocks - 1)
     least = variance * normal
     moved = z.T @ e
     robust = float(moved @ np.linalg.pinv(middle, hermitian=True) @ moved) / q
     plain = float(moved @ np.linalg.solve(least, moved)) / q
-    freedom = max(told - q, 1.0)
+    freedom = max(stretches - q, 1.0)
     p_robust = float(fdtrc(q, freedom, robust * freedom / (freedom + q - 1)))
     p_plain = float(fdtrc(q, max(n - q, 1), plain))
-    p = p_plain if told - q < EFFECT_BLOCKS.value else max(p_robust, p_plain)
+    p = p_plain if stretches - q < EFFECT_BLOCKS.value else max(p_robust, p_plain)
     return Evidence(effect, p, plain * q, errors.shifts[:, columns] @ size, columns)
 
 

@@ -5,27 +5,31 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
+from numpy.typing import NDArray
 
 from smp_motor_ident.diagnosis.limits import (
     FIT_EXPLAINS,
     FIT_HOLDS,
     FIT_INDEPENDENT,
     FRICTION_SHOWN,
+    IMPLIED_BIAS,
     RINGING,
-    SETTLED,
     SQUARE_LEVEL,
     STEADY,
     UNEXPLAINED,
 )
 from smp_motor_ident.estimation import replay
-from smp_motor_ident.estimation.answer import Answer
 from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.estimation.quantities import Answer
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments
+from smp_motor_ident.likelihood.passes import evaluate
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import PHYSICAL
 from smp_motor_ident.result import FitPercent, ResidualTests
+
+Array = NDArray[np.float64]
 
 
 def assess(data: Experiments, fit: Fit, percent: FitPercent, tests: ResidualTests) -> list[Finding]:
@@ -220,15 +224,34 @@ def _ring(fit: Fit) -> float:
 
 
 def _unsettled(data: Experiments, fit: Fit) -> bool:
-    """Tell whether a further step would still move what is reported by half its uncertainty.
+    """Tell whether a further step would move what is reported beyond its interval.
 
-    A descent may end at a kink, or along L/R beside the response, which nothing reports.
+    A descent may end at a kink, or along L/R beside the response, which nothing reports.  At a
+    kink the linear step is long and yet leads uphill: only a way that lowers the sum of squares
+    by as much as such a move is worth counts.
     """
     _, step, _ = replay.promise(data, fit, fit.structure)
     free = np.array(fit.structure.free())
     reported = (free != models.TE) | fit.structure.current
     deviation = np.sqrt(np.diag(fit.covariance()))
-    return bool(np.any(np.abs(step) > SETTLED.value * deviation, where=reported))
+    if not np.any(np.abs(step) > IMPLIED_BIAS.value * deviation, where=reported):
+        return False
+    here = _least_squares(data, fit, fit.z)
+    return any(
+        _least_squares(data, fit, fit.z + share * fit.structure.matrix() @ step)
+        < here - IMPLIED_BIAS.value**2
+        for share in (1.0, 0.3, 0.1)
+    )
+
+
+def _least_squares(data: Experiments, fit: Fit, z: Array) -> float:
+    """Return the weighted sum of squares at coordinates, under the best initial states."""
+    z = z.copy()
+    volts = [models.VC_PLUS, models.VC_MINUS, models.DELAY]
+    z[volts] = np.maximum(z[volts], 0.0)
+    z = fit.structure.complete(z)
+    there = evaluate(data, fit.structure, z, fit.initial, fit.initial, fit.gain, fit.noise)
+    return float(there.objective - there.local_decrease)
 
 
 def advise(fit: Fit, result: Answer, known: Mapping[str, float]) -> list[Finding]:
@@ -278,7 +301,7 @@ def advise(fit: Fit, result: Answer, known: Mapping[str, float]) -> list[Finding
             out.append(
                 _note(
                     "weak_excitation",
-                    f"{others} cannot be told from these data",
+                    f"{others} cannot be identified from these data",
                     f"{others}: excite harder, longer, over more frequencies and in both "
                     "directions",
                 )

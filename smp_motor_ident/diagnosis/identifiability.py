@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.estimation import replay
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.likelihood import recursion as rc
@@ -151,7 +152,7 @@ def what_next(
 
     Several amplitudes and bands are simulated with the estimated motor; the Fisher
     information of each, which grows in proportion to the length, tells how long it must be.
-    Where the current was not measured a family of motors answers the same: the promise holds
+    Where the current was not measured a family of motors answers the same: the prediction holds
     for the least favourable of them whose back-EMF is at least 3 % of what limits the speed.
 
     Parameters
@@ -161,7 +162,7 @@ def what_next(
     accuracy : float
         Wanted relative standard deviation.
     supply : float, optional
-        Largest voltage [V]; by default that of the hardware, else 12 V.
+        Largest voltage [V]; by default that of the hardware, else the recording's largest.
     longest : float
         Longest acceptable recording [s].
     current_noise : float
@@ -171,8 +172,18 @@ def what_next(
     -------
     Proposal
         The shortest one that suffices, or the best one of length ``longest``.
+
+    Raises
+    ------
+    ParameterError
+        When nothing says how much voltage the motor may get.
     """
-    limit = supply or estimate.hardware.supply_voltage or 12.0
+    limit = supply or estimate.hardware.supply_voltage or estimate.largest_voltage
+    if not limit:
+        raise ParameterError(
+            f"{estimate.wheel}: neither the supply nor the voltage of the recording is known; "
+            "give the largest voltage that the motor may get"
+        )
     family, needs_current = _family(estimate, current_noise)
     step = estimate.sample_time or 0.005
     corner = 1 / (2 * np.pi * max(estimate.value("time_constant"), 4 * step))
@@ -200,8 +211,8 @@ def _cost(p: Proposal, accuracy: float) -> tuple[float, float, float]:
 def _family(estimate: Estimate, current_noise: float) -> tuple[list[Fit], bool]:
     """Return the motors that answer as the estimated one does, and whether current is lacking."""
     known = {n: q.value for n, q in estimate.parameters.items() if n in PHYSICAL}
-    told = known.get("resistance") or estimate.hardware.resistance
-    r = told or LARGEST_RESISTANCE
+    given = known.get("resistance") or estimate.hardware.resistance
+    r = given or LARGEST_RESISTANCE
     z = np.zeros(11)
     gain, tau = estimate.value("dc_gain"), estimate.value("time_constant")
     product = estimate.value("time_constant_product") or 0.02 * tau**2

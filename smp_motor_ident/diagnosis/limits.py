@@ -20,6 +20,50 @@ class Limit:
     test: str
 
 
+# Estimation: what is stated, and how surely.
+LOOSE_QUANTITY = Limit(
+    0.5,
+    "of its value",
+    "a quantity known no better than to a factor of two (95 %) decides nothing",
+    "test_estimate.py: a single level of voltage gives one combination",
+)
+NEGLIGIBLE_FRICTION = Limit(
+    0.05,
+    "V",
+    "Coulomb friction certain to that much may be nothing: half a percent of 10 V",
+    "test_estimate.py: a linear motor is recovered without friction",
+)
+HOMOGENEITY = Limit(
+    0.01,
+    "significance level",
+    "one record in a hundred of a motor that does not change may be called one that does",
+    "test_segments.py: a motor that does not change is rarely said to",
+)
+SEGMENTS = Limit(
+    8,
+    "parts of a record",
+    "enough for a scatter (a factor of 1.2 by Student's t), few enough for each to know the motor",
+    "test_segments.py: a motor that warms up",
+)
+SEGMENT_INFORMATION = Limit(
+    0.25,
+    "of the average part's",
+    "a part whose interval is more than twice the others' adds its noise, not the motor's change",
+    "test_segments.py: parts without excitation do not count",
+)
+REST = Limit(
+    0.05,
+    "of the largest voltage",
+    "a motor that does not move at a twentieth of the voltage shows what it shows at none",
+    "test_estimate.py: rest before the excitation changes nothing",
+)
+SAME_LEVEL = Limit(
+    0.02,
+    "of a voltage",
+    "levels closer than a voltmeter and a battery under load hold them are one level",
+    "test_estimate.py: a single level of voltage gives one combination",
+)
+
 # Reading recordings (smp_motor_ident.bag).
 UNPACKED_LEAST = Limit(
     256e6,
@@ -38,6 +82,54 @@ STRAY_ROWS = Limit(
     "1",
     "cost: an estimate without one row in twenty keeps its value; with more it is no table",
     "test/ident/bag/test_csv.py",
+)
+BEAT_FLOOR = Limit(
+    0.5,
+    "sample",
+    "physical: a later beat than half a sample is the next one; the least latency stays below it",
+    "test/ident/bag/test_beat.py",
+)
+BEAT_JITTER = Limit(
+    0.02,
+    "sample",
+    "cost: instants that are off by less change an estimate less than their rounding",
+    "test/ident/bag/test_beat.py",
+)
+BEAT_LOST = Limit(
+    0.02,
+    "1",
+    "cost: with more samples lost the number of a sample, and with it its instant, is a guess",
+    "test/ident/bag/test_beat.py",
+)
+JUMP_SPAN = Limit(
+    20.0,
+    "1",
+    "physical: no signal leaves twenty times the range of 98 % of its values for single samples",
+    "test/ident/bag/test_checks.py",
+)
+JUMP_STEP = Limit(
+    20.0,
+    "1",
+    "physical: what has inertia does not step to and fro by twenty times all but 1 % of its steps",
+    "test/ident/bag/test_checks.py",
+)
+UNSIGNED_CURRENT = Limit(
+    2.0,
+    "1",
+    "physical: an armature's means in both directions cancel but for an offset; a size's add up",
+    "test/ident/bag/test_checks.py",
+)
+SMOOTHER = Limit(
+    0.9,
+    "1",
+    "cost: stamps are kept unless the motion is evidently smoother on the beat that they keep",
+    "test/ident/bag/test_beat.py",
+)
+EXPLAINS = Limit(
+    1e-6,
+    "1",
+    "significance: with a thousand pairs of fields tried, one in a thousand listings is wrong",
+    "test/ident/bag/test_propose.py",
 )
 
 # Assessment of a fit.
@@ -73,14 +165,8 @@ UNEXPLAINED = Limit(
 RINGING = Limit(
     1.5,
     "rad per sample",
-    "at pi a ringing cannot be told from a slower one; at half of that "
+    "at pi a ringing cannot be distinguished from a slower one; at half of that "
     "sampling between two swings still shows both",
-    "test_findings.py",
-)
-SETTLED = Limit(
-    0.5,
-    "standard deviations",
-    "a further step of this size changes an interval's coverage by less than 5 %",
     "test_findings.py",
 )
 STEADY = Limit(
@@ -132,6 +218,25 @@ LARGEST_OFFSET = Limit(
     "a sensor so far from its zero is not calibrated",
     "test_screening.py",
 )
+SIGN_SURE = Limit(
+    4.0,
+    "standard deviations",
+    "of the correlation of two signals that have no part in each other; the largest of twelve "
+    "lags exceeds it by chance once in 2000 records of a standing motor",
+    "test_screening.py",
+)
+SAME_MOTOR = Limit(
+    0.01,
+    "probability",
+    "that records of one motor differ by so much by chance in any quantity",
+    "test_records.py",
+)
+SIGN_ALIKE = Limit(
+    0.5,
+    "correlation",
+    "a quarter of the motion follows the voltage: it turns, however slowly the voltage changes",
+    "test_screening.py",
+)
 RESIDUAL_LEVEL = Limit(
     0.05,
     "probability",
@@ -166,4 +271,41 @@ IMPLIED_BIAS = Limit(
     "standard deviations",
     "the half-width of the 95 % interval that is stated",
     "test_adequacy.py",
+)
+
+
+# Tuning: what may be designed on, and how far gains may go.
+
+FRICTION_KNOWN = Limit(
+    0.02,
+    "share of the supply",
+    "an error of the friction's feed-forward by this changes the speed by as much of its largest "
+    "value as the band in which a change counts as settled",
+    "test/ident/test_tune_truth.py",
+)
+FRICTION_RANGE = Limit(
+    0.5,
+    "share of the supply",
+    "with half of the supply unknown the speed that the motor reaches is not known to a factor 2",
+    "test/ident/test_tune_truth.py",
+)
+UNRELIABLE_SPREAD = Limit(
+    0.1,
+    "relative standard deviation",
+    "least that numbers of an unreliable estimate are drawn with; more where the fit on held-out "
+    "data leaves more of the motion unexplained",
+    "test/ident/test_tune_truth.py",
+)
+SPEED_NOISE = Limit(
+    2.5e-3,
+    "share of the top speed, rms",
+    "four times this is 2 % of half the top speed: with more, counts shake the wheel out of the "
+    "band in which the specification calls a change settled",
+    "test/ident/test_tune_methods.py",
+)
+CANDIDATE_WEIGHT = Limit(
+    0.05,
+    "probability",
+    "a structure that explains the data best less often than that is rejected at the 5 % level",
+    "test_averaging.py: a lag that may be a delay",
 )

@@ -25,6 +25,7 @@ from smp_motor_ident.model.structures import to_internal
 Array = NDArray[np.float64]
 
 BLOCKS = 40  # whose sums of scores give the covariance
+ROWS = 6_000  # of each output that the regression has at most
 NUDGE = 1e-3  # of a signal's size: small against what bends, large against rounding
 SEGMENTS = 20  # beyond which only the angle's offset of each is projected out
 
@@ -87,12 +88,9 @@ def regression(data: Experiments, fit: Fit, gear: float) -> Regression | None:
             members.append((effect, tuple(range(first, first + len(made)))))
             columns += [_stacked(data, fit, c) for c in made]
     table = np.column_stack(columns)
-    block = _blocks(data)
-    ok = np.isfinite(table).all(axis=1)
-    table, block = table[ok], block[ok]
-    if table.shape[0] < 4 * BLOCKS:
+    if np.count_nonzero(columns[0]) < 4 * BLOCKS:
         return None
-    return _projected(table, n_own, block, members, len(fit.structure.free()))
+    return _projected(table, n_own, _blocks(data), members, len(fit.structure.free()))
 
 
 def _projected(
@@ -130,15 +128,29 @@ def _measured(data: Experiments) -> Array:
 
 
 def _stacked(data: Experiments, fit: Fit, columns: Array) -> Array:
-    """Return output and current below each other, in units of their innovations."""
-    parts = [columns[:, 0] / np.sqrt(fit.noise[0, 0])]
-    if columns.shape[1] > 1:
-        parts.append(columns[:, 1] / np.sqrt(fit.noise[1, 1]))
+    """Return output and current below each other, in units of their innovations.
+
+    Of long records the sums over so many samples that `ROWS` of each are left, over the root of
+    their number: what the effects do is slow, and a sum of errors is as good as they are.
+    """
+    measured = _measured(data)
+    begins = np.arange(0, data.size, _together(data))
+    parts = []
+    for k in range(columns.shape[1]):
+        known = np.where(np.isfinite(measured[:, k]), columns[:, k], 0.0)
+        sums = np.add.reduceat(known, begins)
+        parts.append(sums / np.sqrt(fit.noise[k, k] * _together(data)))
     return np.concatenate(parts)
 
 
+def _together(data: Experiments) -> int:
+    """Return how many samples make a row."""
+    return max(1, data.size // ROWS)
+
+
 def _blocks(data: Experiments) -> NDArray[np.int64]:
-    block = np.arange(data.size) * BLOCKS // data.size
+    begins = np.arange(0, data.size, _together(data))
+    block = begins * BLOCKS // data.size
     return np.tile(block, 2 if data.current.size else 1)
 
 

@@ -13,6 +13,8 @@ from smp_motor_ident.diagnosis.limits import (
     METER,
     MOST_LOST,
     OFFSET_SURE,
+    SIGN_ALIKE,
+    SIGN_SURE,
 )
 from smp_motor_ident.errors import InsufficientExcitationError, SignalError
 from smp_motor_ident.finding import Finding
@@ -59,8 +61,8 @@ def screen(records: Sequence[Record]) -> list[Finding]:
     _signs(records, where)
     for record in records:
         _offset(record)
-    notes = dict.fromkeys(note for record in records for note in record.notes)
-    return [*warnings, *(Finding("reading", "warning", note) for note in notes)]
+    read = [finding for record in records for finding in record.findings]
+    return [*warnings, *(f for k, f in enumerate(read) if f not in read[:k])]
 
 
 def _where(records: Sequence[Record]) -> str:
@@ -120,11 +122,26 @@ def _excitation(records: Sequence[Record], where: str) -> None:
         and float(np.ptp(r.voltage)) < 10 * METER.value * abs(level)
         for r, level in zip(records, levels, strict=True)
     ]
-    if all(still) and float(np.ptp(levels)) < METER.value * abs(levels[0]):
+    if (
+        all(still)
+        and float(np.ptp(levels)) < METER.value * abs(levels[0])
+        and not any(_starts(r) for r in records)
+    ):
         raise InsufficientExcitationError(
             f"{where}: the voltage is constant at {levels[0]:.4g} V; a constant "
             "input cannot tell dynamics: record a square or Fourier voltage in both directions"
         )
+
+
+def _starts(record: Record) -> bool:
+    """Tell whether a speed rises under a constant voltage: a step before the first row."""
+    speed = measured_speed(record)
+    speed = np.abs(speed[np.isfinite(speed)])
+    tenth = max(speed.size // 10, 1)
+    steady = float(np.mean(speed[-tenth:]))
+    scatter = float(np.std(speed[-tenth:]))
+    first = float(np.mean(speed[: max(tenth // 10, 3)]))
+    return bool(speed.size >= FEWEST.value and steady - first > max(0.2 * steady, 6 * scatter))
 
 
 def measured_speed(record: Record) -> Array:
@@ -158,11 +175,11 @@ def _ratio(record: Record) -> None:
         _compare(record, angle, what, np.concatenate([[0.0], charge]), "velocity")
 
 
-def _compare(record: Record, angle: Array, what: str, told: Array, other: str) -> None:
+def _compare(record: Record, angle: Array, what: str, other_values: Array, other: str) -> None:
     where = _where([record])
     lag = max(1, min(10, len(record) // 10))
     dt = record.time[lag:] - record.time[:-lag]
-    a, b = (angle[lag:] - angle[:-lag]) / dt, (told[lag:] - told[:-lag]) / dt
+    a, b = (angle[lag:] - angle[:-lag]) / dt, (other_values[lag:] - other_values[:-lag]) / dt
     ok = np.isfinite(a) & np.isfinite(b)
     for s in record.starts[1:]:
         ok[max(0, s - lag) : s] = False
@@ -277,7 +294,7 @@ def _signs(records: Sequence[Record], where: str) -> None:
         ("speed", "swap the motor's leads or the encoder's channels"),
         ("current", "swap the current sensor's sign"),
     ):
-        total = power = 0.0
+        total = power = chance = 0.0
         for record in records:
             y = measured_speed(record) if what == "speed" else record.current
             if y is None:
@@ -288,8 +305,11 @@ def _signs(records: Sequence[Record], where: str) -> None:
             v, x = _averaged(record, y)
             together = float(np.einsum("i,i->", v, x))
             total += together if what == "current" else _slow_product(v, x)
-            power += float(np.sqrt(np.square(v).sum() * np.square(x).sum()))
-        if power > 0 and total < -0.2 * power:
+            size = float(np.sqrt(np.square(v).sum() * np.square(x).sum()))
+            power += size
+            chance += (size * _chance(v, x)) ** 2
+        least = min(SIGN_SURE.value * float(np.sqrt(chance)), SIGN_ALIKE.value * power)
+        if power > 0 and total < -max(0.2 * power, least):
             raise SignalError(
                 f"{where}: swapped sign, {what} runs against the voltage "
                 f"(correlation {total / power:.2f}); {remedy}"
@@ -334,6 +354,18 @@ def _offset(record: Record) -> None:
             f"{_where([record])}: current has an offset of {offset:.2g} A where it reaches "
             f"{largest:.3g} A; zero the current sensor at rest and record again"
         )
+
+
+def _chance(v: Array, y: Array) -> float:
+    """Return the standard deviation of the correlation of two signals that have no part in
+    each other (Bartlett): the sum of the product of their autocorrelations over n.
+    """
+    size = 2 * len(v)
+    own = [np.fft.irfft(np.abs(np.fft.rfft(x, size)) ** 2, size)[: len(v)] for x in (v, y)]
+    if own[0][0] == 0 or own[1][0] == 0:
+        return 1.0
+    product = (own[0] / own[0][0]) * (own[1] / own[1][0])
+    return float(np.sqrt(max(1.0, 2 * product.sum() - 1) / len(v)))
 
 
 def _slow_product(v: Array, y: Array) -> float:

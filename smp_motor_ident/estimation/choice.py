@@ -20,6 +20,7 @@ class Rung:
 
     fit: Fit
     reason: str = ""
+    whole: bool = True
 
     @property
     def label(self) -> str:

@@ -14,6 +14,9 @@ from smp_motor_ident.model.structures import Structure
 
 Array = NDArray[np.float64]
 
+NORMAL_95 = 1.96
+"""Half a 95 % interval of a normal variable, in its standard deviations."""
+
 PLAUSIBLE = np.array([1e-2, 1e-2, 1e-2, 0.25, 1e-4, 1e-4, 1e-4, 1e-2, 1e-4, 1e-2, 1e-2])
 """Inverse squares of how far each coordinate z could be from any value at all."""
 
@@ -25,6 +28,22 @@ class Prior:
     name: str
     value: float
     std: float
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """A coordinate followed to both ends of its 95 % interval, all others fitted again.
+
+    Attributes
+    ----------
+    coordinate : int
+        Index into z.
+    ends : tuple of ndarray, shape (11,) each
+        Coordinates of the whole motor at the lower and the upper end.
+    """
+
+    coordinate: int
+    ends: tuple[Array, Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,8 +80,10 @@ class Fit:
         Of the data.
     widen : ndarray, shape (f,), optional
         Factors on the standard deviations, see `quantisation.widened`.
-    blur : ndarray, shape (f, f), optional
-        Covariance from instants that are not known exactly, see `quantisation.blurred`.
+    added : ndarray, shape (f, f), optional
+        Covariance of what the likelihood does not see: `consider`, `segments`.
+    profiles : tuple of Profile
+        Coordinates whose interval was followed, not extrapolated, see `profile`.
     """
 
     structure: Structure
@@ -80,26 +101,41 @@ class Fit:
     samples: int
     kind: int
     widen: Array | None = None
-    blur: Array | None = None
+    added: Array | None = None
+    profiles: tuple[Profile, ...] = ()
 
     def covariance(self) -> Array:
         """Return the covariance of the free coordinates, shape (f, f).
 
         The inverse information, widened coordinate by coordinate where the scores of
-        whole runs of samples scatter more than white residuals would let them.
+        whole runs of samples scatter more than white residuals would let them; along a
+        profile, what that found.
         """
-        cov = self._white()
+        cov = self.conditional()
+        free = list(self.structure.free())
+        for profile in self.profiles:
+            far = max(profile.ends, key=lambda z: float(np.abs(z - self.z).max()))
+            secant = (far - self.z)[free] / NORMAL_95
+            cov = cov + np.outer(secant, secant)
+        return cov
+
+    def conditional(self) -> Array:
+        """Return the covariance with the profiled coordinates held, shape (f, f)."""
+        cov = self.white()
         widen = np.sqrt(self.colour())
         cov = cov * np.outer(widen, widen)
         if self.widen is not None:
             cov = cov * np.outer(self.widen, self.widen)
-        if self.blur is not None:
-            cov = cov + self.blur
+        if self.added is not None:
+            cov = cov + self.added
+        for profile in self.profiles:
+            i = self.structure.free().index(profile.coordinate)
+            cov = cov - np.outer(cov[:, i], cov[i]) / max(float(cov[i, i]), 1e-300)
         return cov
 
     def colour(self) -> Array:
         """Return by how much each variance is larger than of white residuals, shape (f,)."""
-        cov = self._white()
+        cov = self.white()
         n = len(self.scores)
         if n <= 2 * cov.shape[0]:
             return np.ones(cov.shape[0])
@@ -107,7 +143,8 @@ class Fit:
         sandwich = np.square(moved).sum(axis=0) * (n / (n - 1))
         return np.asarray(np.maximum(1.0, sandwich / np.maximum(np.diag(cov), 1e-300)))
 
-    def _white(self) -> Array:
+    def white(self) -> Array:
+        """Return the covariance of white residuals, shape (f, f)."""
         # Every coordinate lies within some e-folds or volts of any motor's: without that a
         # direction that the data leave open would count as known.
         information = self.information + np.diag(PLAUSIBLE[list(self.structure.free())])

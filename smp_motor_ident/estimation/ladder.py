@@ -13,6 +13,7 @@ from smp_motor_ident.estimation.cold import cold_fit
 from smp_motor_ident.estimation.descent import Options
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.lateness import averaged, with_delay
+from smp_motor_ident.estimation.profile import RISE, one_level, rubbing
 from smp_motor_ident.estimation.thinning import thinned
 from smp_motor_ident.estimation.valley import shaken
 from smp_motor_ident.likelihood import recursion as rc
@@ -103,7 +104,7 @@ def _frictionless(
     if quick is None or not quick.converged or _friction_shows(head, quick, False):
         return []
     rungs = explore(data, plain, options, auto, say, quick if head is data else None)
-    if not rungs or _friction_shows(_of_kind(data, rungs[-1].fit), rungs[-1].fit, True):
+    if not rungs or _may_rub(_of_kind(data, rungs[-1].fit), rungs[-1].fit, options):
         return []
     reason = f"{rungs[-1].reason}; no Coulomb friction shows"
     return [*rungs[:-1], Rung(rungs[-1].fit, reason)]
@@ -119,6 +120,26 @@ def _friction_shows(data: Experiments, fit: Fit, surely_small: bool) -> bool:
     if not np.isfinite(found) or (found / std) ** 2 > 0.5 * np.log(fit.samples):
         return True
     return surely_small and found + 2 * std > LITTLE * float(np.abs(data.hold_value).max())
+
+
+def _may_rub(data: Experiments, fit: Fit, options: Options) -> bool:
+    """Tell whether a friction that is not little would explain the data as well.
+
+    The score at no friction does not tell: a motor that rests under a little friction is
+    driven by its offset under none.
+    """
+    if one_level(data, fit) or _friction_shows(data, fit, True):
+        return True
+    little = LITTLE * float(np.abs(data.hold_value).max())
+    z, initials = rubbing(data, fit, little)
+    held = {**fit.structure.held, "vc_plus": little}
+    rubs = fit.structure.with_(friction="symmetric", held=held)
+    other = min(
+        (descent.descend(data, rubs, rubs.complete(z), initial, fit.noise, fit.ratio, options, 12)
+         for initial in initials),
+        key=lambda f: f.deviance,
+    )  # fmt: skip
+    return other.deviance - fit.deviance < RISE * inflation(fit)
 
 
 def _of_kind(data: Experiments, fit: Fit) -> Experiments:
@@ -140,16 +161,20 @@ def _orders(
         if fitted is not None:
             tried.append(_no_worse(_of_kind(part, fitted), fitted, tried, options))
     tried = _from_richer(part, tried, options)
+    tried = _from_rivals(part, tried, options)
     least = min((f.deviance for f in tried), default=0.0)
     best: Fit | None = None
     for fitted in tried:
         if part is not data:
             if fitted.deviance > least + HOPELESS * inflation(fitted):
-                rungs.append(Rung(_projected(data, fitted), f"rejected on {part.size} samples"))
+                rungs.append(
+                    Rung(_projected(data, fitted), f"rejected on {part.size} samples", whole=False)
+                )
                 continue
             every = _of_kind(data, fitted)
             fitted = horizon.extend(every, fitted.structure, fitted, options)
             fitted = shaken(every, fitted.structure, fitted, options)
+            fitted = _no_worse(every, fitted, [r.fit for r in rungs if r.whole], options)
         if best is None:
             best = fitted
             rungs.append(Rung(fitted, "the simplest" if len(rungs) == 0 else "the simplest left"))
@@ -200,6 +225,41 @@ def _from_richer(data: Experiments, tried: list[Fit], options: Options) -> list[
             fit = min(fit, again, key=lambda f: f.deviance)
         out.append(fit)
     return out
+
+
+def _from_rivals(data: Experiments, tried: list[Fit], options: Options) -> list[Fit]:
+    """Start the likeliest from every rival's answer: what is late in one way may be in another."""
+    if len(tried) < 2:
+        return tried
+    best = min(range(len(tried)), key=lambda i: tried[i].deviance + _price(tried[i]))
+    out = list(tried)
+    for rival in tried:
+        winner = out[best]
+        if rival is winner or rival.kind != winner.kind:
+            continue
+        z = winner.structure.complete(_translated(rival, winner.structure, data.step))
+        again = descent.refine(_of_kind(data, winner), winner.structure, rival, z, options)
+        if again.deviance < winner.deviance:
+            out[best] = again
+    return out
+
+
+def _price(fit: Fit) -> float:
+    return size(fit.structure) * float(np.log(fit.samples))
+
+
+def _translated(rival: Fit, structure: Structure, step: float) -> models.Array:
+    """Return a rival's coordinates, what it is late by put into what the structure has."""
+    z, has = rival.z.copy(), rival.structure
+    late = z[models.DELAY] * has.delay
+    if has.order == 2 and structure.order == 1:
+        late += float(np.exp(z[models.A2] - z[models.A1]))
+    if structure.order == 2 and has.order == 1:
+        z[models.A2] = z[models.A1] + np.log(max(late, 0.1 * step))
+        z[models.TE] = z[models.A2] - z[models.A1]
+        late = 0.1 * step
+    z[models.DELAY] = max(late, 0.1 * step)
+    return z
 
 
 def _projected(data: Experiments, fit: Fit) -> Fit:
@@ -319,16 +379,13 @@ def _without_friction(data: Experiments, best: Fit, options: Options, rungs: lis
         z[models.VC_PLUS] = 1e-3 * np.abs(data.hold_value).max()
         again = descent.refine(data, s, plain, s.complete(z), options)
         best = min(best, again, key=lambda f: f.deviance)
-    cov = best.covariance()
-    i = s.free().index(models.VC_PLUS)
-    most = best.z[models.VC_PLUS] + 2 * float(np.sqrt(cov[i, i]))
-    # Friction that the data do not tell stays: leaving it out would make the gain certain.
-    if most < LITTLE * np.abs(data.hold_value).max() or plain.deviance < best.deviance:
-        # A descent that did not settle is no reason to believe in none.
-        gained = (plain.deviance - best.deviance) / inflation(best)
-        if gained <= float(np.log(best.samples)):
-            rungs.append(Rung(plain, "no Coulomb friction shows"))
-            return plain
+    # Friction that the data do not show stays where a little would explain them as well:
+    # leaving it out would make the gain certain.  A descent that did not settle is no reason
+    # to believe in none.
+    gained = (plain.deviance - best.deviance) / inflation(best)
+    if gained <= float(np.log(best.samples)) and not _may_rub(data, plain, options):
+        rungs.append(Rung(plain, "no Coulomb friction shows"))
+        return plain
     return best
 
 

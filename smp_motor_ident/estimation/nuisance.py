@@ -81,4 +81,4 @@ def _answer(data: Experiments, fit: Fit, richer: Structure, coordinate: int) -> 
 
 def _wider(fit: Fit, answer: Array, variance: float) -> Fit:
     more = np.asarray(variance * np.outer(answer, answer), dtype=np.float64)
-    return replace(fit, blur=more + (0.0 if fit.blur is None else fit.blur))
+    return replace(fit, added=more + (0.0 if fit.added is None else fit.added))

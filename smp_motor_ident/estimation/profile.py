@@ -1,8 +1,14 @@
-"""Intervals of what is poorly told: the deviance is followed, its parabola not trusted.
+"""Intervals from the profile likelihood: the deviance is followed, its parabola not trusted.
 
-At the end of an interval by the covariance the coordinate is held and all others are fitted
-again; where the deviance has risen by less than the parabola says, the interval is too short.
+A coordinate that is poorly known, or at its bound, is held at other values and all others are
+fitted again, until the deviance has risen by the quantile of chi-square (times the sandwich
+factor).  A bound that is reached first ends the interval: then it is one-sided.
 Derivation: docs/derivations.md, section 9.
+
+References
+----------
+Venzon and Moolgavkar, Applied Statistics 37 (1988), 87; Self and Liang, JASA 82 (1987), 605
+(at a bound).
 """
 
 from __future__ import annotations
@@ -13,28 +19,33 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from smp_motor_ident.estimation.descent import Options, descend
+from smp_motor_ident.diagnosis.limits import REST, SAME_LEVEL
+from smp_motor_ident.estimation.descent import Options, descend, initial_of
 from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.estimation.fitted import NORMAL_95, Profile
+from smp_motor_ident.estimation.replay import simulate
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model import structures as models
 
 Array = NDArray[np.float64]
 
-SIGMAS = 1.96
 RISE = float(chi2.ppf(0.95, 1))  # of the deviance at the end of a 95 % interval
-FARTHEST = 3.0  # times wider at most: beyond, the data tell next to nothing
-MANY = 50_000  # samples above which the parabola holds well enough
-LOOSE = {models.A2: 0.1, models.DELAY: 0.1, models.WINDOW: 0.1, models.VC_PLUS: 0.1}
-"""Coordinates that act other than linearly, and the relative uncertainty at which it shows."""
+NONLINEAR = (models.VC_PLUS, models.A2, models.DELAY, models.WINDOW)
+"""Coordinates that act other than linearly, in the order in which they are followed."""
+LOOSE = 0.1  # relative uncertainty at which that shows
+NEAR = 3.0  # standard deviations to a bound within which no parabola is trusted
+STEPS = 8  # points on each side
+MOST_FRICTION = 0.98  # of the largest voltage: with more the motor would not have turned
+FARTHEST = 4.0  # e-folds
 
 
 def profiled(data: Experiments, fit: Fit, options: Options) -> Fit:
-    """Return the fit with its covariance widened where the deviance rises too slowly.
+    """Return the fit with the profiles of what is poorly known.
 
     Parameters
     ----------
     data : Experiments
-        What was fitted.
+        What was fitted, or as many of its samples as tell the same.
     fit : Fit
         With its covariance.
     options : Options
@@ -43,43 +54,145 @@ def profiled(data: Experiments, fit: Fit, options: Options) -> Fit:
     Returns
     -------
     Fit
-        Unchanged where nothing is poorly told, or the parabola holds.
+        Unchanged where nothing is poorly known, or the parabola holds.
     """
-    if data.size > MANY or not fit.converged or np.isfinite(options.huber):
+    if np.isfinite(options.huber):
         return fit
     free = fit.structure.free()
-    factors = np.ones(len(free)) if fit.widen is None else fit.widen.copy()
     std = np.sqrt(np.diag(fit.covariance()))
-    white = np.sqrt(np.diag(_white(fit)))
-    for i, coordinate in enumerate(free):
-        size = 1.0 if coordinate == models.A2 else abs(fit.z[coordinate])
-        if coordinate in LOOSE and LOOSE[coordinate] * size < std[i] < size:
-            # Coloured residuals and repeating counts scale the deviance as they do variances.
-            target = RISE * (std[i] / white[i]) ** 2
-            factors[i] *= max(_side(data, fit, i, s * SIGMAS * std[i], target, options)
-                              for s in (-1.0, 1.0))  # fmt: skip
-    return replace(fit, widen=factors)
+    white = np.sqrt(np.diag(fit.white()))
+    found: list[Profile] = []
+    for coordinate in NONLINEAR:
+        if coordinate not in free:
+            continue
+        i = free.index(coordinate)
+        if coordinate == models.VC_PLUS and one_level(data, fit):
+            both = [rubbing(data, fit, f)[0] for f in _range(data, fit, coordinate)]
+            found.append(Profile(coordinate, (both[0], both[1])))
+            continue
+        value = float(fit.z[coordinate])
+        loose = std[i] > LOOSE * (1.0 if coordinate == models.A2 else abs(value))
+        if not loose and (coordinate == models.A2 or value > NEAR * std[i]):
+            continue
+        # Coloured residuals and repeating counts scale the deviance as they do variances.
+        target = RISE * float((std[i] / white[i]) ** 2)
+        found.append(_followed(data, fit, coordinate, float(std[i]), target, options))
+    return replace(fit, profiles=tuple(found))
 
 
-def _white(fit: Fit) -> Array:
-    return replace(fit, scores=fit.scores[:0], widen=None, blur=None).covariance()
+def one_level(data: Experiments, fit: Fit) -> bool:
+    """Tell whether the motor moves at one level of voltage only, along its motion.
+
+    Then gain and friction trade exactly: with ``s = (v - F) / (v - F')`` the motor of s a0,
+    s a1, s a2 and friction F' moves alike.
+    """
+    settled = fit if len(fit.initial) == len(data.initial) else replace(fit, initial=data.initial)
+    speed = simulate(data, settled)[:, 0]
+    index = np.zeros(data.size, dtype=np.int64)
+    for g, (a, b) in enumerate(zip(data.starts[:-1], data.starts[1:], strict=True)):
+        first = int(data.hold_start[g])
+        last = data.hold_end.size
+        last = int(data.hold_start[g + 1]) if g + 2 < data.starts.size else last
+        ends = data.hold_end[first:last]
+        within = np.searchsorted(ends, data.time[a:b] - 1e-9)
+        index[a:b] = first + np.minimum(within, last - first - 1)
+    moving = np.abs(speed) > REST.value * np.abs(speed).max()
+    driven = (data.hold_value[index] * np.sign(speed))[moving]  # braking is another level
+    level = float(np.median(driven)) if driven.size else 0.0
+    return bool(np.all(np.abs(driven - level) <= SAME_LEVEL.value * level))
 
 
-def _side(
-    data: Experiments, fit: Fit, i: int, move: float, target: float, options: Options
-) -> float:
-    """Return by how much farther than ``move`` the interval reaches on this side."""
-    coordinate = fit.structure.free()[i]
-    name = models.Z_NAMES[coordinate]
-    value = float(fit.z[coordinate] + move)
-    if coordinate != models.A2 and value <= 0.0:
-        return 1.0  # none of these is negative
-    held = fit.structure.with_(held={**fit.structure.held, name: value})
-    cov = _white(fit)
-    z = fit.z + fit.structure.matrix() @ (cov[:, i] / cov[i, i] * move)
-    other = descend(data, held, held.complete(z), fit.initial, fit.noise, fit.ratio, options,
-                    8, 0.05)  # fmt: skip
-    rise = other.deviance - fit.deviance
-    if not np.isfinite(rise) or rise >= target:
-        return 1.0
-    return float(min(np.sqrt(target / max(rise, 1e-9)), FARTHEST))
+def _followed(
+    data: Experiments, fit: Fit, coordinate: int, std: float, target: float, options: Options
+) -> Profile:
+    low, high = _range(data, fit, coordinate)
+    value = float(fit.z[coordinate])
+    size = max(value, 0.02 * high) if coordinate != models.A2 else 1.0
+    first = float(np.clip(NORMAL_95 * std, 0.05 * size, size))
+    target *= data.size / fit.samples
+    here = descend(
+        data, fit.structure, fit.z, initial_of(data, fit), fit.noise, fit.ratio, options, 6
+    )
+    ends = [_end(data, here, coordinate, end, first, target, options) for end in (low, high)]
+    shift = fit.z - here.z
+    return Profile(coordinate, (ends[0] + shift, ends[1] + shift))
+
+
+def _range(data: Experiments, fit: Fit, coordinate: int) -> tuple[float, float]:
+    if coordinate == models.A2:
+        return float(fit.z[models.A2] - FARTHEST), float(fit.z[models.A2] + FARTHEST)
+    if coordinate == models.VC_PLUS:
+        return 0.0, MOST_FRICTION * float(np.abs(data.hold_value).max())
+    return (1e-9 if coordinate == models.WINDOW else 0.0), float(np.ptp(data.time))
+
+
+def _end(
+    data: Experiments,
+    fit: Fit,
+    coordinate: int,
+    bound: float,
+    first: float,
+    target: float,
+    options: Options,
+) -> Array:
+    """Return the coordinates at which the deviance has risen by ``target``, or at the bound."""
+    side = np.sign(bound - fit.z[coordinate])
+    inner, inner_rise, move, near = fit, 0.0, first, fit
+    for _ in range(STEPS if side else 0):
+        value = float(fit.z[coordinate] + side * move)
+        last = side * (value - bound) >= 0
+        value = bound if last else value
+        outer = _held_at(data, near, coordinate, value, options)
+        rise = outer.deviance - fit.deviance
+        if not np.isfinite(rise) or rise >= target:
+            rise = rise if np.isfinite(rise) else 4 * target
+            # The deviance is a parabola between the two, its square root a line.
+            a, b = np.sqrt(max(inner_rise, 0.0)), np.sqrt(rise)
+            share = float(np.clip((np.sqrt(target) - a) / max(b - a, 1e-12), 0.0, 1.0))
+            return np.asarray(inner.z + share * (outer.z - inner.z))
+        inner, inner_rise, near = outer, rise, outer
+        if last:
+            break
+        move *= 2.0
+    return inner.z
+
+
+def _held_at(data: Experiments, near: Fit, coordinate: int, value: float, options: Options) -> Fit:
+    """Fit all others with a coordinate held at a value, its segments moving or at rest at first.
+
+    Friction takes its volts from the gain.
+    """
+    held = {**near.structure.held, models.Z_NAMES[coordinate]: value}
+    structure = near.structure.with_(held=held)
+    if coordinate == models.VC_PLUS:
+        z, initials = rubbing(data, near, value)
+    else:
+        z, initials = near.z.copy(), [near.initial]
+    z[coordinate] = value
+    tried = [
+        descend(data, structure, structure.complete(z), initial, near.noise, near.ratio, options,
+                10, 0.05)
+        for initial in initials
+    ]  # fmt: skip
+    return min(tried, key=lambda f: f.deviance)
+
+
+def rubbing(data: Experiments, near: Fit, value: float) -> tuple[Array, list[Array]]:
+    """Return coordinates and initial states of other friction that turn the motor as fast.
+
+    At one level of voltage these answer exactly alike: all of the response scales.  A segment
+    may also have begun at rest.
+    """
+    full = float(np.abs(data.hold_value).max())
+    scale = (full - value) / max(full - near.z[models.VC_PLUS], 1e-9)
+    z = near.z.copy()
+    z[[models.A0, models.A1, models.A2]] += np.log(scale)
+    z[[models.VC_PLUS, models.VC_MINUS]] = value
+    moving = near.initial.copy()
+    sign = np.sign(near.initial[:, 1])
+    moving[:, 0] = scale * (moving[:, 0] - sign * near.z[models.VC_PLUS]) + sign * value
+    before = np.abs(data.hold_value[data.hold_start[: len(moving)]])
+    at_rest = before < max(value, near.z[models.VC_PLUS])
+    if not np.any(at_rest & near.initial[:, :2].any(axis=1)):
+        return z, [moving]
+    return z, [moving, np.where(at_rest[:, None], np.array([0.0, 0.0, 1.0, 1.0]), 1.0) * moving]

@@ -44,6 +44,7 @@ Z_NAMES = (
 of Coulomb friction in both directions and of load; the current's offset [A]; delay and
 averaging window of the speed [s]."""
 A0, A1, A2, TE, VC_PLUS, VC_MINUS, LOAD, LN_R, OFFSET, DELAY, WINDOW = range(11)
+LOGARITHMS = (A0, A1, A2, TE, LN_R)
 
 PHYSICAL = (
     "resistance",

@@ -18,7 +18,7 @@ from builtin_interfaces.msg import Time
 from rclpy.node import Node
 
 from smp_interfaces.msg import MotorDescription, MotorParameters, MotorState
-from smp_motor_control import WHEELS
+from smp_motor_control import WHEELS, joint_of
 from smp_motor_control.errors import ParameterError, SmpError
 from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.settings import Parameters, described, nested
@@ -67,16 +67,16 @@ class Wheel:
 
     def __init__(self, node: Node, name: str, length: float) -> None:
         self.window = Window(name, length)
-        self.joint_name = f"{name}_wheel_joint"
+        self.joint_name = joint_of(name)
         self.stamp = Time()
         self.status = "collecting: no motor_state yet"
         self.running: Future[Estimate] | None = None
         self.publisher = node.create_publisher(
-            MotorParameters, f"/{name}/motor_parameters", runtime.LATCHED
+            MotorParameters, f"{name}/motor_parameters", runtime.LATCHED
         )
-        topic = f"/{name}/motor_state"
+        topic = f"{name}/motor_state"
         node.create_subscription(MotorState, topic, self._on_state, runtime.STREAM_SUBSCRIBER)
-        topic = f"/{name}/motor_description"
+        topic = f"{name}/motor_description"
         node.create_subscription(MotorDescription, topic, self._on_description, runtime.LATCHED)
 
     def _on_state(self, message: MotorState) -> None:

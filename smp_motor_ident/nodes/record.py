@@ -12,7 +12,7 @@ import re
 import shutil
 import sys
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -134,7 +134,9 @@ class Recorder(Node):
 
     def __init__(self, writer: BagWriter, choice: Choice, duration: float = 0.0) -> None:
         super().__init__("record")
-        self._writer, self._choice = writer, choice
+        self._writer = writer
+        own = {self.resolve_topic_name(name) for name in choice.names}
+        self._choice = replace(choice, names=frozenset(own))
         self._topics: dict[str, Topic] = {}
         self._refused: set[str] = set()
         self._group = Untouched()
@@ -259,7 +261,7 @@ def parser() -> argparse.ArgumentParser:
 def _choice(arguments: argparse.Namespace) -> Choice:
     wanted = pattern("--regex", arguments.regex)
     unwanted = pattern("--exclude", arguments.exclude)
-    names = frozenset(n if n.startswith("/") else f"/{n}" for n in arguments.topics)
+    names = frozenset(arguments.topics)
     if arguments.all:
         return Choice(exclude=unwanted, hidden=arguments.include_hidden)
     return Choice(names, wanted, unwanted, arguments.include_hidden)

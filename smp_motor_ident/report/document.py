@@ -172,7 +172,7 @@ def motors_yaml(estimates: Mapping[str, Estimate], provenance: Iterable[str] = (
         YAML.
     """
     motors = {wheel: motor_entry(estimate) for wheel, estimate in estimates.items()}
-    tree = {"/motor_plant": {"ros__parameters": {"motors": motors}}}
+    tree = {"/**/motor_plant": {"ros__parameters": {"motors": motors}}}
     head = "".join(f"# {line}\n" for line in provenance)
     return head + yaml.safe_dump(tree, sort_keys=False)
 

@@ -1,279 +1,192 @@
-"""The figures of the report, each from plain results to an SVG element."""
+"""The charts of one motor: fit over the data, residual correlations, frequency response."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
-from matplotlib.axes import Axes
 
-from smp_motor_ident.report.series import Comparison, thin
-from smp_motor_ident.report.theme import COLOR, canvas, note, styled, to_svg
-from smp_motor_ident.report.words import label, scaled
-from smp_motor_ident.result import Correlation, Estimate, Quantity, ResidualTests
+from smp_motor_ident.report.chart import Array, Chart, Curve, thin
+from smp_motor_ident.report.series import Comparison
+from smp_motor_ident.report.words import label
+from smp_motor_ident.result import ResidualTests
+
+POINTS = 8000
+"""Of a curve over time; zoomed in tenfold that is still one a pixel."""
+
+COHERENT = 0.6
+"""Below this coherence most of what a frequency shows is not the answer to the voltage."""
 
 
-@styled
-def speed(wheel: str, parts: Sequence[Comparison]) -> str:
-    """Draw measured against simulated speed, and the voltage below, over all data.
+def fit_charts(wheel: str, parts: Sequence[Comparison]) -> list[Chart]:
+    """Return speed, residual and voltage over all stretches of data, one after the other.
 
     Parameters
     ----------
     wheel : str
         Name of the wheel.
     parts : sequence of Comparison
-        Drawn one after the other; estimation and validation are shaded apart.
+        Estimation and validation are shaded apart.
 
     Returns
     -------
-    str
-        SVG.
+    list of Chart
+        Which share their time axis.
     """
-    figure, (top, bottom) = canvas(
-        9.6, 3.7, nrows=2, sharex=True, gridspec_kw={"height_ratios": [3, 1]}
-    )
-    begin = 0.0
+    begin, times, spans = 0.0, [], []
     for part in parts:
-        end = begin + part.time[-1]
-        for axes in (top, bottom):
-            axes.axvspan(begin, end, color=COLOR[part.role], alpha=0.55, linewidth=0)
-        _curves(top, part, begin)
-        bottom.plot(*thin(begin + part.time, part.voltage), color=COLOR["voltage"], lw=0.8)
+        times.append(begin + part.time)
+        end = begin + float(part.time[-1])
+        spans.append((begin, end, part.role))
         begin = end
-    _role_names(top, parts)
-    top.set_ylabel("motor speed [rad/s]")
-    top.legend(loc="upper right", ncols=2, bbox_to_anchor=(1.0, 1.2), borderpad=0)
-    bottom.set(ylabel="voltage [V]", xlabel="time [s]", xlim=(0, begin))
-    figure.align_ylabels()
-    return to_svg(figure, f"speed-{wheel}", f"Measured and simulated speed of {label(wheel)}")
+    time = np.concatenate(times)
+    measured = np.concatenate([part.measured for part in parts])
+    simulated = np.concatenate([part.simulated for part in parts])
+    voltage = np.concatenate([part.voltage for part in parts])
+    keep = np.union1d(thin(measured, POINTS // 2), thin(simulated, POINTS // 2))
+    name = label(wheel)
 
+    def chart(kind: str, y_label: str, height: int, *curves: Curve) -> Chart:
+        return Chart(
+            name=f"{kind}-{wheel}", title=f"{name}: {kind}", x_label="time [s]", y_label=y_label,
+            x=time[keep], curves=curves, spans=tuple(spans), group=wheel, height=height,
+            summary=f"{kind.capitalize()} of {name} over {time[-1]:.1f} s.",
+        )  # fmt: skip
 
-def _curves(axes: Axes, part: Comparison, begin: float = 0.0, width: float = 1.0) -> None:
-    known = axes.get_legend_handles_labels()[1]
-    for name in ("measured", "simulated"):
-        axes.plot(
-            *thin(begin + part.time, getattr(part, name)),
-            color=COLOR[name],
-            lw=width,
-            alpha=0.9,
-            label=None if name in known else name,
-        )
-
-
-def _role_names(axes: Axes, parts: Sequence[Comparison]) -> None:
-    """Name each run of stretches of one role once, above its shading."""
-    begin, previous = 0.0, ""
-    for part in parts:
-        if part.role != previous:
-            word = "fitted to this" if part.role == "estimation" else "only judged by this"
-            axes.annotate(
-                word,
-                (begin, 1.0),
-                xycoords=("data", "axes fraction"),
-                xytext=(4, 4),
-                textcoords="offset points",
-                color=COLOR["muted"],
-                fontsize=9,
-            )
-        begin, previous = begin + part.time[-1], part.role
-
-
-@styled
-def detail(wheel: str, parts: Sequence[Comparison]) -> str:
-    """Draw the liveliest short stretch of held-out data close up, with its residual below."""
-    held_out = [p for p in parts if p.role == "validation"] or list(parts)
-    part = _liveliest(held_out)
-    figure, (top, bottom) = canvas(
-        4.7, 3.7, nrows=2, sharex=True, gridspec_kw={"height_ratios": [3, 1]}
-    )
-    _curves(top, part, width=1.5)
-    top.set_title(f"Close up ({part.role})")
-    top.set_ylabel("motor speed [rad/s]")
-    top.legend(loc="best")
-    bottom.plot(part.time, part.residual, color=COLOR["ink"], lw=0.9)
-    bottom.set(ylabel="difference", xlabel="time [s]", xlim=(part.time[0], part.time[-1]))
-    figure.align_ylabels()
-    return to_svg(figure, f"detail-{wheel}", f"Close-up of the speed of {label(wheel)}")
-
-
-def _liveliest(parts: Sequence[Comparison], seconds: float = 2.0) -> Comparison:
-    """Cut the window in which the voltage moves most."""
-    best: tuple[float, Comparison, int, int] | None = None
-    for part in parts:
-        step = float(np.median(np.diff(part.time)))
-        size = min(part.time.size, max(int(seconds / step), 20))
-        activity = np.cumsum(np.abs(np.diff(part.measured, prepend=part.measured[0])) > 0)
-        moved = activity[size - 1 :] - activity[: activity.size - size + 1]
-        first = int(np.argmax(moved))
-        if best is None or moved[first] > best[0]:
-            best = (float(moved[first]), part, first, first + size)
-    assert best is not None
-    _, part, first, last = best
-    cut = slice(first, last)
-    return Comparison(
-        part.role,
-        part.source,
-        part.time[cut],
-        part.voltage[cut],
-        part.measured[cut],
-        part.simulated[cut],
-    )
-
-
-@styled
-def residuals(wheel: str, tests: ResidualTests) -> str:
-    """Draw the correlation of the residuals with themselves and with the voltage.
-
-    Parameters
-    ----------
-    wheel : str
-        Name of the wheel.
-    tests : ResidualTests
-        The curves that the verdict is of.
-
-    Returns
-    -------
-    str
-        SVG.
-    """
-    figure, (top, bottom) = canvas(4.7, 3.7, nrows=2)
-    _stems(top, tests.autocorrelation, "Residual autocorrelation")
-    _stems(bottom, tests.cross_correlation, "Residual and voltage")
-    bottom.set_xlabel("lag [samples]")
-    return to_svg(figure, f"residual-{wheel}", f"Residual correlations of {label(wheel)}")
-
-
-def _stems(axes: Axes, correlation: Correlation | None, title: str) -> None:
-    axes.set_title(title)
-    if correlation is None:
-        note(axes, "too few samples to tell")
-        return
-    outside = np.abs(correlation.value) > correlation.band
-    for flag, name in ((False, "good"), (True, "bad")):
-        chosen = (outside == flag) & (correlation.value != 1.0)
-        axes.vlines(correlation.lag[chosen], 0, correlation.value[chosen], color=COLOR[name], lw=2)
-    axes.axhspan(-correlation.band, correlation.band, color=COLOR["band"], alpha=0.6, lw=0)
-    largest = float(np.max(np.abs(correlation.value[correlation.lag != 0])))
-    reach = min(1.05, 1.25 * max(largest, 3 * correlation.band))
-    axes.set(ylim=(-reach, reach), xlim=(correlation.lag[0] - 1, correlation.lag[-1] + 1))
-    axes.grid(axis="x", visible=False)
-
-
-@styled
-def certainty(estimate: Estimate) -> str:
-    """Draw how well each quantity is known, as a percentage of itself."""
-    held = _without_repeats(estimate)
-    figure, axes = canvas(4.7, 0.7 + 0.3 * len(held))
-    axes.set(xscale="log", xlim=(1e-3, 300), ylim=(len(held) - 0.4, -0.6))
-    for row, quantity in enumerate(held.values()):
-        _certainty_bar(axes, row, quantity)
-    axes.set_yticks(range(len(held)), [label(name) for name in held], color=COLOR["ink"])
-    axes.set_xticks(
-        [1e-3, 1e-2, 0.1, 1, 10, 100], ["0.001 %", "0.01 %", "0.1 %", "1 %", "10 %", "100 %"]
-    )
-    axes.minorticks_off()
-    axes.tick_params(left=False)
-    axes.grid(axis="y", visible=False)
-    axes.set_title("How well each is known (95 %)")
-    return to_svg(figure, f"certainty-{estimate.wheel}", "How well each quantity is known")
-
-
-def _without_repeats(estimate: Estimate) -> dict[str, Quantity]:
-    parameters = {n: q for n, q in estimate.parameters.items() if n not in estimate.combinations}
-    return {**estimate.combinations, **parameters}
-
-
-def _certainty_bar(axes: Axes, row: int, quantity: Quantity) -> None:
-    left, right = axes.get_xlim()
-    if quantity.status == "unidentifiable" or quantity.value is None:
-        axes.barh(
-            row,
-            right - left,
-            left=left,
-            height=0.62,
-            color="none",
-            edgecolor=COLOR["bad"],
-            hatch="////",
-            lw=0,
-            alpha=0.55,
-        )
-        axes.text(1.0, row, "this data cannot tell", ha="center", va="center", fontsize=9)
-        return
-    if quantity.status == "fixed" or quantity.std is None:
-        axes.text(left * 1.3, row, "given", va="center", color=COLOR["muted"], fontsize=9)
-        return
-    percent = 100.0 * 1.96 * quantity.std / max(abs(quantity.value), 1e-300)
-    color = COLOR["good"] if percent < 10 else COLOR["bad"]
-    axes.barh(row, percent - left, left=left, height=0.62, color=color, alpha=0.75, lw=0)
-    axes.text(percent * 1.2, row, f"± {percent:.2g} %", va="center", fontsize=9, clip_on=True)
-
-
-@styled
-def correlation_matrix(estimate: Estimate) -> str:
-    """Draw the correlations between the errors of the estimates."""
-    std = np.sqrt(np.diag(estimate.covariance))
-    known = np.flatnonzero(std > 0)
-    if known.size < 2:
-        return ""
-    matrix = estimate.covariance[np.ix_(known, known)] / np.outer(std[known], std[known])
-    names = [label(estimate.names[k]) for k in known]
-    figure, axes = canvas(4.7, 1.3 + 0.3 * known.size)
-    for row, column in np.ndindex(*matrix.shape):
-        value = matrix[row, column]
-        if row > column and known.size <= 6:
-            axes.text(column, row, f"{value:+.2f}", ha="center", va="center", fontsize=9)
-        elif row != column:
-            color = COLOR["measured" if value > 0 else "simulated"]
-            axes.scatter(
-                column, row, s=1700 / known.size * abs(value), color=color, alpha=0.85, lw=0
-            )
-        else:
-            axes.scatter(column, row, s=8, color=COLOR["muted"], lw=0)
-    axes.set(xlim=(-0.5, known.size - 0.5), ylim=(known.size - 0.5, -0.5))
-    axes.set_xticks(range(known.size), names, rotation=30, ha="right")
-    axes.set_yticks(range(known.size), names)
-    axes.tick_params(length=0)
-    axes.set_title("Correlation of the errors")
-    return to_svg(figure, f"matrix-{estimate.wheel}", "Correlation of the estimation errors")
-
-
-@styled
-def side_by_side(estimates: Mapping[str, Estimate]) -> str:
-    """Draw every combination of every wheel with its 95 % interval, wheels side by side."""
-    names = [
-        name
-        for name in ("dc_gain", "time_constant", "time_constant_product", "static_voltage", "delay")
-        if any(_has(estimate, name) for estimate in estimates.values())
+    return [
+        chart(
+            "speed",
+            "motor speed [rad/s]",
+            300,
+            Curve("measured", measured[keep], "measured"),
+            Curve("simulated", simulated[keep], "simulated"),
+        ),
+        chart(
+            "residual",
+            "residual [rad/s]",
+            180,
+            Curve("measured − simulated", (measured - simulated)[keep], "ink"),
+        ),
+        chart("voltage", "voltage [V]", 180, Curve("voltage", voltage[keep], "voltage")),
     ]
-    if not names:
-        return ""
-    figure, axes = canvas(9.6, 1.1 + 0.34 * len(estimates), ncols=len(names), squeeze=False)
-    wheels = list(estimates)
-    for column, (name, ax) in enumerate(zip(names, axes[0], strict=True)):
-        for row, wheel in enumerate(wheels):
-            if _has(estimates[wheel], name):
-                _dot(ax, row, scaled(estimates[wheel].combinations[name]))
-        unit = next(e.combinations[name].unit for e in estimates.values() if _has(e, name))
-        ax.set_title(label(name))
-        ax.set_xlabel(scaled(Quantity(0.0, unit=unit)).unit)
-        ax.set_ylim(len(wheels) - 0.5, -0.5)
-        ax.margins(x=0.25)
-        ax.locator_params(axis="x", nbins=4)
-        names_shown = [label(w) for w in wheels] if column == 0 else [""] * len(wheels)
-        ax.set_yticks(range(len(wheels)), names_shown, color=COLOR["ink"])
-        ax.tick_params(left=False)
-    return to_svg(figure, "wheels", "The wheels' quantities side by side")
 
 
-def _has(estimate: Estimate, name: str) -> bool:
-    quantity = estimate.combinations.get(name)
-    return quantity is not None and quantity.value is not None
+def residual_charts(wheel: str, tests: ResidualTests) -> list[Chart]:
+    """Return the correlations that the residual tests have judged, with the tests' own bands."""
+    charts = []
+    for kind, found in (
+        ("autocorrelation", tests.autocorrelation),
+        ("correlation with the voltage", tests.cross_correlation),
+    ):
+        if found is None:
+            continue
+        outside = np.abs(found.value) > found.band
+        charts.append(
+            Chart(
+                name=f"{kind.split()[0]}-{wheel}",
+                title=f"Residual {kind}",
+                x_label="lag [samples]",
+                y_label="correlation",
+                x=found.lag,
+                curves=(
+                    Curve(
+                        "within the band", np.where(outside, np.nan, found.value), "good", "bars"
+                    ),
+                    Curve("outside", np.where(outside, found.value, np.nan), "bad", "bars"),
+                ),
+                lines=(-found.band, 0.0, found.band),
+                height=220,
+                summary=f"{np.sum(outside)} of {found.lag.size} lags lie outside "
+                f"±{found.band:.3g}.",
+            )
+        )
+    return charts
 
 
-def _dot(axes: Axes, row: int, quantity: Quantity) -> None:
-    assert quantity.value is not None
-    color = COLOR[f"wheel-{row % 4 + 1}"]
-    if quantity.std is not None:
-        half = 1.96 * quantity.std
-        axes.plot([quantity.value - half, quantity.value + half], [row, row], color=color, lw=3)
-    axes.plot(quantity.value, row, "o", color=color, ms=8, mec=COLOR["surface"], mew=1.5)
+def frequency_charts(wheel: str, parts: Sequence[Comparison]) -> list[Chart]:
+    """Return gain and phase from voltage to speed, of the data and of the model.
+
+    Both are estimated in the same way from the same voltage, so that friction, the hold and the
+    sampling act on both alike; where they part beyond the band, the model misses something.
+    """
+    found = _response(parts)
+    if found is None:
+        return []
+    frequency, measured, simulated, spread = found
+    name = label(wheel)
+    charts = []
+    for kind, unit, of, low, high in (
+        ("gain", "rad/s/V", np.abs, np.exp(-spread), np.exp(spread)),
+        ("phase", "deg", _degrees, -np.rad2deg(spread), np.rad2deg(spread)),
+    ):
+        y = of(measured)
+        around = (y * low, y * high) if kind == "gain" else (y + low, y + high)
+        charts.append(
+            Chart(
+                name=f"{kind}-{wheel}",
+                title=f"Frequency response: {kind}",
+                x_label="frequency [Hz]",
+                y_label=f"{kind} [{unit}]",
+                x=frequency,
+                curves=(
+                    Curve("data, 95 % band", y, "measured", "points", *around),
+                    Curve("model", of(simulated), "simulated"),
+                ),
+                log="xy" if kind == "gain" else "x",
+                group=f"frequency-{wheel}",
+                height=220,
+                summary=f"{kind.capitalize()} of {name} from {frequency[0]:.2g} to "
+                f"{frequency[-1]:.3g} Hz.",
+            )
+        )
+    return charts
+
+
+def _degrees(response: Array) -> Array:
+    return np.asarray(np.rad2deg(np.unwrap(np.angle(response))))
+
+
+def _response(parts: Sequence[Comparison]) -> tuple[Array, Array, Array, Array] | None:
+    """Return frequencies, response of data and model, and 95 % of the log of the former.
+
+    References
+    ----------
+    J. S. Bendat, A. G. Piersol, *Random Data*, 4th ed., section 9.2.4: the relative deviation of
+    a response with coherence g over n averages is ``sqrt((1 - g) / (2 n g))``.
+    """
+    longest = max(parts, key=lambda part: part.time.size)
+    step = float(np.median(np.diff(longest.time)))
+    size = int(2 ** np.floor(np.log2(max(longest.time.size / 4, 1))))
+    if size < 64 or step <= 0:
+        return None
+    window = np.hanning(size)
+    sums = np.zeros((4, size // 2 + 1), dtype=np.complex128)
+    averages = 0
+    for part in parts:
+        even = np.arange(part.time[0], part.time[-1], step)
+        ok = np.isfinite(part.measured) & np.isfinite(part.simulated)
+        if ok.sum() < size:
+            continue
+        signals = [
+            np.interp(even, part.time[ok], y[ok])
+            for y in (part.voltage, part.measured, part.simulated)
+        ]
+        for first in range(0, even.size - size + 1, size // 2):
+            cut = [s[first : first + size] for s in signals]
+            u, y, z = (np.fft.rfft(window * (c - c.mean())) for c in cut)
+            sums += np.array([u * u.conj(), y * y.conj(), y * u.conj(), z * u.conj()])
+            averages += 1
+    power, own = sums[0].real, sums[1].real
+    with np.errstate(invalid="ignore", divide="ignore"):
+        coherence = np.abs(sums[2]) ** 2 / (power * own)
+        usable = (coherence > COHERENT) & (power > 1e-6 * power.max())
+    usable[0] = False
+    usable[size // 4 :] = False  # above half the Nyquist frequency the hold shapes both
+    index = np.flatnonzero(usable)
+    if averages < 3 or index.size < 5:
+        return None
+    coherence = np.minimum(coherence[index], 1 - 1e-12)
+    # Half of the overlapping segments count as independent averages.
+    spread = 1.96 * np.sqrt((1 - coherence) / (averages * coherence))
+    measured, simulated = sums[2][index] / power[index], sums[3][index] / power[index]
+    return index / (size * step), measured, simulated, spread

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from importlib import resources
+from typing import Any
 
 import jinja2
+import numpy as np
 from markupsafe import Markup
 
+from smp_motor_ident.finding import Finding
 from smp_motor_ident.report import figures, words
 from smp_motor_ident.report.alike import same_response
+from smp_motor_ident.report.drawing import svg
 from smp_motor_ident.report.series import Comparison
 from smp_motor_ident.result import Candidate, Estimate, Quantity
 
@@ -31,8 +36,6 @@ class Report:
         Measured and simulated speed by wheel.
     failures : mapping of str to str
         Wheels that could not be identified, each with the reason.
-    notes : mapping of str to sequence of str
-        What was repaired or assumed while reading, by wheel.
     provenance : mapping of str to str
         How the page came about: command, sources, date, versions.
     """
@@ -40,7 +43,6 @@ class Report:
     estimates: Mapping[str, Estimate]
     comparisons: Mapping[str, Sequence[Comparison]] = field(default_factory=dict)
     failures: Mapping[str, str] = field(default_factory=dict)
-    notes: Mapping[str, Sequence[str]] = field(default_factory=dict)
     provenance: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -57,6 +59,7 @@ class Row:
     unit: str
     status: str
     kind: str
+    share: str
 
 
 def render(report: Report) -> str:
@@ -70,7 +73,7 @@ def render(report: Report) -> str:
     Returns
     -------
     str
-        HTML, complete in itself: no script, and no resource from elsewhere.
+        HTML, complete in itself: script, style and data are inside, nothing is loaded.
     """
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("smp_motor_ident.report", "."),
@@ -80,43 +83,39 @@ def render(report: Report) -> str:
         lstrip_blocks=True,
     )
     environment.filters |= {"label": words.label, "number": words.number}
-    style = resources.files("smp_motor_ident.report").joinpath("report.css").read_text("utf-8")
+    motors = {
+        wheel: _motor(estimate, report.comparisons.get(wheel, ()))
+        for wheel, estimate in report.estimates.items()
+    }
+    charts = [chart for motor in motors.values() for chart in motor["charts"]]
+    data = json.dumps([chart.to_document() for chart in charts], separators=(",", ":"))
     return environment.get_template("report.html.jinja").render(
         report=report,
-        style=Markup(style),
-        side_by_side=Markup(figures.side_by_side(report.estimates))
-        if len(report.estimates) > 1
-        else "",
-        motors={
-            wheel: _motor(
-                _without(estimate, report.notes.get(wheel, ())), report.comparisons.get(wheel, ())
-            )
-            for wheel, estimate in report.estimates.items()
-        },
+        style=Markup(_text("uplot/uPlot.min.css") + _text("colors.css") + _text("report.css")),
+        library=Markup(_text("uplot/uPlot.iife.min.js")),
+        licence=_text("uplot/LICENSE"),
+        script=Markup(_text("plots.js")),
+        data=Markup(data.replace("<", "\\u003c")),
+        draw=lambda chart: Markup(svg(chart)),
+        wheels=_side_by_side(report.estimates) if len(report.estimates) > 1 else (),
+        motors=motors,
     )
 
 
-def _without(estimate: Estimate, notes: Sequence[str]) -> Estimate:
-    """Leave out the warnings that are told as notes on the reading."""
-    return replace(estimate, findings=tuple(f for f in estimate.findings if f.message not in notes))
+def _text(name: str) -> str:
+    return resources.files("smp_motor_ident.report").joinpath(name).read_text("utf-8")
 
 
-def _motor(estimate: Estimate, parts: Sequence[Comparison]) -> dict[str, object]:
+def _motor(estimate: Estimate, parts: Sequence[Comparison]) -> dict[str, Any]:
     """Return what the template shows of one motor."""
-    wheel = estimate.wheel
-    drawn = {}
-    if parts:
-        drawn = {
-            "speed": figures.speed(wheel, parts),
-            "detail": figures.detail(wheel, parts),
-            "residuals": figures.residuals(wheel, estimate.residuals),
-        }
-    drawn["certainty"] = figures.certainty(estimate)
-    drawn["matrix"] = figures.correlation_matrix(estimate)
+    wheel, found = estimate.wheel, words.findings(estimate)
+    fit = figures.fit_charts(wheel, parts) if parts else []
+    residuals = figures.residual_charts(wheel, estimate.residuals)
+    frequency = figures.frequency_charts(wheel, parts) if parts else []
     return {
         "estimate": estimate,
-        "findings": words.findings(estimate),
-        "verdict": _verdict(estimate),
+        "findings": found,
+        "verdict": _verdict(estimate, found),
         "headline": [
             _headline(name, words.scaled(estimate.combinations[name]))
             for name in ("dc_gain", "time_constant", "static_voltage", "delay")
@@ -130,8 +129,50 @@ def _motor(estimate: Estimate, parts: Sequence[Comparison]) -> dict[str, object]
         ],
         "alike": _alike(estimate),
         "candidates": _ranked(estimate.candidates),
-        "figures": {name: Markup(svg) for name, svg in drawn.items()},
+        "correlations": _correlations(estimate),
+        "charts": [*fit, *residuals, *frequency],
+        "fit": fit,
+        "residuals": residuals,
+        "frequency": frequency,
     }
+
+
+def _correlations(estimate: Estimate) -> list[tuple[str, list[float]]]:
+    """Return the correlations between the errors of the estimates, a row a quantity."""
+    std = np.sqrt(np.diag(estimate.covariance))
+    known = np.flatnonzero(std > 0)
+    if known.size < 2:
+        return []
+    matrix = estimate.covariance[np.ix_(known, known)] / np.outer(std[known], std[known])
+    return [(words.label(estimate.names[k]), list(row)) for k, row in zip(known, matrix)]
+
+
+def _side_by_side(
+    estimates: Mapping[str, Estimate],
+) -> list[tuple[str, str, list[tuple[str, tuple[float, float, float]] | None]]]:
+    """Return name, unit and, by wheel, value and interval as shares of the common range."""
+    rows = []
+    for name in ("dc_gain", "time_constant", "time_constant_product", "static_voltage", "delay"):
+        held = [estimate.combinations.get(name) for estimate in estimates.values()]
+        known = [words.scaled(q) if q and q.value is not None else None for q in held]
+        ends = [q.ci95 or (q.value, q.value) for q in known if q is not None]
+        if not ends:
+            continue
+        low, high = min(e[0] for e in ends), max(e[1] for e in ends)  # type: ignore[type-var]
+        cells = [_cell(q, low or 0.0, high or 0.0) if q is not None else None for q in known]
+        unit = next(q.unit for q in known if q is not None)
+        rows.append((words.label(name), words.typeset(unit), cells))
+    return rows
+
+
+def _cell(q: Quantity, low: float, high: float) -> tuple[str, tuple[float, float, float]]:
+    value = q.value or 0.0
+    ends = q.ci95 or (value, value)
+    wide = (high - low) or 1.0
+    return (
+        words.number(q.value, q.std),
+        ((ends[0] - low) / wide, (value - low) / wide, (ends[1] - low) / wide),
+    )
 
 
 def _row(name: str, quantity: Quantity) -> Row:
@@ -151,15 +192,20 @@ def _row(name: str, quantity: Quantity) -> Row:
         unit=words.typeset(quantity.unit),
         status=words.status(quantity),
         kind=quantity.status,
+        share=_share(quantity),
     )
 
 
 def _headline(name: str, quantity: Quantity) -> tuple[str, str, str, str]:
     """Return name, value, unit and relative deviation, short enough for a card."""
-    share = ""
-    if quantity.value and quantity.std:
-        share = f"± {100 * quantity.std / abs(quantity.value):.2g} %"
-    return words.label(name), words.number(quantity.value), quantity.unit, share
+    return words.label(name), words.number(quantity.value), quantity.unit, _share(quantity)
+
+
+def _share(quantity: Quantity) -> str:
+    """Return half the 95 % interval as a percentage of the value."""
+    if not quantity.value or not quantity.std:
+        return "—"
+    return f"± {196 * quantity.std / abs(quantity.value):.2g} %"
 
 
 def _alike(estimate: Estimate) -> list[tuple[str, str, str]]:
@@ -175,21 +221,21 @@ def _alike(estimate: Estimate) -> list[tuple[str, str, str]]:
 
 
 def _ranked(candidates: Sequence[Candidate]) -> list[Candidate]:
-    """Order the rungs by their information criterion, those without one last."""
+    """Order the structures by their information criterion, those without one last."""
     return sorted(candidates, key=lambda c: (c.bic is None, c.bic or 0.0))
 
 
-def _verdict(estimate: Estimate) -> tuple[str, str]:
-    """Return a class (good, fair, poor) and one sentence about how far to trust the model."""
+def _verdict(estimate: Estimate, findings: Sequence[Finding]) -> tuple[str, str, str]:
+    """Return a class, two words and a sentence about how far to trust the model."""
     fit = estimate.fit_percent.validation
     if fit is None:
         text = "No data was held out, so nothing shows yet how the model does elsewhere"
     else:
         text = f"It explains {fit:.1f} % of the speed in data that it was not fitted to"
     if estimate.unreliable:
-        return "poor", f"Unreliable: numbers may be off by more than their intervals. {text}."
+        return "poor", "Unreliable", f"Numbers may be off by more than their intervals. {text}."
     if fit is not None and fit < POOR_FIT:
-        return "poor", f"{text}: too little to build a controller on."
-    if fit is None or any(f.severity == "warning" for f in words.findings(estimate)):
-        return "fair", f"{text}; read the warnings before you rely on it."
-    return "good", f"{text}."
+        return "poor", "Poor fit", f"{text}: too little to build a controller on."
+    if fit is None or any(f.severity == "warning" for f in findings):
+        return "fair", "Read the warnings", f"{text}; read the warnings before you rely on it."
+    return "good", "Reliable", f"{text}."

@@ -1,4 +1,4 @@
-"""What a figure needs beside the estimate: measured and simulated speed, and their difference."""
+"""What a chart needs beside the estimate: measured and simulated speed."""
 
 from __future__ import annotations
 
@@ -34,21 +34,3 @@ class Comparison:
     voltage: Array
     measured: Array
     simulated: Array
-
-    @property
-    def residual(self) -> Array:
-        """Measured minus simulated speed [rad/s]."""
-        return self.measured - self.simulated
-
-
-def thin(time: Array, values: Array, points: int = 1600) -> tuple[Array, Array]:
-    """Keep the smallest and largest value of each of ``points / 2`` stretches."""
-    if values.size <= points:
-        return time, values
-    size = -(-values.size // (points // 2))
-    full = values[: values.size - values.size % size].reshape(-1, size)
-    whole = np.where(np.isfinite(full), full, np.nanmean(values))
-    begin = np.arange(full.shape[0]) * size
-    index = np.concatenate((begin + whole.argmin(axis=1), begin + whole.argmax(axis=1)))
-    index = np.unique(np.concatenate((index, [0, values.size - 1])))
-    return time[index], values[index]

@@ -60,7 +60,7 @@ def model(name: str) -> str:
     Parameters
     ----------
     name : str
-        Rung of the ladder.
+        Of a candidate structure.
 
     Returns
     -------
@@ -168,14 +168,10 @@ def status(quantity: Quantity) -> str:
     str
         For the status column.
     """
-    words = {"estimated": "estimated", "fixed": "given", "unidentifiable": "cannot be told"}
+    words = {"estimated": "estimated", "fixed": "given", "unidentifiable": "not identifiable"}
     return words[quantity.status]
 
 
 def findings(estimate: Estimate) -> list[Finding]:
-    """Return what was found, the gravest first; warnings and advice of older files too."""
-    found = list(estimate.findings)
-    known = {text for f in found for text in (f.message, f.advice)}
-    found += [Finding("", "warning", text) for text in estimate.warnings if text not in known]
-    found += [Finding("", "note", text) for text in estimate.advice if text not in known]
-    return sorted(found, key=lambda f: -SEVERITIES.index(f.severity))
+    """Return what was found, the gravest first."""
+    return sorted(estimate.findings, key=lambda f: -SEVERITIES.index(f.severity))

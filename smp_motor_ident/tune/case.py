@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from smp_motor_ident.errors import DesignError
+from smp_motor_ident.finding import Finding
 from smp_motor_ident.result import Estimate
+from smp_motor_ident.tune.ensemble import Robustness, UncertaintyEnsemble, back_off, softer
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.methods import METHODS
-from smp_motor_ident.tune.motors import draw_motors, motors_of
+from smp_motor_ident.tune.motors import (
+    Friction,
+    draw_motors,
+    friction_of,
+    motors_of,
+    unreliable_spread,
+)
 from smp_motor_ident.tune.plant import sample
-from smp_motor_ident.tune.problem import Method, Problem, Promise, checked, ripple
-from smp_motor_ident.tune.robust import Jury, Robustness, back_off, softer
+from smp_motor_ident.tune.problem import Method, Problem, RequiredMargins, checked, control_noise
 
 CLAMPED = 1 / 6
-"""Largest ripple [share of the supply, rms] of any gains: three times it is half of the supply, and
-a loop whose noise is clamped is none."""
+"""Largest control noise [share of the supply, rms] of any gains: three times it is half of the
+supply, and a loop whose noise is clamped is none."""
 
 
 WORK, FEWEST = 5e7, 50
@@ -27,6 +34,7 @@ WORK, FEWEST = 5e7, 50
 
 COMMON = (
     "max_velocity", "max_acceleration", "transition_time", "together", "samples", "seed",
+    "accept_unreliable",
 )  # fmt: skip
 """Targets that every method understands."""
 
@@ -43,20 +51,26 @@ class Case:
         The method that was asked for.
     problem : Problem
         The nominal motor and the targets.
-    promise : Promise
+    required : RequiredMargins
         What the gains must keep.
-    jury : Jury
+    ensemble : UncertaintyEnsemble
         The motors that the data allow.
     drawn : bool
-        Whether these were drawn; else the jury is the nominal motor alone.
+        Whether these were drawn; else the ensemble is the nominal motor alone.
+    friction : Friction
+        What is known of it.
+    findings : tuple of Finding
+        What is to be said of the estimate.
     """
 
     wheel: str
     method: Method
     problem: Problem
-    promise: Promise
-    jury: Jury
+    required: RequiredMargins
+    ensemble: UncertaintyEnsemble
     drawn: bool
+    friction: Friction
+    findings: tuple[Finding, ...]
 
 
 def prepare(estimate: Estimate, loop: Loop, method: str, targets: dict[str, Any]) -> Case:
@@ -79,18 +93,48 @@ def prepare(estimate: Estimate, loop: Loop, method: str, targets: dict[str, Any]
         When method or targets are unknown.
     """
     chosen = _method(method, targets)
-    plant = sample(motors_of(estimate), loop)
+    findings = list(_reliability(estimate, bool(targets.get("accept_unreliable"))))
+    friction = friction_of(estimate, loop.supply_voltage)
+    findings += [friction.finding] if friction.finding is not None else []
+    planned = np.array([friction.planned])
+    plant = sample(replace(motors_of(estimate), static_voltage=planned), loop)
     problem = Problem(plant, loop, targets)
-    promise = _promise(chosen, problem)
+    required = _required(chosen, problem)
     n = int(checked(targets, "samples") or 1000)
     seed = int(checked(targets, "seed", least=-1) or 0)
     # Eigenvalues cost with the cube of the states: fewer motors where a loop has many.
     states = plant.taps.shape[1] + plant.window + 6
     n = max(min(n, int(WORK / states**3)), FEWEST)
-    motors = draw_motors(estimate, n, np.random.default_rng(seed))
+    motors = draw_motors(estimate, n, np.random.default_rng(seed), friction)
     draws = plant if motors is None else sample(motors, loop, believed=plant.motors)
-    jury = Jury(draws, promise)
-    return Case(estimate.wheel, chosen, problem, promise, jury, motors is not None)
+    ensemble = UncertaintyEnsemble(draws, required)
+    if motors is None:
+        words = "the estimate has no uncertainty: the margins are those of one motor"
+        findings.append(Finding("no_uncertainty", "warning", words))
+    drawn = motors is not None
+    return Case(
+        estimate.wheel, chosen, problem, required, ensemble, drawn, friction, tuple(findings)
+    )
+
+
+def _reliability(estimate: Estimate, accepted: bool) -> tuple[Finding, ...]:
+    """Refuse an unreliable estimate, or return what designing on it takes into account."""
+    grave = [f for f in estimate.findings if f.severity in ("unreliable", "refused")]
+    if not grave:
+        return ()
+    words = "; ".join(f"{f.message}" + (f" ({f.advice})" if f.advice else "") for f in grave)
+    if not accepted:
+        raise DesignError(
+            f"{estimate.wheel}: the identification is unreliable: {words}; gains designed on it "
+            "need not hold: record as advised, or design on it all the same with "
+            "--accept-unreliable"
+        )
+    spread = unreliable_spread(estimate)
+    message = (
+        f"designed on an unreliable identification ({words}): every number of it is taken as known "
+        f"to {spread:.0%} at best"
+    )
+    return (Finding("unreliable_identification", "unreliable", message, {"spread": spread}),)
 
 
 def solve(case: Case) -> tuple[Feedback, float, Robustness]:
@@ -116,14 +160,14 @@ def solve(case: Case) -> tuple[Feedback, float, Robustness]:
     """
     ruled = case.method.solve(case.problem)
     quiet, calm = _within_clamp(case.problem, ruled)
-    feedback, factor, robustness = back_off(case.jury, quiet)
+    feedback, factor, robustness = back_off(case.ensemble, quiet)
     factor *= calm
     if factor == 0.0:
         raise DesignError(
             f"{case.wheel}: no gains of this kind keep a phase margin of "
-            f"{case.promise.phase:g} deg and Ms {case.promise.sensitivity:g} over the motors that "
-            f"the data allow (only {robustness.holds:.0%} do); record more, or ask for smaller "
-            "margins"
+            f"{case.required.phase:g} deg and Ms {case.required.sensitivity:g} over the motors "
+            f"that the data allow (only {robustness.holds:.0%} do); record more, or ask for "
+            "smaller margins"
         )
     return feedback, factor, robustness
 
@@ -131,7 +175,7 @@ def solve(case: Case) -> tuple[Feedback, float, Robustness]:
 def _within_clamp(problem: Problem, feedback: Feedback) -> tuple[Feedback, float]:
     """Soften gains until what quantisation makes at the output leaves room within the clamp."""
     factor, trial = 1.0, feedback
-    while ripple(problem, trial) > CLAMPED * problem.loop.supply_voltage and factor > 0.01:
+    while control_noise(problem, trial) > CLAMPED * problem.loop.supply_voltage and factor > 0.01:
         factor *= 0.95
         trial = softer(feedback, factor)
     return trial, factor
@@ -149,11 +193,11 @@ def _method(name: str, targets: dict[str, Any]) -> Method:
     return METHODS[name]
 
 
-def _promise(method: Method, problem: Problem) -> Promise:
-    """Return what the method promises, as far as the caller's targets leave it."""
-    promise = method.promise
-    return Promise(
-        phase=problem.target("phase_margin", promise.phase),
-        gain=promise.gain,
-        sensitivity=problem.target("maximum_sensitivity", promise.sensitivity, least=1.0),
+def _required(method: Method, problem: Problem) -> RequiredMargins:
+    """Return the margins that the method requires, as far as the caller's targets leave it."""
+    required = method.required
+    return RequiredMargins(
+        phase=problem.target("phase_margin", required.phase),
+        gain=required.gain,
+        sensitivity=problem.target("maximum_sensitivity", required.sensitivity, least=1.0),
     )

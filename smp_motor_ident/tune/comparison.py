@@ -31,7 +31,7 @@ def compare(
     Returns
     -------
     dict of str to Design or DesignError
-        A method that cannot meet the demand is told by its error.
+        A method that cannot meet the demand is there as its error.
     """
     results: dict[str, Design | DesignError] = {}
     for name in METHODS if methods is None else methods:
@@ -69,17 +69,19 @@ def recommend(results: dict[str, Design | DesignError]) -> tuple[str, str]:
         if isinstance(r, Design)
         and r.margins.stable
         and r.margins.sensitivity <= 1.6
-        and r.performance.ripple <= 1.05 * r.loop.noise_limit
+        and r.performance.control_noise <= 1.05 * r.loop.noise_limit
         and math.isfinite(r.performance.settling)
     }
     if not sound:
-        raise DesignError("no method keeps Ms below 1.6 within the ripple that the loop allows")
+        raise DesignError(
+            "no method keeps Ms below 1.6 within the control noise that the loop allows"
+        )
     name = min(sound, key=lambda n: sound[n].performance.load_integral)
     others = sorted(r.performance.load_integral for n, r in sound.items() if n != name)
     best = sound[name]
     better = f", {others[0] / best.performance.load_integral:.2f} times the next" if others else ""
     return name, (
-        f"{METHODS[name].title}: of the methods that keep Ms below 1.6 and the ripple below "
+        f"{METHODS[name].title}: of the methods that keep Ms below 1.6 and the control noise below "
         f"{best.loop.noise_limit:.2g} V it rejects a load best{better}, with a phase margin of "
         f"{best.margins.phase:.0f} deg"
     )

@@ -14,7 +14,7 @@ from smp_motor_ident.tune.margins import frequencies
 from smp_motor_ident.tune.motors import draw_motors, motors_of
 from smp_motor_ident.tune.plant import sample
 from smp_motor_ident.tune.reference import CHANGE, controller_for, planned_change
-from smp_motor_ident.tune.response import Controller, simulate
+from smp_motor_ident.tune.simulation import Controller, simulate
 
 DRAWS = 200
 QUANTILES = (0.01, 0.5, 0.99)

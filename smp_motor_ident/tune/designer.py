@@ -11,17 +11,18 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from smp_motor_control.pid import PidGains
+from smp_motor_ident.finding import Finding
 from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune.case import Case, prepare, solve
+from smp_motor_ident.tune.ensemble import Robustness
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.margins import Margins, loop_margins
-from smp_motor_ident.tune.performance import Performance, measure
 from smp_motor_ident.tune.plant import Plant, sample
-from smp_motor_ident.tune.problem import checked, ripple
+from smp_motor_ident.tune.problem import checked, control_noise
 from smp_motor_ident.tune.reference import Reference, controller_for, plan_reference
-from smp_motor_ident.tune.response import Controller
-from smp_motor_ident.tune.robust import Robustness
+from smp_motor_ident.tune.simulation import Controller
+from smp_motor_ident.tune.specification import Performance, Specification, measure, specify
 
 
 @dataclass(frozen=True)
@@ -44,13 +45,17 @@ class Design:
         Over the distribution of the estimate.
     performance : Performance
         Of the simulated loop.
+    specification : Specification
+        What the loop does over the distribution, in bands.
     reference : Reference
         Limits and duration of set-point changes, at the motor shaft.
     motor : mapping of str to float
         Combinations that it was designed from, at the motor shaft.
+    sensor : mapping of str to float
+        What the reported speed was identified to go through [s].
     wheel : str
         Whose gains these are.
-    warnings : tuple of str
+    findings : tuple of Finding
         What the user should know beside.
     """
 
@@ -61,11 +66,18 @@ class Design:
     loop: Loop
     robustness: Robustness
     performance: Performance
+    specification: Specification
     reference: Reference
     motor: dict[str, float]
+    sensor: dict[str, float]
     wheel: str = ""
-    warnings: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
     feedback: Feedback = field(default_factory=lambda: Feedback(0.0, 0.0))
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """The findings in words."""
+        return tuple(one.message for one in self.findings)
 
 
 def design(estimate: Estimate, loop: Loop, method: str = "margin", **targets: Any) -> Design:
@@ -84,7 +96,8 @@ def design(estimate: Estimate, loop: Loop, method: str = "margin", **targets: An
         What the method understands, such as ``phase_margin`` [deg] or ``bandwidth`` [rad/s], and
         for all: ``max_velocity`` [rad/s, wheel], ``max_acceleration`` [rad/s^2, wheel],
         ``transition_time`` [s], ``together`` (one of several motors that shall arrive together),
-        ``samples`` (draws of the distribution), ``seed``.
+        ``samples`` (draws of the distribution), ``seed``,
+        ``accept_unreliable`` (design on an unreliable estimate, with a wider distribution).
 
     Returns
     -------
@@ -93,7 +106,8 @@ def design(estimate: Estimate, loop: Loop, method: str = "margin", **targets: An
     Raises
     ------
     DesignError
-        When the demand cannot be met; the message tells the limit and the nearest design.
+        When the demand cannot be met, with the limit and the nearest design, or the estimate is
+        unreliable and ``accept_unreliable`` is not given.
     """
     case = prepare(estimate, loop, method, targets)
     return finish(case, *solve(case))
@@ -122,27 +136,32 @@ def finish(case: Case, feedback: Feedback, factor: float, robustness: Robustness
     usual = _usual(case)
     margins = loop_margins(plant, feedback)
     reference = _plan(usual, loop, controller, margins, problem.targets)
-    figures = measure(problem, usual, controller, reference, ripple(problem, feedback))
-    reason, warnings = _explain(case, margins, factor, robustness, figures)
+    figures = measure(problem, usual, controller, reference, control_noise(problem, feedback))
+    reason, findings = _explain(case, margins, factor, robustness, figures)
     m = plant.motors
     return Design(
-        gains=wheel_gains(controller, plant, loop),
+        gains=wheel_gains(case, controller),
         margins=margins,
         reason=reason,
         method=case.method.name,
         loop=loop,
         robustness=robustness,
         performance=figures,
+        specification=specify(case, controller, reference, margins, figures),
         reference=reference,
         motor={
             "dc_gain": 1 / float(m.a0[0]),
             "time_constant": float(m.a1[0] / m.a0[0]),
             "time_constant_product": float(m.a2[0] / m.a0[0]),
-            "static_voltage": float(m.static_voltage[0]),
+            "static_voltage": case.friction.known,
             "delay": float(m.delay[0]),
         },
+        sensor={
+            "averaging_window": float(m.averaging_window[0]),
+            "sensor_lag": float(m.sensor_lag[0]),
+        },
         wheel=case.wheel,
-        warnings=warnings,
+        findings=findings,
         feedback=feedback,
     )
 
@@ -150,8 +169,11 @@ def finish(case: Case, feedback: Feedback, factor: float, robustness: Robustness
 def with_reference(case: Case, one: Design, reference: Reference) -> Design:
     """Return a design with another reference, and the figures that go with it."""
     controller = controller_for(one.loop, one.feedback)
-    figures = measure(case.problem, _usual(case), controller, reference, one.performance.ripple)
-    return replace(one, reference=reference, performance=figures)
+    figures = measure(
+        case.problem, _usual(case), controller, reference, one.performance.control_noise
+    )
+    spec = specify(case, controller, reference, one.margins, figures)
+    return replace(one, reference=reference, performance=figures, specification=spec)
 
 
 def _usual(case: Case) -> Plant:
@@ -160,9 +182,10 @@ def _usual(case: Case) -> Plant:
     return sample(case.problem.plant.motors, replace(loop, delay=loop.expected_delay))
 
 
-def wheel_gains(controller: Controller, plant: Plant, loop: Loop) -> PidGains:
+def wheel_gains(case: Case, controller: Controller) -> PidGains:
     """Return the running controller's settings, per wheel rad/s."""
-    ratio, fb, m = loop.gear_ratio, controller.feedback, plant.motors
+    loop, m = case.problem.loop, case.problem.plant.motors
+    ratio, fb = loop.gear_ratio, controller.feedback
     tracking = controller.tracking
     limit = loop.supply_voltage
     return PidGains(
@@ -178,7 +201,7 @@ def wheel_gains(controller: Controller, plant: Plant, loop: Loop) -> PidGains:
         setpoint_weight_p=controller.weight,
         setpoint_weight_d=controller.weight_d,
         derivative_filter_time_constant=fb.filter_time,
-        feedforward_static=float(m.static_voltage[0]),
+        feedforward_static=case.friction.known,
         feedforward_velocity=float(m.a0[0]) * ratio,
         feedforward_acceleration=float(m.a1[0]) * ratio,
     )
@@ -203,29 +226,38 @@ def _plan(
 
 def _explain(
     case: Case, margins: Margins, factor: float, robustness: Robustness, figures: Performance
-) -> tuple[str, tuple[str, ...]]:
+) -> tuple[str, tuple[Finding, ...]]:
     loop = case.problem.loop
     words = [
-        f"{case.method.title} at {loop.rate:g} Hz with {1e3 * loop.loop_delay:.3g} ms of delay: "
-        f"phase margin {margins.phase:.0f} deg, Ms {margins.sensitivity:.2f}, crossover "
-        f"{margins.crossover:.3g} rad/s"
+        f"{case.method.title} at {loop.rate:g} Hz with {1e3 * loop.loop_delay:.3g} ms of delay"
+        f"{_sensor(case)}: phase margin {margins.phase:.0f} deg, Ms {margins.sensitivity:.2f}, "
+        f"crossover {margins.crossover:.3g} rad/s"
     ]
-    warnings = []
+    findings = list(case.findings)
     if case.drawn:
         words.append(
             f"{robustness.holds:.1%} of {robustness.samples} motors that the data allow keep the "
-            f"promised margins, {robustness.stable:.1%} are stable"
+            f"required margins, {robustness.stable:.1%} are stable"
         )
-    else:
-        warnings.append("the estimate tells no uncertainty: the margins are those of one motor")
     if factor < 1:
         words.append(
-            f"gains backed off to {factor:.0%} of the rule's so that 99 % hold and the ripple from "
-            "the encoder stays within the clamp"
+            f"gains backed off to {factor:.0%} of the rule's so that 99 % hold and the control "
+            "noise from the encoder stays within the clamp"
         )
-    if figures.ripple > 1.05 * loop.noise_limit:
-        warnings.append(
-            f"encoder quantisation makes {figures.ripple:.2g} V of ripple, above "
+    if figures.control_noise > 1.05 * loop.noise_limit:
+        noisy = (
+            f"encoder quantisation makes {figures.control_noise:.2g} V of control noise, above "
             f"{loop.noise_limit:.2g} V"
         )
-    return "; ".join(words), tuple(warnings)
+        findings.append(Finding("control_noise", "warning", noisy))
+    return "; ".join(words), tuple(findings)
+
+
+def _sensor(case: Case) -> str:
+    """Return in words what the sensor that was identified does to the reported speed."""
+    plant, words = case.problem.plant, ""
+    if case.problem.loop.reports_speed and plant.motors.averaging_window[0] > 0 and plant.window:
+        words += f", a speed averaged over {1e3 / plant.average[0, 0]:.3g} ms"
+    if plant.motors.sensor_lag[0] > 0:
+        words += f", a sensor lag of {1e3 * plant.motors.sensor_lag[0]:.3g} ms"
+    return words

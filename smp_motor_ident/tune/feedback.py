@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from smp_motor_ident.tune.arrays import Array, Complex
+from smp_motor_ident.tune.observer_model import SPEED
 from smp_motor_ident.tune.plant import Plant
-from smp_motor_ident.tune.seen import SPEED
 
 
 @dataclass(frozen=True)
@@ -83,17 +83,17 @@ def closed_loop(plant: Plant, feedback: Feedback) -> Array:
     voltages still under way, integral, and derivative filter.
     """
     n, m, s = plant.taps.shape
-    T, window, seen = plant.sample_time, plant.window, plant.seen
-    memory = window if seen is None else seen.by_angle.size
+    T, window, observer = plant.sample_time, plant.window, plant.observer
+    memory = window if observer is None else observer.by_angle.size
     volts, integral = s + memory, s + memory + m - 1
     size = integral + 2
     speed = np.zeros((n, size))
-    if seen is not None:
+    if observer is not None:
         speed[:, s + SPEED] = 1.0
     elif window:
-        speed[:, s:volts] = 1 / (window * T)
+        speed[:, s:volts] = plant.average
     else:
-        speed[:, 0] = 1.0
+        speed[:, plant.sensor] = 1.0
     keep = feedback.filter_time / (feedback.filter_time + T)
     unit = np.eye(size)
     # filtered[k] = keep filtered[k-1] + (1 - keep) speed[k]; the last state is filtered[k-1].
@@ -108,12 +108,12 @@ def closed_loop(plant: Plant, feedback: Feedback) -> Array:
     swept[:, :s] = plant.phi_angle
     swept += plant.taps_angle[:, :1] * output
     swept[:, volts:integral] += plant.taps_angle[:, 1:]
-    if seen is not None:
-        told = seen.taps[0] * output
-        told[:, volts : volts + seen.taps.size - 1] += seen.taps[1:]
-        A[:, s:volts, s:volts] = seen.advance
-        A[:, s:volts] += seen.by_angle[:, None] * swept[:, None, :]
-        A[:, s:volts] += seen.by_voltage[:, None] * told[:, None, :]
+    if observer is not None:
+        delayed = observer.taps[0] * output
+        delayed[:, volts : volts + observer.taps.size - 1] += observer.taps[1:]
+        A[:, s:volts, s:volts] = observer.advance
+        A[:, s:volts] += observer.by_angle[:, None] * swept[:, None, :]
+        A[:, s:volts] += observer.by_voltage[:, None] * delayed[:, None, :]
     elif window:
         A[:, s] = swept
         A[:, s + 1 : volts] = unit[s : volts - 1]
@@ -140,5 +140,9 @@ def spectral_radius(plant: Plant, feedback: Feedback) -> Array:
     ndarray, shape (n,)
         Below 1 where the loop is stable.
     """
-    eigenvalues = np.linalg.eigvals(closed_loop(plant, feedback))
+    A = closed_loop(plant, feedback)
+    if np.ndim(feedback.i) == 0 and feedback.i == 0.0:
+        # An integral that nothing feeds stays as it is, and belongs to no loop.
+        A = np.delete(np.delete(A, -2, axis=1), -2, axis=2)
+    eigenvalues = np.linalg.eigvals(A)
     return np.asarray(np.abs(eigenvalues).max(axis=1), dtype=np.float64)

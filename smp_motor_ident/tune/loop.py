@@ -48,10 +48,12 @@ class Loop:
     observer_bandwidth : float or None
         Bandwidth of the speed observer [rad/s]; None leaves it to the design.
     noise_voltage : float or None
-        Largest voltage ripple [V rms] that encoder quantisation may cause at the output;
+        Largest control noise [V rms] that encoder quantisation may cause at the output;
         None takes 4 % of the supply.
     speed_noise : float
         Standard deviation of the noise on a measured speed [rad/s, motor], beside quantisation.
+    averaging_given : bool
+        Whether ``difference_window`` holds for a reported speed whatever averaging was identified.
 
     Raises
     ------
@@ -72,6 +74,7 @@ class Loop:
     observer_bandwidth: float | None = None
     noise_voltage: float | None = None
     speed_noise: float = 0.0
+    averaging_given: bool = False
 
     def __post_init__(self) -> None:
         if self.speed_source not in SPEED_SOURCES:
@@ -82,7 +85,7 @@ class Loop:
         positive = ("sample_time", "gear_ratio", "counts_per_revolution", "supply_voltage")
         for entry in fields(self):
             value = getattr(self, entry.name)
-            if entry.name == "speed_source" or value is None:
+            if entry.name in ("speed_source", "averaging_given") or value is None:
                 continue
             bound = "positive" if entry.name in positive else "not negative"
             number = isinstance(value, int | float) and not isinstance(value, bool)
@@ -102,6 +105,11 @@ class Loop:
         return 1.0 / self.sample_time
 
     @property
+    def reports_speed(self) -> bool:
+        """Whether the speed of the message is fed back, with all that its sensor does to it."""
+        return self.speed_source == "measured"
+
+    @property
     def loop_delay(self) -> float:
         """Delay beyond the hold [s]: as given, or one sample."""
         return self.sample_time if self.delay is None else self.delay
@@ -113,7 +121,7 @@ class Loop:
 
     @property
     def noise_limit(self) -> float:
-        """Largest voltage ripple from quantisation [V rms]: as given, or 4 % of the supply."""
+        """Largest control noise from quantisation [V rms]: as given, or 4 % of the supply."""
         return 0.04 * self.supply_voltage if self.noise_voltage is None else self.noise_voltage
 
     @property

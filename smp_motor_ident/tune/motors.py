@@ -1,21 +1,33 @@
-"""Motors as the design takes them: the combinations that fix their response, or draws of them."""
+"""Motors as the design takes them: what fixes the response of a drive, and draws of it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
+from smp_motor_ident.diagnosis.limits import FRICTION_KNOWN, FRICTION_RANGE, UNRELIABLE_SPREAD
 from smp_motor_ident.errors import DesignError
-from smp_motor_ident.result import Estimate
+from smp_motor_ident.finding import Finding
+from smp_motor_ident.result import Estimate, Quantity
 from smp_motor_ident.tune.arrays import Array
 
 PHYSICAL = ("resistance", "inductance", "motor_constant", "inertia", "viscous_friction")
+COMBINATIONS = ("dc_gain", "time_constant", "time_constant_product")
+SENSOR = ("delay", "averaging_window", "sensor_lag")
+"""What stands between the motor's speed and the one that is reported: [s] each."""
+
+_POSITIVE = ("dc_gain", "time_constant", "resistance", "inductance", "motor_constant", "inertia")
+
+
+def _zero() -> Array:
+    return np.zeros(1)
 
 
 @dataclass(frozen=True, eq=False)
 class Motors:
-    """Combinations that fix the response from voltage to speed, for a batch of motors.
+    """What fixes the response from voltage to reported speed, for a batch of motors.
 
     Attributes
     ----------
@@ -25,6 +37,10 @@ class Motors:
         The motor's own delay, from applied voltage to reported speed.
     static_voltage : ndarray, shape (n,), [V]
         What Coulomb friction takes.
+    averaging_window : ndarray, shape (n,), [s]
+        Over which the reported speed is averaged; 0 where none was identified.
+    sensor_lag : ndarray, shape (n,), [s]
+        Time constant of the filter of the reported speed.
     """
 
     a0: Array
@@ -32,10 +48,100 @@ class Motors:
     a2: Array
     delay: Array
     static_voltage: Array
+    averaging_window: Array = field(default_factory=_zero)
+    sensor_lag: Array = field(default_factory=_zero)
 
     def __len__(self) -> int:
         """Return the number of motors."""
         return int(self.a0.size)
+
+    def first(self, n: int) -> Motors:
+        """Return the first ``n`` motors of the batch."""
+        return Motors(**{each.name: getattr(self, each.name)[:n] for each in fields(self)})
+
+
+@dataclass(frozen=True)
+class Friction:
+    """What is known of dry friction, as a voltage.
+
+    Attributes
+    ----------
+    known : float
+        What surely is there, which feed-forward may overcome [V].
+    low, high : float
+        Within what it lies [V].
+    finding : Finding or None
+        What is to be said of it.
+    """
+
+    known: float
+    low: float
+    high: float
+    finding: Finding | None = None
+
+    @property
+    def planned(self) -> float:
+        """What the reference must leave room for [V]."""
+        return self.known if self.finding is None else self.high
+
+
+def friction_of(estimate: Estimate, supply: float) -> Friction:
+    """Return what feed-forward may take for known of dry friction.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        With ``static_voltage``, or all that makes it.
+    supply : float
+        Largest voltage [V].
+
+    Returns
+    -------
+    Friction
+
+    Raises
+    ------
+    DesignError
+        When the friction may be anything from nothing to half of the supply.
+    """
+    quantity = _static_voltage(estimate)
+    if quantity is None:
+        words = "dry friction was not identified: the feed-forward leaves it to the integral"
+        return Friction(0.0, 0.0, 0.0, Finding("friction_unknown", "warning", words))
+    if quantity.value is None or not math.isfinite(quantity.std or 0.0):
+        low, high = (0.0, supply) if quantity.ci95 is None else quantity.ci95
+    elif quantity.ci95 is not None:
+        low, high = quantity.ci95
+    else:
+        half = 1.96 * (quantity.std or 0.0)
+        low, high = quantity.value - half, quantity.value + half
+    # Whoever turned the motor did so with less than the supply.
+    low, high = max(low, 0.0), high if quantity.std in (None, 0.0) else min(high, supply)
+    if high - low > FRICTION_RANGE.value * supply:
+        raise DesignError(
+            f"{estimate.wheel}: dry friction may take anything from {low:.3g} to {high:.3g} V of "
+            f"the {supply:g} V supply, so that gain and friction are known as a combination only; "
+            "record the motor at two or more voltages in both directions, through standstill, and "
+            "identify it again"
+        )
+    if high - low <= 2 * FRICTION_KNOWN.value * supply and quantity.value is not None:
+        return Friction(quantity.value, low, high)
+    words = (
+        f"dry friction is only known to lie between {low:.3g} and {high:.3g} V: the feed-forward "
+        f"takes {low:.3g} V of it, the integral does the rest"
+    )
+    advice = "record voltages of both signs through standstill, slowly changing ones among them"
+    evidence = {"low": low, "high": high}
+    return Friction(low, low, high, Finding("friction_range", "warning", words, evidence, advice))
+
+
+def _static_voltage(estimate: Estimate) -> Quantity | None:
+    quantity = estimate.combinations.get("static_voltage")
+    torque = estimate.parameters.get("coulomb_friction")
+    if quantity is not None or torque is None or torque.value is None:
+        return quantity
+    per = estimate.value("resistance") / estimate.value("motor_constant", math.inf)
+    return Quantity(per * torque.value, None if torque.std is None else per * torque.std)
 
 
 def motors_of(estimate: Estimate) -> Motors:
@@ -59,8 +165,13 @@ def motors_of(estimate: Estimate) -> Motors:
     return _motors(estimate, {name: np.array([estimate.value(name)]) for name in _names(estimate)})
 
 
-def draw_motors(estimate: Estimate, n: int, rng: np.random.Generator) -> Motors | None:
+def draw_motors(
+    estimate: Estimate, n: int, rng: np.random.Generator, friction: Friction | None = None
+) -> Motors | None:
     """Draw motors from the distribution of the estimation error.
+
+    What is positive by nature is drawn log-normally, what may be zero normally from there up.
+    An unreliable estimate is drawn at least as wide as what it leaves unexplained.
 
     Parameters
     ----------
@@ -70,29 +181,69 @@ def draw_motors(estimate: Estimate, n: int, rng: np.random.Generator) -> Motors 
         Number of draws.
     rng : numpy.random.Generator
         Source of randomness.
+    friction : Friction or None
+        Within which its voltage is drawn; None takes that of the estimate.
 
     Returns
     -------
     Motors or None
-        A batch of ``n``, or None where the estimate tells no uncertainty of its response.
+        A batch of ``n``, or None where the estimate has no uncertainty of its response.
     """
     names = _names(estimate)
-    known = [name for name in names if name in estimate.names]
-    if not known or not np.any(np.diag(estimate.covariance) > 0):
+    mean = np.array([estimate.value(name) for name in names])
+    covariance = _covariance(estimate, names, mean)
+    wide = friction is not None and friction.high > friction.low
+    if not np.any(np.diag(covariance) > 0) and not wide:
         return None
-    draws = estimate.samples_of(names, n, rng)
-    return _motors(estimate, dict(zip(names, draws.T, strict=True)))
+    positive = np.array([name in _POSITIVE for name in names])
+    scale = np.where(positive, np.where(positive, mean, 1.0), 1.0)
+    relative = covariance / np.outer(scale, scale)
+    # With this log-covariance the log-normal has the estimate's relative covariance.
+    block = np.ix_(positive, positive)
+    relative[block] = np.log1p(np.maximum(relative[block], -1 + 1e-12))
+    centre = np.where(positive, -np.diag(relative) / 2, mean)
+    draws = rng.multivariate_normal(centre, relative, n, method="eigh", check_valid="ignore").T
+    values = {
+        name: mean[k] * np.exp(draws[k]) if positive[k] else np.maximum(draws[k], 0.0)
+        for k, name in enumerate(names)
+    }
+    motors = _motors(estimate, values)
+    if friction is not None:
+        static = np.clip(motors.static_voltage, friction.low, friction.high)
+        if np.ptp(static) == 0.0 and wide:
+            static = rng.uniform(friction.low, friction.high, n)
+        motors = replace(motors, static_voltage=static)
+    return motors
+
+
+def _covariance(estimate: Estimate, names: tuple[str, ...], mean: Array) -> Array:
+    """Return the covariance of some quantities, zero where there is none, widened if unreliable."""
+    covariance = np.zeros((len(names), len(names)))
+    known = [k for k, name in enumerate(names) if name in estimate.names]
+    index = [estimate.names.index(names[k]) for k in known]
+    covariance[np.ix_(known, known)] = estimate.covariance[np.ix_(index, index)]
+    if estimate.unreliable:
+        covariance += np.diag((unreliable_spread(estimate) * mean) ** 2)
+    return np.where(np.isfinite(covariance), covariance, 0.0)
+
+
+def unreliable_spread(estimate: Estimate) -> float:
+    """Return the relative deviation that numbers of an unreliable estimate are given."""
+    fit = estimate.fit_percent.validation
+    unexplained = 1.0 if fit is None else 1.0 - fit / 100
+    return min(max(UNRELIABLE_SPREAD.value, unexplained), 0.5)
 
 
 def _names(estimate: Estimate) -> tuple[str, ...]:
-    tail = ("static_voltage", "delay")
     if estimate.value("dc_gain") and estimate.value("time_constant"):
-        return ("dc_gain", "time_constant", "time_constant_product", *tail)
+        return (*COMBINATIONS, "static_voltage", *SENSOR)
     if all(estimate.value(n) for n in ("resistance", "motor_constant", "inertia")):
-        return (*PHYSICAL, "coulomb_friction", "delay")
+        return (*PHYSICAL, "coulomb_friction", *SENSOR)
+    advice = "; ".join(f.advice for f in estimate.findings if f.advice)
     raise DesignError(
         f"{estimate.wheel}: the estimate holds neither dc_gain and time_constant nor all physical "
-        "parameters; identify the motor again"
+        "parameters, so that no gains can be stood for; "
+        + (advice or "record two or more voltages in both directions and identify the motor again")
     )
 
 
@@ -111,4 +262,6 @@ def _motors(estimate: Estimate, value: dict[str, Array]) -> Motors:
             f"{estimate.wheel}: dc_gain and time_constant must be positive, they are "
             f"{1 / a0[0]:.4g} rad/s/V and {a1[0] / a0[0]:.4g} s"
         )
-    return Motors(a0, a1, a2, np.maximum(value["delay"], 0.0), np.abs(static))
+    sensor = (np.maximum(value[name], 0.0) for name in SENSOR)
+    delay, window, lag = sensor
+    return Motors(a0, a1, a2, delay, np.abs(static), window, lag)

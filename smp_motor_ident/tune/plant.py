@@ -1,7 +1,8 @@
 r"""The motor as a sampled loop sees it: exact zero-order hold with a delay of any length.
 
 A batch of ``n`` motors :math:`e^{-sD} / (a_2 s^2 + a_1 s + a_0)` is sampled at once, so that
-one motor and a thousand draws of an uncertain one are the same few array operations.
+one motor and a thousand draws of an uncertain one are the same few array operations.  How the
+speed is reported is part of it: filtered, averaged over a window, or observed.
 Everything here is at the motor shaft.
 
 References
@@ -12,17 +13,18 @@ References
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from smp_motor_control.motor.model import MotorModel
+from smp_motor_control.motor.response import zero_order_hold
 from smp_motor_control.observer import ObserverNoise
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.tune.arrays import Array, Complex
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.motors import Motors
-from smp_motor_ident.tune.seen import Seen, seen_by_observer
+from smp_motor_ident.tune.observer_model import ObserverModel, observer_model
 
 LONGEST = 300
 """Samples of delay and averaging that a loop may have."""
@@ -32,25 +34,27 @@ LONGEST = 300
 class Plant:
     r"""A batch of sampled motors with their delay and the way their speed is measured.
 
-    ``x[k+1] = phi x[k] + sum_j taps[j] u[k-j]`` with ``x = (speed, scaled acceleration)``;
-    the angle run through in the step is ``phi_angle x[k] + sum_j taps_angle[j] u[k-j]``.
+    ``x[k+1] = phi x[k] + sum_j taps[j] u[k-j]`` with ``x = (speed, acceleration)``, last
+    the filtered speed where the sensor has a lag; the angle run through in the step is
+    ``phi_angle x[k] + sum_j taps_angle[j] u[k-j]``.
 
     Attributes
     ----------
     phi : ndarray, shape (n, s, s)
-        State transition over one sample; ``s`` is 1 for a first-order motor.
+        State transition over one sample.
     taps : ndarray, shape (n, m, s)
         Effect of the last ``m`` controller outputs.
     phi_angle : ndarray, shape (n, s)
     taps_angle : ndarray, shape (n, m)
     sample_time : float
         [s].
-    window : int
-        Samples over which the measured speed is averaged; 0 measures it instantaneously.
+    average : ndarray, shape (n, q), [1/s]
+        Weights of the angles run through in the last ``q`` steps, whose sum is the measured speed;
+        with ``q`` 0 it is the last state of a sensor with lag, else the speed itself.
     motors : Motors
         What was sampled.
-    seen : Seen or None
-        The observer through which the speed is seen, where it is fed back; then ``window`` is 0.
+    observer : ObserverModel or None
+        The observer whose speed is fed back, where there is one; then ``q`` is 0.
     """
 
     phi: Array
@@ -58,13 +62,23 @@ class Plant:
     phi_angle: Array
     taps_angle: Array
     sample_time: float
-    window: int
+    average: Array
     motors: Motors
-    seen: Seen | None = None
+    observer: ObserverModel | None = None
 
     def __len__(self) -> int:
         """Return the number of motors."""
         return int(self.phi.shape[0])
+
+    @property
+    def window(self) -> int:
+        """Steps over which the measured speed is averaged."""
+        return int(self.average.shape[1])
+
+    @property
+    def sensor(self) -> int:
+        """Which state is reported as the speed."""
+        return self.phi.shape[1] - 1 if np.any(self.motors.sensor_lag > 0) else 0
 
     def repeated(self, n: int) -> Plant:
         """Return a batch of ``n`` copies of a batch of one, for ``n`` controllers.
@@ -79,76 +93,80 @@ class Plant:
         Plant
             A batch of ``n``.
         """
-        arrays = (self.phi, self.taps, self.phi_angle, self.taps_angle)
-        phi, taps, phi_angle, taps_angle = (np.repeat(x, n, axis=0) for x in arrays)
-        made = (phi, taps, phi_angle, taps_angle, self.sample_time, self.window, self.motors)
-        return Plant(*made, self.seen)
+        return replace(
+            self,
+            phi=np.repeat(self.phi, n, axis=0),
+            taps=np.repeat(self.taps, n, axis=0),
+            phi_angle=np.repeat(self.phi_angle, n, axis=0),
+            taps_angle=np.repeat(self.taps_angle, n, axis=0),
+            average=np.repeat(self.average, n, axis=0),
+        )
 
-    def response(self, omega: Array, *, window: int | None = None) -> Complex:
+    def response(self, omega: Array, *, true_speed: bool = False) -> Complex:
         """Return the frequency response from controller output to measured speed.
 
         Parameters
         ----------
         omega : ndarray, shape (f,), [rad/s]
             Frequencies up to pi / sample_time.
-        window : int or None
-            Averaging window in samples; None takes the plant's own.
+        true_speed : bool
+            Whether to the motor's own speed instead.
 
         Returns
         -------
         ndarray of complex, shape (n, f), [rad/s/V]
         """
-        return self.transfer(np.exp(1j * np.asarray(omega) * self.sample_time), window=window)
+        z = np.exp(1j * np.asarray(omega) * self.sample_time)
+        return self.transfer(z, true_speed=true_speed)
 
-    def transfer(self, z: Complex, *, window: int | None = None) -> Complex:
+    def transfer(self, z: Complex, *, true_speed: bool = False) -> Complex:
         """Return the transfer function at points of the z plane; see :meth:`response`.
 
         Parameters
         ----------
         z : ndarray of complex, shape (f,)
             Points other than poles.
-        window : int or None
-            Averaging window in samples; None takes the plant's own.
+        true_speed : bool
+            See :meth:`response`.
 
         Returns
         -------
         ndarray of complex, shape (n, f), [rad/s/V]
             One row per motor of the batch.
         """
-        instantaneous = window == 0 or (self.window == 0 and self.seen is None)
-        window = self.window if window is None else window
         z = np.asarray(z, dtype=np.complex128)
         delays = z[None, :] ** -np.arange(self.taps.shape[1])[:, None]
         drive = np.einsum("nms,mf->nsf", self.taps, delays)
         state = _resolvent(self.phi, z, drive)
-        if instantaneous:
+        if true_speed:
             return state[:, 0]
+        if self.observer is None and not self.window:
+            return state[:, self.sensor]
         angle = np.einsum("ns,nsf->nf", self.phi_angle, state) + self.taps_angle @ delays
-        if self.seen is not None:
-            from_angle, from_voltage = self.seen.transfer(z)
-            told = self.seen.taps @ z[None, :] ** -np.arange(self.seen.taps.size)[:, None]
-            seen: Complex = from_angle * angle + from_voltage * told
-            return seen
-        sweep = np.sum(z[None, :] ** -(1.0 + np.arange(window))[:, None], axis=0)
-        response: Complex = angle * sweep / (window * self.sample_time)
-        return response
+        if self.observer is not None:
+            from_angle, from_voltage = self.observer.transfer(z)
+            m = self.observer.taps.size
+            shifted = self.observer.taps @ z[None, :] ** -np.arange(m)[:, None]
+            observed: Complex = from_angle * angle + from_voltage * shifted
+            return observed
+        steps = z[None, :] ** -(1.0 + np.arange(self.window))[:, None]
+        averaged: Complex = angle * (self.average @ steps)
+        return averaged
 
     def angle_noise(self, omega: Array) -> Array:
-        """Return how an error of the counted angle shows in the speed."""
-        T = self.sample_time
-        if self.seen is not None:
-            z = np.exp(1j * np.asarray(omega) * T)
-            squared: Array = np.abs(self.seen.transfer(z)[0] * (z - 1)) ** 2
+        """Return how an error of the counted angle shows in the speed of the first motor."""
+        z = np.exp(1j * np.asarray(omega) * self.sample_time)
+        if self.observer is not None:
+            squared: Array = np.abs(self.observer.transfer(z)[0] * (z - 1)) ** 2
             return squared
-        if not self.window:
-            return np.zeros(np.shape(omega))
-        difference: Array = 2 * np.sin(0.5 * omega * self.window * T) / (self.window * T)
-        return difference**2
+        steps = z[None, :] ** -(1.0 + np.arange(self.window))[:, None]
+        difference = (self.average[:1] @ steps)[0] * (z - 1)
+        lag = 1 + 1j * np.asarray(omega) * self.motors.sensor_lag[0]
+        noise: Array = np.abs(difference / lag) ** 2
+        return noise
 
 
-def sample(
-    motors: Motors, loop: Loop, *, window: int | None = None, believed: Motors | None = None
-) -> Plant:
+def sample(motors: Motors, loop: Loop, *, believed: Motors | None = None) -> Plant:
     """Sample a batch of motors exactly, with the loop's and the motor's delay.
 
     Parameters
@@ -157,8 +175,6 @@ def sample(
         The batch.
     loop : Loop
         Sample time, delay, and how speed is measured.
-    window : int or None
-        Averaging window [samples]; None takes that of the loop.
     believed : Motors or None
         The motor that an observer in the loop takes them all for; None takes the first of them.
 
@@ -172,43 +188,79 @@ def sample(
     DesignError
         When delay and window are more samples than a loop can be designed for.
     """
-    T = loop.sample_time
-    seen = None
-    if window is None:
-        window = int(loop.difference_window)
-        if loop.speed_source == "observer" and loop.count_angle:
-            window, seen = 0, _seen(motors if believed is None else believed, loop)
+    T, n = loop.sample_time, len(motors)
+    observer = None
+    if loop.speed_source == "observer" and loop.count_angle:
+        observer = _observer(motors if believed is None else believed, loop)
+    lag = motors.sensor_lag if loop.reports_speed else np.zeros(1)
+    motors = replace(motors, sensor_lag=np.broadcast_to(lag, n))
+    window = np.zeros(n) if observer is not None else _window(motors, loop)
     total = loop.loop_delay + motors.delay
     whole = np.floor(total / T + 1e-9).astype(int)
     late = np.clip(total - whole * T, 0.0, T)
-    if int(whole.max()) + window > LONGEST:
-        raise DesignError(
-            f"a delay of {1e3 * float(total.max()):.4g} ms and a window of {window} samples at "
-            f"{loop.rate:.4g} Hz are {int(whole.max()) + window} samples, of which at most "
-            f"{LONGEST} can be designed for; sample at {LONGEST / max(float(total.max()), T):.3g} "
-            "Hz or less, or average over fewer samples"
-        )
-    A, B = _continuous(motors)
-    n, s = B.shape
-    phi, gamma, zeta = _integrals(A, B, np.full(n, T))
-    _, recent, recent_angle = _integrals(A, B, T - late)
-    longest = max(int(whole.max()) + 2, 0 if seen is None else seen.taps.size)
-    taps = np.zeros((n, longest, s))
-    taps_angle = np.zeros(taps.shape[:2])
+    _check_length(float(total.max()), float(window.max()), loop)
+    phi, gamma, phi_angle, zeta = _hold(motors, np.full(n, T))
+    _, newest, _, newest_angle = _hold(motors, T - late)
+    # A window within one step sees the end of it only.
+    tail = np.where(window > 0, np.minimum(window, T), T)
+    if np.any(tail < T):
+        begin = T - tail
+        _, _, before, old = _hold(motors, begin)
+        new = _hold(motors, np.maximum(begin - late, 0.0))[3]
+        phi_angle, zeta, newest_angle = phi_angle - before, zeta - old, newest_angle - new
+    s = phi.shape[1]
+    taps: Array = np.zeros((n, int(whole.max()) + 2, s))
+    taps_angle: Array = np.zeros(taps.shape[:2])
     row = np.arange(n)
-    taps[row, whole] = recent
-    taps[row, whole + 1] = gamma - recent
-    taps_angle[row, whole] = recent_angle
-    taps_angle[row, whole + 1] = zeta - recent_angle
-    used = np.any(taps != 0, axis=(0, 2))
+    taps[row, whole], taps[row, whole + 1] = newest, gamma - newest
+    taps_angle[row, whole], taps_angle[row, whole + 1] = newest_angle, zeta - newest_angle
+    used = np.any(taps != 0, axis=(0, 2)) | np.any(taps_angle != 0, axis=0)
     m = int(np.flatnonzero(used)[-1]) + 1
-    if seen is not None:
-        m = max(m, seen.taps.size)
-    ones, _ = _mean_integral(A, np.full(n, T))
-    return Plant(phi, taps[:, :m], ones[:, 0, :], taps_angle[:, :m], T, window, motors, seen)
+    if observer is not None:
+        short = max(observer.taps.size - taps.shape[1], 0)
+        taps = np.pad(taps, ((0, 0), (0, short), (0, 0)))
+        taps_angle = np.pad(taps_angle, ((0, 0), (0, short)))
+        m = max(m, observer.taps.size)
+    taps, taps_angle = taps[:, :m], taps_angle[:, :m]
+    average = _average(window, tail, T)
+    return Plant(phi, taps, phi_angle, taps_angle, T, average, motors, observer)
 
 
-def _seen(believed: Motors, loop: Loop) -> Seen:
+def _window(motors: Motors, loop: Loop) -> Array:
+    """Return the length over which the fed back speed is averaged [s], 0 where it is not."""
+    own = np.full(len(motors), loop.difference_window * loop.sample_time)
+    if not loop.reports_speed or loop.averaging_given:
+        return own
+    identified = np.broadcast_to(motors.averaging_window, len(motors))
+    if not np.any(identified > 0):
+        # A filter that was identified is all that the sensor does.
+        return np.where(motors.sensor_lag > 0, 0.0, own) if np.any(motors.sensor_lag > 0) else own
+    return np.maximum(identified, 0.01 * loop.sample_time)
+
+
+def _average(window: Array, tail: Array, T: float) -> Array:
+    """Return the weights of the steps in an average, the last step's in part."""
+    if not np.any(window > 0):
+        return np.zeros((window.size, 0))
+    steps = np.maximum(window / T, 1.0)
+    weights = np.clip(steps[:, None] - np.arange(int(np.ceil(steps.max() - 1e-9))), 0.0, 1.0)
+    weights /= np.where(window < T, tail, window)[:, None]
+    return np.asarray(weights)
+
+
+def _check_length(delay: float, window: float, loop: Loop) -> None:
+    samples = int(delay / loop.sample_time) + round(window / loop.sample_time)
+    if samples <= LONGEST:
+        return
+    raise DesignError(
+        f"a delay of {1e3 * delay:.4g} ms and a window of {1e3 * window:.4g} ms at "
+        f"{loop.rate:.4g} Hz are {samples} samples, of which at most {LONGEST} can be designed "
+        f"for; sample at {LONGEST / max(delay + window, loop.sample_time):.3g} Hz or less, or "
+        "average over fewer samples"
+    )
+
+
+def _observer(believed: Motors, loop: Loop) -> ObserverModel:
     """Return the observer that runs with the first of some motors as its model."""
     a0, a1, a2 = (float(a[0]) for a in (believed.a0, believed.a1, believed.a2))
     model = MotorModel(
@@ -217,64 +269,44 @@ def _seen(believed: Motors, loop: Loop) -> Seen:
         time_constant_product=a2 / a0,
         delay=float(believed.delay[0]),
     )
-    return seen_by_observer(
+    return observer_model(
         model, loop.sample_time, loop.count_angle, ObserverNoise(), loop.loop_delay
     )
 
 
-def _continuous(motors: Motors) -> tuple[Array, Array]:
-    a0, a1, a2 = motors.a0, motors.a1, motors.a2
-    if np.all(a2 <= 1e-12 * a1 * a1 / a0):
-        return (-a0 / a1)[:, None, None], (1 / a1)[:, None]
-    a2 = np.maximum(a2, 1e-10 * a1 * a1 / a0)
-    natural = np.sqrt(a0 / a2)
-    A = np.zeros((len(motors), 2, 2))
-    A[:, 0, 1], A[:, 1, 0], A[:, 1, 1] = natural, -natural, -a1 / a2
-    B = np.zeros((len(motors), 2))
-    B[:, 1] = natural / a0
-    return A, B
+def _hold(motors: Motors, t: Array) -> tuple[Array, Array, Array, Array]:
+    """Return transition, effect of a held volt, and both for the angle, over ``t``.
 
-
-def _exponential(A: Array, t: Array) -> Array:
-    """Return exp(A t) of a batch of 1x1 or 2x2 matrices in closed form."""
-    if A.shape[1] == 1:
-        first_order: Array = np.exp(A * t[:, None, None])
-        return first_order
-    half = 0.5 * np.trace(A, axis1=1, axis2=2)
-    root = np.sqrt((half**2 - np.linalg.det(A)).astype(np.complex128))
-    plus, minus = np.exp((half + root) * t), np.exp((half - root) * t)
-    small = np.abs(root * t) < 1e-6
-    safe = np.where(small, 1.0, root)
-    sine = np.where(small, np.exp(half * t) * t, (plus - minus) / (2 * safe)).real
-    cosine = (0.5 * (plus + minus)).real
-    shifted = A - half[:, None, None] * np.eye(2)
-    second_order: Array = cosine[:, None, None] * np.eye(2) + sine[:, None, None] * shifted
-    return second_order
-
-
-def _mean_integral(A: Array, t: Array) -> tuple[Array, Array]:
-    """Return the first and second integrals of exp(A s) over 0 to t."""
-    eye = np.eye(A.shape[1])
-    first = np.linalg.solve(A, _exponential(A, t) - eye)
-    second = np.linalg.solve(A, first - t[:, None, None] * eye)
-    return first, second
-
-
-def _integrals(A: Array, B: Array, t: Array) -> tuple[Array, Array, Array]:
-    """Return transition, and what a constant input adds to state and angle, over ``t``."""
-    first, second = _mean_integral(A, t)
-    return (
-        _exponential(A, t),
-        np.einsum("nij,nj->ni", first, B),
-        np.einsum("nij,nj->ni", second, B)[:, 0],
-    )
+    With a sensor of lag f its speed y is a third state: ``y + f y' = w`` has the particular
+    solution ``c1 w + c2 w'``, and the angle that it runs through lags by what it still holds.
+    """
+    gain, tau, tp = 1 / motors.a0, motors.a1 / motors.a0, motors.a2 / motors.a0
+    held = zero_order_hold(gain, tau, tp, t)
+    if not np.any(motors.sensor_lag > 0):
+        return held
+    f = np.maximum(motors.sensor_lag, 1e-6 * np.max(motors.sensor_lag))
+    f = np.where(np.abs(tp - tau * f + f * f) < 1e-6 * f * f, 1.00001 * f, f)
+    c2 = -f * tp / (tp - tau * f + f * f)
+    c1 = 1 - f * f / (tp - tau * f + f * f)
+    decay = np.exp(-t / f)
+    phi, gamma = np.zeros((t.size, 3, 3)), np.zeros((t.size, 3))
+    phi[:, :2, :2], phi[:, 2, 2] = held.transition, decay
+    rows = c1[:, None] * held.transition[:, 0] + c2[:, None] * held.transition[:, 1]
+    phi[:, 2, :2] = rows - decay[:, None] * np.stack([c1, c2], axis=1)
+    gamma[:, :2], gamma[:, 2] = held.forced, gain * (1 - phi[:, 2, 0] - decay)
+    angle = -f[:, None] * phi[:, 2]
+    angle[:, :2] += held.angle_transition
+    angle[:, 2] += f
+    return phi, gamma, angle, held.angle_forced - f * gamma[:, 2]
 
 
 def _resolvent(phi: Array, z: Complex, drive: Complex) -> Complex:
-    """Return (z I - phi)^-1 drive for a batch of 1x1 or 2x2 matrices."""
-    if phi.shape[1] == 1:
-        solved: Complex = drive / (z - phi[:, :, 0])[:, None, :]
-        return solved
+    """Return (z I - phi)^-1 drive for a batch; a sensor's state, the last of three, is fed only."""
+    if phi.shape[1] == 3:
+        inner = _resolvent(phi[:, :2, :2], z, drive[:, :2])
+        last = np.einsum("ns,nsf->nf", phi[:, 2, :2], inner) + drive[:, 2]
+        last = last / (z - phi[:, 2, 2, None])
+        return np.concatenate([inner, last[:, None]], axis=1)
     a, b = z - phi[:, 0, 0, None], -phi[:, 0, 1, None]
     c, d = -phi[:, 1, 0, None], z - phi[:, 1, 1, None]
     determinant = a * d - b * c

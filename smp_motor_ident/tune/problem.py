@@ -12,14 +12,14 @@ import numpy as np
 
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.tune.arrays import Array, Complex
-from smp_motor_ident.tune.feedback import Feedback, terms
+from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.margins import grid_for
 from smp_motor_ident.tune.plant import Plant
 
 
 @dataclass(frozen=True)
-class Promise:
+class RequiredMargins:
     """Margins that a method's gains keep on the loop that runs.
 
     Attributes
@@ -85,13 +85,13 @@ class Problem:
 
     @cached_property
     def true_response(self) -> Complex:
-        """Response to the true speed, not the one that is seen, on the grid, shape (f,)."""
-        response: Complex = self.plant.response(self.omega, window=0)[0]
+        """Response to the true speed, not the measured one, on the grid, shape (f,)."""
+        response: Complex = self.plant.response(self.omega, true_speed=True)[0]
         return response
 
     @cached_property
     def reduced(self) -> FirstOrderDelay:
-        """Half-rule reduction; hold and averaging window count as delay.
+        """Half-rule reduction; hold, averaging window and the sensor's lag count as delay.
 
         A pair of complex poles is taken as a double real one of the same sum.
         """
@@ -99,7 +99,7 @@ class Problem:
         tau = float(m.a1[0] / m.a0[0])
         root = math.sqrt(max(tau**2 - 4 * float(m.a2[0] / m.a0[0]), 0.0))
         fast = 0.5 * (tau - root)
-        dead = self.loop.loop_delay + float(m.delay[0]) + 0.5 * T * (1 + self.plant.window)
+        dead = 0.5 * T + measured_lag(self.plant, self.loop.loop_delay)
         return FirstOrderDelay(1 / float(m.a0[0]), tau - fast / 2, dead + fast / 2)
 
     @cached_property
@@ -190,7 +190,7 @@ class Method:
     ----------
     name, title, source : str
         Keyword, words for the table, and where it was published.
-    promise : Promise
+    required : RequiredMargins
         What its gains keep; scaled back where the rule alone would not.
     solve : callable
         From the problem to the feedback gains.
@@ -201,9 +201,29 @@ class Method:
     name: str
     title: str
     source: str
-    promise: Promise
+    required: RequiredMargins
     solve: Callable[[Problem], Feedback]
     targets: tuple[str, ...] = ()
+
+
+def measured_lag(plant: Plant, delay: float) -> float:
+    """Return how much later than the motor's speed the measurement shows it [s].
+
+    Parameters
+    ----------
+    plant : Plant
+        With the way its speed is measured.
+    delay : float
+        Of the loop [s].
+
+    Returns
+    -------
+    float
+    """
+    late = delay + float(plant.motors.delay[0])
+    if plant.window:
+        late += 0.5 / float(plant.average[0, 0])
+    return late + float(plant.motors.sensor_lag[0])
 
 
 def noise_filter(problem: Problem, omega: Array) -> Array:
@@ -228,7 +248,7 @@ def noise_filter(problem: Problem, omega: Array) -> Array:
     return density + loop.speed_noise**2
 
 
-def ripple(problem: Problem, feedback: Feedback) -> float:
+def control_noise(problem: Problem, feedback: Feedback) -> float:
     """Return the voltage that measurement noise causes at the controller's output.
 
     Parameters
@@ -248,14 +268,3 @@ def ripple(problem: Problem, feedback: Feedback) -> float:
     through = np.abs(control / (1 + problem.response * control)) ** 2
     power = np.trapezoid(through * noise_filter(problem, omega), omega) / omega[-1]
     return math.sqrt(float(power))
-
-
-__all__ = [
-    "FirstOrderDelay",
-    "Method",
-    "Problem",
-    "Promise",
-    "noise_filter",
-    "ripple",
-    "terms",
-]

@@ -25,7 +25,8 @@ from smp_motor_ident.tune.arrays import Array
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.plant import Plant, sample
-from smp_motor_ident.tune.response import Controller, minimum_jerk, simulate, step_figures
+from smp_motor_ident.tune.problem import measured_lag
+from smp_motor_ident.tune.simulation import Controller, minimum_jerk, simulate, step_figures
 
 HEADROOM = 0.92
 """Share of the supply that a constant speed may use; the rest is left to the feedback."""
@@ -86,13 +87,6 @@ def controller_for(loop: Loop, feedback: Feedback) -> Controller:
     elif feedback.i > 0 and feedback.p > 0:
         tracking = feedback.p / feedback.i
     return Controller(feedback, weight_d=1.0, limit=loop.supply_voltage, tracking=tracking)
-
-
-def measured_lag(plant: Plant, loop: Loop) -> float:
-    """Return how much later than the reference the measurement shows it [s]."""
-    dead = loop.expected_delay + float(plant.motors.delay[0])
-    window = 0 if loop.speed_source == "observer" else plant.window
-    return dead + 0.5 * loop.sample_time * window
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,7 +187,7 @@ def plan_reference(
 def _fastest(plant: Plant, loop: Loop, speed: float, together: bool) -> Reference:
     """Return a plan that keeps to the voltage alone."""
     m = plant.motors
-    lag = measured_lag(plant, loop)
+    lag = measured_lag(plant, loop.expected_delay)
     drive = Drive(
         top_speed=(PEAK * loop.supply_voltage - float(m.static_voltage[0])) / float(m.a0[0]),
         time_constant=float(m.a1[0] / m.a0[0]),

@@ -2,7 +2,7 @@
 
 Each candidate costs in its own way: a difference over more samples makes less noise and more
 lag, the observer makes little of both while its model is right.  All are designed for, and the
-gains that reject a load best within the same margins and the same ripple tell which to take.
+gains that reject a load best within the same margins and the same control noise tell which to take.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from smp_motor_ident.errors import DesignError
 from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune.case import prepare, solve
 from smp_motor_ident.tune.loop import Loop
-from smp_motor_ident.tune.problem import ripple
+from smp_motor_ident.tune.problem import control_noise
 
 WINDOWS = (2, 4, 8, 16)
 """Samples to difference over that are tried beside what the hardware reports."""
@@ -37,13 +37,13 @@ class Trial:
     integral : float
         Integral gain within the margins [V/rad, wheel]; the error that a load leaves is its
         inverse.
-    ripple : float
+    control_noise : float
         Voltage from quantisation [V rms].
     """
 
     loop: Loop
     integral: float
-    ripple: float
+    control_noise: float
 
     @property
     def name(self) -> str:
@@ -76,8 +76,8 @@ def choose_source(estimate: Estimate, loop: Loop, **targets: Any) -> tuple[Loop,
     usual = _trial(estimate, loop, targets)
     if loop.counts_per_revolution is None:
         return loop, "the reported speed: the encoder's counts are not known"
-    # Averaging longer helps only where the ripple is what holds the gains back.
-    noisy = usual is None or usual.ripple > 0.9 * loop.noise_limit
+    # Averaging longer helps only where the control noise is what holds the gains back.
+    noisy = usual is None or usual.control_noise > 0.9 * loop.noise_limit
     windows = [
         _trial(estimate, replace(loop, speed_source="difference", difference_window=w), targets)
         for w in WINDOWS
@@ -91,20 +91,20 @@ def choose_source(estimate: Estimate, loop: Loop, **targets: Any) -> tuple[Loop,
             best = trial
     if best is None:
         return loop, "the reported speed: no source allows what is asked"
-    told = "; ".join(
-        f"{t.name} allows i = {t.integral:.3g} V/rad at {1e3 * t.ripple:.3g} mV of ripple"
+    compared = "; ".join(
+        f"{t.name} allows i = {t.integral:.3g} V/rad at {1e3 * t.control_noise:.3g} mV of ripple"
         for t in (usual, longer, watched)
         if t is not None
     )
-    return best.loop, f"{best.name}: {told}"
+    return best.loop, f"{best.name}: {compared}"
 
 
 def _trial(estimate: Estimate, loop: Loop, targets: dict[str, Any]) -> Trial | None:
-    # The ripple that the loop allows is a limit here: nothing is gained by noise.
+    # The control noise that the loop allows is a limit here: nothing is gained by noise.
     strict = replace(loop, noise_voltage=loop.noise_limit)
     try:
         case = prepare(estimate, strict, "margin", {**targets, "samples": DRAWS})
         feedback = solve(case)[0]
     except DesignError:
         return None
-    return Trial(loop, feedback.i * loop.gear_ratio, ripple(case.problem, feedback))
+    return Trial(loop, feedback.i * loop.gear_ratio, control_noise(case.problem, feedback))

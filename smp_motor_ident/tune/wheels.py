@@ -15,9 +15,9 @@ from smp_motor_ident.errors import DesignError
 from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune.case import Case, prepare, solve
 from smp_motor_ident.tune.designer import Design, finish, with_reference
+from smp_motor_ident.tune.ensemble import Robustness, back_off
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.loop import Loop
-from smp_motor_ident.tune.robust import Robustness, back_off
 
 Sets = Literal["auto", "one", "each"]
 
@@ -100,7 +100,7 @@ def design_wheels(
 def _with(case: Case, shared: Feedback) -> Design:
     """Finish a design with gains that are per wheel rad/s."""
     mine = shared.scaled(1 / case.problem.loop.gear_ratio)
-    return finish(case, mine, 1.0, case.jury.judge(mine))
+    return finish(case, mine, 1.0, case.ensemble.assess(mine))
 
 
 def _together(
@@ -166,18 +166,18 @@ def common_drive(designs: Mapping[str, Design]) -> Drive:
     return common
 
 
-class _Panel:
-    """All wheels' juries as one: gains, per wheel rad/s, are as good as on the worst wheel."""
+class _AllWheels:
+    """All wheels' ensembles as one: gains, per wheel rad/s, are as good as on the worst wheel."""
 
     def __init__(self, cases: Mapping[str, Case]) -> None:
         self.cases = cases
 
-    def judge(self, feedback: Feedback) -> Robustness:
-        verdicts = [
-            case.jury.judge(feedback.scaled(1 / case.problem.loop.gear_ratio))
+    def assess(self, feedback: Feedback) -> Robustness:
+        found = [
+            case.ensemble.assess(feedback.scaled(1 / case.problem.loop.gear_ratio))
             for case in self.cases.values()
         ]
-        return min(verdicts, key=lambda verdict: verdict.holds)
+        return min(found, key=lambda one: one.holds)
 
 
 def _choose(
@@ -186,11 +186,11 @@ def _choose(
     """Return the feedback for all, per wheel rad/s, or None, and why."""
     if sets == "each" or len(own) == 1:
         return None, "one set of gains each"
-    panel = _Panel(cases)
+    everyone = _AllWheels(cases)
     best: tuple[float, Feedback] | None = None
     for wheel, one in own.items():
         candidate = one.feedback.scaled(cases[wheel].problem.loop.gear_ratio)
-        shared, factor, _ = back_off(panel, candidate)
+        shared, factor, _ = back_off(everyone, candidate)
         if factor == 0.0:
             continue
         loss = max(other.feedback.i * other.loop.gear_ratio / shared.i for other in own.values())
@@ -199,7 +199,7 @@ def _choose(
     if best is None:
         if sets == "one":
             raise DesignError(
-                "no set of gains keeps the promised margins on all wheels: the motors differ too "
+                "no set of gains keeps the required margins on all wheels: the motors differ too "
                 "much; ask for one set each, or for smaller margins"
             )
         return None, "one set of gains each: no set keeps the margins on all wheels"

@@ -66,7 +66,7 @@ def gains_yaml(designs: Mapping[str, Design], provenance: Iterable[str]) -> str:
         YAML.
     """
     tree = {
-        f"/{wheel}/wheel_pid": {"ros__parameters": parameters(design)}
+        f"/**/{wheel}/wheel_pid": {"ros__parameters": parameters(design)}
         for wheel, design in designs.items()
     }
     head = "".join(f"# {line}\n" for line in provenance)
@@ -108,7 +108,9 @@ def _entry(design: Design) -> dict[str, Any]:
         "gains": dataclasses.asdict(design.gains),
         "margins": dataclasses.asdict(design.margins),
         "robustness": dataclasses.asdict(design.robustness),
+        "findings": [one.to_document() for one in design.findings],
         "performance": dataclasses.asdict(design.performance),
+        "specification": _specification(design),
         "reference": {
             "max_velocity": design.reference.max_velocity / design.loop.gear_ratio,
             "max_acceleration": design.reference.max_acceleration / design.loop.gear_ratio,
@@ -119,9 +121,15 @@ def _entry(design: Design) -> dict[str, Any]:
         },
         "loop": {**dataclasses.asdict(design.loop), "delay": design.loop.loop_delay},
         "motor": dict(design.motor),
+        "sensor": dict(design.sensor),
     }
     plain: dict[str, Any] = _plain(entry)
     return plain
+
+
+def _specification(design: Design) -> dict[str, Any]:
+    entry = dataclasses.asdict(design.specification)
+    return {**entry, "change": design.specification.change / design.loop.gear_ratio}
 
 
 def _plain(value: Any) -> Any:

@@ -35,7 +35,8 @@ def settings(**gains: object) -> LoopSettings:
     [
         ({"i": -100.0}, r"i is -100; it must be in \[0, 1e\+08\], and is beyond by 100"),
         ({"p": -1e-3}, "p is -0.001"),
-        ({"setpoint_weight_p": 1.7e308}, r"setpoint_weight_p is 1.7e\+308; it must be in \[0, 1\]"),
+        ({"setpoint_weight_p": 7.0}, r"setpoint_weight_p is 7; it must be in \[0, 1\], .* by 6"),
+        ({"setpoint_weight_p": 1.7e308}, "setpoint_weight_p is 1.7e"),
         ({"setpoint_weight_d": -0.1}, "setpoint_weight_d is -0.1"),
         ({"feedforward_velocity": -1.0}, "feedforward_velocity is -1"),
         ({"feedforward_acceleration": -1.0}, "feedforward_acceleration is -1"),

@@ -127,6 +127,20 @@ def test_settings_change_without_a_jump_of_the_output():
     assert after.output == pytest.approx(before.output, abs=0.1)
 
 
+@pytest.mark.parametrize("delays", [(0.0, 0.4), (0.4, 0.0)])
+def test_reference_delay_changes_while_driving_without_a_jump_of_the_reference(delays):
+    before, after = (settings_of("rear_left", reference_delay=delay) for delay in delays)
+    loop = WheelLoop(before)
+    loop.start(0.0)
+    for _ in range(400):
+        out = loop.step(1.5, 1.5, 0.005)
+    loop.configure(after)
+    changed = [loop.step(1.5, 1.5, 0.005).output for _ in range(50)]
+    assert loop.reference.velocity == pytest.approx(1.5)
+    # Without an error nothing is to change but the way in which the feed-forward is put together.
+    assert changed == pytest.approx([out.output] * 50, abs=0.1)
+
+
 def test_counts_without_known_hardware_fall_back_to_the_reported_speed():
     loop = WheelLoop(settings_of("rear_left", speed_source="observer"))
     assert loop.speed(0.005, 1.23, 77, 3.0) == 1.23

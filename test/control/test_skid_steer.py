@@ -9,15 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from smp_motor_control import LEFT, RIGHT
 from smp_motor_control.body.kinematics import (
-    LEFT,
-    RIGHT,
     HeadingHold,
     Odometry,
     SkidSteer,
     SpeedLimiter,
 )
-from smp_motor_control.body.kinematics import side_mean as mean_of
 from smp_motor_control.errors import ParameterError
 
 ROBOT = SkidSteer(
@@ -63,8 +61,6 @@ def test_impossible_geometry_is_refused_by_name(name: str, value: float) -> None
 def test_sides_hold_the_wheels_of_the_contract() -> None:
     assert LEFT == ("front_left", "rear_left")
     assert RIGHT == ("front_right", "rear_right")
-    assert mean_of({"front_left": 2.0, "rear_left": math.nan}, LEFT) == 2.0
-    assert math.isnan(mean_of({}, LEFT))
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])

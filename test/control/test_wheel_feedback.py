@@ -85,7 +85,24 @@ def test_velocity_stands_in_for_a_position_that_is_nan() -> None:
     feed(feedback, 0.0, "abcd", math.nan, 2.0)
     feedback.take(0.0, TIMEOUT)
     feed(feedback, 0.01, "abcd", math.nan, 2.0)
-    assert feedback.take(0.01, TIMEOUT) == pytest.approx((0.02, 0.02))
+    assert feedback.take(0.01, TIMEOUT) == pytest.approx((0.02, 0.02, 2.0, 2.0))
+
+
+@pytest.mark.parametrize("stall", [0.1, 0.12, 0.5, 1.0])
+def test_speed_over_a_stall_is_the_travel_over_the_time_it_was_travelled_in(stall: float) -> None:
+    feedback = make()
+    stamps = [0.005 * k for k in range(100)]
+    stamps += [0.5 + stall + 0.005 * k for k in range(100)]
+    speeds = []
+    for k, stamp in enumerate(stamps):
+        feed(feedback, stamp, "acd", 3.0 * stamp)
+        if k % 4 == 0:
+            feed(feedback, stamp, "b", 3.0 * stamp)
+            feedback.receive("b", WheelSample(stamp, 3.0 * stamp, 0.0), stamp)
+        if k % 4 == 3:  # taken in the middle of a round: b is three samples behind
+            travel = feedback.take(stamp, 2.0)
+            speeds += [] if travel is None else [travel.left_speed, travel.right_speed]
+    assert speeds[2:] == pytest.approx([3.0] * (len(speeds) - 2))
 
 
 def test_sample_without_a_number_is_no_sign_of_life() -> None:

@@ -15,6 +15,7 @@ import pytest
 from smp_motor_ident.diagnosis import limits
 from smp_motor_ident.diagnosis.advice import _fit
 from smp_motor_ident.estimate import estimate
+from smp_motor_ident.finding import Finding
 from smp_motor_ident.result import FitPercent, ResidualTests
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -68,6 +69,7 @@ def test_the_curves_are_what_the_verdict_is_of() -> None:
 
 
 def test_what_was_said_while_reading_is_a_finding() -> None:
-    result = estimate(replace(motors.record("rear_left"), notes=("a note of the reader",)))
-    assert "a note of the reader" in result.warnings
-    assert [f.code for f in result.findings if f.message == "a note of the reader"] == ["reading"]
+    read = Finding("samples_missing", "warning", "what the reader found")
+    result = estimate(replace(motors.record("rear_left"), findings=(read,)))
+    assert read.message in result.warnings
+    assert read in result.findings

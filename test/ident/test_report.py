@@ -5,25 +5,39 @@ from __future__ import annotations
 import json
 import os
 import re
+from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from browser import CHROMIUM, Browser
+from scipy.signal import lfilter
 
+from smp_motor_control.parameter_file import read_parameters
 from smp_motor_ident.errors import BagError, ParameterError
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.record import Hardware
+from smp_motor_ident.report.chart import thin
 from smp_motor_ident.report.document import (
     identification_document,
     motors_yaml,
     read_identification,
     write_together,
 )
+from smp_motor_ident.report.drawing import ticks
+from smp_motor_ident.report.figures import frequency_charts, residual_charts
 from smp_motor_ident.report.html import Report, render
-from smp_motor_ident.report.series import Comparison, thin
-from smp_motor_ident.result import Candidate, Estimate, FitPercent, Quantity, ResidualTests
+from smp_motor_ident.report.series import Comparison
+from smp_motor_ident.result import (
+    Candidate,
+    Correlation,
+    Estimate,
+    FitPercent,
+    Quantity,
+    ResidualTests,
+)
 
 PHYSICAL = {
     "resistance": (12.919, "ohm"),
@@ -33,6 +47,11 @@ PHYSICAL = {
     "viscous_friction": (2.4e-5, "N m s/rad"),
     "coulomb_friction": (1e-4, "N m"),
 }
+
+
+def correlation(*values: float) -> Correlation:
+    """With a band of 0.1."""
+    return Correlation(np.arange(1.0, 1 + len(values)), np.array(values), 0.1)
 
 
 def estimate(wheel: str = "front_left", *, current: bool = True) -> Estimate:
@@ -52,7 +71,7 @@ def estimate(wheel: str = "front_left", *, current: bool = True) -> Estimate:
         covariance=np.array([[1e-2, 5e-6], [5e-6, 1e-8]]),
         fit_percent=FitPercent(97.2, 96.8),
         candidates=(Candidate("first_order", 91.0, -10.0, False, "slower lag <b>missed</b>"),),
-        residuals=ResidualTests(True, False),
+        residuals=ResidualTests(True, False, correlation(0.01, 0.02), correlation(0.3, 0.1)),
         findings=(
             Finding(
                 "alike",
@@ -79,16 +98,14 @@ def comparison(role: str, n: int = 4000) -> Comparison:
 
 
 class Outside(HTMLParser):
-    """Collects every address that a page would load, and the tags that were left open."""
+    """Collects every address that a page would load, and its identifiers."""
 
     def __init__(self) -> None:
         super().__init__()
         self.addresses: list[str] = []
-        self.scripts = 0
         self.identifiers: list[str] = []
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.scripts += tag == "script"
         for name, value in attrs:
             if name in ("src", "href", "xlink:href") and not (value or "").startswith("#"):
                 self.addresses.append(value or "")
@@ -104,14 +121,13 @@ def page() -> str:
     }
     parts = [comparison("estimation"), comparison("validation")]
     failures = {"rear_left": "voltage is constant; excite the motor"}
-    return render(Report(wheels, {"front_left": parts}, failures, {}, {"Command": "identify a b"}))
+    return render(Report(wheels, {"front_left": parts}, failures, {"Command": "identify a b"}))
 
 
 def test_page_loads_nothing_from_elsewhere(page: str) -> None:
     outside = Outside()
     outside.feed(page)
     assert outside.addresses == []
-    assert outside.scripts == 0
     assert "@import" not in page
     assert not re.search(r"url\((?!#)", page)
 
@@ -131,14 +147,57 @@ def test_names_of_users_are_escaped(page: str) -> None:
 def test_page_tells_failures_warnings_and_unidentifiable_parameters(page: str) -> None:
     assert "voltage is constant; excite the motor" in page
     assert "look alike at 100 Hz" in page
-    assert page.count("cannot be told") >= len(PHYSICAL)
+    assert page.count("not identifiable") >= len(PHYSICAL)
 
 
-def test_every_colour_of_the_figures_is_a_variable_of_the_page(page: str) -> None:
+def test_every_colour_of_the_charts_is_a_variable_of_the_page(page: str) -> None:
+    charts = json.loads(re.findall(r'id="charts">(.*?)</script>', page, re.DOTALL)[0])
     used = set(re.findall(r"var\(--([a-z0-9-]+)\)", page))
+    used |= {curve["color"] for chart in charts for curve in chart["curves"]}
+    used |= {span[2] for chart in charts for span in chart["spans"]}
     defined = set(re.findall(r"--([a-z0-9-]+):", page))
     assert used <= defined
-    assert "#0100" not in page
+
+
+def test_each_chart_has_a_drawing_for_print_and_words_for_those_who_cannot_see_it(
+    page: str,
+) -> None:
+    charts = json.loads(re.findall(r'id="charts">(.*?)</script>', page, re.DOTALL)[0])
+    assert {chart["name"].split("-")[0] for chart in charts} >= {
+        "speed", "residual", "voltage", "autocorrelation", "correlation", "gain", "phase",
+    }  # fmt: skip
+    assert len(re.findall(r'<svg class="static" role="img" [^>]*aria-label="[^"]', page)) == len(
+        charts
+    )
+
+
+FRAME = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
+"""What is set in a chart is drawn in a frame of its own."""
+
+
+@pytest.mark.skipif(not CHROMIUM, reason="no Chromium on this machine")
+def test_a_browser_draws_every_chart_zooms_and_asks_nobody(page: str, tmp_path: Path) -> None:
+    file = tmp_path / "report.html"
+    file.write_text(page)
+    with Browser(tmp_path / "profile") as browser:
+        for width, dark in ((1200, False), (390, True)):
+            browser.open(file, width, dark=dark)
+            figures = browser.value("document.querySelectorAll('figure.chart').length")
+            assert figures > 0
+            for inside in ("figure.ready", "figure canvas"):
+                assert browser.value(f"document.querySelectorAll('{inside}').length") == figures
+            assert browser.value("document.documentElement.scrollWidth") <= width
+        # Speed, residual and voltage share their time: all three show the zoomed stretch.
+        browser.value("document.querySelector('button[data-key=\"+\"]').click()")
+        browser.ask("Runtime.evaluate", awaitPromise=True, expression=FRAME)
+        shown = "[...document.querySelectorAll('.live')].slice(0, 3).map(e => e.dataset.shown)"
+        first, *others = browser.value(shown)
+        begin, end = map(float, first.split())
+        assert others == [first, first]
+        # Two stretches of 4000 samples at 5 ms, of which the middle half is shown.
+        assert (begin, end) == pytest.approx((10.0, 30.0), abs=0.1)
+        assert browser.complaints == []
+        assert set(browser.requests) == {file.as_uri()}
 
 
 def test_document_reads_back_as_the_same_estimates(tmp_path: Path) -> None:
@@ -152,7 +211,7 @@ def test_document_reads_back_as_the_same_estimates(tmp_path: Path) -> None:
 def test_motors_file_has_parameters_where_known_and_combinations_where_not() -> None:
     wheels = {"front_left": estimate(), "rear_left": estimate("rear_left", current=False)}
     text = motors_yaml(wheels, ["from a bag"])
-    motors = yaml.safe_load(text)["/motor_plant"]["ros__parameters"]["motors"]
+    motors = yaml.safe_load(text)["/**/motor_plant"]["ros__parameters"]["motors"]
     assert text.startswith("# from a bag\n")
     assert motors["front_left"]["inertia"] == PHYSICAL["inertia"][0]
     assert "dc_gain" not in motors["front_left"]
@@ -172,6 +231,68 @@ def test_a_damaged_document_is_named_with_its_reason(
     path.write_text(text)
     with pytest.raises(BagError, match=reason) as error:
         read_identification(path)
+    assert str(path) in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("junk", [None, True, -1, 1e308, 10**400, "x", [], {}, [[]], {"a": {}}])
+def test_whatever_stands_anywhere_in_a_document_it_is_read_or_refused_in_a_line(
+    tmp_path: Path, junk: object
+) -> None:
+    whole = json.dumps(identification_document({"w": estimate()}))
+
+    def places(node: object, way: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
+        items = node.items() if isinstance(node, dict) else enumerate(node)  # type: ignore[call-overload]
+        for key, value in items:
+            yield (*way, key)
+            if isinstance(value, (dict, list)):
+                yield from places(value, (*way, key))
+
+    path = tmp_path / "identification.json"
+    for *way, last in places(json.loads(whole)):
+        document = node = json.loads(whole)
+        for key in way:
+            node = node[key]
+        node[last] = junk
+        path.write_text(json.dumps(document))
+        said = f"{path}: read"
+        try:
+            read_identification(path)
+        except BagError as error:
+            said = str(error)
+        assert said.startswith(f"{path}: ")
+        assert "\n" not in said
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"schema": 1, "motors": ' + '{"a":' * 100_000])
+def test_a_document_nested_without_end_is_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "identification.json").write_text(text)
+    with pytest.raises(BagError, match="is not JSON"):
+        read_identification(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("[" * 100_000, "nested"),
+        ("a: " * 3, "is not YAML"),
+        ("{" * 40 + "}" * 40, "nested|is not YAML"),
+        ("a: &a [x,x,x,x,x,x,x,x,x,x]\n" + "".join(
+            f"{chr(98 + k)}: &{chr(98 + k)} [{','.join([f'*{chr(97 + k)}'] * 10)}]\n"
+            for k in range(8)
+        ), "values"),
+        ("x" * 1_000_001, "larger"),
+        ("front_left: 3", "no ROS parameter file"),
+        ("\xff", "is not YAML"),
+    ],
+)  # fmt: skip
+def test_a_parameter_file_that_is_none_is_refused_in_a_line(
+    tmp_path: Path, text: str, reason: str
+) -> None:
+    path = tmp_path / "gains.yaml"
+    path.write_bytes(text.encode("latin-1"))
+    with pytest.raises(ParameterError, match=reason) as error:
+        read_parameters(path)
     assert str(path) in str(error.value)
     assert "\n" not in str(error.value)
 
@@ -214,12 +335,45 @@ def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
         write_together({tmp_path / "file" / "sub" / "x": "1"})
 
 
+def test_the_chart_of_the_residuals_shows_what_the_test_has_judged() -> None:
+    tests = ResidualTests(False, True, correlation(0.5, 0.01), correlation(0.02, 0.01))
+    own, cross = residual_charts("w", tests)
+    assert own.lines == cross.lines == (-0.1, 0.0, 0.1)
+    inside, outside = own.curves
+    assert outside.y[0] == 0.5
+    assert np.isnan(outside.y[1])
+    assert inside.y[1] == 0.01
+    assert np.isnan(cross.curves[1].y).all()  # independent: none outside
+
+
+def test_frequency_response_of_data_is_that_of_the_system_they_come_from() -> None:
+    # A first-order lag sampled exactly, under noise: gain k/|1 + j w tau| of the held input.
+    k, tau, step, n = 25.0, 0.1, 0.005, 16_384
+    rng = np.random.default_rng(11)
+    voltage = np.repeat(rng.uniform(-8, 8, n // 8), 8)
+    decay = np.exp(-step / tau)
+    speed = lfilter([k * (1 - decay)], [1, -decay], voltage)
+    part = Comparison("validation", "b", np.arange(n) * step, voltage, speed, speed)
+    gain, _ = frequency_charts("w", [part])
+    z = np.exp(2j * np.pi * gain.x * step)
+    truth = np.abs(k * (1 - decay) / (1 - decay / z))
+    low = gain.x < 10
+    # Leakage of a window of 20 s over a lag of 0.1 s is far below a percent.
+    np.testing.assert_allclose(gain.curves[0].y[low], truth[low], rtol=0.01)
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.0, 46.0), (-3.2, 3.2), (1e-7, 2e-7)])
+def test_ticks_are_round_and_inside(low: float, high: float) -> None:
+    found = ticks(low, high)
+    assert 3 <= len(found) <= 12
+    assert low <= found[0] < found[-1] <= high
+
+
 def test_thinning_keeps_peaks_and_order() -> None:
-    time = np.arange(100_000) * 1e-3
-    values = np.sin(time)
+    values = np.sin(np.arange(100_000) * 1e-3)
     values[54_321] = 9.0
     values[77] = np.nan
-    short_time, short = thin(time, values, 1000)
-    assert short.size <= 1004
-    assert np.nanmax(short) == 9.0
-    assert np.all(np.diff(short_time) > 0)
+    index = thin(values, 1000)
+    assert index.size <= 1004
+    assert np.nanmax(values[index]) == 9.0
+    assert np.all(np.diff(index) > 0)

@@ -6,6 +6,8 @@ import motors
 import numpy as np
 import pytest
 
+from smp_motor_ident.diagnosis.identifiability import what_next
+from smp_motor_ident.diagnosis.screening import _signs
 from smp_motor_ident.errors import InsufficientExcitationError, SignalError
 from smp_motor_ident.estimate import estimate
 
@@ -121,3 +123,23 @@ def test_one_step_does_not_pretend_to_separate_gain_from_friction():
         return
     assert gain.std > 0.01 * gain.value
     assert abs(gain.value - motors.truth("rear_left", 0.3)["dc_gain"]) < 3 * gain.std
+
+
+def test_a_motor_that_stands_has_no_swapped_sign():
+    """What a noisy sensor says of a standing motor has no sign, however it falls out."""
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        slow = np.cumsum(rng.standard_normal(N))  # drifts as a command does
+        slow = 5.0 * (slow - slow.mean()) / np.abs(slow - slow.mean()).max()
+        noise = rng.standard_normal(N)
+        noise = replace(GOOD, voltage=slow, count=None, current=None, velocity=noise)
+        _signs([noise], "record")
+    with pytest.raises(SignalError, match="swapped sign"):
+        _signs([replace(GOOD, count=-GOOD.count, velocity=-GOOD.velocity)], "record")
+
+
+def test_what_next_stays_within_what_the_recording_had():
+    poor = motors.record("rear_left", current=False, amplitude=5.0)
+    hardware = replace(poor.hardware, supply_voltage=None)
+    proposal = what_next(estimate(replace(poor, hardware=hardware)))
+    assert proposal.amplitude <= 5.0

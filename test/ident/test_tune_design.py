@@ -31,13 +31,13 @@ def combinations(row):
 def estimate(k=0, std=0.0, **more) -> Estimate:
     values = {**combinations(TABLE_1[k]), **more}
     covariance = np.diag([(std * x) ** 2 for x in values.values()])
-    told = {name: Quantity(value) for name, value in values.items()}
-    return Estimate("front_left", "second_order", {}, told, tuple(values), covariance)
+    known = {name: Quantity(value) for name, value in values.items()}
+    return Estimate("front_left", "second_order", {}, known, tuple(values), covariance)
 
 
 def of_parameters(row) -> Estimate:
-    told = {name: Quantity(value) for name, value in zip(PHYSICAL, row, strict=True)}
-    return Estimate("front_left", "electromechanical", told, {})
+    known = {name: Quantity(value) for name, value in zip(PHYSICAL, row, strict=True)}
+    return Estimate("front_left", "electromechanical", known, {})
 
 
 @pytest.mark.parametrize("k", range(4))
@@ -100,12 +100,12 @@ def test_uncertainty_makes_the_design_back_off_and_say_so():
 def test_robustness_is_judged_on_fresh_draws_as_well():
     """Gains chosen on one sample of the distribution hold on another, with another seed."""
     one = design(estimate(1, std=0.05), Loop(), seed=1)
+    from smp_motor_ident.tune.ensemble import UncertaintyEnsemble
     from smp_motor_ident.tune.motors import draw_motors
     from smp_motor_ident.tune.plant import sample
-    from smp_motor_ident.tune.robust import Jury
 
     fresh = sample(draw_motors(estimate(1, std=0.05), 4000, np.random.default_rng(99)), Loop())
-    verdict = Jury(fresh, METHODS["margin"].promise).judge(one.feedback)
+    verdict = UncertaintyEnsemble(fresh, METHODS["margin"].required).assess(one.feedback)
     # 99 % of 1000 draws: the binomial spread of a fresh sample is 0.3 %, three of them.
     assert verdict.holds >= 0.98
     assert verdict.stable == 1.0
@@ -158,7 +158,10 @@ def test_impossible_demand_is_refused_with_the_limit(targets, words):
     [
         (Loop(sample_time=1e-5, delay=0.5), "sample at 600 Hz or less"),
         (Loop(difference_window=1000), "average over fewer samples"),
-        (Loop(supply_voltage=1e-3), "the nearest that holds has a ripple of|nothing near it"),
+        (
+            Loop(supply_voltage=1e-3),
+            "the nearest that holds has a control_noise of|nothing near it",
+        ),
     ],
 )
 def test_impossible_loop_is_refused_with_what_to_do(loop, words):
@@ -200,7 +203,7 @@ def test_comparison_recommends_a_sound_design_for_a_reason():
     assert "load" in reason
     for other in results.values():
         sound = other.margins.sensitivity <= 1.6
-        if sound and other.performance.ripple <= other.loop.noise_limit:
+        if sound and other.performance.control_noise <= other.loop.noise_limit:
             assert chosen.performance.load_integral <= other.performance.load_integral
 
 

@@ -15,7 +15,7 @@ from smp_motor_control.reference.profile import ProfileLimits, Reference
 from smp_motor_control.reference.time_optimal import VoltageLimited
 from smp_motor_control.wheel.loop import LoopSettings, WheelLoop
 from smp_motor_control.wheel.simulation import Timing, simulate_closed_loop
-from smp_motor_ident.cli.tune import read_estimates
+from smp_motor_ident.cli.tuning import read_estimates
 from smp_motor_ident.tune import Loop, design, design_wheels
 from smp_motor_ident.tune.motors import motors_of
 from smp_motor_ident.tune.plant import sample

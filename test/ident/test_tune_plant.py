@@ -14,7 +14,7 @@ from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.margins import batch_margins, grid_for, loop_margins
 from smp_motor_ident.tune.motors import Motors
 from smp_motor_ident.tune.plant import sample
-from smp_motor_ident.tune.response import Controller, minimum_jerk, simulate
+from smp_motor_ident.tune.simulation import Controller, minimum_jerk, simulate
 
 # Motor 1 of the paper's Table 1, and a first-order motor.
 MOTOR_1 = (0.039142, 0.0019981, 3.1755e-5)

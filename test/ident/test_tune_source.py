@@ -13,12 +13,13 @@ from smp_motor_control.motor.hardware import DriveSettings
 from smp_motor_control.motor.model import MotorModel
 from smp_motor_control.wheel.loop import LoopSettings
 from smp_motor_control.wheel.simulation import Timing, simulate_closed_loop
-from smp_motor_ident.cli.tune import main, read_estimates
+from smp_motor_ident.cli.tune import main
+from smp_motor_ident.cli.tuning import read_estimates
 from smp_motor_ident.tune import Loop, design
 from smp_motor_ident.tune.feedback import spectral_radius
 from smp_motor_ident.tune.motors import Motors, motors_of
 from smp_motor_ident.tune.plant import sample
-from smp_motor_ident.tune.response import Controller, simulate
+from smp_motor_ident.tune.simulation import Controller, simulate
 from smp_motor_ident.tune.source import choose_source
 
 MOTORS = Path(__file__).resolve().parents[2] / "config" / "motors_paper.yaml"
@@ -38,7 +39,7 @@ def test_an_observer_with_the_right_model_sees_the_speed_itself(estimates):
     loop = observed(200.0, delay=0.01)  # whole samples: the mean voltage is the voltage
     omega = np.geomspace(1.0, 600.0, 50)
     seen = sample(motors, loop).response(omega)
-    true = sample(motors, loop, window=0).response(omega)
+    true = sample(motors, loop).response(omega, true_speed=True)
     np.testing.assert_allclose(seen, true, rtol=1e-6)  # rounding of the matrix exponential
 
 
@@ -106,7 +107,7 @@ def test_at_1_khz_the_observer_is_taken_and_said_why(estimates):
     plain = design(estimates["rear_left"], Loop(sample_time=0.001, noise_voltage=0.48))
     better = design(estimates["rear_left"], replace(loop, noise_voltage=0.48))
     assert better.gains.i > 1.5 * plain.gains.i
-    assert better.performance.ripple <= 1.01 * 0.48
+    assert better.performance.control_noise <= 1.01 * 0.48
 
 
 def test_at_200_hz_the_reported_speed_does(estimates):

@@ -68,7 +68,7 @@ def test_four_wheels_at_a_kilohertz_are_recorded_without_a_lost_message(
         assert "lost" not in recorder.output
     records = read_records(bag)
     assert all(len(records[wheel]) == 2000 for wheel in WHEELS)
-    assert not any("missing" in note for note in records["front_left"].notes)
+    assert not any("missing" in f.message for f in records["front_left"].findings)
 
 
 def test_best_effort_messages_are_recorded_or_told_as_lost(
@@ -99,8 +99,8 @@ def test_best_effort_messages_are_recorded_or_told_as_lost(
         # that stands still for a tenth of a second may lose as many.
         assert len(places) > 1700
         lost = places[-1] - places[0] + 1 - len(places)
-        told = re.search(rf"{name}  \((\d+) lost\)", recorder.output)
-        assert lost == (int(told[1]) if told else 0)
+        said = re.search(rf"{name}  \((\d+) lost\)", recorder.output)
+        assert lost == (int(said[1]) if said else 0)
 
 
 def test_late_publishers_latched_ones_and_mixed_qos_are_recorded(

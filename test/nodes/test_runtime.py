@@ -173,11 +173,11 @@ def test_an_event_of_what_was_just_destroyed_does_not_end_the_spin(context, exec
     node = rclpy.create_node("destroying", context=context)
     executor.add_node(node)
     reliable = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
-    told: list[str] = []
+    named: list[str] = []
     found: dict[str, Subscription] = {}
 
     def destroy_the_other(name: str, other: str) -> None:
-        told.append(name)
+        named.append(name)
         node.destroy_subscription(found[other])
 
     for name, other in (("one", "two"), ("two", "one")):
@@ -198,11 +198,11 @@ def test_an_event_of_what_was_just_destroyed_does_not_end_the_spin(context, exec
         assert time.monotonic() < end, "no event of the three"
         everything.wait(10_000_000)
     destroying = steady_timer(node, 0.01, lambda: node.destroy_subscription(third))
-    spin_until(executor, node, lambda: told)
+    spin_until(executor, node, lambda: named)
     node.destroy_timer(destroying)
     for _ in range(20):
         spin_until(executor, node, lambda: True)
-    assert told in (["one"], ["two"])
+    assert named in (["one"], ["two"])
 
 
 def test_exception_in_a_callback_comes_out_of_the_spin(context, executor):

@@ -153,7 +153,7 @@ def test_apply_changes_four_running_wheels_without_a_stop(process, robot, tmp_pa
     assert "kept" in output
     assert "1 -> " in output  # the difference was shown: p was 1
     for wheel in WHEELS:
-        wanted = yaml.safe_load(gains.read_text())[f"/{wheel}/wheel_pid"]["ros__parameters"]
+        wanted = yaml.safe_load(gains.read_text())[f"/**/{wheel}/wheel_pid"]["ros__parameters"]
         assert wanted["p"] != 1.0
         assert robot.gain(wheel) == wanted["p"]
     # A stop would show as standstill; a bumpless change leaves the speed within the noise of
@@ -228,9 +228,9 @@ def period_with(motor, delay: float) -> float:
 
 def test_relay_on_a_running_wheel_gives_gains_without_a_model(process, robot, eventually, tmp_path):
     output = tmp_path / "relay.yaml"
-    code, told = run_tune(process, "--relay", "rear_right", "--supply", "12", "--output", output)
-    assert code == 0, told
-    gains = yaml.safe_load(output.read_text())["/rear_right/wheel_pid"]["ros__parameters"]
+    code, said = run_tune(process, "--relay", "rear_right", "--supply", "12", "--output", output)
+    assert code == 0, said
+    gains = yaml.safe_load(output.read_text())["/**/rear_right/wheel_pid"]["ros__parameters"]
     share, integral, _ = RULES["tyreus_luyben", "pi"]
     ultimate, period = gains["p"] / share, gains["p"] / gains["i"] / integral
     # Whatever a busy machine adds to the delay moves the period, and the ultimate gain with it: it

@@ -60,9 +60,26 @@ def test_linear_algebra_stays_on_one_thread():
             "print(len(os.listdir('/proc/self/task')))\n"
         )
         command = [sys.executable, "-c", program]
-        told = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
-        return int(told.stdout)
+        shown = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+        return int(shown.stdout)
 
     if threads("") == 1:
         pytest.skip("this machine's linear algebra has one thread anyway")
     assert threads("import smp_motor_control.entry") == 1
+
+
+def test_a_package_that_is_not_installed_is_named_with_what_to_type(process, tmp_path):
+    (tmp_path / "numba.py").write_text("raise ModuleNotFoundError(name='numba')\n")
+    for executable in ("identify", "tune", "identifier"):
+        path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
+        started = process(executable, "--force", "x.csv", env={"PYTHONPATH": path})
+        assert started.wait(20.0) == 2
+        assert "pip install numba" in started.output
+        assert "Traceback" not in started.output
+
+
+@pytest.mark.parametrize("executable", ["wheel_pid", "skid_steer", "excite", "identifier", "play"])
+def test_every_node_has_help(process, executable):
+    started = process(executable, "--help")
+    assert started.wait(30.0) == 0
+    assert f"usage: {executable}" in started.output

@@ -7,18 +7,39 @@ from pathlib import Path
 
 import pytest
 
+from smp_motor_control import WHEELS
+from smp_motor_control.errors import ParameterError
+from smp_motor_control.parameter_file import require_nodes
+
 LAUNCH = Path(__file__).parents[2] / "launch" / "smp.launch.py"
 
 
-def test_launch_file_describes_plant_wheels_and_body():
+def test_launch_file_starts_plant_wheels_and_body_of_any_robot():
     pytest.importorskip("launch_ros", reason="ros2 launch is not among the wheels")
+    from launch import LaunchContext
+
     spec = importlib.util.spec_from_file_location("smp_launch", LAUNCH)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    description = module.generate_launch_description()
-    executables = [getattr(e, "node_executable", "") for e in description.entities]
+    context = LaunchContext()
+    for entity in module.generate_launch_description().entities[:-1]:
+        entity.execute(context)
+    executables = [node.node_executable for node in module.start(context)]
     assert executables.count("wheel_pid") == 4
     assert {"motor_plant", "skid_steer"} <= set(executables)
+    context.launch_configurations["left_wheels"] = "unknown"
+    with pytest.raises(ParameterError, match="says nothing to /unknown/wheel_pid"):
+        module.start(context)
+
+
+def test_parameter_file_speaks_to_the_nodes_of_every_robot(tmp_path):
+    gains = LAUNCH.parents[1] / "config" / "gains.yaml"
+    require_nodes(gains, [f"/{wheel}/wheel_pid" for wheel in WHEELS])
+    require_nodes(gains, [f"/a/b/{wheel}/wheel_pid" for wheel in WHEELS])
+    with pytest.raises(ParameterError, match="says nothing to /front_left/motor_plant"):
+        require_nodes(gains, ["/front_left/motor_plant"])
+    with pytest.raises(ParameterError, match="cannot be read"):
+        require_nodes(tmp_path / "none.yaml", [])
 
 
 def test_launch_file_is_python_that_names_real_executables_and_files():
@@ -26,4 +47,5 @@ def test_launch_file_is_python_that_names_real_executables_and_files():
     compile(text, LAUNCH.name, "exec")
     root = LAUNCH.parents[1]
     for name in ("motors_paper.yaml", "gains.yaml", "skid_steer.yaml"):
-        assert name in text and (root / "config" / name).exists()
+        assert name in text
+        assert (root / "config" / name).exists()

@@ -1,7 +1,7 @@
 """JSON logs: rows of objects, objects of columns, JSON lines, and WPILib's SysId.
 
 SysId and its forerunner frc-characterization keep lists of rows by the name of the test
-(``slow-forward`` and the like); what their columns are is told by the number of them
+(``slow-forward`` and the like); what their columns are follows from the number of them
 (github.com/wpilibsuite/sysid, docs/data-collection.md).
 """
 

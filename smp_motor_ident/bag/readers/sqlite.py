@@ -209,7 +209,7 @@ class _SqliteFile:
         for column in table[:-1]:
             log = log * 10 + (column - 48)
         raw: Bytes = np.frombuffer(data, np.uint8)
-        channel = self._channels[0]  # told apart by the caller
+        channel = self._channels[0]  # the caller tells topics apart
         return last, topic, Batch(channel, raw, np.cumsum(length) - length, length, log)
 
     def _salvaged(self, asked: dict[int, Channel], last: int) -> Iterator[tuple[float, Batch]]:

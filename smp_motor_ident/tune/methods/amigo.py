@@ -10,7 +10,7 @@ References
 from __future__ import annotations
 
 from smp_motor_ident.tune.feedback import Feedback
-from smp_motor_ident.tune.problem import Method, Problem, Promise
+from smp_motor_ident.tune.problem import Method, Problem, RequiredMargins
 
 
 def _solve(problem: Problem) -> Feedback:
@@ -29,7 +29,7 @@ AMIGO = Method(
     "amigo",
     "AMIGO",
     "Astrom and Hagglund 2004",
-    Promise(phase=45.0, gain=2.0, sensitivity=1.7),
+    RequiredMargins(phase=45.0, gain=2.0, sensitivity=1.7),
     _solve,
     ("structure",),
 )

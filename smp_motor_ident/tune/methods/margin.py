@@ -1,4 +1,4 @@
-"""Bandwidth under a margin: the best gains of all that keep phase margin, Ms and ripple.
+"""Bandwidth under a margin: the best gains of all that keep phase margin, Ms and control noise.
 
 Crossover, phase margin and share of the derivative span every PI and PID controller; the
 search looks at thousands at once on the sampled loop's frequency response, then zooms in.
@@ -17,24 +17,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from smp_motor_ident.diagnosis.limits import SPEED_NOISE
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.tune.arrays import Array, Complex
 from smp_motor_ident.tune.feedback import Feedback, spectral_radius
 from smp_motor_ident.tune.margins import loop_margins
 from smp_motor_ident.tune.methods.simc import SIMC
-from smp_motor_ident.tune.problem import Method, Problem, Promise, noise_filter
+from smp_motor_ident.tune.problem import Method, Problem, RequiredMargins, noise_filter
 
 FOCUS = ("balanced", "tracking", "load")
-MORE_RIPPLE, ENOUGH = 8, 1.2
-"""Steps of a fifth by which the default limit of the ripple may be raised, until the integral gain
-is so many times that of SIMC."""
-
-STEADY = 5e-4
-"""Largest share of the top speed, rms, by which quantisation may shake the wheel: four times that
-is the 2 % within which a change by a tenth of the top speed settles."""
-
-STEADY_AT_MOST = 1.35
-"""Factor on that where the ripple may be more, too: three times is what settles then."""
+MORE_NOISE, ENOUGH = 8, 1.2
+"""Steps of a fifth by which the default limit of the control noise may be raised, until the
+integral gain is so many times that of SIMC."""
 
 PEAK = {"balanced": 1.25, "tracking": 1.05, "load": math.inf}
 """Largest peak of the complementary sensitivity, by what the design is for."""
@@ -69,8 +63,8 @@ def _solve(problem: Problem) -> Feedback:
     found = _no_softer_than_simc(problem, found, margin, peak, focus)
     if found is None:
         raise DesignError(
-            f"no controller keeps a phase margin of {margin:g} deg, Ms {peak:g} and a ripple of "
-            f"{problem.loop.noise_limit:.3g} V; {_nearest(problem, margin, peak, focus)}"
+            f"no controller keeps a phase margin of {margin:g} deg, Ms {peak:g} and a control "
+            f"noise of {problem.loop.noise_limit:.3g} V; {_nearest(problem, margin, peak, focus)}"
         )
     return found[0]
 
@@ -84,23 +78,26 @@ def _nearest(problem: Problem, margin: float, peak: float, focus: str) -> str:
         limit = factor * problem.loop.noise_limit
         noisier = replace(problem, loop=replace(problem.loop, noise_voltage=limit))
         if _search(noisier, margin, max(peak, 1.4), focus) is not None:
-            return f"the nearest that holds has a ripple of {limit:.3g} V and Ms {max(peak, 1.4):g}"
+            return (
+                f"the nearest that holds has a control noise of {limit:.3g} V and "
+                f"Ms {max(peak, 1.4):g}"
+            )
     return "nothing near it does; shorten the delay, or take an encoder with more counts"
 
 
 def _no_softer_than_simc(
     problem: Problem, found: _Found | None, margin: float, peak: float, focus: str
 ) -> _Found | None:
-    """Allow more ripple, as little as it takes, where its default costs the load rejection of SIMC.
+    """Allow more control noise, as little as it takes, where its default costs more than SIMC.
 
-    SIMC does not look at the ripple; who compares at the same Ms shall not lose here.
+    SIMC does not look at the control noise; who compares at the same Ms shall not lose here.
     """
     if problem.loop.noise_voltage is not None:
         return found
     rule = SIMC.solve(replace(problem, targets={}))
     allowed = problem.loop.noise_limit
     trial, best, most = found, found, 0.0
-    for _ in range(MORE_RIPPLE):
+    for _ in range(MORE_NOISE):
         if trial is not None:
             same = at_sensitivity(problem, rule, _peak(problem, trial[0]))
             better = trial[0].i / same.i
@@ -210,7 +207,7 @@ def _terms(omega: Array, T: float, filter_time: Array) -> tuple[Complex, Complex
 
 
 def _hold(problem: Problem, c: _Candidates, margin: float, peak: float, hump: float) -> Array:
-    """Return which candidates keep Ms, the hump of T, phase and gain margin, and ripple."""
+    """Return which candidates keep Ms, the hump of T, phase and gain margin, and control noise."""
     omega, T = problem.omega, problem.loop.sample_time
     integral, derivative = _terms(omega, T, c.filter_time[:, None])
     control = c.p[:, None] + c.i[:, None] * integral + c.d[:, None] * derivative
@@ -226,14 +223,11 @@ def _hold(problem: Problem, c: _Candidates, margin: float, peak: float, hump: fl
     near = np.abs(np.abs(loop) - 1) < 0.1
     good &= np.where(near, np.abs(np.angle(-loop)), np.pi).min(axis=1) >= np.deg2rad(0.9 * margin)
     power = np.abs(control * back) ** 2 * noise_filter(problem, omega)
-    ripple = np.sqrt(np.trapezoid(power, omega, axis=1) / omega[-1])
-    good &= ripple <= problem.loop.noise_limit
+    control_noise = np.sqrt(np.trapezoid(power, omega, axis=1) / omega[-1])
+    good &= control_noise <= problem.loop.noise_limit
     shaking = np.trapezoid(power * np.abs(problem.true_response) ** 2, omega, axis=1) / omega[-1]
     top = problem.loop.supply_voltage / float(problem.plant.motors.a0[0])
-    # Who is allowed more ripple is allowed a little more of this.
-    more = problem.loop.noise_limit / (0.04 * problem.loop.supply_voltage)
-    more = min(max(more, 1.0), STEADY_AT_MOST)
-    return np.asarray(good & (np.sqrt(shaking) <= STEADY * more * top))
+    return np.asarray(good & (np.sqrt(shaking) <= SPEED_NOISE.value * top))
 
 
 def _at_bandwidth(problem: Problem, wished: float, margin: float, peak: float) -> Feedback:
@@ -250,7 +244,7 @@ def _at_bandwidth(problem: Problem, wished: float, margin: float, peak: float) -
     delay = 1e3 * (problem.loop.loop_delay + float(problem.plant.motors.delay[0]))
     raise DesignError(
         f"bandwidth {wished:.4g} rad/s cannot keep a phase margin of {margin:g} deg, Ms {peak:g} "
-        f"and a ripple of {problem.loop.noise_limit:.3g} V with {delay:.3g} ms of delay at "
+        f"and a control noise of {problem.loop.noise_limit:.3g} V with {delay:.3g} ms of delay at "
         f"{problem.loop.rate:.4g} Hz (Nyquist {nyquist:.4g} rad/s); {hint} rad/s"
     )
 
@@ -259,7 +253,7 @@ MARGIN = Method(
     "margin",
     "largest integral gain under phase margin, Ms and ripple",
     "Astrom, Panagopoulos and Hagglund 1998",
-    Promise(phase=60.0, gain=2.0, sensitivity=1.4),
+    RequiredMargins(phase=60.0, gain=2.0, sensitivity=1.4),
     _solve,
     ("phase_margin", "maximum_sensitivity", "focus", "bandwidth", "structure"),
 )

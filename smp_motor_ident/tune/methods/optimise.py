@@ -2,7 +2,7 @@
 
 A population of controllers runs through the same two experiments, a set-point step with
 saturation and a load step.  The cost is the time-weighted error of both, relative to SIMC's,
-with penalties on overshoot, Ms and ripple; the cross-entropy method moves the population.
+with penalties on overshoot, Ms and control noise; the cross-entropy method moves the population.
 
 References
 ----------
@@ -23,11 +23,11 @@ from smp_motor_ident.tune.arrays import Array
 from smp_motor_ident.tune.feedback import Feedback, spectral_radius
 from smp_motor_ident.tune.methods.simc import SIMC
 from smp_motor_ident.tune.plant import Plant
-from smp_motor_ident.tune.problem import Method, Problem, Promise, noise_filter
-from smp_motor_ident.tune.response import Controller, simulate
+from smp_motor_ident.tune.problem import Method, Problem, RequiredMargins, noise_filter
+from smp_motor_ident.tune.simulation import Controller, simulate
 
 POPULATION, ELITE, GENERATIONS = 48, 10, 14
-PROMISE = Promise(phase=45.0, gain=2.0, sensitivity=1.6)
+REQUIRED = RequiredMargins(phase=45.0, gain=2.0, sensitivity=1.6)
 
 
 def _solve(problem: Problem) -> Feedback:
@@ -64,8 +64,8 @@ class _Cost:
     def __init__(self, problem: Problem, start: Feedback) -> None:
         self.problem = problem
         T, model = problem.loop.sample_time, problem.reduced
-        horizon = 6 * (model.delay + model.time_constant)
-        self.time = T * np.arange(1, max(int(horizon / T), 40) + 1)
+        span = 6 * (model.delay + model.time_constant)
+        self.time = T * np.arange(1, max(int(span / T), 40) + 1)
         self.plants: dict[int, Plant] = {}
         speed = 0.3 * problem.loop.supply_voltage * model.gain
         self.step = np.full(self.time.size, speed)
@@ -100,9 +100,9 @@ class _Cost:
         back = 1 / (1 + control * problem.response)
         peak = np.abs(back).max(axis=1)
         power = np.abs(control * back) ** 2 * noise_filter(problem, omega)
-        ripple = np.sqrt(np.trapezoid(power, omega, axis=1) / omega[-1])
-        excess = np.maximum(peak - PROMISE.sensitivity, 0) * 20
-        excess += np.maximum(ripple / problem.loop.noise_limit - 1, 0) * 20
+        control_noise = np.sqrt(np.trapezoid(power, omega, axis=1) / omega[-1])
+        excess = np.maximum(peak - REQUIRED.sensitivity, 0) * 20
+        excess += np.maximum(control_noise / problem.loop.noise_limit - 1, 0) * 20
         value = errors.sum(axis=0) + 10 * np.maximum(over - 0.1, 0) + excess
         return np.where(np.isfinite(value), value, 1e9)
 
@@ -111,7 +111,7 @@ OPTIMISE = Method(
     "optimise",
     "least time-weighted error of the simulated loop",
     "Graham and Lathrop 1953",
-    PROMISE,
+    REQUIRED,
     _solve,
     (),
 )

@@ -17,9 +17,9 @@ import numpy as np
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.tune.feedback import Feedback, spectral_radius
 from smp_motor_ident.tune.margins import batch_margins
-from smp_motor_ident.tune.problem import Method, Problem, Promise
+from smp_motor_ident.tune.problem import Method, Problem, RequiredMargins
 
-PROMISE = Promise(phase=45.0, gain=2.0, sensitivity=1.7)
+REQUIRED = RequiredMargins(phase=45.0, gain=2.0, sensitivity=1.7)
 
 
 def place(problem: Problem, natural_frequency: float, damping: float) -> Feedback:
@@ -50,7 +50,7 @@ def _solve(problem: Problem) -> Feedback:
     if not _good(problem, feedback, wished * damping):
         raise DesignError(
             f"natural_frequency {wished:.4g} rad/s with damping {damping:g} leaves the loop "
-            f"below a phase margin of {PROMISE.phase:g} deg or above Ms {PROMISE.sensitivity:g}; "
+            f"below a phase margin of {REQUIRED.phase:g} deg or above Ms {REQUIRED.sensitivity:g}; "
             f"the nearest design that holds has {limit:.4g} rad/s"
         )
     return feedback
@@ -63,7 +63,7 @@ def _good(problem: Problem, feedback: Feedback, decay: float) -> bool:
         return False
     loop = problem.response * feedback.response(problem.omega, problem.loop.sample_time)
     m = batch_margins(loop[None], problem.omega)
-    return bool(m.phase[0] >= PROMISE.phase and m.sensitivity[0] <= PROMISE.sensitivity)
+    return bool(m.phase[0] >= REQUIRED.phase and m.sensitivity[0] <= REQUIRED.sensitivity)
 
 
 def _fastest(problem: Problem, damping: float) -> tuple[float, Feedback]:
@@ -75,7 +75,7 @@ def _fastest(problem: Problem, damping: float) -> tuple[float, Feedback]:
             best = float(frequency), feedback
     if best is None:
         raise DesignError(
-            f"no pole pair of damping {damping:g} keeps Ms below {PROMISE.sensitivity:g}; ask for "
+            f"no pole pair of damping {damping:g} keeps Ms below {REQUIRED.sensitivity:g}; ask for "
             "another damping or use the method 'margin'"
         )
     return best
@@ -85,7 +85,7 @@ POLE_PLACEMENT = Method(
     "pole_placement",
     "dominant pole pair, fastest that holds its margin",
     "Astrom and Hagglund 2006, section 6.4",
-    PROMISE,
+    REQUIRED,
     _solve,
     ("natural_frequency", "damping"),
 )

@@ -21,7 +21,7 @@ from smp_motor_ident.errors import DesignError
 from smp_motor_ident.tune.arrays import Array
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.methods.ziegler_nichols import from_ultimate
-from smp_motor_ident.tune.problem import Method, Problem, Promise
+from smp_motor_ident.tune.problem import Method, Problem, RequiredMargins
 
 LEAST_CYCLES = 4
 ALIKE = 0.25
@@ -40,16 +40,17 @@ def oscillate(
     steps = int(seconds / T)
     phi, taps = plant.phi[0], plant.taps[0]
     phi_angle, taps_angle = plant.phi_angle[0], plant.taps_angle[0]
+    average = plant.average[0]
     x, past = np.zeros(phi.shape[0]), np.zeros(taps.shape[0])
     angle = np.zeros(window + 1)
     voltage, speed = np.empty(steps), np.empty(steps)
     output = amplitude
     for k in range(steps):
         if window:
-            seen = np.floor(angle / count) * count if count else angle
-            measured = (seen[0] - seen[-1]) / (window * T)
+            counted = np.floor(angle / count) * count if count else angle
+            measured = -np.diff(counted) @ average
         else:
-            measured = x[0]
+            measured = x[plant.sensor]
         if measured > hysteresis:
             output = -amplitude
         elif measured < -hysteresis:
@@ -145,7 +146,7 @@ RELAY = Method(
     "relay",
     "Tyreus-Luyben from relay feedback",
     "Astrom and Hagglund 1984",
-    Promise(phase=30.0, gain=2.0, sensitivity=2.2),
+    RequiredMargins(phase=30.0, gain=2.0, sensitivity=2.2),
     _solve,
     ("relay_amplitude", "rule", "structure"),
 )

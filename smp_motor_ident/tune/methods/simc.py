@@ -12,7 +12,7 @@ References
 from __future__ import annotations
 
 from smp_motor_ident.tune.feedback import Feedback
-from smp_motor_ident.tune.problem import Method, Problem, Promise
+from smp_motor_ident.tune.problem import Method, Problem, RequiredMargins
 
 
 def _simc(problem: Problem) -> Feedback:
@@ -29,12 +29,12 @@ def _lambda(problem: Problem) -> Feedback:
     return Feedback(p, p / model.time_constant)
 
 
-PROMISE = Promise(phase=45.0, gain=2.0, sensitivity=1.7)
+REQUIRED = RequiredMargins(phase=45.0, gain=2.0, sensitivity=1.7)
 SIMC = Method(
     "simc",
     "SIMC, closed loop as fast as the delay",
     "Skogestad 2003",
-    PROMISE,
+    REQUIRED,
     _simc,
     ("closed_loop_time_constant",),
 )
@@ -42,7 +42,7 @@ LAMBDA = Method(
     "lambda",
     "lambda, closed loop as fast as the motor",
     "Dahlin 1968; Rivera, Morari and Skogestad 1986",
-    PROMISE,
+    REQUIRED,
     _lambda,
     ("closed_loop_time_constant",),
 )

@@ -16,7 +16,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from smp_motor_ident.tune.feedback import Feedback
-from smp_motor_ident.tune.problem import Method, Problem, Promise
+from smp_motor_ident.tune.problem import Method, Problem, RequiredMargins
 
 RULES = {
     # rule, structure: gain as a share of Ku, integral and derivative time as shares of Tu
@@ -67,7 +67,7 @@ ZIEGLER_NICHOLS = Method(
     "ziegler_nichols",
     "Ziegler-Nichols from the ultimate point",
     "Ziegler and Nichols 1942",
-    Promise(phase=20.0, gain=1.5, sensitivity=3.5),
+    RequiredMargins(phase=20.0, gain=1.5, sensitivity=3.5),
     lambda problem: _solve("ziegler_nichols", problem),
     ("structure",),
 )
@@ -75,7 +75,7 @@ TYREUS_LUYBEN = Method(
     "tyreus_luyben",
     "Tyreus-Luyben from the ultimate point",
     "Tyreus and Luyben 1992",
-    Promise(phase=30.0, gain=2.0, sensitivity=2.2),
+    RequiredMargins(phase=30.0, gain=2.0, sensitivity=2.2),
     lambda problem: _solve("tyreus_luyben", problem),
     ("structure",),
 )

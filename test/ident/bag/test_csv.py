@@ -71,7 +71,7 @@ def test_empty_cells_are_missing_values(tmp_path: Path) -> None:
     record = read_records(tmp_path / "log.csv", ["voltage=u velocity=y current=i time=t"])["motor"]
     assert np.isnan(record.velocity).sum() == 10
     assert record.current is None
-    assert "velocity: 10 values missing" in " ".join(record.notes)
+    assert "velocity: 10 values missing" in " ".join(f.message for f in record.findings)
 
 
 def test_a_file_without_time_has_a_sample_time(tmp_path: Path) -> None:

@@ -152,7 +152,7 @@ def test_split_bags_are_one_recording(
     record = read_records(bag)["front_left"]
     corpus.assert_read(record, truth)
     assert record.starts == (0,)
-    assert ("metadata.yaml" in " ".join(record.notes)) is not described
+    assert ("metadata.yaml" in " ".join(f.message for f in record.findings)) is not described
 
 
 def test_a_missing_part_of_a_split_bag_is_told_with_its_messages(
@@ -165,7 +165,7 @@ def test_a_missing_part_of_a_split_bag_is_told_with_its_messages(
     corpus.write_metadata(bag, ["bag_0.mcap", "bag_1.mcap"], messages)
     record = read_records(bag)["front_left"]
     corpus.assert_read(record, truth, 100)
-    notes = " ".join(record.notes)
+    notes = " ".join(f.message for f in record.findings)
     assert "bag_1.mcap is missing" in notes
     assert "100 of 300 messages" in notes
 
@@ -183,7 +183,7 @@ def test_a_damaged_part_of_a_split_bag_costs_only_itself(
     record = read_records(bag)["front_left"]
     assert len(record) == 200
     assert record.starts == (0, 100)
-    notes = " ".join(record.notes)
+    notes = " ".join(f.message for f in record.findings)
     assert "bag_1.mcap: is empty" in notes
     assert "200 of 300 messages" in notes
 
@@ -241,7 +241,7 @@ def test_fewer_messages_than_the_metadata_promise_are_told(
         storage="sqlite3",
         counts={"/front_left/motor_state": 1234},
     )
-    notes = " ".join(read_records(bag)["front_left"].notes)
+    notes = " ".join(f.message for f in read_records(bag)["front_left"].findings)
     assert "200 of 1234 messages could be read" in notes
 
 
@@ -269,7 +269,7 @@ def test_messages_that_only_the_journal_holds_are_read(
     before = (dead / "bag.db3").read_bytes()
     record = read_records(dead / "bag.db3")["front_left"]
     corpus.assert_read(record, truth)
-    assert "journal" in " ".join(record.notes)
+    assert "journal" in " ".join(f.message for f in record.findings)
     assert (dead / "bag.db3").read_bytes() == before
 
 
@@ -358,8 +358,8 @@ def test_a_folder_of_bags_tells_which_of_them_could_not_be_read(
     (tmp_path / "bad" / "x_0.mcap").write_bytes(b"")
     records = read_experiments(tmp_path)["front_left"]
     assert [len(record) for record in records] == [20]
-    assert "not read:" in " ".join(records[0].notes)
-    assert "is empty" in " ".join(records[0].notes)
+    assert "not read:" in " ".join(f.message for f in records[0].findings)
+    assert "is empty" in " ".join(f.message for f in records[0].findings)
     with pytest.raises(BagError, match="is empty"):
         read_experiments([tmp_path / "good", tmp_path / "bad"])
 
@@ -396,7 +396,9 @@ def test_a_wheel_that_never_spoke_does_not_hide_the_others(
         database.execute("DELETE FROM messages WHERE topic_id = 4")
     records = read_records(path)
     assert set(records) == {"front_left"}
-    assert "not read: bag.db3: rear_left" in " ".join(records["front_left"].notes)
+    assert "not read: bag.db3: rear_left" in " ".join(
+        f.message for f in records["front_left"].findings
+    )
 
 
 @pytest.mark.parametrize("text", ["", ":\n - {", "a: 1", "rosbag2_bagfile_information: 7"])
@@ -408,4 +410,4 @@ def test_damaged_metadata_do_not_hide_the_files(
     (tmp_path / "metadata.yaml").write_text(text)
     record = read_records(tmp_path)["front_left"]
     corpus.assert_read(record, truth)
-    assert "metadata.yaml is damaged" in " ".join(record.notes)
+    assert "metadata.yaml is damaged" in " ".join(f.message for f in record.findings)

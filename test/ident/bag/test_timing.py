@@ -77,29 +77,29 @@ def test_shuffled_samples_are_sorted_and_that_is_told(
     record = read_records(path)["front_left"]
     corpus.assert_read(record, truth)
     shuffled = list(order) != sorted(order)
-    assert ("out of order" in " ".join(record.notes)) is shuffled
+    assert ("out of order" in " ".join(f.message for f in record.findings)) is shuffled
 
 
 @MANY
 @given(
     bits=st.sampled_from([8, 12, 16, 24, 31, 32, 48, 63, 64]),
     seed=st.integers(0, 2**32 - 1),
-    told=st.booleans(),
+    known=st.booleans(),
 )
-def test_a_counter_that_wraps_at_any_width_is_unwrapped(bits: int, seed: int, told: bool) -> None:
+def test_a_counter_that_wraps_at_any_width_is_unwrapped(bits: int, seed: int, known: bool) -> None:
     rng = np.random.default_rng(seed)
     # A motor's counts change smoothly, by at most a sixteenth of the range from sample to sample.
     speed = np.sin(np.arange(400) / rng.uniform(20, 60)) * 2.0 ** min(bits - 4, 40)
     truth = np.cumsum(speed.astype(np.int64)) + rng.integers(0, 2 ** min(bits - 1, 40))
     half = np.int64(64 - bits)
     raw = (truth << half) >> half
-    if not told and bits not in (16, 32):
+    if not known and bits not in (16, 32):
         return
-    found = unwrap(raw, bits if told else None)
+    found = unwrap(raw, bits if known else None)
     np.testing.assert_array_equal(found.count - found.count[0], truth - truth[0])
     assert found.resets.size == 0
     wrapped = bool((raw != truth - truth[0] + raw[0]).any())
-    if not told:
+    if not known:
         assert bool(found.findings) == wrapped
 
 
@@ -138,7 +138,7 @@ def test_a_reset_counter_begins_a_new_segment(tmp_path: Path, corpus: SimpleName
     record = read(tmp_path / "bag.mcap", corpus, truth.messages())
     assert record.starts == (0, 120)
     assert np.all(np.diff(record.count)[np.arange(299) != 119] == 50)
-    assert "reset 1 times" in " ".join(record.notes)
+    assert "reset 1 times" in " ".join(f.message for f in record.findings)
 
 
 def test_a_few_lost_samples_are_bridged_and_more_begin_a_segment(
@@ -154,7 +154,7 @@ def test_a_few_lost_samples_are_bridged_and_more_begin_a_segment(
     record = read(tmp_path / "bag.mcap", corpus, some)
     assert len(record) == kept.size
     assert [int(kept[s]) for s in record.starts] == [0, 205, 350]
-    notes = " ".join(record.notes)
+    notes = " ".join(f.message for f in record.findings)
     assert "3 samples missing in 2 places" in notes
     assert "2 gaps of up to 0.51 s (55 samples missing)" in notes
     # The mean of a ramp over two and three intervals, of which only the last was seen.
@@ -176,7 +176,7 @@ def test_late_samples_are_not_taken_for_lost_ones(tmp_path: Path, corpus: Simple
     record = read(tmp_path / "bag.mcap", corpus, truth.messages())
     corpus.assert_read(record, truth)
     assert record.starts == (0,)
-    assert "missing" not in " ".join(record.notes)
+    assert "missing" not in " ".join(f.message for f in record.findings)
 
 
 def test_duplicates_are_left_out_and_told(tmp_path: Path, corpus: SimpleNamespace) -> None:
@@ -185,7 +185,7 @@ def test_duplicates_are_left_out_and_told(tmp_path: Path, corpus: SimpleNamespac
     record = read(tmp_path / "bag.mcap", corpus, [*messages, *messages[40:60]])
     corpus.assert_read(record, truth)
     assert "20 samples have the time of another and were left out (duplicates)" in " ".join(
-        record.notes
+        [f.message for f in record.findings]
     )
 
 
@@ -202,7 +202,7 @@ def test_samples_without_a_voltage_are_left_out_and_told(
     assert len(record) == 98
     assert record.current is None
     assert np.isnan(record.velocity).sum() == 1
-    notes = " ".join(record.notes)
+    notes = " ".join(f.message for f in record.findings)
     assert "2 samples without a finite voltage were left out" in notes
     assert "velocity: 1 values missing" in notes
 
@@ -214,7 +214,7 @@ def test_header_stamps_days_away_from_the_log_are_used_and_that_is_told(
     truth = corpus.motion(n=100)
     record = read(tmp_path / "bag.mcap", corpus, truth.messages(latency=days * 86_400 * 10**9 + 7))
     corpus.assert_read(record, truth)
-    notes = " ".join(record.notes)
+    notes = " ".join(f.message for f in record.findings)
     assert "time: header stamps" in notes
     assert (f"{days * 86400:+d}.000000 s from the header's" in notes) is bool(days)
 
@@ -228,7 +228,9 @@ def test_stamps_that_are_not_set_are_not_the_time(tmp_path: Path, corpus: Simple
     ]
     record = read(tmp_path / "bag.mcap", corpus, [*truth.messages()[:1], *messages])
     corpus.assert_read(record, truth)
-    assert "time: log times (the header stamps are not set)" in " ".join(record.notes)
+    assert "time: log times (the header stamps are not set)" in " ".join(
+        f.message for f in record.findings
+    )
 
 
 def test_a_clock_that_was_set_back_begins_a_new_segment(
@@ -244,7 +246,7 @@ def test_a_clock_that_was_set_back_begins_a_new_segment(
     record = read(tmp_path / "bag.mcap", corpus, [*truth.messages()[:1], *messages])
     assert record.starts == (0, 100)
     np.testing.assert_array_equal(record.voltage, truth.voltage)
-    assert "set back 1 times" in " ".join(record.notes)
+    assert "set back 1 times" in " ".join(f.message for f in record.findings)
 
 
 def floats(corpus: SimpleNamespace, topic: str, times: Any, values: Any) -> list[Any]:
@@ -282,7 +284,7 @@ def test_a_stamped_output_meets_an_unstamped_input_by_offset_and_drift(
     record = read(
         tmp_path / "bag.mcap", corpus, messages, "voltage=/u.data velocity=/js.velocity[w]"
     )
-    notes = " ".join(record.notes)
+    notes = " ".join(f.message for f in record.findings)
     assert "offset and drift" in notes
     assert "drifting by +50 ppm" in notes
     # Mean over the interval of what was held: at most one input period old, none in the future.
@@ -336,7 +338,9 @@ def test_samples_before_the_first_command_are_left_out(
     )
     record = read(tmp_path / "bag.mcap", corpus, messages, "voltage=/u.data velocity=/w.data")
     assert len(record) == 70
-    assert "30 samples before the first voltage were left out" in " ".join(record.notes)
+    assert "30 samples before the first voltage were left out" in " ".join(
+        f.message for f in record.findings
+    )
 
 
 def test_an_input_that_stops_ends_the_record_there(tmp_path: Path, corpus: SimpleNamespace) -> None:
@@ -347,7 +351,7 @@ def test_an_input_that_stops_ends_the_record_there(tmp_path: Path, corpus: Simpl
         key=lambda sent: sent.stamp,
     )
     record = read(tmp_path / "bag.mcap", corpus, messages, "voltage=/u.data velocity=/w.data")
-    notes = " ".join(record.notes)
+    notes = " ".join(f.message for f in record.findings)
     assert "no voltage came for more than 0.2 s" in notes
     assert len(record.starts) == 2
 
@@ -372,7 +376,7 @@ def test_outputs_of_several_topics_come_onto_one_axis(
     assert record.sample_time == pytest.approx(0.01)
     # A straight line is interpolated exactly, but for rounding.
     np.testing.assert_allclose(record.velocity, (record.time + 0.001) * 100, rtol=1e-9)
-    assert "velocity: interpolated" in " ".join(record.notes)
+    assert "velocity: interpolated" in " ".join(f.message for f in record.findings)
 
 
 def test_an_angle_that_wraps_at_a_turn_is_unwrapped(
@@ -388,7 +392,7 @@ def test_an_angle_that_wraps_at_a_turn_is_unwrapped(
         tmp_path / "bag.mcap", corpus, messages, "voltage=/u.data position=/angle.data:deg"
     )
     np.testing.assert_allclose(np.diff(record.position), np.deg2rad(7.0), rtol=1e-9)
-    assert "wraps at one turn" in " ".join(record.notes)
+    assert "wraps at one turn" in " ".join(f.message for f in record.findings)
 
 
 def test_recordings_of_different_gearboxes_are_not_joined(

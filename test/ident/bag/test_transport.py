@@ -100,6 +100,6 @@ def test_tune_designs_for_the_delay_of_a_bag_and_says_so(tmp_path, corpus, capsy
     assert loops["front_left"]["loop"]["usual_delay"] == pytest.approx(found.usual)
     # The bag holds one wheel; the others have what every loop has without a bag.
     assert loops["rear_left"]["loop"]["delay"] == 0.005
-    for told in (capsys.readouterr().out, output.read_text()):
-        assert "600 commands of" in told
-        assert "rear_left" in told and "tells no delay: taken as one sample" in told
+    for text in (capsys.readouterr().out, output.read_text()):
+        assert "600 commands of" in text
+        assert "rear_left" in text and "tells no delay: taken as one sample" in text

@@ -26,7 +26,7 @@ def samples_and_words(path: Path) -> tuple[int, str]:
     except BagError as error:
         count, words = 0, str(error)
     else:
-        return len(record), " ".join(record.notes)
+        return len(record), " ".join(f.message for f in record.findings)
     assert "\n" not in words
     assert path.name in words or path.parent.name in words
     return count, words

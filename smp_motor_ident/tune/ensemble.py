@@ -8,12 +8,12 @@ from typing import Protocol
 import numpy as np
 
 from smp_motor_ident.tune.feedback import Feedback, spectral_radius
-from smp_motor_ident.tune.margins import batch_margins, grid_for
+from smp_motor_ident.tune.margins import BatchMargins, batch_margins, grid_for
 from smp_motor_ident.tune.plant import Plant
-from smp_motor_ident.tune.problem import Promise
+from smp_motor_ident.tune.problem import RequiredMargins
 
 SHARE = 0.99
-"""Share of the distribution for which a promise must hold."""
+"""Share of the distribution for which the required margins must hold."""
 
 
 @dataclass(frozen=True)
@@ -23,11 +23,11 @@ class Robustness:
     Attributes
     ----------
     samples : int
-        Motors drawn; 0 where the estimate tells no uncertainty.
+        Motors drawn; 0 where the estimate has no uncertainty.
     stable : float
         Share with a stable loop [0..1].
     holds : float
-        Share that keeps every promised margin [0..1].
+        Share that keeps every required margin [0..1].
     phase, gain, sensitivity : float
         Phase margin [deg], gain margin [-] and Ms [-] that 99 % keep.
     """
@@ -40,36 +40,40 @@ class Robustness:
     sensitivity: float
 
 
-class Judge(Protocol):
+class Assessor(Protocol):
     """Whoever can say what gains do over some motors."""
 
-    def judge(self, feedback: Feedback) -> Robustness:
-        """Return what the gains do; see :meth:`Jury.judge`."""
+    def assess(self, feedback: Feedback) -> Robustness:
+        """Return what the gains do; see :meth:`UncertaintyEnsemble.assess`."""
 
 
-class Jury:
-    """Judges gains over a batch of motors, whose response is computed once.
+class UncertaintyEnsemble:
+    """Assesses gains over a batch of motors, whose response is computed once.
 
     Parameters
     ----------
     plant : Plant
         The draws.
-    promise : Promise
+    required : RequiredMargins
         What the gains must keep.
     """
 
-    def __init__(self, plant: Plant, promise: Promise) -> None:
+    def __init__(self, plant: Plant, required: RequiredMargins) -> None:
         self.plant = plant
-        self.promise = promise
+        self.required = required
         self.omega = grid_for(plant, 200)
         self.response = plant.response(self.omega)
 
-    def judge(self, feedback: Feedback) -> Robustness:
-        """Return what the gains do over the batch."""
+    def margins(self, feedback: Feedback) -> BatchMargins:
+        """Return the margins of every motor of the batch."""
         loop = self.response * feedback.response(self.omega, self.plant.sample_time)
-        m = batch_margins(loop, self.omega)
+        return batch_margins(loop, self.omega)
+
+    def assess(self, feedback: Feedback) -> Robustness:
+        """Return what the gains do over the batch."""
+        m = self.margins(feedback)
         stable = spectral_radius(self.plant, feedback) < 1
-        p = self.promise
+        p = self.required
         # A hundredth of slack: the grid's resolution.
         holds = stable & (m.phase >= 0.99 * p.phase) & (m.gain >= 0.99 * p.gain)
         holds &= m.sensitivity <= 1.01 * p.sensitivity
@@ -84,32 +88,32 @@ class Jury:
         )
 
 
-def back_off(jury: Judge, feedback: Feedback) -> tuple[Feedback, float, Robustness]:
-    """Scale gains down until 99 % of the motors keep the promise.
+def back_off(ensemble: Assessor, feedback: Feedback) -> tuple[Feedback, float, Robustness]:
+    """Scale gains down until 99 % of the motors keep the required margins.
 
     Proportional and derivative action shrink with the factor, integral action with its square,
     so that the loop keeps its shape while its crossover moves down.
     """
-    verdict = jury.judge(feedback)
-    if verdict.holds >= SHARE:
-        return feedback, 1.0, verdict
+    found = ensemble.assess(feedback)
+    if found.holds >= SHARE:
+        return feedback, 1.0, found
     good, bad = None, 1.0
     factor = 0.97
     while factor > 0.01:
         trial = softer(feedback, factor)
-        verdict = jury.judge(trial)
-        if verdict.holds >= SHARE:
-            good = factor, trial, verdict
+        found = ensemble.assess(trial)
+        if found.holds >= SHARE:
+            good = factor, trial, found
             break
         bad, factor = factor, factor * factor
     if good is None:
-        return feedback, 0.0, jury.judge(feedback)
+        return feedback, 0.0, ensemble.assess(feedback)
     for _ in range(6):
         middle = 0.5 * (good[0] + bad)
         trial = softer(feedback, middle)
-        verdict = jury.judge(trial)
-        if verdict.holds >= SHARE:
-            good = middle, trial, verdict
+        found = ensemble.assess(trial)
+        if found.holds >= SHARE:
+            good = middle, trial, found
         else:
             bad = middle
     return good[1], good[0], good[2]

@@ -1,8 +1,8 @@
 """Step and load responses of the loop, a batch of motors or of controllers at once.
 
 The running PID (saturation, anti-windup, set-point weights, feed-forward) on the sampled
-motor, everything at the motor shaft.  Coulomb friction is left out: its feed-forward cancels
-it while the wheel turns.
+motor, everything at the motor shaft.  Coulomb friction acts as the voltage that it takes, with a
+sign that it keeps for a sample, and holds a motor at rest that is given less.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ import numpy as np
 from smp_motor_ident._compile import compiled
 from smp_motor_ident.tune.arrays import Array
 from smp_motor_ident.tune.feedback import Feedback
+from smp_motor_ident.tune.observer_model import SPEED
 from smp_motor_ident.tune.plant import Plant
-from smp_motor_ident.tune.seen import SPEED
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +69,8 @@ def simulate(
     forward: Array | None = None,
     load: Array | None = None,
     count_angle: float = 0.0,
+    friction: Array | None = None,
+    modelled: float = 0.0,
 ) -> Response:
     """Run the closed loop from rest.
 
@@ -87,7 +89,12 @@ def simulate(
     load : ndarray, shape (k,), [V], or None
         Load as the voltage that it takes from the motor.
     count_angle : float
-        One count [rad]; 0 measures without quantisation.
+        One count [rad]; 0 measures without quantisation.  Every motor of the batch begins
+        elsewhere within a count.
+    friction : ndarray, shape (n,), [V], or None
+        Dry friction, as the voltage that it takes.
+    modelled : float
+        Of it, what the observer's model has [V].
 
     Returns
     -------
@@ -104,7 +111,7 @@ def simulate(
         controller.limit,
         1.0 / np.asarray(controller.tracking),
     )
-    seen = plant.seen
+    observer = plant.observer
     none = np.zeros((0, 0))
     speed, voltage = _run(
         plant.phi,
@@ -112,16 +119,19 @@ def simulate(
         plant.phi_angle,
         plant.taps_angle,
         plant.sample_time,
-        plant.window,
-        none if seen is None else seen.advance,
-        none.ravel() if seen is None else seen.by_angle,
-        none.ravel() if seen is None else seen.by_voltage,
-        none.ravel() if seen is None else seen.taps,
+        plant.sensor,
+        plant.average,
+        none if observer is None else observer.advance,
+        none.ravel() if observer is None else observer.by_angle,
+        none.ravel() if observer is None else observer.by_voltage,
+        none.ravel() if observer is None else observer.taps,
         np.stack([np.broadcast_to(np.asarray(x, dtype=np.float64), n) for x in numbers], axis=1),
         np.asarray(reference, dtype=np.float64),
         np.asarray(reference if high is None else high, dtype=np.float64),
         np.zeros(steps) if forward is None else forward,
         np.zeros(steps) if load is None else load,
+        np.zeros(n) if friction is None else np.ascontiguousarray(friction),
+        modelled,
         count_angle,
     )
     return Response(plant.sample_time * np.arange(steps), speed, voltage)
@@ -137,6 +147,27 @@ def _turned(newest: float, oldest: float, count_angle: float) -> float:
 
 
 @compiled
+def _averaged(weights: Array, angle: Array, count_angle: float) -> float:
+    """Return the weighted sum of the angles run through in the last steps."""
+    total = 0.0
+    for q in range(weights.size):
+        total += weights[q] * _turned(angle[q], angle[q + 1], count_angle)
+    return total
+
+
+@compiled
+def _drag(speed: float, friction: float, past: Array, reach: Array, load: float) -> float:
+    """Return what dry friction takes over a sample [V]: at rest, of what pushes, all it can."""
+    if speed != 0.0 or friction == 0.0:
+        return float(friction * np.sign(speed))
+    pushed = 0.0
+    for q in range(past.size):
+        if reach[q] != 0.0 and abs(past[q] - load) > abs(pushed):
+            pushed = past[q] - load
+    return float(min(max(pushed, -friction), friction))
+
+
+@compiled
 def _weighted(weights: Array, values: Array) -> float:
     total = 0.0
     for k in range(weights.size):
@@ -146,10 +177,10 @@ def _weighted(weights: Array, values: Array) -> float:
 
 @compiled
 def _observed(
-    advance: Array, by_angle: Array, by_voltage: Array, state: Array, swept: float, told: float
+    advance: Array, by_angle: Array, by_voltage: Array, state: Array, swept: float, voltage: float
 ) -> Array:
     """Return the observer's state after a sample."""
-    following = by_angle * swept + by_voltage * told
+    following = by_angle * swept + by_voltage * voltage
     for a in range(state.size):
         for b in range(state.size):
             following[a] += advance[a, b] * state[b]
@@ -163,31 +194,34 @@ def _run(
     phi_angle: Array,
     taps_angle: Array,
     T: float,
-    window: int,
+    sensor: int,
+    average: Array,
     advance: Array,
     by_angle: Array,
     by_voltage: Array,
-    told_taps: Array,
+    observer_taps: Array,
     controllers: Array,
     low: Array,
     high: Array,
     forward: Array,
     load: Array,
+    friction: Array,
+    modelled: float,
     count_angle: float,
 ) -> tuple[Array, Array]:
     n, m, s = taps.shape
-    steps = low.size
+    steps, window = low.size, average.shape[1]
     speed, voltage = np.empty((n, steps)), np.empty((n, steps))
     for j in range(n):
         p, i, d, filter_time, weight, weight_d, limit, back = controllers[j]
         x, following, past = np.zeros(s), np.zeros(s), np.zeros(m)
-        angle = np.zeros(window + 1)
+        angle = np.full(window + 1, count_angle * ((0.5 + 0.618034 * j) % 1.0))
         observer = np.zeros(by_angle.size)
         integral = previous = rate = 0.0
         for k in range(steps):
-            measured = observer[SPEED] if observer.size else x[0]
+            measured = observer[SPEED] if observer.size else x[sensor]
             if window > 0:
-                measured = _turned(angle[0], angle[window], count_angle) / (window * T)
+                measured = _averaged(average[j], angle, count_angle)
             reference = min(max(measured, low[k]), high[k])
             slope = weight_d * reference - measured
             rate = (filter_time * rate + slope - previous) / (filter_time + T)
@@ -200,26 +234,30 @@ def _run(
             for q in range(m - 1, 0, -1):
                 past[q] = past[q - 1]
             past[0] = given
+            drag = _drag(x[0], friction[j], past, taps_angle[j], load[k])
             swept = 0.0
             following[:] = 0.0
             for a in range(s):
                 swept += phi_angle[j, a] * x[a]
                 for b in range(s):
                     following[a] += phi[j, a, b] * x[b]
-            # The load acts at once, the controller's voltage after its delay.
+            # Load and friction act at once, the controller's voltage after its delay.
             for q in range(m):
-                volts = past[q] - load[k]
+                volts = past[q] - load[k] - drag
                 swept += taps_angle[j, q] * volts
                 for a in range(s):
                     following[a] += taps[j, q, a] * volts
+            if friction[j] > 0.0 and (following[0] * x[0] < 0.0 or following[0] * drag < 0.0):
+                following[:2], swept = 0.0, 0.0
             for q in range(window, 0, -1):
                 angle[q] = angle[q - 1]
             before = angle[0]
             angle[0] += swept
             if observer.size:
                 swept = _turned(angle[0], before, count_angle)
-                told = _weighted(told_taps, past)
-                observer[:] = _observed(advance, by_angle, by_voltage, observer, swept, told)
+                delayed = _weighted(observer_taps, past)
+                delayed -= modelled * np.sign(observer[SPEED])
+                observer[:] = _observed(advance, by_angle, by_voltage, observer, swept, delayed)
             x[:] = following
     return speed, voltage
 
@@ -239,7 +277,7 @@ def minimum_jerk(distance: float, duration: float, time: Array) -> tuple[Array, 
 
 @dataclass(frozen=True)
 class StepFigures:
-    """What a step response tells.
+    """Figures of a step response.
 
     Attributes
     ----------
@@ -289,7 +327,7 @@ def step_figures(time: Array, speed: Array, voltage: Array, final: float) -> Ste
 
 @dataclass(frozen=True)
 class LoadFigures:
-    """What the response to a load step tells, per volt that the load takes.
+    """Figures of the response to a load step, per volt that the load takes.
 
     Attributes
     ----------

@@ -29,7 +29,7 @@ SPEED = 1
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class ObserverModel:
     """The observer as a filter, the same for every motor that it may meet.
 
     Attributes
@@ -38,7 +38,7 @@ class Seen:
     by_angle, by_voltage : ndarray, shape (q,)
     taps : ndarray, shape (m,)
         Shares of the last controller outputs in the mean voltage of a sample, as the observer
-        is told it and shifts it by the delay of its model.
+        gets it and shifts it by the delay of its model.
     """
 
     advance: Array
@@ -47,7 +47,7 @@ class Seen:
     taps: Array
 
     def transfer(self, z: Complex) -> tuple[Complex, Complex]:
-        """Return the transfer from swept angle and from mean voltage to the speed seen.
+        """Return the transfer from swept angle and from mean voltage to the observed speed.
 
         Parameters
         ----------
@@ -64,9 +64,9 @@ class Seen:
         return found[:, SPEED, 0], found[:, SPEED, 1]
 
 
-def seen_by_observer(
+def observer_model(
     model: MotorModel, sample_time: float, quantum: float, noise: ObserverNoise, loop_delay: float
-) -> Seen:
+) -> ObserverModel:
     """Return the steady-state observer of a model as a filter."""
     correct = np.array(steady_gain(model, quantum, noise, sample_time)[:4])
     (F,), (G,) = prediction(model, np.array([sample_time]))
@@ -84,4 +84,4 @@ def seen_by_observer(
     late = min(max(total / sample_time - whole, 0.0), 1.0)
     taps = np.zeros(whole + 2)
     taps[whole], taps[whole + 1] = 1 - late, late
-    return Seen(advance, by_angle, by_voltage, taps if late else taps[:-1])
+    return ObserverModel(advance, by_angle, by_voltage, taps if late else taps[:-1])

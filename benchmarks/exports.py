@@ -1,0 +1,188 @@
+"""Do exported gains do in the target's own arithmetic what their comment says?
+
+    python benchmarks/exports.py [--motors 50]
+
+Each target's control law is written here from its documentation, on a motor that is sampled by the
+matrix exponential: counts, whole numbers, clamp and one sample of delay included.  Printed is, for
+the paper's motors and random ones, specified and simulated settling and overshoot of an abrupt
+change by half of the largest speed, and Ms.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from closed_loop import COUNTS, RATIO, SUPPLY, TABLE_1, overshoot, settling
+from scipy.linalg import expm
+from tuning import combinations, estimate_of, random_motors
+
+from smp_motor_ident.errors import DesignError
+from smp_motor_ident.tune import Loop, design
+from smp_motor_ident.tune.exports import FORMATS, check
+from smp_motor_ident.tune.exports.target import duration
+
+Law = Callable[[float, float, int], float]
+"""From set-point and speed [rad/s, motor] and the counts of the interval to volts."""
+
+
+def ros2_controllers(n: Mapping[str, float], T: float) -> Law:
+    """control_toolbox: forward Euler, used one step later, driven back while clamped."""
+    integral = 0.0
+
+    def law(r: float, y: float, counts: int) -> float:
+        nonlocal integral
+        e = (r - y) / RATIO
+        wanted = n["p"] * e + integral
+        command = min(max(wanted, n["u_clamp_min"]), n["u_clamp_max"])
+        integral += T * (n["i"] * e + (command - wanted) / n["tracking_time_constant"])
+        return min(max(command + n["feedforward_gain"] * r / RATIO, -SUPPLY), SUPPLY)
+
+    return law
+
+
+def linorobot2(n: Mapping[str, float], T: float) -> Law:
+    """RPM of the wheel in, PWM of ten bits out, the sum unlimited."""
+    total = 0.0
+
+    def law(r: float, y: float, counts: int) -> float:
+        nonlocal total
+        measured = counts / T * 60 / (COUNTS * RATIO)
+        error = r / RATIO * 60 / (2 * math.pi) - measured
+        total += error
+        pwm = min(max(n["K_P"] * error + n["K_I"] * total, -1023), 1023)
+        return int(pwm) / 1023 * SUPPLY
+
+    return law
+
+
+def ros_arduino_bridge(n: Mapping[str, float], T: float) -> Law:
+    """Whole numbers, divided towards zero, added to the output of before."""
+    output, before = 0, 0
+
+    def law(r: float, y: float, counts: int) -> float:
+        nonlocal output, before
+        wanted = r * COUNTS / (2 * math.pi) * T
+        error = int(wanted - counts)
+        output += int((n["Kp"] * error - n["Kd"] * (counts - before)) / n["Ko"])
+        output = min(max(output, -255), 255)
+        before = counts
+        return output / 255 * SUPPLY
+
+    return law
+
+
+def arduino_pid(n: Mapping[str, float], T: float) -> Law:
+    """The sum with the present error, sum and output clamped."""
+    total = 0.0
+
+    def law(r: float, y: float, counts: int) -> float:
+        nonlocal total
+        e = (r - counts / T * 2 * math.pi / COUNTS) / RATIO
+        total = min(max(total + n["Ki"] * T * e, -255), 255)
+        return int(min(max(n["Kp"] * e + total, -255), 255)) / 255 * SUPPLY
+
+    return law
+
+
+def roboclaw(n: Mapping[str, float], T: float) -> Law:
+    """Duty as a share of QPPS, as far as is known."""
+    total = 0.0
+
+    def law(r: float, y: float, counts: int) -> float:
+        nonlocal total
+        e = r * COUNTS / (2 * math.pi) - counts / T
+        limit = n["QPPS"]
+        total = min(max(total + n["I"] / 65536 * T * e, -limit), limit)
+        return min(max((n["P"] / 65536 * e + total) / limit, -1), 1) * SUPPLY
+
+    return law
+
+
+def wpilib(n: Mapping[str, float], T: float) -> Law:
+    """Feed-forward of a constant speed, and kP."""
+
+    def law(r: float, y: float, counts: int) -> float:
+        volts = math.copysign(n["kS"], r) + n["kV"] * r / RATIO + n["kP"] * (r - y) / RATIO
+        return min(max(volts, -SUPPLY), SUPPLY)
+
+    return law
+
+
+LAWS = {
+    law.__name__: law
+    for law in (ros2_controllers, linorobot2, ros_arduino_bridge, arduino_pid, roboclaw, wpilib)
+}
+
+
+def run(motor, law: Law, T: float, target: float, seconds: float):
+    """Return instants and true speed of an abrupt change of set-point from rest."""
+    a0, a1, a2 = combinations(motor)
+    A = np.zeros((4, 4))
+    A[0, 1], A[2, 0] = 1.0, 1.0
+    A[1] = (-a0 / a2, -a1 / a2, 0.0, 1 / a2)
+    step = expm(A * T)
+    x, sent, before, speeds = np.zeros(4), 0.0, 0, []
+    y = 0.0
+    for _ in range(int(seconds / T)):
+        speeds.append(x[0])
+        count = math.floor(x[2] * COUNTS / (2 * math.pi))
+        y = (count - before) / T * 2 * math.pi / COUNTS
+        x[3], sent = sent, law(target, y, count - before)
+        before = count
+        x = step @ x
+    return T * np.arange(len(speeds)), np.array(speeds)
+
+
+def attempt(name: str, motor) -> tuple[float, float, float, float, float] | None:
+    """Return specified and simulated settling [s] and overshoot [%], and Ms."""
+    target = FORMATS[name]
+    T = 1 / target.rate
+    loop = Loop(sample_time=T, gear_ratio=RATIO, counts_per_revolution=COUNTS,
+                supply_voltage=SUPPLY, speed_source="difference")  # fmt: skip
+    try:
+        one = design(estimate_of(motor), loop, samples=100, **target.targets)
+        gains = target.convert(one)
+    except DesignError:
+        return None
+    found = check(one, gains)
+    change = 0.5 * one.reference.max_velocity
+    t, speed = run(motor, LAWS[name](gains.numbers, T), T, change, duration(one, gains))
+    # A tick of the encoder beside what whole numbers leave.
+    band = max(0.02, found.resting_error + 2 * math.pi / COUNTS / T / change)
+    return (
+        found.step.settling, settling(t, speed, change, band),
+        found.step.overshoot, overshoot(speed, change), found.margins.sensitivity,
+    )  # fmt: skip
+
+
+def largest(difference: np.ndarray) -> float:
+    """Return the largest difference of those that exist."""
+    there = np.abs(difference[np.isfinite(difference)])
+    return float(there.max()) if there.size else math.nan
+
+
+def main() -> int:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--motors", type=int, default=50, help="random ones beside the paper's")
+    motors = [*TABLE_1.values(), *random_motors(parser.parse_args().motors)]
+    print("| format | designed | settling specified | simulated | overshoot specified | simulated"
+          " | largest difference | Ms |")  # fmt: skip
+    print("| --- " * 8 + "|")
+    for name in FORMATS:
+        rows = [one for motor in motors if (one := attempt(name, motor)) is not None]
+        s, t, o, p, m = np.array(rows).T
+        worst = f"{1e3 * largest(t - s):.0f} ms, {np.max(np.abs(p - o)):.1f} points"
+        print(
+            f"| `{name}` | {len(rows)} of {len(motors)} | {1e3 * np.median(s):.0f} ms | "
+            f"{1e3 * np.median(t):.0f} ms | {np.median(o):.1f} % | {np.median(p):.1f} % | "
+            f"{worst} | {m.max():.2f} |"
+        )
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,386 @@
+"""Faults drawn at random against real processes: no forbidden motion, no dead node.
+
+    python benchmarks/faults.py                         # one hour, seed of the day
+    python benchmarks/faults.py --minutes 2 --seed 7
+    python benchmarks/faults.py --parameters 5000       # sets through the service of a live wheel
+    python benchmarks/faults.py --core 5000             # the same without processes
+
+Faults come singly or in pairs, at set-points drawn too.  What is allowed is the table of
+docs/decisions/when-a-wheel-stops.md: a fault that stops must have done so in its time, with half
+a second for a busy machine; after that the motor gets nothing, or the small voltage of at most
+three tries; once it has passed, and a person has called ~/reset, the wheel drives again.
+Exit code 1 where that does not hold; the seed and the draw are printed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "test"), str(ROOT / "test" / "control")]
+WHEEL = "front_left"
+NODE = f"{WHEEL}/wheel_pid"
+SUPPLY, SLACK = 12.0, 0.5
+FASTEST = 5.0
+"""Speed of this wheel at its supply [rad/s], and what a coarse mean may add."""
+TRY_VOLTAGE = 1.05 * 4.0 + 0.02  # and a step of the PWM
+GAINS = {
+    "p": 1.5, "i": 20.0, "u_clamp_min": -SUPPLY, "u_clamp_max": SUPPLY, "fault_retry": 0.5,
+    "antiwindup_strategy": "back_calculation", "max_acceleration": 15.0, "feedback_timeout": 0.3,
+    "feedforward_velocity": 2.6, "feedforward_acceleration": 0.13, "feedforward_static": 0.4,
+    "model.dc_gain": 25.55, "model.time_constant": 0.051, "model.static_voltage": 0.45,
+}  # fmt: skip
+"""With the model of the wheel, so that sets of parameters are judged by it."""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """What goes wrong: how it begins, whether and by when the wheel must have stopped."""
+
+    name: str
+    begin: Callable[[Campaign], None]
+    within: float = math.inf  # infinite: the wheel drives on
+    of_the_relay: bool = True
+    tried: bool = False  # the wheel may be tried again meanwhile
+
+
+class Campaign:
+    """Plant, relay and wheel, and what is asked of them."""
+
+    def __init__(self, domain: int, through_relay: bool) -> None:
+        from wheel_robot import Relay, WheelRobot
+
+        self.robot = WheelRobot(domain)
+        self.draw = random.Random(0)
+        self.relay = Relay(self.robot, WHEEL)
+        self.seen = self.robot.states["raw" if through_relay else WHEEL]
+        self.speed = 1.0
+        motors = Path(tempfile.mkdtemp()) / "motors.yaml"
+        text = (ROOT / "config" / "motors_paper.yaml").read_text()
+        motors.write_text(yaml.safe_dump(_only(yaml.safe_load(text))))
+        self.plant = subprocess.Popen(
+            ["motor_plant", "--ros-args", "-p", "rate:=100.0", "-p", f"motors_file:={motors}",
+             *(["-r", f"{WHEEL}/motor_state:={WHEEL}/raw_state"] if through_relay else [])],
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+        self.start_wheel()
+        self.spin_until(lambda: self.robot.commands[WHEEL], 40.0)
+
+    def start_wheel(self) -> None:
+        given = [part for k, v in GAINS.items() for part in ("-p", f"{k}:={v}")]
+        self.wheel = subprocess.Popen(
+            ["wheel_pid", "--ros-args", "-r", f"__ns:=/{WHEEL}", *given],
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+
+    def close(self) -> None:
+        for process in (self.wheel, self.plant):
+            process.send_signal(signal.SIGCONT)
+            process.send_signal(signal.SIGINT)
+            process.wait(5.0)
+        self.robot.close()
+
+    def spin_until(self, condition: Callable[[], object], within: float) -> bool:
+        end = time.monotonic() + within
+        while not condition():
+            if time.monotonic() > end:
+                return False
+            self.robot.spin()
+            del self.seen[:-200], self.robot.diagnoses[:-200]
+        return True
+
+    def true_speed(self) -> float:
+        last = self.seen[-6:]
+        if len(last) < 6:
+            return math.nan
+        stamps = [m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec for m in last]
+        return (last[-1].position - last[0].position) / max(stamps[-1] - stamps[0], 1e-3)
+
+    def stamp(self) -> float:
+        last = self.seen
+        return last[-1].header.stamp.sec + 1e-9 * last[-1].header.stamp.nanosec if last else 0.0
+
+    def voltage(self) -> float:
+        last = self.seen
+        # What acts at the instant; the mean voltage of a late sample holds the time before too.
+        return SUPPLY * float(last[-1].duty_cycle) if last else 0.0
+
+    def drives(self) -> bool:
+        return abs(self.true_speed() - self.speed) < 0.15 * abs(self.speed) + 0.05
+
+    def heal(self) -> None:
+        """Take every fault away, as a person does who then calls ~/reset."""
+        self.relay.passes()
+        self.robot.setpoint = self.speed
+        if self.wheel.poll() is not None:
+            self.start_wheel()
+        else:
+            self.wheel.send_signal(signal.SIGCONT)
+            self.robot.trigger(NODE, "reset")
+
+    def ends(self, number: int) -> None:
+        self.wheel.send_signal(number)
+        self.wheel.wait(5.0)
+
+
+def _only(motors: Any) -> Any:
+    """Return a motor file with the one wheel of the campaign."""
+    if not isinstance(motors, dict):
+        return motors
+    if WHEEL in motors:
+        return {WHEEL: motors[WHEEL]}
+    return {key: _only(value) for key, value in motors.items()}
+
+
+def _rival(campaign: Campaign) -> None:
+    """Command the full voltage under another name, again and again, with every sample."""
+    from smp_interfaces.msg import MotorCommand
+
+    publisher = campaign.robot.node.create_publisher(MotorCommand, f"/{WHEEL}/motor_command", 10)
+    inner = campaign.relay.fault
+
+    def meddle(message: Any) -> Any:
+        publisher.publish(MotorCommand(voltage=SUPPLY))
+        return inner(message)
+
+    campaign.relay.fault = meddle
+
+
+def _asks(value: float | None) -> Callable[[Campaign], None]:
+    return lambda campaign: setattr(campaign.robot, "setpoint", value)
+
+
+def _parameters(campaign: Campaign) -> None:
+    draw = campaign.draw
+    values = random_parameters(draw)
+    campaign.robot.set(NODE, **values)
+    campaign.robot.set(NODE, **_usual(values))
+
+
+BRAKES = 0.5 + 1.2
+FAULTS = [
+    Fault("feedback lost", lambda c: setattr(c.relay, "fault", lambda m: []), 0.3),
+    Fault("feedback late", lambda c: c.relay.delays(0.6), 0.7),
+    Fault("velocity nan", lambda c: c.relay.changes(velocity=math.nan), 0.3),
+    Fault("velocity inf", lambda c: c.relay.changes(velocity=math.inf), 0.3),
+    Fault("encoder dead", lambda c: c.relay.freezes(), 1.2, tried=True),
+    Fault("leads swapped", lambda c: c.relay.changes(
+        velocity=lambda v: -v, encoder_count=lambda n: -n, position=lambda p: -p), 0.7,
+        tried=True),
+    Fault("duplicated", lambda c: setattr(c.relay, "fault", lambda m: [m, m])),
+    Fault("clock back", lambda c: c.relay.shifts_stamps(-10.0)),
+    Fault("voltage nan", lambda c: c.relay.changes(voltage=math.nan, current=math.inf)),
+    Fault("set-points cease", _asks(None), BRAKES, of_the_relay=False),
+    Fault("set-point nan", _asks(math.nan), BRAKES, of_the_relay=False),
+    Fault("set-point inf", _asks(math.inf), BRAKES, of_the_relay=False),
+    Fault("killed", lambda c: c.ends(signal.SIGKILL), 0.3, of_the_relay=False),
+    Fault("hung up", lambda c: c.ends(signal.SIGHUP), 0.3, of_the_relay=False),
+    Fault("quit", lambda c: c.ends(signal.SIGQUIT), 0.3, of_the_relay=False),
+    Fault("frozen process", lambda c: c.wheel.send_signal(signal.SIGSTOP), 0.3,
+          of_the_relay=False),
+    Fault("another writer", _rival, of_the_relay=False),
+    Fault("parameters", _parameters, of_the_relay=False),
+]  # fmt: skip
+
+
+def trial(campaign: Campaign, faults: list[Fault], duration: float) -> str:
+    """Put faults in for a time; return what was forbidden, or nothing."""
+    for fault in sorted(faults, key=lambda fault: not fault.of_the_relay):
+        fault.begin(campaign)
+    begin, begun = time.monotonic(), time.time()
+    stopping = [fault.within for fault in faults if fault.within < math.inf]
+    # One fault may keep the other from being seen before it has passed on to zero itself.
+    deadline = begin + (max(stopping) if stopping else math.inf) + SLACK
+    tried = any(fault.tried for fault in faults)
+    wrong: list[str] = []
+
+    def look() -> bool:
+        # By the stamps of the plant: this process may be behind on a busy machine.
+        late = campaign.stamp() - begun > deadline - begin
+        most = TRY_VOLTAGE if tried else 0.05
+        if late and abs(campaign.voltage()) > most:
+            wrong.append(f"{campaign.voltage():+.2f} V")
+        elif abs(campaign.true_speed()) > FASTEST:
+            wrong.append(f"{campaign.true_speed():+.2f} rad/s")
+        return bool(wrong)
+
+    campaign.spin_until(look, max(duration, deadline - begin + 0.5) if stopping else duration)
+    if wrong:
+        return f"{wrong[0]} {time.monotonic() - begin:.2f} s after"
+    if campaign.plant.poll() is not None:
+        return "the plant is dead"
+    ends = {"killed", "hung up", "quit"}
+    if campaign.wheel.poll() is not None and not ends & {fault.name for fault in faults}:
+        return f"wheel_pid is dead, exit code {campaign.wheel.returncode}"
+    campaign.heal()
+    if not campaign.spin_until(campaign.drives, 20.0):
+        return f"does not drive again: {campaign.robot.last_diagnosis(NODE)}"
+    return ""
+
+
+def run(minutes: float, seed: int, campaign: Campaign) -> bool:
+    """Run the campaign; return whether nothing forbidden happened."""
+    draw = campaign.draw = random.Random(seed)
+    counts: Counter[str] = Counter()
+    failures = []
+    campaign.robot.setpoint = campaign.speed
+    campaign.spin_until(campaign.drives, 20.0)
+    end = time.monotonic() + 60.0 * minutes
+    relay = [fault for fault in FAULTS if fault.of_the_relay]
+    other = [f for f in FAULTS if not f.of_the_relay and f.begin is not _rival]
+    while time.monotonic() < end and len(failures) < 20:
+        faults = [draw.choice(FAULTS)]
+        if draw.random() < 0.4:
+            # While a wheel at fault is at rest it is free for another writer.
+            faults = [draw.choice(relay), draw.choice(other)]
+        campaign.speed = campaign.robot.setpoint = draw.choice([-1, 1]) * draw.uniform(0.6, 1.8)
+        if not campaign.spin_until(campaign.drives, 20.0):
+            failures.append("before any fault: does not drive")
+            break
+        name, duration = " + ".join(fault.name for fault in faults), draw.uniform(0.3, 3.0)
+        counts.update([fault.name for fault in faults])
+        wrong = trial(campaign, faults, duration)
+        if wrong:
+            failures.append(f"{name} at {campaign.speed:+.2f} rad/s for {duration:.1f} s: {wrong}")
+            print(f"FAILED (draw {sum(counts.values())}) {failures[-1]}", flush=True)
+            campaign.heal()
+    for name, number in sorted(counts.items()):
+        print(f"  {number:5d} x {name}")
+    print(f"seed {seed}: {sum(counts.values())} faults, {len(failures)} forbidden")
+    return not failures
+
+
+def random_parameters(draw: random.Random) -> dict[str, Any]:
+    """Return a set of parameters of wheel_pid around usual values and at the boundaries."""
+    usual = {
+        "p": 2.0, "i": 60.0, "d": 0.02, "u_clamp_max": 12.0, "i_clamp_max": 12.0,
+        "setpoint_weight_p": 0.5, "setpoint_weight_d": 0.2, "error_deadband": 1e-3,
+        "derivative_filter_time_constant": 0.005, "feedforward_static": 0.4,
+        "feedforward_velocity": 2.6, "feedforward_acceleration": 0.13,
+        "model__dc_gain": 25.5, "model__time_constant": 0.05, "model__static_voltage": 0.45,
+        "model__time_constant_product": 8e-4, "model__delay": 0.005, "observer__load": 1.0,
+        "observer__voltage": 0.005, "observer__count": 0.3, "max_acceleration": 15.0,
+        "max_jerk": 300.0, "transition_time": 0.2, "reference_delay": 0.0075,
+        "drive__top_speed": 3.0, "drive__time_constant": 0.05,
+    }  # fmt: skip
+    values: dict[str, Any] = {}
+    for name in draw.sample(sorted(usual), draw.randint(1, 6)):
+        boundary = [0.0, 5e-324, 1e-300, 1.7e308, -1.7e308, 1e9, math.nan, math.inf, -1.0]
+        spread = usual[name] * 10.0 ** draw.gauss(0.0, 1.0)
+        values[name] = draw.choice(boundary) if draw.random() < 0.15 else spread
+    if draw.random() < 0.3:
+        values["speed_source"] = draw.choice(["measured", "difference", "observer"])
+    return values
+
+
+def _usual(values: dict[str, Any]) -> dict[str, Any]:
+    """Return what takes a random set back."""
+    none = {name: 0.0 for name in values if name.startswith(("model__", "drive__"))}
+    rest = {
+        "max_jerk": 0.0, "transition_time": 0.0, "reference_delay": 0.0, "d": 0.0,
+        "i_clamp_max": math.inf, "setpoint_weight_p": 1.0, "setpoint_weight_d": 0.0,
+        "error_deadband": 0.0, "derivative_filter_time_constant": 0.0, "observer__load": 1.0,
+        "observer__voltage": 0.005, "observer__count": 0.3, "speed_source": "measured",
+    }  # fmt: skip
+    return {**rest, **none, **{name.replace(".", "__"): value for name, value in GAINS.items()}}
+
+
+def parameters(count: int, seed: int, campaign: Campaign) -> bool:
+    """Set parameters of a live wheel through its service; return whether it lives and follows."""
+    draw = random.Random(seed)
+    campaign.robot.setpoint = campaign.speed
+    campaign.spin_until(campaign.drives, 20.0)
+    accepted = wrong = 0
+    for k in range(count):
+        values = random_parameters(draw)
+        ok, _ = campaign.robot.set(NODE, **values)
+        accepted += ok
+        if not ok:
+            continue
+        fastest = 0.0
+        end = time.monotonic() + 0.4
+        while time.monotonic() < end:
+            campaign.robot.spin()
+            fastest = max(fastest, abs(campaign.true_speed()))
+        # Who says that the motor is another one is believed.
+        known = not any(name.startswith("model__") for name in values)
+        away = known and fastest > 2.5 * campaign.speed
+        if campaign.wheel.poll() is not None or away:
+            wrong += 1
+            print(f"FAILED set {k}: {fastest:.2f} rad/s, alive {campaign.wheel.poll() is None}, "
+                  f"{values}")  # fmt: skip
+            if campaign.wheel.poll() is not None:
+                campaign.start_wheel()
+        campaign.heal()
+        if not campaign.robot.set(NODE, **_usual(values))[0]:
+            print(f"FAILED set {k}: the usual parameters are refused")
+            wrong += 1
+        campaign.spin_until(campaign.drives, 5.0)
+    print(f"seed {seed}: {count} sets, {accepted} accepted, {wrong} wrong")
+    return not wrong
+
+
+def core(count: int, seed: int) -> bool:
+    """Judge sets without processes; return whether all that are accepted follow."""
+    from test_acceptance import RATIO, WHEEL, drives, random_settings
+
+    from smp_motor_control.errors import ParameterError
+    from smp_motor_control.wheel.acceptance import check
+
+    draw, accepted, wrong = random.Random(seed), 0, 0
+    for _ in range(count):
+        try:
+            given = random_settings(draw)
+            check(given, WHEEL)
+        except ParameterError:
+            continue
+        accepted += 1
+        share = drives(given, RATIO)
+        if not share < 2.5:
+            wrong += 1
+            print(f"FAILED {share:.2f} set-points: {given}")
+    print(f"seed {seed}: {count} sets, {accepted} accepted, {wrong} wrong")
+    return not wrong
+
+
+def main() -> int:
+    """Run what is asked for; exit code 1 where something forbidden happened."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--minutes", type=float, default=60.0)
+    parser.add_argument("--seed", type=int, default=int(time.time()) // 86400)
+    parser.add_argument("--parameters", type=int, metavar="N", help="sets through the service")
+    parser.add_argument("--core", type=int, metavar="N", help="sets without processes")
+    arguments = parser.parse_args()
+    domain = int(os.environ.setdefault("ROS_DOMAIN_ID", "97"))
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    print(f"seed {arguments.seed}", flush=True)
+    if arguments.core:
+        return 0 if core(arguments.core, arguments.seed) else 1
+    campaign = Campaign(domain, through_relay=not arguments.parameters)
+    try:
+        if arguments.parameters:
+            held = parameters(arguments.parameters, arguments.seed, campaign)
+        else:
+            held = run(arguments.minutes, arguments.seed, campaign)
+    finally:
+        campaign.close()
+    return 0 if held else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

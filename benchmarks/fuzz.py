@@ -1,0 +1,340 @@
+"""Spoilt recordings of every format: what the reader makes of them, in a table.
+
+    python benchmarks/fuzz.py [--files 20000] [--seed 1] [--formats mcap csv ...]
+
+Each file is a sound one (written by rosbags, mcap, sqlite3, scipy, openpyxl or by hand) with some
+of its bytes changed, cut off, doubled, moved or replaced by extreme numbers.  Outcomes: an
+answer; a partial answer with a warning; a refusal of one line.  Anything else fails: a
+traceback, more than 30 s, more than 1 GB of memory.  Every failure is printed with its number.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+import multiprocessing
+import random
+import resource
+import signal
+import sqlite3
+import struct
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import lz4.frame
+import mcap.writer
+import numpy as np
+import openpyxl
+import scipy.io
+import yaml
+import zstandard
+from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.typesys import Stores, get_typestore
+
+from smp_motor_ident.bag import list_topics, load, read_records
+from smp_motor_ident.errors import BagError, SignalError
+
+N = 120
+SECONDS, MEMORY = 30, 1_000_000_000
+MESSAGES = ["voltage=/pwm.data velocity=/joint_states.velocity[right]"]
+COLUMNS = ["voltage=u velocity=y time=t"]
+_RNG = np.random.default_rng(5)
+T, U, Y = 0.01 * np.arange(N), _RNG.uniform(-6, 6, N), np.cumsum(_RNG.normal(0, 1, N))
+
+
+def _messages(ros1: bool) -> tuple[Any, list[tuple[str, str, int, bytes]]]:
+    store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_JAZZY)
+    number, joints = "std_msgs/msg/Float64", "sensor_msgs/msg/JointState"
+    stamp, header = store.types["builtin_interfaces/msg/Time"], store.types["std_msgs/msg/Header"]
+    write = store.serialize_ros1 if ros1 else store.serialize_cdr
+    sent = []
+    for k in range(N):
+        at = 1_700_000_000_000_000_000 + round(1e9 * T[k])
+        sent.append(("/pwm", number, at, bytes(write(store.types[number](float(U[k])), number))))
+        head = [k] if ros1 else []
+        message = store.types[joints](
+            header(*head, stamp(*divmod(at, 10**9)), "base"),
+            ["left", "right"], np.zeros(2), np.array([0.0, Y[k]]), np.zeros(0),
+        )  # fmt: skip
+        sent.append(("/joint_states", joints, at, bytes(write(message, joints))))
+    return store, sent
+
+
+def _mcap(kind: str) -> bytes:
+    store, sent = _messages(False)
+    file, ids = io.BytesIO(), {}
+    writer = mcap.writer.Writer(
+        file, chunk_size=2048, compression=mcap.writer.CompressionType[kind]
+    )
+    writer.start("ros2")
+    for topic, name, at, data in sent:
+        if topic not in ids:
+            text = store.generate_msgdef(name, ros_version=2)[0].encode()
+            schema = writer.register_schema(name, "ros2msg", text)
+            ids[topic] = writer.register_channel(topic, "cdr", schema)
+        writer.add_message(ids[topic], at, data, at)
+    writer.finish()
+    return file.getvalue()
+
+
+def _sqlite() -> bytes:
+    _, sent = _messages(False)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "a.db3")
+        base = sqlite3.connect(path)
+        base.executescript(
+            "PRAGMA page_size=1024;"
+            "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT,"
+            " serialization_format TEXT, offered_qos_profiles TEXT);"
+            "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER,"
+            " data BLOB);"
+        )
+        ids: dict[str, int] = {}
+        for topic, name, at, data in sent:
+            if topic not in ids:
+                ids[topic] = len(ids) + 1
+                base.execute(
+                    "INSERT INTO topics VALUES (?,?,?,'cdr','')", (ids[topic], topic, name)
+                )
+            base.execute("INSERT INTO messages VALUES (NULL,?,?,?)", (ids[topic], at, data))
+        base.commit()
+        base.close()
+        return path.read_bytes()
+
+
+def _ros1(kind: Ros1Writer.CompressionFormat | None) -> bytes:
+    store, sent = _messages(True)
+    with tempfile.TemporaryDirectory() as folder:
+        path, ids = Path(folder, "a.bag"), {}
+        writer = Ros1Writer(path)
+        writer.chunk_threshold = 2048
+        if kind:
+            writer.set_compression(kind)
+        with writer:
+            for topic, name, at, data in sent:
+                if topic not in ids:
+                    ids[topic] = writer.add_connection(topic, name, typestore=store)
+                writer.write(ids[topic], at, data)
+        return path.read_bytes()
+
+
+def _mat(packed: bool) -> bytes:
+    file = io.BytesIO()
+    content = {"t": T, "u": U, "y": Y, "s": {"a": T, "b": ["x", "y"]}, "c": "text"}
+    scipy.io.savemat(file, content, do_compression=packed)
+    return file.getvalue()
+
+
+def _wpilog() -> bytes:
+    def record(entry: int, stamp: int, payload: bytes) -> bytes:
+        return struct.pack("<BBBI", 0x30, entry, len(payload), stamp) + payload
+
+    parts = [b"WPILOG", struct.pack("<HI", 0x0100, 0)]
+    for entry, name in enumerate((b"u", b"y"), 1):
+        text = struct.pack("<BIIcI6sI", 0, entry, 1, name, 6, b"double", 0)
+        parts.append(record(0, 0, text))
+    for k in range(N):
+        for entry, value in enumerate((U[k], Y[k]), 1):
+            parts.append(record(entry, round(1e6 * T[k]), struct.pack("<d", value)))
+    return b"".join(parts)
+
+
+def _xlsx() -> bytes:
+    book, file = openpyxl.Workbook(), io.BytesIO()
+    for row in [("t", "u", "y"), *zip(T, U, Y)]:
+        book.active.append(row)
+    book.save(file)
+    return file.getvalue()
+
+
+def _rows() -> list[dict[str, float]]:
+    return [{"t": t, "u": u, "y": y} for t, u, y in zip(T.tolist(), U.tolist(), Y.tolist())]
+
+
+def _csv(separator: str) -> bytes:
+    lines = [separator.join("tuy"), *(separator.join(map(repr, r.values())) for r in _rows())]
+    return "\n".join(lines).encode()
+
+
+def _sysid() -> bytes:
+    rows = np.stack([T, U, Y, Y], axis=1).tolist()
+    return json.dumps({"sysid": True, "units": "Rotations", "slow-forward": rows}).encode()
+
+
+def _metadata() -> bytes:
+    entry = {"name": "/pwm", "type": "std_msgs/msg/Float64", "serialization_format": "cdr"}
+    return yaml.safe_dump(
+        {
+            "rosbag2_bagfile_information": {
+                "version": 9,
+                "relative_file_paths": ["a.mcap"],
+                "topics_with_message_count": [{"topic_metadata": entry, "message_count": N}],
+            }
+        }
+    ).encode()
+
+
+SEEDS: dict[str, tuple[str, Callable[[], bytes], list[str] | None]] = {
+    "mcap": ("a.mcap", lambda: _mcap("NONE"), MESSAGES),
+    "mcap zstd": ("a.mcap", lambda: _mcap("ZSTD"), MESSAGES),
+    "mcap lz4": ("a.mcap", lambda: _mcap("LZ4"), MESSAGES),
+    "mcap.zstd": ("a.mcap.zstd", lambda: zstandard.compress(_mcap("NONE")), MESSAGES),
+    "mcap.lz4": ("a.mcap.lz4", lambda: lz4.frame.compress(_mcap("NONE")), MESSAGES),
+    "sqlite": ("a.db3", _sqlite, MESSAGES),
+    "ros1": ("a.bag", lambda: _ros1(None), MESSAGES),
+    "ros1 bz2": ("a.bag", lambda: _ros1(Ros1Writer.CompressionFormat.BZ2), MESSAGES),
+    "ros1 lz4": ("a.bag", lambda: _ros1(Ros1Writer.CompressionFormat.LZ4), MESSAGES),
+    "mat": ("a.mat", lambda: _mat(False), COLUMNS),
+    "mat packed": ("a.mat", lambda: _mat(True), COLUMNS),
+    "wpilog": ("a.wpilog", _wpilog, ["voltage=u velocity=y"]),
+    "sysid": ("a.json", _sysid, None),
+    "json": ("a.json", lambda: json.dumps(_rows()).encode(), COLUMNS),
+    "jsonl": ("a.jsonl", lambda: "\n".join(map(json.dumps, _rows())).encode(), COLUMNS),
+    "xlsx": ("a.xlsx", _xlsx, COLUMNS),
+    "csv": ("a.csv", lambda: _csv(","), COLUMNS),
+    "csv blanks": ("a.txt", lambda: _csv(" "), COLUMNS),
+    "metadata": ("metadata.yaml", _metadata, MESSAGES),
+    "mapping": ("map.yaml", lambda: b"motors:\n  left: {voltage: /pwm.data, velocity: y}\n", None),
+    "msg": ("Float64.msg", lambda: b"float64 data\nFloat64[<=3] more\nuint8 X=1\n", MESSAGES),
+}
+"""File name, its sound bytes, and the mapping, by what is fuzzed."""
+
+EXTREME = [
+    *(struct.pack("<I", v) for v in (0, 1, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF)),
+    *(struct.pack("<Q", v) for v in (0, 2**31, 2**63 - 1, 2**63, 2**64 - 1)),
+    *(struct.pack("<d", v) for v in (np.nan, np.inf, 1e300, -1e-300)),
+    b"\0", b"\xff" * 16, b"\n", b",", b"[" * 4000, b"{" * 3000, b'{"a":' * 2000, b"9" * 5000,
+    b"1e999", b"&a [*a]", b"- " * 2000, b"\x28\xb5\x2f\xfd", b"\x04\x22\x4d\x18",
+]  # fmt: skip
+
+
+def spoil(data: bytes, draw: random.Random) -> bytes:
+    """Return a recording with one to eight places spoilt."""
+    spoilt = bytearray(data)
+    for _ in range(draw.choice((1, 1, 1, 2, 3, 8))):
+        size = len(spoilt)
+        at = draw.choice((draw.randrange(size + 1), draw.randrange(min(size, 200) + 1)))
+        match draw.randrange(8):
+            case 0:
+                del spoilt[at:]
+            case 1 | 2 if at < size:
+                spoilt[at] ^= 1 << draw.randrange(8)
+            case 3 if at < size:
+                spoilt[at] = draw.randrange(256)
+            case 4 | 5:
+                piece = draw.choice(EXTREME)
+                spoilt[at : at + (len(piece) if len(piece) < 20 else 0)] = piece
+            case 6:
+                begin = draw.randrange(size + 1)
+                spoilt[at:at] = spoilt[begin : begin + draw.randrange(1, 400)]
+            case _:
+                del spoilt[at : at + draw.randrange(1, 200)]
+    return bytes(spoilt)
+
+
+def outcome(name: str, data: bytes, folder: Path) -> str:
+    """Return what comes of a file: an answer, a partial answer, a refusal of one line."""
+    file, _, mapping = SEEDS[name]
+    path = folder / file
+    path.write_bytes(data)
+    target: Path = path
+    if name == "metadata":
+        (folder / "a.mcap").write_bytes(SOUND["mcap"])
+        target = folder
+    try:
+        if name == "mapping":
+            load(path)
+            return "answer"
+        if name == "msg":
+            (folder / "a.db3").write_bytes(SOUND["sqlite"])
+            list_topics(folder / "a.db3", [str(path)])
+            return "answer"
+        listed = list_topics(target)
+        records = read_records(target, mapping)
+    except (BagError, SignalError) as error:
+        text = str(error)
+        return "refused" if text and "\n" not in text and len(text) < 4000 else "long message"
+    finally:
+        path.unlink()
+        (folder / "a.mcap").unlink(missing_ok=True)
+        (folder / "a.db3").unlink(missing_ok=True)
+    found = [f for r in records.values() for f in r.findings] + [
+        f for o in listed for f in o.findings
+    ]
+    return "partial" if any(f.severity != "note" for f in found) else "answer"
+
+
+SOUND: dict[str, bytes] = {}
+
+
+def campaign(name: str, count: int, seed: int) -> tuple[str, Counter[str], list[str], float, float]:
+    """Fuzz one format; return the counts, what failed, the memory and the longest time."""
+    SOUND.update({key: SEEDS[key][1]() for key in {name, "mcap", "sqlite"}})
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    counts: Counter[str] = Counter()
+    failures: list[str] = []
+    longest = 0.0
+
+    def stop(*_: object) -> None:
+        raise TimeoutError(f"more than {SECONDS} s")
+
+    signal.signal(signal.SIGALRM, stop)
+    with tempfile.TemporaryDirectory() as place:
+        for k in range(count):
+            data = spoil(SOUND[name], random.Random(f"{name} {seed} {k}"))
+            start = time.perf_counter()
+            signal.alarm(SECONDS)
+            try:
+                result = outcome(name, data, Path(place))
+            except BaseException as error:
+                result = type(error).__name__
+            signal.alarm(0)
+            longest = max(longest, time.perf_counter() - start)
+            counts[result] += 1
+            if result not in ("answer", "partial", "refused"):
+                failures.append(f"{name}, seed {seed}, file {k}: {result}")
+    used = 1024.0 * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
+    if used > MEMORY:
+        failures.append(f"{name}, seed {seed}: {used / 1e6:.0f} MB")
+    return name, counts, failures, used, longest
+
+
+def main() -> int:
+    """Run the campaign; exit code 1 where anything failed."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("--files", type=int, default=20_000)
+    parser.add_argument("--seed", type=int, default=int(time.time()))
+    parser.add_argument("--formats", nargs="+", default=list(SEEDS), choices=list(SEEDS))
+    parser.add_argument("--jobs", type=int, default=2)
+    given = parser.parse_args()
+    each = max(given.files // len(given.formats), 1)
+    print(f"seed {given.seed}, {each} files of each format")
+    print("format        answer  partial  refused  failed     MB      s")
+    every: Counter[str] = Counter()
+    bad: list[str] = []
+    with multiprocessing.get_context("spawn").Pool(given.jobs, maxtasksperchild=1) as pool:
+        work = [pool.apply_async(campaign, (name, each, given.seed)) for name in given.formats]
+        for name, counts, failures, used, longest in (part.get() for part in work):
+            three = [counts[key] for key in ("answer", "partial", "refused")]
+            print(
+                f"{name:12} {three[0]:7} {three[1]:8} {three[2]:8} {each - sum(three):7} "
+                f"{used / 1e6:6.0f} {longest:6.1f}",
+                flush=True,
+            )
+            every += counts
+            bad += failures
+    print(f"all: {dict(every)}")
+    print("\n".join(bad[:50]) or "no traceback, no hang, memory within bounds")
+    return 1 if bad else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,143 @@
+"""Arrival stamps put back on the beat of their sender.
+
+Sample k of a regular sender arrives at ``a + T n_k + latency_k`` with a latency that is never
+negative, and ``n_k - k`` samples lost before it.  The line of least latencies under all arrivals is
+an edge of their lower convex hull (the linear programme ``min sum(latency), latency >= 0``): the
+beat is the lower envelope of the arrivals, whatever the distribution of the latency is.  Coarse or
+repeated stamps, which round a regular time down, lie above such a line, too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from scipy.ndimage import minimum_filter1d
+
+from smp_motor_ident.bag.clock import rhythm
+from smp_motor_ident.bag.storage import Array, Integers
+from smp_motor_ident.diagnosis.limits import BEAT_FLOOR, BEAT_JITTER, BEAT_LOST
+
+_LEAST = 50
+"""Samples below which a beat is not looked for."""
+
+
+@dataclass(frozen=True, eq=False)
+class Beat:
+    """A regular clock behind arrivals.
+
+    ``time`` are the instants [ns], ``period`` the interval [ns], ``latency`` the median delay
+    [ns] behind the fastest, ``repeated`` whether arrivals came several at once.
+    """
+
+    time: Integers
+    period: float
+    latency: float
+    repeated: bool
+
+
+def find_beat(arrival: Integers) -> Beat | None:
+    """Return the regular clock behind arrivals; None where there is none, or they are regular."""
+    if arrival.size < _LEAST or np.any(np.diff(arrival) < 0):
+        return None
+    # Pauses divide the arrivals: each part has a phase of its own.
+    usual = (arrival[-1] - arrival[0]) / (arrival.size - 1)
+    pause = max(20 * usual, rhythm(arrival).gap() if rhythm(arrival).regular else 0.0)
+    edges = [0, *(np.flatnonzero(np.diff(arrival) > pause) + 1).tolist(), arrival.size]
+    time, periods, late = arrival.copy(), [], []
+    for begin, end in pairwise(edges):
+        if end - begin < _LEAST:
+            return None
+        fitted = _fit(arrival[begin:end])
+        if fitted is None:
+            return None
+        time[begin:end] = arrival[begin] + np.rint(fitted[0]).astype(np.int64)
+        periods.append(fitted[1])
+        late.append((arrival[begin:end] - time[begin:end]).astype(np.float64))
+    latency, period = np.concatenate(late), float(np.median(periods))
+    if np.std(latency) < BEAT_JITTER.value * period or np.any(np.diff(time) <= 0):
+        return None
+    repeated = float(np.mean(np.diff(arrival) < 0.02 * period)) > BEAT_LOST.value
+    return Beat(time, period, float(np.median(latency)), repeated)
+
+
+def _fit(arrival: Integers) -> tuple[Array, float] | None:
+    """Return the beat's instants from the first arrival [ns], and its period."""
+    since = (arrival - arrival[0]).astype(np.float64)
+    usual = since[-1] / (since.size - 1)
+    if usual <= 0:
+        return None
+    apart = np.flatnonzero(np.diff(since, prepend=-np.inf, append=np.inf) > 0.02 * usual)
+    longest = int(np.diff(apart).max(initial=1))  # samples that came at once
+    window = max(32, 4 * longest)
+    if 4 * window > since.size:
+        return None
+    number = np.arange(since.size, dtype=np.float64)
+    for lost in (0, 1):
+        if lost:
+            number += _lost(since, number, window)
+            if number[-1] - (since.size - 1) > BEAT_LOST.value * since.size:
+                return None
+        begin, period = _line(number, since)
+        latency = since - begin - period * number
+        floors = [part.min() for part in np.array_split(latency, since.size // window)]
+        # What arrives late catches up: where the sender is regular the floor stays.
+        if period > 0 and max(floors) <= BEAT_FLOOR.value * period * longest:
+            return begin + period * number, period
+    return None
+
+
+def _lost(since: Array, number: Array, window: int) -> Array:
+    """Return how many samples were lost up to each: the floor rises by whole periods for good."""
+    parts = np.array_split(np.arange(since.size), since.size // (2 * window))
+    parts = parts[:: max(len(parts) // 200, 1)]
+    period = float(np.median([_line(number[p], since[p])[1] for p in parts]))
+    lost = np.zeros(since.size)
+    if period <= 0:
+        return lost
+    rest = since - period * number
+    floor = minimum_filter1d(rest, window, origin=-(window // 2), mode="nearest")
+    risen = np.flatnonzero(floor[window:] - floor[:-window] > 0.75 * period) + window
+    at = 0
+    for k in risen.tolist():
+        if k >= at:
+            lost[k:] += round(float(floor[k] - floor[k - window]) / period)
+            at = k + window
+    return lost
+
+
+def _line(number: Array, value: Array) -> tuple[float, float]:
+    """Return offset and slope of the line of least sum under the points."""
+    blocks = np.array_split(np.arange(number.size), min(number.size, 500))
+    slope = (value[-1] - value[0]) / max(number[-1] - number[0], 1.0)
+    rest = value - slope * number
+    lowest = [int(block[np.argmin(rest[block])]) for block in blocks]
+    hull: list[int] = []
+    for k in lowest:
+        while len(hull) > 1:
+            i, j = hull[-2:]
+            run, rise = number[j] - number[i], value[j] - value[i]
+            if rise * (number[k] - number[i]) < (value[k] - value[i]) * run:
+                break
+            hull.pop()
+        hull.append(k)
+    middle = float(np.mean(number))
+    edge = next((m for m in range(len(hull) - 1) if number[hull[m + 1]] >= middle), 0)
+    if len(hull) < 2:
+        return float(value[0]), float(slope)
+    i, j = hull[edge], hull[edge + 1]
+    slope = (value[j] - value[i]) / (number[j] - number[i])
+    return float(value[i] - slope * number[i]), float(slope)
+
+
+def roughness(time: Integers, value: Array) -> float:
+    """Return how far samples lie from the line between their neighbours, without the worst."""
+    since = (time - time[0]).astype(np.float64)
+    span = since[2:] - since[:-2]
+    good = (span > 0) & np.isfinite(value[2:] + value[1:-1] + value[:-2])
+    if good.sum() < _LEAST // 2:
+        return np.inf
+    weight = (since[1:-1] - since[:-2])[good] / span[good]
+    middle = value[:-2][good] * (1 - weight) + value[2:][good] * weight
+    return float(np.mean(np.sort(np.abs(value[1:-1][good] - middle))[: int(0.95 * good.sum())]))

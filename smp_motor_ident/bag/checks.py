@@ -1,0 +1,87 @@
+"""What signals cannot be: values that jump impossibly, currents without sign."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import median_filter
+
+from smp_motor_ident.bag.axis import Series
+from smp_motor_ident.bag.storage import Array
+from smp_motor_ident.diagnosis.limits import JUMP_SPAN, JUMP_STEP, UNSIGNED_CURRENT
+from smp_motor_ident.errors import BagError
+
+_LEAST = 50
+_SAMPLED = 5000
+"""Values that quantiles and means are taken of."""
+
+
+def impossible(value: Array, *, steps_allowed: bool) -> NDArray[np.bool_]:
+    """Return which values jump away and back by more than the signal's own range allows.
+
+    A value is impossible that lies many spans of the signal away from its neighbours; where steps
+    are not allowed (whatever has inertia), also one that jumps to and fro by many usual steps.
+    """
+    none = np.zeros(value.size, bool)
+    sound = np.flatnonzero(np.isfinite(value))
+    if sound.size < _LEAST:
+        return none
+    x = value[sound]
+    with np.errstate(over="ignore", invalid="ignore"):
+        some = x[:: max(x.size // _SAMPLED, 1)]
+        low, high = np.quantile(some, [0.01, 0.99])
+        span = max(high - low, 1e-3 * max(abs(low), abs(high)))
+        step = np.abs(np.diff(x))
+        usual = float(np.quantile(step[:: max(x.size // _SAMPLED, 1)], 0.99))
+        if np.ptp(x) <= JUMP_SPAN.value * span and step.max() <= JUMP_STEP.value * usual:
+            return none
+        away = np.abs(x - median_filter(x, 5, mode="nearest"))
+        bad = (away > JUMP_SPAN.value * span) & (span > 0)
+        if not steps_allowed:
+            both = np.zeros(x.size, bool)
+            both[1:-1] = np.minimum(step[:-1], step[1:]) > JUMP_STEP.value * usual
+            both[1:-1] &= np.diff(x)[:-1] * np.diff(x)[1:] < 0
+            bad |= both & (away > 0.5 * span) & (usual > 0)
+    none[sound[bad]] = True
+    return none
+
+
+def is_unsigned(voltage: Series, current: Series) -> bool:
+    """Return whether a current is positive in both directions: of the supply, or without sign.
+
+    The armature's current has the sign of what drives it: its means where the voltage is positive
+    and where it is negative cancel, but for an offset.
+    """
+    sound = np.isfinite(current.value)
+    every = max(current.time.size // _SAMPLED, 1)
+    time, amperes = current.time[sound][::every], current.value[sound][::every]
+    if time.size < _LEAST or voltage.time.size < 2:
+        return False
+    index = np.clip(np.searchsorted(voltage.time, time, "right") - 1, 0, voltage.time.size - 1)
+    volts = voltage.value[index]
+    volts = np.where(np.isfinite(volts), volts, 0.0)
+    driven = np.abs(volts) > 0.1 * np.abs(volts).max()
+    forward, backward = driven & (volts > 0), driven & (volts < 0)
+    if min(forward.mean(), backward.mean()) < 0.05:
+        return False
+    ahead, back = float(amperes[forward].mean()), float(amperes[backward].mean())
+    if abs(ahead + back) < UNSIGNED_CURRENT.value * abs(ahead - back):
+        return False
+    low, high = np.quantile(amperes, [0.05, 0.95])
+    return bool(low > -0.2 * high)  # but for little that is given back to the supply
+
+
+def signed(size: Series, direction: Series, where: str) -> Series:
+    """Return a signal with the sign of a direction column: negative where it is 0 or below."""
+    levels = np.unique(direction.value[np.isfinite(direction.value)])
+    if not 1 <= levels.size <= 3:
+        raise BagError(
+            f"{where}: direction has {levels.size} values; two, such as 0 and 1, are signs"
+        )
+    sign = np.sign(direction.value)
+    if levels.min() >= 0:  # 0 and 1
+        sign = np.where(direction.value > 0, 1.0, -1.0)
+    elif levels.max() <= 0:  # 0 and -1, as a scale of -1 makes them
+        sign = np.where(direction.value < 0, -1.0, 1.0)
+    index = np.searchsorted(direction.time, size.time, "right") - 1
+    return Series(size.time, size.value * sign[np.maximum(index, 0)], size.number, size.bits)

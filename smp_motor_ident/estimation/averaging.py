@@ -1,0 +1,135 @@
+"""Where several structures explain the data equally well, values that cover them all.
+
+The deviance of each candidate is a sum over runs of samples.  Drawing the runs' shares again and
+again shows how often each candidate would have been the best: its weight.  What is stated is the
+weighted mean, its variance that within the chosen structure plus that between the candidates.
+
+References
+----------
+Yao, Vehtari, Simpson and Gelman, Bayesian Analysis 13 (2018), 917, section 3.4 (pseudo-BMA+);
+Burnham and Anderson, Model Selection and Multimodel Inference, 2nd ed., section 4.3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smp_motor_ident.diagnosis.limits import CANDIDATE_WEIGHT
+from smp_motor_ident.estimation import replay
+from smp_motor_ident.estimation.choice import SCEPSIS, size
+from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.estimation.fitted import NORMAL_95
+from smp_motor_ident.estimation.quantities import Answer
+from smp_motor_ident.likelihood.experiments import Experiments
+from smp_motor_ident.result import Quantity
+
+Array = NDArray[np.float64]
+
+BLOCKS = 60
+DRAWS = 400
+ABSENT = ("delay", "averaging_window", "time_constant_product", "load_voltage")
+"""Quantities that are nothing in a structure that does not have them."""
+
+
+def weights(data: Callable[[Fit], Experiments], fits: Sequence[Fit], seed: int = 0) -> Array:
+    """Return the weight of each candidate, by a Bayesian bootstrap of runs of samples.
+
+    Parameters
+    ----------
+    data : callable
+        Returns what a fit was made of; the measured outputs are the same for all.
+    fits : sequence of Fit
+        On all data.
+    seed : int
+        Of the draws.
+
+    Returns
+    -------
+    ndarray, shape (len(fits),)
+        Summing to 1.
+    """
+    rows = []
+    for fit in fits:
+        own = data(fit)
+        residual = own.output - replay.outputs(own, fit, gain=True)
+        seen = np.isfinite(residual)
+        square = np.where(seen, np.square(residual), 0.0)
+        variance = float(square.sum() / seen.sum())
+        edges = np.linspace(0, residual.size, BLOCKS + 1).astype(np.int64)[:-1]
+        rows.append(np.add.reduceat(square / variance + seen * np.log(variance), edges))
+    runs = np.array(rows)
+    rng = np.random.default_rng(seed)
+    shares = rng.dirichlet(np.ones(BLOCKS), DRAWS) * BLOCKS
+    price = np.array([size(f.structure) * (np.log(f.samples) + SCEPSIS) for f in fits])
+    total = shares @ runs.T + price
+    each = np.exp(-0.5 * (total - total.min(axis=1, keepdims=True)))
+    return np.asarray((each / each.sum(axis=1, keepdims=True)).mean(axis=0))
+
+
+def averaged(result: Answer, weight: Array, others: Sequence[Answer]) -> Answer:
+    """Return an answer that covers the candidates.
+
+    Parameters
+    ----------
+    result : Answer
+        Of the chosen structure, the first of the weights.
+    weight : ndarray, shape (1 + len(others),)
+        Of all candidates.
+    others : sequence of Answer
+        Of the other candidates.
+
+    Returns
+    -------
+    Answer
+        With the same quantities.
+    """
+    keep = np.flatnonzero(weight[1:] > CANDIDATE_WEIGHT.value)
+    if not keep.size or not result.names:
+        return result
+    share = np.concatenate([weight[:1], weight[1:][keep]])
+    share = share / share.sum()
+    own = np.array([_value(result, n, 0.0) for n in result.names])
+    values = np.array([own] + [[_value(others[k], n, v) for n, v in zip(result.names, own)]
+                               for k in keep])  # fmt: skip
+    mean = share @ values
+    between = (values - mean).T @ (share[:, None] * (values - mean))
+    shift = dict(zip(result.names, zip(mean, np.diag(between))))
+    return replace(
+        result,
+        combinations=_shifted(result.combinations, shift),
+        parameters=_shifted(result.parameters, shift),
+        covariance=result.covariance + between,
+    )
+
+
+def _value(answer: Answer, name: str, own: float) -> float:
+    """Return a candidate's value; the chosen one's where it has none."""
+    quantity = answer.combinations.get(name) or answer.parameters.get(name)
+    if quantity is None and name in ABSENT:
+        return 0.0
+    return own if quantity is None or quantity.value is None else quantity.value
+
+
+def _shifted(
+    quantities: Mapping[str, Quantity], shift: Mapping[str, tuple[float, float]]
+) -> dict[str, Quantity]:
+    out = dict(quantities)
+    for name, quantity in quantities.items():
+        if name not in shift or quantity.value is None or quantity.std is None:
+            continue
+        mean, between = float(shift[name][0]), float(shift[name][1])
+        low, high = quantity.ci95 or (quantity.value, quantity.value)
+        reach = NORMAL_95**2 * between
+        down = mean - float(np.sqrt((quantity.value - low) ** 2 + reach))
+        out[name] = replace(
+            quantity,
+            value=mean,
+            std=float(np.hypot(quantity.std, np.sqrt(between))),
+            ci95=(max(down, 0.0) if low >= 0 else down,
+                  mean + float(np.sqrt((high - quantity.value) ** 2 + reach))),
+        )  # fmt: skip
+    return out

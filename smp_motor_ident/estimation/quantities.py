@@ -1,0 +1,271 @@
+"""From a fit to quantities: values with their certainty, or the statement that there is none.
+
+Derivation: docs/derivations.md, sections 9 and 11.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smp_motor_ident.diagnosis.limits import LOOSE_QUANTITY, NEGLIGIBLE_FRICTION
+from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.estimation.fitted import NORMAL_95
+from smp_motor_ident.estimation.inversion import solved_for
+from smp_motor_ident.model import structures as models
+from smp_motor_ident.model.structures import PHYSICAL
+from smp_motor_ident.result import UNITS, Quantity
+
+Array = NDArray[np.float64]
+
+TRADED = ("dc_gain", "static_voltage", "static_voltage_reverse", "load_voltage")
+"""Of a steady speed at one level of voltage only ``dc_gain (level - static_voltage)`` is known."""
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """Quantities of one fit.
+
+    Attributes
+    ----------
+    parameters, combinations : dict of str to Quantity
+        As in `result.Estimate`.
+    names : tuple of str
+        Of the covariance.
+    covariance : ndarray, shape (p, p)
+        Joint, over parameters and combinations.
+    loose : tuple of str
+        Parameters that the structure has but these data do not identify.
+    level : float
+        The voltage [V] that ``steady_speed`` belongs to, 0 where that is not reported.
+    """
+
+    parameters: dict[str, Quantity]
+    combinations: dict[str, Quantity]
+    names: tuple[str, ...]
+    covariance: Array
+    loose: tuple[str, ...] = field(default=())
+    level: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Values:
+    """Values, gradients by the free coordinates, and differences to both ends of each profile."""
+
+    value: dict[str, float]
+    row: dict[str, Array]
+    ends: dict[str, list[tuple[float, float]]]
+
+    def covariance(self, conditional: Array) -> Array:
+        """Return the joint covariance: linear beside the profiles, their secants along them."""
+        rows = np.array([self.row[n] for n in self.value]).reshape(len(self.value), -1)
+        joint = rows @ conditional @ rows.T
+        for k in range(len(next(iter(self.ends.values()), []))):
+            pairs = np.array([self.ends[n][k] for n in self.value])
+            # The end at which the quantities move most, measured by their own values.
+            size = np.abs(pairs) / np.maximum(np.abs(list(self.value.values())), 1e-12)[:, None]
+            secant = pairs[:, int(np.argmax(size.sum(axis=0)))] / NORMAL_95
+            joint = joint + np.outer(secant, secant)
+        return np.asarray(joint)
+
+    def interval(self, name: str, conditional: Array) -> tuple[float, float]:
+        """Return the 95 % interval: the ends of all profiles and the rest, in quadrature."""
+        rest = NORMAL_95**2 * float(self.row[name] @ conditional @ self.row[name])
+        low = high = rest
+        for pair in self.ends[name]:
+            low += min(0.0, *pair) ** 2
+            high += max(0.0, *pair) ** 2
+        return self.value[name] - float(np.sqrt(low)), self.value[name] + float(np.sqrt(high))
+
+
+def answer(
+    fit: Fit, fixed: Mapping[str, float], unseen_friction: float = 0.0, level: float = 0.0
+) -> Answer:
+    """Turn a fit into quantities.
+
+    Parameters
+    ----------
+    fit : Fit
+        Of any structure.
+    fixed : mapping of str to float
+        What the user gave.
+    unseen_friction : float
+        Standard deviation of a friction that the structure leaves out [V].
+    level : float
+        The voltage that lasted longest [V].
+
+    Returns
+    -------
+    Answer
+        Physical parameters are there for current, or where ``fixed`` leaves one solution.
+    """
+    structure, conditional = fit.structure, fit.conditional()
+    reported = _reported(structure)
+    values = _values(fit, fixed, reported, level)
+    joint = values.covariance(conditional)
+    if unseen_friction > 0:
+        joint += np.diag(np.square([_friction(n, fit) * unseen_friction for n in values.value]))
+    spread = dict(zip(values.value, np.sqrt(np.maximum(np.diag(joint), 0.0)), strict=True))
+    one_level = spread["dc_gain"] > LOOSE_QUANTITY.value * values.value["dc_gain"]
+    combinations = {}
+    for name in reported:
+        interval = values.interval(name, conditional)
+        if unseen_friction > 0:
+            reach = NORMAL_95 * spread[name]
+            interval = values.value[name] - reach, values.value[name] + reach
+        if one_level and name in TRADED:
+            combinations[name] = Quantity(None, None, _positive(name, interval), UNITS[name],
+                                          "unidentifiable")  # fmt: skip
+        elif name != "steady_speed" or one_level:
+            combinations[name] = _quantity(name, values.value[name], spread[name], interval)
+    parameters, loose = _parameters(fit, fixed, values, spread, combinations)
+    keep = [
+        i
+        for i, n in enumerate(values.value)
+        if (q := combinations.get(n) or parameters.get(n)) is not None and q.status == "estimated"
+    ]
+    names = tuple(values.value)
+    return Answer(
+        parameters,
+        combinations,
+        tuple(names[i] for i in keep),
+        joint[np.ix_(keep, keep)],
+        loose,
+        level if one_level else 0.0,
+    )
+
+
+def _values(fit: Fit, fixed: Mapping[str, float], reported: list[str], level: float) -> _Values:
+    matrix, free = fit.structure.matrix(), list(fit.structure.free())
+    there, gradients = _at(fit.z, fit.structure, level)
+    value = {n: there[n] for n in reported}
+    row = {n: gradients[n] @ matrix for n in reported}
+    known = _physical_rows(fit, fixed, matrix)
+    value |= {n: v for n, (v, _) in known.items()}
+    row |= {n: r for n, (_, r) in known.items()}
+    ends: dict[str, list[tuple[float, float]]] = {n: [] for n in value}
+    for profile in fit.profiles:
+        sides = []
+        for z in profile.ends:
+            moved, _ = _at(z, fit.structure, level)
+            step = (z - fit.z)[free]
+            sides.append({n: moved[n] - there[n] if n in reported else row[n] @ step
+                          for n in value})  # fmt: skip
+        for n in value:
+            ends[n].append((float(sides[0][n]), float(sides[1][n])))
+    return _Values(value, row, ends)
+
+
+def _at(
+    z: Array, structure: models.Structure, level: float
+) -> tuple[dict[str, float], dict[str, Array]]:
+    """Return the combinations of coordinates, the steady speed at a level among them."""
+    values, gradients = models.combinations(z, structure.order)
+    friction = "static_voltage" if level >= 0 else "static_voltage_reverse"
+    net = level - np.copysign(values[friction], level) - values["load_voltage"]
+    values["steady_speed"] = values["dc_gain"] * net
+    gradients["steady_speed"] = net * gradients["dc_gain"] - values["dc_gain"] * (
+        np.copysign(1.0, level) * gradients[friction] + gradients["load_voltage"]
+    )
+    return values, gradients
+
+
+def _parameters(
+    fit: Fit,
+    fixed: Mapping[str, float],
+    values: _Values,
+    spread: Mapping[str, float],
+    combinations: Mapping[str, Quantity],
+) -> tuple[dict[str, Quantity], tuple[str, ...]]:
+    parameters: dict[str, Quantity] = {}
+    loose = []
+    conditional = fit.conditional()
+    names = list(PHYSICAL)
+    if fit.structure.friction == "asymmetric" and "coulomb_friction_reverse" in values.value:
+        names.append("coulomb_friction_reverse")
+    for name in names:
+        if name in fixed:
+            parameters[name] = Quantity(float(fixed[name]), unit=UNITS[name], status="fixed")
+        elif name in values.value and not _too_loose(name, values.value[name], spread[name], fit):
+            interval = values.interval(name, conditional)
+            parameters[name] = _quantity(name, values.value[name], spread[name], interval)
+        else:
+            loose += [name] if name in values.value else []
+            parameters[name] = Quantity(None, unit=UNITS[name], status="unidentifiable")
+    if "delay" in fixed:
+        parameters["delay"] = Quantity(fixed["delay"], unit="s", status="fixed")
+    elif "delay" in combinations:
+        parameters["delay"] = combinations["delay"]
+    return parameters, tuple(loose)
+
+
+def _friction(name: str, fit: Fit) -> float:
+    """Return how much of a quantity a volt of Coulomb friction is."""
+    if name == "coulomb_friction" and fit.structure.current:
+        values, _ = models.physical(fit.z)
+        return values["motor_constant"] / values["resistance"]
+    return float(name == "static_voltage")
+
+
+def _reported(structure: models.Structure) -> list[str]:
+    names = ["dc_gain"]
+    if not structure.name.startswith("static_gain"):
+        names.append("time_constant")
+    if structure.order == 2:
+        names.append("time_constant_product")
+    names.append("static_voltage")
+    if structure.friction == "asymmetric":
+        names.append("static_voltage_reverse")
+    if structure.load:
+        names.append("load_voltage")
+    names.append("steady_speed")
+    if structure.delay or "delay" in structure.held:
+        names.append("delay")
+    if structure.window or "window" in structure.held:
+        names.append("averaging_window")
+    return names
+
+
+def _physical_rows(
+    fit: Fit, fixed: Mapping[str, float], matrix: Array
+) -> dict[str, tuple[float, Array]]:
+    """Return value and gradient (by the free coordinates) of each identifiable parameter."""
+    # R and L known and L/R fixed: what is left follows from the coefficients one by one.
+    electric = {"ln_r", "ln_te"} <= set(fit.structure.held)
+    if fit.structure.order != 2:
+        return {}
+    if fit.structure.current or electric:
+        values, gradients = models.physical(fit.z)
+        if values["motor_constant"] <= 0:
+            return {}
+        return {n: (values[n], gradients[n] @ matrix) for n in values if n not in fixed}
+    return solved_for(fit, fixed, matrix, fit.covariance())
+
+
+def _too_loose(name: str, value: float, std: float, fit: Fit) -> bool:
+    """Decide from the certainty; friction near nothing, known to be so, is an answer."""
+    if not np.isfinite(std) or not np.isfinite(value):
+        return True
+    if std < LOOSE_QUANTITY.value * abs(value):
+        return False
+    values, _ = models.physical(fit.z)
+    per = values["motor_constant"] / values["resistance"]
+    if name.startswith("coulomb_friction"):
+        return std > NEGLIGIBLE_FRICTION.value * per
+    if name == "viscous_friction":
+        return std > 0.02 * per * float(np.exp(fit.z[models.A0]))
+    return True
+
+
+def _positive(name: str, interval: tuple[float, float]) -> tuple[float, float]:
+    """Return an interval without what a quantity cannot be."""
+    if name in ("load_voltage", "steady_speed"):
+        return interval
+    return max(interval[0], 0.0), interval[1]
+
+
+def _quantity(name: str, value: float, std: float, interval: tuple[float, float]) -> Quantity:
+    return Quantity(float(value), float(std), _positive(name, interval), UNITS[name])

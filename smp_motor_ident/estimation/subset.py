@@ -1,0 +1,40 @@
+"""The parts of recordings that tell of a motor: rest before and after the excitation removed."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from smp_motor_ident.diagnosis.limits import REST
+from smp_motor_ident.record import Record
+
+MARGIN = 10  # samples of rest kept on either side
+
+
+def excited(record: Record) -> Record:
+    """Return a record without the rest before its first and after its last excitation.
+
+    Parameters
+    ----------
+    record : Record
+        Of one motor.
+
+    Returns
+    -------
+    Record
+        The same where it rests nowhere, or all the time.
+    """
+    moves = np.abs(record.voltage) > REST.value * np.abs(record.voltage).max()
+    for name in ("velocity", "position", "count"):
+        values = getattr(record, name)
+        if values is None:
+            continue
+        y = np.where(np.isfinite(values), values, 0.0)
+        y = np.abs(y) if name == "velocity" else np.abs(np.diff(y, prepend=y[0]))
+        moves |= y > REST.value * float(np.max(y))
+        break
+    busy = np.flatnonzero(moves)
+    if not busy.size:
+        return record
+    # An offset of the sensor, seen long enough at rest, would speak against any friction.
+    begin, end = max(0, int(busy[0]) - MARGIN), min(len(record), int(busy[-1]) + MARGIN + 1)
+    return record if begin == 0 and end == len(record) else record.slice(begin, end)

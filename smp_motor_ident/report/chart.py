@@ -1,0 +1,115 @@
+"""A chart as data: what the page's script draws to zoom into, and what is drawn for print."""
+
+from __future__ import annotations
+
+import base64
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.floating[Any]]
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """One line, row of points or row of bars over the chart's x.
+
+    Attributes
+    ----------
+    name : str
+        In the legend.
+    y : ndarray, shape (n,)
+        NaN where there is nothing.
+    color : str
+        CSS variable of the page.
+    low, high : ndarray, shape (n,), or None
+        Band around the line.
+    """
+
+    name: str
+    y: Array
+    color: str
+    kind: Literal["line", "points", "bars"] = "line"
+    low: Array | None = None
+    high: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Chart:
+    """Curves over one x.
+
+    Attributes
+    ----------
+    name : str
+        Identifier in the page.
+    title, x_label, y_label : str
+        In words, with units.
+    x : ndarray, shape (n,)
+        Increasing.
+    lines : tuple of float
+        Levels that are marked.
+    spans : tuple of (float, float, str)
+        Stretches of x with the CSS variable that shades them.
+    group : str
+        Charts of one group share cursor and zoom in x.
+    summary : str
+        What the chart shows, for those who cannot see it.
+    """
+
+    name: str
+    title: str
+    x_label: str
+    y_label: str
+    x: Array
+    curves: tuple[Curve, ...]
+    log: str = ""
+    lines: tuple[float, ...] = ()
+    spans: tuple[tuple[float, float, str], ...] = ()
+    group: str = ""
+    height: int = 260
+    summary: str = ""
+
+    def to_document(self) -> dict[str, Any]:
+        """Return what the page's script draws."""
+        return {
+            "name": self.name,
+            "labels": [self.x_label, self.y_label],
+            "x": _packed(self.x),
+            "curves": [
+                {
+                    "name": c.name,
+                    "color": c.color,
+                    "kind": c.kind,
+                    "y": _packed(c.y),
+                    "band": None
+                    if c.low is None or c.high is None
+                    else [_packed(c.low), _packed(c.high)],
+                }
+                for c in self.curves
+            ],
+            "log": self.log,
+            "lines": self.lines,
+            "spans": self.spans,
+            "group": self.group,
+            "height": self.height,
+        }
+
+
+def _packed(values: Array) -> str:
+    """Return numbers as base64 of little-endian float32: 5 bytes each, and quick to read."""
+    return base64.b64encode(np.asarray(values, dtype="<f4").tobytes()).decode()
+
+
+def thin(values: Array, points: int) -> NDArray[np.intp]:
+    """Return the indices of the smallest and largest value of each of ``points / 2`` stretches."""
+    if values.size <= points:
+        return np.arange(values.size)
+    size = -(-values.size // (points // 2))
+    rows = values[: values.size - values.size % size].reshape(-1, size)
+    begin = np.arange(rows.shape[0]) * size
+    low = np.where(np.isfinite(rows), rows, np.inf).argmin(axis=1)
+    high = np.where(np.isfinite(rows), rows, -np.inf).argmax(axis=1)
+    index = np.concatenate((begin + low, begin + high, [0, values.size - 1]))
+    return np.asarray(np.unique(index))

@@ -1,0 +1,171 @@
+"""A chart as SVG: for print, for a browser without script, and for figures in files."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from html import escape
+
+import numpy as np
+
+from smp_motor_ident.report.chart import Array, Chart, Curve, thin
+
+WIDTH = 720
+LEFT, RIGHT, TOP, BOTTOM = 64, 12, 8, 40
+POINTS = 600
+"""More than one point a pixel shows nothing more."""
+
+
+def svg(chart: Chart) -> str:
+    """Return the chart as an SVG element whose colours are CSS variables.
+
+    Parameters
+    ----------
+    chart : Chart
+        Of which line, points, bars, bands, levels and shaded spans are drawn.
+
+    Returns
+    -------
+    str
+        With ``role="img"`` and the chart's summary.
+    """
+    plane = _Plane(chart)
+    parts = [
+        f'<svg class="static" role="img" viewBox="0 0 {WIDTH} {chart.height}" '
+        f'aria-label="{escape(chart.summary or chart.title)}">'
+    ]
+    for begin, end, color in chart.spans:
+        x = plane.x(np.array([begin, end]))
+        parts.append(
+            f'<rect x="{x[0]:.0f}" y="{TOP}" width="{x[1] - x[0]:.0f}" '
+            f'height="{plane.bottom - TOP}" fill="var(--{color})"/>'
+        )
+    parts += plane.axes()
+    for level in chart.lines:
+        y = plane.y(np.array([level]))[0]
+        parts.append(_path(f"M{LEFT} {y:.1f}H{WIDTH - RIGHT}", "muted", 'stroke-dasharray="4 3"'))
+    for curve in chart.curves:
+        parts += plane.curve(curve)
+    return "".join([*parts, "</svg>"])
+
+
+def _path(way: str, color: str, more: str = "") -> str:
+    return f'<path d="{way}" fill="none" stroke="var(--{color})" {more}/>'
+
+
+class _Plane:
+    """From the chart's units to the drawing's."""
+
+    def __init__(self, chart: Chart) -> None:
+        self.chart = chart
+        self.bottom = chart.height - BOTTOM
+        values = [a for c in chart.curves for a in (c.y, c.low, c.high) if a is not None]
+        values.append(np.array(chart.lines))
+        self._x_range = _range([chart.x], "x" in chart.log, 0.0)
+        self._y_range = _range(values, "y" in chart.log, 0.05)
+
+    def x(self, values: Array) -> Array:
+        """Return horizontal places."""
+        return _place(values, self._x_range, "x" in self.chart.log, LEFT, WIDTH - RIGHT)
+
+    def y(self, values: Array) -> Array:
+        """Return vertical places."""
+        return _place(values, self._y_range, "y" in self.chart.log, self.bottom, TOP)
+
+    def axes(self) -> list[str]:
+        """Return grid, numbers and labels."""
+        parts = []
+        for tick in ticks(*self._x_range, "x" in self.chart.log):
+            x = self.x(np.array([tick]))[0]
+            parts.append(_path(f"M{x:.1f} {TOP}V{self.bottom}", "grid"))
+            parts.append(_text(x, self.bottom + 15, f"{tick:g}", "middle"))
+        for tick in ticks(*self._y_range, "y" in self.chart.log, 5):
+            y = self.y(np.array([tick]))[0]
+            parts.append(_path(f"M{LEFT} {y:.1f}H{WIDTH - RIGHT}", "grid"))
+            parts.append(_text(LEFT - 6, y + 4, f"{tick:g}", "end"))
+        middle = (TOP + self.bottom) / 2
+        parts.append(_text((LEFT + WIDTH) / 2, self.bottom + 33, self.chart.x_label, "middle"))
+        turned = f'transform="rotate(-90 14 {middle:.0f})"'
+        parts.append(_text(14, middle, self.chart.y_label, "middle", turned))
+        return parts
+
+    def curve(self, curve: Curve) -> list[str]:
+        """Return one curve with its band."""
+        parts = []
+        if curve.low is not None and curve.high is not None:
+            ok = np.isfinite(curve.low) & np.isfinite(curve.high)
+            x = self.x(self.chart.x[ok])
+            ring = (
+                np.concatenate((x, x[::-1])),
+                np.concatenate((self.y(curve.high[ok]), self.y(curve.low[ok])[::-1])),
+            )
+            way = _polyline(*ring)
+            parts.append(f'<path d="{way}" fill="var(--{curve.color})" fill-opacity=".2"/>')
+        keep = thin(curve.y, POINTS)
+        x, y = self.x(self.chart.x[keep]), self.y(curve.y[keep])
+        if curve.kind == "line":
+            parts.append(_path(_polyline(x, y), curve.color, 'stroke-width="1.4"'))
+            return parts
+        ok = np.isfinite(y)
+        if curve.kind == "bars":
+            zero = self.y(np.zeros(1))[0]
+            way = "".join(f"M{a:.1f} {zero:.1f}V{b:.1f}" for a, b in zip(x[ok], y[ok]))
+            parts.append(_path(way, curve.color, 'stroke-width="3"'))
+        else:
+            way = "".join(f"M{a:.1f} {b:.1f}h0" for a, b in zip(x[ok], y[ok]))
+            parts.append(_path(way, curve.color, 'stroke-width="5" stroke-linecap="round"'))
+        return parts
+
+
+def _range(values: Sequence[Array], log: bool, margin: float) -> tuple[float, float]:
+    everything = np.concatenate([np.ravel(v) for v in values])
+    everything = everything[np.isfinite(everything) & ((everything > 0) | (not log))]
+    if everything.size == 0:
+        return (0.1, 1.0) if log else (0.0, 1.0)
+    low, high = float(everything.min()), float(everything.max())
+    if low == high:
+        low, high = (low / 2, high * 2) if log else (low - 1.0, high + 1.0)
+    wide = 0.0 if log else margin * (high - low)
+    return low - wide, high + wide
+
+
+def _place(values: Array, ends: tuple[float, float], log: bool, first: float, last: float) -> Array:
+    low, high = ends
+    with np.errstate(invalid="ignore", divide="ignore"):
+        share = (
+            np.log(values / low) / math.log(high / low) if log else (values - low) / (high - low)
+        )
+    return np.asarray(first + np.clip(share, -0.02, 1.02) * (last - first))
+
+
+def ticks(low: float, high: float, log: bool = False, about: int = 8) -> list[float]:
+    """Return round numbers between two ends, about so many; powers of ten where logarithmic."""
+    if log:
+        powers = range(math.ceil(math.log10(low)), math.floor(math.log10(high)) + 1)
+        found = [10.0**k for k in powers]
+        if len(found) >= 2:
+            return found
+    rough = (high - low) / about
+    size = 10.0 ** math.floor(math.log10(rough))
+    step = next(m * size for m in (1, 2, 5, 10) if m * size >= rough)
+    first, last = math.ceil(low / step), math.floor(high / step)
+    return [round(k * step, 12) for k in range(first, last + 1)]
+
+
+def _polyline(x: Array, y: Array) -> str:
+    """Return a path that is interrupted where there is no value."""
+    way, down = [], False
+    for a, b in zip(x.tolist(), y.tolist()):
+        if b != b:
+            down = False
+            continue
+        way.append(f"{'L' if down else 'M'}{a:.1f} {b:.1f}")
+        down = True
+    return "".join(way)
+
+
+def _text(x: float, y: float, text: str, anchor: str, more: str = "") -> str:
+    return (
+        f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" font-size="11" '
+        f'fill="var(--muted)" {more}>{escape(text)}</text>'
+    )

@@ -1,0 +1,90 @@
+"""Gains for loops that others run: one file a target, in its own units and arithmetic."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from smp_motor_ident.result import Estimate
+from smp_motor_ident.tune.exports import (
+    arduino_pid,
+    linorobot2,
+    roboclaw,
+    ros2_controllers,
+    ros_arduino_bridge,
+    wpilib,
+)
+from smp_motor_ident.tune.exports.target import BAND, Check, Format, Gains, check
+from smp_motor_ident.tune.loop import Loop
+from smp_motor_ident.tune.wheels import Sets, design_wheels
+
+FORMATS: Mapping[str, Format] = {
+    module.FORMAT.name: module.FORMAT
+    for module in (
+        ros2_controllers,
+        linorobot2,
+        ros_arduino_bridge,
+        arduino_pid,
+        roboclaw,
+        wpilib,
+    )
+}
+"""Every target by its name."""
+
+
+def export(
+    name: str, estimates: Mapping[str, Estimate], loops: Mapping[str, Loop], **targets: Any
+) -> tuple[str, dict[str, Check]]:
+    """Design for a target's loop and return its text, with what it does there.
+
+    Parameters
+    ----------
+    name : str
+        One of :data:`FORMATS`.
+    estimates, loops : mapping of str to Estimate, to Loop
+        By wheel; the loops as the target runs them.
+    **targets
+        Of the method, beside the format's own.
+
+    Returns
+    -------
+    text : str
+        With comments on margins and on what is missing.
+    checks : dict of str to Check
+        By wheel.
+
+    Raises
+    ------
+    DesignError
+        When the demand cannot be met in that loop.
+    """
+    target = FORMATS[name]
+    sets: Sets = "one" if target.one_set else "each"
+    asked = {**target.targets, **targets}
+    wheels = design_wheels(estimates, loops, "margin", sets, together=False, **asked)
+    gains = {wheel: target.convert(one) for wheel, one in wheels.designs.items()}
+    checks = {wheel: check(one, gains[wheel]) for wheel, one in wheels.designs.items()}
+    mark = "//" if name in ("linorobot2", "ros_arduino_bridge", "arduino_pid") else "#"
+    head = [f"{target.title}, from {target.source}", f"not expressed: {'; '.join(target.missing)}"]
+    for wheel, one in checks.items():
+        m, step = one.margins, one.step
+        head.append(
+            f"{wheel} at {wheels.designs[wheel].loop.rate:.4g} Hz: phase margin {m.phase:.0f} deg, "
+            f"gain margin {m.gain:.2f}, Ms {m.sensitivity:.2f}; an abrupt change by half of the "
+            f"largest speed {_settles(one)}, overshoot {step.overshoot:.2g} %"
+        )
+        head.extend(f"  {words}" for words in wheels.designs[wheel].warnings)
+    text = "".join(f"{mark} {line}\n" for line in head)
+    return text + target.render(wheels.designs, gains), checks
+
+
+def _settles(one: Check) -> str:
+    if one.resting_error > BAND:
+        return f"rests within {one.resting_error:.1%} of it, as whole numbers allow"
+    if math.isnan(one.step.settling):
+        return "does not settle within 2 %"
+    return f"settles in {one.step.settling:.3g} s"
+
+
+__all__ = ["FORMATS", "Check", "Format", "Gains", "check", "export"]

@@ -1,0 +1,52 @@
+"""Arduino PID_v1: PWM of wheel rad/s, proportional on error.
+
+References
+----------
+github.com/br3ttb/Arduino-PID-Library, PID_v1: the sum of ``Ki T e``, with the present error, and
+the output are both kept within the limits; ``Kp`` on the error, ``Kd`` on the measurement.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from smp_motor_ident.tune.designer import Design
+from smp_motor_ident.tune.exports.target import Format, Gains, present_error, rounded
+from smp_motor_ident.tune.feedback import Feedback
+
+LIMIT = 255
+
+
+def _convert(design: Design) -> Gains:
+    loop, T = design.loop, design.loop.sample_time
+    scale = LIMIT / loop.supply_voltage * loop.gear_ratio
+    wanted = present_error(design.feedback, T)
+    p, i = rounded(max(wanted.p, 0.0) * scale), rounded(wanted.i * scale)
+    feedback = Feedback((p + i * T) / scale, i / scale)
+    numbers = {"Kp": p, "Ki": i, "Kd": 0.0, "SampleTime": round(1e3 * T)}
+    return Gains(numbers, feedback)
+
+
+def _render(designs: Mapping[str, Design], gains: Mapping[str, Gains]) -> str:
+    lines = []
+    for wheel, one in gains.items():
+        n = one.numbers
+        lines += [
+            f"// {wheel}: input and set-point in rad/s of the wheel, output in PWM",
+            f"PID {wheel}_pid(&{wheel}_speed, &{wheel}_pwm, &{wheel}_target, "
+            f"{n['Kp']!r}, {n['Ki']!r}, {n['Kd']!r}, P_ON_E, DIRECT);",
+            f"// in setup(): {wheel}_pid.SetOutputLimits(-{LIMIT}, {LIMIT}); "
+            f"{wheel}_pid.SetSampleTime({n['SampleTime']}); {wheel}_pid.SetMode(AUTOMATIC);",
+        ]
+    return "\n".join(lines) + "\n"
+
+
+FORMAT = Format(
+    "arduino_pid",
+    "Arduino PID_v1 (PWM of wheel rad/s)",
+    "github.com/br3ttb/Arduino-PID-Library",
+    100.0,
+    _convert,
+    _render,
+    ("feed-forward", "the planned reference", "anti-windup beyond limits of the sum"),
+)

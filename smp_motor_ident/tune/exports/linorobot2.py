@@ -1,0 +1,47 @@
+"""linorobot2: PWM of wheel RPM, every 20 ms, one set for all wheels.
+
+References
+----------
+github.com/linorobot/linorobot2_hardware, firmware: configuration ``K_P``, ``K_I``, ``K_D``,
+``PWM_BITS``.  ``pwm = K_P e + K_I sum(e) + K_D (e - e_before)``, the sum with the present error and
+without a limit, the output within ``+-(2^PWM_BITS - 1)``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from smp_motor_ident.tune.designer import Design
+from smp_motor_ident.tune.exports.target import Format, Gains, present_error, rounded
+from smp_motor_ident.tune.feedback import Feedback
+
+PWM_BITS = 10
+
+
+def _convert(design: Design) -> Gains:
+    loop, T = design.loop, design.loop.sample_time
+    # PWM per RPM of the wheel, from volts per rad/s of the motor.
+    scale = (2**PWM_BITS - 1) / loop.supply_voltage * loop.gear_ratio * 2 * math.pi / 60
+    wanted = present_error(design.feedback, T)
+    p, i = rounded(max(wanted.p, 0.0) * scale), rounded(wanted.i * T * scale)
+    feedback = Feedback((p + i) / scale, i / T / scale)
+    return Gains({"K_P": p, "K_I": i, "K_D": 0.0}, feedback)
+
+
+def _render(designs: Mapping[str, Design], gains: Mapping[str, Gains]) -> str:
+    numbers = next(iter(gains.values())).numbers
+    lines = [f"#define PWM_BITS {PWM_BITS}"]
+    return "\n".join([*lines, *(f"#define {n} {v!r}" for n, v in numbers.items())]) + "\n"
+
+
+FORMAT = Format(
+    "linorobot2",
+    "linorobot2 firmware (PWM of wheel RPM)",
+    "github.com/linorobot/linorobot2_hardware",
+    50.0,
+    _convert,
+    _render,
+    ("feed-forward", "anti-windup", "the planned reference"),
+    one_set=True,
+)

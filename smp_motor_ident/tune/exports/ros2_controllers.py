@@ -1,0 +1,63 @@
+"""ros2_controllers: ``pid_controller`` with the gains of control_toolbox, Jazzy.
+
+References
+----------
+control.ros.org/jazzy: ros2_controllers, pid_controller user documentation; control_toolbox, class
+Pid.  The integral is forward Euler and used one step later, as in the running loop of this package.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import yaml
+
+from smp_motor_ident.tune.designer import Design
+from smp_motor_ident.tune.exports.target import Format, Gains, rounded
+from smp_motor_ident.tune.feedback import Feedback
+
+
+def _convert(design: Design) -> Gains:
+    ratio, supply = design.loop.gear_ratio, design.loop.supply_voltage
+    p, i = (rounded(design.feedback.p * ratio), rounded(design.feedback.i * ratio))
+    tracking = rounded(p / i)
+    numbers = {
+        "p": p, "i": i, "d": 0.0, "u_clamp_max": supply, "u_clamp_min": -supply,
+        "tracking_time_constant": tracking, "feedforward_gain": 0.0,
+    }  # fmt: skip
+    feedback = Feedback(p / ratio, i / ratio)
+    return Gains(numbers, feedback, tracking=tracking)
+
+
+def _render(designs: Mapping[str, Design], gains: Mapping[str, Gains]) -> str:
+    joints = [f"{wheel}_wheel_joint" for wheel in designs]
+    rate = math.floor(next(iter(designs.values())).loop.rate)
+    parameters = {
+        "dof_names": joints,
+        "command_interface": "voltage",
+        "reference_and_state_interfaces": ["velocity"],
+        "enable_feedforward": False,
+        "gains": {
+            joint: {**one.numbers, "antiwindup_strategy": "back_calculation"}
+            for joint, one in zip(joints, gains.values(), strict=True)
+        },
+    }
+    manager = {"update_rate": rate, "pid_controller": {"type": "pid_controller/PidController"}}
+    tree = {
+        "controller_manager": {"ros__parameters": manager},
+        "pid_controller": {"ros__parameters": parameters},
+    }
+    return yaml.safe_dump(tree, sort_keys=False)
+
+
+FORMAT = Format(
+    "ros2_controllers",
+    "ros2_controllers pid_controller (volts of wheel rad/s)",
+    "control.ros.org/jazzy, pid_controller and control_toolbox",
+    100.0,
+    _convert,
+    _render,
+    ("the planned reference, and without it feed-forward: an abrupt one would overshoot",),
+    counts=False,
+)

@@ -1,0 +1,175 @@
+"""What an export is: numbers for another loop, what they do in it, and what it cannot express."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from smp_motor_ident.tune.designer import Design
+from smp_motor_ident.tune.feedback import Feedback
+from smp_motor_ident.tune.loop import Loop
+from smp_motor_ident.tune.margins import Margins, loop_margins
+from smp_motor_ident.tune.motors import Motors
+from smp_motor_ident.tune.plant import Plant, sample
+from smp_motor_ident.tune.reference import CHANGE
+from smp_motor_ident.tune.simulation import Controller, StepFigures, simulate, step_figures
+
+
+@dataclass(frozen=True)
+class Gains:
+    """Numbers in a target's own units, and what they are at the motor shaft.
+
+    Attributes
+    ----------
+    numbers : mapping of str to float
+        As the target takes them.
+    feedback : Feedback
+        The same, as rounded, as the feedback of the running loop.
+    weight : float
+        Of the set-point in the proportional action [-].
+    static, velocity : float
+        Feed-forward [V], [V s/rad].
+    tracking : float
+        Time constant of anti-windup that comes nearest to the target's [s].
+    resting_error : float
+        Below which whole numbers let an error be [rad/s, motor].
+    """
+
+    numbers: Mapping[str, float]
+    feedback: Feedback
+    weight: float = 1.0
+    static: float = 0.0
+    velocity: float = 0.0
+    tracking: float = math.inf
+    resting_error: float = 0.0
+
+
+@dataclass(frozen=True)
+class Format:
+    """One loop that others run.
+
+    Attributes
+    ----------
+    name, title, source : str
+        Keyword, words for people, and where its arithmetic is documented.
+    rate : float
+        Steps per second, unless the user says otherwise [Hz].
+    convert : callable
+        From a design to the target's numbers.
+    render : callable
+        From the numbers of all wheels to the text that the target takes.
+    missing : tuple of str
+        What of a design it cannot express.
+    counts : bool
+        Whether it makes its speed from counts, over one of its intervals.
+    one_set : bool
+        Whether all wheels share their numbers.
+    targets : mapping of str to str
+        What the method is asked for.
+    """
+
+    name: str
+    title: str
+    source: str
+    rate: float
+    convert: Callable[[Design], Gains]
+    render: Callable[[Mapping[str, Design], Mapping[str, Gains]], str]
+    missing: tuple[str, ...]
+    counts: bool = True
+    one_set: bool = False
+    targets: Mapping[str, str] = field(
+        default_factory=lambda: {"structure": "pi", "focus": "tracking"}
+    )
+
+
+@dataclass(frozen=True)
+class Check:
+    """What exported numbers do in the target's loop.
+
+    Attributes
+    ----------
+    margins : Margins
+        Of that loop.
+    step : StepFigures
+        Of an abrupt change of set-point from rest by half of the largest speed; no settling time
+        where it may rest beyond 2 %.
+    resting_error : float
+        Share of that change by which it may rest beside it [-].
+    """
+
+    margins: Margins
+    step: StepFigures
+    resting_error: float
+
+
+BAND = 0.02
+"""Within which a change of set-point counts as settled."""
+
+
+def plant_of(design: Design, loop: Loop) -> Plant:
+    """Return the sampled motor that a design is for."""
+    a0 = 1 / design.motor["dc_gain"]
+    a1, a2 = a0 * design.motor["time_constant"], a0 * design.motor["time_constant_product"]
+    values = (a0, a1, a2, design.motor["delay"], design.motor["static_voltage"])
+    sensor = (design.sensor["averaging_window"], design.sensor["sensor_lag"])
+    return sample(Motors(*(np.array([x]) for x in (*values, *sensor))), loop)
+
+
+def check(design: Design, gains: Gains) -> Check:
+    """Compute margins and step response of the loop that the target runs.
+
+    Parameters
+    ----------
+    design : Design
+        That the gains come from.
+    gains : Gains
+        As exported.
+
+    Returns
+    -------
+    Check
+    """
+    loop = design.loop
+    plant = plant_of(design, loop)
+    target = CHANGE * design.reference.max_velocity
+    time = loop.sample_time * np.arange(int(duration(design, gains) / loop.sample_time))
+    controller = Controller(
+        gains.feedback, weight=gains.weight, limit=loop.supply_voltage, tracking=gains.tracking
+    )
+    forward = np.full(time.size, gains.static + gains.velocity * target)
+    friction = np.array([design.motor["static_voltage"]])
+    run = simulate(
+        plant, controller, np.full(time.size, target), forward=forward, friction=friction
+    )
+    step = step_figures(time, run.speed[0], run.voltage[0], target)
+    if gains.resting_error > BAND * target:
+        step = replace(step, settling=math.nan)
+    return Check(loop_margins(plant, gains.feedback), step, gains.resting_error / target)
+
+
+def duration(design: Design, gains: Gains) -> float:
+    """Return how long a change of set-point is looked at, tail of the integral included [s]."""
+    fb, a0 = gains.feedback, 1 / design.motor["dc_gain"]
+    tail = 8 * (fb.p + a0) / fb.i if fb.i > 0 else 0.0
+    return float(0.5 + 12 * design.motor["time_constant"] + tail)
+
+
+def present_error(feedback: Feedback, sample_time: float) -> Feedback:
+    """Return the gains for an integral that has the present error in it already.
+
+    ``p e + I + i T e`` is ``(p + i T) e + I``: of the proportional gain so much is there.
+    """
+    return Feedback(feedback.p - feedback.i * sample_time, feedback.i)
+
+
+def ticks(loop: Loop) -> float:
+    """Return the counts of a motor radian."""
+    return 1 / loop.count_angle if loop.count_angle else math.nan
+
+
+def rounded(value: float, digits: int = 5) -> float:
+    """Return a number as it is printed."""
+    return float(f"{value:.{digits}g}")

@@ -1,0 +1,230 @@
+"""How a design performs in simulation: figures of the nominal loop, and bands over the ensemble."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from smp_motor_ident.tune.arrays import Array
+from smp_motor_ident.tune.case import Case
+from smp_motor_ident.tune.feedback import Feedback
+from smp_motor_ident.tune.margins import Margins
+from smp_motor_ident.tune.plant import Plant, sample
+from smp_motor_ident.tune.problem import Problem
+from smp_motor_ident.tune.reference import CHANGE, Reference, planned_change
+from smp_motor_ident.tune.simulation import (
+    Controller,
+    load_figures,
+    simulate,
+    step_figures,
+)
+
+
+@dataclass(frozen=True)
+class Performance:
+    """What the simulated loop does; speeds at the motor shaft.
+
+    Attributes
+    ----------
+    rise, settling : float
+        Of a set-point step through the reference [s]: 10 to 90 %, and until within 2 %.
+    overshoot : float
+        Of the same [%].
+    step_settling, step_overshoot : float
+        The same for an abrupt step with the feedback gains alone.
+    load_peak : float
+        Speed lost per volt of load [rad/s/V].
+    load_integral : float
+        Integral of the magnitude of the error per volt of load [rad/V].
+    load_recovery : float
+        Until a tenth of the loss is left [s].
+    peak_voltage : float
+        Largest voltage of the set-point step [V].
+    control_noise : float
+        Voltage from quantisation at constant speed [V rms].
+    """
+
+    rise: float
+    settling: float
+    overshoot: float
+    step_settling: float
+    step_overshoot: float
+    load_peak: float
+    load_integral: float
+    load_recovery: float
+    peak_voltage: float
+    control_noise: float
+
+
+def measure(
+    problem: Problem,
+    usual: Plant,
+    controller: Controller,
+    reference: Reference,
+    control_noise: float,
+) -> Performance:
+    """Simulate set-point and load steps of one design.
+
+    Parameters
+    ----------
+    problem : Problem
+        Plant and loop.
+    usual : Plant
+        The same plant with the delay that is usual, for the set-point step.
+    controller : Controller
+        The design.
+    reference : Reference
+        How set-points change.
+    control_noise : float
+        From :func:`smp_motor_ident.tune.problem.control_noise` [V rms].
+
+    Returns
+    -------
+    Performance
+    """
+    fb = controller.feedback
+    change = CHANGE * reference.max_velocity
+    time = _instants(problem, fb, reference)
+    plan = planned_change(usual, reference, change, time)
+    run = simulate(usual, controller, plan.low, high=plan.high, forward=plan.forward)
+    planned = step_figures(time, run.speed[0], run.voltage[0], change)
+    # Small, so that saturation does not hide the loop.
+    alone = Controller(fb)
+    run_step = simulate(problem.plant, alone, np.ones(time.size))
+    abrupt = step_figures(time, run_step.speed[0], run_step.voltage[0], 1.0)
+    pushed = simulate(problem.plant, alone, np.zeros(time.size), load=np.ones(time.size))
+    load = load_figures(time, pushed.speed[0])
+    return Performance(
+        rise=planned.rise,
+        settling=planned.settling,
+        overshoot=planned.overshoot,
+        step_settling=abrupt.settling,
+        step_overshoot=abrupt.overshoot,
+        load_peak=load.peak,
+        load_integral=load.integral,
+        load_recovery=load.recovery,
+        peak_voltage=planned.peak_voltage,
+        control_noise=control_noise,
+    )
+
+
+@dataclass(frozen=True)
+class Band:
+    """A figure of the nominal loop, and the least and largest over the motors that may be.
+
+    Attributes
+    ----------
+    value, low, high : float
+        NaN where there is none, such as a settling time of a loop that does not settle.
+    """
+
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Specification:
+    """What the loop does to a change of set-point from rest, and its margins, in bands.
+
+    Simulated with counts, dry friction and the usual delay, over draws of all that the estimate
+    leaves open; the margins bear the longest delay.
+
+    Attributes
+    ----------
+    samples : int
+        Motors that the bands are over; 0 where the estimate has no uncertainty.
+    change : float
+        Of the set-point [rad/s, motor].
+    overshoot : Band
+        [%].
+    settling : Band
+        Until within 2 % [s].
+    phase_margin, gain_margin, sensitivity : Band
+        [deg], [-], [-].
+    """
+
+    samples: int
+    change: float
+    overshoot: Band
+    settling: Band
+    phase_margin: Band
+    gain_margin: Band
+    sensitivity: Band
+
+
+DRAWS = 300
+"""Motors that the bands of a specification are over, fewer where a change takes many samples."""
+
+WORK, FEWEST = 1e6, 100
+"""Samples that are simulated for a specification, and least motors."""
+
+
+def specify(
+    case: Case, controller: Controller, reference: Reference, margins: Margins, figures: Performance
+) -> Specification:
+    """Simulate the loop over the motors that the estimate allows.
+
+    Parameters
+    ----------
+    case : Case
+        With the ensemble.
+    controller : Controller
+        The design.
+    reference : Reference
+        How set-points change.
+    margins, figures : Margins, Performance
+        Of the nominal loop.
+
+    Returns
+    -------
+    Specification
+    """
+    problem, known = case.problem, case.friction.known
+    nominal, loop = problem.plant.motors, replace(problem.loop, delay=problem.loop.expected_delay)
+    change = CHANGE * reference.max_velocity
+    usual = sample(nominal, loop)
+    time = _instants(problem, controller.feedback, reference)
+    plan = planned_change(usual, reference, change, time)
+    drawn = case.ensemble.plant.motors.first(max(int(min(DRAWS, WORK / time.size)), FEWEST))
+    plant = sample(drawn, loop, believed=nominal) if case.drawn else usual
+    run = simulate(
+        plant,
+        controller,
+        plan.low,
+        high=plan.high,
+        forward=plan.forward + known * np.sign(plan.reference + plan.forward),
+        count_angle=0.0 if np.any(plant.motors.sensor_lag > 0) else loop.count_angle,
+        friction=drawn.static_voltage if case.drawn else np.array([known]),
+        modelled=known,
+    )
+    each = [
+        step_figures(time, speed, volts, change)
+        for speed, volts in zip(run.speed, run.voltage, strict=True)
+    ]
+    found = case.ensemble.margins(controller.feedback)
+    return Specification(
+        samples=len(each) if case.drawn else 0,
+        change=change,
+        overshoot=_band(figures.overshoot, [one.overshoot for one in each]),
+        settling=_band(figures.settling, [one.settling for one in each]),
+        phase_margin=_band(margins.phase, found.phase),
+        gain_margin=_band(margins.gain, found.gain),
+        sensitivity=_band(margins.sensitivity, found.sensitivity),
+    )
+
+
+def _band(value: float, over: Sequence[float] | Array) -> Band:
+    both = np.append(np.asarray(over, dtype=np.float64), value)
+    return Band(value, float(both.min()), float(both.max()))
+
+
+def _instants(problem: Problem, fb: Feedback, reference: Reference) -> Array:
+    """Return the instants over which a change of set-point is simulated, until it is over."""
+    T = problem.loop.sample_time
+    span = reference.transition_time + 8 * problem.reduced.time_constant
+    if fb.i > 0:
+        span += 4 * (fb.p + 1 / problem.reduced.gain) / fb.i
+    return T * np.arange(min(max(int(span / T), 50), 20_000))

@@ -1,0 +1,143 @@
+"""Headless Chromium as a test drives it: over a pipe, by its own protocol, without a network."""
+
+from __future__ import annotations
+
+import base64
+import itertools
+import json
+import os
+import select
+import shutil
+import subprocess
+import time
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+CHROMIUM = next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), ""
+)
+
+
+class Browser:
+    """One page of a browser, and all that it asked for or complained about.
+
+    Parameters
+    ----------
+    profile : Path
+        Folder for what the browser writes.
+    """
+
+    def __init__(self, profile: Path) -> None:
+        mine, its = os.pipe(), os.pipe()  # commands go out, answers come in
+        self._out, self._in = mine[1], its[0]
+        arguments = [
+            "--headless",
+            "--no-sandbox",
+            "--disable-gpu",
+            "--disable-background-networking",
+            "--disable-component-update",
+            "--disable-sync",
+            "--no-first-run",
+            "--remote-debugging-pipe",
+            "--host-resolver-rules=MAP * 0.0.0.0",
+        ]
+        self._process = subprocess.Popen(
+            ["bash", "-c", f'exec "$@" 3<&{mine[0]} 4>&{its[1]}', "bash", CHROMIUM, *arguments,
+             f"--user-data-dir={profile}", "about:blank"],
+            pass_fds=(mine[0], its[1]), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL, start_new_session=True,
+        )  # fmt: skip
+        os.close(mine[0])
+        os.close(its[1])
+        self._numbers = itertools.count(1)
+        self._rest = b""
+        self._session = ""
+        self.complaints: list[str] = []
+        self.requests: list[str] = []
+
+    def __enter__(self) -> Browser:
+        target = self._page()
+        attached = self.ask("Target.attachToTarget", targetId=target, flatten=True)
+        self._session = attached["sessionId"]
+        for domain in ("Page", "Runtime", "Log", "Network"):
+            self.ask(f"{domain}.enable")
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._process.kill()
+        self._process.wait()
+        os.close(self._out)
+        os.close(self._in)
+
+    def _page(self) -> str:
+        """The first page, which may need a moment to appear."""
+        for _ in range(200):
+            for one in self.ask("Target.getTargets")["targetInfos"]:
+                if one["type"] == "page":
+                    return str(one["targetId"])
+        raise AssertionError("the browser opened no page")
+
+    def ask(self, method: str, **parameters: Any) -> dict[str, Any]:
+        """Send one command and return its result."""
+        number = next(self._numbers)
+        message = {"id": number, "method": method, "params": parameters}
+        if self._session:
+            message["sessionId"] = self._session
+        os.write(self._out, json.dumps(message).encode() + b"\0")
+        while True:
+            answer = self._read()
+            if answer.get("id") == number:
+                assert "error" not in answer, answer
+                return dict(answer["result"])
+
+    def _read(self, patience: float = 60.0) -> dict[str, Any]:
+        deadline = time.monotonic() + patience
+        while b"\0" not in self._rest:
+            ready, _, _ = select.select([self._in], [], [], deadline - time.monotonic())
+            assert ready, "the browser does not answer"
+            self._rest += os.read(self._in, 1 << 20)
+        line, _, self._rest = self._rest.partition(b"\0")
+        message: dict[str, Any] = json.loads(line)
+        self._note(message)
+        return message
+
+    def _note(self, message: dict[str, Any]) -> None:
+        given = message.get("params", {})
+        if message.get("method") == "Network.requestWillBeSent":
+            self.requests.append(given["request"]["url"])
+        elif message.get("method") == "Runtime.exceptionThrown":
+            self.complaints.append(str(given["exceptionDetails"]))
+        elif message.get("method") == "Log.entryAdded":
+            self.complaints.append(given["entry"]["text"])
+        elif message.get("method") == "Runtime.consoleAPICalled" and given["type"] == "error":
+            self.complaints.append(str(given["args"]))
+
+    def open(self, path: Path, width: int, *, dark: bool = False, height: int = 900) -> None:
+        """Show a file at a width, and wait until it is loaded."""
+        self.ask(
+            "Emulation.setDeviceMetricsOverride",
+            width=width, height=height, deviceScaleFactor=1, mobile=width < 500,
+        )  # fmt: skip
+        scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
+        self.ask("Emulation.setEmulatedMedia", features=[scheme])
+        self.ask("Page.navigate", url=path.as_uri())
+        while self._read().get("method") != "Page.loadEventFired":
+            pass
+
+    def value(self, expression: str) -> Any:
+        """Return the value of a JavaScript expression."""
+        answer = self.ask("Runtime.evaluate", expression=expression, returnByValue=True)
+        return answer["result"].get("value")
+
+    def picture(self, path: Path) -> None:
+        """Write what is shown as PNG, the whole page."""
+        size = self.ask("Page.getLayoutMetrics")["cssContentSize"]
+        clip = {**{k: size[k] for k in ("x", "y", "width", "height")}, "scale": 1}
+        shot = self.ask("Page.captureScreenshot", clip=clip, captureBeyondViewport=True)
+        path.write_bytes(base64.b64decode(shot["data"]))

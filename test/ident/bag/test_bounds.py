@@ -1,0 +1,137 @@
+"""What spoilt and hostile files may cost: bounded memory, one line, no traceback."""
+
+from __future__ import annotations
+
+import importlib.util
+import random
+import resource
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import lz4.frame
+import numpy as np
+import pytest
+import zstandard
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+
+from smp_motor_ident.bag import read_records
+from smp_motor_ident.errors import BagError
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+def _fuzz() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("fuzz", ROOT / "benchmarks" / "fuzz.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["fuzz"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+FUZZ = _fuzz()
+
+
+@pytest.mark.parametrize("name", list(FUZZ.SEEDS))
+def test_a_sound_file_of_every_format_is_an_answer(tmp_path: Path, name: str) -> None:
+    FUZZ.SOUND.update({key: FUZZ.SEEDS[key][1]() for key in {name, "mcap", "sqlite"}})
+    assert FUZZ.outcome(name, FUZZ.SOUND[name], tmp_path) == "answer"
+
+
+@pytest.mark.parametrize("name", list(FUZZ.SEEDS))
+@settings(
+    max_examples=15,
+    deadline=10_000,  # ms: a hang
+    phases=[Phase.generate],
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+@given(seed=st.integers(0, 2**32))
+def test_a_spoilt_file_gives_an_answer_or_one_line(tmp_path: Path, name: str, seed: int) -> None:
+    if name not in FUZZ.SOUND:
+        FUZZ.SOUND.update({key: FUZZ.SEEDS[key][1]() for key in {name, "mcap", "sqlite"}})
+    spoilt = FUZZ.spoil(FUZZ.SOUND[name], random.Random(seed))
+    assert FUZZ.outcome(name, spoilt, tmp_path) in ("answer", "partial", "refused")
+
+
+def bomb(kind: str, size: int) -> bytes:
+    """Return a compressed MCAP file of zeros behind its magic."""
+    head = b"\x89MCAP0\r\n"
+    if kind == "lz4":
+        return lz4.frame.compress(head + bytes(size), store_size=True)
+    return zstandard.ZstdCompressor(level=19).compress(head + bytes(size))
+
+
+@pytest.mark.parametrize("kind", ["zstd", "lz4"])
+def test_a_bomb_is_refused_within_bounded_memory(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / f"bag.mcap.{kind}"
+    path.write_bytes(bomb(kind, 400_000_000))
+    code = (
+        "import sys, resource\n"
+        "from smp_motor_ident.bag import read_records\n"
+        "from smp_motor_ident.errors import BagError\n"
+        "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
+        "try:\n    read_records(sys.argv[1])\n"
+        "except BagError as error:\n    print(error)\n"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(path)],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=ROOT,
+    )
+    message, kilobytes = done.stdout.splitlines()
+    assert "SMP_BAG_UNPACKED" in message and path.name in message
+    assert int(kilobytes) < 100_000  # unpacked on disk, a piece at a time
+
+
+def test_the_limit_can_be_raised_and_lowered(
+    tmp_path: Path, corpus: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    truth = corpus.motion()
+    plain = corpus.write_mcap(tmp_path / "plain.mcap", truth.messages())
+    path = tmp_path / "bag.mcap.zstd"
+    path.write_bytes(zstandard.compress(plain.read_bytes()))
+    monkeypatch.setenv("SMP_BAG_UNPACKED", "10K")
+    with pytest.raises(BagError, match="SMP_BAG_UNPACKED"):
+        read_records(path)
+    monkeypatch.setenv("SMP_BAG_UNPACKED", "1G")
+    corpus.assert_read(read_records(path)["front_left"], truth)
+    monkeypatch.setenv("SMP_BAG_UNPACKED", "much")
+    with pytest.raises(BagError, match="'MUCH'"):
+        read_records(path)
+
+
+def test_an_lz4_frame_that_lies_about_its_size_takes_no_memory(tmp_path: Path) -> None:
+    frame = bytearray(lz4.frame.compress(b"\x89MCAP0\r\n" + bytes(1000), store_size=True))
+    frame[6:14] = (4_400_000_000).to_bytes(8, "little")  # the checksum of the head fails, too
+    path = tmp_path / "bag.mcap.lz4"
+    path.write_bytes(bytes(frame))
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(BagError):
+        read_records(path)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # kB
+
+
+def test_the_second_frame_of_a_compressed_chunk_is_read(
+    tmp_path: Path, corpus: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import mcap.writer
+
+    once = zstandard.compress
+
+    def two_frames(data: bytes) -> bytes:
+        half = len(data) // 2
+        return bytes(once(data[:half]) + once(data[half:]))
+
+    monkeypatch.setattr(mcap.writer.zstandard, "compress", two_frames, raising=False)
+    truth = corpus.motion(n=100)
+    zstd = mcap.writer.CompressionType.ZSTD
+    path = corpus.write_mcap(tmp_path / "bag.mcap", truth.messages(), compression=zstd)
+    record = read_records(path)["front_left"]
+    corpus.assert_read(record, truth)
+    np.testing.assert_array_equal(record.voltage, truth.voltage)

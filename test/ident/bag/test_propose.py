@@ -1,0 +1,109 @@
+"""Mappings are proposed of signals that behave as what they are called, and tried before."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from smp_motor_ident.bag import list_topics, read_records
+
+N = 600
+T = 0.01 * np.arange(N)
+
+
+def motor(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return voltage and speed of a first-order motor with noise, 20 rad/s/V and 0.1 s."""
+    rng = np.random.default_rng(seed)
+    voltage = np.repeat(rng.uniform(-6, 6, N // 20), 20)
+    speed = np.zeros(N)
+    for k in range(1, N):
+        speed[k] = speed[k - 1] + (1 - np.exp(-0.1)) * (20 * voltage[k - 1] - speed[k - 1])
+    return voltage, speed + rng.normal(0, 0.5, N)
+
+
+def write(path: Path, **columns: Sequence[float]) -> Path:
+    rows = zip(*columns.values())
+    lines = [";".join(columns), *(";".join(repr(float(v)) for v in row) for row in rows)]
+    path.write_text("\n".join(lines))
+    return path
+
+
+def test_a_bag_of_two_wheels_is_mapped_and_the_pwms_full_scale_asked_for(
+    tmp_path: Path, corpus: SimpleNamespace
+) -> None:
+    (u, y), (v, z) = motor(1), motor(2)
+    number, joints = "std_msgs/msg/Float64", "sensor_msgs/msg/JointState"
+    twist = "geometry_msgs/msg/Twist"
+    vector = corpus.TYPES.types["geometry_msgs/msg/Vector3"]
+    sent = []
+    for k in range(N):
+        at = corpus.START + round(1e9 * T[k])
+        for topic, value in (("/left/pwm", u[k]), ("/right/pwm", v[k])):
+            data = corpus.serialized(number, data=float(round(value / 12 * 32767)))
+            sent.append(corpus.Sent(topic, number, at, data))
+        speeds = np.array([y[k], z[k]])
+        data = corpus.serialized(
+            joints,
+            header=corpus.header(at),
+            name=["left_wheel", "right_wheel"],
+            position=np.zeros(0),
+            velocity=speeds,
+            effort=np.zeros(0),
+        )
+        sent.append(corpus.Sent("/joint_states", joints, at, data))
+        data = corpus.serialized(
+            twist, linear=vector(u[k], 0.0, 0.0), angular=vector(0.0, 0.0, 0.0)
+        )
+        sent.append(corpus.Sent("/cmd_vel", twist, at, data))
+    listing = list_topics(corpus.write_mcap(tmp_path / "bag.mcap", sent))[0]
+    assert listing.suggestion == [
+        "left.voltage=/left/pwm.data:pwm",
+        "left.velocity=/joint_states.velocity[left_wheel]",
+        "right.voltage=/right/pwm.data:pwm",
+        "right.velocity=/joint_states.velocity[right_wheel]",
+    ]
+    assert [text.partition("=")[0] for text in listing.asked] == [
+        "pwm_full_scale",
+        "supply_voltage",
+    ]
+    given = [*listing.suggestion, "pwm_full_scale=32767", "supply_voltage=12"]
+    records = read_records(tmp_path / "bag.mcap", given)
+    np.testing.assert_allclose(records["right"].velocity, z)
+    # One step of 32767 ticks of 12 V.
+    np.testing.assert_allclose(records["left"].voltage[1:], u[:-1], atol=12 / 32767)
+
+
+@pytest.mark.parametrize(
+    ("names", "suggestion"),
+    [
+        (("Zeit", "Spannung", "Drehzahl"), ["voltage=Spannung", "velocity=Drehzahl:rpm"]),
+        (("tiempo", "tension", "velocidad"), ["voltage=tension", "velocity=velocidad"]),
+        (("时间", "电压", "速度"), ["voltage=电压", "velocity=速度"]),
+        (
+            ("time [s]", "u [mV]", "speed [rpm]"),
+            ['voltage="u [mV]":mV', 'velocity="speed [rpm]":rpm'],
+        ),
+    ],
+)
+def test_names_of_other_languages_and_units_in_brackets_are_understood(
+    tmp_path: Path, names: tuple[str, str, str], suggestion: list[str]
+) -> None:
+    path = write(tmp_path / "log.csv", **dict(zip(names, (T, *motor(3)))))
+    assert list_topics(path)[0].suggestion[:2] == suggestion
+    assert len(read_records(path, list_topics(path)[0].suggestion)["motor"]) == N
+
+
+def test_of_two_voltages_the_one_that_explains_the_speed_is_proposed(tmp_path: Path) -> None:
+    voltage, speed = motor(4)
+    other = motor(5)[0]
+    path = write(tmp_path / "log.csv", t=T, u_other=other, input_volts=voltage, omega=speed)
+    assert list_topics(path)[0].suggestion[0] == "voltage=input_volts"
+
+
+def test_nothing_is_proposed_where_nothing_explains_the_speed(tmp_path: Path) -> None:
+    path = write(tmp_path / "log.csv", t=T, voltage=motor(6)[0], speed=motor(7)[1])
+    assert list_topics(path)[0].suggestion == []

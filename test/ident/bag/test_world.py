@@ -1,0 +1,120 @@
+"""Tables as loggers of the world write them: every one holds the same 300 samples."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from smp_motor_ident.bag import read_records
+from smp_motor_ident.errors import BagError
+
+N = 300
+T = 0.01 * np.arange(N)
+RNG = np.random.default_rng(1)
+U = np.round(RNG.uniform(-6, 6, N), 4)
+Y = np.round(np.cumsum(RNG.normal(0, 1, N)), 4)
+MAP = "voltage=u velocity=y time=t"
+START = np.datetime64("2026-06-01T16:16:31", "us")
+ISO = [str(START + round(1e6 * t)) for t in T]
+
+
+def rows(separator: str = ",", time: Callable[[int], str] = lambda k: f"{T[k]:.2f}") -> list[str]:
+    return [separator.join((time(k), repr(float(U[k])), repr(float(Y[k])))) for k in range(N)]
+
+
+def text(lines: list[str], head: str = "t,u,y") -> str:
+    return "\n".join([head, *lines] if head else lines)
+
+
+def with_lines(lines: list[str], *strange: str) -> list[str]:
+    return [*lines[:100], *strange, *lines[100:]]
+
+
+TABLES: dict[str, tuple[str, str, str]] = {
+    # text, mapping, the finding's code
+    "no names": (text(rows(), ""), "voltage=c2 velocity=c3 time=c1", "no_column_names"),
+    "a row of units": (text(rows(time=lambda k: str(10 * k)), "t,u,y\n[ms],[V],[rad/s]"), MAP, ""),
+    "ISO times": (text(rows(time=lambda k: ISO[k] + "Z")), MAP, ""),
+    "dates and blanks": (text(rows(time=lambda k: ISO[k].replace("T", " "))), MAP, ""),
+    "another zone": (text(rows(time=lambda k: ISO[k] + "+02:00")), MAP, ""),
+    "time of day": (text(rows(time=lambda k: ISO[k][11:])), MAP, ""),
+    "nanoseconds since 1970": (
+        text(rows(time=lambda k: str(1_780_000_000_000_000_000 + 10_000_000 * k))),
+        MAP,
+        "time_unit",
+    ),
+    "milliseconds since 1970": (
+        text(rows(time=lambda k: str(1_780_000_000_000 + 10 * k))),
+        MAP,
+        "time_unit",
+    ),
+    "a time that begins anywhere": (text(rows(time=lambda k: f"{7060 + T[k]:.2f}")), MAP, ""),
+    "stray lines": (
+        text(with_lines(rows(), "t,u,y", "# restarted", "Brown-out!")),
+        MAP,
+        "stray_rows",
+    ),
+    "semicolons and decimal commas": (
+        text([line.replace(".", ",") for line in rows(";")], "t;u;y"),
+        MAP,
+        "",
+    ),
+    "tabs": (text(rows("\t"), "t\tu\ty"), MAP, ""),
+    "blanks": (text(rows("   "), "t u y"), MAP, ""),
+    "a preamble": (text(rows(), "Scope 4000\nDate;Monday\n\nt,u,y"), MAP, ""),
+    "quotes": (
+        text(['"' + line.replace(",", '","') + '"' for line in rows()], '"t","u","y"'),
+        MAP,
+        "",
+    ),
+    "a separator too many": (text([line + "," for line in rows()], "t,u,y,"), MAP, ""),
+    "a column of words": (text([line + ",run" for line in rows()], "t,u,y,state"), MAP, ""),
+    "names of another language": (text(rows(), "时间,Spannung,vitesse mesurée"),
+                                  "voltage=Spannung velocity=vitesse mesurée time=时间", ""),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", list(TABLES))
+def test_a_table_of_the_world_is_read(tmp_path: Path, name: str) -> None:
+    content, mapping, code = TABLES[name]
+    (tmp_path / "log.csv").write_text(content)
+    record = read_records(tmp_path / "log.csv", [mapping])["motor"]
+    assert len(record) == N
+    np.testing.assert_allclose(record.time, T, atol=1e-6)  # float64 since 1970: 0.2 us
+    np.testing.assert_array_equal(record.voltage[1:], U[:-1])
+    np.testing.assert_array_equal(record.velocity, Y)
+    assert [f.code for f in record.findings if f.code != "gear_ratio_assumed"] == [code] * bool(
+        code
+    )
+
+
+def test_set_and_state_in_two_files_are_one_recording_on_their_clocks(tmp_path: Path) -> None:
+    (tmp_path / "set.csv").write_text(
+        text([f"{t:.3f},{u!r}" for t, u in zip(T, U.tolist())], "t,u")
+    )
+    state = [f"{1e3 * t + 4:.0f},{y!r}" for t, y in zip(T, Y.tolist())]
+    (tmp_path / "state.csv").write_text(text(state, "time_ms,w"))
+    (tmp_path / "other.csv").write_text("a,b\n1,2\n3,4\n")
+    record = read_records(tmp_path, ["voltage=/set.u velocity=/state.w time=t"])["motor"]
+    assert record.source == "set+state"
+    np.testing.assert_array_equal(record.velocity, Y)
+    # 6 ms of an interval of 10 ms the voltage was the last one's, 4 ms the next one's.
+    np.testing.assert_allclose(record.voltage[1:], 0.6 * U[:-1] + 0.4 * U[1:], rtol=1e-6)
+
+
+def test_a_file_with_more_words_than_rows_is_refused_by_its_line(tmp_path: Path) -> None:
+    lines = [line if k % 10 else "Brown-out!" for k, line in enumerate(rows())]
+    (tmp_path / "log.csv").write_text(text(lines))
+    with pytest.raises(BagError, match="line 12, column 't': 'Brown-out!' is no number"):
+        read_records(tmp_path / "log.csv", [MAP])
+
+
+def test_a_record_whose_first_row_is_the_step_keeps_it(tmp_path: Path) -> None:
+    lines = [f"{t:.2f},6,{60 * (1 - np.exp(-t / 0.1)):.6f}" for t in T]
+    (tmp_path / "log.csv").write_text(text(lines))
+    record = read_records(tmp_path / "log.csv", [MAP])["motor"]
+    assert len(record) == N and record.voltage[0] == 6.0 and record.velocity is not None
+    assert record.velocity[0] == 0.0

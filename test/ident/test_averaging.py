@@ -1,0 +1,32 @@
+"""Candidates that explain the data alike are all covered by what is stated."""
+
+import numpy as np
+
+from smp_motor_ident.estimation.averaging import averaged
+from smp_motor_ident.estimation.quantities import Answer
+from smp_motor_ident.result import Quantity
+
+
+def _answer(lag: float, delay: float | None) -> Answer:
+    combinations = {"time_constant": Quantity(lag, 0.001, (lag - 0.00196, lag + 0.00196), "s")}
+    if delay is not None:
+        combinations["delay"] = Quantity(delay, 0.001, (delay - 0.00196, delay + 0.00196), "s")
+    names = tuple(combinations)
+    return Answer({}, combinations, names, 1e-6 * np.eye(len(names)))
+
+
+def test_a_lag_that_may_be_a_delay_is_stated_with_both():
+    both = averaged(_answer(0.05, 0.01), np.array([0.6, 0.4]), [_answer(0.06, None)])
+    lag, delay = both.combinations["time_constant"], both.combinations["delay"]
+    # Means and variances of a mixture, by its definition.
+    np.testing.assert_allclose(lag.value, 0.6 * 0.05 + 0.4 * 0.06)
+    np.testing.assert_allclose(lag.std**2, 0.001**2 + 0.6 * 0.4 * 0.01**2)
+    np.testing.assert_allclose(delay.value, 0.6 * 0.01)
+    # What is late in all stays as well known as it was: the two go against each other.
+    assert both.covariance[0, 1] < 0
+    np.testing.assert_allclose(both.covariance[0, 1], -0.6 * 0.4 * 0.01 * 0.01)
+
+
+def test_a_candidate_that_is_rejected_changes_nothing():
+    alone = _answer(0.05, 0.01)
+    assert averaged(alone, np.array([0.999, 0.001]), [_answer(0.06, None)]) is alone

@@ -1,0 +1,73 @@
+"""Poor but common records: what is a combination is stated as one, rest teaches nothing."""
+
+from dataclasses import replace
+
+import motors
+import numpy as np
+import pytest
+
+from smp_motor_ident.errors import DesignError
+from smp_motor_ident.estimate import estimate
+from smp_motor_ident.record import Record
+from smp_motor_ident.tune import Loop, design
+
+TRUTH = {"dc_gain": 15.0, "time_constant": 0.12, "static_voltage": 2.0}
+
+
+def _record(voltage: np.ndarray, rate: float = 500.0, noise: float = 0.5) -> Record:
+    """Return the exact first-order answer with Coulomb friction, driven one way, and noise."""
+    gain, tau, friction = TRUTH.values()
+    rng = np.random.default_rng(3)
+    keep = np.exp(-1 / rate / tau)
+    w = np.zeros(voltage.size)
+    for k in range(1, voltage.size):
+        ahead = keep * w[k - 1] + (1 - keep) * gain * (voltage[k] - friction)
+        w[k] = max(ahead, 0.0)  # it stops within the interval; the fraction is below the noise
+    t = np.arange(voltage.size) / rate
+    return Record("motor", t, voltage, velocity=w + noise * rng.standard_normal(t.size))
+
+
+@pytest.mark.parametrize("rest", [0, 200])
+def test_a_single_level_of_voltage_gives_one_combination(rest):
+    record = _record(np.r_[np.zeros(rest), np.full(600, 8.0)])
+    if rest == 0:  # the first row is the step: the motor stood before it
+        assert np.ptp(record.voltage) == 0.0
+    found = estimate(record)
+    for name in ("dc_gain", "static_voltage"):
+        q = found.combinations[name]
+        assert q.value is None and q.status == "unidentifiable"
+        assert q.ci95[0] <= TRUTH[name] <= q.ci95[1]
+    steady = found.combinations["steady_speed"]
+    # 4 standard deviations: one in 16,000.
+    assert abs(steady.value - 15.0 * (8.0 - 2.0)) < 4 * steady.std
+    assert steady.std < 1.0
+    assert [f.evidence["voltage"] for f in found.findings if f.code == "one_level"] == [8.0]
+    with pytest.raises(DesignError, match="combination"):
+        design(found, Loop())
+
+
+def test_two_levels_know_gain_and_friction_apart():
+    found = estimate(_record(np.r_[np.zeros(100), np.full(400, 8.0), np.full(400, 4.0)]))
+    for name in ("dc_gain", "static_voltage"):
+        q = found.combinations[name]
+        assert q.value is not None, name
+        assert abs(q.value - TRUTH[name]) < 4 * q.std, name
+    assert "steady_speed" not in found.combinations
+
+
+def test_rest_before_the_excitation_changes_nothing():
+    driven = motors.record("rear_left", current=False, seconds=3.0)
+    n = 4000
+    t = np.arange(n + len(driven)) / 200.0
+    rested = replace(
+        driven,
+        time=t,
+        voltage=np.r_[np.zeros(n), driven.voltage],
+        velocity=np.r_[np.zeros(n), driven.velocity],
+        count=np.r_[np.full(n, driven.count[0]), driven.count],
+    )
+    with_it, without = estimate(rested), estimate(driven)
+    assert with_it.model == without.model
+    for name in ("dc_gain", "time_constant", "static_voltage"):
+        a, b = with_it.combinations[name], without.combinations[name]
+        assert abs(a.value - b.value) < b.std, name

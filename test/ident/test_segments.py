@@ -1,0 +1,51 @@
+"""A motor that changes within a record gets the intervals of the next recording, others do not."""
+
+import motors
+import numpy as np
+
+from smp_motor_ident.estimate import estimate
+from smp_motor_ident.record import Record
+
+
+def _first_order(gain, tau, friction, seed, seconds=40.0, rate=100.0):
+    """Return a record of tau w' = gain (v - friction) - w, gain and friction given per sample."""
+    rng = np.random.default_rng(seed)
+    n = int(seconds * rate)
+    t = np.arange(n) / rate
+    v = np.repeat(rng.choice([3.0, 5.0, 8.0], n // 20), 20)[:n]
+    w = np.zeros(n)
+    keep = np.exp(-1 / rate / tau)
+    gain, friction = np.broadcast_to(gain, n), np.broadcast_to(friction, n)
+    for k in range(1, n):
+        w[k] = keep * w[k - 1] + (1 - keep) * gain[k] * max(v[k] - friction[k], 0.0)
+    return Record("motor", t, v, velocity=w + 0.2 * rng.standard_normal(n))
+
+
+def _changes(record):
+    return [f for f in estimate(record, "first_order").findings if f.code == "motor_changes"]
+
+
+def test_a_motor_that_warms_up_is_said_to_and_its_interval_reaches_the_next_day():
+    n = 4000
+    warm = np.linspace(10.0, 10.4, n)  # 4 % in 40 s
+    found = estimate(_first_order(warm, 0.08, np.linspace(0.6, 0.5, n), 1), "first_order")
+    assert [f for f in found.findings if f.code == "motor_changes"]
+    # Its mean is 10.2; the next record begins where this one ended.
+    gain = found.combinations["dc_gain"]
+    assert gain.ci95[0] < 10.0 and gain.ci95[1] > 10.4
+    assert gain.std < 0.6  # three quarters more than the drift: Student's t and its noise
+
+
+def test_a_motor_that_does_not_change_is_rarely_said_to():
+    # One in a hundred by the test's size: two of eight has a chance of 0.3 %.
+    assert sum(bool(_changes(_first_order(10.0, 0.08, 0.6, s))) for s in range(8)) < 2
+
+
+def test_parts_without_excitation_do_not_count():
+    still = motors.record("rear_left", current=False, seconds=4.0)
+    found = estimate(still)
+    truth = motors.truth("rear_left", 0.3)
+    for name in ("dc_gain", "time_constant"):
+        q = found.combinations[name]
+        assert abs(q.value - truth[name]) < 4 * q.std, name
+        assert q.std < 0.02 * truth[name], name  # the bound is 0.1 %

@@ -1,0 +1,240 @@
+"""Gains hold on the drive that was identified: its sensor, its friction, and what is not known."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from smp_motor_ident.cli.tune import main as tune
+from smp_motor_ident.errors import DesignError
+from smp_motor_ident.finding import Finding
+from smp_motor_ident.record import Hardware
+from smp_motor_ident.report.document import identification_document
+from smp_motor_ident.result import Estimate, FitPercent, Quantity
+from smp_motor_ident.tune import Loop, design
+
+MOTOR = {"dc_gain": 25.0, "time_constant": 0.05, "time_constant_product": 6e-4}
+LOOP = Loop(sample_time=0.01, delay=0.01, gear_ratio=1.0, counts_per_revolution=2000.0)
+DOUBT = Finding("dead_zone", "unreliable", "a dead zone of 2 V", {}, "record slow ramps")
+
+
+def estimate(std: float = 0.01, findings=(), **more) -> Estimate:
+    values = {**MOTOR, "static_voltage": 0.4, **more}
+    deviations = [std * v for v in values.values()]
+    return Estimate(
+        "front_left",
+        "second_order",
+        {},
+        {n: Quantity(v, s) for (n, v), s in zip(values.items(), deviations, strict=True)},
+        tuple(values),
+        np.diag(np.square(deviations)),
+        FitPercent(97.0, 96.0),
+        findings=tuple(findings),
+        sample_time=0.01,
+        hardware=Hardware(1.0, 2000.0, 0, 12.0),
+    )
+
+
+def change(one, motor, window=0.0, lag=0.0, share=0.5, seconds=2.0):
+    """Return time and speed of a change of set-point, integrated in small steps.
+
+    The controller is written from the published rules of the running one; friction acts on the
+    voltage's side.
+    """
+    T, sub = one.loop.sample_time, 50
+    h = T / sub
+    gains, plan, model = one.gains, one.reference, one.motor
+    steps = int(seconds / T)
+    target = share * plan.max_velocity
+    profile = plan.profile()
+    profile.set_target(target, T)
+    path = [profile.ahead(k * T) for k in range(steps + 1)]
+    r = np.array([p.velocity for p in path])
+    a = np.array([p.acceleration for p in path])
+    time = T * np.arange(steps)
+    bend = model["time_constant_product"] / model["time_constant"]
+    forward = gains.feedforward_velocity * (0.5 * (r[1:] + r[:-1]) - T / 12 * np.diff(a))
+    forward += gains.feedforward_acceleration * (np.diff(r) + bend * np.diff(a)) / T
+    forward += gains.feedforward_static
+    late = [plan.lag + plan.doubt, plan.lag, max(plan.lag - plan.doubt, 0.0)]
+    around = np.array([np.interp(time - x, time, r[:-1]) for x in late])
+    gain, tau, tp, friction = (
+        motor[n] for n in ("dc_gain", "time_constant", "time_constant_product", "static_voltage")
+    )
+    speed = rate = filtered = angle = integral = before = slope = 0.0
+    angles, sent, out = [0.0], [0.0] * (round(one.loop.loop_delay / T) + 1), np.empty(steps)
+    for k in range(steps):
+        if lag:
+            y = filtered
+        else:
+            back = max(round((window or T) / h), 1)
+            y = (angles[-1] - (angles[-1 - back] if len(angles) > back else 0.0)) / (back * h)
+        low, high = around[:, k].min(), around[:, k].max()
+        e = min(max(y, low), high) - y
+        tf = gains.derivative_filter_time_constant
+        weighted = gains.setpoint_weight_d * (e + y) - y
+        slope = (tf * slope + weighted - before) / (tf + T)
+        before = weighted
+        wanted = gains.p * (gains.setpoint_weight_p * (e + y) - y) + integral + gains.d * slope
+        wanted += forward[k]
+        given = min(max(wanted, -12.0), 12.0)
+        integral += T * (gains.i * e + (given - wanted) / gains.tracking_time_constant)
+        sent = [given, *sent[:-1]]
+        out[k] = speed
+        for _ in range(sub):
+            drive = sent[-1] - math.copysign(friction, speed) if speed else max(
+                sent[-1] - friction, 0.0
+            )  # fmt: skip
+            rate += h * (gain * drive - speed - tau * rate) / tp
+            speed = max(speed + h * rate, 0.0)
+            rate = rate if speed > 0 or drive > 0 else 0.0
+            filtered += h * (speed - filtered) / lag if lag else 0.0
+            angle += h * speed
+            angles.append(angle)
+    return time, out / target
+
+
+def overshoot(one, motor, **sensor) -> float:
+    return 100 * (change(one, motor, **sensor)[1].max() - 1)
+
+
+TRUE = {**MOTOR, "static_voltage": 0.4}
+
+
+@pytest.mark.parametrize(
+    ("sensor", "name"), [({"window": 0.05}, "averaging_window"), ({"lag": 0.04}, "sensor_lag")]
+)
+def test_gains_are_of_the_speed_that_the_firmware_reports(sensor, name):
+    value = next(iter(sensor.values()))
+    aware, ignorant = design(estimate(**{name: value}), LOOP), design(estimate(), LOOP)
+    # A quarter of a percent: the test's integration in steps of a fiftieth.
+    assert overshoot(aware, TRUE, **sensor) <= aware.specification.overshoot.high + 0.25
+    assert overshoot(aware, TRUE, **sensor) < 2.0
+    assert overshoot(ignorant, TRUE, **sensor) > 3.0
+    assert aware.reference.lag == pytest.approx(
+        0.01 + (value / 2 if name == "averaging_window" else value)
+    )
+
+
+def test_drives_within_the_uncertainty_stay_within_the_specified_bands():
+    one = design(estimate(std=0.03), LOOP)
+    spec, rng, held = one.specification, np.random.default_rng(8), []
+    for _ in range(40):
+        true = {n: v * math.exp(0.03 * rng.normal()) for n, v in TRUE.items()}
+        time, speed = change(one, true)
+        outside = np.flatnonzero(np.abs(speed - 1) > 0.02)
+        settled = time[outside[-1] + 1]
+        held.append(
+            100 * (speed.max() - 1) <= spec.overshoot.high + 0.25
+            and settled <= spec.settling.high + LOOP.sample_time
+        )
+    # 300 draws leave a share of 1/300 on each side; of 40 at most one by chance (99.2 %).
+    assert sum(held) >= 39
+    assert spec.settling.low <= one.performance.settling <= spec.settling.high
+    assert spec.phase_margin.low >= 0.99 * 60
+    assert spec.samples == 300
+
+
+def test_unreliable_identification_is_refused_and_widens_what_is_designed_on_it():
+    with pytest.raises(DesignError, match=r"unreliable: a dead zone of 2 V \(record slow ramps\)"):
+        design(estimate(findings=[DOUBT]), LOOP)
+    sure = design(estimate(), LOOP)
+    wide = design(estimate(findings=[DOUBT]), LOOP, accept_unreliable=True)
+    assert wide.gains.i < 0.95 * sure.gains.i
+    assert wide.specification.settling.high > sure.specification.settling.high
+    assert any("unreliable identification" in words for words in wide.warnings)
+    # A note or a warning is no reason to refuse.
+    assert design(estimate(findings=[replace(DOUBT, severity="warning")]), LOOP).gains == sure.gains
+
+
+def with_friction(quantity: Quantity) -> Estimate:
+    one = estimate()
+    names = tuple(n for n in one.names if n != "static_voltage")
+    keep = [one.names.index(n) for n in names]
+    known = {**one.combinations, "static_voltage": quantity}
+    return replace(
+        one, combinations=known, names=names, covariance=one.covariance[np.ix_(keep, keep)]
+    )
+
+
+@pytest.mark.parametrize(
+    "quantity",
+    [Quantity(0.0, 1.1e6), Quantity(None, status="unidentifiable"), Quantity(1.0, math.inf)],
+)
+def test_friction_that_may_be_anything_is_refused_with_what_to_record(quantity):
+    with pytest.raises(DesignError, match="record the motor at two or more voltages"):
+        design(with_friction(quantity), LOOP)
+
+
+def test_friction_known_as_a_range_is_fed_forward_as_far_as_it_is_known():
+    one = design(with_friction(Quantity(1.0, 0.5, (0.6, 2.4))), LOOP)
+    assert one.gains.feedforward_static == 0.6
+    assert any("between 0.6 and 2.4 V" in words for words in one.warnings)
+    for friction in (0.6, 1.5, 2.4):
+        true = {**TRUE, "static_voltage": friction}
+        assert overshoot(one, true) <= one.specification.overshoot.high + 0.25
+    # The reference leaves room for all that it may take.
+    assert one.reference.max_velocity <= 25.0 * (0.92 * 12.0 - 2.4)
+
+
+def test_coarse_counts_cost_no_more_than_the_limits_ask_for():
+    """Of PI and PID gains of a dense grid within margins and control noise none is far better."""
+    from smp_motor_ident.tune.feedback import Feedback, spectral_radius
+    from smp_motor_ident.tune.margins import batch_margins
+    from smp_motor_ident.tune.motors import motors_of
+    from smp_motor_ident.tune.plant import sample
+    from smp_motor_ident.tune.problem import Problem, control_noise
+
+    loop = replace(LOOP, counts_per_revolution=48.0, noise_voltage=0.48)
+    one = design(estimate(), loop, structure="pi")
+    problem = Problem(sample(motors_of(estimate()), loop), loop)
+    best = 0.0
+    for p in np.geomspace(0.002, 0.3, 40):
+        for i in np.geomspace(0.05, 10.0, 40):
+            feedback = Feedback(float(p), float(i))
+            if i > best and control_noise(problem, feedback) <= 0.48:
+                omega, T = problem.omega, loop.sample_time
+                gain = problem.response * feedback.response(omega, T)
+                m, hump = batch_margins(gain[None], omega), np.abs(gain / (1 + gain)).max()
+                good = m.phase[0] >= 60 and m.sensitivity[0] <= 1.4 and hump <= 1.25
+                if good and spectral_radius(problem.plant, feedback)[0] < 1:
+                    best = float(i)
+    # The uncertainty of the motor, 1 %, is not in the grid.
+    assert one.gains.i >= 0.85 * best
+
+
+def test_command_refuses_an_unreliable_result_unless_it_is_accepted(tmp_path, capsys):
+    source, output = tmp_path / "identification.json", tmp_path / "gains.yaml"
+    source.write_text(json.dumps(identification_document({"": estimate(findings=[DOUBT])})))
+    assert tune([str(source), "--output", str(output)]) == 1
+    assert "a dead zone of 2 V" in capsys.readouterr().err
+    assert not output.exists()
+    assert tune([str(source), "--output", str(output), "--accept-unreliable"]) == 0
+    assert "designed on an unreliable identification" in capsys.readouterr().out
+    entry = json.loads(output.with_suffix(".json").read_text())["wheels"][""]
+    assert entry["findings"][0]["code"] == "unreliable_identification"
+    for name in ("overshoot", "settling", "phase_margin", "gain_margin", "sensitivity"):
+        band = entry["specification"][name]
+        assert band["low"] <= band["value"] <= band["high"]
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_any_inductance_at_any_rate_ends_in_stable_gains(seed):
+    """The short version of ``benchmarks/random_designs.py``."""
+    rng = np.random.default_rng(seed)
+    electrical, rate = 10 ** rng.uniform(-5, -2), 20 * 250 ** rng.uniform()
+    values = {
+        "time_constant": 0.03 + electrical,
+        "time_constant_product": 0.03 * electrical,
+        "averaging_window": rng.uniform(0, 3) / rate,
+    }
+    source = ("measured", "difference", "observer")[seed % 3]
+    loop = replace(LOOP, sample_time=1 / rate, delay=None, speed_source=source)
+    one = design(estimate(**values), loop, samples=60)
+    assert one.margins.stable
+    assert one.performance.overshoot < 5.0
+    assert math.isfinite(one.specification.settling.value)

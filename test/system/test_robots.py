@@ -1,0 +1,89 @@
+"""Robots side by side: every executable in the robot's namespace, wheels one level below."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import rclpy
+import yaml
+from geometry_msgs.msg import TwistStamped
+from nav_msgs.msg import Odometry
+from rclpy.executors import SingleThreadedExecutor
+
+from smp_motor_control import WHEELS
+
+ROOT = Path(__file__).resolve().parents[2]
+Process = Callable[..., Any]
+
+SPEEDS = {"robot1": 0.1, "robot2": -0.15}
+"""Of the two bodies [m/s]."""
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> tuple[Path, Path]:
+    """Motors and gains of a robot of two wheels, from those of the paper's first two."""
+    names = {"front_left": "left", "front_right": "right"}
+    paper = yaml.safe_load((ROOT / "config" / "motors_paper.yaml").read_text())
+    (document,) = paper.values()
+    motors = document["ros__parameters"]["motors"]
+    document["ros__parameters"]["motors"] = {to: motors[name] for name, to in names.items()}
+    gains = yaml.safe_load((ROOT / "config" / "gains.yaml").read_text())
+    tree = {f"/**/{to}/wheel_pid": gains[f"/**/{name}/wheel_pid"] for name, to in names.items()}
+    (tmp_path / "motors.yaml").write_text(yaml.safe_dump({"/**/motor_plant": document}))
+    (tmp_path / "gains.yaml").write_text(yaml.safe_dump(tree))
+    return tmp_path / "motors.yaml", tmp_path / "gains.yaml"
+
+
+def begin(process: Process, robot: str, sides: tuple[str, str], motors: Path, gains: Path) -> None:
+    process("motor_plant", "--ros-args", "-r", f"__ns:=/{robot}", "-p", f"motors_file:={motors}")
+    left, right = (side.split() for side in sides)
+    for wheel in (*left, *right):
+        place = ("-r", f"__ns:=/{robot}/{wheel}", "--params-file", gains)
+        process("wheel_pid", "--ros-args", *place)
+    named = [f"{s}_wheel_names:=[{', '.join(n)}]" for s, n in (("left", left), ("right", right))]
+    options = ("-r", f"__ns:=/{robot}", "-p", named[0], "-p", named[1])
+    process("skid_steer", "--ros-args", *options)
+
+
+def test_two_robots_with_two_and_four_wheels_drive_independently(
+    process: Process, files: tuple[Path, Path], ros_domain: int
+) -> None:
+    begin(process, "robot1", ("left", "right"), *files)
+    lefts, rights = " ".join(WHEELS[::2]), " ".join(WHEELS[1::2])
+    config = ROOT / "config"
+    begin(process, "robot2", (lefts, rights), config / "motors_paper.yaml", config / "gains.yaml")
+    context = rclpy.Context()
+    rclpy.init(args=[], context=context, domain_id=ros_domain)
+    node = rclpy.create_node("driver", context=context)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    seen: dict[str, list[Odometry]] = {robot: [] for robot in SPEEDS}
+    senders = {}
+    for robot, kept in seen.items():
+        node.create_subscription(Odometry, f"/{robot}/odom", kept.append, 10)
+        senders[robot] = node.create_publisher(TwistStamped, f"/{robot}/cmd_vel", 10)
+
+    def settled() -> bool:
+        return all(
+            seen[robot] and abs(seen[robot][-1].twist.twist.linear.x - speed) < 0.1 * abs(speed)
+            for robot, speed in SPEEDS.items()
+        )
+
+    end = time.monotonic() + 60.0
+    while time.monotonic() < end and not settled():
+        for robot, speed in SPEEDS.items():
+            message = TwistStamped()
+            message.header.stamp = node.get_clock().now().to_msg()
+            message.twist.linear.x = speed
+            senders[robot].publish(message)
+        executor.spin_once(timeout_sec=0.02)
+    assert settled(), {r: m[-1].twist.twist.linear.x for r, m in seen.items() if m}
+    last = seen["robot1"][-1]
+    assert (last.header.frame_id, last.child_frame_id) == ("robot1/odom", "robot1/base_link")
+    executor.shutdown()
+    node.destroy_node()
+    rclpy.shutdown(context=context)
