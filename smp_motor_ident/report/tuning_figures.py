@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from importlib import resources
 
+import numpy as np
+from numpy.typing import NDArray
+
 from smp_motor_ident.report.chart import Chart, Curve
 from smp_motor_ident.report.drawing import WIDTH, svg
 from smp_motor_ident.report.words import label
@@ -26,23 +29,30 @@ def tuning_charts(wheels: Mapping[str, Curves], limit: float) -> list[Chart]:
     list of Chart
         The grey line is the reference.
     """
-    first = next(iter(wheels.values()))
+    # Wheels of different time constants are computed over different lengths and bands.
+    longest = max(wheels.values(), key=lambda c: float(c.time[-1]))
+    time = longest.time
+    omega = np.unique(np.concatenate([c.omega for c in wheels.values()]))
 
     def chart(
         kind: str, title: str, y_label: str, log: str = "", lines: tuple[float, ...] = ()
     ) -> Chart:
         timed = kind in ("step", "load")
-        bands = {wheel: getattr(c, kind) for wheel, c in wheels.items()}
+        x = time if timed else omega
+        bands = {
+            wheel: _on(x, c.time if timed else c.omega, getattr(c, kind))
+            for wheel, c in wheels.items()
+        }
         curves = tuple(
             Curve(label(wheel), rows[1], f"wheel-{k % 4 + 1}", "line", rows[0], rows[2])
             for k, (wheel, rows) in enumerate(bands.items())
         )
         if kind == "step":
-            curves += (Curve("reference", first.reference, "muted"),)
+            curves += (Curve("reference", _on(x, longest.time, longest.reference), "muted"),)
         return Chart(
             name=kind, title=title, y_label=y_label, log=log, lines=lines, curves=curves,
             x_label="time [ms]" if timed else "frequency [rad/s]",
-            x=1e3 * first.time if timed else first.omega,
+            x=1e3 * x if timed else x,
             summary=f"{title}, of {', '.join(map(label, wheels))}",
         )  # fmt: skip
 
@@ -53,6 +63,14 @@ def tuning_charts(wheels: Mapping[str, Curves], limit: float) -> list[Chart]:
         chart("phase", "Loop gain: phase", "phase [deg]", "x", (-180.0,)),
         chart("sensitivity", f"Sensitivity (line: Ms {limit:g})", "|S|", "x", (limit,)),
     ]
+
+
+def _on(
+    x: NDArray[np.float64], own: NDArray[np.float64], rows: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return curves on another axis, shape (..., x.size); NaN outside of their own."""
+    flat = [np.interp(x, own, row, left=np.nan, right=np.nan) for row in np.atleast_2d(rows)]
+    return np.array(flat).reshape(*rows.shape[:-1], x.size)
 
 
 def tuning_svg(wheels: Mapping[str, Curves], limit: float) -> str:

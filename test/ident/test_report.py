@@ -30,6 +30,7 @@ from smp_motor_ident.report.drawing import ticks
 from smp_motor_ident.report.figures import frequency_charts, residual_charts
 from smp_motor_ident.report.html import Report, render
 from smp_motor_ident.report.series import Comparison
+from smp_motor_ident.report.tuning_figures import tuning_charts
 from smp_motor_ident.result import (
     Candidate,
     Correlation,
@@ -38,6 +39,7 @@ from smp_motor_ident.result import (
     Quantity,
     ResidualTests,
 )
+from smp_motor_ident.tune.curves import Curves
 
 PHYSICAL = {
     "resistance": (12.919, "ohm"),
@@ -377,3 +379,17 @@ def test_thinning_keeps_peaks_and_order() -> None:
     assert index.size <= 1004
     assert np.nanmax(values[index]) == 9.0
     assert np.all(np.diff(index) > 0)
+
+
+def test_wheels_of_different_time_constants_share_the_axes_of_a_tuning():
+    def curves(n: int, slow: float) -> Curves:
+        band = np.ones((3, n))
+        return Curves(
+            time=np.linspace(0.0, slow, n), reference=np.ones(n), step=band, load=band,
+            omega=np.geomspace(1 / slow, 100.0, n), gain=band, phase=band, sensitivity=band,
+        )  # fmt: skip
+
+    charts = tuning_charts({"fast": curves(20, 0.2), "slow": curves(31, 0.5)}, 1.4)
+    assert all(c.y.shape == chart.x.shape for chart in charts for c in chart.curves)
+    step = charts[0]
+    assert step.x[-1] == 500.0 and np.isnan(step.curves[0].y[-1]) and step.curves[1].y[-1] == 1.0
