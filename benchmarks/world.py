@@ -1,4 +1,4 @@
-"""Recordings with the effects of real drives: right, told why, refused, or silently wrong.
+"""Recordings with the effects of real drives: right, named, refused, or silently wrong.
 
 An independent simulator (`world_motor`) records random motors with one of the effects of
 `world_effects` in one of three strengths; every estimate is held against the truth.  ``right``:

@@ -94,11 +94,14 @@ class _Stop:
         threading.Thread(target=self._read_signals, args=(inlet,), daemon=True).start()
 
     def _read_signals(self, inlet: int) -> None:
+        asked = False
         while number := os.read(inlet, 1):
             if number[0] not in _SIGNALS:  # such as SIGCONT, handled by a node itself
                 continue
-            if self.requested.is_set():
+            # Who asks twice does not want to wait; a terminal that closes just says it twice.
+            if asked and number[0] != signal.SIGHUP:
                 os._exit(1)
+            asked = True
             self.request()
 
 

@@ -27,7 +27,7 @@ class Terminal:
     suspend : callable
         Called before Ctrl-Z suspends the process, and before it is hung up.
     leave : callable
-        Called when the terminal is gone or asks to quit (SIGHUP, SIGQUIT).
+        Called when the terminal is gone.
     resume : callable
         Called after the process was continued.
 
@@ -54,8 +54,6 @@ class Terminal:
         self.take()
         signal.signal(signal.SIGTSTP, self._on_suspend)
         signal.signal(signal.SIGCONT, self._on_continue)
-        for number in (signal.SIGHUP, signal.SIGQUIT):
-            signal.signal(number, lambda number, frame: leave())
 
     def take(self) -> None:
         """Get keys one by one from now on."""

@@ -47,11 +47,11 @@ def tune_by_relay(arguments: argparse.Namespace, files: Sequence[Path]) -> int:
     gain, period = read_oscillation(*evenly(vars(seen)))
     rule, structure = arguments.rule or "tyreus_luyben", arguments.structure or "pi"
     ruled = by_rule(rule, structure, gain, period)
-    told = (
+    line = (
         f"{wheel}: ultimate gain {gain:.4g} V s/rad (wheel), period {1e3 * period:.3g} ms; {rule}: "
         f"p {ruled.p:.4g}, i {ruled.i:.4g}, d {ruled.d:.4g}"
     )
-    print(told)
+    print(line)
     if files:
         parameters = {
             "p": ruled.p,
@@ -63,7 +63,7 @@ def tune_by_relay(arguments: argparse.Namespace, files: Sequence[Path]) -> int:
             "antiwindup_strategy": "back_calculation",
         }
         tree = {f"/**/{wheel}/wheel_pid": {"ros__parameters": parameters}}
-        text = f"# Tuned by relay feedback. {told}\n" + yaml.safe_dump(tree, sort_keys=False)
+        text = f"# Tuned by relay feedback. {line}\n" + yaml.safe_dump(tree, sort_keys=False)
         write_together({files[0]: text}, arguments.force)
         print(f"written: {files[0]}")
     return 0

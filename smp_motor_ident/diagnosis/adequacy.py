@@ -140,18 +140,18 @@ def _test(
     blocks = int(errors.block[-1]) + 1 if errors.block.size else 0
     scores = np.stack([np.bincount(errors.block, z[:, j] * left, blocks) for j in range(q)], axis=1)
     weights = np.stack([np.bincount(errors.block, z[:, j] ** 2, blocks) for j in range(q)])
-    told = float(np.min(weights.sum(axis=1) ** 2 / np.square(weights).sum(axis=1)))
-    if told - q < EFFECT_BLOCKS.value and not white:
-        return None  # what shows it lies in a few stretches: chance cannot be told
+    stretches = float(np.min(weights.sum(axis=1) ** 2 / np.square(weights).sum(axis=1)))
+    if stretches - q < EFFECT_BLOCKS.value and not white:
+        return None  # what shows it lies in a few stretches: chance cannot be excluded
     middle = scores.T @ scores * blocks / (blocks - 1)
     least = variance * normal
     moved = z.T @ e
     robust = float(moved @ np.linalg.pinv(middle, hermitian=True) @ moved) / q
     plain = float(moved @ np.linalg.solve(least, moved)) / q
-    freedom = max(told - q, 1.0)
+    freedom = max(stretches - q, 1.0)
     p_robust = float(fdtrc(q, freedom, robust * freedom / (freedom + q - 1)))
     p_plain = float(fdtrc(q, max(n - q, 1), plain))
-    p = p_plain if told - q < EFFECT_BLOCKS.value else max(p_robust, p_plain)
+    p = p_plain if stretches - q < EFFECT_BLOCKS.value else max(p_robust, p_plain)
     return Evidence(effect, p, plain * q, errors.shifts[:, columns] @ size, columns)
 
 

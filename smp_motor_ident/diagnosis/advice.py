@@ -301,7 +301,7 @@ def advise(fit: Fit, result: Answer, known: Mapping[str, float]) -> list[Finding
             out.append(
                 _note(
                     "weak_excitation",
-                    f"{others} cannot be told from these data",
+                    f"{others} cannot be identified from these data",
                     f"{others}: excite harder, longer, over more frequencies and in both "
                     "directions",
                 )

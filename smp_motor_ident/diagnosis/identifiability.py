@@ -152,7 +152,7 @@ def what_next(
 
     Several amplitudes and bands are simulated with the estimated motor; the Fisher
     information of each, which grows in proportion to the length, tells how long it must be.
-    Where the current was not measured a family of motors answers the same: the promise holds
+    Where the current was not measured a family of motors answers the same: the prediction holds
     for the least favourable of them whose back-EMF is at least 3 % of what limits the speed.
 
     Parameters
@@ -211,8 +211,8 @@ def _cost(p: Proposal, accuracy: float) -> tuple[float, float, float]:
 def _family(estimate: Estimate, current_noise: float) -> tuple[list[Fit], bool]:
     """Return the motors that answer as the estimated one does, and whether current is lacking."""
     known = {n: q.value for n, q in estimate.parameters.items() if n in PHYSICAL}
-    told = known.get("resistance") or estimate.hardware.resistance
-    r = told or LARGEST_RESISTANCE
+    given = known.get("resistance") or estimate.hardware.resistance
+    r = given or LARGEST_RESISTANCE
     z = np.zeros(11)
     gain, tau = estimate.value("dc_gain"), estimate.value("time_constant")
     product = estimate.value("time_constant_product") or 0.02 * tau**2

@@ -165,7 +165,7 @@ UNEXPLAINED = Limit(
 RINGING = Limit(
     1.5,
     "rad per sample",
-    "at pi a ringing cannot be told from a slower one; at half of that "
+    "at pi a ringing cannot be distinguished from a slower one; at half of that "
     "sampling between two swings still shows both",
     "test_findings.py",
 )

@@ -175,11 +175,11 @@ def _ratio(record: Record) -> None:
         _compare(record, angle, what, np.concatenate([[0.0], charge]), "velocity")
 
 
-def _compare(record: Record, angle: Array, what: str, told: Array, other: str) -> None:
+def _compare(record: Record, angle: Array, what: str, other_values: Array, other: str) -> None:
     where = _where([record])
     lag = max(1, min(10, len(record) // 10))
     dt = record.time[lag:] - record.time[:-lag]
-    a, b = (angle[lag:] - angle[:-lag]) / dt, (told[lag:] - told[:-lag]) / dt
+    a, b = (angle[lag:] - angle[:-lag]) / dt, (other_values[lag:] - other_values[:-lag]) / dt
     ok = np.isfinite(a) & np.isfinite(b)
     for s in record.starts[1:]:
         ok[max(0, s - lag) : s] = False

@@ -68,8 +68,8 @@ def speed_fit(records: Sequence[Record], data: Experiments, fit: Fit) -> float:
     given = [r.velocity for r in records]
     if all(v is not None for v in given):
         velocity = np.concatenate([v for v in given if v is not None])
-        told = percent(velocity, at_once), percent(velocity, _means(data, predicted[:, 1], 1))
-        best = max([best, *(x for x in told if np.isfinite(x))])
+        reported = percent(velocity, at_once), percent(velocity, _means(data, predicted[:, 1], 1))
+        best = max([best, *(x for x in reported if np.isfinite(x))])
     return best
 
 

@@ -59,7 +59,7 @@ def test_parameter_file_holds_what_the_four_nodes_take(identified, capsys):
     document = json.loads((identified / "gains.json").read_text())
     assert document["wheels"]["rear_left"]["margins"]["phase"] > 59
     assert document["wheels"]["rear_left"]["loop"]["sample_time"] == 0.005
-    assert (identified / "gains.svg").read_text().startswith("<?xml")
+    assert (identified / "gains.svg").read_text().startswith(("<?xml", "<svg"))
     assert "one set of gains for all" in capsys.readouterr().out
 
 

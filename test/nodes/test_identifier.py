@@ -26,24 +26,24 @@ def robot(ros_domain: int) -> Iterator[WheelRobot]:
 def test_it_demands_motion_before_it_names_a_number_and_then_names_the_right_one(
     process, robot, eventually
 ):
-    told: list[MotorParameters] = []
+    heard: list[MotorParameters] = []
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     robot.node.create_subscription(
-        MotorParameters, "/front_left/motor_parameters", told.append, latched
+        MotorParameters, "/front_left/motor_parameters", heard.append, latched
     )
     process("motor_plant")
     settings = ["-p", "period:=1.0", "-p", "window:=12.0", "-p", "wheels:=[front_left]"]
     identifier = process("identifier", "--ros-args", *settings)
-    eventually(lambda: told, 30.0, robot.spin, "nothing heard")
+    eventually(lambda: heard, 30.0, robot.spin, "nothing heard")
     # At rest: the status says what is missing, and there is no number.
-    eventually(lambda: "turned for 0.0" in told[-1].status, 10.0, robot.spin, "no reason")
-    assert all(not m.names and m.status.startswith("collecting") for m in told)
-    assert math.isnan(told[-1].fit_percent)
+    eventually(lambda: "turned for 0.0" in heard[-1].status, 10.0, robot.spin, "no reason")
+    assert all(not m.names and m.status.startswith("collecting") for m in heard)
+    assert math.isnan(heard[-1].fit_percent)
 
     excite = ["-p", "wheels:=[front_left]", "-p", "duration:=15.0", "-p", "amplitude:=9.0"]
     process("excite", "--ros-args", *excite)
-    eventually(lambda: told[-1].names, 60.0, robot.spin, "no estimate")
-    found = told[-1]
+    eventually(lambda: heard[-1].names, 60.0, robot.spin, "no estimate")
+    found = heard[-1]
     assert found.status.split(":")[0] in ("valid", "unreliable")
     assert found.joint_name == "front_left_wheel_joint"
     k = found.names.index("dc_gain")

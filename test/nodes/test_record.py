@@ -99,8 +99,8 @@ def test_best_effort_messages_are_recorded_or_told_as_lost(
         # that stands still for a tenth of a second may lose as many.
         assert len(places) > 1700
         lost = places[-1] - places[0] + 1 - len(places)
-        told = re.search(rf"{name}  \((\d+) lost\)", recorder.output)
-        assert lost == (int(told[1]) if told else 0)
+        said = re.search(rf"{name}  \((\d+) lost\)", recorder.output)
+        assert lost == (int(said[1]) if said else 0)
 
 
 def test_late_publishers_latched_ones_and_mixed_qos_are_recorded(

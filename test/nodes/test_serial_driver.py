@@ -29,7 +29,7 @@ PERIOD = 0.01
 
 
 class Firmware(threading.Thread):
-    """The board: turns its motors as told, reports each period, stops on silence."""
+    """The board: turns its motors as commanded, reports each period, stops on silence."""
 
     def __init__(self, device: Path) -> None:
         super().__init__(daemon=True)

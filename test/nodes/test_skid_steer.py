@@ -422,7 +422,6 @@ def test_wheels_are_left_at_zero_on_exit(start, peer, eventually, end: str) -> N
     ("arguments", "named"),
     [
         (["-p", "wheel_radius:=-0.1"], "wheel_radius"),
-        (["-p", "wheel_diameter:=0.1"], "wheel_diameter"),
         (["-p", "angular.z.max_velocity:=1.0", "-p", "angular.z.min_velocity:=2.0"], "angular.z"),
         (["-p", "use_stamped_vel:=3"], "use_stamped_vel"),
         (["-p", "left_wheel_names:=[a, front_right]"], "named twice"),

@@ -86,7 +86,7 @@ def terminal(ros_domain: int) -> Iterator:
 
 
 class Listener:
-    """What the robot would be told."""
+    """What the robot would be asked."""
 
     def __init__(self, domain: int) -> None:
         self.context = rclpy.Context()

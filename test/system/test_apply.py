@@ -228,8 +228,8 @@ def period_with(motor, delay: float) -> float:
 
 def test_relay_on_a_running_wheel_gives_gains_without_a_model(process, robot, eventually, tmp_path):
     output = tmp_path / "relay.yaml"
-    code, told = run_tune(process, "--relay", "rear_right", "--supply", "12", "--output", output)
-    assert code == 0, told
+    code, said = run_tune(process, "--relay", "rear_right", "--supply", "12", "--output", output)
+    assert code == 0, said
     gains = yaml.safe_load(output.read_text())["/**/rear_right/wheel_pid"]["ros__parameters"]
     share, integral, _ = RULES["tyreus_luyben", "pi"]
     ultimate, period = gains["p"] / share, gains["p"] / gains["i"] / integral

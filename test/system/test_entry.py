@@ -60,8 +60,8 @@ def test_linear_algebra_stays_on_one_thread():
             "print(len(os.listdir('/proc/self/task')))\n"
         )
         command = [sys.executable, "-c", program]
-        told = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
-        return int(told.stdout)
+        shown = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+        return int(shown.stdout)
 
     if threads("") == 1:
         pytest.skip("this machine's linear algebra has one thread anyway")
