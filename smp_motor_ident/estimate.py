@@ -177,7 +177,9 @@ def _covering(
     data: Experiments, rungs: Sequence[Rung], result: Answer, known: Mapping[str, float]
 ) -> tuple[Answer, dict[str, float]]:
     """Return the answer over all structures that explain the data as well, and their weights."""
-    whole = [r for r in rungs[:-1] if r.whole and np.isfinite(r.fit.deviance)]
+    whole = [r for r in rungs[:-1] if r.whole and r.fit.converged]
+    if data.quantum > 0:  # a speed in coarse steps is a difference of counts, by its making
+        whole = [r for r in whole if r.fit.kind == rungs[-1].fit.kind]
     if not whole or result.level:
         return result, {}
     fits = [rungs[-1].fit, *(r.fit for r in whole)]

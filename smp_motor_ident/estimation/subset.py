@@ -7,6 +7,7 @@ import numpy as np
 from smp_motor_ident.diagnosis.limits import REST
 from smp_motor_ident.record import Record
 
+LONG = 2_000  # samples of rest: a quarter of what the start looks at (`start.resample`)
 MARGIN = 10  # samples of rest kept on either side
 
 
@@ -33,7 +34,8 @@ def excited(record: Record) -> Record:
         moves |= y > REST.value * float(np.max(y))
         break
     busy = np.flatnonzero(moves)
-    if not busy.size:
+    # A rest shorter than the excitation does not hide it, and shows the sensor's noise.
+    if not busy.size or (busy[0] < LONG and len(record) < 2 * (busy[-1] - busy[0])):
         return record
     # An offset of the sensor, seen long enough at rest, would speak against any friction.
     begin, end = max(0, int(busy[0]) - MARGIN), min(len(record), int(busy[-1]) + MARGIN + 1)

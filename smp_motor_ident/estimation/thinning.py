@@ -19,7 +19,6 @@ FINER = 8  # samples to keep in the longest interval over which the speed hardly
 LEAST = 2_000  # samples of each segment, or so, that stay
 MOST = 200_000  # samples looked at
 JUMP = 0.02  # of the input's range: a change above it stays where it is
-SLIGHT = 0.03  # of a speed's variance: half of it is what passes between two samples kept
 FEWEST = 4  # samples to one, below which thinning is not worth it
 
 
@@ -36,10 +35,10 @@ def thinned(data: Experiments) -> Experiments:
     Returns
     -------
     Experiments
-        ``data`` itself where current or a mean speed is an output, or where it is not
-        oversampled.
+        ``data`` itself where current or speed is an output, for their noise is not a counter's
+        and a window over some samples would not show, or where it is not oversampled.
     """
-    if data.current.size or data.kind == rc.MEAN_SPEED:
+    if data.kind != rc.ANGLE or data.current.size:
         return data
     k = min(_idle(data) // FINER, data.size // (LEAST * (len(data.starts) - 1)))
     return _every(data, k) if k >= FEWEST else data
@@ -48,8 +47,6 @@ def thinned(data: Experiments) -> Experiments:
 def _idle(data: Experiments) -> int:
     """Return over how many samples a mean speed still shows the whole motion."""
     y = data.output[np.isfinite(data.output)][:MOST]
-    if data.kind == rc.SPEED:
-        return _unchanged(y)
     rough = float(np.diff(y, n=4).var()) / 70 if y.size > 8 else 0.0
     noise = 2 * max(rough, data.quantum**2 / 12)
 
@@ -62,16 +59,6 @@ def _idle(data: Experiments) -> int:
     while 8 * k < y.size and motion(2 * k) > 0.98 * motion(k):
         k *= 2
     return k
-
-
-def _unchanged(speed: Array) -> int:
-    """Return over how many samples a speed hardly changes, its noise aside."""
-    total = 2 * float(np.var(speed))
-    noise = 2 * float(np.diff(speed, n=4).var()) / 70 if speed.size > 8 else 0.0
-    k = 1
-    while 8 * k < speed.size and np.var(speed[2 * k :] - speed[: -2 * k]) - noise < SLIGHT * total:
-        k *= 2
-    return k * FINER // 2
 
 
 def _every(data: Experiments, k: int) -> Experiments:
