@@ -70,7 +70,8 @@ def _on(
 ) -> NDArray[np.float64]:
     """Return curves on another axis, shape (..., x.size); NaN outside of their own."""
     flat = [np.interp(x, own, row, left=np.nan, right=np.nan) for row in np.atleast_2d(rows)]
-    return np.array(flat).reshape(*rows.shape[:-1], x.size)
+    on: NDArray[np.float64] = np.array(flat).reshape(*rows.shape[:-1], x.size)
+    return on
 
 
 def tuning_svg(wheels: Mapping[str, Curves], limit: float) -> str:
