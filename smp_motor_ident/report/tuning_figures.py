@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from importlib import resources
 
 import numpy as np
-from numpy.typing import NDArray
 
 from smp_motor_ident.report.chart import Chart, Curve
 from smp_motor_ident.report.drawing import WIDTH, svg
 from smp_motor_ident.report.words import label
+from smp_motor_ident.tune.arrays import Array
 from smp_motor_ident.tune.curves import Curves
 
 
@@ -65,12 +65,10 @@ def tuning_charts(wheels: Mapping[str, Curves], limit: float) -> list[Chart]:
     ]
 
 
-def _on(
-    x: NDArray[np.float64], own: NDArray[np.float64], rows: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _on(x: Array, own: Array, rows: Array) -> Array:
     """Return curves on another axis, shape (..., x.size); NaN outside of their own."""
     flat = [np.interp(x, own, row, left=np.nan, right=np.nan) for row in np.atleast_2d(rows)]
-    on: NDArray[np.float64] = np.array(flat).reshape(*rows.shape[:-1], x.size)
+    on: Array = np.array(flat).reshape(*rows.shape[:-1], x.size)
     return on
 
 
