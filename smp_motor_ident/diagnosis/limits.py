@@ -266,6 +266,13 @@ EFFECT_OWN = Limit(
     "thousandth is one of them; less is rounding of the differences",
     "test_adequacy.py",
 )
+BUNCHED = Limit(
+    0.05,
+    "share of the mean interval",
+    "cost: the start puts the samples on a grid of their median interval, of 20 times as many "
+    "points as there are samples at this share, and without end where stamps are equal",
+    "test_bunched.py",
+)
 IMPLIED_BIAS = Limit(
     1.96,
     "standard deviations",
