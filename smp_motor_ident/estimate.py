@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from smp_motor_ident.diagnosis import validation as validate
 from smp_motor_ident.diagnosis.adequacy import adequacy, stated
-from smp_motor_ident.diagnosis.bunched import merge_bunches
 from smp_motor_ident.diagnosis.advice import advise, assess
+from smp_motor_ident.diagnosis.bunched import merge_bunches
 from smp_motor_ident.diagnosis.limits import CANDIDATE_WEIGHT
 from smp_motor_ident.diagnosis.residuals import residual_tests
 from smp_motor_ident.diagnosis.screening import screen
