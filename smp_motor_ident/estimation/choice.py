@@ -15,8 +15,8 @@ SURELY = 3.0  # times the price: a gain that rejects the simpler model whatever 
 
 
 @dataclass(frozen=True, eq=False)
-class Rung:
-    """A fitted structure and what was decided about it."""
+class FittedCandidate:
+    """A fitted candidate structure and what was decided about it."""
 
     fit: Fit
     reason: str = ""
@@ -79,9 +79,9 @@ def size(structure: Structure) -> int:
     return len(free) - (models.TE in free and not structure.current)
 
 
-def inflation(fit: Fit) -> float:
+def sandwich_factor(fit: Fit) -> float:
     """Return by how much the scores scatter more than white residuals would let them."""
-    return max(1.0, float(np.median(fit.colour())))
+    return max(1.0, float(np.median(fit.sandwich_factors())))
 
 
 def needed(simple: Fit, rich: Fit) -> tuple[bool, str]:
@@ -111,7 +111,7 @@ def needed(simple: Fit, rich: Fit) -> tuple[bool, str]:
     Rao and Scott, Ann. Statist. 12 (1984), 46 (such sums, and correcting by one factor).
     """
     more = size(rich.structure) - size(simple.structure)
-    gained = (simple.deviance - rich.deviance) / float(rich.colour().max())
+    gained = (simple.deviance - rich.deviance) / float(rich.sandwich_factors().max())
     price = more * (float(np.log(simple.samples)) + SCEPSIS)
     if not rich.converged and gained < SURELY * price:
         return False, "did not converge"
@@ -122,7 +122,7 @@ def needed(simple: Fit, rich: Fit) -> tuple[bool, str]:
         )
     loose = _loose(simple, rich)
     if loose and gained < SURELY * price:
-        return False, f"its {loose} cannot be told from these data"
+        return False, f"its {loose} is not identifiable from these data"
     return True, f"{label(simple.structure)} is rejected (gain {gained:.0f}, price {price:.0f})"
 
 

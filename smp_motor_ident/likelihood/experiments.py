@@ -79,7 +79,7 @@ class Experiments:
         """Return the same experiments, the speed taken for a mean over a trailing window."""
         return replace(self, kind=rc.MEAN_SPEED)
 
-    def head(self, duration: float) -> Experiments:
+    def data_window(self, duration: float) -> Experiments:
         """Return all up to ``duration`` seconds after the first voltage, of all segments together.
 
         A standstill before the first voltage teaches nothing, so it does not count.

@@ -1,4 +1,4 @@
-"""Choice among the ladder: the simplest model that the data do not reject, with reasons."""
+"""Order selection: the simplest candidate structure that the data do not reject, with reasons."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ from dataclasses import replace
 
 import numpy as np
 
-from smp_motor_ident.estimation import descent, horizon, replay
-from smp_motor_ident.estimation.choice import Rung, inflation, label, needed, size
-from smp_motor_ident.estimation.cold import cold_fit
+from smp_motor_ident.estimation import data_window, descent, prediction
+from smp_motor_ident.estimation.choice import FittedCandidate, label, needed, sandwich_factor, size
+from smp_motor_ident.estimation.delay_and_averaging import with_averaging, with_delay
 from smp_motor_ident.estimation.descent import Options
 from smp_motor_ident.estimation.fit import Fit
-from smp_motor_ident.estimation.lateness import averaged, with_delay
+from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.estimation.profile import RISE, one_level, rubbing
+from smp_motor_ident.estimation.ridge import random_restart
 from smp_motor_ident.estimation.thinning import thinned
-from smp_motor_ident.estimation.valley import shaken
 from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import Structure
 
-HOPELESS = 40.0  # deviance on the head of the data by which a rung is out for good
+HOPELESS = 40.0  # deviance on the screening subset by which a candidate is out for good
 RIVAL = 20.0  # deviance by which a delay must do better than a second lag
 LITTLE = 0.02  # of the largest voltage: friction below it may be left out
 
@@ -35,8 +35,8 @@ def explore(
     auto: bool,
     say: Say,
     first: Fit | None = None,
-) -> list[Rung]:
-    """Fit the rungs that come into question; the last one is the choice.
+) -> list[FittedCandidate]:
+    """Fit the candidates that come into question; the last one is the choice.
 
     Parameters
     ----------
@@ -49,73 +49,75 @@ def explore(
     auto : bool
         Whether the order may be chosen.
     say : callable
-        Told what is being done.
+        Receives what is being done.
     first : Fit, optional
         Of ``base``, where it is known already.
 
     Returns
     -------
-    list of Rung
+    list of FittedCandidate
         In the order of trial, the chosen one at the end.
     """
     smooth = _frictionless(data, base, options, auto, say)
     if smooth:
         return smooth
-    rungs: list[Rung] = []
+    candidates: list[FittedCandidate] = []
     if base.current or not auto:
         if first is None or first.structure != base:
-            first = _cold(data, base, options, say)
+            first = _initial_fit(data, base, options, say)
         if first is None:
             return []
         best = first
-        rungs.append(Rung(first, "asked for" if not auto else "current is measured"))
+        candidates.append(
+            FittedCandidate(first, "asked for" if not auto else "current is measured")
+        )
         if auto and data.kind == rc.SPEED:
-            best = _try_average(data, best, options, rungs, say)
+            best = _try_average(data, best, options, candidates, say)
     else:
-        found = _orders(data, base, options, say, rungs)
+        found = _orders(data, base, options, say, candidates)
         if found is None:
             return []
         best = found
-    best = _variations(data, best, options, rungs, say)
-    reason = next((r.reason for r in rungs if r.fit is best), "")
-    return [r for r in rungs if r.fit is not best] + [Rung(best, reason)]
+    best = _variations(data, best, options, candidates, say)
+    reason = next((r.reason for r in candidates if r.fit is best), "")
+    return [r for r in candidates if r.fit is not best] + [FittedCandidate(best, reason)]
 
 
-def _cold(data: Experiments, s: Structure, options: Options, say: Say) -> Fit | None:
+def _initial_fit(data: Experiments, s: Structure, options: Options, say: Say) -> Fit | None:
     say(f"fitting {label(s)}")
     if s.delay:
         return with_delay(data, s, options, None)
-    return cold_fit(data, s, options)
+    return initial_fit(data, s, options)
 
 
 def _frictionless(
     data: Experiments, base: Structure, options: Options, auto: bool, say: Say
-) -> list[Rung]:
+) -> list[FittedCandidate]:
     """Climb without friction where the score of a linear motor asks for none.
 
     Where there is none, a descent with friction has no bottom to find: L/R beside the
-    response's own coefficients is told by friction alone.
+    response's own coefficients is identifiable by friction alone.
     """
     if base.current or base.friction != "symmetric" or options.priors or data.quantum > 0:
         return []
     plain = base.with_(friction="none", shape=False)
-    head = descent.head(data)
-    quick = cold_fit(head, plain, options)
-    if quick is None or not quick.converged or _friction_shows(head, quick, False):
+    subset = descent.screening_subset(data)
+    quick = initial_fit(subset, plain, options)
+    if quick is None or not quick.converged or _friction_shows(subset, quick, False):
         return []
-    rungs = explore(data, plain, options, auto, say, quick if head is data else None)
-    if not rungs or _may_rub(_of_kind(data, rungs[-1].fit), rungs[-1].fit, options):
+    candidates = explore(data, plain, options, auto, say, quick if subset is data else None)
+    if not candidates or _may_rub(_of_kind(data, candidates[-1].fit), candidates[-1].fit, options):
         return []
-    reason = f"{rungs[-1].reason}; no Coulomb friction shows"
-    return [*rungs[:-1], Rung(rungs[-1].fit, reason)]
+    reason = f"{candidates[-1].reason}; no Coulomb friction shows"
+    return [*candidates[:-1], FittedCandidate(candidates[-1].fit, reason)]
 
 
 def _friction_shows(data: Experiments, fit: Fit, surely_small: bool) -> bool:
     """Tell by the score whether Coulomb friction is there, or may be and is not little."""
     structure = fit.structure.with_(friction="symmetric")
-    _, step, cov = replay.promise(data, fit, structure)
+    _, step, cov = prediction.predicted_decrease(data, fit, structure)
     i = structure.free().index(models.VC_PLUS)
-    std = float(np.sqrt(max(cov[i, i], 1e-300)) * np.sqrt(inflation(fit)))
+    std = float(np.sqrt(max(cov[i, i], 1e-300)) * np.sqrt(sandwich_factor(fit)))
     found = max(float(step[i]), 0.0)
     if not np.isfinite(found) or (found / std) ** 2 > 0.5 * np.log(fit.samples):
         return True
@@ -132,14 +134,15 @@ def _may_rub(data: Experiments, fit: Fit, options: Options) -> bool:
         return True
     little = LITTLE * float(np.abs(data.hold_value).max())
     z, initials = rubbing(data, fit, little)
-    held = {**fit.structure.held, "vc_plus": little}
-    rubs = fit.structure.with_(friction="symmetric", held=held)
+    fixed = {**fit.structure.fixed, "vc_plus": little}
+    rubs = fit.structure.with_(friction="symmetric", fixed=fixed)
     other = min(
-        (descent.descend(data, rubs, rubs.complete(z), initial, fit.noise, fit.ratio, options, 12)
+        (descent.descend(data, rubs, rubs.complete(z), initial, fit.noise, fit.noise_ratio,
+                         options, 12)
          for initial in initials),
         key=lambda f: f.deviance,
     )  # fmt: skip
-    return other.deviance - fit.deviance < RISE * inflation(fit)
+    return other.deviance - fit.deviance < RISE * sandwich_factor(fit)
 
 
 def _of_kind(data: Experiments, fit: Fit) -> Experiments:
@@ -147,15 +150,19 @@ def _of_kind(data: Experiments, fit: Fit) -> Experiments:
 
 
 def _orders(
-    data: Experiments, base: Structure, options: Options, say: Say, rungs: list[Rung]
+    data: Experiments,
+    base: Structure,
+    options: Options,
+    say: Say,
+    candidates: list[FittedCandidate],
 ) -> Fit | None:
     """Climb, by the number of parameters, as far as the data ask.
 
-    Rungs that the head of a long record rejects by far are not fitted to all of it.
+    Candidates that the screening subset rejects by far are not fitted to all of a long record.
     """
-    part = descent.head(thinned(data))
+    part = descent.screening_subset(thinned(data))
     tried: list[Fit] = []
-    for structure in _ladder(base, data.kind == rc.SPEED, data.quantum > 0):
+    for structure in _structures(base, data.kind == rc.SPEED, data.quantum > 0):
         say(f"fitting {label(structure)}")
         fitted = _one(part, structure, options, tried)
         if fitted is not None:
@@ -166,27 +173,35 @@ def _orders(
     best: Fit | None = None
     for fitted in tried:
         if part is not data:
-            if fitted.deviance > least + HOPELESS * inflation(fitted):
-                rungs.append(
-                    Rung(_projected(data, fitted), f"rejected on {part.size} samples", whole=False)
+            if fitted.deviance > least + HOPELESS * sandwich_factor(fitted):
+                candidates.append(
+                    FittedCandidate(
+                        _projected(data, fitted), f"rejected on {part.size} samples", whole=False
+                    )
                 )
                 continue
             every = _of_kind(data, fitted)
-            fitted = horizon.extend(every, fitted.structure, fitted, options)
-            fitted = shaken(every, fitted.structure, fitted, options)
-            fitted = _no_worse(every, fitted, [r.fit for r in rungs if r.whole], options)
+            fitted = data_window.extend(every, fitted.structure, fitted, options)
+            fitted = random_restart(every, fitted.structure, fitted, options)
+            fitted = _no_worse(every, fitted, [r.fit for r in candidates if r.whole], options)
         if best is None:
             best = fitted
-            rungs.append(Rung(fitted, "the simplest" if len(rungs) == 0 else "the simplest left"))
+            candidates.append(
+                FittedCandidate(
+                    fitted, "the simplest" if len(candidates) == 0 else "the simplest left"
+                )
+            )
             continue
         if size(fitted.structure) == size(best.structure):
             # Every motor has a second lag, few have a delay: alike, the lag is believed.
             lag = fitted.structure.order > best.structure.order
-            verdict = fitted.deviance < best.deviance + (RIVAL * inflation(fitted) if lag else 0.0)
+            verdict = fitted.deviance < best.deviance + (
+                RIVAL * sandwich_factor(fitted) if lag else 0.0
+            )
             reason = f"fits {'better' if verdict else 'worse'} than {label(best.structure)}"
         else:
             verdict, reason = needed(best, fitted)
-        rungs.append(Rung(fitted, reason))
+        candidates.append(FittedCandidate(fitted, reason))
         if verdict:
             best = fitted
     return best
@@ -210,7 +225,7 @@ def _no_worse(data: Experiments, fit: Fit, known: list[Fit], options: Options) -
 
 
 def _from_richer(data: Experiments, tried: list[Fit], options: Options) -> list[Fit]:
-    """Start the simpler rungs from the likeliest one as well: its torque noise may be theirs."""
+    """Start the simpler candidates from the likeliest too: its torque noise may be theirs."""
     best = min(tried, key=lambda f: f.deviance, default=None)
     out = []
     for fit in tried:
@@ -263,7 +278,7 @@ def _translated(rival: Fit, structure: Structure, step: float) -> models.Array:
 
 
 def _projected(data: Experiments, fit: Fit) -> Fit:
-    """Return a fit of the head with its deviance projected to all data."""
+    """Return a fit of the screening subset with its deviance projected to all data."""
     return replace(
         fit,
         initial=descent.initial_of(data, fit),
@@ -272,8 +287,8 @@ def _projected(data: Experiments, fit: Fit) -> Fit:
     )
 
 
-def _ladder(base: Structure, speed: bool, coarse: bool) -> list[Structure]:
-    """Return the rungs by number of parameters.
+def _structures(base: Structure, speed: bool, coarse: bool) -> list[Structure]:
+    """Return the candidate structures by number of parameters.
 
     A speed that comes in coarse steps is a difference of counts, a mean over a window by its
     making: a second time constant is asked for beside that window, not in its place.
@@ -282,24 +297,24 @@ def _ladder(base: Structure, speed: bool, coarse: bool) -> list[Structure]:
     second = replace(base, name="second_order", order=2, shape=True)
     late, late2 = first.with_(delay=True), second.with_(delay=True)
     if not speed:
-        rungs = [first, late, second, late2]
+        candidates = [first, late, second, late2]
     elif coarse:
-        rungs = [first, late, first.with_(window=True), late.with_(window=True)]
-        rungs += [second.with_(window=True), late2.with_(window=True)]
+        candidates = [first, late, first.with_(window=True), late.with_(window=True)]
+        candidates += [second.with_(window=True), late2.with_(window=True)]
     else:
-        rungs = [first, late, first.with_(window=True), second, late.with_(window=True)]
-        rungs += [second.with_(window=True), late2]
-    return [r for r in rungs if not (r.delay and "delay" in base.held)]
+        candidates = [first, late, first.with_(window=True), second, late.with_(window=True)]
+        candidates += [second.with_(window=True), late2]
+    return [r for r in candidates if not (r.delay and "delay" in base.fixed)]
 
 
 def _one(data: Experiments, structure: Structure, options: Options, known: list[Fit]) -> Fit | None:
-    """Fit one rung, started from what the rungs below it found."""
+    """Fit one candidate, started from what the simpler ones found."""
     if structure.window:
         late = replace(structure, name="first_order", order=1, shape=False, delay=True)
         twin = _find(known, late) or _find(known, late.with_(window=False))
         if twin is None or structure.order == 1:
             twin = _find(known, structure.with_(window=False, delay=True))
-        return averaged(data, structure, options, twin)
+        return with_averaging(data, structure, options, twin)
     if structure.delay:
         return with_delay(data, structure, options, _find(known, structure.with_(delay=False)))
     extra = []
@@ -311,14 +326,16 @@ def _one(data: Experiments, structure: Structure, options: Options, known: list[
         z[models.DELAY] = 0.0
         extra = [z]
     near = min(known, key=lambda f: f.deviance, default=None)
-    return cold_fit(data, structure, options, extra, near=near)
+    return initial_fit(data, structure, options, extra, near=near)
 
 
 def _find(known: list[Fit], structure: Structure) -> Fit | None:
     return next((f for f in known if f.structure == structure), None)
 
 
-def _variations(data: Experiments, best: Fit, options: Options, rungs: list[Rung], say: Say) -> Fit:
+def _variations(
+    data: Experiments, best: Fit, options: Options, candidates: list[FittedCandidate], say: Say
+) -> Fit:
     """Add what the data ask for, take away what they do not show."""
     s = best.structure
     if best.kind == rc.MEAN_SPEED:
@@ -326,7 +343,7 @@ def _variations(data: Experiments, best: Fit, options: Options, rungs: list[Rung
     trials: list[dict[str, object]] = []
     if best.structure.current:
         trials.append({"offset": True})
-        if "delay" not in s.held and not best.structure.delay:
+        if "delay" not in s.fixed and not best.structure.delay:
             trials.append({"delay": True})
     if best.structure.friction != "asymmetric":
         trials.append({"load": True})
@@ -334,7 +351,7 @@ def _variations(data: Experiments, best: Fit, options: Options, rungs: list[Rung
         trials.append({"friction": "asymmetric", "load": True})
     for change in trials:
         richer = best.structure.with_(**change)
-        if richer == best.structure or not _promising(data, best, richer):
+        if richer == best.structure or not _worth_a_fit(data, best, richer):
             continue
         say(f"trying {label(richer)}")
         z = best.z.copy()
@@ -344,34 +361,36 @@ def _variations(data: Experiments, best: Fit, options: Options, rungs: list[Rung
         verdict, reason = needed(best, other)
         if verdict and "delay" in change and other.z[models.DELAY] < 0.03 * data.step:
             verdict, reason = False, "a delay of hundredths of a sample is how the input was held"
-        if verdict and other.ratio > 0:  # what looked like torque noise may have been this
-            other = horizon.grow(data, richer, other, options)
-        rungs.append(Rung(other, reason))
+        if verdict and other.noise_ratio > 0:  # what looked like torque noise may have been this
+            other = data_window.grow(data, richer, other, options)
+        candidates.append(FittedCandidate(other, reason))
         if verdict:
             best = other
-    return _without_friction(data, best, options, rungs)
+    return _without_friction(data, best, options, candidates)
 
 
-def _promising(data: Experiments, best: Fit, richer: Structure) -> bool:
+def _worth_a_fit(data: Experiments, best: Fit, richer: Structure) -> bool:
     """Tell from the score whether a fit of more is worth its passes."""
     if not best.converged:
         return True
-    gain, _, _ = replay.promise(data, best, richer)
+    gain, _, _ = prediction.predicted_decrease(data, best, richer)
     price = (size(richer) - size(best.structure)) * float(np.log(best.samples))
-    return not gain < 0.5 * price * inflation(best)
+    return not gain < 0.5 * price * sandwich_factor(best)
 
 
-def _without_friction(data: Experiments, best: Fit, options: Options, rungs: list[Rung]) -> Fit:
+def _without_friction(
+    data: Experiments, best: Fit, options: Options, candidates: list[FittedCandidate]
+) -> Fit:
     """Leave Coulomb friction out where the data show that there is next to none."""
     s = best.structure
-    if s.friction != "symmetric" or "vc_plus" in s.held:
+    if s.friction != "symmetric" or "vc_plus" in s.fixed:
         return best
     smooth = s.with_(friction="none", shape=False)
-    head = _of_kind(descent.head(data), best)
-    if head.size < data.size:
-        with_it = descent.refine(head, s, best, best.z, options)
-        without = descent.refine(head, smooth, with_it, best.z, options)
-        if without.deviance > with_it.deviance + HOPELESS * inflation(with_it):
+    subset = _of_kind(descent.screening_subset(data), best)
+    if subset.size < data.size:
+        with_it = descent.refine(subset, s, best, best.z, options)
+        without = descent.refine(subset, smooth, with_it, best.z, options)
+        if without.deviance > with_it.deviance + HOPELESS * sandwich_factor(with_it):
             return best
     plain = descent.refine(data, smooth, best, best.z, options)
     if plain.deviance < best.deviance:  # then friction has led astray
@@ -382,15 +401,15 @@ def _without_friction(data: Experiments, best: Fit, options: Options, rungs: lis
     # Friction that the data do not show stays where a little would explain them as well:
     # leaving it out would make the gain certain.  A descent that did not settle is no reason
     # to believe in none.
-    gained = (plain.deviance - best.deviance) / inflation(best)
+    gained = (plain.deviance - best.deviance) / sandwich_factor(best)
     if gained <= float(np.log(best.samples)) and not _may_rub(data, plain, options):
-        rungs.append(Rung(plain, "no Coulomb friction shows"))
+        candidates.append(FittedCandidate(plain, "no Coulomb friction shows"))
         return plain
     return best
 
 
 def _try_average(
-    data: Experiments, best: Fit, options: Options, rungs: list[Rung], say: Say
+    data: Experiments, best: Fit, options: Options, candidates: list[FittedCandidate], say: Say
 ) -> Fit:
     """Try a speed averaged over a window of a sample or more, current being measured."""
     structure = best.structure.with_(window=True)
@@ -400,9 +419,9 @@ def _try_average(
         z = best.z.copy()
         z[models.WINDOW] = width * data.step
         starts.append(z)
-    fitted = cold_fit(data.as_mean_speed(), structure, options, starts, keep=3, own=False)
+    fitted = initial_fit(data.as_mean_speed(), structure, options, starts, keep=3, own=False)
     if fitted is None:
         return best
     verdict, reason = needed(best, fitted)
-    rungs.append(Rung(fitted, reason))
+    candidates.append(FittedCandidate(fitted, reason))
     return fitted if verdict else best
