@@ -149,5 +149,5 @@ def test_what_next_stays_within_what_the_recording_had():
 def test_a_motor_below_its_friction_stands_whatever_offset_its_sensor_shows(sign):
     volts = np.where(np.arange(N) < N // 4, 0.002, 1.1 * sign)
     offset = replace(GOOD, count=None, current=None, voltage=volts, velocity=np.full(N, 0.13))
-    with pytest.raises(SignalError, match="standing motor.*no excitation above friction"):
+    with pytest.raises(SignalError, match=r"standing motor.*no excitation above friction"):
         estimate(offset)
