@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from smp_motor_ident.diagnosis import validation as validate
 from smp_motor_ident.diagnosis.adequacy import adequacy, stated
 from smp_motor_ident.diagnosis.advice import advise, assess
+from smp_motor_ident.diagnosis.bunched import merge_bunches
 from smp_motor_ident.diagnosis.limits import CANDIDATE_WEIGHT
 from smp_motor_ident.diagnosis.residuals import residual_tests
 from smp_motor_ident.diagnosis.screening import screen
@@ -110,6 +111,7 @@ def estimate(
     say = progress or (lambda _: None)
     known = _checked(model, fixed, loss, group)
     _check_bounds(bounds or {}, model, group)
+    group = [merge_bunches(r) for r in group]
     findings = screen(group)
     group = [excited(r) for r in group]
     use_current = _has_current(group) and model in ("auto", "electromechanical")

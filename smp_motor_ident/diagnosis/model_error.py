@@ -39,7 +39,9 @@ class Regression:
     residual : ndarray, shape (n,)
         Of unit variance; the current's after the output's.
     regressors : ndarray, shape (n, r)
-        Responses to effects.
+        Responses to effects, the model's own coordinates projected out.
+    whole : ndarray, shape (n, r)
+        The same as they are.
     shifts : ndarray, shape (f, r)
         Change of the free coordinates for a unit of each.
     block : ndarray of int, shape (n,)
@@ -50,6 +52,7 @@ class Regression:
 
     residual: Array
     regressors: Array
+    whole: Array
     shifts: Array
     block: NDArray[np.int64]
     members: Sequence[tuple[Effect, tuple[int, ...]]]
@@ -113,7 +116,7 @@ def _projected(
         seen = tuple(c for c in columns if kept[c + 1])
         if seen:
             usable.append((effect, seen))
-    return Regression(left[:, 0], left[:, 1:], answer[:n_free, 1:], block, usable)
+    return Regression(left[:, 0], left[:, 1:], rest[:, 1:], answer[:n_free, 1:], block, usable)
 
 
 def _predicted(data: Experiments, fit: Fit) -> Array:
