@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from smp_motor_ident.estimation import data_window, descent, prediction
+from smp_motor_ident.estimation.candidate_starts import from_richer, from_rivals, no_worse, of_kind
 from smp_motor_ident.estimation.choice import FittedCandidate, label, needed, sandwich_factor, size
 from smp_motor_ident.estimation.delay_and_averaging import with_averaging, with_delay
 from smp_motor_ident.estimation.descent import Options
@@ -106,7 +107,7 @@ def _frictionless(
     if quick is None or not quick.converged or _friction_shows(subset, quick, False):
         return []
     candidates = explore(data, plain, options, auto, say, quick if subset is data else None)
-    if not candidates or _may_rub(_of_kind(data, candidates[-1].fit), candidates[-1].fit, options):
+    if not candidates or _may_rub(of_kind(data, candidates[-1].fit), candidates[-1].fit, options):
         return []
     reason = f"{candidates[-1].reason}; no Coulomb friction shows"
     return [*candidates[:-1], FittedCandidate(candidates[-1].fit, reason)]
@@ -145,10 +146,6 @@ def _may_rub(data: Experiments, fit: Fit, options: Options) -> bool:
     return other.deviance - fit.deviance < RISE * sandwich_factor(fit)
 
 
-def _of_kind(data: Experiments, fit: Fit) -> Experiments:
-    return data.as_mean_speed() if fit.kind == rc.MEAN_SPEED else data
-
-
 def _orders(
     data: Experiments,
     base: Structure,
@@ -166,9 +163,9 @@ def _orders(
         say(f"fitting {label(structure)}")
         fitted = _one(part, structure, options, tried)
         if fitted is not None:
-            tried.append(_no_worse(_of_kind(part, fitted), fitted, tried, options))
-    tried = _from_richer(part, tried, options)
-    tried = _from_rivals(part, tried, options)
+            tried.append(no_worse(of_kind(part, fitted), fitted, tried, options))
+    tried = from_richer(part, tried, options)
+    tried = from_rivals(part, tried, options)
     least = min((f.deviance for f in tried), default=0.0)
     best: Fit | None = None
     for fitted in tried:
@@ -180,10 +177,10 @@ def _orders(
                     )
                 )
                 continue
-            every = _of_kind(data, fitted)
+            every = of_kind(data, fitted)
             fitted = data_window.extend(every, fitted.structure, fitted, options)
             fitted = random_restart(every, fitted.structure, fitted, options)
-            fitted = _no_worse(every, fitted, [r.fit for r in candidates if r.whole], options)
+            fitted = no_worse(every, fitted, [r.fit for r in candidates if r.whole], options)
         if best is None:
             best = fitted
             candidates.append(
@@ -205,76 +202,6 @@ def _orders(
         if verdict:
             best = fitted
     return best
-
-
-def _no_worse(data: Experiments, fit: Fit, known: list[Fit], options: Options) -> Fit:
-    """Hold a fit against those that it contains: their answers are starts as good as any."""
-    free = set(fit.structure.free())
-    inner = [f for f in known if f.kind == fit.kind and set(f.structure.free()) < free]
-    least = min(inner, key=lambda f: f.deviance, default=fit)
-    if least.deviance >= fit.deviance:
-        return fit
-    z = least.z.copy()
-    if fit.structure.order > least.structure.order:
-        z[models.A2] = 2 * z[models.A1] - z[models.A0] + np.log(0.02)
-        z[models.TE] = z[models.A2] - z[models.A1]
-    if fit.structure.delay and not least.structure.delay:
-        z[models.DELAY] = 0.1 * data.step
-    again = descent.refine(data, fit.structure, least, fit.structure.complete(z), options)
-    return min(fit, again, key=lambda f: f.deviance)
-
-
-def _from_richer(data: Experiments, tried: list[Fit], options: Options) -> list[Fit]:
-    """Start the simpler candidates from the likeliest too: its torque noise may be theirs."""
-    best = min(tried, key=lambda f: f.deviance, default=None)
-    out = []
-    for fit in tried:
-        free, more = set(fit.structure.free()), set(best.structure.free()) if best else set()
-        if best is not None and free < more and fit.kind == best.kind:
-            z = best.z.copy()
-            late = z[models.DELAY] * (models.DELAY not in free)
-            if fit.structure.order == 2 and late > 0:
-                z[models.A2] = np.logaddexp(z[models.A2], z[models.A1] + np.log(late))
-            part = _of_kind(data, fit)
-            again = descent.refine(part, fit.structure, best, fit.structure.complete(z), options)
-            fit = min(fit, again, key=lambda f: f.deviance)
-        out.append(fit)
-    return out
-
-
-def _from_rivals(data: Experiments, tried: list[Fit], options: Options) -> list[Fit]:
-    """Start the likeliest from every rival's answer: what is late in one way may be in another."""
-    if len(tried) < 2:
-        return tried
-    best = min(range(len(tried)), key=lambda i: tried[i].deviance + _price(tried[i]))
-    out = list(tried)
-    for rival in tried:
-        winner = out[best]
-        if rival is winner or rival.kind != winner.kind:
-            continue
-        z = winner.structure.complete(_translated(rival, winner.structure, data.step))
-        again = descent.refine(_of_kind(data, winner), winner.structure, rival, z, options)
-        if again.deviance < winner.deviance:
-            out[best] = again
-    return out
-
-
-def _price(fit: Fit) -> float:
-    return size(fit.structure) * float(np.log(fit.samples))
-
-
-def _translated(rival: Fit, structure: Structure, step: float) -> models.Array:
-    """Return a rival's coordinates, what it is late by put into what the structure has."""
-    z, has = rival.z.copy(), rival.structure
-    late = z[models.DELAY] * has.delay
-    if has.order == 2 and structure.order == 1:
-        late += float(np.exp(z[models.A2] - z[models.A1]))
-    if structure.order == 2 and has.order == 1:
-        z[models.A2] = z[models.A1] + np.log(max(late, 0.1 * step))
-        z[models.TE] = z[models.A2] - z[models.A1]
-        late = 0.1 * step
-    z[models.DELAY] = max(late, 0.1 * step)
-    return z
 
 
 def _projected(data: Experiments, fit: Fit) -> Fit:
@@ -386,7 +313,7 @@ def _without_friction(
     if s.friction != "symmetric" or "vc_plus" in s.fixed:
         return best
     smooth = s.with_(friction="none", shape=False)
-    subset = _of_kind(descent.screening_subset(data), best)
+    subset = of_kind(descent.screening_subset(data), best)
     if subset.size < data.size:
         with_it = descent.refine(subset, s, best, best.z, options)
         without = descent.refine(subset, smooth, with_it, best.z, options)
