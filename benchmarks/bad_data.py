@@ -241,7 +241,7 @@ def judge(record: Record, truth: dict, words: str = "") -> dict:
               if q.status == "estimated" and q.std and n in truth}  # fmt: skip
     errors = {n: abs(q.value - truth[n]) / q.std for n, q in claims.items()}
     worst = max(errors, key=lambda n: errors[n])
-    doubt = e.unreliable or any("doubtful" in w for w in e.warnings)
+    doubt = e.unreliable
     says = "unreliable" if doubt else ("wrong" if errors[worst] > FAR else "right")
     off = abs(claims[worst].value / truth[worst] - 1) if truth[worst] else claims[worst].value
     return {"says": says, "words": "; ".join(e.warnings), "worst": worst, "sigmas": errors[worst],

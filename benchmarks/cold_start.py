@@ -18,8 +18,8 @@ from known_motors import TABLE_1, recording, table
 from smp_motor_ident.errors import SmpError
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.estimation import fit
-from smp_motor_ident.estimation.cold import cold_fit
 from smp_motor_ident.estimation.descent import Options
+from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import Structure
@@ -48,12 +48,12 @@ def minimum(record, z, current: bool, friction: bool) -> dict:
     )  # fmt: skip
     data = prepare([record], current)
     begun = time.perf_counter()
-    found = cold_fit(data, structure, Options())
+    found = initial_fit(data, structure, Options())
     spent = time.perf_counter() - begun
     if found is None:
         return {"right": False, "seconds": spent}
     near = fit.solve(
-        data, structure, structure.complete(z), np.zeros((1, 4)), found.noise, found.ratio
+        data, structure, structure.complete(z), np.zeros((1, 4)), found.noise, found.noise_ratio
     )
     # At or below the deviance that a start from the truth reaches; 0.1 % of noise.
     above = found.deviance - near.deviance
@@ -72,7 +72,7 @@ def answer(record, z) -> dict:
               if q.status == "estimated" and q.std and n in values}  # fmt: skip
     errors = {n: abs(q.value - values[n]) / q.std for n, q in claims.items()}
     worst = max(errors, key=lambda n: errors[n])
-    words = [w for w in e.warnings if e.unreliable or "doubtful" in w]
+    words = list(e.warnings) if e.unreliable else []
     off = abs(claims[worst].value / values[worst] - 1) if values[worst] else 0.0
     return {"says": "unreliable" if words else "sure", "words": "; ".join(words), "model": e.model,
             "worst": worst, "sigmas": errors[worst], "off": off,

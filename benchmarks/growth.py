@@ -14,8 +14,8 @@ import numpy as np
 from known_motors import TABLE_1, recording, table
 
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.estimation.cold import cold_fit
 from smp_motor_ident.estimation.descent import Options
+from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.model.structures import Structure
 from smp_motor_ident.record import Hardware, Record
@@ -64,7 +64,7 @@ def child(folder: str, counts: bool, friction: bool, whole: bool) -> None:
             gain, tau = e.value("dc_gain"), e.value("time_constant")
             product = e.value("time_constant_product")
             return [float(x) for x in np.log([1 / gain, tau / gain, product / gain])]
-        return [float(x) for x in cold_fit(prepare([given], False), structure, Options()).z[:3]]
+        return [float(x) for x in initial_fit(prepare([given], False), structure, Options()).z[:3]]
 
     call(record.slice(0, min(len(record), 8_000)))  # compiled code into memory
     gc.collect()

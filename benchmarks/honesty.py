@@ -35,12 +35,12 @@ CASES = (
 
 def least_certain(record, z, current: bool, known: tuple[str, ...]) -> float:
     """Return the bound's largest relative std of R, L, K, J, b as far as they are not known."""
-    held = {}
+    fixed = {}
     if "resistance" in known and current:
-        held["ln_r"] = float(z[models.LN_R])
+        fixed["ln_r"] = float(z[models.LN_R])
     if "inductance" in known:
-        held["ln_te"] = float(z[models.TE])
-    structure = Structure("bound", current=current, shape=False, held=held)
+        fixed["ln_te"] = float(z[models.TE])
+    structure = Structure("bound", current=current, shape=False, fixed=fixed)
     data = prepare([record], current)
     noise = np.diag([QUANTUM**2 / 12, CURRENT_NOISE**2])
     start = np.zeros((1, 4))

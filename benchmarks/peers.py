@@ -68,8 +68,8 @@ def cost(record: Record, x: np.ndarray) -> float:
     """
     if not np.all(np.isfinite(x)):
         return float("nan")
-    held = dict(zip(("ln_a0", "ln_a1", "ln_a2", "vc_plus"), map(float, x)))
-    structure = Structure("speed", friction="symmetric" if len(x) > 3 else "none", held=held)
+    fixed = dict(zip(("ln_a0", "ln_a1", "ln_a2", "vc_plus"), map(float, x)))
+    structure = Structure("speed", friction="symmetric" if len(x) > 3 else "none", fixed=fixed)
     data = prepare([record], False)
     return solve(data, structure, np.zeros(11), data.initial, NOISE * np.eye(2)).objective * NOISE
 

@@ -28,8 +28,8 @@ from growth import growth  # noqa: E402
 from known_motors import TABLE_1, recording, table  # noqa: E402
 
 from smp_motor_ident.estimate import estimate  # noqa: E402
-from smp_motor_ident.estimation.cold import cold_fit  # noqa: E402
 from smp_motor_ident.estimation.descent import Options  # noqa: E402
+from smp_motor_ident.estimation.initialisation import initial_fit  # noqa: E402
 from smp_motor_ident.likelihood.experiments import prepare  # noqa: E402
 from smp_motor_ident.model.structures import Structure  # noqa: E402
 from smp_motor_ident.record import Record  # noqa: E402
@@ -53,7 +53,7 @@ class Run:
 def ours(record: Record, friction: bool) -> np.ndarray:
     """Return the coordinates from cold: the fit alone."""
     kind = "symmetric" if friction else "none"
-    fit = cold_fit(prepare([record], False), Structure("speed", friction=kind), Options())
+    fit = initial_fit(prepare([record], False), Structure("speed", friction=kind), Options())
     return fit.z[[0, 1, 2, 4]] if friction else fit.z[:3]
 
 

@@ -114,12 +114,12 @@ def judge(job: tuple[int, int, int, bool]) -> tuple[int, str, str]:
 def main() -> None:
     """Run and print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--motors", type=int, default=3, help="an effect")
+    parser.add_argument("--motors", type=int, default=3, help="motors an effect")
     parser.add_argument("--seed", type=int, default=None)
     parser.add_argument("--effects", default="")
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--rich", action="store_true", help="only excitation that tells much")
-    parser.add_argument("--list", action="store_true", help="print every case")
+    parser.add_argument("--list", action="store_true", help="print every case as it comes")
     args = parser.parse_args()
     seed = args.seed if args.seed is not None else int(time.time())
     words = [w.strip().lower() for w in args.effects.split(",") if w.strip()]
@@ -131,14 +131,11 @@ def main() -> None:
     ]
     begin = time.time()
     counts: dict[int, Counter[str]] = {k: Counter() for k in chosen}
-    lines = []
     with ProcessPoolExecutor(args.processes) as pool:
         for number, outcome, about in pool.map(judge, jobs, chunksize=1):
             counts[number][outcome] += 1
-            lines.append((outcome, about))
-    if args.list:
-        for outcome, about in lines:
-            print(f"{outcome:8} {about}")
+            if args.list:
+                print(f"{outcome:8} {about}", flush=True)
     print(f"\nseed {seed}, {args.motors} motors an effect, {time.time() - begin:.0f} s\n")
     print("| effect | " + " | ".join(OUTCOMES) + " |\n|" + " --- |" * (1 + len(OUTCOMES)))
     total: Counter[str] = Counter()

@@ -1,4 +1,4 @@
-"""The one door: records of a motor in, an `Estimate` out, or a refusal that says why."""
+"""The entry point: records of a motor in, an `Estimate` out, or a refusal that says why."""
 
 from __future__ import annotations
 
@@ -10,18 +10,19 @@ from numpy.typing import NDArray
 from smp_motor_ident.diagnosis import validation as validate
 from smp_motor_ident.diagnosis.adequacy import adequacy, stated
 from smp_motor_ident.diagnosis.advice import advise, assess
+from smp_motor_ident.diagnosis.bunched import merge_bunches
 from smp_motor_ident.diagnosis.limits import CANDIDATE_WEIGHT
 from smp_motor_ident.diagnosis.residuals import residual_tests
 from smp_motor_ident.diagnosis.screening import screen
 from smp_motor_ident.errors import InsufficientExcitationError, ParameterError, SignalError
-from smp_motor_ident.estimation import flexible_shaft, ladder
+from smp_motor_ident.estimation import flexible_shaft, order_selection
 from smp_motor_ident.estimation.averaging import averaged, weights
-from smp_motor_ident.estimation.choice import Rung
-from smp_motor_ident.estimation.cold import cold_fit
-from smp_motor_ident.estimation.descent import Options, head, refine
+from smp_motor_ident.estimation.choice import FittedCandidate
+from smp_motor_ident.estimation.consider_covariance import consider_friction, consider_timing
+from smp_motor_ident.estimation.data_window import extend, grow
+from smp_motor_ident.estimation.descent import Options, refine, screening_subset
 from smp_motor_ident.estimation.fit import Fit, Prior
-from smp_motor_ident.estimation.horizon import extend, grow
-from smp_motor_ident.estimation.nuisance import blurred, unseen_friction
+from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.estimation.profile import profiled
 from smp_motor_ident.estimation.quantisation import widened
 from smp_motor_ident.estimation.quantities import Answer, answer
@@ -47,7 +48,7 @@ LARGEST_OFFSET = 0.1
 INSTANT = 0.01
 MANY = 400_000
 MANY_TO_PROFILE = 20_000  # samples above which as few are followed as tell the same
-FAR = 100.0  # deviance on the head by which a way of holding the command is out
+FAR = 100.0  # deviance on the screening subset by which a way of holding the command is out
 
 
 def estimate(
@@ -60,7 +61,7 @@ def estimate(
     validation: Sequence[Record] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Estimate:
-    """Estimate a motor from recordings, from cold, with what is and is not known.
+    """Estimate a motor from recordings, without initial values, with what is and is not known.
 
     Output-error or innovations least squares on counts, angle or speed (and current where
     it is measured) with analytic sensitivities; no initial guess is needed.
@@ -70,7 +71,7 @@ def estimate(
     records : Record or sequence of Record
         Of one motor; each record (and segment) has its own initial state.
     model : str
-        ``auto``, or a rung of the ladder: ``static_gain``, ``first_order``,
+        ``auto``, or a candidate structure: ``static_gain``, ``first_order``,
         ``second_order``, ``electromechanical``.
     fixed : mapping of str to float, optional
         Parameters that the user knows, by the names of `models.PHYSICAL` or ``delay``,
@@ -83,12 +84,12 @@ def estimate(
         Held-out records; by default the last part of ``records`` is held out for the
         validation figure, and used again for the final estimate.
     progress : callable, optional
-        Told in words what is being done.
+        Receives in words what is being done.
 
     Returns
     -------
     Estimate
-        Values with standard deviations; what cannot be told has no value.
+        Values with standard deviations; what is not identifiable has no value.
 
     Raises
     ------
@@ -110,35 +111,40 @@ def estimate(
     say = progress or (lambda _: None)
     known = _checked(model, fixed, loss, group)
     _check_bounds(bounds or {}, model, group)
+    group = [merge_bunches(r) for r in group]
     findings = screen(group)
     group = [excited(r) for r in group]
     use_current = _has_current(group) and model in ("auto", "electromechanical")
     base = _structure(model, use_current, known, group)
     hold, first = _hold(group, base, LOSSES[loss], say)
     data = prepare(group, use_current, hold=hold)
-    if base.window or "window" in base.held:
+    if base.window or "window" in base.fixed:
         data = data.as_mean_speed()
     options = Options(huber=LOSSES[loss])
-    rungs = ladder.explore(data, base, options, model == "auto", say, first)
-    if not rungs:
+    candidates = order_selection.explore(data, base, options, model == "auto", say, first)
+    if not candidates:
         raise InsufficientExcitationError(
             f"{_where(group)}: no motor model explains these data; record 20 s or more of a "
             "square or Fourier voltage that turns the motor in both directions"
         )
-    chosen = _constrain(_for_final(data, rungs[-1].fit), rungs[-1].fit, options, known, bounds)
+    chosen = _constrain(
+        _for_final(data, candidates[-1].fit), candidates[-1].fit, options, known, bounds
+    )
     final = _for_final(data, chosen)
     few = thinned(final) if final.size > MANY_TO_PROFILE else final
     chosen = profiled(few, widened(final, chosen), options)
-    chosen, unseen = unseen_friction(final, blurred(final, chosen, _instants(group, hold)))
+    chosen, friction_std = consider_friction(
+        final, consider_timing(final, chosen, _instants(group, hold))
+    )
     chosen, change = heterogeneous(final, chosen)
-    result = answer(chosen, known, unseen, _level(final))
-    result, alike = _covering(data, rungs, result, known)
+    result = answer(chosen, known, friction_std, _level(final))
+    result, alike = _covering(data, candidates, result, known)
     fitted = validate.speed_fit(group, final, chosen)
     _refuse(group, chosen, result, fitted)
     _refuse_offset(group, chosen)
     say("validating")
-    held = _validation(group, validation, chosen, options, hold)
-    percent = FitPercent(fitted, held)
+    held_out = _validation(group, validation, chosen, options, hold)
+    percent = FitPercent(fitted, held_out)
     tests = residual_tests(final, chosen)
     findings += [
         *assess(final, chosen, percent, tests),
@@ -154,7 +160,7 @@ def estimate(
         names=result.names,
         covariance=result.covariance,
         fit_percent=percent,
-        candidates=_candidates(rungs, chosen, group, data),
+        candidates=_candidates(candidates, chosen, group, data),
         residuals=tests,
         findings=tuple(findings),
         samples=data.size,
@@ -174,18 +180,21 @@ def _level(data: Experiments) -> float:
 
 
 def _covering(
-    data: Experiments, rungs: Sequence[Rung], result: Answer, known: Mapping[str, float]
+    data: Experiments,
+    candidates: Sequence[FittedCandidate],
+    result: Answer,
+    known: Mapping[str, float],
 ) -> tuple[Answer, dict[str, float]]:
     """Return the answer over all structures that explain the data as well, and their weights."""
-    whole = [r for r in rungs[:-1] if r.whole and r.fit.converged]
+    whole = [r for r in candidates[:-1] if r.whole and r.fit.converged]
     if data.quantum > 0:  # a speed in coarse steps is a difference of counts, by its making
-        whole = [r for r in whole if r.fit.kind == rungs[-1].fit.kind]
+        whole = [r for r in whole if r.fit.kind == candidates[-1].fit.kind]
     if not whole or result.level:
         return result, {}
-    fits = [rungs[-1].fit, *(r.fit for r in whole)]
+    fits = [candidates[-1].fit, *(r.fit for r in whole)]
     weight = weights(lambda fit: _for_final(data, fit), fits)
     found = averaged(result, weight, [answer(f, known) for f in fits[1:]])
-    labels = [rungs[-1].label, *(r.label for r in whole)]
+    labels = [candidates[-1].label, *(r.label for r in whole)]
     alike = {n: float(w) for n, w in zip(labels, weight, strict=True) if w > CANDIDATE_WEIGHT.value}
     return found, alike if len(alike) > 1 else {}
 
@@ -287,33 +296,35 @@ def _has_current(group: Sequence[Record]) -> bool:
 def _structure(
     model: str, use_current: bool, known: Mapping[str, float], group: Sequence[Record]
 ) -> Structure:
-    held: dict[str, float] = {}
+    fixed: dict[str, float] = {}
     if "resistance" in known and (use_current or "inductance" in known):
-        held["ln_r"] = float(np.log(known["resistance"]))
+        fixed["ln_r"] = float(np.log(known["resistance"]))
     if "resistance" in known and "inductance" in known:
-        held["ln_te"] = float(np.log(known["inductance"] / known["resistance"]))
+        fixed["ln_te"] = float(np.log(known["inductance"] / known["resistance"]))
     if "delay" in known:
-        held["delay"] = known["delay"]
+        fixed["delay"] = known["delay"]
     window = known.get("averaging_window", max(r.velocity_window for r in group))
     if window > 0:
-        held["window"] = window
-    rung = model.removesuffix("_asymmetric")
+        fixed["window"] = window
+    candidate = model.removesuffix("_asymmetric")
     asymmetric = model.endswith("_asymmetric")
     friction = "asymmetric" if asymmetric else "symmetric"
     if use_current:
-        return Structure("electromechanical", 2, friction, current=True, load=asymmetric, held=held)
-    if rung in ("auto", "electromechanical"):
-        rung = "second_order"
-    order = 2 if rung == "second_order" else 1
+        return Structure(
+            "electromechanical", 2, friction, current=True, load=asymmetric, fixed=fixed
+        )
+    if candidate in ("auto", "electromechanical"):
+        candidate = "second_order"
+    order = 2 if candidate == "second_order" else 1
     # How friction is felt depends on L/R, which the linear response leaves open.
-    return Structure(rung, order, friction, shape=order == 2, load=asymmetric, held=held)
+    return Structure(candidate, order, friction, shape=order == 2, load=asymmetric, fixed=fixed)
 
 
 def _hold(
     group: Sequence[Record], base: Structure, huber: float, say: Callable[[str], None]
 ) -> tuple[str, Fit | None]:
     """Choose how the command ran inside the intervals, by what explains the outputs best."""
-    if base.order != 2 or "window" in base.held or sum(len(r) for r in group) > MANY:
+    if base.order != 2 or "window" in base.fixed or sum(len(r) for r in group) > MANY:
         return "held", None
     plain = prepare(group, base.current)
     if plain.kind != rc.ANGLE or thinned(plain) is not plain:
@@ -324,14 +335,14 @@ def _hold(
         return "held", None
     say("how the command was held between samples")
     options = Options(huber=huber)
-    best = cold_fit(plain, base if base.current else base.with_(shape=False), options)
+    best = initial_fit(plain, base if base.current else base.with_(shape=False), options)
     if best is None:
         return "held", None
     hold = "held"
-    part = head(plain)
+    part = screening_subset(plain)
     near = refine(part, best.structure, best, best.z, options) if part is not plain else best
     for other, data in others.items():
-        fitted = grow(head(data), best.structure, near, options)
+        fitted = grow(screening_subset(data), best.structure, near, options)
         if fitted.deviance > near.deviance + FAR and fitted.converged:
             continue
         fitted = extend(data, best.structure, fitted, options)
@@ -377,7 +388,7 @@ def _constrain(
         Prior(n, known[n], 1e-4 * max(abs(known[n]), 1e-2 * scale[n]))
         for n in PHYSICAL
         if n in known
-        and not (n == "resistance" or (n == "inductance" and "ln_te" in fit.structure.held))
+        and not (n == "resistance" or (n == "inductance" and "ln_te" in fit.structure.fixed))
     ]
     for name, (low, high) in (bounds or {}).items():
         if not low <= values[name] <= high:
@@ -449,22 +460,22 @@ def _validation(
 
 
 def _candidates(
-    rungs: Sequence[Rung], chosen: Fit, group: Sequence[Record], data: Experiments
+    candidates: Sequence[FittedCandidate], chosen: Fit, group: Sequence[Record], data: Experiments
 ) -> tuple[Candidate, ...]:
     out = []
-    for n, rung in enumerate(rungs):
-        last = n == len(rungs) - 1
-        fit = chosen if last else rung.fit
+    for n, candidate in enumerate(candidates):
+        last = n == len(candidates) - 1
+        fit = chosen if last else candidate.fit
         value = validate.speed_fit(group, _for_final(data, fit), fit)
         if value < LEAST_FIT and not last:
             value = float("nan")  # a descent that left the motor behind has no fit to speak of
         out.append(
             Candidate(
-                rung.label,
+                candidate.label,
                 value if np.isfinite(value) else None,
-                rung.bic,
+                candidate.bic,
                 last,
-                rung.reason,
+                candidate.reason,
             )
         )
     return tuple(out)

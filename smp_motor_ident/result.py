@@ -77,7 +77,7 @@ class FitPercent:
 
 @dataclass(frozen=True)
 class Candidate:
-    """One rung of the model ladder, as it did on the data."""
+    """A candidate structure, as it did on the data."""
 
     model: str
     fit_percent: float | None
@@ -115,7 +115,7 @@ class Estimate:
     Attributes
     ----------
     wheel, model : str
-        Name of the wheel, and of the rung of the ladder that was chosen.
+        Name of the wheel, and of the candidate structure that was chosen.
     parameters : mapping of str to Quantity
         Physical parameters at the motor shaft, with ``unidentifiable`` ones listed as such.
     combinations : mapping of str to Quantity
@@ -167,7 +167,7 @@ class Estimate:
 
     @property
     def identifiable(self) -> bool:
-        """Whether every parameter of the model could be told."""
+        """Whether every parameter of the model is identifiable."""
         return not self.unidentifiable
 
     def value(self, name: str, default: float = 0.0) -> float:
@@ -209,11 +209,11 @@ class Estimate:
             One draw a row.
         """
         drawn = np.tile([self.value(name) for name in names], (n, 1)).astype(np.float64)
-        held = [name for name in names if name in self.names and self.value(name) > 0]
-        if not held:
+        positive = [name for name in names if name in self.names and self.value(name) > 0]
+        if not positive:
             return drawn
-        index = [self.names.index(name) for name in held]
-        mean = np.array([self.value(name) for name in held])
+        index = [self.names.index(name) for name in positive]
+        mean = np.array([self.value(name) for name in positive])
         relative = self.covariance[np.ix_(index, index)] / np.outer(mean, mean)
         # A log-normal with this log-mean and log-covariance has exactly the estimate as its
         # mean and the relative covariance above.
@@ -221,7 +221,7 @@ class Estimate:
         draws = rng.multivariate_normal(
             -np.diag(log_covariance) / 2, log_covariance, n, method="eigh", check_valid="ignore"
         )
-        for column, name in enumerate(held):
+        for column, name in enumerate(positive):
             drawn[:, list(names).index(name)] = mean[column] * np.exp(draws[:, column])
         return drawn
 

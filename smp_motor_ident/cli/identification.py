@@ -29,7 +29,7 @@ from smp_motor_ident.errors import (
     SmpError,
 )
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.estimation.predict import simulate
+from smp_motor_ident.estimation.simulation import simulate
 from smp_motor_ident.record import Record
 from smp_motor_ident.report import words
 from smp_motor_ident.report.document import (

@@ -18,7 +18,7 @@ from smp_motor_ident.diagnosis.limits import (
     STEADY,
     UNEXPLAINED,
 )
-from smp_motor_ident.estimation import replay
+from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.quantities import Answer
 from smp_motor_ident.finding import Finding
@@ -112,7 +112,7 @@ def _fit(percent: FitPercent, tests: ResidualTests) -> list[Finding]:
 def _resolution(data: Experiments, fit: Fit, tests: ResidualTests) -> list[Finding]:
     out = []
     own = data.quantum**2 / 12
-    beyond = 0 < UNEXPLAINED.value * own < fit.noise[0, 0] and fit.ratio == 0
+    beyond = 0 < UNEXPLAINED.value * own < fit.noise[0, 0] and fit.noise_ratio == 0
     if data.kind == rc.ANGLE and beyond and tests.white is False:
         times = float(np.sqrt(fit.noise[0, 0] / own))
         out.append(
@@ -154,7 +154,7 @@ def _sensors(fit: Fit) -> list[Finding]:
                 "zero the current sensor at rest",
             )
         )
-    if s.window or "window" in s.held:
+    if s.window or "window" in s.fixed:
         window = float(fit.z[models.WINDOW])
         out.append(
             Finding(
@@ -169,7 +169,7 @@ def _sensors(fit: Fit) -> list[Finding]:
 
 
 def _torque_noise(data: Experiments, fit: Fit) -> list[Finding]:
-    if fit.ratio <= 0 or data.kind != rc.ANGLE:
+    if fit.noise_ratio <= 0 or data.kind != rc.ANGLE:
         return []
     out = []
     if not fit.structure.current and _plain_square(data, fit):
@@ -189,7 +189,7 @@ def _torque_noise(data: Experiments, fit: Fit) -> list[Finding]:
             "warning",
             "the motion scatters beyond the counter's resolution (a load that fluctuates, or a "
             "command that switches between samples)",
-            {"intensity": float(fit.ratio)},
+            {"intensity": float(fit.noise_ratio)},
         )
     )
     return out
@@ -230,7 +230,7 @@ def _unsettled(data: Experiments, fit: Fit) -> bool:
     kink the linear step is long and yet leads uphill: only a way that lowers the sum of squares
     by as much as such a move is worth counts.
     """
-    _, step, _ = replay.promise(data, fit, fit.structure)
+    _, step, _ = prediction.predicted_decrease(data, fit, fit.structure)
     free = np.array(fit.structure.free())
     reported = (free != models.TE) | fit.structure.current
     deviation = np.sqrt(np.diag(fit.covariance()))

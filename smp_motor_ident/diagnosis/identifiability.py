@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident.errors import ParameterError
-from smp_motor_ident.estimation import replay
+from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import prepare
@@ -269,7 +269,7 @@ def _least_certain(record: Record, family: Sequence[Fit]) -> dict[str, float]:
 
 def _relative_std(record: Record, fit: Fit) -> dict[str, float]:
     data = replace(prepare([record], True), kind=rc.ANGLE)
-    information = replay.information(data, fit)
+    information = prediction.information(data, fit)
     cov = replace(fit, information=information).covariance()
     values, gradients = models.physical(fit.z)
     matrix = fit.structure.matrix()

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from smp_motor_ident.diagnosis.effects import EFFECTS, Effect, Motion
 from smp_motor_ident.diagnosis.limits import EFFECT_OWN
 from smp_motor_ident.diagnosis.residuals import voltage_at_samples
-from smp_motor_ident.estimation import replay
+from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments
@@ -39,7 +39,9 @@ class Regression:
     residual : ndarray, shape (n,)
         Of unit variance; the current's after the output's.
     regressors : ndarray, shape (n, r)
-        Responses to effects.
+        Responses to effects, the model's own coordinates projected out.
+    whole : ndarray, shape (n, r)
+        The same as they are.
     shifts : ndarray, shape (f, r)
         Change of the free coordinates for a unit of each.
     block : ndarray of int, shape (n,)
@@ -50,6 +52,7 @@ class Regression:
 
     residual: Array
     regressors: Array
+    whole: Array
     shifts: Array
     block: NDArray[np.int64]
     members: Sequence[tuple[Effect, tuple[int, ...]]]
@@ -113,12 +116,12 @@ def _projected(
         seen = tuple(c for c in columns if kept[c + 1])
         if seen:
             usable.append((effect, seen))
-    return Regression(left[:, 0], left[:, 1:], answer[:n_free, 1:], block, usable)
+    return Regression(left[:, 0], left[:, 1:], rest[:, 1:], answer[:n_free, 1:], block, usable)
 
 
 def _predicted(data: Experiments, fit: Fit) -> Array:
     """Return the one-step predictions of the output (and current) as columns."""
-    return replay.simulate(data, fit, gain=True)[:, 1:]
+    return prediction.simulate(data, fit, gain=True)[:, 1:]
 
 
 def _measured(data: Experiments) -> Array:
@@ -200,7 +203,7 @@ def _response(data: Experiments, fit: Fit, base: Array, effect: Effect, signal: 
 
 def _motions(data: Experiments, fit: Fit, gear: float) -> tuple[Motion, Motion]:
     """Return the free run at the sections' middles and at the samples."""
-    run = replay.simulate(data, fit)
+    run = prediction.simulate(data, fit)
     speed = run[:, 0]
     back = to_internal(fit.z, fit.structure.order)[0][2]
     angle = data.output if data.kind == rc.ANGLE else np.zeros(data.size)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from smp_motor_ident.diagnosis.limits import RESIDUAL_LEVEL
-from smp_motor_ident.estimation import replay
+from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.result import Correlation, ResidualTests
@@ -45,7 +45,7 @@ def residual_tests(data: Experiments, fit: Fit, lags: int = 25) -> ResidualTests
     ----------
     L. Ljung, *System Identification: Theory for the User*, 2nd ed., section 16.6.
     """
-    residual = data.output - replay.outputs(data, fit, gain=True)
+    residual = data.output - prediction.outputs(data, fit, gain=True)
     voltage = voltage_at_samples(data)
     ok = np.isfinite(residual)
     e = np.where(ok, residual - residual[ok].mean(), 0.0)[:MOST]

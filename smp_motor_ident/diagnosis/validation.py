@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident.estimation import replay
+from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments, prepare
@@ -59,7 +59,7 @@ def speed_fit(records: Sequence[Record], data: Experiments, fit: Fit) -> float:
         Against the recorded speed; against counts or angles as mean speeds over so many
         samples that their resolution is 2 % of the speed's scatter (one where it is fine).
     """
-    predicted = replay.simulate(data, fit)
+    predicted = prediction.simulate(data, fit)
     at_once = predicted[:, 1] if data.kind != rc.ANGLE else predicted[:, 0]
     if data.kind != rc.ANGLE:
         return percent(data.output, at_once)
@@ -124,7 +124,7 @@ def held_out(records: Sequence[Record], fit: Fit, hold: str = "held") -> float:
     data = prepare(records, False, kind, hold)
     if fit.kind == rc.MEAN_SPEED and data.kind == rc.SPEED:
         data = data.as_mean_speed()
-    return speed_fit(records, data, replay.settle(data, fit))
+    return speed_fit(records, data, prediction.settle(data, fit))
 
 
 def split(records: Sequence[Record], share: float = 0.7) -> tuple[list[Record], list[Record]]:

@@ -1,1 +1,1 @@
-"""From prepared records to the fitted model: start, descent, choice among the ladder, certainty."""
+"""From prepared records to the fitted model: start, descent, order selection, uncertainty."""

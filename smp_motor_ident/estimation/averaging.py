@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident.diagnosis.limits import CANDIDATE_WEIGHT
-from smp_motor_ident.estimation import replay
+from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.choice import SCEPSIS, size
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.fitted import NORMAL_95
@@ -55,7 +55,7 @@ def weights(data: Callable[[Fit], Experiments], fits: Sequence[Fit], seed: int =
     rows = []
     for fit in fits:
         own = data(fit)
-        residual = own.output - replay.outputs(own, fit, gain=True)
+        residual = own.output - prediction.outputs(own, fit, gain=True)
         seen = np.isfinite(residual)
         square = np.where(seen, np.square(residual), 0.0)
         variance = float(square.sum() / seen.sum())

@@ -15,8 +15,8 @@ SURELY = 3.0  # times the price: a gain that rejects the simpler model whatever 
 
 
 @dataclass(frozen=True, eq=False)
-class Rung:
-    """A fitted structure and what was decided about it."""
+class FittedCandidate:
+    """A fitted candidate structure and what was decided about it."""
 
     fit: Fit
     reason: str = ""
@@ -79,19 +79,9 @@ def size(structure: Structure) -> int:
     return len(free) - (models.TE in free and not structure.current)
 
 
-def inflation(fit: Fit, beside: Fit | None = None) -> float:
-    """Return by how much the scores scatter more than white residuals would let them.
-
-    Under coloured residuals the deviance that a needless coordinate gains is chi-square times
-    the ratio of its variance to that of white residuals.
-    """
-    colour = fit.colour()
-    middle = float(np.median(colour))
-    if beside is None:
-        return max(1.0, middle)
-    free, before = fit.structure.free(), beside.structure.free()
-    added = [colour[free.index(i)] for i in free if i not in before]
-    return float(max([1.0, middle, *added, *beside.colour()]))
+def sandwich_factor(fit: Fit) -> float:
+    """Return by how much the scores scatter more than white residuals would let them."""
+    return max(1.0, float(np.median(fit.sandwich_factors())))
 
 
 def needed(simple: Fit, rich: Fit) -> tuple[bool, str]:
@@ -108,9 +98,20 @@ def needed(simple: Fit, rich: Fit) -> tuple[bool, str]:
         Whether ``rich`` is needed.
     reason : str
         In words.
+
+    Notes
+    -----
+    Under coloured residuals the deviance that needless coordinates gain is a sum of chi-squares,
+    each times a ratio of variances, of which the largest is taken: at the point where the richer
+    model is: what the simpler one misses at a step is no noise, and no reason to keep it.
+
+    References
+    ----------
+    White, Econometrica 50 (1982), 1, section 3 (the test under a sandwich covariance);
+    Rao and Scott, Ann. Statist. 12 (1984), 46 (such sums, and correcting by one factor).
     """
     more = size(rich.structure) - size(simple.structure)
-    gained = (simple.deviance - rich.deviance) / inflation(rich, simple)
+    gained = (simple.deviance - rich.deviance) / float(rich.sandwich_factors().max())
     price = more * (float(np.log(simple.samples)) + SCEPSIS)
     if not rich.converged and gained < SURELY * price:
         return False, "did not converge"
@@ -121,7 +122,7 @@ def needed(simple: Fit, rich: Fit) -> tuple[bool, str]:
         )
     loose = _loose(simple, rich)
     if loose and gained < SURELY * price:
-        return False, f"its {loose} cannot be told from these data"
+        return False, f"its {loose} is not identifiable from these data"
     return True, f"{label(simple.structure)} is rejected (gain {gained:.0f}, price {price:.0f})"
 
 

@@ -15,7 +15,7 @@ from smp_motor_ident.model.structures import Structure
 
 Array = NDArray[np.float64]
 
-HEAD = 12_000  # samples on which candidates and noise levels are compared
+SCREENING_SAMPLES = 12_000  # samples on which candidates and noise levels are compared
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Options:
     upper: Array | None = None
 
 
-def head(data: Experiments) -> Experiments:
+def screening_subset(data: Experiments) -> Experiments:
     """Return the part on which models are compared, or all where that is little more.
 
     Parameters
@@ -49,14 +49,14 @@ def head(data: Experiments) -> Experiments:
     Returns
     -------
     Experiments
-        Of `HEAD` samples or so; ``data`` itself where it has less than three times as many.
+        Of `SCREENING_SAMPLES` or so; ``data`` itself where it has less than three times as many.
     """
-    part = data.head(HEAD * data.step)
+    part = data.data_window(SCREENING_SAMPLES * data.step)
     return part if data.size > 3 * part.size else data
 
 
-def ratio_of(bandwidth: float, step: float, kind: int) -> float:
-    """Return the torque-noise ratio at which the innovations follow with a bandwidth."""
+def noise_ratio_of(bandwidth: float, step: float, kind: int) -> float:
+    """Return the process-to-measurement noise ratio that gives the innovations a bandwidth."""
     return bandwidth ** (4 if kind == rc.ANGLE else 2) * step
 
 
@@ -67,11 +67,11 @@ def bandwidth(z: Array, data: Experiments) -> float:
 
 def first_noise(data: Experiments) -> Array:
     """Return a first guess of the residuals' covariance, from resolution and scatter."""
-    y = data.output[:HEAD]
+    y = data.output[:SCREENING_SAMPLES]
     v0 = max(data.quantum**2 / 12, 1e-12 * _variance(y, 0), 1e-4 * _variance(y, 4) / 70, 1e-18)
     v1 = 1.0
     if data.current.size:
-        i = data.current[:HEAD]
+        i = data.current[:SCREENING_SAMPLES]
         v1 = max(_variance(i, 2) / 6 * 0.1, 1e-8 * _variance(i, 0), 1e-12)
     return np.diag([v0, v1])
 
@@ -99,7 +99,7 @@ def descend(
     z: Array,
     initial: Array,
     noise: Array,
-    ratio: float,
+    noise_ratio: float,
     options: Options,
     iterations: int,
     tolerance: float = 1e-2,
@@ -111,7 +111,7 @@ def descend(
         z,
         initial,
         noise,
-        ratio,
+        noise_ratio,
         options.huber,
         options.priors,
         iterations,
@@ -140,12 +140,14 @@ def refine(data: Experiments, structure: Structure, near: Fit, z: Array, options
     Returns
     -------
     Fit
-        With the noise ratio of ``near``.
+        With the process-to-measurement noise ratio of ``near``.
     """
-    return descend(data, structure, z, initial_of(data, near), near.noise, near.ratio, options, 30)
+    return descend(
+        data, structure, z, initial_of(data, near), near.noise, near.noise_ratio, options, 30
+    )
 
 
 def restate(data: Experiments, structure: Structure, fit: Fit, options: Options) -> Fit:
     """Return a fit's coordinates as the answer of a structure in which more is free."""
-    once = descend(data, structure, fit.z, fit.initial, fit.noise, fit.ratio, options, 1)
+    once = descend(data, structure, fit.z, fit.initial, fit.noise, fit.noise_ratio, options, 1)
     return replace(once, z=fit.z, initial=fit.initial, converged=fit.converged)

@@ -40,14 +40,14 @@ class _Descent:
         z: Array,
         initial: Array,
         noise: Array,
-        ratio: float,
+        noise_ratio: float,
         huber: float,
         priors: Sequence[Prior],
         lower: Array,
         upper: Array,
     ) -> None:
         self.data, self.structure, self.huber, self.priors = data, structure, huber, priors
-        self.ratio = ratio
+        self.noise_ratio = noise_ratio
         self.lower, self.upper = lower, upper
         self.matrix = structure.matrix()
         self.own = own_columns(data, structure)
@@ -55,7 +55,7 @@ class _Descent:
         self.z = structure.complete(np.minimum(np.maximum(z, lower), upper))
         self.start, self.initial = initial.copy(), initial.copy()
         self.smooth = structure.friction == "none" and not structure.delay
-        self.only_scale = not self.current and huber == math.inf and ratio == 0
+        self.only_scale = not self.current and huber == math.inf and noise_ratio == 0
         self.damping, self.passes, self.converged = 1e-3, 0, False
         self.look(proper(noise))
 
@@ -70,7 +70,7 @@ class _Descent:
         """Pass where it is, with this noise and the gain that goes with it."""
         self.noise = noise
         self.gain = gain_for(self.z, self.structure.order, self.data.kind, self.data.step,
-                             self.ratio, noise, self.current)  # fmt: skip
+                             self.noise_ratio, noise, self.current)  # fmt: skip
         self.here: Pass = self._pass(self.z, self.initial)
 
     def look_again(self, noise: Array) -> None:
@@ -162,7 +162,7 @@ class _Descent:
             z=self.z,
             initial=self.initial,
             noise=noise,
-            ratio=self.ratio,
+            noise_ratio=self.noise_ratio,
             gain=self.gain,
             objective=here.objective,
             deviance=value,
@@ -181,7 +181,7 @@ def solve(
     z: Array,
     initial: Array,
     noise: Array,
-    ratio: float = 0.0,
+    noise_ratio: float = 0.0,
     huber: float = np.inf,
     priors: Sequence[Prior] = (),
     iterations: int = 40,
@@ -202,7 +202,7 @@ def solve(
         What is free.
     z, initial, noise : ndarray
         Start: coordinates, initial states, covariance of the output and current residuals.
-    ratio : float
+    noise_ratio : float
         Torque noise over output noise, see `noise.kalman_gain`.
     huber : float
         Bound of the robust loss in standard deviations.
@@ -223,7 +223,7 @@ def solve(
     widest = _bounds()
     lower = widest[0] if lower is None else lower
     upper = widest[1] if upper is None else upper
-    descent = _Descent(data, structure, z, initial, noise, ratio, huber, priors, lower, upper)
+    descent = _Descent(data, structure, z, initial, noise, noise_ratio, huber, priors, lower, upper)
     for n in range(ROUNDS):
         if not math.isfinite(descent.here.objective):
             break

@@ -60,7 +60,7 @@ class Fit:
         q, w, angle, load of each segment.
     noise : ndarray, shape (2, 2)
         Covariance of the innovations of (output, current).
-    ratio : float
+    noise_ratio : float
         Intensity of the torque noise over the output's noise variance.
     gain : ndarray, shape (3, 2)
         Innovation gain.
@@ -90,7 +90,7 @@ class Fit:
     z: Array
     initial: Array
     noise: Array
-    ratio: float
+    noise_ratio: float
     gain: Array
     objective: float
     deviance: float
@@ -120,9 +120,9 @@ class Fit:
         return cov
 
     def conditional(self) -> Array:
-        """Return the covariance with the profiled coordinates held, shape (f, f)."""
+        """Return the covariance with the profiled coordinates fixed, shape (f, f)."""
         cov = self.white()
-        widen = np.sqrt(self.colour())
+        widen = np.sqrt(self.sandwich_factors())
         cov = cov * np.outer(widen, widen)
         if self.widen is not None:
             cov = cov * np.outer(self.widen, self.widen)
@@ -133,7 +133,7 @@ class Fit:
             cov = cov - np.outer(cov[:, i], cov[i]) / max(float(cov[i, i]), 1e-300)
         return cov
 
-    def colour(self) -> Array:
+    def sandwich_factors(self) -> Array:
         """Return by how much each variance is larger than of white residuals, shape (f,)."""
         cov = self.white()
         n = len(self.scores)

@@ -33,7 +33,7 @@ from scipy.stats import chi2
 
 from smp_motor_ident._compile import compiled
 from smp_motor_ident.errors import InsufficientExcitationError
-from smp_motor_ident.estimation.predict import simulate
+from smp_motor_ident.estimation.simulation import simulate
 from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import output_of
 from smp_motor_ident.record import Record

@@ -1,6 +1,6 @@
 """Intervals from the profile likelihood: the deviance is followed, its parabola not trusted.
 
-A coordinate that is poorly known, or at its bound, is held at other values and all others are
+A coordinate that is poorly known, or at its bound, is fixed at other values and all others are
 fitted again, until the deviance has risen by the quantile of chi-square (times the sandwich
 factor).  A bound that is reached first ends the interval: then it is one-sided.
 Derivation: docs/derivations.md, section 9.
@@ -23,7 +23,7 @@ from smp_motor_ident.diagnosis.limits import REST, SAME_LEVEL
 from smp_motor_ident.estimation.descent import Options, descend, initial_of
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.fitted import NORMAL_95, Profile
-from smp_motor_ident.estimation.replay import simulate
+from smp_motor_ident.estimation.prediction import simulate
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model import structures as models
 
@@ -111,7 +111,7 @@ def _followed(
     first = float(np.clip(NORMAL_95 * std, 0.05 * size, size))
     target *= data.size / fit.samples
     here = descend(
-        data, fit.structure, fit.z, initial_of(data, fit), fit.noise, fit.ratio, options, 6
+        data, fit.structure, fit.z, initial_of(data, fit), fit.noise, fit.noise_ratio, options, 6
     )
     ends = [_end(data, here, coordinate, end, first, target, options) for end in (low, high)]
     shift = fit.z - here.z
@@ -142,7 +142,7 @@ def _end(
         value = float(fit.z[coordinate] + side * move)
         last = side * (value - bound) >= 0
         value = bound if last else value
-        outer = _held_at(data, near, coordinate, value, options)
+        outer = _fixed_at(data, near, coordinate, value, options)
         rise = outer.deviance - fit.deviance
         if not np.isfinite(rise) or rise >= target:
             rise = rise if np.isfinite(rise) else 4 * target
@@ -157,21 +157,21 @@ def _end(
     return inner.z
 
 
-def _held_at(data: Experiments, near: Fit, coordinate: int, value: float, options: Options) -> Fit:
-    """Fit all others with a coordinate held at a value, its segments moving or at rest at first.
+def _fixed_at(data: Experiments, near: Fit, coordinate: int, value: float, options: Options) -> Fit:
+    """Fit all others with a coordinate fixed at a value, its segments moving or at rest at first.
 
     Friction takes its volts from the gain.
     """
-    held = {**near.structure.held, models.Z_NAMES[coordinate]: value}
-    structure = near.structure.with_(held=held)
+    fixed = {**near.structure.fixed, models.Z_NAMES[coordinate]: value}
+    structure = near.structure.with_(fixed=fixed)
     if coordinate == models.VC_PLUS:
         z, initials = rubbing(data, near, value)
     else:
         z, initials = near.z.copy(), [near.initial]
     z[coordinate] = value
     tried = [
-        descend(data, structure, structure.complete(z), initial, near.noise, near.ratio, options,
-                10, 0.05)
+        descend(data, structure, structure.complete(z), initial, near.noise, near.noise_ratio,
+                options, 10, 0.05)
         for initial in initials
     ]  # fmt: skip
     return min(tried, key=lambda f: f.deviance)

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident.estimation import replay
+from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments
@@ -42,7 +42,7 @@ def widened(data: Experiments, fit: Fit, seed: int = 0) -> Fit:
     Fit
         Unchanged where noise dithers the counter or the replays agree with the covariance.
     """
-    if data.kind != rc.ANGLE or data.quantum == 0 or fit.ratio > 0:
+    if data.kind != rc.ANGLE or data.quantum == 0 or fit.noise_ratio > 0:
         return fit
     own = data.quantum**2 / 12
     if fit.noise[0, 0] > 3 * own or not fit.structure.free():
@@ -65,12 +65,12 @@ def widened(data: Experiments, fit: Fit, seed: int = 0) -> Fit:
 
 def _shares(data: Experiments, fit: Fit) -> tuple[Array, Array]:
     """Return the covariances that independent errors of counter and current would make."""
-    whole = replay.information(data, fit)
-    inverse = replay.inverse(whole)
+    whole = prediction.information(data, fit)
+    inverse = prediction.inverse(whole)
     if not data.current.size:
         return inverse, np.zeros_like(inverse)
     lost = replace(data, current=np.full(data.size, np.nan))
-    counter = replay.information(lost, fit)
+    counter = prediction.information(lost, fit)
     return inverse @ counter @ inverse, inverse @ (whole - counter) @ inverse
 
 
@@ -79,7 +79,7 @@ def _errors(
 ) -> Array:
     """Return the estimate's errors where nothing but the counter errs, shape (replays, f)."""
     matrix = fit.structure.matrix()
-    predicted = replay.simulate(data, fit)
+    predicted = prediction.simulate(data, fit)
     noise = np.sqrt(max(fit.noise[0, 0] - own, 0.0))
     current = data.current
     if current.size:
@@ -89,10 +89,10 @@ def _errors(
     half = vectors * np.sqrt(np.maximum(values, 0.0))
     for _ in range(int(np.clip(MOST // data.size, *REPLAYS))):
         near = fit.structure.complete(fit.z + matrix @ (half @ rng.standard_normal(len(half))))
-        angle = replay.outputs(data, replace(fit, z=near))
+        angle = prediction.outputs(data, replace(fit, z=near))
         shown = angle + rng.uniform(0, data.quantum) + noise * rng.standard_normal(data.size)
         wrong = np.floor(shown / data.quantum) * data.quantum - angle
         counts = predicted[:, 1] + wrong - wrong.mean()
         counts[np.isnan(data.output)] = np.nan
-        errors.append(replay.one_step(replace(data, output=counts, current=current), fit))
+        errors.append(prediction.one_step(replace(data, output=counts, current=current), fit))
     return np.array(errors)

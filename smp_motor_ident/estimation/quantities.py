@@ -82,7 +82,7 @@ class _Values:
 
 
 def answer(
-    fit: Fit, fixed: Mapping[str, float], unseen_friction: float = 0.0, level: float = 0.0
+    fit: Fit, fixed: Mapping[str, float], friction_std: float = 0.0, level: float = 0.0
 ) -> Answer:
     """Turn a fit into quantities.
 
@@ -92,7 +92,7 @@ def answer(
         Of any structure.
     fixed : mapping of str to float
         What the user gave.
-    unseen_friction : float
+    friction_std : float
         Standard deviation of a friction that the structure leaves out [V].
     level : float
         The voltage that lasted longest [V].
@@ -106,14 +106,14 @@ def answer(
     reported = _reported(structure)
     values = _values(fit, fixed, reported, level)
     joint = values.covariance(conditional)
-    if unseen_friction > 0:
-        joint += np.diag(np.square([_friction(n, fit) * unseen_friction for n in values.value]))
+    if friction_std > 0:
+        joint += np.diag(np.square([_friction(n, fit) * friction_std for n in values.value]))
     spread = dict(zip(values.value, np.sqrt(np.maximum(np.diag(joint), 0.0)), strict=True))
     one_level = spread["dc_gain"] > LOOSE_QUANTITY.value * values.value["dc_gain"]
     combinations = {}
     for name in reported:
         interval = values.interval(name, conditional)
-        if unseen_friction > 0:
+        if friction_std > 0:
             reach = NORMAL_95 * spread[name]
             interval = values.value[name] - reach, values.value[name] + reach
         if one_level and name in TRADED:
@@ -222,9 +222,9 @@ def _reported(structure: models.Structure) -> list[str]:
     if structure.load:
         names.append("load_voltage")
     names.append("steady_speed")
-    if structure.delay or "delay" in structure.held:
+    if structure.delay or "delay" in structure.fixed:
         names.append("delay")
-    if structure.window or "window" in structure.held:
+    if structure.window or "window" in structure.fixed:
         names.append("averaging_window")
     return names
 
@@ -234,7 +234,7 @@ def _physical_rows(
 ) -> dict[str, tuple[float, Array]]:
     """Return value and gradient (by the free coordinates) of each identifiable parameter."""
     # R and L known and L/R fixed: what is left follows from the coefficients one by one.
-    electric = {"ln_r", "ln_te"} <= set(fit.structure.held)
+    electric = {"ln_r", "ln_te"} <= set(fit.structure.fixed)
     if fit.structure.order != 2:
         return {}
     if fit.structure.current or electric:

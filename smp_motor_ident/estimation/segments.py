@@ -23,7 +23,7 @@ from scipy.stats import f as f_distribution
 from smp_motor_ident.diagnosis.limits import HOMOGENEITY, SEGMENT_INFORMATION, SEGMENTS
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.fitted import NORMAL_95, PLAUSIBLE
-from smp_motor_ident.estimation.replay import inverse as inverse_of
+from smp_motor_ident.estimation.prediction import inverse as inverse_of
 from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.passes import gather
@@ -32,7 +32,7 @@ from smp_motor_ident.model import structures as models
 Array = NDArray[np.float64]
 
 FEWEST = 4  # parts of which a scatter can be taken
-ORDERED = 6  # parts of which a drift can be told from scatter
+ORDERED = 6  # parts of which a drift is distinguishable from scatter
 LOOSE = 0.3  # e-folds, or of the value: a coordinate known worse from a part is left out
 COMPARED = [i for i in range(len(models.Z_NAMES)) if i != models.TE]
 
@@ -109,7 +109,7 @@ def _steps(data: Experiments, fit: Fit) -> tuple[Array, Array, Array, list[int]]
     cut = _parted(data, fit, int(SEGMENTS.value))
     sums = gather(cut, structure, fit.z, cut.initial, fit.gain, fit.noise)
     common = [i for i, c in enumerate(structure.free()) if c in COMPARED]
-    colour = np.sqrt(_fast_colour(fit))
+    factors = np.sqrt(_fast_factors(fit))
     plausible = np.diag(PLAUSIBLE[list(structure.free())])
     middle, steps, covs = [], [], []
     for b, (normal, gradient) in enumerate(zip(sums.normal, sums.gradient, strict=True)):
@@ -119,7 +119,7 @@ def _steps(data: Experiments, fit: Fit) -> tuple[Array, Array, Array, list[int]]
         inverse = inverse_of(left + plausible, 1e-15)
         middle.append(0.5 * (cut.starts[b] + cut.starts[b + 1]) / data.size)
         steps.append(inverse @ score)
-        covs.append(inverse * np.outer(colour, colour))
+        covs.append(inverse * np.outer(factors, factors))
     step, cov, when = np.array(steps), np.array(covs), np.array(middle)
     variance = np.einsum("bii->bi", cov)
     size = np.where(
@@ -136,7 +136,7 @@ def _steps(data: Experiments, fit: Fit) -> tuple[Array, Array, Array, list[int]]
     return when[keep] - when[keep].mean(), step[np.ix_(keep, common)], cov[at], common
 
 
-def _fast_colour(fit: Fit) -> Array:
+def _fast_factors(fit: Fit) -> Array:
     """Return the sandwich factors of residuals that hang together for less than a part.
 
     Differences between neighbouring blocks (von Neumann) leave out what drifts.

@@ -1,4 +1,4 @@
-"""A start from cold: state-variable filters, linear least squares, one instrumental step.
+"""Starting values: state-variable filters, linear least squares, one instrumental step.
 
 Derivation: docs/derivations.md, section 10.
 """

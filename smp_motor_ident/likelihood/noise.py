@@ -64,7 +64,7 @@ def steady_gain(
     be: float,
     resistance: float,
     step: float,
-    ratio: float,
+    noise_ratio: float,
     current_noise: float,
 ) -> tuple[Array, Array]:
     """Return gain and innovation covariance for an angle (and a current) measured.
@@ -77,7 +77,7 @@ def steady_gain(
         R [ohm].
     step : float
         Sampling interval [s].
-    ratio : float
+    noise_ratio : float
         Intensity of white noise on the acceleration over the angle's noise variance.
     current_noise : float
         Variance of the current's noise over the angle's; 0 without current.
@@ -102,7 +102,7 @@ def steady_gain(
         c = (part[1], part[3], part[5])
         for i in range(3):
             for j in range(3):
-                h[i, j] += weight * step * ratio * c[i] * c[j]
+                h[i, j] += weight * step * noise_ratio * c[i] * c[j]
     g: Array = np.zeros((3, 3))
     g[2, 2] = 1.0
     if current_noise > 0.0:
@@ -145,16 +145,16 @@ CLOSEST = 0.95  # correlation of two outputs' residuals
 
 
 def kalman_gain(
-    z: Array, order: int, kind: int, step: float, ratio: float, current_noise: float
+    z: Array, order: int, kind: int, step: float, noise_ratio: float, current_noise: float
 ) -> tuple[Array, Array]:
     """Return the steady innovation gain of the sliding motor under torque noise."""
     gain = np.zeros((3, 2))
     innovation = np.diag([1.0, current_noise if current_noise > 0 else 1.0])
-    if ratio <= 0 or kind != recursion.ANGLE:
+    if noise_ratio <= 0 or kind != recursion.ANGLE:
         return gain, innovation
     par, _ = to_internal(z, order)
     found, spread = steady_gain(
-        par[TE], par[TM], par[K], par[BE], par[LN_R], step, ratio, current_noise
+        par[TE], par[TM], par[K], par[BE], par[LN_R], step, noise_ratio, current_noise
     )
     if not np.all(np.isfinite(found)):
         return gain, innovation
@@ -162,20 +162,20 @@ def kalman_gain(
 
 
 def gain_for(
-    z: Array, order: int, kind: int, step: float, ratio: float, noise: Array, current: bool
+    z: Array, order: int, kind: int, step: float, noise_ratio: float, noise: Array, current: bool
 ) -> Array:
     """Return the innovation gain that goes with a covariance of the innovations."""
-    if ratio <= 0:
+    if noise_ratio <= 0:
         return np.zeros((3, 2))
     relative = float(noise[1, 1] / noise[0, 0]) if current else 0.0
-    gain, innovation = kalman_gain(z, order, kind, step, ratio, relative)
+    gain, innovation = kalman_gain(z, order, kind, step, noise_ratio, relative)
     for _ in range(3):  # noise holds innovations; the ratio of the sensors' own is wanted
         if not current:
             break
         relative = float(
             (noise[1, 1] / innovation[1, 1] * relative) / (noise[0, 0] / innovation[0, 0])
         )
-        gain, innovation = kalman_gain(z, order, kind, step, ratio, relative)
+        gain, innovation = kalman_gain(z, order, kind, step, noise_ratio, relative)
     return gain
 
 

@@ -83,7 +83,7 @@ def _columns(
 
 @compiled
 def small_solve(a: Array, b: Array) -> None:
-    """Solve ``a x = b`` by elimination; what cannot be told is zero."""
+    """Solve ``a x = b`` by elimination; what is not identifiable is zero."""
     n = b.shape[0]
     for k in range(n):
         best = k

@@ -1,4 +1,4 @@
-"""The ladder of model structures: coordinates, what each can separate, and physical meaning.
+"""Candidate structures of the motor: coordinates, what each can separate, and physical meaning.
 
 All structures are the one motor
 
@@ -55,7 +55,7 @@ PHYSICAL = (
     "coulomb_friction",
 )
 MODELS = ("static_gain", "first_order", "second_order", "electromechanical")
-"""The ladder, simplest first; ``_asymmetric`` may follow each name."""
+"""The candidate structures, simplest first; ``_asymmetric`` may follow each name."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Structure:
     Attributes
     ----------
     name : str
-        Rung of the ladder.
+        Name of the candidate structure.
     order : int
         1 (no inductance) or 2.
     friction : {'none', 'symmetric', 'asymmetric'}
@@ -78,8 +78,8 @@ class Structure:
         Whether these are coordinates.
     own_load : bool
         Whether every segment has a constant load of its own.
-    held : mapping of str to float
-        Coordinates held at a value (by name of `Z_NAMES`).
+    fixed : mapping of str to float
+        Coordinates fixed at a value (by name of `Z_NAMES`).
     """
 
     name: str
@@ -92,7 +92,7 @@ class Structure:
     window: bool = False
     offset: bool = False
     own_load: bool = False
-    held: Mapping[str, float] = field(default_factory=dict)
+    fixed: Mapping[str, float] = field(default_factory=dict)
 
     def free(self) -> tuple[int, ...]:
         """Return the indices of the free coordinates."""
@@ -114,7 +114,7 @@ class Structure:
             (self.window, WINDOW),
         ):
             wanted += [index] if flag else []
-        return tuple(i for i in wanted if Z_NAMES[i] not in self.held)
+        return tuple(i for i in wanted if Z_NAMES[i] not in self.fixed)
 
     def matrix(self) -> Array:
         """Return dz/dfree, shape (11, free), read-only: the ties between the coordinates."""
@@ -128,13 +128,13 @@ class Structure:
             m[i, j] = 1.0
         if self.friction == "symmetric":
             m[VC_MINUS] = m[VC_PLUS]
-        if self.order == 2 and TE not in free and "ln_te" not in self.held:
+        if self.order == 2 and TE not in free and "ln_te" not in self.fixed:
             m[TE] = m[A2] - m[A1]
         m.flags.writeable = False
         return m
 
     def complete(self, z: Array) -> Array:
-        """Return z with held and tied coordinates put to their values.
+        """Return z with fixed and tied coordinates put to their values.
 
         Parameters
         ----------
@@ -153,7 +153,7 @@ class Structure:
             (self.delay, DELAY),
         ):
             z[index] = z[index] if there else 0.0
-        for name, value in self.held.items():
+        for name, value in self.fixed.items():
             z[Z_NAMES.index(name)] = value
         if self.friction == "none":
             z[VC_PLUS] = z[VC_MINUS] = 0.0
@@ -161,7 +161,7 @@ class Structure:
             z[VC_MINUS] = z[VC_PLUS]
         if self.name.startswith("static_gain"):
             z[A1] = z[A0] - 30.0
-        if self.order == 2 and TE not in self.free() and "ln_te" not in self.held:
+        if self.order == 2 and TE not in self.free() and "ln_te" not in self.fixed:
             z[TE] = z[A2] - z[A1]
         return z
 

@@ -63,8 +63,8 @@ def test_little_torque_noise_is_not_taken_for_much(wheel, noise):
         motors.record(wheel, kinds=("fourier",), seconds=20.0, current=False, torque_noise=noise)
     )
     check(found, motors.truth(wheel, 0.3), ("dc_gain", "time_constant", "static_voltage"))
-    told = motors.record(wheel, current=False, torque_noise=noise)
-    check(estimate(told), motors.truth(wheel, 0.3), ("dc_gain", "time_constant"))
+    record = motors.record(wheel, current=False, torque_noise=noise)
+    check(estimate(record), motors.truth(wheel, 0.3), ("dc_gain", "time_constant"))
 
 
 def _told_of_a_plain_square(wheel: str, voltage: np.ndarray) -> bool:
@@ -220,7 +220,7 @@ def test_bounds_that_cannot_be_kept_are_refused_by_name(bounds, current):
 
 @pytest.mark.parametrize("seed", [0, 3])
 def test_a_square_wave_without_current_does_not_lead_friction_astray(seed):
-    # Stopping and starting makes kinks; another valley would be some 15 deviations away.
+    # Stopping and starting makes kinks; another minimum would be some 15 deviations away.
     result = estimate(
         motors.record("front_right", current=False, kinds=("square",), seed=seed),
         model="second_order",

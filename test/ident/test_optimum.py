@@ -10,10 +10,10 @@ from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.estimation import replay
-from smp_motor_ident.estimation.cold import cold_fit
+from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.descent import Options, first_noise
 from smp_motor_ident.estimation.fit import solve
+from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.likelihood.noise import proper, renewed, whitening
 from smp_motor_ident.likelihood.normal_equations import cholesky_solve, damped_step, eliminate
@@ -51,9 +51,9 @@ def random_record(seed, n=3000, noise=0.5):
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_cold_fit_is_the_least_squares_optimum_that_scipy_finds_from_the_truth(seed):
+def test_initial_fit_is_the_least_squares_optimum_that_scipy_finds_from_the_truth(seed):
     record, truth = random_record(seed)
-    fit = cold_fit(prepare([record], False), Structure("linear", friction="none"), Options())
+    fit = initial_fit(prepare([record], False), Structure("linear", friction="none"), Options())
 
     def residual(x):
         return reference(record.voltage, *np.exp(x[:3]), *x[3:]) - record.velocity
@@ -69,9 +69,9 @@ def test_cold_fit_is_the_least_squares_optimum_that_scipy_finds_from_the_truth(s
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_without_noise_the_cold_fit_returns_the_motor_itself(seed):
+def test_without_noise_the_initial_fit_returns_the_motor_itself(seed):
     record, truth = random_record(seed, noise=0.0)
-    fit = cold_fit(prepare([record], False), Structure("linear", friction="none"), Options())
+    fit = initial_fit(prepare([record], False), Structure("linear", friction="none"), Options())
     # Rounding of speeds of 1e2 rad/s, summed over the record.
     np.testing.assert_allclose(fit.z[:3], truth, atol=1e-8)
 
@@ -194,10 +194,12 @@ def test_information_of_a_motor_that_never_moves_is_finite():
     record = Record("motor", 0.01 * np.arange(n), np.zeros(n), velocity=np.zeros(n))
     data = prepare([record], False)
     structure = Structure("x", friction="none", load=True)
-    fit = cold_fit(
+    fit = initial_fit(
         prepare([random_record(0)[0]], False), Structure("x", friction="none"), Options()
     )
-    gain, step, covariance = replay.promise(data, replace(fit, initial=data.initial), structure)
+    gain, step, covariance = prediction.predicted_decrease(
+        data, replace(fit, initial=data.initial), structure
+    )
     assert np.isfinite(gain)
     assert np.all(np.isfinite(step)) and np.all(np.isfinite(covariance))
 

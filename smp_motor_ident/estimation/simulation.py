@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident.diagnosis.validation import percent
-from smp_motor_ident.estimation import replay
+from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import prepare
@@ -42,10 +42,10 @@ def simulate(estimate: Estimate, record: Record) -> tuple[Array, Array]:
     """
     data = prepare([record], False)
     fit = _motor(estimate)
-    if fit.structure.held["window"] > 0 and data.kind == rc.SPEED:
+    if fit.structure.fixed["window"] > 0 and data.kind == rc.SPEED:
         data = data.as_mean_speed()
-    settled = replay.settle(data, fit)
-    predicted = replay.simulate(data, settled)
+    settled = prediction.settle(data, fit)
+    predicted = prediction.simulate(data, settled)
     if data.kind != rc.ANGLE:
         return data.output, predicted[:, 1]
     mean = _differences(record, predicted[:, 1])
@@ -66,16 +66,16 @@ def _differences(record: Record, angle: Array) -> Array:
 def _motor(estimate: Estimate) -> Fit:
     """Return the estimate as a fit with nothing free."""
     z, order = coordinates(estimate)
-    held = dict(zip(models.Z_NAMES, map(float, z), strict=True))
+    fixed = dict(zip(models.Z_NAMES, map(float, z), strict=True))
     name = "static_gain" if estimate.model.startswith("static_gain") else "estimated"
-    structure = Structure(name, order, "asymmetric", held=held)
+    structure = Structure(name, order, "asymmetric", fixed=fixed)
     nothing = np.zeros((0, 0))
     return Fit(
         structure=structure,
         z=z,
         initial=np.zeros((1, 4)),
         noise=np.eye(2),
-        ratio=0.0,
+        noise_ratio=0.0,
         gain=np.zeros((3, 2)),
         objective=0.0,
         deviance=0.0,

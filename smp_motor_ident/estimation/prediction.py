@@ -105,7 +105,9 @@ def one_step(data: Experiments, fit: Fit) -> Array:
     return np.asarray(inverse(here.normal) @ here.gradient)
 
 
-def promise(data: Experiments, fit: Fit, richer: Structure) -> tuple[float, Array, Array]:
+def predicted_decrease(
+    data: Experiments, fit: Fit, richer: Structure
+) -> tuple[float, Array, Array]:
     """Return what freeing more would gain, by the score: one pass in place of a fit.
 
     Parameters
@@ -150,11 +152,11 @@ def settle(data: Experiments, fit: Fit, iterations: int = 12) -> Fit:
         With the initial states and loads of ``data``; the motor is as it was.
     """
     free = fit.structure.free()
-    held = {**fit.structure.held, **{models.Z_NAMES[i]: float(fit.z[i]) for i in free}}
-    if models.TE not in free and "ln_te" not in held:
-        held["ln_te"] = float(fit.z[models.TE])
+    fixed = {**fit.structure.fixed, **{models.Z_NAMES[i]: float(fit.z[i]) for i in free}}
+    if models.TE not in free and "ln_te" not in fixed:
+        fixed["ln_te"] = float(fit.z[models.TE])
     if fit.structure.friction == "symmetric":
-        held["vc_minus"] = float(fit.z[models.VC_MINUS])
-    structure = fit.structure.with_(held=held, own_load=True)
+        fixed["vc_minus"] = float(fit.z[models.VC_MINUS])
+    structure = fit.structure.with_(fixed=fixed, own_load=True)
     done = solve(data, structure, fit.z, data.initial, fit.noise, iterations=iterations)
     return replace(done, structure=fit.structure, z=fit.z)

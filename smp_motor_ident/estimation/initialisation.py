@@ -1,4 +1,4 @@
-"""From a cold start to the right minimum: rank candidates, refine the best, grow the horizon.
+"""From regressions to the right minimum: rank candidates, refine the best, grow the data window.
 
 Derivation: docs/derivations.md, sections 8 and 10.
 """
@@ -10,18 +10,18 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident.estimation import replay, start
+from smp_motor_ident.estimation import prediction, start
+from smp_motor_ident.estimation.data_window import grow
 from smp_motor_ident.estimation.descent import (
-    HEAD,
+    SCREENING_SAMPLES,
     Options,
     bandwidth,
     descend,
     first_noise,
-    ratio_of,
+    noise_ratio_of,
 )
 from smp_motor_ident.estimation.fit import Fit
-from smp_motor_ident.estimation.horizon import grow
-from smp_motor_ident.estimation.valley import better, shapes
+from smp_motor_ident.estimation.ridge import better, shapes
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.noise import deviance, kalman_gain
 from smp_motor_ident.model import structures as models
@@ -63,7 +63,7 @@ def candidates(data: Experiments, structure: Structure) -> list[Array]:
     return found
 
 
-def cold_fit(
+def initial_fit(
     data: Experiments,
     structure: Structure,
     options: Options,
@@ -96,27 +96,27 @@ def cold_fit(
     Fit or None
         None where no candidate could be simulated.
     """
-    head = data.head(min(8.0, HEAD * data.step))
+    subset = data.data_window(min(8.0, SCREENING_SAMPLES * data.step))
     starts = [
         structure.complete(z) for z in [*extra, *(candidates(data, structure) if own else [])]
     ]
     starts = [z for z in starts if np.all(np.isfinite(z))]
     if not starts:
         return None
-    noise = first_noise(head)
-    ranked = sorted(starts, key=lambda z: _score(head, structure, z, noise))
+    noise = first_noise(subset)
+    ranked = sorted(starts, key=lambda z: _score(subset, structure, z, noise))
     best: Fit | None = None
     tried: list[Array] = []
     if models.TE in structure.free() and not structure.current:
         ranked = [shaped for z in _distinct(ranked, data.step, 2) for shaped in shapes(z)]
-        ranked = sorted(ranked, key=lambda z: _score(head, structure, z, noise))
+        ranked = sorted(ranked, key=lambda z: _score(subset, structure, z, noise))
         keep = SHAPES
     for z in ranked:
         if any(_alike(z, other, data.step) for other in tried):
             continue
         tried.append(z)
-        ratio = ratio_of(bandwidth(z, head), head.step, head.kind)
-        one = descend(head, structure, z, head.initial, noise, ratio, options, 25, 0.1)
+        noise_ratio = noise_ratio_of(bandwidth(z, subset), subset.step, subset.kind)
+        one = descend(subset, structure, z, subset.initial, noise, noise_ratio, options, 25, 0.1)
         again = best is not None and abs(one.deviance - best.deviance) < 0.1
         if best is None or better(one, best):
             best = one
@@ -127,11 +127,11 @@ def cold_fit(
             break
     assert best is not None
     if structure.current:
-        best = _elsewhere(head, structure, best, options)
+        best = _elsewhere(subset, structure, best, options)
     return grow(data, structure, best, options, near)
 
 
-def _elsewhere(head: Experiments, structure: Structure, best: Fit, options: Options) -> Fit:
+def _elsewhere(subset: Experiments, structure: Structure, best: Fit, options: Options) -> Fit:
     """Try other L, and other R at the same L, where the fit leaves them open.
 
     An L/R of less than a sample, or an R that next to nothing falls off at, leaves a surface so
@@ -147,8 +147,8 @@ def _elsewhere(head: Experiments, structure: Structure, best: Fit, options: Opti
             z = best.z.copy()
             for i, power in change.items():
                 z[i] += power * np.log(factor)
-            other = descend(head, structure, structure.complete(z), best.initial, best.noise,
-                            best.ratio, options, 25, 0.1)  # fmt: skip
+            other = descend(subset, structure, structure.complete(z), best.initial, best.noise,
+                            best.noise_ratio, options, 25, 0.1)  # fmt: skip
             if other.deviance < best.deviance - 1:
                 best = other
     return best
@@ -168,11 +168,11 @@ def _alike(z: Array, other: Array, step: float) -> bool:
     return bool(d[:5].max() < 0.05 and late < 0.5)
 
 
-def _score(head: Experiments, structure: Structure, z: Array, noise: Array) -> float:
+def _score(subset: Experiments, structure: Structure, z: Array, noise: Array) -> float:
     """Return the deviance of a candidate on the innovations (robust against drift)."""
-    ratio = ratio_of(bandwidth(z, head), head.step, head.kind)
-    relative = noise[1, 1] / noise[0, 0] if head.current.size else 0.0
-    gain, _ = kalman_gain(z, structure.order, head.kind, head.step, ratio, relative)
-    spread = replay.run_spread(head, structure, z, gain, noise)
+    noise_ratio = noise_ratio_of(bandwidth(z, subset), subset.step, subset.kind)
+    relative = noise[1, 1] / noise[0, 0] if subset.current.size else 0.0
+    gain, _ = kalman_gain(z, structure.order, subset.kind, subset.step, noise_ratio, relative)
+    spread = prediction.run_spread(subset, structure, z, gain, noise)
     value = deviance(spread)
     return value if np.isfinite(value) else np.inf

@@ -1,4 +1,4 @@
-"""Torque noise found on the head of the data, and the horizon grown from there.
+"""Torque noise found on the screening subset, and the data window grown from there.
 
 Derivation: docs/derivations.md, sections 7 and 10.
 """
@@ -11,15 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident.estimation.descent import (
-    HEAD,
+    SCREENING_SAMPLES,
     Options,
     bandwidth,
     descend,
     initial_of,
-    ratio_of,
+    noise_ratio_of,
 )
 from smp_motor_ident.estimation.fit import Fit
-from smp_motor_ident.estimation.valley import along_friction
+from smp_motor_ident.estimation.ridge import along_friction
 from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model import structures as models
@@ -41,7 +41,7 @@ def grow(
     options: Options,
     near: Fit | None = None,
 ) -> Fit:
-    """Find the noise ratio on a growing horizon, then fit all data.
+    """Find the process-to-measurement noise ratio on a growing data window, then fit all data.
 
     Parameters
     ----------
@@ -50,24 +50,24 @@ def grow(
     structure : Structure
         What is free.
     first : Fit
-        On the head of the data, with a high ratio.
+        On the screening subset, with a high noise ratio.
     options : Options
         Loss and prior knowledge.
     near : Fit, optional
-        Of another structure, whose ratio is a good first guess.
+        Of another structure, whose noise ratio is a good first guess.
 
     Returns
     -------
     Fit
         On all data.
     """
-    part = data.head(min(HEAD * data.step, 60.0))
-    best = _find_ratio(part, structure, first, options, near)
+    part = data.data_window(min(SCREENING_SAMPLES * data.step, 60.0))
+    best = _find_noise_ratio(part, structure, first, options, near)
     found = along_friction(part, structure, best, options)
-    if found.ratio > 0 and found.deviance < best.deviance - PRICE:
-        again = _find_ratio(part, structure, found, options, found)
+    if found.noise_ratio > 0 and found.deviance < best.deviance - PRICE:
+        again = _find_noise_ratio(part, structure, found, options, found)
         found = min(found, again, key=lambda f: f.deviance)
-    if found.ratio > 0 and found.noise[0, 0] < FLOOR * part.quantum**2 / 12:
+    if found.noise_ratio > 0 and found.noise[0, 0] < FLOOR * part.quantum**2 / 12:
         # It came from afar on innovations; in free run nothing is left for torque noise.
         free_run = descend(part, structure, found.z, found.initial, found.noise, 0.0, options, 40)
         if free_run.noise[0, 0] < FLOOR * part.quantum**2 / 12:
@@ -77,7 +77,7 @@ def grow(
 
 
 def extend(data: Experiments, structure: Structure, best: Fit, options: Options) -> Fit:
-    """Carry a fit of the head on to all data, on a growing horizon.
+    """Carry a fit of the screening subset on to all data, on a growing data window.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ def extend(data: Experiments, structure: Structure, best: Fit, options: Options)
     structure : Structure
         What is free.
     best : Fit
-        On the head of the data.
+        On the screening subset.
     options : Options
         Loss and prior knowledge.
 
@@ -95,30 +95,37 @@ def extend(data: Experiments, structure: Structure, best: Fit, options: Options)
     Fit
         On all data.
     """
-    part = data.head(min(HEAD * data.step, 60.0))
+    part = data.data_window(min(SCREENING_SAMPLES * data.step, 60.0))
     if best.samples == data.size and best.converged:
         return best
-    horizon = part.size * 4 if structure.friction != "none" else data.size
+    samples = part.size * 4 if structure.friction != "none" else data.size
     # The last stretch is at most six times the one before, as those in between are.
-    while 1.5 * horizon < data.size and best.ratio == 0:
-        longer = data.head(horizon * data.step)
+    while 1.5 * samples < data.size and best.noise_ratio == 0:
+        longer = data.data_window(samples * data.step)
         best = descend(
-            longer, structure, best.z, initial_of(longer, best), best.noise, best.ratio, options, 8
+            longer,
+            structure,
+            best.z,
+            initial_of(longer, best),
+            best.noise,
+            best.noise_ratio,
+            options,
+            8,
         )
-        horizon *= 6
+        samples *= 6
     return descend(
-        data, structure, best.z, initial_of(data, best), best.noise, best.ratio, options, 25
+        data, structure, best.z, initial_of(data, best), best.noise, best.noise_ratio, options, 25
     )
 
 
-def _find_ratio(
+def _find_noise_ratio(
     part: Experiments, structure: Structure, first: Fit, options: Options, near: Fit | None
 ) -> Fit:
-    """Walk from following to free run; keep the likeliest ratio of torque noise."""
+    """Walk from following to free run; keep the likeliest process-to-measurement noise ratio."""
 
-    def fitted(near: Fit, ratio: float, passes: int) -> Fit:
+    def fitted(near: Fit, noise_ratio: float, passes: int) -> Fit:
         initial = initial_of(part, near)
-        one = descend(part, structure, near.z, initial, near.noise, ratio, options, passes)
+        one = descend(part, structure, near.z, initial, near.noise, noise_ratio, options, passes)
         return _at_rest(part, structure, one, options)
 
     # A speed output survives torque noise in free run, and free run has no bias where the
@@ -128,22 +135,22 @@ def _find_ratio(
         return free_run
     # Residuals no larger than the counter's own resolution leave nothing for torque noise.
     quiet = free_run.noise[0, 0] < FLOOR * part.quantum**2 / 12
-    if quiet or (free_run.converged and near is not None and near.ratio == 0):
+    if quiet or (free_run.converged and near is not None and near.noise_ratio == 0):
         return free_run
     band = bandwidth(first.z, part)
     path: dict[float, Fit] = {}
     here = first
 
     def walked(near: Fit, x: float) -> Fit:
-        return fitted(near, ratio_of(band * float(np.exp(x)), part.step, part.kind), 15)
+        return fitted(near, noise_ratio_of(band * float(np.exp(x)), part.step, part.kind), 15)
 
-    if near is not None and near.ratio > 0:
-        x = float(np.log((near.ratio / part.step) ** 0.25 / band))
-        path[x] = fitted(first, near.ratio, 20)
+    if near is not None and near.noise_ratio > 0:
+        x = float(np.log((near.noise_ratio / part.step) ** 0.25 / band))
+        path[x] = fitted(first, near.noise_ratio, 20)
         best = _likeliest(path, walked)
-        return min(free_run, best, key=lambda f: f.deviance + PRICE * (f.ratio > 0))
+        return min(free_run, best, key=lambda f: f.deviance + PRICE * (f.noise_ratio > 0))
     for factor in (1.0, 0.3, 0.1, 0.03, 0.01):
-        here = fitted(here, ratio_of(band * factor, part.step, part.kind), 20)
+        here = fitted(here, noise_ratio_of(band * factor, part.step, part.kind), 20)
         path[float(np.log(factor))] = here
         worst = here.deviance - min(f.deviance for f in path.values())
         if worst > (60 if here.converged else 2000):
@@ -191,5 +198,5 @@ def _at_rest(data: Experiments, structure: Structure, fit: Fit, options: Options
         return fit
     initial = fit.initial.copy()
     initial[slow, 1] = 0.0
-    other = descend(data, structure, fit.z, initial, fit.noise, fit.ratio, options, 12)
+    other = descend(data, structure, fit.z, initial, fit.noise, fit.noise_ratio, options, 12)
     return other if other.deviance < fit.deviance else fit

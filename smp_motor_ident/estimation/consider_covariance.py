@@ -1,4 +1,4 @@
-"""What is held at a value though it is not known exactly: its uncertainty handed on.
+"""Consider covariance: the uncertainty of what is fixed though not known exactly, handed on.
 
 A delay or a friction that the model leaves out is not known to be nothing.  The estimate's
 answer to it, ``G = N^-1 N_beside``, carries its variance to all that is reported.
@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident.estimation import replay
+from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model import structures as models
@@ -21,7 +21,7 @@ from smp_motor_ident.model.structures import Structure
 Array = NDArray[np.float64]
 
 
-def blurred(data: Experiments, fit: Fit, instant: float) -> Fit:
+def consider_timing(data: Experiments, fit: Fit, instant: float) -> Fit:
     """Return the fit with its covariance widened by what the input's instants leave open.
 
     Parameters
@@ -36,16 +36,16 @@ def blurred(data: Experiments, fit: Fit, instant: float) -> Fit:
     Returns
     -------
     Fit
-        Unchanged where the delay is a coordinate, or held by the user.
+        Unchanged where the delay is a coordinate, or fixed by the user.
     """
     structure = fit.structure
-    if instant <= 0 or structure.delay or "delay" in structure.held or not structure.free():
+    if instant <= 0 or structure.delay or "delay" in structure.fixed or not structure.free():
         return fit
     answer, _ = _answer(data, fit, structure.with_(delay=True), models.DELAY)
     return _wider(fit, answer, instant**2)
 
 
-def unseen_friction(data: Experiments, fit: Fit) -> tuple[Fit, float]:
+def consider_friction(data: Experiments, fit: Fit) -> tuple[Fit, float]:
     """Return the fit with its covariance widened by a friction that was left out.
 
     Parameters
@@ -66,16 +66,16 @@ def unseen_friction(data: Experiments, fit: Fit) -> tuple[Fit, float]:
     if structure.friction != "none" or not structure.free():
         return fit, 0.0
     answer, left = _answer(data, fit, structure.with_(friction="symmetric"), models.VC_PLUS)
-    variance = float(np.max(fit.colour())) / max(left, 1e-12)
+    variance = float(np.max(fit.sandwich_factors())) / max(left, 1e-12)
     return _wider(fit, answer, variance), float(np.sqrt(variance))
 
 
 def _answer(data: Experiments, fit: Fit, richer: Structure, coordinate: int) -> tuple[Array, float]:
     """Return how the fit answers to one more coordinate, and the information left on that."""
-    both = replay.information(data, replace(fit, structure=richer))
+    both = prediction.information(data, replace(fit, structure=richer))
     keep = [i for i, c in enumerate(richer.free()) if c != coordinate]
     late = richer.free().index(coordinate)
-    answer = replay.inverse(both[np.ix_(keep, keep)], 1e-12) @ both[keep, late]
+    answer = prediction.inverse(both[np.ix_(keep, keep)], 1e-12) @ both[keep, late]
     return answer, float(both[late, late] - both[late, keep] @ answer)
 
 

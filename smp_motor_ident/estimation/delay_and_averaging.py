@@ -8,9 +8,9 @@ from __future__ import annotations
 import numpy as np
 
 from smp_motor_ident.estimation import descent, start
-from smp_motor_ident.estimation.cold import cold_fit
 from smp_motor_ident.estimation.descent import Options
 from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import Structure
@@ -19,7 +19,7 @@ from smp_motor_ident.model.structures import Structure
 def with_delay(
     data: Experiments, delayed: Structure, options: Options, plain: Fit | None
 ) -> Fit | None:
-    """Fit with a delay, started from several: the surface has a valley for each sample."""
+    """Fit with a delay, started from several: the surface has a minimum for each sample."""
     structure = delayed.with_(delay=False)
     starts = []
     if plain is not None:
@@ -31,7 +31,7 @@ def with_delay(
         for z in start.lagged_candidates(data, structure, lag):
             z[models.DELAY] = max(lag - 0.5, 0.1) * data.step
             starts.append(z)
-    fit = cold_fit(data, delayed, options, starts, keep=4, own=False, near=plain)
+    fit = initial_fit(data, delayed, options, starts, keep=4, own=False, near=plain)
     return _snap(data, fit, options)
 
 
@@ -45,14 +45,14 @@ def _snap(data: Experiments, fit: Fit | None, options: Options) -> Fit | None:
         return None
     best = fit
     for n in {int(fit.z[models.DELAY] / data.step), int(fit.z[models.DELAY] / data.step) + 1}:
-        whole = fit.structure.with_(held={**fit.structure.held, "delay": n * data.step})
+        whole = fit.structure.with_(fixed={**fit.structure.fixed, "delay": n * data.step})
         other = descent.refine(data, whole, fit, fit.z, options)
         if other.deviance < best.deviance - 1:
             best = descent.restate(data, fit.structure, other, options)
     return best
 
 
-def averaged(
+def with_averaging(
     data: Experiments, structure: Structure, options: Options, twin: Fit | None
 ) -> Fit | None:
     """Fit a speed averaged over a window, started from what looked like a delay."""
@@ -77,5 +77,5 @@ def averaged(
         starts.append(z)
     mean = data.as_mean_speed()
     own = structure.order == 2 and not structure.delay
-    fitted = cold_fit(mean, structure, options, starts, keep=3, own=own)
+    fitted = initial_fit(mean, structure, options, starts, keep=3, own=own)
     return _snap(mean, fitted, options) if structure.delay else fitted

@@ -1,4 +1,4 @@
-"""The valley along which friction and gain trade where the current is not measured.
+"""The likelihood's ridge along which friction and gain trade where no current is measured.
 
 Derivation: docs/derivations.md, section 10.
 """
@@ -17,8 +17,8 @@ from smp_motor_ident.model.structures import Structure
 Array = NDArray[np.float64]
 
 SHARES = (0.97, 0.7, 0.1)  # of a0 that K is
-SHAKES = 6  # fresh starts around a place where a descent was held
-SHAKE = (1.0, 0.3, 3.0)  # standard deviations (or e-folds, where these are more) to it
+RESTARTS = 6  # fresh starts around a place where a descent was stuck
+RESTART_LENGTHS = (1.0, 0.3, 3.0)  # standard deviations (or e-folds, where these are more) to it
 ALIKE = 0.5  # deviance by which two fits explain the data alike
 OPEN = 0.3  # standard deviation of ln a2 above which other starts are tried
 
@@ -26,7 +26,7 @@ OPEN = 0.3  # standard deviation of ln a2 above which other starts are tried
 def along_friction(part: Experiments, structure: Structure, best: Fit, options: Options) -> Fit:
     """Try other shares of friction and gain that turn the motor as fast at full voltage.
 
-    Without current the two trade against each other along a long curved valley.
+    Without current the two trade against each other along a long curved ridge of the likelihood.
     """
     if structure.current or models.VC_PLUS not in structure.free():
         return best
@@ -46,7 +46,9 @@ def along_friction(part: Experiments, structure: Structure, best: Fit, options: 
     best = _along_lag(part, structure, best, options)
     if best.converged or structure.friction != "symmetric":
         return best
-    return shaken(part, structure, _scan_friction(part, structure, best, options, full), options)
+    return random_restart(
+        part, structure, _scan_friction(part, structure, best, options, full), options
+    )
 
 
 def better(one: Fit, other: Fit) -> bool:
@@ -61,15 +63,15 @@ def better(one: Fit, other: Fit) -> bool:
     return bool(mine > 4 * theirs or (mine > theirs / 4 and one.deviance < other.deviance))
 
 
-def shaken(part: Experiments, structure: Structure, best: Fit, options: Options) -> Fit:
-    """Begin again around a descent that did not settle: a kink holds it at one place only."""
+def random_restart(part: Experiments, structure: Structure, best: Fit, options: Options) -> Fit:
+    """Restart at random around a descent that did not settle: a kink holds it at one place only."""
     rng = np.random.default_rng(len(part.starts))
     matrix = structure.matrix()
-    for n in range(SHAKES):
+    for n in range(RESTARTS):
         if best.converged:
             break
         values, vectors = np.linalg.eigh(best.covariance())
-        length = SHAKE[n % len(SHAKE)]
+        length = RESTART_LENGTHS[n % len(RESTART_LENGTHS)]
         move = vectors @ (np.sqrt(np.maximum(values, 0.0)) * rng.standard_normal(len(values)))
         largest = float(np.abs(matrix @ move)[[models.A0, models.A1, models.A2, models.TE]].max())
         z = best.z + matrix @ move * min(length, length / max(largest, 1e-12))
@@ -83,7 +85,7 @@ def shapes(z: Array) -> list[Array]:
     """Return motors of the same linear response, by shares of the back-EMF in what limits it.
 
     ``K = a0 - be`` and ``be te^2 - a1 te + a2 = 0``: which of two lags is the electric one,
-    and how much the motor brakes itself, is told by friction alone.
+    and how much the motor brakes itself, is identifiable by friction alone.
     """
     a0, a1, a2 = np.exp(z[: models.A2 + 1])
     out = []
@@ -100,7 +102,7 @@ def shapes(z: Array) -> list[Array]:
 def _from(z: Array, part: Experiments, structure: Structure, best: Fit, options: Options) -> Fit:
     """Descend from other coordinates in the surroundings of the best fit so far."""
     start = structure.complete(z)
-    return descend(part, structure, start, best.initial, best.noise, best.ratio, options, 30)
+    return descend(part, structure, start, best.initial, best.noise, best.noise_ratio, options, 30)
 
 
 def _along_lag(part: Experiments, structure: Structure, best: Fit, options: Options) -> Fit:
@@ -109,7 +111,7 @@ def _along_lag(part: Experiments, structure: Structure, best: Fit, options: Opti
     if models.A2 not in free or models.TE not in free:
         return best
     i = free.index(models.A2)
-    starts = shapes(best.z) if best.ratio > 0 or not best.converged else []
+    starts = shapes(best.z) if best.noise_ratio > 0 or not best.converged else []
     if not best.converged or best.covariance()[i, i] > OPEN**2:
         for share in (0.05, 0.2, 0.6):
             z = best.z.copy()
@@ -129,7 +131,7 @@ def _scan_friction(
     """Search friction by the profile of the deviance: the others are fitted at each value.
 
     Where the motor sticks often, the joint surface has a kink at every start and stop, and a
-    descent along the valley ends at one of them; across the valley it does not.
+    descent along the ridge ends at one of them; across the ridge it does not.
     """
     profile: dict[float, Fit] = {}
 
@@ -138,9 +140,9 @@ def _scan_friction(
             near = min(profile.values(), key=lambda f: abs(_level(f) - level), default=best)
             z = near.z.copy()
             z[models.A0] += np.log((full - level) / max(full - _level(near), 1e-9))
-            fixed = structure.with_(held={**structure.held, "vc_plus": level})
+            fixed = structure.with_(fixed={**structure.fixed, "vc_plus": level})
             profile[level] = descend(part, fixed, fixed.complete(z), near.initial, near.noise,
-                                    best.ratio, options, 12, 0.1)  # fmt: skip
+                                    best.noise_ratio, options, 12, 0.1)  # fmt: skip
         return profile[level]
 
     grid = sorted({_level(best), *(full * np.array([0.003, 0.008, 0.016, 0.025, 0.04, 0.08]))})
@@ -155,7 +157,9 @@ def _scan_friction(
     least = min(profile.values(), key=lambda f: f.deviance)
     if least.deviance >= best.deviance - 1:
         return best
-    return descend(part, structure, least.z, least.initial, least.noise, best.ratio, options, 30)
+    return descend(
+        part, structure, least.z, least.initial, least.noise, best.noise_ratio, options, 30
+    )
 
 
 def _level(fit: Fit) -> float:

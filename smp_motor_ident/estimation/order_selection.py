@@ -1,0 +1,354 @@
+"""Order selection: the simplest candidate structure that the data do not reject, with reasons."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from smp_motor_ident.estimation import data_window, descent, prediction
+from smp_motor_ident.estimation.candidate_starts import from_richer, from_rivals, no_worse, of_kind
+from smp_motor_ident.estimation.choice import FittedCandidate, label, needed, sandwich_factor, size
+from smp_motor_ident.estimation.delay_and_averaging import with_averaging, with_delay
+from smp_motor_ident.estimation.descent import Options
+from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.estimation.initialisation import initial_fit
+from smp_motor_ident.estimation.profile import RISE, one_level, rubbing
+from smp_motor_ident.estimation.ridge import random_restart
+from smp_motor_ident.estimation.thinning import thinned
+from smp_motor_ident.likelihood import recursion as rc
+from smp_motor_ident.likelihood.experiments import Experiments
+from smp_motor_ident.model import structures as models
+from smp_motor_ident.model.structures import Structure
+
+HOPELESS = 40.0  # deviance on the screening subset by which a candidate is out for good
+RIVAL = 20.0  # deviance by which a delay must do better than a second lag
+LITTLE = 0.02  # of the largest voltage: friction below it may be left out
+
+Say = Callable[[str], None]
+
+
+def explore(
+    data: Experiments,
+    base: Structure,
+    options: Options,
+    auto: bool,
+    say: Say,
+    first: Fit | None = None,
+) -> list[FittedCandidate]:
+    """Fit the candidates that come into question; the last one is the choice.
+
+    Parameters
+    ----------
+    data : Experiments
+        Prepared records.
+    base : Structure
+        What the user asked for, or where ``auto`` begins.
+    options : Options
+        Loss and prior knowledge.
+    auto : bool
+        Whether the order may be chosen.
+    say : callable
+        Receives what is being done.
+    first : Fit, optional
+        Of ``base``, where it is known already.
+
+    Returns
+    -------
+    list of FittedCandidate
+        In the order of trial, the chosen one at the end.
+    """
+    smooth = _frictionless(data, base, options, auto, say)
+    if smooth:
+        return smooth
+    candidates: list[FittedCandidate] = []
+    if base.current or not auto:
+        if first is None or first.structure != base:
+            first = _initial_fit(data, base, options, say)
+        if first is None:
+            return []
+        best = first
+        candidates.append(
+            FittedCandidate(first, "asked for" if not auto else "current is measured")
+        )
+        if auto and data.kind == rc.SPEED:
+            best = _try_average(data, best, options, candidates, say)
+    else:
+        found = _orders(data, base, options, say, candidates)
+        if found is None:
+            return []
+        best = found
+    best = _variations(data, best, options, candidates, say)
+    reason = next((r.reason for r in candidates if r.fit is best), "")
+    return [r for r in candidates if r.fit is not best] + [FittedCandidate(best, reason)]
+
+
+def _initial_fit(data: Experiments, s: Structure, options: Options, say: Say) -> Fit | None:
+    say(f"fitting {label(s)}")
+    if s.delay:
+        return with_delay(data, s, options, None)
+    return initial_fit(data, s, options)
+
+
+def _frictionless(
+    data: Experiments, base: Structure, options: Options, auto: bool, say: Say
+) -> list[FittedCandidate]:
+    """Climb without friction where the score of a linear motor asks for none.
+
+    Where there is none, a descent with friction has no bottom to find: L/R beside the
+    response's own coefficients is identifiable by friction alone.
+    """
+    if base.current or base.friction != "symmetric" or options.priors or data.quantum > 0:
+        return []
+    plain = base.with_(friction="none", shape=False)
+    subset = descent.screening_subset(data)
+    quick = initial_fit(subset, plain, options)
+    if quick is None or not quick.converged or _friction_shows(subset, quick, False):
+        return []
+    candidates = explore(data, plain, options, auto, say, quick if subset is data else None)
+    if not candidates or _may_rub(of_kind(data, candidates[-1].fit), candidates[-1].fit, options):
+        return []
+    reason = f"{candidates[-1].reason}; no Coulomb friction shows"
+    return [*candidates[:-1], FittedCandidate(candidates[-1].fit, reason)]
+
+
+def _friction_shows(data: Experiments, fit: Fit, surely_small: bool) -> bool:
+    """Tell by the score whether Coulomb friction is there, or may be and is not little."""
+    structure = fit.structure.with_(friction="symmetric")
+    _, step, cov = prediction.predicted_decrease(data, fit, structure)
+    i = structure.free().index(models.VC_PLUS)
+    std = float(np.sqrt(max(cov[i, i], 1e-300)) * np.sqrt(sandwich_factor(fit)))
+    found = max(float(step[i]), 0.0)
+    if not np.isfinite(found) or (found / std) ** 2 > 0.5 * np.log(fit.samples):
+        return True
+    return surely_small and found + 2 * std > LITTLE * float(np.abs(data.hold_value).max())
+
+
+def _may_rub(data: Experiments, fit: Fit, options: Options) -> bool:
+    """Tell whether a friction that is not little would explain the data as well.
+
+    The score at no friction does not tell: a motor that rests under a little friction is
+    driven by its offset under none.
+    """
+    if one_level(data, fit) or _friction_shows(data, fit, True):
+        return True
+    little = LITTLE * float(np.abs(data.hold_value).max())
+    z, initials = rubbing(data, fit, little)
+    fixed = {**fit.structure.fixed, "vc_plus": little}
+    rubs = fit.structure.with_(friction="symmetric", fixed=fixed)
+    other = min(
+        (descent.descend(data, rubs, rubs.complete(z), initial, fit.noise, fit.noise_ratio,
+                         options, 12)
+         for initial in initials),
+        key=lambda f: f.deviance,
+    )  # fmt: skip
+    return other.deviance - fit.deviance < RISE * sandwich_factor(fit)
+
+
+def _orders(
+    data: Experiments,
+    base: Structure,
+    options: Options,
+    say: Say,
+    candidates: list[FittedCandidate],
+) -> Fit | None:
+    """Climb, by the number of parameters, as far as the data ask.
+
+    Candidates that the screening subset rejects by far are not fitted to all of a long record.
+    """
+    part = descent.screening_subset(thinned(data))
+    tried: list[Fit] = []
+    for structure in _structures(base, data.kind == rc.SPEED, data.quantum > 0):
+        say(f"fitting {label(structure)}")
+        fitted = _one(part, structure, options, tried)
+        if fitted is not None:
+            tried.append(no_worse(of_kind(part, fitted), fitted, tried, options))
+    tried = from_richer(part, tried, options)
+    tried = from_rivals(part, tried, options)
+    least = min((f.deviance for f in tried), default=0.0)
+    best: Fit | None = None
+    for fitted in tried:
+        if part is not data:
+            if fitted.deviance > least + HOPELESS * sandwich_factor(fitted):
+                candidates.append(
+                    FittedCandidate(
+                        _projected(data, fitted), f"rejected on {part.size} samples", whole=False
+                    )
+                )
+                continue
+            every = of_kind(data, fitted)
+            fitted = data_window.extend(every, fitted.structure, fitted, options)
+            fitted = random_restart(every, fitted.structure, fitted, options)
+            fitted = no_worse(every, fitted, [r.fit for r in candidates if r.whole], options)
+        if best is None:
+            best = fitted
+            candidates.append(
+                FittedCandidate(
+                    fitted, "the simplest" if len(candidates) == 0 else "the simplest left"
+                )
+            )
+            continue
+        if size(fitted.structure) == size(best.structure):
+            # Every motor has a second lag, few have a delay: alike, the lag is believed.
+            lag = fitted.structure.order > best.structure.order
+            verdict = fitted.deviance < best.deviance + (
+                RIVAL * sandwich_factor(fitted) if lag else 0.0
+            )
+            reason = f"fits {'better' if verdict else 'worse'} than {label(best.structure)}"
+        else:
+            verdict, reason = needed(best, fitted)
+        candidates.append(FittedCandidate(fitted, reason))
+        if verdict:
+            best = fitted
+    return best
+
+
+def _projected(data: Experiments, fit: Fit) -> Fit:
+    """Return a fit of the screening subset with its deviance projected to all data."""
+    return replace(
+        fit,
+        initial=descent.initial_of(data, fit),
+        deviance=fit.deviance * data.size / fit.samples,
+        samples=data.size,
+    )
+
+
+def _structures(base: Structure, speed: bool, coarse: bool) -> list[Structure]:
+    """Return the candidate structures by number of parameters.
+
+    A speed that comes in coarse steps is a difference of counts, a mean over a window by its
+    making: a second time constant is asked for beside that window, not in its place.
+    """
+    first = replace(base, name="first_order", order=1, shape=False)
+    second = replace(base, name="second_order", order=2, shape=True)
+    late, late2 = first.with_(delay=True), second.with_(delay=True)
+    if not speed:
+        candidates = [first, late, second, late2]
+    elif coarse:
+        candidates = [first, late, first.with_(window=True), late.with_(window=True)]
+        candidates += [second.with_(window=True), late2.with_(window=True)]
+    else:
+        candidates = [first, late, first.with_(window=True), second, late.with_(window=True)]
+        candidates += [second.with_(window=True), late2]
+    return [r for r in candidates if not (r.delay and "delay" in base.fixed)]
+
+
+def _one(data: Experiments, structure: Structure, options: Options, known: list[Fit]) -> Fit | None:
+    """Fit one candidate, started from what the simpler ones found."""
+    if structure.window:
+        late = replace(structure, name="first_order", order=1, shape=False, delay=True)
+        twin = _find(known, late) or _find(known, late.with_(window=False))
+        if twin is None or structure.order == 1:
+            twin = _find(known, structure.with_(window=False, delay=True))
+        return with_averaging(data, structure, options, twin)
+    if structure.delay:
+        return with_delay(data, structure, options, _find(known, structure.with_(delay=False)))
+    extra = []
+    if structure.order == 2 and known:
+        z = min(known, key=lambda f: f.deviance).z.copy()
+        slow = np.exp(z[models.A1] - z[models.A0])
+        z[models.A2] = z[models.A1] + np.log(max(z[models.DELAY] + z[models.WINDOW], 0.05 * slow))
+        z[models.TE] = z[models.A2] - z[models.A1]
+        z[models.DELAY] = 0.0
+        extra = [z]
+    near = min(known, key=lambda f: f.deviance, default=None)
+    return initial_fit(data, structure, options, extra, near=near)
+
+
+def _find(known: list[Fit], structure: Structure) -> Fit | None:
+    return next((f for f in known if f.structure == structure), None)
+
+
+def _variations(
+    data: Experiments, best: Fit, options: Options, candidates: list[FittedCandidate], say: Say
+) -> Fit:
+    """Add what the data ask for, take away what they do not show."""
+    s = best.structure
+    if best.kind == rc.MEAN_SPEED:
+        data = data.as_mean_speed()
+    trials: list[dict[str, object]] = []
+    if best.structure.current:
+        trials.append({"offset": True})
+        if "delay" not in s.fixed and not best.structure.delay:
+            trials.append({"delay": True})
+    if best.structure.friction != "asymmetric":
+        trials.append({"load": True})
+    if best.structure.friction == "symmetric":
+        trials.append({"friction": "asymmetric", "load": True})
+    for change in trials:
+        richer = best.structure.with_(**change)
+        if richer == best.structure or not _worth_a_fit(data, best, richer):
+            continue
+        say(f"trying {label(richer)}")
+        z = best.z.copy()
+        if "delay" in change:
+            z[models.DELAY] = 0.3 * data.step
+        other = descent.refine(data, richer, best, z, options)
+        verdict, reason = needed(best, other)
+        if verdict and "delay" in change and other.z[models.DELAY] < 0.03 * data.step:
+            verdict, reason = False, "a delay of hundredths of a sample is how the input was held"
+        if verdict and other.noise_ratio > 0:  # what looked like torque noise may have been this
+            other = data_window.grow(data, richer, other, options)
+        candidates.append(FittedCandidate(other, reason))
+        if verdict:
+            best = other
+    return _without_friction(data, best, options, candidates)
+
+
+def _worth_a_fit(data: Experiments, best: Fit, richer: Structure) -> bool:
+    """Tell from the score whether a fit of more is worth its passes."""
+    if not best.converged:
+        return True
+    gain, _, _ = prediction.predicted_decrease(data, best, richer)
+    price = (size(richer) - size(best.structure)) * float(np.log(best.samples))
+    return not gain < 0.5 * price * sandwich_factor(best)
+
+
+def _without_friction(
+    data: Experiments, best: Fit, options: Options, candidates: list[FittedCandidate]
+) -> Fit:
+    """Leave Coulomb friction out where the data show that there is next to none."""
+    s = best.structure
+    if s.friction != "symmetric" or "vc_plus" in s.fixed:
+        return best
+    smooth = s.with_(friction="none", shape=False)
+    subset = of_kind(descent.screening_subset(data), best)
+    if subset.size < data.size:
+        with_it = descent.refine(subset, s, best, best.z, options)
+        without = descent.refine(subset, smooth, with_it, best.z, options)
+        if without.deviance > with_it.deviance + HOPELESS * sandwich_factor(with_it):
+            return best
+    plain = descent.refine(data, smooth, best, best.z, options)
+    if plain.deviance < best.deviance:  # then friction has led astray
+        z = plain.z.copy()
+        z[models.VC_PLUS] = 1e-3 * np.abs(data.hold_value).max()
+        again = descent.refine(data, s, plain, s.complete(z), options)
+        best = min(best, again, key=lambda f: f.deviance)
+    # Friction that the data do not show stays where a little would explain them as well:
+    # leaving it out would make the gain certain.  A descent that did not settle is no reason
+    # to believe in none.
+    gained = (plain.deviance - best.deviance) / sandwich_factor(best)
+    if gained <= float(np.log(best.samples)) and not _may_rub(data, plain, options):
+        candidates.append(FittedCandidate(plain, "no Coulomb friction shows"))
+        return plain
+    return best
+
+
+def _try_average(
+    data: Experiments, best: Fit, options: Options, candidates: list[FittedCandidate], say: Say
+) -> Fit:
+    """Try a speed averaged over a window of a sample or more, current being measured."""
+    structure = best.structure.with_(window=True)
+    say(f"trying {label(structure)}")
+    starts = []
+    for width in (1.02, 2.0, 4.0):
+        z = best.z.copy()
+        z[models.WINDOW] = width * data.step
+        starts.append(z)
+    fitted = initial_fit(data.as_mean_speed(), structure, options, starts, keep=3, own=False)
+    if fitted is None:
+        return best
+    verdict, reason = needed(best, fitted)
+    candidates.append(FittedCandidate(fitted, reason))
+    return fitted if verdict else best

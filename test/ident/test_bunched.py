@@ -1,0 +1,45 @@
+"""Samples that are stamped alike count as one, and the user hears of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import motors
+import numpy as np
+import pytest
+
+from smp_motor_ident.diagnosis.bunched import merge_bunches
+from smp_motor_ident.estimate import estimate
+from smp_motor_ident.record import Record
+
+
+def bunched(size: int) -> Record:
+    """A record whose stamps are equal (but for 1 ns) in bunches, as a coarse clock makes them."""
+    made = motors.record("rear_left", current=False, seconds=8.0)
+    row = np.arange(len(made))
+    last = np.minimum((row // size + 1) * size - 1, len(made) - 1)
+    return replace(made, time=made.time[last] + 1e-9 * (row % size))
+
+
+def test_a_record_with_equal_stamps_is_estimated_as_without_and_says_so() -> None:
+    plain = estimate(motors.record("rear_left", current=False, seconds=8.0))
+    found = estimate(bunched(4))
+    assert [f.severity for f in found.findings if f.code == "stamps_equal"] == ["warning"]
+    # A voltage that is known as a mean over 20 ms in place of 5 ms: 5 % of the slower motion.
+    assert found.value("dc_gain") == pytest.approx(plain.value("dc_gain"), rel=0.02)
+    assert found.value("time_constant") == pytest.approx(plain.value("time_constant"), rel=0.05)
+
+
+def test_segments_begin_where_they_began() -> None:
+    made = bunched(4)
+    made = replace(made, starts=(0, 401, 1203))
+    merged = merge_bunches(made)
+    assert [made.time[s] for s in made.starts] == pytest.approx(
+        [merged.time[s] for s in merged.starts],
+        abs=1e-8,  # the nanoseconds within a bunch
+    )
+
+
+def test_stamps_that_tell_samples_apart_are_left_alone() -> None:
+    made = motors.record("rear_left", current=False, seconds=5.0)
+    assert merge_bunches(made) is made
