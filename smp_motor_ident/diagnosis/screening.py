@@ -56,6 +56,8 @@ def screen(records: Sequence[Record]) -> list[Finding]:
     for record in records:
         _saturation(record)
         _ratio(record)
+    _standing(records, where)
+    for record in records:
         _frozen(record)
     _motion(records, where)
     _signs(records, where)
@@ -270,17 +272,22 @@ def _frozen(record: Record) -> None:
             )
 
 
-def _motion(records: Sequence[Record], where: str) -> None:
-    moved = [
-        np.nanmax(np.abs(s)) if np.isfinite(s).any() else 0.0 for s in map(measured_speed, records)
-    ]
-    largest = max(float(np.abs(r.voltage).max()) for r in records)
-    counts = [int(np.ptp(r.count)) for r in records if r.count is not None]
-    if max(moved) == 0.0:
+def _standing(records: Sequence[Record], where: str) -> None:
+    """Refuse a speed that never changes, at 0 or at a sensor's offset, whatever the voltage."""
+    speeds = [s[np.isfinite(s)] for s in map(measured_speed, records)]
+    speeds = [s for s in speeds if s.size]
+    if not speeds or (max(map(np.ptp, speeds)) == 0 and np.ptp([s[0] for s in speeds]) == 0):
+        largest = max(float(np.abs(r.voltage).max()) for r in records)
+        level = float(speeds[0][0]) if speeds else 0.0
         raise SignalError(
-            f"{where}: dead encoder or a motor that does not turn: the output stays constant "
-            f"while the voltage reaches {largest:.3g} V; check the encoder, or drive harder"
+            f"{where}: a standing motor or a dead encoder: the speed stays at {level:.3g} rad/s "
+            f"while the voltage reaches {largest:.3g} V, no excitation above friction; drive "
+            "harder, or check the encoder's cable"
         )
+
+
+def _motion(records: Sequence[Record], where: str) -> None:
+    counts = [int(np.ptp(r.count)) for r in records if r.count is not None]
     if counts and len(counts) == len(records) and max(counts) < 20:
         raise InsufficientExcitationError(
             f"{where}: the motor moved by {max(counts)} encoder counts only; "

@@ -79,19 +79,9 @@ def size(structure: Structure) -> int:
     return len(free) - (models.TE in free and not structure.current)
 
 
-def sandwich_factor(fit: Fit, beside: Fit | None = None) -> float:
-    """Return by how much the scores scatter more than white residuals would let them.
-
-    Under coloured residuals the deviance that a needless coordinate gains is chi-square times
-    the ratio of its variance to that of white residuals.
-    """
-    factors = fit.sandwich_factors()
-    middle = float(np.median(factors))
-    if beside is None:
-        return max(1.0, middle)
-    free, before = fit.structure.free(), beside.structure.free()
-    added = [factors[free.index(i)] for i in free if i not in before]
-    return float(max([1.0, middle, *added, *beside.sandwich_factors()]))
+def sandwich_factor(fit: Fit) -> float:
+    """Return by how much the scores scatter more than white residuals would let them."""
+    return max(1.0, float(np.median(fit.sandwich_factors())))
 
 
 def needed(simple: Fit, rich: Fit) -> tuple[bool, str]:
@@ -108,9 +98,20 @@ def needed(simple: Fit, rich: Fit) -> tuple[bool, str]:
         Whether ``rich`` is needed.
     reason : str
         In words.
+
+    Notes
+    -----
+    Under coloured residuals the deviance that needless coordinates gain is a sum of chi-squares,
+    each times a ratio of variances, of which the largest is taken: at the point where the richer
+    model is: what the simpler one misses at a step is no noise, and no reason to keep it.
+
+    References
+    ----------
+    White, Econometrica 50 (1982), 1, section 3 (the test under a sandwich covariance);
+    Rao and Scott, Ann. Statist. 12 (1984), 46 (such sums, and correcting by one factor).
     """
     more = size(rich.structure) - size(simple.structure)
-    gained = (simple.deviance - rich.deviance) / sandwich_factor(rich, simple)
+    gained = (simple.deviance - rich.deviance) / float(rich.sandwich_factors().max())
     price = more * (float(np.log(simple.samples)) + SCEPSIS)
     if not rich.converged and gained < SURELY * price:
         return False, "did not converge"

@@ -185,9 +185,14 @@ def speed_quantum(velocity: Array) -> float:
     steps = steps[steps > 1e-6 * max(span, 1e-300)]
     if steps.size < 4:
         return 0.0
-    quantum = float(np.median(steps))
-    whole = (levels - levels[0]) / quantum
-    # Published logs round: a twentieth of a step is allowed.
+    # Published logs round: a twentieth of a step is allowed, and what a single step is out by
+    # must not add up over many: a line through all levels tells the step.
+    count = np.concatenate([[0.0], np.cumsum(np.round(steps / np.median(steps)))])
+    levels = levels[0] + np.concatenate([[0.0], np.cumsum(steps)])
+    if np.ptp(count) == 0:
+        return 0.0
+    quantum, first = (float(x) for x in np.polyfit(count, levels, 1))
+    whole = (levels - first) / quantum
     regular = np.mean(np.abs(whole - np.round(whole)) < 0.05)
     return quantum if regular > 0.95 and 2e-3 * span < quantum < 0.2 * span else 0.0
 

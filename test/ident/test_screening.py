@@ -143,3 +143,11 @@ def test_what_next_stays_within_what_the_recording_had():
     hardware = replace(poor.hardware, supply_voltage=None)
     proposal = what_next(estimate(replace(poor, hardware=hardware)))
     assert proposal.amplitude <= 5.0
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_motor_below_its_friction_stands_whatever_offset_its_sensor_shows(sign):
+    volts = np.where(np.arange(N) < N // 4, 0.002, 1.1 * sign)
+    offset = replace(GOOD, count=None, current=None, voltage=volts, velocity=np.full(N, 0.13))
+    with pytest.raises(SignalError, match=r"standing motor.*no excitation above friction"):
+        estimate(offset)
