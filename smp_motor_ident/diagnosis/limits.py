@@ -263,7 +263,7 @@ EFFECT_OWN = Limit(
     1e-2,
     "share of the sum of squares",
     "the shape of an effect (of a friction curve, of a supply) is known to a tenth at best: what "
-    "the model's own coordinates imitate to a tenth cannot be told from them",
+    "the model's own coordinates imitate to a tenth cannot be separated from them",
     "test_adequacy.py",
 )
 BUNCHED = Limit(
