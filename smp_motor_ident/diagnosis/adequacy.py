@@ -30,6 +30,7 @@ from smp_motor_ident.diagnosis.limits import (
     EFFECT_LEVEL,
     EFFECT_OWN,
     IMPLIED_BIAS,
+    RELEVANT_BIAS,
 )
 from smp_motor_ident.diagnosis.model_error import BLOCKS, Regression, regression
 from smp_motor_ident.estimation.fit import Fit
@@ -43,6 +44,7 @@ Array = NDArray[np.float64]
 Stated = tuple[str, Quantity, Array]
 """Name, value and gradient by the free coordinates of a number that is stated."""
 
+INTERFACE = ("delay", "averaging_window")
 ROUNDS = 3  # effects that are named at most
 
 
@@ -112,7 +114,7 @@ def adequacy(
         if not shown:
             break
         first = max(shown, key=lambda e: e.gain - 2 * len(e.columns))
-        out.append(_finding(first, shown, numbers))
+        out.append(_finding(first, shown, numbers, data.step))
         named += first.columns
     return out
 
@@ -175,15 +177,18 @@ def _without(errors: Regression, named: Sequence[int]) -> Regression:
     return replace(errors, residual=residual, regressors=rest, members=members)
 
 
-def _finding(first: Evidence, shown: Sequence[Evidence], numbers: Sequence[Stated]) -> Finding:
+def _finding(
+    first: Evidence, shown: Sequence[Evidence], numbers: Sequence[Stated], step: float
+) -> Finding:
     worst, times, share = "", 0.0, 0.0
     for name, quantity, row in numbers:
         if quantity.value is None or not quantity.std:
             continue
         shift = abs(float(row @ first.shift))
-        if shift / quantity.std > times:
-            worst, times = name, shift / quantity.std
-            share = shift / max(abs(quantity.value), 1e-300)
+        # Times of the interface matter beside the sampling interval, however small they are.
+        size = max(abs(quantity.value), step if name in INTERFACE else 1e-300)
+        if shift > RELEVANT_BIAS.value * size and shift / quantity.std > times:
+            worst, times, share = name, shift / quantity.std, shift / size
     also = [e.effect.cause for e in shown if e is not first and e.gain > 0.8 * first.gain]
     words = " or ".join([first.effect.cause, *also[:2]])
     evidence: dict[str, float | str | None] = {
@@ -195,7 +200,7 @@ def _finding(first: Evidence, shown: Sequence[Evidence], numbers: Sequence[State
         "alternatives": ", ".join(e.effect.code for e in shown if e is not first) or None,
     }
     if times < IMPLIED_BIAS.value:
-        message = f"the model's error shows {words}; it moves no stated number beyond its interval"
+        message = f"the model's error shows {words}; it moves no stated number by what matters"
         return Finding(first.effect.code, "note", message, evidence)
     return Finding(
         first.effect.code,

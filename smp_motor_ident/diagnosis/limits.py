@@ -280,6 +280,13 @@ IMPLIED_BIAS = Limit(
     "test_adequacy.py",
 )
 
+RELEVANT_BIAS = Limit(
+    0.02,
+    "of a number, or of a sampling interval for a delay",
+    "costs a loop a fiftieth of its bandwidth or of its sampling interval: less than any margin",
+    "test_adequacy.py",
+)
+
 
 # Tuning: what may be designed on, and how far gains may go.
 

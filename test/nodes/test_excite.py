@@ -64,7 +64,7 @@ def test_excite_leaves_a_wheel_that_another_drives_alone(process, robot, eventua
     [
         ("amplitude:=20.0", "must not exceed max_voltage"),
         ("signal:=noise", "known are sine"),
-        ("wheels:=[left]", "wheels has 'left'"),
+        ("wheels:=[left]", "nobody listens on /left/motor_command"),
         ("duration:=-1.0", "duration is -1.0"),
         ("wait:=0.2", "nobody listens on /front_left/motor_command"),
     ],
