@@ -26,8 +26,8 @@ PUBLIC = {
 SECTIONS = ("Parameters\n", "Returns\n", "Yields\n")
 
 
-def has_sections(node: ast.FunctionDef) -> bool:
-    """Tell whether a function is documented in sections."""
+def has_sections(node: ast.FunctionDef | ast.ClassDef) -> bool:
+    """Tell whether a function or class is documented in sections."""
     doc = ast.get_docstring(node) or ""
     return node.name in PUBLIC or any(section + "-" * 5 in doc for section in SECTIONS)
 
@@ -48,12 +48,11 @@ def main(files: list[str]) -> int:
     config = parse_config(Path(__file__).parent.parent)
     findings = 0
     for file in files:
-        functions = [
-            node
-            for node in ast.walk(ast.parse(Path(file).read_text(encoding="utf-8")))
-            if isinstance(node, ast.FunctionDef)
-        ]
+        tree = ast.parse(Path(file).read_text(encoding="utf-8"))
+        functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+        classes = [node for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
         brief = {node.lineno for node in functions if not has_sections(node)}
+        brief |= {node.lineno for node in classes if not has_sections(node)}
         mild = {node.lineno for node in functions if says_what_it_returns(node)}
         inner = {
             node.lineno
