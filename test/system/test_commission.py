@@ -48,7 +48,8 @@ def test_a_killed_commission_leaves_the_controllers_as_they_were(
     process: Process, robot: WheelRobot, eventually: Callable[..., None]
 ) -> None:
     process("motor_plant")
-    process("wheel_pid", "--ros-args", "-r", "__ns:=/rear_left")
+    gains = ("-p", "p:=2.0", "-p", "i:=40.0")
+    process("wheel_pid", "--ros-args", "-r", "__ns:=/rear_left", *gains)
     eventually(lambda: robot.states["rear_left"], 30.0, robot.spin, "no robot")
     tool = process("commission", "--output", "r", "--wheel", "rear_left", "--yes")
     eventually(
