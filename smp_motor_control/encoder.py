@@ -150,20 +150,7 @@ class DifferencedSpeed:
         self._past.clear()
 
     def step(self, time: float, count: int) -> float:
-        """Take one sample.
-
-        Parameters
-        ----------
-        time : float
-            Instant of the sample [s], later than the one before.
-        count : int
-            As the hardware reports it.
-
-        Returns
-        -------
-        float
-            Mean motor speed over the window [rad/s]; NaN at the first sample.
-        """
+        """Take one sample."""
         self.total = total = self._unwrap(count)
         past = self._past
         past.append((time, total))

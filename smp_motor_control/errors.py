@@ -17,29 +17,7 @@ class ParameterError(SmpError, ValueError):
 
 
 def check_range(name: str, value: float, low: float, high: float, unit: str = "") -> float:
-    """Return a number that lies between two limits, of which the message names both.
-
-    Parameters
-    ----------
-    name : str
-        Of the parameter.
-    value : float
-        What was given.
-    low, high : float
-        Smallest and largest number allowed.
-    unit : str
-        For the message.
-
-    Returns
-    -------
-    float
-        The value.
-
-    Raises
-    ------
-    ParameterError
-        When it is no number, or not between them.
-    """
+    """Return a number that lies between two limits, of which the message names both."""
     number = not isinstance(value, (bool, str)) and hasattr(value, "__float__")
     if number and low <= float(value) <= high:
         return float(value)

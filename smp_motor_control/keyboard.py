@@ -39,19 +39,9 @@ _SEQUENCE = re.compile(r"\x1b(?:\[|O)[0-9;]*([A-Za-z~])|\x1b|(.)", re.DOTALL)
 def keys_of(text: str) -> list[str]:
     """Return the keys that a terminal's characters stand for.
 
-    Parameters
-    ----------
-    text : str
-        As read; escape sequences other than those of the arrows are dropped.
-
-    Returns
-    -------
-    list of str
-        Single characters in lower case, and ``up``, ``down``, ``left``, ``right``.
-
     Examples
     --------
-    >>> keys_of("W\\x1b[A\\x1b[5~+")
+    >>> keys_of("W\x1b[A\x1b[5~+")
     ['w', 'up', '+']
     """
     keys = []
@@ -131,15 +121,7 @@ class Keyboard:
         self._seen = -math.inf
 
     def press(self, key: str, now: float) -> None:
-        """Take in a key.
-
-        Parameters
-        ----------
-        key : str
-            As :func:`keys_of` names it; an unknown one stops, as any mistake should.
-        now : float
-            [s].
-        """
+        """Take in a key."""
         motions: Mapping[str, object] = BODY_KEYS if self.body_mode else WHEEL_KEYS
         if key in motions:
             self._held, self._seen = key, now
@@ -159,33 +141,11 @@ class Keyboard:
             self.selected = {self.wheel_names[int(key) - 1]}
 
     def driving(self, now: float) -> bool:
-        """Tell whether a motion key is held.
-
-        Parameters
-        ----------
-        now : float
-            [s].
-
-        Returns
-        -------
-        bool
-            False once its repeats have stopped.
-        """
+        """Tell whether a motion key is held."""
         return bool(self._held) and now - self._seen <= self.speeds.timeout
 
     def body(self, now: float) -> tuple[float, float]:
-        """Return the velocity asked of the body.
-
-        Parameters
-        ----------
-        now : float
-            [s].
-
-        Returns
-        -------
-        tuple of float
-            Linear [m/s] and angular [rad/s]; zero while no key is held.
-        """
+        """Return the velocity asked of the body."""
         linear, angular = BODY_KEYS.get(self._held, (0.0, 0.0)) if self.driving(now) else (0.0, 0.0)
         return (
             linear * self.scale * self.speeds.linear,
@@ -193,18 +153,7 @@ class Keyboard:
         )
 
     def wheels(self, now: float) -> dict[str, float]:
-        """Return the speed asked of every wheel.
-
-        Parameters
-        ----------
-        now : float
-            [s].
-
-        Returns
-        -------
-        dict of str to float
-            [rad/s]; zero for wheels that are not selected, or while no key is held.
-        """
+        """Return the speed asked of every wheel."""
         share = WHEEL_KEYS.get(self._held, 0.0) if self.driving(now) else 0.0
         speed = share * self.scale * self.speeds.wheel
         return {wheel: speed if wheel in self.selected else 0.0 for wheel in self.wheel_names}

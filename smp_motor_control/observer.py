@@ -113,22 +113,6 @@ def steady_gain(model: MotorModel, quantum: float, noise: ObserverNoise, dt: flo
     constant (Gauss-Legendre), then doubled, ``Q(2h) = F Q(h) F' + Q(h)``; the Riccati equation
     is doubled as well.  Sums of positive terms alone: nothing overflows or cancels, however
     small L/R is against the step.
-
-    Parameters
-    ----------
-    model : MotorModel
-        The identified motor.
-    quantum : float
-        Angle of one count [rad].
-    noise : ObserverNoise
-        What to expect of load, voltage and encoder.
-    dt : float
-        Length of the step [s].
-
-    Returns
-    -------
-    SteadyGain
-        Gains and variance of the innovation.
     """
     free = FreeResponse(model.time_constant, model.time_constant_product)
     gain, tau, tp = model.dc_gain, model.time_constant, free.product
@@ -247,27 +231,7 @@ class SpeedObserver:
         self.speed = math.nan
 
     def step(self, count: int, voltage: float, dt: float) -> float:
-        """Take in one sample.
-
-        Parameters
-        ----------
-        count : int
-            As the hardware reports it.
-        voltage : float
-            Mean armature voltage over the interval that ends with the sample [V].
-        dt : float
-            Length of that interval [s], positive.
-
-        Returns
-        -------
-        float
-            Speed of the motor shaft [rad/s]; NaN at the first sample.
-
-        Raises
-        ------
-        ParameterError
-            When voltage or dt is not finite, or dt not positive; nothing has changed.
-        """
+        """Take in one sample."""
         if not 0.0 < dt < math.inf or voltage - voltage != 0.0:
             raise ParameterError(f"observer got {voltage} V over {dt} s: must be finite, dt > 0")
         total = self._unwrap(count)

@@ -33,23 +33,7 @@ _Loader.add_implicit_resolver(
 
 
 def read_yaml(path: str | Path) -> Any:
-    """Read a YAML file of bounded size and depth.
-
-    Parameters
-    ----------
-    path : str or Path
-        The file.
-
-    Returns
-    -------
-    dict, list or scalar
-        What it holds.
-
-    Raises
-    ------
-    ParameterError
-        When it cannot be read, is not YAML, or is larger or deeper than any parameter file.
-    """
+    """Read a YAML file of bounded size and depth."""
     try:
         with Path(path).open("rb") as file:
             data = file.read(MOST_BYTES + 1)
@@ -84,23 +68,7 @@ def _check_size(document: Any, path: str | Path) -> None:
 
 
 def read_parameters(path: str | Path) -> dict[str, dict[str, Any]]:
-    """Read a ROS parameter file.
-
-    Parameters
-    ----------
-    path : str or Path
-        The file.
-
-    Returns
-    -------
-    dict of str to dict
-        Parameters by their ROS names (``model.delay``), by the node's full name.
-
-    Raises
-    ------
-    ParameterError
-        As :func:`read_yaml`, and when the file is no parameter file.
-    """
+    """Read a ROS parameter file."""
     document = read_yaml(path)
     if not isinstance(document, Mapping) or not document:
         raise ParameterError(f"{path}: is no ROS parameter file: expected node names with values")
@@ -123,20 +91,7 @@ def flat(tree: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def require_nodes(path: str | Path, nodes: Iterable[str]) -> None:
-    """Refuse a parameter file that says nothing to a node: it would run on its defaults.
-
-    Parameters
-    ----------
-    path : str or Path
-        The file; names in it may hold ``*`` for one part and ``**`` for any number.
-    nodes : iterable of str
-        Full names.
-
-    Raises
-    ------
-    ParameterError
-        As :func:`read_parameters`, and with the nodes that no name in the file fits.
-    """
+    """Refuse a parameter file that says nothing to a node: it would run on its defaults."""
     names = list(read_parameters(path))
     patterns = [
         re.escape(name).replace(r"/\*\*", r"(/\w+)*").replace(r"\*", r"\w+") for name in names

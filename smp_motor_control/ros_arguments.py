@@ -8,16 +8,6 @@ from collections.abc import Sequence
 def split_arguments(argv: Sequence[str]) -> tuple[list[str], list[str]]:
     """Return a program's own arguments, and those from ``--ros-args`` to ``--``.
 
-    Parameters
-    ----------
-    argv : sequence of str
-        Without the program's name.
-
-    Returns
-    -------
-    own, ros : list of str
-        The second one with ``--ros-args``, empty where there are none.
-
     Examples
     --------
     >>> split_arguments(["bag", "--ros-args", "-r", "__ns:=/robot1", "--", "--force"])

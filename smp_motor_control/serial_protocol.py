@@ -65,45 +65,17 @@ def encode(text: str) -> bytes:
 def encode_voltages(voltages: Sequence[float]) -> bytes:
     """Return the command of all motors.
 
-    Parameters
-    ----------
-    voltages : sequence of float
-        [V]; what is no number is 0.
-
-    Returns
-    -------
-    bytes
-        One line.
-
     Examples
     --------
     >>> encode_voltages([1.5, -12.0])
-    b'V,1500,-12000*4C\\n'
+    b'V,1500,-12000*4C\n'
     """
     numbers = [round(1e3 * v) if math.isfinite(v) else 0 for v in voltages]
     return encode(",".join(["V", *map(str, numbers)]))
 
 
 def decode_state(line: str, motors: int) -> BoardState:
-    """Read a board's line.
-
-    Parameters
-    ----------
-    line : str
-        Without its end.
-    motors : int
-        How many the board has.
-
-    Returns
-    -------
-    BoardState
-        What it says.
-
-    Raises
-    ------
-    ParameterError
-        When the sum does not fit, or it is not what a board says.
-    """
+    """Read a board's line."""
     text, _, sum_ = line.strip().rpartition("*")
     fields = text.split(",")
     if checksum(text) != sum_.upper() or fields[0] != "S":

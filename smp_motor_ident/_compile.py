@@ -46,31 +46,10 @@ def compiled(function: F) -> F:
     """Compile a function to machine code on its first call and keep it on disk.
 
     Floating-point sums may be regrouped; NaN keeps its meaning.
-
-    Parameters
-    ----------
-    function : callable
-        Of scalars and numpy arrays.
-
-    Returns
-    -------
-    callable
-        The same function, compiled; the signature is unchanged.
     """
     return cast(F, _stamped(numba.njit(**OPTIONS)(function)))
 
 
 def inlined(function: F) -> F:
-    """Compile a function into its callers: for the few that are called at every sample.
-
-    Parameters
-    ----------
-    function : callable
-        Of scalars and numpy arrays.
-
-    Returns
-    -------
-    callable
-        The same function, compiled; the signature is unchanged.
-    """
+    """Compile a function into its callers: for the few that are called at every sample."""
     return cast(F, _stamped(numba.njit(forceinline=True, **OPTIONS)(function)))

@@ -38,18 +38,7 @@ class BodyCommand:
         self.reset()
 
     def configure(self, timeout: float) -> None:
-        """Change the time-out.
-
-        Parameters
-        ----------
-        timeout : float
-            [s]; 0 for none.
-
-        Raises
-        ------
-        ParameterError
-            When it is negative or not finite.
-        """
+        """Change the time-out."""
         if not 0.0 <= timeout < math.inf:
             raise ParameterError(f"timeout is {timeout} s: must be finite and not negative")
         self.timeout = timeout
@@ -62,22 +51,7 @@ class BodyCommand:
     def receive(
         self, linear: float, angular: float, age: float | None, steady_now: float
     ) -> Verdict:
-        """Take in a command.
-
-        Parameters
-        ----------
-        linear, angular : float
-            Velocity of the body [m/s], [rad/s].
-        age : float or None
-            Time since its stamp [s]; None where it has none, or a zero one.
-        steady_now : float
-            Time of arrival on a clock that never jumps [s].
-
-        Returns
-        -------
-        Verdict
-            Whether it holds now.
-        """
+        """Take in a command."""
         if age is not None and self.timeout > 0.0 and not age < self.timeout:
             return Verdict.STALE
         if not (math.isfinite(linear) and math.isfinite(angular)):
@@ -87,49 +61,15 @@ class BodyCommand:
         return Verdict.ZERO_STAMP if age is None else Verdict.ACCEPTED
 
     def age(self, steady_now: float) -> float:
-        """Return how old the newest command is.
-
-        Parameters
-        ----------
-        steady_now : float
-            [s].
-
-        Returns
-        -------
-        float
-            [s]; infinite before the first.
-        """
+        """Return how old the newest command is."""
         return steady_now - self._born
 
     def timed_out(self, steady_now: float) -> bool:
-        """Tell whether the command is too old to be followed.
-
-        Parameters
-        ----------
-        steady_now : float
-            [s].
-
-        Returns
-        -------
-        bool
-            Never with a time-out of 0.
-        """
+        """Tell whether the command is too old to be followed."""
         return self.timeout > 0.0 and self.age(steady_now) > self.timeout
 
     def at(self, steady_now: float) -> tuple[float, float] | None:
-        """Return the velocity that is asked for.
-
-        Parameters
-        ----------
-        steady_now : float
-            [s].
-
-        Returns
-        -------
-        tuple of float or None
-            Linear and angular velocity [m/s], [rad/s]; zero after the time-out; None before
-            the first command.
-        """
+        """Return the velocity that is asked for."""
         if self._velocity is None:
             return None
         return (0.0, 0.0) if self.timed_out(steady_now) else self._velocity

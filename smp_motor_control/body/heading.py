@@ -48,18 +48,7 @@ class HeadingHold:
         self.reset()
 
     def configure(self, p: float, i: float, max_correction: float, max_error: float) -> None:
-        """Change the settings; the reference stays.
-
-        Parameters
-        ----------
-        p, i, max_correction, max_error : float
-            As for the class.
-
-        Raises
-        ------
-        ParameterError
-            When a gain is negative or a limit not positive.
-        """
+        """Change the settings; the reference stays."""
         for name, value in {"p": p, "i": i}.items():
             if not 0.0 <= value < math.inf:
                 raise ParameterError(f"heading {name} is {value}: must not be negative")
@@ -75,22 +64,7 @@ class HeadingHold:
         self._integral = 0.0
 
     def step(self, angular: float, yaw: float, dt: float) -> float:
-        """Return the yaw rate to command so that the heading follows the one asked for.
-
-        Parameters
-        ----------
-        angular : float
-            Yaw rate asked for [rad/s].
-        yaw : float
-            Measured [rad], wrapped or not.
-        dt : float
-            [s].
-
-        Returns
-        -------
-        float
-            [rad/s]; what was asked for where the yaw is not finite.
-        """
+        """Return the yaw rate to command so that the heading follows the one asked for."""
         if not math.isfinite(yaw):
             self.reset()
             return angular

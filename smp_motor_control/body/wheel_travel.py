@@ -89,17 +89,7 @@ class WheelFeedback:
         self._wheels: dict[str, _Wheel] = {}
 
     def receive(self, wheel: str, sample: WheelSample, steady_now: float) -> None:
-        """Take in a sample; one that is not finite in position and velocity says nothing.
-
-        Parameters
-        ----------
-        wheel : str
-            Of one of the sides.
-        sample : WheelSample
-            What it says.
-        steady_now : float
-            Time of arrival on a clock that never jumps [s].
-        """
+        """Take in a sample; one that is not finite in position and velocity says nothing."""
         if not (math.isfinite(sample.position) or math.isfinite(sample.velocity)):
             return
         known = self._wheels.get(wheel)
@@ -109,20 +99,7 @@ class WheelFeedback:
             known.latest, known.arrived = sample, steady_now
 
     def silent(self, steady_now: float, timeout: float) -> dict[str, float]:
-        """Return the wheels that have not been heard for too long.
-
-        Parameters
-        ----------
-        steady_now : float
-            [s].
-        timeout : float
-            [s].
-
-        Returns
-        -------
-        dict of str to float
-            Age of the wheel's last sample [s]; infinite where there was none.
-        """
+        """Return the wheels that have not been heard for too long."""
         ages = {
             wheel: steady_now - self._wheels[wheel].arrived if wheel in self._wheels else math.inf
             for wheel in (*self.left, *self.right)
@@ -139,18 +116,6 @@ class WheelFeedback:
 
         A wheel that is silent for longer than the time-out no longer counts for its side's
         mean; when it is back, it counts from there on.
-
-        Parameters
-        ----------
-        steady_now : float
-            [s].
-        timeout : float
-            [s].
-
-        Returns
-        -------
-        SideTravel or None
-            None while all wheels of a side are silent, or none tells anything new.
         """
         moved = {wheel: self._moved(known) for wheel, known in self._wheels.items()}
         silent = self.silent(steady_now, timeout)

@@ -82,26 +82,7 @@ class MotorEntry:
 
 
 def load_motors(path: str | Path, wheels: Iterable[str] | None = None) -> dict[str, MotorEntry]:
-    """Read the motors of a ROS parameter file.
-
-    Parameters
-    ----------
-    path : str or Path
-        YAML, as in ``config/motors_paper.yaml`` or written by ``identify``.
-    wheels : iterable of str, optional
-        Motors that must be there.
-
-    Returns
-    -------
-    dict of str to MotorEntry
-        By wheel, in the order of the file.
-
-    Raises
-    ------
-    ParameterError
-        When the file cannot be read, lacks a motor or a key, or has an unknown or
-        impossible one; the message names the file, the motor and the value.
-    """
+    """Read the motors of a ROS parameter file."""
     motors = _find_motors(read_yaml(path), str(path))
     return parse_motors(motors, str(path), wheels)
 
@@ -128,18 +109,7 @@ def _find_motors(document: Any, source: str) -> Mapping[str, Any]:
 
 
 def nest(dotted: Mapping[str, Any]) -> dict[str, Any]:
-    """Return nested mappings of keys with dots, as ROS names parameters.
-
-    Parameters
-    ----------
-    dotted : mapping
-        Such as ``{"front_left.inertia": 1e-6}``.
-
-    Returns
-    -------
-    dict
-        Such as ``{"front_left": {"inertia": 1e-6}}``.
-    """
+    """Return nested mappings of keys with dots, as ROS names parameters."""
     top: dict[str, Any] = {}
     for key, value in dotted.items():
         *way, last = key.split(".")
@@ -154,27 +124,7 @@ def nest(dotted: Mapping[str, Any]) -> dict[str, Any]:
 def parse_motors(
     motors: Mapping[str, Any], source: str, wheels: Iterable[str] | None = None
 ) -> dict[str, MotorEntry]:
-    """Return the motors of an already nested mapping.
-
-    Parameters
-    ----------
-    motors : mapping of str to mapping
-        By wheel.
-    source : str
-        Named in messages.
-    wheels : iterable of str, optional
-        Motors that must be there.
-
-    Returns
-    -------
-    dict of str to MotorEntry
-        By wheel.
-
-    Raises
-    ------
-    ParameterError
-        As :func:`load_motors`.
-    """
+    """Return the motors of an already nested mapping."""
     entries = {str(name): _entry(motors[name], f"{source}: {name}") for name in motors}
     for name in entries:
         if not _NAME.match(name):

@@ -147,26 +147,7 @@ def try_gains(
     supply: float,
     say: Callable[[str], None] = print,
 ) -> Outcome:
-    """Set parameters in all wheels, watch the loops, and take all back when one misbehaves.
-
-    Parameters
-    ----------
-    client : RobotClient
-        Inside its block.
-    values : mapping of str to mapping
-        New parameters by wheel.
-    trial : float
-        How long the loops are watched [s].
-    supply : float
-        [V].
-    say : callable
-        Is given lines for the user.
-
-    Returns
-    -------
-    Outcome
-        Whether the gains are kept.
-    """
+    """Set parameters in all wheels, watch the loops, and take all back when one misbehaves."""
     watches = {wheel: Watch(supply) for wheel in values}
     with client.listen(PidState, {f"{w}/pid_state": one.take for w, one in watches.items()}):
         old = client.get_parameters({controller(w): list(new) for w, new in values.items()})

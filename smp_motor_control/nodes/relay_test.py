@@ -120,24 +120,7 @@ class _Test:
 
 
 def oscillate(client: RobotClient, wheel: str, relay: Relay, duration: float) -> Oscillation:
-    """Do the test on a running wheel whose controller is paused meanwhile.
-
-    Parameters
-    ----------
-    client : RobotClient
-        Inside its block.
-    wheel : str
-        Name of the wheel.
-    relay : Relay
-        What switches.
-    duration : float
-        How long it switches [s].
-
-    Returns
-    -------
-    Oscillation
-        What was seen.
-    """
+    """Do the test on a running wheel whose controller is paused meanwhile."""
     client.wait_for_wheels([wheel], PATIENCE)
     with client.paused([wheel]):
         test = _Test(client, wheel, relay)

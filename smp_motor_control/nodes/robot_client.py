@@ -304,13 +304,7 @@ class RobotClient:
 
     @contextlib.contextmanager
     def paused(self, wheels: Sequence[str]) -> Any:
-        """Deactivate the wheels' active controllers inside the block.
-
-        Raises
-        ------
-        RobotError
-            When someone else commands a wheel, or a controller does not obey.
-        """
+        """Deactivate the wheels' active controllers inside the block."""
         self.spin(1.0)  # who is discovered together with the wheel is not so at the same instant
         for wheel in wheels:
             if rival := self.strangers(wheel):
@@ -333,13 +327,7 @@ class RobotClient:
     def drive(
         self, segments: Sequence[tuple[str, float, float, float]], wheels: Sequence[str]
     ) -> list[tuple[str, float, float]]:
-        """Drive through segments of (name, m/s, rad/s, s), and stop whatever happens.
-
-        Returns
-        -------
-        list of tuple
-            Name, begin and end of each segment, as stamps [s].
-        """
+        """Drive through segments of (name, m/s, rad/s, s), and stop whatever happens."""
         cmd_vel = self.node.create_publisher(TwistStamped, "cmd_vel", 1)
 
         def send(linear: float, angular: float) -> None:

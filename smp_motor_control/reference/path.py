@@ -44,20 +44,7 @@ class ReferencePath:
         self._past: deque[tuple[float, float]] = deque([(0.0, velocity)])
 
     def step(self, setpoint: float, dt: float) -> Reference:
-        """Advance to this sample, and head for the set-point from here.
-
-        Parameters
-        ----------
-        setpoint : float
-            [rad/s].
-        dt : float
-            Since the last sample [s].
-
-        Returns
-        -------
-        Reference
-            At this sample.
-        """
+        """Advance to this sample, and head for the set-point from here."""
         profile = self.profile
         self._recent.append(dt)
         self.usual = sorted(self._recent)[len(self._recent) // 2]

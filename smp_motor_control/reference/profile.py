@@ -94,13 +94,7 @@ class Profile:
         self.transition_time = transition_time if transition_time >= _SHORTEST else 0.0
 
     def reset(self, velocity: float = 0.0) -> None:
-        """Rest at a velocity, such as the measured one when a loop is closed.
-
-        Parameters
-        ----------
-        velocity : float
-            [rad/s].
-        """
+        """Rest at a velocity, such as the measured one when a loop is closed."""
         self.target = velocity
         self.now = Reference(velocity, 0.0, 0.0)
         self._transition: MinimumJerk | Limited | VoltageLimited | None = None
@@ -178,18 +172,7 @@ class Profile:
         return max(abs(drive.needed(x)) for x in seen) <= 1.001 * most
 
     def step(self, dt: float) -> Reference:
-        """Advance by one sample.
-
-        Parameters
-        ----------
-        dt : float
-            [s], not negative.
-
-        Returns
-        -------
-        Reference
-            The reference at the new instant, within the velocity limit.
-        """
+        """Advance by one sample."""
         if self._transition is None:
             return self.now
         self._elapsed += dt

@@ -121,16 +121,6 @@ class Rhythm:
 
         A late sample after which the others catch up is late, not preceded by a loss: the
         beat must stay behind by whole intervals.
-
-        Parameters
-        ----------
-        time : ndarray of int64, [ns]
-            Instants of the samples, increasing.
-
-        Returns
-        -------
-        ndarray of int64, shape (n - 1,)
-            Zeros where the signal has no rhythm.
         """
         steps = np.diff(time)
         number: Integers = np.zeros(steps.size, np.int64)

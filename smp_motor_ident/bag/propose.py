@@ -97,27 +97,7 @@ class _Candidate:
 def list_topics(
     paths: Any, msg_files: Iterable[str] = (), *, progress: Progress | None = None
 ) -> list[Listing]:
-    """List what recordings offer, and suggest how to map it.
-
-    Parameters
-    ----------
-    paths : path or sequence of paths
-        As for `smp_motor_ident.bag.read_records`.
-    msg_files : iterable of str
-        ``.msg`` files for types that the bag does not define.
-    progress : callable, optional
-        ``progress(fraction, name)``.
-
-    Returns
-    -------
-    list of Listing
-        One per recording.
-
-    Raises
-    ------
-    BagError
-        When a path cannot be read.
-    """
+    """List what recordings offer, and suggest how to map it."""
     types = Types(msg_files)
     listings = []
     for recording in recordings(paths):

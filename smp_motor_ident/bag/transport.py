@@ -57,18 +57,7 @@ class TransportDelay:
     answers: int
 
     def until_applied(self, sample_time: float) -> tuple[float, float]:
-        """Return usual and longest delay until the voltage is applied.
-
-        Parameters
-        ----------
-        sample_time : float
-            Of the loop that will run [s].
-
-        Returns
-        -------
-        usual, longest : float
-            [s]; whole samples where the driver waits for its next one.
-        """
+        """Return usual and longest delay until the voltage is applied."""
         if not self.latched:
             return self.usual, self.longest
         usual, longest = (

@@ -87,22 +87,7 @@ def _fresh(folder: Path, keep: bool) -> Path:
 
 
 def start(robot: steps.Robot, motors: Path, rate: float) -> steps.Robot:
-    """Start the simulated robot and wait until it lives; its controllers stay inactive.
-
-    Parameters
-    ----------
-    robot : Robot
-        To be started.
-    motors : Path
-        Parameter file of the true motors.
-    rate : float
-        Samples per second [Hz].
-
-    Returns
-    -------
-    Robot
-        All nodes answer, all wheels report.
-    """
+    """Start the simulated robot and wait until it lives; its controllers stay inactive."""
     processes, client = robot.processes, robot.client
     given = ["--ros-args", "-p", f"motors_file:={motors.resolve()}", "-p", f"rate:={rate}"]
     processes.start("motor_plant", "motor_plant", *given, priority=1)
@@ -135,24 +120,7 @@ def learn(robot: steps.Robot, say: Any) -> tuple[dict[str, Estimate], dict[str, 
 def drive(
     robot: steps.Robot, gains: Mapping[str, Mapping[str, Any]], say: Any
 ) -> tuple[Path, list[tuple[str, float, float]]]:
-    """Set the gains, switch the controllers on, and drive through :data:`DRIVE`.
-
-    Parameters
-    ----------
-    robot : Robot
-        That runs.
-    gains : mapping of str to mapping
-        Parameters by wheel.
-    say : callable
-        Takes what goes on, in words.
-
-    Returns
-    -------
-    bag : Path
-        The recording.
-    segments : list of tuple of str, float, float
-        Name, begin and end of each segment [s].
-    """
+    """Set the gains, switch the controllers on, and drive through :data:`DRIVE`."""
     steps.set_gains(robot, gains)
     robot.switch("activate")
     say("gains set in the running controllers; driving")

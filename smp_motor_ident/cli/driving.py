@@ -76,22 +76,7 @@ def longest_stall(bag: Path, wheels: Sequence[str]) -> float:
 
 
 def wheel_speed(state: Columns, hardware: Hardware) -> tuple[Array, Array]:
-    """Return the wheel's speed as its encoder saw it.
-
-    Parameters
-    ----------
-    state : Columns
-        With ``encoder_count``.
-    hardware : Hardware
-        Of the wheel.
-
-    Returns
-    -------
-    time : ndarray, shape (n,), [s]
-        Even.
-    speed : ndarray, shape (n,), [rad/s, wheel]
-        Slope of a parabola over :data:`SMOOTHING`, so that one count is not taken for motion.
-    """
+    """Return the wheel's speed as its encoder saw it."""
     counts = unwrap(state.fields["encoder_count"], hardware.encoder_bits)
     turn = 2 * np.pi / float(hardware.counts_per_revolution or 1.0)
     angle = Gearbox(hardware.gear_ratio).to_wheel(turn) * (counts - counts[0])

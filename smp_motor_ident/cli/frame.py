@@ -67,24 +67,7 @@ def run(
     work: Work | str,
     argv: Sequence[str] | None,
 ) -> int:
-    """Parse, do the work, and turn whatever happens into a line and an exit code.
-
-    Parameters
-    ----------
-    parser : argparse.ArgumentParser
-        Of the tool.
-    work : callable or str
-        From the parsed arguments to an exit code; None is 0.  A str is the module of this
-        package whose ``work`` that is, imported after the arguments are understood, so that
-        ``--help`` does not wait for what computes.
-    argv : sequence of str or None
-        Arguments; None takes those of the process.
-
-    Returns
-    -------
-    int
-        0 done, 1 the data do not support the answer, 2 wrong usage or unreadable input.
-    """
+    """Parse, do the work, and turn whatever happens into a line and an exit code."""
     before = sys.stdout
     sys.stdout = _Output(before or open(os.devnull, "w"))  # noqa: SIM115  (closed by the shell: None)
     try:

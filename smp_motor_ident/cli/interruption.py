@@ -38,18 +38,7 @@ def check() -> None:
 
 @contextmanager
 def held() -> Iterator[None]:
-    """Let the block come to its end before an interruption is raised.
-
-    Yields
-    ------
-    None
-        For what must not be left half done, such as starting a process and noting it.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        At the end of the block, when a signal came inside it.
-    """
+    """Let the block come to its end before an interruption is raised."""
     _held.set()
     try:
         yield

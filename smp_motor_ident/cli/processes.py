@@ -34,25 +34,7 @@ class ProcessError(SmpError):
 
 
 def connect(name: str, ros_arguments: Sequence[str] = ()) -> Any:
-    """Return the client of a running robot, for a ``with`` block; imports ROS only now.
-
-    Parameters
-    ----------
-    name : str
-        Of its node.
-    ros_arguments : sequence of str
-        Such as those that name the robot's namespace.
-
-    Returns
-    -------
-    smp_motor_control.nodes.robot_client.RobotClient
-        Not yet connected.
-
-    Raises
-    ------
-    ParameterError
-        When there is no ROS in this shell, or its domain is impossible.
-    """
+    """Return the client of a running robot, for a ``with`` block; imports ROS only now."""
     if wrong := wrong_domain():
         raise ParameterError(wrong)
     try:
@@ -153,20 +135,7 @@ class Processes:
                 signal.signal(number, handler)
 
     def start(self, name: str, node: str, *arguments: str, priority: int = 0) -> None:
-        """Start a node.
-
-        Parameters
-        ----------
-        name : str
-            Under which it is known here, and its log is called.
-        node : str
-            Name of its executable.
-        *arguments : str
-            Passed on to it.
-        priority : int
-            Real-time priority, if the system grants it; so a busy machine does not slow the
-            simulated robot down. 0 for none.
-        """
+        """Start a node."""
         self._logs.mkdir(parents=True, exist_ok=True)
         parent = os.getpid()
         with (self._logs / f"{name}.log").open("wb") as log, interruption.held():
@@ -196,20 +165,7 @@ class Processes:
         return f"{lines[-1] if lines else 'it said nothing'} (log: {path})"
 
     def wait(self, name: str, timeout: float) -> None:
-        """Wait for a process that ends by itself.
-
-        Parameters
-        ----------
-        name : str
-            As given to :meth:`start`.
-        timeout : float
-            [s].
-
-        Raises
-        ------
-        ProcessError
-            When it does not end in time or not with exit code 0, or another one ends.
-        """
+        """Wait for a process that ends by itself."""
         process = self._running[name]
         deadline = time.monotonic() + timeout
         while process.poll() is None:
@@ -224,13 +180,7 @@ class Processes:
             )
 
     def stop(self, *names: str) -> None:
-        """Stop processes together: politely, then firmly.
-
-        Parameters
-        ----------
-        *names : str
-            As given to :meth:`start`.
-        """
+        """Stop processes together: politely, then firmly."""
         group = [self._running.pop(name) for name in names if name in self._running]
         for number, patience in ((signal.SIGINT, 5.0), (signal.SIGTERM, 2.0), (signal.SIGKILL, 5)):
             for process in group:

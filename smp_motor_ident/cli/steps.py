@@ -49,13 +49,7 @@ class Robot:
         return [f"{wheel}/wheel_pid" for wheel in self.wheels]
 
     def switch(self, transition: str) -> None:
-        """Let every wheel's controller go through a lifecycle transition.
-
-        Parameters
-        ----------
-        transition : str
-            ``configure``, ``activate`` or ``deactivate``.
-        """
+        """Let every wheel's controller go through a lifecycle transition."""
         self.client.change_states(self.wheel_nodes(), transition)
 
 
@@ -64,20 +58,7 @@ TOPICS = "/(.*/)?(motor_.*|pid_state|wheel_setpoints|cmd_vel|odom|joint_states|d
 
 
 def record(robot: Robot, name: str) -> Path:
-    """Begin to record.
-
-    Parameters
-    ----------
-    robot : Robot
-        That runs.
-    name : str
-        Of the bag.
-
-    Returns
-    -------
-    Path
-        Where it is written.
-    """
+    """Begin to record."""
     bag = robot.folder / name
     arguments = ("--output", str(bag), "--regex", TOPICS, *robot.ros_arguments)
     robot.processes.start("record", "record", *arguments)
@@ -120,15 +101,7 @@ def _succeed(tool: str, code: int) -> None:
 
 
 def set_gains(robot: Robot, gains: Mapping[str, Mapping[str, Any]]) -> None:
-    """Set gains in the running controllers through their parameter services.
-
-    Parameters
-    ----------
-    robot : Robot
-        That runs.
-    gains : mapping of str to mapping
-        Parameters by wheel.
-    """
+    """Set gains in the running controllers through their parameter services."""
     robot.client.set_parameters({f"{wheel}/wheel_pid": dict(p) for wheel, p in gains.items()})
 
 

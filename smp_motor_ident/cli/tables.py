@@ -22,22 +22,7 @@ def console() -> Console:
 
 
 def table(title: str, *columns: str, left: int = 1) -> Table:
-    """Return an empty table.
-
-    Parameters
-    ----------
-    title : str
-        Set above it.
-    *columns : str
-        Headings.
-    left : int
-        How many of the first columns hold words; the others are aligned right.
-
-    Returns
-    -------
-    Table
-        To which rows are added.
-    """
+    """Return an empty table."""
     made = Table(
         title=title or None,
         title_justify="left",

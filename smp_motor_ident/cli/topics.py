@@ -16,22 +16,7 @@ MOST_FIELDS = 12
 
 
 def list_topics(paths: Sequence[str], msg_files: Sequence[str], program: str) -> int:
-    """Print what recordings offer, and a mapping that may fit.
-
-    Parameters
-    ----------
-    paths : sequence of str
-        Recordings.
-    msg_files : sequence of str
-        ``.msg`` files of types that they do not define.
-    program : str
-        Name of the tool.
-
-    Returns
-    -------
-    int
-        Exit code.
-    """
+    """Print what recordings offer, and a mapping that may fit."""
     out = console()
     with progress(program) as say:
         say("reading")

@@ -11,18 +11,7 @@ from smp_motor_ident.cli.tune_arguments import parser
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the tool.
-
-    Parameters
-    ----------
-    argv : sequence of str or None
-        Arguments; None takes those of the process.
-
-    Returns
-    -------
-    int
-        0 done, 1 no gains meet what was asked, 2 wrong usage or unreadable input.
-    """
+    """Run the tool."""
     return frame.run(parser(), _work, argv)
 
 

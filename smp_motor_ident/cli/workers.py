@@ -23,27 +23,7 @@ _JOBS: dict[str, Callable[[Say], Any]] = {}
 def in_parallel(
     jobs: Mapping[str, Callable[[Say], Result]], say: Say, cold: bool = False
 ) -> dict[str, Result]:
-    """Do every job, each in a process that is forked and so has what is loaded already.
-
-    Parameters
-    ----------
-    jobs : mapping of str to callable
-        By name; each takes what it may tell its progress to.
-    say : callable
-        Takes a text and the share of the work that is done.
-    cold : bool
-        Nothing is compiled yet: the first job is done alone, so that only one process compiles.
-
-    Returns
-    -------
-    dict of str to object
-        What the jobs returned, in their order.
-
-    Raises
-    ------
-    Exception
-        The first that a job raised; the others are ended.
-    """
+    """Do every job, each in a process that is forked and so has what is loaded already."""
     cores = min(len(os.sched_getaffinity(0)), len(jobs))
     if cold and cores > 1:
         first, *others = jobs

@@ -80,26 +80,7 @@ def adequacy(
     gear: float,
     tests: ResidualTests,
 ) -> list[Finding]:
-    """Name what the model lacks, and whether that moves a stated number beyond its interval.
-
-    Parameters
-    ----------
-    data : Experiments
-        What was fitted.
-    fit : Fit
-        The estimate.
-    numbers : sequence of Stated
-        What is stated, see `stated`.
-    gear : float
-        Motor revolutions a wheel revolution.
-    tests : ResidualTests
-        Whether the innovations passed for white.
-
-    Returns
-    -------
-    list of Finding
-        Empty where nothing of what is known of real drives shows.
-    """
+    """Name what the model lacks, and whether that moves a stated number beyond its interval."""
     if not fit.structure.free() or data.size < 4 * BLOCKS:
         return []
     errors = regression(data, fit, gear)
@@ -213,18 +194,7 @@ def _finding(
 
 
 def stated(fit: Fit, result: Answer) -> list[Stated]:
-    """Return the numbers that are stated, with their gradients by the free coordinates.
-
-    Parameters
-    ----------
-    fit, result : Fit, Answer
-        The estimate.
-
-    Returns
-    -------
-    list of Stated
-        Of those that are functions of the coordinates.
-    """
+    """Return the numbers that are stated, with their gradients by the free coordinates."""
     matrix = fit.structure.matrix()
     _, rows = models.combinations(fit.z, fit.structure.order)
     if fit.structure.current:

@@ -33,24 +33,7 @@ Array = NDArray[np.float64]
 
 
 def assess(data: Experiments, fit: Fit, percent: FitPercent, tests: ResidualTests) -> list[Finding]:
-    """Return what speaks against an estimate, or must be known to read it.
-
-    Parameters
-    ----------
-    data : Experiments
-        What was fitted.
-    fit : Fit
-        The estimate.
-    percent : FitPercent
-        On the data and on held-out data.
-    tests : ResidualTests
-        Of the innovations.
-
-    Returns
-    -------
-    list of Finding
-        Empty where nothing speaks against the result.
-    """
+    """Return what speaks against an estimate, or must be known to read it."""
     return [
         *_descent(data, fit),
         *_fit(percent, tests),
@@ -255,20 +238,7 @@ def _least_squares(data: Experiments, fit: Fit, z: Array) -> float:
 
 
 def advise(fit: Fit, result: Answer, known: Mapping[str, float]) -> list[Finding]:
-    """Return what to record or measure to know what is not known.
-
-    Parameters
-    ----------
-    fit, result : Fit, Answer
-        The estimate.
-    known : mapping of str to float
-        What the user fixed.
-
-    Returns
-    -------
-    list of Finding
-        Notes, each with its advice.
-    """
+    """Return what to record or measure to know what is not known."""
     missing = [n for n in PHYSICAL if result.parameters[n].status == "unidentifiable"]
     out = []
     s = fit.structure

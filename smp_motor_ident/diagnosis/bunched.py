@@ -18,17 +18,6 @@ def merge_bunches(record: Record) -> Record:
     A clock too coarse for the rate, or a transport that delivers many messages at once, stamps
     several samples alike.  The last of a bunch was measured next to its stamp; the voltage is
     the mean of the bunch's, for the bunch spans the time since the one before.
-
-    Parameters
-    ----------
-    record : Record
-        As read.
-
-    Returns
-    -------
-    Record
-        The same record where its stamps tell the samples apart; else one sample a bunch, with
-        a warning among the findings.
     """
     starts = np.array(record.starts)
     step = np.diff(record.time)

@@ -61,22 +61,6 @@ def structural(
     """Return which parameters of the linear motor its signals can separate at all.
 
     ``w/v`` shows ``a0, a1, a2``; with current ``i/v = (J s + b)/(K ...)`` shows all five.
-
-    Parameters
-    ----------
-    parameters : mapping of str to float
-        R, L, K, J, b by the names of `models.PHYSICAL`.
-    current : bool
-        Whether the current is measured.
-    fixed : sequence of str
-        Parameters known beforehand.
-    tolerance : float
-        Below it a singular value counts as zero.
-
-    Returns
-    -------
-    Rank
-        By the logarithms of the free parameters, so without units.
     """
     names = [n for n in PHYSICAL[:5] if n not in fixed]
     frequency = np.asarray(2 * np.pi * np.geomspace(0.05, 50, 40), dtype=np.float64)
@@ -154,29 +138,6 @@ def what_next(
     information of each, which grows in proportion to the length, tells how long it must be.
     Where the current was not measured a family of motors answers the same: the prediction holds
     for the least favourable of them whose back-EMF is at least 3 % of what limits the speed.
-
-    Parameters
-    ----------
-    estimate : Estimate
-        Of the motor, so far.
-    accuracy : float
-        Wanted relative standard deviation.
-    supply : float, optional
-        Largest voltage [V]; by default that of the hardware, else the recording's largest.
-    longest : float
-        Longest acceptable recording [s].
-    current_noise : float
-        Of the current sensor [A], where the current is not measured yet.
-
-    Returns
-    -------
-    Proposal
-        The shortest one that suffices, or the best one of length ``longest``.
-
-    Raises
-    ------
-    ParameterError
-        When nothing says how much voltage the motor may get.
     """
     limit = supply or estimate.hardware.supply_voltage or estimate.largest_voltage
     if not limit:

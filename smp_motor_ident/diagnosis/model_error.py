@@ -59,22 +59,7 @@ class Regression:
 
 
 def regression(data: Experiments, fit: Fit, gear: float) -> Regression | None:
-    """Return residuals and responses, whitened, the model's coordinates projected out.
-
-    Parameters
-    ----------
-    data : Experiments
-        What was fitted.
-    fit : Fit
-        The estimate.
-    gear : float
-        Motor revolutions a wheel revolution.
-
-    Returns
-    -------
-    Regression or None
-        None where there are too few samples.
-    """
+    """Return residuals and responses, whitened, the model's coordinates projected out."""
     base = _predicted(data, fit)
     columns = [_stacked(data, fit, _measured(data) - base)]
     columns += [_stacked(data, fit, c) for c in _own(data, fit, base)]

@@ -52,18 +52,7 @@ class RecordScatter:
 
 
 def between_records(estimates: Sequence[Estimate]) -> list[RecordScatter]:
-    """Return how far records of one motor scatter beyond their stated uncertainties.
-
-    Parameters
-    ----------
-    estimates : sequence of Estimate
-        One a record, of one wheel.
-
-    Returns
-    -------
-    list of RecordScatter
-        For every quantity that at least two records state with a standard deviation.
-    """
+    """Return how far records of one motor scatter beyond their stated uncertainties."""
     names = dict.fromkeys(n for e in estimates for n in (*e.combinations, *e.parameters))
     out = []
     for name in names:
@@ -101,19 +90,7 @@ def _scatter(name: str, index: Sequence[int], values: Array, deviations: Array) 
 
 
 def same_motor(estimates: Sequence[Estimate]) -> list[Finding]:
-    """Say whether several records are of one motor, by what they state.
-
-    Parameters
-    ----------
-    estimates : sequence of Estimate
-        One a record, of one wheel.
-
-    Returns
-    -------
-    list of Finding
-        A warning for every quantity whose records differ by more than they state, the level
-        shared among the quantities; a note where none does.
-    """
+    """Say whether several records are of one motor, by what they state."""
     scatters = between_records(estimates)
     out = []
     for s in scatters:

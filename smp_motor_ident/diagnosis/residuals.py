@@ -27,20 +27,6 @@ def residual_tests(data: Experiments, fit: Fit, lags: int = 25) -> ResidualTests
     Autocorrelations (cross-correlations with the voltage) at up to ``lags`` lags stay, with
     95 % confidence for all of them together, inside the band.
 
-    Parameters
-    ----------
-    data : Experiments
-        What was fitted.
-    fit : Fit
-        With its innovation gain.
-    lags : int
-        How many.
-
-    Returns
-    -------
-    ResidualTests
-        Of the mechanical output, with the curves that it judges.
-
     References
     ----------
     L. Ljung, *System Identification: Theory for the User*, 2nd ed., section 16.6.
@@ -71,18 +57,7 @@ def residual_tests(data: Experiments, fit: Fit, lags: int = 25) -> ResidualTests
 
 
 def voltage_at_samples(data: Experiments) -> Array:
-    """Return the voltage at the samples' instants, segment by segment.
-
-    Parameters
-    ----------
-    data : Experiments
-        Whose input may change between samples.
-
-    Returns
-    -------
-    ndarray, shape (n,), [V]
-        Of the section in which each instant lies.
-    """
+    """Return the voltage at the samples' instants, segment by segment."""
     if data.plain:
         return data.hold_value
     out = np.empty(data.size)

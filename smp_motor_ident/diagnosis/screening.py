@@ -27,26 +27,7 @@ RUN_COLOUR = 20.0  # by which neighbouring runs' errors hang together, at most
 
 
 def screen(records: Sequence[Record]) -> list[Finding]:
-    """Refuse records that cannot lead to a right answer; name the reason and the remedy.
-
-    Parameters
-    ----------
-    records : sequence of Record
-        Of one motor.
-
-    Returns
-    -------
-    list of Finding
-        Warnings about what can be lived with, and what was said while reading.
-
-    Raises
-    ------
-    SignalError
-        When signals contradict each other or physics: lost samples, dead encoder, swapped
-        sign, wrong ratio between counts and speed, saturated sensor.
-    InsufficientExcitationError
-        When the voltage or the motion does not suffice.
-    """
+    """Refuse records that cannot lead to a right answer; name the reason and the remedy."""
     warnings: list[Finding] = []
     where = _where(records)
     _length(records, where)

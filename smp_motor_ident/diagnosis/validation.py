@@ -21,18 +21,7 @@ COARSE = 0.02  # of the speed's scatter: what a counter's resolution may add to 
 
 
 def percent(measured: Array, predicted: Array) -> float:
-    """Return the normalised fit ``100 (1 - |y - yhat| / |y - mean y|)``.
-
-    Parameters
-    ----------
-    measured, predicted : ndarray, shape (n,)
-        NaN where lost.
-
-    Returns
-    -------
-    float
-        100 is perfect, 0 is no better than the mean.
-    """
+    """Return the normalised fit ``100 (1 - |y - yhat| / |y - mean y|)``."""
     ok = np.isfinite(measured) & np.isfinite(predicted)
     y, z = measured[ok], predicted[ok]
     scatter = float(np.sqrt(np.square(y - y.mean()).sum())) if y.size else 0.0
@@ -42,23 +31,7 @@ def percent(measured: Array, predicted: Array) -> float:
 
 
 def speed_fit(records: Sequence[Record], data: Experiments, fit: Fit) -> float:
-    """Return the fit percent of the freely simulated speed.
-
-    Parameters
-    ----------
-    records : sequence of Record
-        What ``data`` was prepared from.
-    data : Experiments
-        With the initial states of ``fit``.
-    fit : Fit
-        The motor.
-
-    Returns
-    -------
-    float
-        Against the recorded speed; against counts or angles as mean speeds over so many
-        samples that their resolution is 2 % of the speed's scatter (one where it is fine).
-    """
+    """Return the fit percent of the freely simulated speed."""
     predicted = prediction.simulate(data, fit)
     at_once = predicted[:, 1] if data.kind != rc.ANGLE else predicted[:, 0]
     if data.kind != rc.ANGLE:
@@ -104,22 +77,7 @@ def _means(data: Experiments, angle: Array, lag: int) -> Array:
 
 
 def held_out(records: Sequence[Record], fit: Fit, hold: str = "held") -> float:
-    """Return the fit percent on records that the fit has not seen.
-
-    Parameters
-    ----------
-    records : sequence of Record
-        Only their initial states and constant loads are fitted.
-    fit : Fit
-        The motor.
-    hold : str
-        As in `experiments.prepare`.
-
-    Returns
-    -------
-    float
-        See `speed_fit`.
-    """
+    """Return the fit percent on records that the fit has not seen."""
     kind = "speed" if fit.kind != rc.ANGLE else "auto"
     data = prepare(records, False, kind, hold)
     if fit.kind == rc.MEAN_SPEED and data.kind == rc.SPEED:
@@ -128,20 +86,7 @@ def held_out(records: Sequence[Record], fit: Fit, hold: str = "held") -> float:
 
 
 def split(records: Sequence[Record], share: float = 0.7) -> tuple[list[Record], list[Record]]:
-    """Divide records into a part to fit and a part to hold out.
-
-    Parameters
-    ----------
-    records : sequence of Record
-        Of one motor.
-    share : float
-        Part to fit: whole records where there are three or more, else time.
-
-    Returns
-    -------
-    fitted, kept : list of Record
-        ``kept`` is empty where the records are too short to divide.
-    """
+    """Divide records into a part to fit and a part to hold out."""
     if len(records) >= 3:
         n = max(1, round((1 - share) * len(records)))
         kept = list(range(1, len(records), max(1, len(records) // n)))[:n]
@@ -186,19 +131,7 @@ class Comparison:
 
 
 def compare(estimates: Mapping[str, Estimate]) -> list[Comparison]:
-    """Put wheels side by side.
-
-    Parameters
-    ----------
-    estimates : mapping of str to Estimate
-        By wheel.
-
-    Returns
-    -------
-    list of Comparison
-        For every quantity that all wheels have; ``sigmas`` compares the wheel with the
-        mean of the others, by both their uncertainties and the others' own scatter.
-    """
+    """Put wheels side by side."""
     names = [n for e in estimates.values() for n in (*e.parameters, *e.combinations)]
     out = []
     for name in dict.fromkeys(names):

@@ -36,22 +36,7 @@ ABSENT = ("delay", "averaging_window", "time_constant_product", "load_voltage")
 
 
 def weights(data: Callable[[Fit], Experiments], fits: Sequence[Fit], seed: int = 0) -> Array:
-    """Return the weight of each candidate, by a Bayesian bootstrap of runs of samples.
-
-    Parameters
-    ----------
-    data : callable
-        Returns what a fit was made of; the measured outputs are the same for all.
-    fits : sequence of Fit
-        On all data.
-    seed : int
-        Of the draws.
-
-    Returns
-    -------
-    ndarray, shape (len(fits),)
-        Summing to 1.
-    """
+    """Return the weight of each candidate, by a Bayesian bootstrap of runs of samples."""
     rows = []
     for fit in fits:
         own = data(fit)
@@ -71,22 +56,7 @@ def weights(data: Callable[[Fit], Experiments], fits: Sequence[Fit], seed: int =
 
 
 def averaged(result: Answer, weight: Array, others: Sequence[Answer]) -> Answer:
-    """Return an answer that covers the candidates.
-
-    Parameters
-    ----------
-    result : Answer
-        Of the chosen structure, the first of the weights.
-    weight : ndarray, shape (1 + len(others),)
-        Of all candidates.
-    others : sequence of Answer
-        Of the other candidates.
-
-    Returns
-    -------
-    Answer
-        With the same quantities.
-    """
+    """Return an answer that covers the candidates."""
     keep = np.flatnonzero(weight[1:] > CANDIDATE_WEIGHT.value)
     if not keep.size or not result.names:
         return result

@@ -34,18 +34,7 @@ class FittedCandidate:
 
 
 def label(structure: Structure) -> str:
-    """Return a structure's name in words.
-
-    Parameters
-    ----------
-    structure : Structure
-        Any.
-
-    Returns
-    -------
-    str
-        Such as ``first_order with delay``.
-    """
+    """Return a structure's name in words."""
     added = [
         word
         for flag, word in (
@@ -62,19 +51,7 @@ def label(structure: Structure) -> str:
 
 
 def size(structure: Structure) -> int:
-    """Return the number of parameters that a structure is charged for.
-
-    Parameters
-    ----------
-    structure : Structure
-        With its free coordinates.
-
-    Returns
-    -------
-    int
-        L/R beside the response's own coefficients is not charged: leaving it free is honest
-        about what is not known, it claims nothing.
-    """
+    """Return the number of parameters that a structure is charged for."""
     free = structure.free()
     return len(free) - (models.TE in free and not structure.current)
 
@@ -86,24 +63,6 @@ def sandwich_factor(fit: Fit) -> float:
 
 def needed(simple: Fit, rich: Fit) -> tuple[bool, str]:
     """Decide whether the data reject the simpler of two models.
-
-    Parameters
-    ----------
-    simple, rich : Fit
-        On the same data.
-
-    Returns
-    -------
-    verdict : bool
-        Whether ``rich`` is needed.
-    reason : str
-        In words.
-
-    Notes
-    -----
-    Under coloured residuals the deviance that needless coordinates gain is a sum of chi-squares,
-    each times a ratio of variances, of which the largest is taken: at the point where the richer
-    model is: what the simpler one misses at a step is no noise, and no reason to keep it.
 
     References
     ----------

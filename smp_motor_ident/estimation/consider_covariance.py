@@ -22,22 +22,7 @@ Array = NDArray[np.float64]
 
 
 def consider_timing(data: Experiments, fit: Fit, instant: float) -> Fit:
-    """Return the fit with its covariance widened by what the input's instants leave open.
-
-    Parameters
-    ----------
-    data : Experiments
-        What was fitted.
-    fit : Fit
-        With or without delay among its coordinates.
-    instant : float
-        Standard deviation of a common error of the input's instants [s].
-
-    Returns
-    -------
-    Fit
-        Unchanged where the delay is a coordinate, or fixed by the user.
-    """
+    """Return the fit with its covariance widened by what the input's instants leave open."""
     structure = fit.structure
     if instant <= 0 or structure.delay or "delay" in structure.fixed or not structure.free():
         return fit
@@ -46,22 +31,7 @@ def consider_timing(data: Experiments, fit: Fit, instant: float) -> Fit:
 
 
 def consider_friction(data: Experiments, fit: Fit) -> tuple[Fit, float]:
-    """Return the fit with its covariance widened by a friction that was left out.
-
-    Parameters
-    ----------
-    data : Experiments
-        What was fitted.
-    fit : Fit
-        Perhaps without friction.
-
-    Returns
-    -------
-    fit : Fit
-        Unchanged where friction is a coordinate.
-    std : float
-        How well the data tell that there is none [V]; 0 where friction is a coordinate.
-    """
+    """Return the fit with its covariance widened by a friction that was left out."""
     structure = fit.structure
     if structure.friction != "none" or not structure.free():
         return fit, 0.0

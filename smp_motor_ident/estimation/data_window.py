@@ -41,26 +41,7 @@ def grow(
     options: Options,
     near: Fit | None = None,
 ) -> Fit:
-    """Find the process-to-measurement noise ratio on a growing data window, then fit all data.
-
-    Parameters
-    ----------
-    data : Experiments
-        Prepared records.
-    structure : Structure
-        What is free.
-    first : Fit
-        On the screening subset, with a high noise ratio.
-    options : Options
-        Loss and prior knowledge.
-    near : Fit, optional
-        Of another structure, whose noise ratio is a good first guess.
-
-    Returns
-    -------
-    Fit
-        On all data.
-    """
+    """Find the process-to-measurement noise ratio on a growing data window, then fit all data."""
     part = data.data_window(min(SCREENING_SAMPLES * data.step, 60.0))
     best = _find_noise_ratio(part, structure, first, options, near)
     found = along_friction(part, structure, best, options)
@@ -77,24 +58,7 @@ def grow(
 
 
 def extend(data: Experiments, structure: Structure, best: Fit, options: Options) -> Fit:
-    """Carry a fit of the screening subset on to all data, on a growing data window.
-
-    Parameters
-    ----------
-    data : Experiments
-        Prepared records.
-    structure : Structure
-        What is free.
-    best : Fit
-        On the screening subset.
-    options : Options
-        Loss and prior knowledge.
-
-    Returns
-    -------
-    Fit
-        On all data.
-    """
+    """Carry a fit of the screening subset on to all data, on a growing data window."""
     part = data.data_window(min(SCREENING_SAMPLES * data.step, 60.0))
     if best.samples == data.size and best.converged:
         return best

@@ -39,18 +39,7 @@ class Options:
 
 
 def screening_subset(data: Experiments) -> Experiments:
-    """Return the part on which models are compared, or all where that is little more.
-
-    Parameters
-    ----------
-    data : Experiments
-        Prepared records.
-
-    Returns
-    -------
-    Experiments
-        Of `SCREENING_SAMPLES` or so; ``data`` itself where it has less than three times as many.
-    """
+    """Return the part on which models are compared, or all where that is little more."""
     part = data.data_window(SCREENING_SAMPLES * data.step)
     return part if data.size > 3 * part.size else data
 
@@ -122,26 +111,7 @@ def descend(
 
 
 def refine(data: Experiments, structure: Structure, near: Fit, z: Array, options: Options) -> Fit:
-    """Fit a structure from another's answer on the same data.
-
-    Parameters
-    ----------
-    data : Experiments
-        Prepared records.
-    structure : Structure
-        What is free now.
-    near : Fit
-        The other's answer.
-    z : ndarray, shape (11,)
-        Coordinates to start from.
-    options : Options
-        Loss and prior knowledge.
-
-    Returns
-    -------
-    Fit
-        With the process-to-measurement noise ratio of ``near``.
-    """
+    """Fit a structure from another's answer on the same data."""
     return descend(
         data, structure, z, initial_of(data, near), near.noise, near.noise_ratio, options, 30
     )

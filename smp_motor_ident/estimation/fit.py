@@ -193,32 +193,6 @@ def solve(
 
     Levenberg-Marquardt in z with the initial states eliminated; the noise covariance is
     re-estimated from the residuals until it stays (concentrated likelihood).
-
-    Parameters
-    ----------
-    data : Experiments
-        Prepared records.
-    structure : Structure
-        What is free.
-    z, initial, noise : ndarray
-        Start: coordinates, initial states, covariance of the output and current residuals.
-    noise_ratio : float
-        Torque noise over output noise, see `noise.kalman_gain`.
-    huber : float
-        Bound of the robust loss in standard deviations.
-    priors : sequence of Prior
-        What the user knows of physical parameters.
-    iterations : int
-        Most passes over the data.
-    tolerance : float
-        Ends when a step is below this fraction of every standard deviation.
-    lower, upper : ndarray, shape (11,), optional
-        Bounds of z.
-
-    Returns
-    -------
-    Fit
-        With ``converged`` False where the passes did not suffice.
     """
     widest = _bounds()
     lower = widest[0] if lower is None else lower

@@ -78,25 +78,7 @@ class _Segment:
 
 
 def flexible_shaft(records: Sequence[Record], rigid: Estimate) -> Estimate:
-    """Estimate a motor with a flexible shaft, from what a rigid one explains.
-
-    Parameters
-    ----------
-    records : sequence of Record
-        Of one motor.
-    rigid : Estimate
-        Of the same records, of second order.
-
-    Returns
-    -------
-    Estimate
-        With ``resonance_frequency`` [rad/s] and ``resonance_damping`` among its combinations.
-
-    Raises
-    ------
-    InsufficientExcitationError
-        When no resonance is seen in the data.
-    """
+    """Estimate a motor with a flexible shaft, from what a rigid one explains."""
     segments = [s for r in records for s in _segments(r, rigid)]
     stiff = _rigid_start(rigid)
     stiff, ar, _ = _fit(segments, [stiff], np.ones(1))

@@ -34,20 +34,7 @@ OPEN = 0.02  # standard deviation of ln L/R or ln R above which other starts are
 
 
 def candidates(data: Experiments, structure: Structure) -> list[Array]:
-    """Return starting coordinates for a structure, from linear regressions.
-
-    Parameters
-    ----------
-    data : Experiments
-        Prepared records.
-    structure : Structure
-        What will be fitted.
-
-    Returns
-    -------
-    list of ndarray, shape (11,)
-        Unranked.
-    """
+    """Return starting coordinates for a structure, from linear regressions."""
     found = start.current_candidates(data) if structure.current else []
     if not found:
         frictions = (False,) if structure.friction == "none" else (True, False)
@@ -72,30 +59,7 @@ def initial_fit(
     own: bool = True,
     near: Fit | None = None,
 ) -> Fit | None:
-    """Fit a structure without any guess.
-
-    Parameters
-    ----------
-    data : Experiments
-        Prepared records.
-    structure : Structure
-        What is free.
-    options : Options
-        Loss and prior knowledge.
-    extra : sequence of ndarray, shape (11,)
-        Further starts, such as a simpler structure's answer.
-    keep : int
-        How many of the ranked candidates are refined.
-    own : bool
-        Whether the regressions' candidates join ``extra``.
-    near : Fit, optional
-        Of another structure on the same data: its torque noise is a good first guess.
-
-    Returns
-    -------
-    Fit or None
-        None where no candidate could be simulated.
-    """
+    """Fit a structure without any guess."""
     subset = data.data_window(min(8.0, SCREENING_SAMPLES * data.step))
     starts = [
         structure.complete(z) for z in [*extra, *(candidates(data, structure) if own else [])]

@@ -22,24 +22,7 @@ RESPONSE = [models.A0, models.A1, models.A2]
 def solved_for(
     fit: Fit, fixed: Mapping[str, float], matrix: Array, covariance: Array
 ) -> dict[str, tuple[float, Array]]:
-    """Solve ``a(R, L, K, J, b) = a`` for what the user has not fixed, where that is unique.
-
-    Parameters
-    ----------
-    fit : Fit
-        Of second order, without current.
-    fixed : mapping of str to float
-        What the user gave.
-    matrix : ndarray, shape (11, f)
-        dz by the free coordinates.
-    covariance : ndarray, shape (f, f)
-        Of the free coordinates.
-
-    Returns
-    -------
-    dict
-        Value and gradient by the free coordinates; empty where there is no single solution.
-    """
+    """Solve ``a(R, L, K, J, b) = a`` for what the user has not fixed, where that is unique."""
     free = [n for n in PHYSICAL[:5] if n not in fixed]
     if len(free) > len(RESPONSE) or not free:
         return {}

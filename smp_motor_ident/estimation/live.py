@@ -51,19 +51,7 @@ class Window:
         position: float,
         count: int,
     ) -> None:
-        """Take one sample; a time that does not increase begins the window anew.
-
-        Parameters
-        ----------
-        time : float
-            Stamp [s].
-        voltage, current : float
-            [V], [A]; a sample without finite voltage is left out.
-        velocity, position : float
-            Of the wheel [rad/s], [rad].
-        count : int
-            As the hardware reports it.
-        """
+        """Take one sample; a time that does not increase begins the window anew."""
         if not (np.isfinite(time) and np.isfinite(voltage)):
             return
         if len(self) and time <= self._values[self._end - 1, 0]:
@@ -93,13 +81,7 @@ class Window:
         self._begin, self._end = 0, held
 
     def record(self) -> Record | None:
-        """Return what is held; None below 10 samples.
-
-        Returns
-        -------
-        Record or None
-            A gap of more than five sampling intervals begins a new segment.
-        """
+        """Return what is held; None below 10 samples."""
         if len(self) < 10:
             return None
         held = self._values[self._begin : self._end].copy()
@@ -151,20 +133,7 @@ class Demands:
 
 
 def missing(record: Record | None, demands: Demands) -> list[str]:
-    """Return what the record lacks, in words; empty where an estimate may be made.
-
-    Parameters
-    ----------
-    record : Record or None
-        The window.
-    demands : Demands
-        What is asked for.
-
-    Returns
-    -------
-    list of str
-        One entry per unmet demand, with the figure reached.
-    """
+    """Return what the record lacks, in words; empty where an estimate may be made."""
     if record is None:
         return ["no motor_state yet"]
     voltage, speed = record.voltage, _speed(record)

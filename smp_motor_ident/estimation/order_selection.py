@@ -37,28 +37,7 @@ def explore(
     say: Say,
     first: Fit | None = None,
 ) -> list[FittedCandidate]:
-    """Fit the candidates that come into question; the last one is the choice.
-
-    Parameters
-    ----------
-    data : Experiments
-        Prepared records.
-    base : Structure
-        What the user asked for, or where ``auto`` begins.
-    options : Options
-        Loss and prior knowledge.
-    auto : bool
-        Whether the order may be chosen.
-    say : callable
-        Receives what is being done.
-    first : Fit, optional
-        Of ``base``, where it is known already.
-
-    Returns
-    -------
-    list of FittedCandidate
-        In the order of trial, the chosen one at the end.
-    """
+    """Fit the candidates that come into question; the last one is the choice."""
     smooth = _frictionless(data, base, options, auto, say)
     if smooth:
         return smooth

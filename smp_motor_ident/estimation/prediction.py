@@ -27,38 +27,12 @@ def run_spread(
 
 
 def simulate(data: Experiments, fit: Fit, gain: bool = False) -> Array:
-    """Return speed, output and current as the fitted motor predicts them.
-
-    Parameters
-    ----------
-    data : Experiments
-        With as many segments as the fit has initial states.
-    fit : Fit
-        Coordinates, initial states.
-    gain : bool
-        Whether measurements correct the state (innovations) or not (free run).
-
-    Returns
-    -------
-    ndarray, shape (n, 2) or with current (n, 3)
-        [rad/s], [output], [A].
-    """
+    """Return speed, output and current as the fitted motor predicts them."""
     return _predict(data, fit, gain, 3 if data.current.size else 2)
 
 
 def outputs(data: Experiments, fit: Fit, gain: bool = False) -> Array:
-    """Return the output alone as the fitted motor predicts it.
-
-    Parameters
-    ----------
-    data, fit, gain
-        As in `simulate`.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        [output].
-    """
+    """Return the output alone as the fitted motor predicts it."""
     return _predict(data, fit, gain, 1)[:, 0]
 
 
@@ -82,20 +56,7 @@ def inverse(normal: Array, rcond: float = 1e-13) -> Array:
 
 
 def information(data: Experiments, fit: Fit) -> Array:
-    """Return the Fisher information that experiments would give about a fit's coordinates.
-
-    Parameters
-    ----------
-    data : Experiments
-        Their times and voltages; outputs may be zero.
-    fit : Fit
-        Coordinates and noise.
-
-    Returns
-    -------
-    ndarray, shape (f, f)
-        Initial states eliminated.
-    """
+    """Return the Fisher information that experiments would give about a fit's coordinates."""
     return _again(data, fit.structure, fit).normal
 
 
@@ -108,26 +69,7 @@ def one_step(data: Experiments, fit: Fit) -> Array:
 def predicted_decrease(
     data: Experiments, fit: Fit, richer: Structure
 ) -> tuple[float, Array, Array]:
-    """Return what freeing more would gain, by the score: one pass in place of a fit.
-
-    Parameters
-    ----------
-    data : Experiments
-        What was fitted.
-    fit : Fit
-        Converged.
-    richer : Structure
-        In which more is free.
-
-    Returns
-    -------
-    gain : float
-        Deviance, to second order.
-    step : ndarray, shape (f,)
-        Undamped step of the free coordinates.
-    covariance : ndarray, shape (f, f)
-        Of white residuals.
-    """
+    """Return what freeing more would gain, by the score: one pass in place of a fit."""
     here = _again(data, richer, fit)
     covariance = inverse(here.normal)
     step = covariance @ here.gradient
@@ -135,22 +77,7 @@ def predicted_decrease(
 
 
 def settle(data: Experiments, fit: Fit, iterations: int = 12) -> Fit:
-    """Fit only the initial states and constant loads of other data (free run).
-
-    Parameters
-    ----------
-    data : Experiments
-        Such as held-out records.
-    fit : Fit
-        The motor.
-    iterations : int
-        Most passes.
-
-    Returns
-    -------
-    Fit
-        With the initial states and loads of ``data``; the motor is as it was.
-    """
+    """Fit only the initial states and constant loads of other data (free run)."""
     free = fit.structure.free()
     fixed = {**fit.structure.fixed, **{models.Z_NAMES[i]: float(fit.z[i]) for i in free}}
     if models.TE not in free and "ln_te" not in fixed:

@@ -40,22 +40,7 @@ FARTHEST = 4.0  # e-folds
 
 
 def profiled(data: Experiments, fit: Fit, options: Options) -> Fit:
-    """Return the fit with the profiles of what is poorly known.
-
-    Parameters
-    ----------
-    data : Experiments
-        What was fitted, or as many of its samples as tell the same.
-    fit : Fit
-        With its covariance.
-    options : Options
-        Loss and prior knowledge.
-
-    Returns
-    -------
-    Fit
-        Unchanged where nothing is poorly known, or the parabola holds.
-    """
+    """Return the fit with the profiles of what is poorly known."""
     if np.isfinite(options.huber):
         return fit
     free = fit.structure.free()

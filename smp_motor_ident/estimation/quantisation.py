@@ -26,22 +26,7 @@ REACH = 2.0  # standard deviations to which motions near the estimate are replay
 
 
 def widened(data: Experiments, fit: Fit, seed: int = 0) -> Fit:
-    """Return the fit with its covariance widened where quantisation repeats.
-
-    Parameters
-    ----------
-    data : Experiments
-        What was fitted.
-    fit : Fit
-        With the covariance of independent errors.
-    seed : int
-        Of the counter's random zeros.
-
-    Returns
-    -------
-    Fit
-        Unchanged where noise dithers the counter or the replays agree with the covariance.
-    """
+    """Return the fit with its covariance widened where quantisation repeats."""
     if data.kind != rc.ANGLE or data.quantum == 0 or fit.noise_ratio > 0:
         return fit
     own = data.quantum**2 / 12

@@ -84,24 +84,7 @@ class _Values:
 def answer(
     fit: Fit, fixed: Mapping[str, float], friction_std: float = 0.0, level: float = 0.0
 ) -> Answer:
-    """Turn a fit into quantities.
-
-    Parameters
-    ----------
-    fit : Fit
-        Of any structure.
-    fixed : mapping of str to float
-        What the user gave.
-    friction_std : float
-        Standard deviation of a friction that the structure leaves out [V].
-    level : float
-        The voltage that lasted longest [V].
-
-    Returns
-    -------
-    Answer
-        Physical parameters are there for current, or where ``fixed`` leaves one solution.
-    """
+    """Turn a fit into quantities."""
     structure, conditional = fit.structure, fit.conditional()
     reported = _reported(structure)
     values = _values(fit, fixed, reported, level)

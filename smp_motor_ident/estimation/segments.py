@@ -38,22 +38,7 @@ COMPARED = [i for i in range(len(models.Z_NAMES)) if i != models.TE]
 
 
 def heterogeneous(data: Experiments, fit: Fit) -> tuple[Fit, dict[str, float]]:
-    """Return the fit with its covariance widened by how the motor changes.
-
-    Parameters
-    ----------
-    data : Experiments
-        What was fitted.
-    fit : Fit
-        With the covariance of a motor that does not change.
-
-    Returns
-    -------
-    fit : Fit
-        Unchanged where the parts agree.
-    change : dict of str to float
-        Coordinate to the standard deviation between recordings; empty where the parts agree.
-    """
+    """Return the fit with its covariance widened by how the motor changes."""
     found = _steps(data, fit)
     if found is None:
         return fit, {}

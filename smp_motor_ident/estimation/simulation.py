@@ -23,22 +23,6 @@ def simulate(estimate: Estimate, record: Record) -> tuple[Array, Array]:
 
     Only the state at the beginning of each segment is fitted; from there on the motor sees
     nothing but the voltage.
-
-    Parameters
-    ----------
-    estimate : Estimate
-        The motor; combinations suffice.
-    record : Record
-        Of this motor.
-
-    Returns
-    -------
-    measured : ndarray, shape (n,), [rad/s]
-        The recorded velocity; where there is none, counts or angle differenced over one
-        sample.  NaN where lost.
-    simulated : ndarray, shape (n,), [rad/s]
-        At the instants, or averaged over the intervals: whichever of the two the measured
-        speed is.
     """
     data = prepare([record], False)
     fit = _motor(estimate)

@@ -12,18 +12,7 @@ MARGIN = 10  # samples of rest kept on either side
 
 
 def excited(record: Record) -> Record:
-    """Return a record without the rest before its first and after its last excitation.
-
-    Parameters
-    ----------
-    record : Record
-        Of one motor.
-
-    Returns
-    -------
-    Record
-        The same where it rests nowhere, or all the time.
-    """
+    """Return a record without the rest before its first and after its last excitation."""
     moves = np.abs(record.voltage) > REST.value * np.abs(record.voltage).max()
     for name in ("velocity", "position", "count"):
         values = getattr(record, name)

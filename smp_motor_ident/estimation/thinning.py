@@ -26,17 +26,6 @@ def thinned(data: Experiments) -> Experiments:
     """Return every k-th sample where there are far more than the motor's motion needs.
 
     The input keeps its jumps where they are; between them it is averaged.
-
-    Parameters
-    ----------
-    data : Experiments
-        Prepared records.
-
-    Returns
-    -------
-    Experiments
-        ``data`` itself where current or speed is an output, for their noise is not a counter's
-        and a window over some samples would not show, or where it is not oversampled.
     """
     if data.kind != rc.ANGLE or data.current.size:
         return data

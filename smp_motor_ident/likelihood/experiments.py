@@ -200,25 +200,7 @@ def speed_quantum(velocity: Array) -> float:
 def prepare(
     records: Sequence[Record], use_current: bool, kind: str = "auto", hold: str = "held"
 ) -> Experiments:
-    """Put records one after the other; segments keep their own state.
-
-    Parameters
-    ----------
-    records : sequence of Record
-        Of one motor.
-    use_current : bool
-        Whether current is an output.
-    kind : {'auto', 'speed', 'angle'}
-        Which mechanical output.
-    hold : {'held', 'switched', 'middle'}
-        How the command ran inside the intervals of which the voltage is the mean: constant;
-        switching where two-level jumps nearby did; switching half-way.
-
-    Returns
-    -------
-    Experiments
-        Views where there is one record whose input needs no splitting.
-    """
+    """Put records one after the other; segments keep their own state."""
     outputs = [output_of(r, kind) for r in records]
     if len({k for _, k, _ in outputs}) > 1:
         outputs = [output_of(r, "speed") for r in records]

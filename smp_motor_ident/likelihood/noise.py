@@ -67,28 +67,7 @@ def steady_gain(
     noise_ratio: float,
     current_noise: float,
 ) -> tuple[Array, Array]:
-    """Return gain and innovation covariance for an angle (and a current) measured.
-
-    Parameters
-    ----------
-    te, tm, k, be : float
-        As in `propagator.second_order`; ``te`` 0 means first order.
-    resistance : float
-        R [ohm].
-    step : float
-        Sampling interval [s].
-    noise_ratio : float
-        Intensity of white noise on the acceleration over the angle's noise variance.
-    current_noise : float
-        Variance of the current's noise over the angle's; 0 without current.
-
-    Returns
-    -------
-    gain : ndarray, shape (3, 2)
-        From (angle, current) to (q, w, angle).
-    innovation : ndarray, shape (2, 2)
-        Over the angle's noise variance.
-    """
+    """Return gain and innovation covariance for an angle (and a current) measured."""
     row = _row(step, te, tm, k, be)
     a: Array = np.zeros((3, 3))  # the transposed transition
     a[0, 0], a[1, 0], a[0, 1], a[1, 1] = row[0], row[1], row[2], row[3]

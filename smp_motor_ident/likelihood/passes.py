@@ -107,34 +107,7 @@ def gather(
     predicted: Array | None = None,
     differentiate: bool = True,
 ) -> Sums:
-    """Run over the data once.
-
-    Parameters
-    ----------
-    data : Experiments
-        Prepared records.
-    structure : Structure
-        Order, friction and what is free.
-    z : ndarray, shape (11,)
-        Coordinates.
-    initial : ndarray, shape (g, 4)
-        q, w, angle, load of each segment.
-    gain : ndarray, shape (3, 2)
-        Innovation gain.
-    noise : ndarray, shape (2, 2), optional
-        Covariance of (output, current); 1 each by default.
-    huber : float
-        Bound of the robust loss in standard deviations.
-    predicted : ndarray, shape (n, 1), (n, 2) or (n, 3), optional
-        Filled with the output; or with speed and output, and perhaps current.
-    differentiate : bool
-        Whether the columns of the problem are wanted.
-
-    Returns
-    -------
-    Sums
-        Without columns where ``differentiate`` is False.
-    """
+    """Run over the data once."""
     noise = np.eye(2) if noise is None else noise
     par, internal = to_internal(z, structure.order)
     slope = (
@@ -214,24 +187,7 @@ def evaluate(
     huber: float = np.inf,
     priors: Sequence[tuple[Array, float]] = (),
 ) -> Pass:
-    """Run, add what is known beforehand, and eliminate the initial states.
-
-    Parameters
-    ----------
-    data, structure, z, initial
-        As in `gather`.
-    start : ndarray, shape (g, 4)
-        Initial states as they were first guessed.
-    gain, noise, huber
-        As in `gather`.
-    priors : sequence of (ndarray, float)
-        Rows of the common columns and by how much each misses, in standard deviations.
-
-    Returns
-    -------
-    Pass
-        With an infinite objective where the numbers left the range of floating point.
-    """
+    """Run, add what is known beforehand, and eliminate the initial states."""
     sums = gather(data, structure, z, initial, gain, noise, huber)
     own = own_columns(data, structure)
     segments, f, o = len(sums.cost), structure.matrix().shape[1], len(own)

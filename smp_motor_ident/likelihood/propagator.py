@@ -236,19 +236,7 @@ def expand(values: Array, table: Array) -> None:
 
 @compiled
 def evaluate(table: Array, u: float, out: Array, at: int) -> None:
-    """Evaluate the polynomials.
-
-    Parameters
-    ----------
-    table : ndarray, shape (NODES * n,)
-        Of `expand`.
-    u : float
-        Where, -1 to 1.
-    out : ndarray
-        Overwritten from ``at`` on.
-    at : int
-        First entry.
-    """
+    """Evaluate the polynomials."""
     width = table.shape[0] // NODES
     c1, c2, c3, c4 = table[width:], table[2 * width :], table[3 * width :], table[4 * width :]
     c5, c6, c7 = table[5 * width :], table[6 * width :], table[7 * width :]

@@ -142,56 +142,7 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
     predicted: Array,
     usual: float,
 ) -> int:
-    """Run over all segments; fill the sums in place.
-
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        Sampling instants [s].
-    starts : ndarray of int, shape (g + 1,)
-        First sample of each segment, and n.
-    hold_end, hold_value : ndarray, shape (m,)
-        Instants [s] until which the input was held at the values [V].
-    hold_start : ndarray of int, shape (g,)
-        First section of each segment; it also holds what came before.
-    output, current : ndarray, shape (n,)
-        Mechanical output (NaN where lost); current [A], shape (0,) where it is not used.
-    kind : int
-        SPEED, ANGLE or MEAN_SPEED (over the trailing window).
-    friction : bool
-        Whether Coulomb friction is in the model.
-    par, slope : ndarray, shapes (11,) and (11, c)
-        Internal parameters (see the constants of this module; te and tm not as logarithms)
-        and their derivatives by the c common columns (those of te and tm logarithmic).
-    initial : ndarray, shape (g, 4)
-        q, w, th and load of each segment.
-    local : ndarray of int, shape (l,)
-        Which of these four are columns of the problem.
-    gain : ndarray, shape (3, 2)
-        Innovation gain from (output, current) to (q, w, th).
-    weight : ndarray, shape (2, 3)
-        Lower triangular whitening of (output, current); third column: of one alone.
-    huber : float
-        Residuals beyond this many standard deviations count linearly.
-    normal, gradient, cost : ndarray, shapes (g, p, p), (g, p), (g,)
-        Sums, p = c + l; overwritten.
-    spread : ndarray, shape (6,)
-        Sums of squares and product of the raw residuals, and their numbers; overwritten.
-    block_length, blocks, block_segment
-        Scores are summed over runs of ``block_length`` samples into rows of ``blocks``.
-    ring : ndarray, shape (r, 3 + 2 p)
-        Memory for the window of MEAN_SPEED; shape (0, 0) otherwise.
-    predicted : ndarray, shape (n, 1), (n, 2) or (n, 3)
-        Filled with the output; or with speed and output, and perhaps current; shape (0, 3)
-        where not wanted.
-    usual : float
-        Usual interval [s] where the stamps jitter; 0 where they do not.
-
-    Returns
-    -------
-    int
-        Number of rows of ``blocks`` in use.
-    """
+    """Run over all segments; fill the sums in place."""
     n_common = slope.shape[1]
     p = n_common + local.shape[0]
     columns = p > 0

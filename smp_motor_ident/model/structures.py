@@ -134,18 +134,7 @@ class Structure:
         return m
 
     def complete(self, z: Array) -> Array:
-        """Return z with fixed and tied coordinates put to their values.
-
-        Parameters
-        ----------
-        z : ndarray, shape (11,)
-            Any coordinates.
-
-        Returns
-        -------
-        ndarray, shape (11,)
-            Coordinates that satisfy this structure.
-        """
+        """Return z with fixed and tied coordinates put to their values."""
         z = z.copy()
         for there, index in (
             (self.load, LOAD),
@@ -166,18 +155,7 @@ class Structure:
         return z
 
     def with_(self, **changes: object) -> Structure:
-        """Return a copy with some attributes changed.
-
-        Parameters
-        ----------
-        **changes : object
-            Attributes by name, with their new values.
-
-        Returns
-        -------
-        Structure
-            The same in all else.
-        """
+        """Return a copy with some attributes changed."""
         return replace(self, **changes)  # type: ignore[arg-type]
 
 
@@ -185,20 +163,6 @@ def to_internal(z: Array, order: int) -> tuple[Array, Array]:
     """Map coordinates to the recursion's parameters.
 
     ``tm = a2/te``, ``be = a1/te - a2/te^2``, ``K = a0 - be``; first order: tm = a1, K = a0.
-
-    Parameters
-    ----------
-    z : ndarray, shape (11,)
-        Coordinates.
-    order : int
-        1 or 2.
-
-    Returns
-    -------
-    par : ndarray, shape (11,)
-        te, tm, K, be, Vc+, Vc-, load, R, current offset, delay, window.
-    slope : ndarray, shape (11, 11)
-        Its derivative by z; rows of te, tm and R are of their logarithms.
     """
     par = np.array(z, dtype=np.float64)
     slope = np.zeros((len(Z_NAMES), len(Z_NAMES)))
@@ -229,24 +193,7 @@ def _fill_internal(par: Array, slope: Array, order: int) -> None:
 
 
 def combinations(z: Array, order: int) -> tuple[dict[str, float], dict[str, Array]]:
-    """Return what voltage and speed tell, and its gradients by z.
-
-    Parameters
-    ----------
-    z : ndarray, shape (11,)
-        Coordinates.
-    order : int
-        1 or 2.
-
-    Returns
-    -------
-    values : dict
-        ``dc_gain`` = 1/a0, ``time_constant`` = a1/a0, ``time_constant_product`` = a2/a0,
-        ``static_voltage`` (forward and reverse), ``load_voltage``, ``delay``,
-        ``averaging_window``.
-    gradients : dict
-        Of shape (11,) each.
-    """
+    """Return what voltage and speed tell, and its gradients by z."""
     unit = np.eye(len(Z_NAMES))
     tau = np.exp(z[A1] - z[A0])
     gain = np.exp(-z[A0])
@@ -272,18 +219,6 @@ def physical(z: Array) -> tuple[dict[str, float], dict[str, Array]]:
     """Return the physical parameters of a second-order structure and their gradients by z.
 
     ``L = R te``, ``K = a0 - be``, ``J = tm K/R``, ``b = be K/R``, ``Tc = Vc K/R``.
-
-    Parameters
-    ----------
-    z : ndarray, shape (11,)
-        Coordinates.
-
-    Returns
-    -------
-    values : dict
-        By the names of the contract, SI, at the motor shaft.
-    gradients : dict
-        Of shape (11,) each.
     """
     par, slope = to_internal(z, 2)
     te, tm, k, be = par[:4]
@@ -321,18 +256,7 @@ def from_physical(
     viscous_friction: float,
     coulomb_friction: float = 0.0,
 ) -> Array:
-    """Return the coordinates z of a motor.
-
-    Parameters
-    ----------
-    resistance, inductance, motor_constant, inertia, viscous_friction, coulomb_friction : float
-        SI, at the motor shaft.
-
-    Returns
-    -------
-    ndarray, shape (11,)
-        Coordinates of the second-order structure.
-    """
+    """Return the coordinates z of a motor."""
     z = np.zeros(len(Z_NAMES))
     r, k = resistance, motor_constant
     te, tm, be = inductance / r, r * inertia / k, r * viscous_friction / k

@@ -101,15 +101,7 @@ class Wheel:
         )
 
     def tell(self, status: str, found: Estimate | None = None) -> None:
-        """Publish an answer.
-
-        Parameters
-        ----------
-        status : str
-            What the numbers may be used for, and why not if they may not.
-        found : Estimate or None
-            The numbers.
-        """
+        """Publish an answer."""
         self.status = status
         message = MotorParameters(joint_name=self.joint_name, status=status)
         message.header.stamp = self.stamp
@@ -190,18 +182,7 @@ def _identify(record: Record, model: str) -> Estimate:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the node.
-
-    Parameters
-    ----------
-    argv : list of str or None
-        ROS arguments.
-
-    Returns
-    -------
-    int
-        Exit code.
-    """
+    """Run the node."""
     return runtime.run("identifier", Identifier, argv)
 
 

@@ -24,40 +24,13 @@ COMBINATIONS = ("dc_gain", "time_constant", "time_constant_product", "static_vol
 
 
 def identification_document(estimates: Mapping[str, Estimate]) -> dict[str, Any]:
-    """Return the content of ``identification.json``.
-
-    Parameters
-    ----------
-    estimates : mapping of str to Estimate
-        By wheel.
-
-    Returns
-    -------
-    dict
-        Of plain types, with the keys of the contract.
-    """
+    """Return the content of ``identification.json``."""
     motors = {wheel: estimate.to_document() for wheel, estimate in estimates.items()}
     return {"schema": SCHEMA, "motors": motors}
 
 
 def read_identification(path: Path) -> dict[str, Estimate]:
-    """Read ``identification.json``.
-
-    Parameters
-    ----------
-    path : Path
-        The file, or the folder that ``identify`` wrote it to.
-
-    Returns
-    -------
-    dict of str to Estimate
-        By wheel, in the file's order.
-
-    Raises
-    ------
-    BagError
-        When the file cannot be read, is not JSON, or lacks a key of the contract.
-    """
+    """Read ``identification.json``."""
     if path.is_dir():
         path = path / "identification.json"
     try:
@@ -157,20 +130,7 @@ def motor_entry(estimate: Estimate) -> dict[str, float | int]:
 
 
 def motors_yaml(estimates: Mapping[str, Estimate], provenance: Iterable[str] = ()) -> str:
-    """Return ``motors.yaml``: a ROS 2 parameter file that ``motor_plant`` loads as it is.
-
-    Parameters
-    ----------
-    estimates : mapping of str to Estimate
-        By wheel.
-    provenance : iterable of str
-        Lines that become comments at the file's head.
-
-    Returns
-    -------
-    str
-        YAML.
-    """
+    """Return ``motors.yaml``: a ROS 2 parameter file that ``motor_plant`` loads as it is."""
     motors = {wheel: motor_entry(estimate) for wheel, estimate in estimates.items()}
     tree = {"/**/motor_plant": {"ros__parameters": {"motors": motors}}}
     head = "".join(f"# {line}\n" for line in provenance)
@@ -178,20 +138,7 @@ def motors_yaml(estimates: Mapping[str, Estimate], provenance: Iterable[str] = (
 
 
 def check_free(paths: Iterable[Path], force: bool) -> None:
-    """Refuse to overwrite.
-
-    Parameters
-    ----------
-    paths : iterable of Path
-        Files about to be written.
-    force : bool
-        Whether overwriting was asked for.
-
-    Raises
-    ------
-    ParameterError
-        When a file exists and `force` is false, or a path is a folder.
-    """
+    """Refuse to overwrite."""
     for path in paths:
         if path.is_dir():
             raise ParameterError(f"{path}: is a folder, not a file; choose another --output")
@@ -200,20 +147,7 @@ def check_free(paths: Iterable[Path], force: bool) -> None:
 
 
 def write_together(files: Mapping[Path, str | bytes], force: bool = False) -> None:
-    """Write several files of one folder so that all of them appear, or none.
-
-    Parameters
-    ----------
-    files : mapping of Path to str or bytes
-        Contents by path; all in the same folder, which is made if needed.
-    force : bool
-        Replace files that exist.
-
-    Raises
-    ------
-    ParameterError
-        When a file exists and `force` is false, or the folder cannot be written.
-    """
+    """Write several files of one folder so that all of them appear, or none."""
     check_free(files, force)
     (folder,) = {path.parent for path in files}
     made = next((p for p in reversed((folder, *folder.parents)) if not p.exists()), None)

@@ -17,18 +17,7 @@ POINTS = 600
 
 
 def svg(chart: Chart) -> str:
-    """Return the chart as an SVG element whose colours are CSS variables.
-
-    Parameters
-    ----------
-    chart : Chart
-        Of which line, points, bars, bands, levels and shaded spans are drawn.
-
-    Returns
-    -------
-    str
-        With ``role="img"`` and the chart's summary.
-    """
+    """Return the chart as an SVG element whose colours are CSS variables."""
     plane = _Plane(chart)
     parts = [
         f'<svg class="static" role="img" viewBox="0 0 {WIDTH} {chart.height}" '

@@ -19,20 +19,7 @@ COHERENT = 0.6
 
 
 def fit_charts(wheel: str, parts: Sequence[Comparison]) -> list[Chart]:
-    """Return speed, residual and voltage over all stretches of data, one after the other.
-
-    Parameters
-    ----------
-    wheel : str
-        Name of the wheel.
-    parts : sequence of Comparison
-        Estimation and validation are shaded apart.
-
-    Returns
-    -------
-    list of Chart
-        Which share their time axis.
-    """
+    """Return speed, residual and voltage over all stretches of data, one after the other."""
     begin, times, spans = 0.0, [], []
     for part in parts:
         times.append(begin + part.time)

@@ -63,18 +63,7 @@ class Row:
 
 
 def render(report: Report) -> str:
-    """Return the page.
-
-    Parameters
-    ----------
-    report : Report
-        What it tells.
-
-    Returns
-    -------
-    str
-        HTML, complete in itself: script, style and data are inside, nothing is loaded.
-    """
+    """Return the page."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("smp_motor_ident.report", "."),
         autoescape=True,

@@ -15,20 +15,7 @@ from smp_motor_ident.tune.curves import Curves
 
 
 def tuning_charts(wheels: Mapping[str, Curves], limit: float) -> list[Chart]:
-    """Return the charts of the designs of all wheels.
-
-    Parameters
-    ----------
-    wheels : mapping of str to Curves
-        By wheel; bands are what 98 % of the motors that the data allow stay within.
-    limit : float
-        Ms of the specification [-].
-
-    Returns
-    -------
-    list of Chart
-        The grey line is the reference.
-    """
+    """Return the charts of the designs of all wheels."""
     # Wheels of different time constants are computed over different lengths and bands.
     longest = max(wheels.values(), key=lambda c: float(c.time[-1]))
     time = longest.time

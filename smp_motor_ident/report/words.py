@@ -37,53 +37,19 @@ MODELS: Mapping[str, str] = {
 
 
 def label(name: str) -> str:
-    """Return a wheel, quantity or model in words.
-
-    Parameters
-    ----------
-    name : str
-        Such as ``front_left`` or ``dc_gain``.
-
-    Returns
-    -------
-    str
-        Such as ``Front left``, ``DC gain``.
-    """
+    """Return a wheel, quantity or model in words."""
     if name in EXPLAINED:
         return EXPLAINED[name][1]
     return name.replace("_", " ").strip().capitalize()
 
 
 def model(name: str) -> str:
-    """Return a model's name in words.
-
-    Parameters
-    ----------
-    name : str
-        Of a candidate structure.
-
-    Returns
-    -------
-    str
-        What it describes.
-    """
+    """Return a model's name in words."""
     return MODELS.get(name, name.replace("_", " "))
 
 
 def number(value: float | None, std: float | None = None) -> str:
     """Return a number with the digits that its standard deviation supports.
-
-    Parameters
-    ----------
-    value : float or None
-        The number.
-    std : float or None
-        Its standard deviation; without it five digits are given.
-
-    Returns
-    -------
-    str
-        Such as ``25.52`` or ``1.130e-06``.
 
     Examples
     --------
@@ -107,18 +73,7 @@ def number(value: float | None, std: float | None = None) -> str:
 
 
 def spread(std: float | None) -> str:
-    """Return a standard deviation with two digits.
-
-    Parameters
-    ----------
-    std : float or None
-        The deviation.
-
-    Returns
-    -------
-    str
-        Such as ``0.012``.
-    """
+    """Return a standard deviation with two digits."""
     if std is None or not math.isfinite(std):
         return "—"
     if std == 0 or 1e-4 <= std < 1e3:
@@ -132,18 +87,7 @@ def typeset(unit: str) -> str:
 
 
 def scaled(quantity: Quantity) -> Quantity:
-    """Return a time in milliseconds, anything else as it is.
-
-    Parameters
-    ----------
-    quantity : Quantity
-        In SI units.
-
-    Returns
-    -------
-    Quantity
-        In a unit that makes its digits easy to read.
-    """
+    """Return a time in milliseconds, anything else as it is."""
     unit, factor = {"s": ("ms", 1e3), "s^2": ("ms²", 1e6)}.get(quantity.unit, (quantity.unit, 1.0))
     value, std, ci95 = quantity.value, quantity.std, quantity.ci95
     return replace(
@@ -156,18 +100,7 @@ def scaled(quantity: Quantity) -> Quantity:
 
 
 def status(quantity: Quantity) -> str:
-    """Return in words where a number comes from.
-
-    Parameters
-    ----------
-    quantity : Quantity
-        One number of an estimate.
-
-    Returns
-    -------
-    str
-        For the status column.
-    """
+    """Return in words where a number comes from."""
     words = {"estimated": "estimated", "fixed": "given", "unidentifiable": "not identifiable"}
     return words[quantity.status]
 

@@ -74,24 +74,7 @@ class Case:
 
 
 def prepare(estimate: Estimate, loop: Loop, method: str, targets: dict[str, Any]) -> Case:
-    """Sample the motor and the draws of its distribution; see :func:`design`.
-
-    Parameters
-    ----------
-    estimate, loop, method
-        As for :func:`design`.
-    targets : dict
-        Its keywords.
-
-    Returns
-    -------
-    Case
-
-    Raises
-    ------
-    DesignError
-        When method or targets are unknown.
-    """
+    """Sample the motor and the draws of its distribution; see :func:`design`."""
     chosen = _method(method, targets)
     findings = list(_reliability(estimate, bool(targets.get("accept_unreliable"))))
     friction = friction_of(estimate, loop.supply_voltage)
@@ -138,26 +121,7 @@ def _reliability(estimate: Estimate, accepted: bool) -> tuple[Finding, ...]:
 
 
 def solve(case: Case) -> tuple[Feedback, float, Robustness]:
-    """Find the feedback gains, backed off as far as the uncertainty asks for it.
-
-    Parameters
-    ----------
-    case : Case
-        From :func:`prepare`.
-
-    Returns
-    -------
-    feedback : Feedback
-        At the motor shaft.
-    factor : float
-        By which the rule's gains were backed off; 1 where they were not.
-    robustness : Robustness
-
-    Raises
-    ------
-    DesignError
-        When the demand cannot be met.
-    """
+    """Find the feedback gains, backed off as far as the uncertainty asks for it."""
     ruled = case.method.solve(case.problem)
     quiet, calm = _within_clamp(case.problem, ruled)
     feedback, factor, robustness = back_off(case.ensemble, quiet)

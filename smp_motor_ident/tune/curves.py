@@ -52,19 +52,7 @@ class Curves:
 
 
 def curves(estimate: Estimate, design: Design) -> Curves:
-    """Compute the curves of a design over the distribution of its estimate.
-
-    Parameters
-    ----------
-    estimate : Estimate
-        That the design was made from.
-    design : Design
-        The design.
-
-    Returns
-    -------
-    Curves
-    """
+    """Compute the curves of a design over the distribution of its estimate."""
     loop, ratio = design.loop, design.loop.gear_ratio
     nominal = motors_of(estimate)
     drawn = draw_motors(estimate, DRAWS, np.random.default_rng(0))

@@ -37,34 +37,11 @@ class Feedback:
     filter_time: float = 0.0
 
     def scaled(self, factor: float) -> Feedback:
-        """Return the same controller with every gain multiplied by ``factor``.
-
-        Parameters
-        ----------
-        factor : float
-            Of the loop gain.
-
-        Returns
-        -------
-        Feedback
-            With the same filter.
-        """
+        """Return the same controller with every gain multiplied by ``factor``."""
         return replace(self, p=self.p * factor, i=self.i * factor, d=self.d * factor)
 
     def response(self, omega: Array, sample_time: float) -> Complex:
-        """Return the frequency response from error to volts.
-
-        Parameters
-        ----------
-        omega : ndarray, shape (f,), [rad/s]
-            Frequencies above 0.
-        sample_time : float
-            [s].
-
-        Returns
-        -------
-        ndarray of complex, shape (f,), [V s/rad]
-        """
+        """Return the frequency response from error to volts."""
         integral, derivative = terms(omega, sample_time, self.filter_time)
         return self.p + self.i * integral + self.d * derivative
 
@@ -126,20 +103,7 @@ def closed_loop(plant: Plant, feedback: Feedback) -> Array:
 
 
 def spectral_radius(plant: Plant, feedback: Feedback) -> Array:
-    """Return the largest eigenvalue magnitude of every closed loop of a batch.
-
-    Parameters
-    ----------
-    plant : Plant
-        A batch of ``n``.
-    feedback : Feedback
-        One controller for all of them.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        Below 1 where the loop is stable.
-    """
+    """Return the largest eigenvalue magnitude of every closed loop of a batch."""
     A = closed_loop(plant, feedback)
     if np.ndim(feedback.i) == 0 and feedback.i == 0.0:
         # An integral that nothing feeds stays as it is, and belongs to no loop.

@@ -61,39 +61,13 @@ def frequencies(sample_time: float, slowest: float, count: int = 500) -> Array:
 
 
 def grid_for(plant: Plant, count: int = 500) -> Array:
-    """Return the frequency grid that suits a batch of plants; see :func:`frequencies`.
-
-    Parameters
-    ----------
-    plant : Plant
-        The slowest of its motors sets the lowest frequency.
-    count : int
-        Number of frequencies.
-
-    Returns
-    -------
-    ndarray, shape (count,), [rad/s]
-        Up to the Nyquist frequency.
-    """
+    """Return the frequency grid that suits a batch of plants; see :func:`frequencies`."""
     motors = plant.motors
     return frequencies(plant.sample_time, float(np.min(motors.a0 / motors.a1)), count)
 
 
 def loop_margins(plant: Plant, feedback: Feedback) -> Margins:
-    """Return the margins of one loop, by python-control.
-
-    Parameters
-    ----------
-    plant : Plant
-        A batch of one.
-    feedback : Feedback
-        The controller.
-
-    Returns
-    -------
-    Margins
-        Those of the worst crossover where there are several.
-    """
+    """Return the margins of one loop, by python-control."""
     omega = grid_for(plant, 2000)
     loop = plant.response(omega)[0] * feedback.response(omega, plant.sample_time)
     data = control.FRD(loop, omega, smooth=True)
@@ -125,20 +99,7 @@ class BatchMargins:
 
 
 def batch_margins(loop: Complex, omega: Array) -> BatchMargins:
-    """Return the margins of many loops from their frequency responses.
-
-    Parameters
-    ----------
-    loop : ndarray of complex, shape (n, f)
-        Loop gains on the grid.
-    omega : ndarray, shape (f,), [rad/s]
-        The grid, ascending.
-
-    Returns
-    -------
-    BatchMargins
-        Crossings are interpolated linearly between grid points.
-    """
+    """Return the margins of many loops from their frequency responses."""
     size = np.log(np.abs(loop))
     falls = (size[:, :-1] > 0) != (size[:, 1:] > 0)
     share = size[:, :-1] / np.where(falls, size[:, :-1] - size[:, 1:], 1.0)

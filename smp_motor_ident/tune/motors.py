@@ -86,24 +86,7 @@ class Friction:
 
 
 def friction_of(estimate: Estimate, supply: float) -> Friction:
-    """Return what feed-forward may take for known of dry friction.
-
-    Parameters
-    ----------
-    estimate : Estimate
-        With ``static_voltage``, or all that makes it.
-    supply : float
-        Largest voltage [V].
-
-    Returns
-    -------
-    Friction
-
-    Raises
-    ------
-    DesignError
-        When the friction may be anything from nothing to half of the supply.
-    """
+    """Return what feed-forward may take for known of dry friction."""
     quantity = _static_voltage(estimate)
     if quantity is None:
         words = "dry friction was not identified: the feed-forward leaves it to the integral"
@@ -145,23 +128,7 @@ def _static_voltage(estimate: Estimate) -> Quantity | None:
 
 
 def motors_of(estimate: Estimate) -> Motors:
-    """Return the motor of an estimate, from whatever combinations or parameters it holds.
-
-    Parameters
-    ----------
-    estimate : Estimate
-        With ``dc_gain`` and ``time_constant``, or with all physical parameters.
-
-    Returns
-    -------
-    Motors
-        A batch of one.
-
-    Raises
-    ------
-    DesignError
-        When the estimate holds neither, or one of them is not positive.
-    """
+    """Return the motor of an estimate, from whatever combinations or parameters it holds."""
     return _motors(estimate, {name: np.array([estimate.value(name)]) for name in _names(estimate)})
 
 
@@ -172,22 +139,6 @@ def draw_motors(
 
     What is positive by nature is drawn log-normally, what may be zero normally from there up.
     An unreliable estimate is drawn at least as wide as what it leaves unexplained.
-
-    Parameters
-    ----------
-    estimate : Estimate
-        As for :func:`motors_of`.
-    n : int
-        Number of draws.
-    rng : numpy.random.Generator
-        Source of randomness.
-    friction : Friction or None
-        Within which its voltage is drawn; None takes that of the estimate.
-
-    Returns
-    -------
-    Motors or None
-        A batch of ``n``, or None where the estimate has no uncertainty of its response.
     """
     names = _names(estimate)
     mean = np.array([estimate.value(name) for name in names])

@@ -47,17 +47,7 @@ class ObserverModel:
     taps: Array
 
     def transfer(self, z: Complex) -> tuple[Complex, Complex]:
-        """Return the transfer from swept angle and from mean voltage to the observed speed.
-
-        Parameters
-        ----------
-        z : ndarray of complex, shape (f,)
-
-        Returns
-        -------
-        from_angle, from_voltage : ndarray of complex, shape (f,)
-            Of what happens between a sample and the next one to the speed at the first.
-        """
+        """Return the transfer from swept angle and from mean voltage to the observed speed."""
         eye = np.eye(self.by_angle.size)
         inputs = np.stack([self.by_angle, self.by_voltage], axis=1)
         found = np.linalg.solve(z[:, None, None] * eye - self.advance, inputs[None])

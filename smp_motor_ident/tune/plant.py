@@ -81,18 +81,7 @@ class Plant:
         return self.phi.shape[1] - 1 if np.any(self.motors.sensor_lag > 0) else 0
 
     def repeated(self, n: int) -> Plant:
-        """Return a batch of ``n`` copies of a batch of one, for ``n`` controllers.
-
-        Parameters
-        ----------
-        n : int
-            Number of copies.
-
-        Returns
-        -------
-        Plant
-            A batch of ``n``.
-        """
+        """Return a batch of ``n`` copies of a batch of one, for ``n`` controllers."""
         return replace(
             self,
             phi=np.repeat(self.phi, n, axis=0),
@@ -103,37 +92,12 @@ class Plant:
         )
 
     def response(self, omega: Array, *, true_speed: bool = False) -> Complex:
-        """Return the frequency response from controller output to measured speed.
-
-        Parameters
-        ----------
-        omega : ndarray, shape (f,), [rad/s]
-            Frequencies up to pi / sample_time.
-        true_speed : bool
-            Whether to the motor's own speed instead.
-
-        Returns
-        -------
-        ndarray of complex, shape (n, f), [rad/s/V]
-        """
+        """Return the frequency response from controller output to measured speed."""
         z = np.exp(1j * np.asarray(omega) * self.sample_time)
         return self.transfer(z, true_speed=true_speed)
 
     def transfer(self, z: Complex, *, true_speed: bool = False) -> Complex:
-        """Return the transfer function at points of the z plane; see :meth:`response`.
-
-        Parameters
-        ----------
-        z : ndarray of complex, shape (f,)
-            Points other than poles.
-        true_speed : bool
-            See :meth:`response`.
-
-        Returns
-        -------
-        ndarray of complex, shape (n, f), [rad/s/V]
-            One row per motor of the batch.
-        """
+        """Return the transfer function at points of the z plane; see :meth:`response`."""
         z = np.asarray(z, dtype=np.complex128)
         delays = z[None, :] ** -np.arange(self.taps.shape[1])[:, None]
         drive = np.einsum("nms,mf->nsf", self.taps, delays)
@@ -167,27 +131,7 @@ class Plant:
 
 
 def sample(motors: Motors, loop: Loop, *, believed: Motors | None = None) -> Plant:
-    """Sample a batch of motors exactly, with the loop's and the motor's delay.
-
-    Parameters
-    ----------
-    motors : Motors
-        The batch.
-    loop : Loop
-        Sample time, delay, and how speed is measured.
-    believed : Motors or None
-        The motor that an observer in the loop takes them all for; None takes the first of them.
-
-    Returns
-    -------
-    Plant
-        The sampled batch.
-
-    Raises
-    ------
-    DesignError
-        When delay and window are more samples than a loop can be designed for.
-    """
+    """Sample a batch of motors exactly, with the loop's and the motor's delay."""
     T, n = loop.sample_time, len(motors)
     observer = None
     if loop.speed_source == "observer" and loop.count_angle:

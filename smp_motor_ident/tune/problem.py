@@ -117,54 +117,18 @@ class Problem:
         return 1 / float(np.abs(self.plant.response(np.array([w]))[0, 0])), 2 * math.pi / w
 
     def filter_time(self, natural: float) -> float:
-        """Return the derivative filter: the loop's if it names one, else ``natural``.
-
-        Parameters
-        ----------
-        natural : float
-            What the method would take [s].
-
-        Returns
-        -------
-        float
-            Time constant [s], half a sample at least where it is the method's.
-        """
+        """Return the derivative filter: the loop's if it names one, else ``natural``."""
         given = self.loop.derivative_filter_time_constant
         return max(natural, 0.5 * self.loop.sample_time) if given is None else given
 
     def target(self, name: str, default: float, *, least: float = 0.0) -> float:
-        """Return a numeric target, checked.
-
-        Parameters
-        ----------
-        name : str
-            Keyword of the target.
-        default : float
-            Where it is not given.
-        least : float
-            The target must be above this.
-
-        Returns
-        -------
-        float
-
-        Raises
-        ------
-        DesignError
-            When it is not a finite number above ``least``.
-        """
+        """Return a numeric target, checked."""
         value = checked(self.targets, name, least)
         return default if value is None else value
 
     @property
     def structure(self) -> str:
-        """``pi`` or ``pid`` as the caller asks for it, empty where he does not.
-
-        Raises
-        ------
-        DesignError
-            When it is neither.
-        """
+        """``pi`` or ``pid`` as the caller asks for it, empty where he does not."""
         value = self.targets.get("structure")
         if value not in (None, "pi", "pid"):
             raise DesignError(f"structure is {value!r}; it must be pi or pid")
@@ -207,19 +171,7 @@ class Method:
 
 
 def measured_lag(plant: Plant, delay: float) -> float:
-    """Return how much later than the motor's speed the measurement shows it [s].
-
-    Parameters
-    ----------
-    plant : Plant
-        With the way its speed is measured.
-    delay : float
-        Of the loop [s].
-
-    Returns
-    -------
-    float
-    """
+    """Return how much later than the motor's speed the measurement shows it [s]."""
     late = delay + float(plant.motors.delay[0])
     if plant.window:
         late += 0.5 / float(plant.average[0, 0])
@@ -231,17 +183,6 @@ def noise_filter(problem: Problem, omega: Array) -> Array:
 
     Quantisation of the count is taken as white and uniform over one count, then differenced or
     observed.
-
-    Parameters
-    ----------
-    problem : Problem
-        Encoder and averaging window.
-    omega : ndarray, shape (f,), [rad/s]
-
-    Returns
-    -------
-    ndarray, shape (f,), [rad^2/s^2]
-        Variance per share of the band up to Nyquist.
     """
     loop = problem.loop
     density: Array = problem.plant.angle_noise(omega) * loop.count_angle**2 / 12
@@ -249,20 +190,7 @@ def noise_filter(problem: Problem, omega: Array) -> Array:
 
 
 def control_noise(problem: Problem, feedback: Feedback) -> float:
-    """Return the voltage that measurement noise causes at the controller's output.
-
-    Parameters
-    ----------
-    problem : Problem
-        Loop and encoder.
-    feedback : Feedback
-        The gains.
-
-    Returns
-    -------
-    float
-        [V rms].
-    """
+    """Return the voltage that measurement noise causes at the controller's output."""
     omega = problem.omega
     control = feedback.response(omega, problem.loop.sample_time)
     through = np.abs(control / (1 + problem.response * control)) ** 2

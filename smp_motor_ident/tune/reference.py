@@ -69,12 +69,7 @@ class Reference:
     drive: Drive
 
     def profile(self) -> Profile:
-        """Return the reference as the running loop leads it, at rest at zero.
-
-        Returns
-        -------
-        Profile
-        """
+        """Return the reference as the running loop leads it, at rest at zero."""
         limits = ProfileLimits(acceleration=self.max_acceleration)
         return Profile(limits, self.transition_time, self.drive)
 
@@ -129,20 +124,7 @@ def planned_change(plant: Plant, plan: Reference, distance: float, time: Array) 
 
 
 def top_speed(plant: Plant, supply: float) -> float:
-    """Return the speed that a motor reaches at the headroom of the supply.
-
-    Parameters
-    ----------
-    plant : Plant
-        A batch of one.
-    supply : float
-        [V].
-
-    Returns
-    -------
-    float
-        At the motor shaft [rad/s].
-    """
+    """Return the speed that a motor reaches at the headroom of the supply."""
     m = plant.motors
     return float((HEADROOM * supply - m.static_voltage[0]) / m.a0[0])
 

@@ -72,34 +72,7 @@ def simulate(
     friction: Array | None = None,
     modelled: float = 0.0,
 ) -> Response:
-    """Run the closed loop from rest.
-
-    Parameters
-    ----------
-    plant : Plant
-        A batch of ``n`` motors.
-    controller : Controller
-        With numbers, or arrays of shape (n,).
-    reference : ndarray, shape (k,), [rad/s]
-        What the error is taken from, at the sampling instants.
-    high : ndarray, shape (k,), [rad/s], or None
-        Where given, there is no error while the measurement is between ``reference`` and this.
-    forward : ndarray, shape (k,), [V], or None
-        Feed-forward.
-    load : ndarray, shape (k,), [V], or None
-        Load as the voltage that it takes from the motor.
-    count_angle : float
-        One count [rad]; 0 measures without quantisation.  Every motor of the batch begins
-        elsewhere within a count.
-    friction : ndarray, shape (n,), [V], or None
-        Dry friction, as the voltage that it takes.
-    modelled : float
-        Of it, what the observer's model has [V].
-
-    Returns
-    -------
-    Response
-    """
+    """Run the closed loop from rest."""
     n, steps, fb = len(plant), reference.size, controller.feedback
     numbers = (
         fb.p,
@@ -298,19 +271,7 @@ class StepFigures:
 
 
 def step_figures(time: Array, speed: Array, voltage: Array, final: float) -> StepFigures:
-    """Read a step response.
-
-    Parameters
-    ----------
-    time, speed, voltage : ndarray, shape (k,)
-        One response, [s], [rad/s], [V].
-    final : float
-        Value that was asked for [rad/s].
-
-    Returns
-    -------
-    StepFigures
-    """
+    """Read a step response."""
     relative = speed / final
     outside = np.flatnonzero(np.abs(relative - 1) > 0.02)
     last = int(outside[-1]) if outside.size else -1

@@ -56,23 +56,7 @@ class Trial:
 
 
 def choose_source(estimate: Estimate, loop: Loop, **targets: Any) -> tuple[Loop, str]:
-    """Return the loop with the speed source to take, and the reason.
-
-    Parameters
-    ----------
-    estimate : Estimate
-        The motor, with its uncertainty: it decides how far the observer is to be trusted.
-    loop : Loop
-        With the source that is there in any case.
-    **targets
-        Margins, as the method 'margin' takes them.
-
-    Returns
-    -------
-    loop : Loop
-    reason : str
-        One sentence with what the candidates allow.
-    """
+    """Return the loop with the speed source to take, and the reason."""
     usual = _trial(estimate, loop, targets)
     if loop.counts_per_revolution is None:
         return loop, "the reported speed: the encoder's counts are not known"

@@ -65,25 +65,7 @@ def measure(
     reference: Reference,
     control_noise: float,
 ) -> Performance:
-    """Simulate set-point and load steps of one design.
-
-    Parameters
-    ----------
-    problem : Problem
-        Plant and loop.
-    usual : Plant
-        The same plant with the delay that is usual, for the set-point step.
-    controller : Controller
-        The design.
-    reference : Reference
-        How set-points change.
-    control_noise : float
-        From :func:`smp_motor_ident.tune.problem.control_noise` [V rms].
-
-    Returns
-    -------
-    Performance
-    """
+    """Simulate set-point and load steps of one design."""
     fb = controller.feedback
     change = CHANGE * reference.max_velocity
     time = _instants(problem, fb, reference)
@@ -165,23 +147,7 @@ WORK, FEWEST = 1e6, 100
 def specify(
     case: Case, controller: Controller, reference: Reference, margins: Margins, figures: Performance
 ) -> Specification:
-    """Simulate the loop over the motors that the estimate allows.
-
-    Parameters
-    ----------
-    case : Case
-        With the ensemble.
-    controller : Controller
-        The design.
-    reference : Reference
-        How set-points change.
-    margins, figures : Margins, Performance
-        Of the nominal loop.
-
-    Returns
-    -------
-    Specification
-    """
+    """Simulate the loop over the motors that the estimate allows."""
     problem, known = case.problem, case.friction.known
     nominal, loop = problem.plant.motors, replace(problem.loop, delay=problem.loop.expected_delay)
     change = CHANGE * reference.max_velocity

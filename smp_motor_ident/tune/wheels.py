@@ -52,34 +52,7 @@ def design_wheels(
     together: bool = True,
     **targets: Any,
 ) -> WheelSet:
-    """Design for every wheel of a robot.
-
-    Parameters
-    ----------
-    estimates : mapping of str to Estimate
-        By wheel.
-    loops : mapping of str to Loop
-        By wheel.
-    method : str
-        As for :func:`smp_motor_ident.tune.design`.
-    sets : {'auto', 'one', 'each'}
-        One set of feedback gains for all, one for each, or decided by the spread: one set where
-        no wheel loses more than a tenth of its load rejection by it.
-    together : bool
-        Whether all shall arrive together, on the one reference that the weakest can follow;
-        else each is as fast as its own voltage allows.
-    **targets
-        As for :func:`smp_motor_ident.tune.design`.
-
-    Returns
-    -------
-    WheelSet
-
-    Raises
-    ------
-    DesignError
-        When a wheel has no design, or one set was asked for and does not hold for all.
-    """
+    """Design for every wheel of a robot."""
     if not estimates:
         raise DesignError("no motor was identified; identify a bag that holds one")
     together = together and len(estimates) > 1

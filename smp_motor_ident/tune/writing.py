@@ -16,18 +16,7 @@ SCHEMA = 1
 
 
 def parameters(design: Design) -> dict[str, Any]:
-    """Return the parameters of one wheel's ``wheel_pid`` node.
-
-    Parameters
-    ----------
-    design : Design
-        Of that wheel.
-
-    Returns
-    -------
-    dict
-        Nested as ROS 2 parameter files are; every number with a decimal point.
-    """
+    """Return the parameters of one wheel's ``wheel_pid`` node."""
     gains = dataclasses.asdict(design.gains)
     gains.pop("error_deadband")
     ratio, reference = design.loop.gear_ratio, design.reference
@@ -51,20 +40,7 @@ def parameters(design: Design) -> dict[str, Any]:
 
 
 def gains_yaml(designs: Mapping[str, Design], provenance: Iterable[str]) -> str:
-    """Return the parameter file of all wheel nodes.
-
-    Parameters
-    ----------
-    designs : mapping of str to Design
-        By wheel.
-    provenance : iterable of str
-        Lines that become comments at the file's head.
-
-    Returns
-    -------
-    str
-        YAML.
-    """
+    """Return the parameter file of all wheel nodes."""
     tree = {
         f"/**/{wheel}/wheel_pid": {"ros__parameters": parameters(design)}
         for wheel, design in designs.items()
@@ -76,22 +52,7 @@ def gains_yaml(designs: Mapping[str, Design], provenance: Iterable[str]) -> str:
 def gains_document(
     designs: Mapping[str, Design], provenance: Mapping[str, Any], reason: str
 ) -> dict[str, Any]:
-    """Return the content of ``gains.json``.
-
-    Parameters
-    ----------
-    designs : mapping of str to Design
-        By wheel.
-    provenance : mapping of str to Any
-        Sources, date and command; plain types.
-    reason : str
-        Why one set of gains or one each.
-
-    Returns
-    -------
-    dict
-        Of plain types; numbers that do not exist are None.
-    """
+    """Return the content of ``gains.json``."""
     return {
         "schema": SCHEMA,
         "provenance": dict(provenance),
@@ -143,16 +104,5 @@ def _plain(value: Any) -> Any:
 
 
 def to_json(document: Mapping[str, Any]) -> str:
-    """Return a document as text.
-
-    Parameters
-    ----------
-    document : mapping
-        Of plain types without NaN.
-
-    Returns
-    -------
-    str
-        JSON, indented.
-    """
+    """Return a document as text."""
     return json.dumps(document, indent=2, allow_nan=False) + "\n"

@@ -36,29 +36,7 @@ FORMATS: Mapping[str, Format] = {
 def export(
     name: str, estimates: Mapping[str, Estimate], loops: Mapping[str, Loop], **targets: Any
 ) -> tuple[str, dict[str, Check]]:
-    """Design for a target's loop and return its text, with what it does there.
-
-    Parameters
-    ----------
-    name : str
-        One of :data:`FORMATS`.
-    estimates, loops : mapping of str to Estimate, to Loop
-        By wheel; the loops as the target runs them.
-    **targets
-        Of the method, beside the format's own.
-
-    Returns
-    -------
-    text : str
-        With comments on margins and on what is missing.
-    checks : dict of str to Check
-        By wheel.
-
-    Raises
-    ------
-    DesignError
-        When the demand cannot be met in that loop.
-    """
+    """Design for a target's loop and return its text, with what it does there."""
     target = FORMATS[name]
     sets: Sets = "one" if target.one_set else "each"
     asked = {**target.targets, **targets}

@@ -119,19 +119,7 @@ def plant_of(design: Design, loop: Loop) -> Plant:
 
 
 def check(design: Design, gains: Gains) -> Check:
-    """Compute margins and step response of the loop that the target runs.
-
-    Parameters
-    ----------
-    design : Design
-        That the gains come from.
-    gains : Gains
-        As exported.
-
-    Returns
-    -------
-    Check
-    """
+    """Compute margins and step response of the loop that the target runs."""
     loop = design.loop
     plant = plant_of(design, loop)
     target = CHANGE * design.reference.max_velocity

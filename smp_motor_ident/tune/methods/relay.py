@@ -63,29 +63,7 @@ def oscillate(
 
 
 def read_oscillation(voltage: Array, speed: Array, sample_time: float) -> tuple[float, float]:
-    """Return ultimate gain and period of a recorded relay oscillation.
-
-    Parameters
-    ----------
-    voltage : ndarray, shape (k,), [V]
-        ``voltage[j]`` is what the relay asked for after ``speed[j]``.
-    speed : ndarray, shape (k,), [rad/s]
-        As measured.
-    sample_time : float
-        [s].
-
-    Returns
-    -------
-    gain : float
-        Ultimate gain [V s/rad].
-    period : float
-        Ultimate period [s].
-
-    Raises
-    ------
-    DesignError
-        When there is no steady oscillation of at least four cycles.
-    """
+    """Return ultimate gain and period of a recorded relay oscillation."""
     switches = np.flatnonzero((voltage[:-1] <= 0) & (voltage[1:] > 0)) + 1
     # The first half of the cycles is the transient.
     switches = switches[switches.size // 2 :]

@@ -36,24 +36,7 @@ def from_ultimate(problem: Problem, rule: str, gain: float, period: float) -> Fe
 
 
 def by_rule(rule: str, structure: str, gain: float, period: float) -> Feedback:
-    """Apply a rule to an ultimate point without a model.
-
-    Parameters
-    ----------
-    rule : str
-        ``ziegler_nichols`` or ``tyreus_luyben``.
-    structure : str
-        ``pi`` or ``pid``.
-    gain : float
-        Ultimate gain, of the shaft that the controller shall be of [V s/rad].
-    period : float
-        Ultimate period [s].
-
-    Returns
-    -------
-    Feedback
-        Of the same shaft.
-    """
+    """Apply a rule to an ultimate point without a model."""
     share, integral, derivative = RULES[rule, structure]
     p, td = share * gain, derivative * period
     return Feedback(p, p / (integral * period), p * td, td / 10)
