@@ -6,6 +6,7 @@ from smp_motor_control.errors import ParameterError, SmpError
 
 __all__ = [
     "BagError",
+    "CurrentError",
     "DesignError",
     "InsufficientExcitationError",
     "ParameterError",
@@ -22,6 +23,10 @@ class SignalError(SmpError):
     """A signal of a record contradicts itself, another signal, or physics."""
 
     exit_code = 1
+
+
+class CurrentError(SignalError):
+    """The current contradicts voltage and motion, which do not contradict each other."""
 
 
 class InsufficientExcitationError(SmpError):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,44 +12,36 @@ from smp_motor_ident.diagnosis import validation as validate
 from smp_motor_ident.diagnosis.adequacy import adequacy, stated
 from smp_motor_ident.diagnosis.advice import advise, assess
 from smp_motor_ident.diagnosis.bunched import merge_bunches
-from smp_motor_ident.diagnosis.limits import CANDIDATE_WEIGHT
+from smp_motor_ident.diagnosis.current_kind import ARMATURE, current_kind
+from smp_motor_ident.diagnosis.limits import CANDIDATE_WEIGHT, LEAST_FIT, PROFILED
+from smp_motor_ident.diagnosis.refusal import no_candidate, refuse
 from smp_motor_ident.diagnosis.residuals import residual_tests
+from smp_motor_ident.diagnosis.scope import blames_current, current_left_out, scope
 from smp_motor_ident.diagnosis.screening import screen
-from smp_motor_ident.errors import InsufficientExcitationError, ParameterError, SignalError
-from smp_motor_ident.estimation import flexible_shaft, order_selection
+from smp_motor_ident.errors import InsufficientExcitationError, SignalError, SmpError
+from smp_motor_ident.estimation import flexible_shaft, order_selection, prediction
 from smp_motor_ident.estimation.averaging import averaged, weights
+from smp_motor_ident.estimation.candidate_starts import of_kind
 from smp_motor_ident.estimation.choice import FittedCandidate
 from smp_motor_ident.estimation.consider_covariance import consider_friction, consider_timing
-from smp_motor_ident.estimation.data_window import extend, grow
-from smp_motor_ident.estimation.descent import Options, refine, screening_subset
+from smp_motor_ident.estimation.descent import refine
 from smp_motor_ident.estimation.fit import Fit, Prior
-from smp_motor_ident.estimation.initialisation import initial_fit
+from smp_motor_ident.estimation.hold_choice import chosen_hold, instant_deviation
 from smp_motor_ident.estimation.profile import profiled
 from smp_motor_ident.estimation.quantisation import widened
 from smp_motor_ident.estimation.quantities import Answer, answer
+from smp_motor_ident.estimation.request import Request, base_structure, checked
 from smp_motor_ident.estimation.segments import heterogeneous
 from smp_motor_ident.estimation.subset import excited
 from smp_motor_ident.estimation.thinning import thinned
 from smp_motor_ident.finding import Finding
-from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments, prepare
-from smp_motor_ident.likelihood.hold import between_samples
 from smp_motor_ident.model import structures as models
-from smp_motor_ident.model.structures import MODELS, PHYSICAL, Structure
+from smp_motor_ident.model.structures import PHYSICAL, Structure
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import Candidate, Estimate, FitPercent
 
 Array = NDArray[np.float64]
-
-LOSSES = {"linear": np.inf, "huber": 2.0}
-FIXABLE = (*PHYSICAL, "delay", "averaging_window")
-WORST_FIT = 30.0
-LEAST_FIT = -100.0
-LARGEST_OFFSET = 0.1
-INSTANT = 0.01
-MANY = 400_000
-MANY_TO_PROFILE = 20_000  # samples above which as few are followed as tell the same
-FAR = 100.0  # deviance on the screening subset by which a way of holding the command is out
 
 
 def estimate(
@@ -108,49 +101,72 @@ def estimate(
     if model == flexible_shaft.NAME:
         rigid = estimate(group, "second_order", fixed=fixed, loss=loss, progress=progress)
         return flexible_shaft.flexible_shaft(group, rigid)
-    say = progress or (lambda _: None)
-    known = _checked(model, fixed, loss, group)
-    _check_bounds(bounds or {}, model, group)
+    request = checked(group, model, fixed, bounds, loss, validation, progress)
     group = [merge_bunches(r) for r in group]
-    findings = screen(group)
+    kind = current_kind(group) if request.may_leave_current else ARMATURE
+    if kind != ARMATURE:
+        group, request = request.without_current(group)
+    found = screen(group)
     group = [excited(r) for r in group]
-    use_current = _has_current(group) and model in ("auto", "electromechanical")
-    base = _structure(model, use_current, known, group)
-    hold, first = _hold(group, base, LOSSES[loss], say)
-    data = prepare(group, use_current, hold=hold)
+    if kind != ARMATURE:
+        return _estimated(group, request, [*found, current_left_out(kind)])
+    return _answered(group, request, found)
+
+
+def _answered(group: list[Record], request: Request, found: Sequence[Finding]) -> Estimate:
+    """Estimate; without the current where that is what does not fit."""
+    if not request.may_leave_current:
+        return _estimated(group, request, found)
+    first: Estimate | None = None
+    refusal: SmpError | None = None
+    try:
+        first = _estimated(group, request, found)
+        reason = next((f.code for f in first.findings if blames_current(f)), "")
+        if not reason:
+            return first
+    except (SignalError, InsufficientExcitationError) as error:
+        refusal, reason = error, "refused"
+    bare, other = request.without_current(group)
+    try:
+        second: Estimate | None = _estimated(bare, other, [*found, current_left_out(reason)])
+    except (SignalError, InsufficientExcitationError):
+        if refusal is not None:
+            raise refusal from None
+        second = None
+    if first is not None and (second is None or second.unreliable):
+        return first
+    assert second is not None
+    return second
+
+
+def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) -> Estimate:
+    """Choose a structure, fit it, and say how far it can be trusted."""
+    base = base_structure(request, group)
+    options = request.options
+    hold, first = chosen_hold(group, base, options, request.say)
+    data = prepare(group, request.use_current, hold=hold)
     if base.window or "window" in base.fixed:
         data = data.as_mean_speed()
-    options = Options(huber=LOSSES[loss])
-    candidates = order_selection.explore(data, base, options, model == "auto", say, first)
+    auto = request.model == "auto"
+    candidates = order_selection.explore(data, base, options, auto, request.say, first)
     if not candidates:
-        raise InsufficientExcitationError(
-            f"{_where(group)}: no motor model explains these data; record 20 s or more of a "
-            "square or Fourier voltage that turns the motor in both directions"
-        )
-    chosen = _constrain(
-        _for_final(data, candidates[-1].fit), candidates[-1].fit, options, known, bounds
-    )
-    final = _for_final(data, chosen)
-    few = thinned(final) if final.size > MANY_TO_PROFILE else final
-    chosen = profiled(few, widened(final, chosen), options)
-    chosen, friction_std = consider_friction(
-        final, consider_timing(final, chosen, _instants(group, hold))
-    )
-    chosen, change = heterogeneous(final, chosen)
-    result = answer(chosen, known, friction_std, _level(final))
-    result, alike = _covering(data, candidates, result, known)
+        raise no_candidate(group)
+    chosen, friction_std, change = _certain(data, candidates[-1].fit, request, group, hold)
+    final = of_kind(data, chosen)
+    result = answer(chosen, request.known, friction_std, _level(final))
+    result, alike = _covering(data, candidates, result, request.known)
     fitted = validate.speed_fit(group, final, chosen)
-    _refuse(group, chosen, result, fitted)
-    _refuse_offset(group, chosen)
-    say("validating")
-    held_out = _validation(group, validation, chosen, options, hold)
-    percent = FitPercent(fitted, held_out)
+    refuse(group, chosen, result, fitted)
+    request.say("validating")
+    own, common = _validation(group, request, final, chosen, hold)
+    percent = FitPercent(fitted, own)
     tests = residual_tests(final, chosen)
-    findings += [
-        *assess(final, chosen, percent, tests),
+    findings = [
+        *found,
+        *assess(final, chosen, FitPercent(fitted, common), tests),
         *adequacy(final, chosen, stated(chosen, result), group[0].hardware.gear_ratio, tests),
-        *advise(chosen, result, known),
-        *_findings(result, change, alike),
+        *advise(chosen, result, request.known),
+        *scope(result, change, alike),
     ]
     return Estimate(
         wheel=group[0].wheel,
@@ -170,6 +186,20 @@ def estimate(
         sources=tuple(dict.fromkeys(r.source for r in group if r.source)),
         hardware=group[0].hardware,
     )
+
+
+def _certain(
+    data: Experiments, fit: Fit, request: Request, group: Sequence[Record], hold: str
+) -> tuple[Fit, float, dict[str, float]]:
+    """Return the chosen fit with all of its uncertainty, and how the motor changes."""
+    final = of_kind(data, fit)
+    chosen = _constrain(final, fit, request)
+    few = thinned(final) if final.size > PROFILED.value else final
+    chosen = profiled(few, widened(final, chosen), request.options)
+    timed = consider_timing(final, chosen, instant_deviation(group, hold))
+    chosen, friction_std = consider_friction(final, timed)
+    chosen, change = heterogeneous(final, chosen)
+    return chosen, friction_std, change
 
 
 def _level(data: Experiments) -> float:
@@ -192,195 +222,22 @@ def _covering(
     if not whole or result.level:
         return result, {}
     fits = [candidates[-1].fit, *(r.fit for r in whole)]
-    weight = weights(lambda fit: _for_final(data, fit), fits)
+    weight = weights(lambda fit: of_kind(data, fit), fits)
     found = averaged(result, weight, [answer(f, known) for f in fits[1:]])
     labels = [candidates[-1].label, *(r.label for r in whole)]
     alike = {n: float(w) for n, w in zip(labels, weight, strict=True) if w > CANDIDATE_WEIGHT.value}
     return found, alike if len(alike) > 1 else {}
 
 
-def _findings(
-    result: Answer, change: Mapping[str, float], alike: Mapping[str, float]
-) -> list[Finding]:
-    out = []
-    if alike:
-        words = ", ".join(f"{name} ({100 * w:.0f} %)" for name, w in alike.items())
-        out.append(
-            Finding(
-                "structures_alike",
-                "note",
-                f"the data do not decide between {words}: values and intervals cover them all",
-                dict(alike),
-                "sample faster, and excite with sharp steps of several sizes: a delay, an averaged "
-                "speed and a second lag differ in the first samples after a step",
-            )
-        )
-    if result.level:
-        speed = result.combinations["steady_speed"]
-        out.append(
-            Finding(
-                "one_level",
-                "warning",
-                f"of gain and static voltage only the steady speed at {result.level:.3g} V is "
-                f"known, {speed.value:.4g} rad/s: every pair with this product "
-                "dc_gain (voltage - static_voltage) moves the motor alike",
-                {"voltage": result.level, "steady_speed": speed.value},
-                "record two levels of voltage, or a reversal, to know gain and friction apart",
-            )
-        )
-    if change:
-        out.append(
-            Finding(
-                "motor_changes",
-                "note",
-                "parts of the recordings differ by more than their noise (temperature, friction): "
-                "the intervals are those of another recording of this motor",
-                dict(change),
-                "let the motor warm up, or record on several days, to know how much it changes",
-            )
-        )
-    return out
-
-
-def _where(group: Sequence[Record]) -> str:
-    sources = ", ".join(dict.fromkeys(r.source for r in group if r.source))
-    return f"{sources or 'record'}: {group[0].wheel}"
-
-
-def _checked(
-    model: str, fixed: Mapping[str, float] | None, loss: str, group: Sequence[Record]
-) -> dict[str, float]:
-    if not group:
-        raise ParameterError("estimate needs at least one record")
-    if model != "auto" and model.removesuffix("_asymmetric") not in MODELS:
-        raise ParameterError(f"model {model!r} is not one of auto, {', '.join(MODELS)}")
-    if loss not in LOSSES:
-        raise ParameterError(f"loss {loss!r} is not one of {', '.join(LOSSES)}")
-    known = dict(fixed or {})
-    for name, value in known.items():
-        if name not in FIXABLE:
-            raise ParameterError(f"fixed {name!r} is not one of {', '.join(FIXABLE)}")
-        positive = name in PHYSICAL[:4] or name == "averaging_window"
-        if not np.isfinite(value) or value < 0 or (positive and value == 0):
-            raise ParameterError(f"fixed {name} = {value} is not a motor's")
-    wheels = {r.wheel for r in group}
-    if len(wheels) > 1:
-        raise ParameterError(f"records of one motor are needed, got {', '.join(sorted(wheels))}")
-    ohmmeter = group[0].hardware.resistance
-    if "resistance" not in known and ohmmeter and np.isfinite(ohmmeter) and not _has_current(group):
-        known["resistance"] = float(ohmmeter)
-    return known
-
-
-def _check_bounds(
-    bounds: Mapping[str, tuple[float, float]], model: str, group: Sequence[Record]
-) -> None:
-    for name, limits in bounds.items():
-        if name not in PHYSICAL:
-            raise ParameterError(f"bounds of {name!r}: not one of {', '.join(PHYSICAL)}")
-        if len(limits) != 2 or not limits[0] <= limits[1]:
-            raise ParameterError(f"bounds of {name} = {limits}: two numbers, the lower one first")
-        if model not in ("auto", "electromechanical") or not _has_current(group):
-            raise ParameterError(
-                f"bounds of {name}: voltage and speed alone do not tell it; record the current "
-                "too, or leave the bounds out"
-            )
-
-
-def _has_current(group: Sequence[Record]) -> bool:
-    there = [r.current for r in group if r.current is not None]
-    finite = sum(int(np.isfinite(c).sum()) for c in there)
-    return finite > 0.3 * sum(len(r) for r in group) and any(np.nanstd(c) > 0 for c in there)
-
-
-def _structure(
-    model: str, use_current: bool, known: Mapping[str, float], group: Sequence[Record]
-) -> Structure:
-    fixed: dict[str, float] = {}
-    if "resistance" in known and (use_current or "inductance" in known):
-        fixed["ln_r"] = float(np.log(known["resistance"]))
-    if "resistance" in known and "inductance" in known:
-        fixed["ln_te"] = float(np.log(known["inductance"] / known["resistance"]))
-    if "delay" in known:
-        fixed["delay"] = known["delay"]
-    window = known.get("averaging_window", max(r.velocity_window for r in group))
-    if window > 0:
-        fixed["window"] = window
-    candidate = model.removesuffix("_asymmetric")
-    asymmetric = model.endswith("_asymmetric")
-    friction = "asymmetric" if asymmetric else "symmetric"
-    if use_current:
-        return Structure(
-            "electromechanical", 2, friction, current=True, load=asymmetric, fixed=fixed
-        )
-    if candidate in ("auto", "electromechanical"):
-        candidate = "second_order"
-    order = 2 if candidate == "second_order" else 1
-    # How friction is felt depends on L/R, which the linear response leaves open.
-    return Structure(candidate, order, friction, shape=order == 2, load=asymmetric, fixed=fixed)
-
-
-def _hold(
-    group: Sequence[Record], base: Structure, huber: float, say: Callable[[str], None]
-) -> tuple[str, Fit | None]:
-    """Choose how the command ran inside the intervals, by what explains the outputs best."""
-    if base.order != 2 or "window" in base.fixed or sum(len(r) for r in group) > MANY:
-        return "held", None
-    plain = prepare(group, base.current)
-    if plain.kind != rc.ANGLE or thinned(plain) is not plain:
-        return "held", None  # how the command ran within so short an interval does not show
-    others = {h: prepare(group, base.current, hold=h) for h in ("switched", "middle")}
-    others = {h: d for h, d in others.items() if d.hold_end.size > plain.hold_end.size}
-    if not others:
-        return "held", None
-    say("how the command was held between samples")
-    options = Options(huber=huber)
-    best = initial_fit(plain, base if base.current else base.with_(shape=False), options)
-    if best is None:
-        return "held", None
-    hold = "held"
-    part = screening_subset(plain)
-    near = refine(part, best.structure, best, best.z, options) if part is not plain else best
-    for other, data in others.items():
-        fitted = grow(screening_subset(data), best.structure, near, options)
-        if fitted.deviance > near.deviance + FAR and fitted.converged:
-            continue
-        fitted = extend(data, best.structure, fitted, options)
-        if fitted.deviance < best.deviance - 30:
-            hold, best = other, fitted
-    return hold, best
-
-
-def _instants(group: Sequence[Record], hold: str) -> float:
-    """Return how well the input's instants are known [s].
-
-    A command on a clock of its own, or jittered stamps, leave a hundredth of an interval open.
-    """
-    steps = np.concatenate([np.diff(r.time[:MANY]) for r in group])
-    step = float(np.median(steps))
-    jitter = float(np.median(np.abs(steps - step)))
-    loose = hold != "held" or jitter > 1e-3 * step or any(between_samples(r) for r in group)
-    return INSTANT * step if loose else 0.0
-
-
-def _for_final(data: Experiments, fit: Fit) -> Experiments:
-    return data.as_mean_speed() if fit.kind == rc.MEAN_SPEED else data
-
-
 def _name(structure: Structure) -> str:
     return structure.name + ("_asymmetric" if structure.friction == "asymmetric" else "")
 
 
-def _constrain(
-    data: Experiments,
-    fit: Fit,
-    options: Options,
-    known: Mapping[str, float],
-    bounds: Mapping[str, tuple[float, float]] | None,
-) -> Fit:
+def _constrain(data: Experiments, fit: Fit, request: Request) -> Fit:
     """Refit under what the user holds fixed or bounded, and what physics forbids."""
     if not fit.structure.current:
         return fit
+    known = request.known
     values, _ = models.physical(fit.z)
     scale = {n: abs(values[n]) for n in PHYSICAL}
     scale["viscous_friction"] = values["motor_constant"] ** 2 / values["resistance"]
@@ -390,7 +247,7 @@ def _constrain(
         if n in known
         and not (n == "resistance" or (n == "inductance" and "ln_te" in fit.structure.fixed))
     ]
-    for name, (low, high) in (bounds or {}).items():
+    for name, (low, high) in request.bounds.items():
         if not low <= values[name] <= high:
             priors.append(Prior(name, float(np.clip(values[name], low, high)), 1e-4 * scale[name]))
     if values["viscous_friction"] < 0 and "viscous_friction" not in known:
@@ -403,60 +260,30 @@ def _constrain(
         )
     if not priors:
         return fit
-    bound = Options(options.huber, tuple(priors), options.lower, options.upper)
+    bound = replace(request.options, priors=tuple(priors))
     return refine(data, fit.structure, fit, fit.z, bound)
 
 
-def _refuse(group: Sequence[Record], fit: Fit, result: Answer, fitted: float) -> None:
-    where = _where(group)
-    if not np.isfinite(fitted) or fitted < WORST_FIT:
-        raise SignalError(
-            f"{where}: the voltage does not explain the motion (fit {fitted:.0f} %); check that "
-            "voltage and encoder belong to the same motor, and that nothing else drives it"
-        )
-    loose = [
-        n
-        for n in ("dc_gain", "time_constant")
-        if (q := result.combinations.get(n)) and (q.std or 0) > 0.5 * abs(q.value or 1)
-    ]
-    if loose:
-        raise InsufficientExcitationError(
-            f"{where}: the data do not tell {' and '.join(loose)}; record a longer excitation "
-            "with several frequencies, in both directions and well above the friction"
-        )
-
-
-def _refuse_offset(group: Sequence[Record], fit: Fit) -> None:
-    offset = abs(fit.z[models.OFFSET])
-    if not fit.structure.offset or not fit.structure.current:
-        return
-    largest = max(float(np.nanmax(np.abs(r.current))) for r in group if r.current is not None)
-    if offset > LARGEST_OFFSET * max(largest - offset, 1e-12):
-        raise SignalError(
-            f"{_where(group)}: current has an offset of {fit.z[models.OFFSET]:.3g} A where it "
-            f"reaches {largest:.3g} A; zero the current sensor at rest and record again"
-        )
-
-
 def _validation(
-    group: Sequence[Record],
-    validation: Sequence[Record] | None,
-    fit: Fit,
-    options: Options,
-    hold: str,
-) -> float | None:
+    group: Sequence[Record], request: Request, data: Experiments, fit: Fit, hold: str
+) -> tuple[float | None, float | None]:
+    """Return the fit percent of held-out data: of their own motion, and of the records'."""
+    validation, options = request.validation, request.options
+    scatter = float(prediction.simulate(data, fit)[:, 0].std())
     if validation is not None:
-        value = validate.held_out(list(validation), fit, hold)
+        found = validate.held_out(list(validation), fit, hold, scatter)
     else:
         fitted, kept = validate.split(group)
         if not kept:
-            return None
-        data = _for_final(prepare(fitted, fit.structure.current, hold=hold), fit)
-        if np.ptp(data.hold_value) == 0 or all(np.ptp(r.voltage) == 0 for r in kept):
-            return None
-        start = Fit(**{**vars(fit), "initial": data.initial})
-        value = validate.held_out(kept, refine(data, fit.structure, start, fit.z, options), hold)
-    return value if np.isfinite(value) else None
+            return None, None
+        part = of_kind(prepare(fitted, fit.structure.current, hold=hold), fit)
+        if np.ptp(part.hold_value) == 0 or all(np.ptp(r.voltage) == 0 for r in kept):
+            return None, None
+        start = Fit(**{**vars(fit), "initial": part.initial})
+        refined = refine(part, fit.structure, start, fit.z, options)
+        found = validate.held_out(kept, refined, hold, scatter)
+    own, common = (x if np.isfinite(x) else None for x in found)
+    return own, common
 
 
 def _candidates(
@@ -466,8 +293,8 @@ def _candidates(
     for n, candidate in enumerate(candidates):
         last = n == len(candidates) - 1
         fit = chosen if last else candidate.fit
-        value = validate.speed_fit(group, _for_final(data, fit), fit)
-        if value < LEAST_FIT and not last:
+        value = validate.speed_fit(group, of_kind(data, fit), fit)
+        if value < LEAST_FIT.value and not last:
             value = float("nan")  # a descent that left the motor behind has no fit to speak of
         out.append(
             Candidate(

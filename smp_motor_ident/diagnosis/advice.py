@@ -18,7 +18,7 @@ from smp_motor_ident.diagnosis.limits import (
     STEADY,
     UNEXPLAINED,
 )
-from smp_motor_ident.estimation import prediction
+from smp_motor_ident.estimation import prediction, shape_constraint
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.quantities import Answer
 from smp_motor_ident.finding import Finding
@@ -33,7 +33,10 @@ Array = NDArray[np.float64]
 
 
 def assess(data: Experiments, fit: Fit, percent: FitPercent, tests: ResidualTests) -> list[Finding]:
-    """Return what speaks against an estimate, or must be known to read it."""
+    """Return what speaks against an estimate, or must be known to read it.
+
+    The held-out fit is here of the motion in the data that were fitted.
+    """
     return [
         *_descent(data, fit),
         *_fit(percent, tests),
@@ -74,7 +77,8 @@ def _fit(percent: FitPercent, tests: ResidualTests) -> list[Finding]:
             Finding(
                 "validation",
                 "unreliable",
-                f"held-out data fit {validation:.0f} % against {estimation:.0f} %; the "
+                f"held-out data are left unexplained by {100 - validation:.0f} % of the motion, "
+                f"the fitted ones by {100 - estimation:.0f} %; the "
                 "motor or its load changed, or the excitation was too poor",
                 {"estimation": estimation, "validation": validation},
                 "record 20 s or more of one excitation under one load",
@@ -233,6 +237,8 @@ def _least_squares(data: Experiments, fit: Fit, z: Array) -> float:
     volts = [models.VC_PLUS, models.VC_MINUS, models.DELAY]
     z[volts] = np.maximum(z[volts], 0.0)
     z = fit.structure.complete(z)
+    if shape_constraint.applies(fit.structure):
+        z = shape_constraint.within(z)
     there = evaluate(data, fit.structure, z, fit.initial, fit.initial, fit.gain, fit.noise)
     return float(there.objective - there.local_decrease)
 

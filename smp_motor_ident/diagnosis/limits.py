@@ -63,6 +63,63 @@ SAME_LEVEL = Limit(
     "levels closer than a voltmeter and a battery under load hold them are one level",
     "test_estimate.py: a single level of voltage gives one combination",
 )
+CURRENT_THERE = Limit(
+    0.3,
+    "share of the samples",
+    "cost: with less of the current its noise decides more than the motor does",
+    "test_estimate.py: a current that is rarely there is not used",
+)
+CURRENT_KIND = Limit(
+    0.5,
+    "of what the armature's equation leaves",
+    "cost: a current is taken for what it is called unless another equation of as many "
+    "coefficients leaves half of the squares; noise leaves as much of either",
+    "test_current_kind.py",
+)
+INSTANT = Limit(
+    0.01,
+    "sample",
+    "physical: a command on a clock of its own, or stamps that jitter, are known to a hundredth of "
+    "an interval at best",
+    "test_intervals.py",
+)
+HOLD_COST = Limit(
+    400_000,
+    "samples",
+    "cost: a second fit of a longer record takes seconds, and the instants average out",
+    "test_mirror.py",
+)
+HOLD_HOPELESS = Limit(
+    100.0,
+    "deviance",
+    "cost: no more data make up for odds of e^50 to 1 on the screening subset",
+    "test_mirror.py",
+)
+HOLD_EVIDENCE = Limit(
+    30.0,
+    "deviance",
+    "significance: odds of e^15 to 1 against the command as it was recorded, which is what most "
+    "drivers do",
+    "test_mirror.py",
+)
+WORST_FIT = Limit(
+    30.0,
+    "% of the speed",
+    "below it half of the motion's variance comes from elsewhere: what is fitted is not the motor",
+    "test_screening.py",
+)
+LEAST_FIT = Limit(
+    -100.0,
+    "% of the speed",
+    "an error twice the motion is no fit to compare: a descent that left the motor behind",
+    "test_estimate.py",
+)
+PROFILED = Limit(
+    20_000,
+    "samples",
+    "cost: ends of an interval are found on as few samples as tell the same, each a descent",
+    "test_intervals.py",
+)
 
 # Reading recordings (smp_motor_ident.bag).
 UNPACKED_LEAST = Limit(

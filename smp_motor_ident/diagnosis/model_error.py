@@ -76,7 +76,7 @@ def regression(data: Experiments, fit: Fit, gear: float) -> Regression | None:
             members.append((effect, tuple(range(first, first + len(made)))))
             columns += [_stacked(data, fit, c) for c in made]
     table = np.column_stack(columns)
-    if np.count_nonzero(columns[0]) < 4 * BLOCKS:
+    if np.count_nonzero(columns[0]) < 4 * BLOCKS or not np.isfinite(table).all():
         return None
     return _projected(table, n_own, _blocks(data), members, len(fit.structure.free()))
 
@@ -145,10 +145,12 @@ def _blocks(data: Experiments) -> NDArray[np.int64]:
 def _own(data: Experiments, fit: Fit, base: Array) -> list[Array]:
     """Return the sensitivities to the free coordinates and to each segment's initial state."""
     structure = fit.structure
-    deviation = np.sqrt(np.diag(fit.covariance()))
+    # With all others fixed: coordinates that hang together (L/R of next to nothing) leave a
+    # motor for other physics within their joint deviations.
+    deviation = 1 / np.sqrt(np.maximum(np.diag(fit.information), 1e-300))
     out = []
     for j in range(len(structure.free())):
-        step = 0.3 * float(np.clip(deviation[j], 1e-7, 0.05))
+        step = 0.3 * float(np.clip(deviation[j], 1e-9, 0.05))
         z = fit.z + step * structure.matrix()[:, j]
         out.append((_predicted(data, replace(fit, z=z)) - base) / step)
     columns = own_columns(data, structure)

@@ -290,7 +290,7 @@ def _signs(records: Sequence[Record], where: str) -> None:
             ok = np.isfinite(y)
             if ok.sum() < 20:
                 continue
-            v, x = _averaged(record, y)
+            v, x = averaged_runs(record, y)
             together = float(np.einsum("i,i->", v, x))
             total += together if what == "current" else _slow_product(v, x)
             size = float(np.sqrt(np.square(v).sum() * np.square(x).sum()))
@@ -304,7 +304,7 @@ def _signs(records: Sequence[Record], where: str) -> None:
             )
 
 
-def _averaged(record: Record, values: Array) -> tuple[Array, Array]:
+def averaged_runs(record: Record, values: Array) -> tuple[Array, Array]:
     """Return voltage and a signal as means over short runs, in which a counter's noise is small."""
     k = max(1, len(record) // RUNS)
     n = len(record) // k * k
@@ -323,8 +323,8 @@ def _offset(record: Record) -> None:
         return
     speed = measured_speed(record)
     there = np.isfinite(record.current) & np.isfinite(speed)
-    v, i = _averaged(record, np.where(there, record.current, np.nan))
-    _, w = _averaged(record, np.where(there, speed, np.nan))
+    v, i = averaged_runs(record, np.where(there, record.current, np.nan))
+    _, w = averaged_runs(record, np.where(there, speed, np.nan))
     if len(v) < 20:
         return
     columns = np.column_stack([v, w, np.ones(len(v))])

@@ -20,28 +20,34 @@ Array = NDArray[np.float64]
 COARSE = 0.02  # of the speed's scatter: what a counter's resolution may add to it
 
 
-def percent(measured: Array, predicted: Array) -> float:
-    """Return the normalised fit ``100 (1 - |y - yhat| / |y - mean y|)``."""
+def percent(measured: Array, predicted: Array, scatter: float = 0.0) -> float:
+    """Return the normalised fit ``100 (1 - |y - yhat| / |y - mean y|)``.
+
+    With ``scatter`` [rad/s] given the root mean square of the error is held against that.
+    """
     ok = np.isfinite(measured) & np.isfinite(predicted)
     y, z = measured[ok], predicted[ok]
-    scatter = float(np.sqrt(np.square(y - y.mean()).sum())) if y.size else 0.0
-    if scatter == 0.0:
+    scatter = scatter or (float(y.std()) if y.size else 0.0)
+    if scatter == 0.0 or not y.size:
         return float("nan")
-    return float(100 * (1 - np.sqrt(np.square(y - z).sum()) / scatter))
+    return float(100 * (1 - np.sqrt(np.square(y - z).mean()) / scatter))
 
 
-def speed_fit(records: Sequence[Record], data: Experiments, fit: Fit) -> float:
-    """Return the fit percent of the freely simulated speed."""
+def speed_fit(
+    records: Sequence[Record], data: Experiments, fit: Fit, scatter: float = 0.0
+) -> float:
+    """Return the fit percent of the freely simulated speed, of its own scatter or a given one."""
     predicted = prediction.simulate(data, fit)
     at_once = predicted[:, 1] if data.kind != rc.ANGLE else predicted[:, 0]
     if data.kind != rc.ANGLE:
-        return percent(data.output, at_once)
+        return percent(data.output, at_once, scatter)
     lag = _lag(data, predicted[:, 1])
-    best = percent(_means(data, _filled(data), lag), _means(data, predicted[:, 1], lag))
+    best = percent(_means(data, _filled(data), lag), _means(data, predicted[:, 1], lag), scatter)
     given = [r.velocity for r in records]
     if all(v is not None for v in given):
         velocity = np.concatenate([v for v in given if v is not None])
-        reported = percent(velocity, at_once), percent(velocity, _means(data, predicted[:, 1], 1))
+        means = _means(data, predicted[:, 1], 1)
+        reported = percent(velocity, at_once, scatter), percent(velocity, means, scatter)
         best = max([best, *(x for x in reported if np.isfinite(x))])
     return best
 
@@ -76,13 +82,18 @@ def _means(data: Experiments, angle: Array, lag: int) -> Array:
     return speed
 
 
-def held_out(records: Sequence[Record], fit: Fit, hold: str = "held") -> float:
-    """Return the fit percent on records that the fit has not seen."""
+def held_out(records: Sequence[Record], fit: Fit, hold: str, scatter: float) -> tuple[float, float]:
+    """Return the fit percent on records that the fit has not seen.
+
+    Of their own scatter, and of that of the records that the fit has seen: where the motor
+    hardly moves, its own scatter is what the sensor adds.
+    """
     kind = "speed" if fit.kind != rc.ANGLE else "auto"
     data = prepare(records, False, kind, hold)
     if fit.kind == rc.MEAN_SPEED and data.kind == rc.SPEED:
         data = data.as_mean_speed()
-    return speed_fit(records, data, prediction.settle(data, fit))
+    settled = prediction.settle(data, fit)
+    return speed_fit(records, data, settled), speed_fit(records, data, settled, scatter)
 
 
 def split(records: Sequence[Record], share: float = 0.7) -> tuple[list[Record], list[Record]]:

@@ -11,13 +11,14 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from smp_motor_ident.estimation import shape_constraint
 from smp_motor_ident.estimation.fitted import Fit, Prior
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.noise import deviance, gain_for, proper, renewed
 from smp_motor_ident.likelihood.normal_equations import damped_step
 from smp_motor_ident.likelihood.passes import Pass, evaluate, own_columns
 from smp_motor_ident.model import structures as models
-from smp_motor_ident.model.structures import Structure, to_internal
+from smp_motor_ident.model.structures import Structure
 
 __all__ = ["Fit", "Prior", "solve"]
 
@@ -27,6 +28,7 @@ STALL = 4, 0.02  # passes that together gain less deviance than this end a desce
 FREE = 0.1  # damping (relative to the diagonal) below which a step counts as undamped
 LARGEST = 80.0  # logarithm of a coordinate: 1e35
 CLOSE = 0.3  # of the tolerance, within which a step is not even tried where there are kinks
+FASTEST = 1e-3  # of a sample: L/R below it shows in nothing, and leaves the coordinates stiff
 ROUNDS = 12  # most times that the noise is estimated anew
 
 
@@ -53,6 +55,9 @@ class _Descent:
         self.own = own_columns(data, structure)
         self.current = data.current.size > 0
         self.z = structure.complete(np.minimum(np.maximum(z, lower), upper))
+        self.shaped = shape_constraint.applies(structure)
+        if self.shaped:
+            self.z = shape_constraint.within(self.z)
         self.start, self.initial = initial.copy(), initial.copy()
         self.smooth = structure.friction == "none" and not structure.delay
         self.only_scale = not self.current and huber == math.inf and noise_ratio == 0
@@ -84,12 +89,11 @@ class _Descent:
     def step(self) -> tuple[Array, Array, float]:
         """Return where the damped step leads, and its length in standard deviations."""
         here = self.here
-        step, size = damped_step(
-            here.normal, here.gradient, self.damping, self.matrix, self.z, self.lower, self.upper
-        )
+        step, size = self._solved(self.damping)
         z = np.minimum(np.maximum(self.z + self.matrix @ step, self.lower), self.upper)
         z = self.structure.complete(z)
-        _one_sign(z, self.structure)
+        if self.shaped:
+            z = shape_constraint.within(z)
         moved = self.initial.copy()
         moved[:, list(self.own)] += here.local_step - here.local_gain @ step
         return z, moved, size
@@ -101,13 +105,24 @@ class _Descent:
 
     def settled(self) -> bool:
         """Tell whether an undamped step would stay within half a standard deviation."""
-        here = self.here
-        return bool(
-            damped_step(
-                here.normal, here.gradient, 1e-9, self.matrix, self.z, self.lower, self.upper
-            )[1]
-            < 0.5
-        )
+        return self._solved(1e-9)[1] < 0.5
+
+    def _solved(self, damping: float) -> tuple[Array, float]:
+        """Return the damped step and its length; along the edge of a motor's shapes, if there."""
+        normal, gradient = self.here.normal, self.here.gradient
+        bounds = self.lower, self.upper
+        step, size = damped_step(normal, gradient, damping, self.matrix, self.z, *bounds)
+        share = shape_constraint.passed(self.z + self.matrix @ step) if self.shaped else None
+        ties = None if share is None else shape_constraint.tied(self.structure, self.z, share)
+        if ties is None:
+            return step, size
+        along, first = ties
+        short, _ = damped_step(
+            along.T @ normal @ along, along.T @ (gradient - normal @ first), damping,
+            self.matrix @ along, self.z, *bounds,
+        )  # fmt: skip
+        step = along @ short + first
+        return step, math.sqrt(max(float(step @ normal @ step), 0.0))
 
     def descend(self, iterations: int, tolerance: float, first: bool) -> None:
         """Step until the end, or (the first time) until the noise is worth another look."""
@@ -194,7 +209,7 @@ def solve(
     Levenberg-Marquardt in z with the initial states eliminated; the noise covariance is
     re-estimated from the residuals until it stays (concentrated likelihood).
     """
-    widest = _bounds()
+    widest = _bounds(FASTEST * data.step if data.current.size else 0.0)
     lower = widest[0] if lower is None else lower
     upper = widest[1] if upper is None else upper
     descent = _Descent(data, structure, z, initial, noise, noise_ratio, huber, priors, lower, upper)
@@ -211,13 +226,15 @@ def solve(
     return descent.result()
 
 
-def _bounds() -> tuple[Array, Array]:
+def _bounds(fastest: float) -> tuple[Array, Array]:
     """Return bounds of z: what floating point can hold, and no negative volts or seconds."""
     lower, upper = np.full(11, -np.inf), np.full(11, np.inf)
     logarithms = [models.A0, models.A1, models.A2, models.TE, models.LN_R]
     lower[logarithms], upper[logarithms] = -LARGEST, LARGEST
     lower[[models.VC_PLUS, models.VC_MINUS, models.DELAY]] = 0.0
     lower[models.WINDOW] = 1e-9
+    if fastest > 0:
+        lower[models.TE] = math.log(fastest)
     return lower, upper
 
 
@@ -228,15 +245,3 @@ def _linearise(priors: Sequence[Prior], z: Array, matrix: Array) -> list[tuple[A
     return [
         (gradients[p.name] @ matrix / p.std, (p.value - values[p.name]) / p.std) for p in priors
     ]
-
-
-def _one_sign(z: Array, structure: Structure) -> None:
-    """Keep K and (without current) b of one sign, in place."""
-    if structure.order != 2 or structure.current or models.TE not in structure.free():
-        return
-    z[models.TE] = max(z[models.TE], z[models.A2] - z[models.A1])
-    for _ in range(60):
-        par, _ = to_internal(z, 2)
-        if par[2] > 0.02 * np.exp(z[models.A0]):
-            return
-        z[models.TE] += 0.3 if z[models.TE] > z[models.A2] - z[models.A1] + 0.7 else -0.05

@@ -1,0 +1,65 @@
+"""What a recorded current is: the armature's, its size without sign, or the supply's.
+
+The winding says ``i = (v - K w) / R + offset`` but for what L adds at steps; without sign it is
+the size of that, at the supply of a bridge its product with the duty cycle (power is kept).  Each
+is a regression of two coefficients and an offset; the kind is what explains the current best.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smp_motor_ident.diagnosis.limits import CURRENT_KIND, FEWEST
+from smp_motor_ident.diagnosis.screening import averaged_runs, measured_speed
+from smp_motor_ident.record import Record
+
+Array = NDArray[np.float64]
+
+ARMATURE, UNSIGNED, SUPPLY = "armature", "current_unsigned", "current_of_supply"
+ROUNDS = 6
+"""In which the sign of the armature's current, and with it the coefficients, settle."""
+
+
+def current_kind(group: Sequence[Record]) -> str:
+    """Return the kind of current of all records together."""
+    parts = [_signals(r) for r in group if r.current is not None]
+    v, w, i = (np.concatenate(x) for x in zip(*parts, strict=True)) if parts else ([], [], [])
+    if len(i) < FEWEST.value:
+        return ARMATURE
+    ones = np.ones(len(i))
+    rests = {
+        ARMATURE: _rest(np.column_stack([v, w, ones]), i)[1],
+        UNSIGNED: _unsigned_rest(v, w, i),
+        SUPPLY: _rest(np.column_stack([v * v, v * w, ones]), i)[1],
+    }
+    best = min(rests, key=lambda kind: rests[kind])
+    return best if rests[best] < CURRENT_KIND.value * rests[ARMATURE] else ARMATURE
+
+
+def _signals(record: Record) -> tuple[Array, Array, Array]:
+    """Return voltage, speed and current as means over short runs."""
+    speed = measured_speed(record)
+    assert record.current is not None
+    there = np.isfinite(record.current) & np.isfinite(speed)
+    v, i = averaged_runs(record, np.where(there, record.current, np.nan))
+    _, w = averaged_runs(record, np.where(there, speed, np.nan))
+    return v, w, i
+
+
+def _rest(columns: Array, values: Array) -> tuple[Array, float]:
+    """Return the coefficients of a regression and the squares that it leaves."""
+    answer: Array = np.linalg.lstsq(columns, values, rcond=1e-8)[0].astype(np.float64)
+    return answer, float(np.square(values - columns @ answer).sum())
+
+
+def _unsigned_rest(v: Array, w: Array, i: Array) -> float:
+    sign = np.sign(v)
+    least = np.inf
+    for _ in range(ROUNDS):
+        answer, rest = _rest(np.column_stack([sign * v, sign * w, np.ones(len(i))]), i)
+        least = min(least, rest)
+        sign = np.sign(answer[0] * v + answer[1] * w)
+    return least

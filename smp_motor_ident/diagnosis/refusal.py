@@ -1,0 +1,61 @@
+"""Estimates that are refused after the fit: the model does not explain the data, or too little."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from smp_motor_ident.diagnosis.limits import LARGEST_OFFSET, LOOSE_QUANTITY, WORST_FIT
+from smp_motor_ident.errors import CurrentError, InsufficientExcitationError, SignalError
+from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.estimation.quantities import Answer
+from smp_motor_ident.model import structures as models
+from smp_motor_ident.record import Record
+
+
+def where(group: Sequence[Record]) -> str:
+    """Return files and wheel in words."""
+    sources = ", ".join(dict.fromkeys(r.source for r in group if r.source))
+    return f"{sources or 'record'}: {group[0].wheel}"
+
+
+def no_candidate(group: Sequence[Record]) -> InsufficientExcitationError:
+    """Return the refusal of data that no structure could be started on."""
+    return InsufficientExcitationError(
+        f"{where(group)}: no motor model explains these data; record 20 s or more of a "
+        "square or Fourier voltage that turns the motor in both directions"
+    )
+
+
+def refuse(group: Sequence[Record], fit: Fit, result: Answer, fitted: float) -> None:
+    """Refuse what the model does not explain, and what the data hardly tell."""
+    if not np.isfinite(fitted) or fitted < WORST_FIT.value:
+        raise SignalError(
+            f"{where(group)}: the voltage does not explain the motion (fit {fitted:.0f} %); check "
+            "that voltage and encoder belong to the same motor, and that nothing else drives it"
+        )
+    loose = [
+        n
+        for n in ("dc_gain", "time_constant")
+        if (q := result.combinations.get(n))
+        and (q.std or 0) > LOOSE_QUANTITY.value * abs(q.value or 1)
+    ]
+    if loose:
+        raise InsufficientExcitationError(
+            f"{where(group)}: the data do not tell {' and '.join(loose)}; record a longer "
+            "excitation with several frequencies, in both directions and well above the friction"
+        )
+    _refuse_offset(group, fit)
+
+
+def _refuse_offset(group: Sequence[Record], fit: Fit) -> None:
+    offset = abs(fit.z[models.OFFSET])
+    if not fit.structure.offset or not fit.structure.current:
+        return
+    largest = max(float(np.nanmax(np.abs(r.current))) for r in group if r.current is not None)
+    if offset > LARGEST_OFFSET.value * max(largest - offset, 1e-12):
+        raise CurrentError(
+            f"{where(group)}: current has an offset of {fit.z[models.OFFSET]:.3g} A where it "
+            f"reaches {largest:.3g} A; zero the current sensor at rest and record again"
+        )

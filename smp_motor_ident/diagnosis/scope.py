@@ -1,0 +1,77 @@
+"""What stated values cover: structures that are alike, a single level, a motor that changes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from smp_motor_ident.diagnosis.effects import EFFECTS
+from smp_motor_ident.estimation.quantities import Answer
+from smp_motor_ident.finding import Finding
+
+
+def scope(result: Answer, change: Mapping[str, float], alike: Mapping[str, float]) -> list[Finding]:
+    """Return what a reader must know of the values' meaning."""
+    out = []
+    if alike:
+        out.append(_alike(alike))
+    if result.level:
+        out.append(_one_level(result))
+    if change:
+        out.append(
+            Finding(
+                "motor_changes",
+                "note",
+                "parts of the recordings differ by more than their noise (temperature, friction): "
+                "the intervals are those of another recording of this motor",
+                dict(change),
+                "let the motor warm up, or record on several days, to know how much it changes",
+            )
+        )
+    return out
+
+
+def _alike(weights: Mapping[str, float]) -> Finding:
+    words = ", ".join(f"{name} ({100 * w:.0f} %)" for name, w in weights.items())
+    return Finding(
+        "structures_alike",
+        "note",
+        f"the data do not decide between {words}: values and intervals cover them all",
+        dict(weights),
+        "sample faster, and excite with sharp steps of several sizes: a delay, an averaged "
+        "speed and a second lag differ in the first samples after a step",
+    )
+
+
+def _one_level(result: Answer) -> Finding:
+    speed = result.combinations["steady_speed"]
+    return Finding(
+        "one_level",
+        "warning",
+        f"of gain and static voltage only the steady speed at {result.level:.3g} V is "
+        f"known, {speed.value:.4g} rad/s: every pair with this product "
+        "dc_gain (voltage - static_voltage) moves the motor alike",
+        {"voltage": result.level, "steady_speed": speed.value},
+        "record two levels of voltage, or a reversal, to know gain and friction apart",
+    )
+
+
+OF_CURRENT = {effect.code: effect for effect in EFFECTS if effect.place == "current"}
+
+
+def blames_current(finding: Finding) -> bool:
+    """Tell whether a finding says that the current, not the motion, is off."""
+    return finding.severity == "unreliable" and finding.code in OF_CURRENT
+
+
+def current_left_out(reason: str) -> Finding:
+    """Return why the answer is one without the current, and what would make it useful."""
+    effect = OF_CURRENT.get(reason)
+    what = f"shows {effect.cause}" if effect else "does not fit voltage and motion"
+    return Finding(
+        "current_left_out",
+        "warning",
+        f"the current {what}: this is the answer without it, and what only the current tells "
+        "(resistance, inductance, motor constant, inertia, friction torques) is not stated",
+        {"reason": reason},
+        effect.advice if effect else "record the armature's current with its sign, unfiltered",
+    )

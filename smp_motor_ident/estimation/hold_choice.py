@@ -1,0 +1,62 @@
+"""How the command ran between the samples: held, switched inside the interval, or in its middle."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from smp_motor_ident.diagnosis.limits import HOLD_COST, HOLD_EVIDENCE, HOLD_HOPELESS, INSTANT
+from smp_motor_ident.estimation.data_window import extend, grow
+from smp_motor_ident.estimation.descent import Options, refine, screening_subset
+from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.estimation.initialisation import initial_fit
+from smp_motor_ident.estimation.thinning import thinned
+from smp_motor_ident.likelihood import recursion as rc
+from smp_motor_ident.likelihood.experiments import prepare
+from smp_motor_ident.likelihood.hold import between_samples
+from smp_motor_ident.model.structures import Structure
+from smp_motor_ident.record import Record
+
+
+def chosen_hold(
+    group: Sequence[Record], base: Structure, options: Options, say: Callable[[str], None]
+) -> tuple[str, Fit | None]:
+    """Choose how the command ran inside the intervals, by what explains the outputs best."""
+    samples = sum(len(r) for r in group)
+    if base.order != 2 or "window" in base.fixed or samples > HOLD_COST.value:
+        return "held", None
+    plain = prepare(group, base.current)
+    if plain.kind != rc.ANGLE or thinned(plain) is not plain:
+        return "held", None  # how the command ran within so short an interval does not show
+    others = {h: prepare(group, base.current, hold=h) for h in ("switched", "middle")}
+    others = {h: d for h, d in others.items() if d.hold_end.size > plain.hold_end.size}
+    if not others:
+        return "held", None
+    say("how the command was held between samples")
+    best = initial_fit(plain, base if base.current else base.with_(shape=False), options)
+    if best is None:
+        return "held", None
+    hold = "held"
+    part = screening_subset(plain)
+    near = refine(part, best.structure, best, best.z, options) if part is not plain else best
+    for other, data in others.items():
+        fitted = grow(screening_subset(data), best.structure, near, options)
+        if fitted.deviance > near.deviance + HOLD_HOPELESS.value and fitted.converged:
+            continue
+        fitted = extend(data, best.structure, fitted, options)
+        if fitted.deviance < best.deviance - HOLD_EVIDENCE.value:
+            hold, best = other, fitted
+    return hold, best
+
+
+def instant_deviation(group: Sequence[Record], hold: str) -> float:
+    """Return how well the input's instants are known [s].
+
+    A command on a clock of its own, or jittered stamps, leave a part of an interval open.
+    """
+    steps = np.concatenate([np.diff(r.time[: int(HOLD_COST.value)]) for r in group])
+    step = float(np.median(steps))
+    jitter = float(np.median(np.abs(steps - step)))
+    loose = hold != "held" or jitter > 1e-3 * step or any(between_samples(r) for r in group)
+    return INSTANT.value * step if loose else 0.0

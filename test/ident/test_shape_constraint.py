@@ -1,0 +1,69 @@
+"""A descent that comes to the edge of what a motor can be goes on along it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from smp_motor_ident.estimation import shape_constraint
+from smp_motor_ident.estimation.descent import Options, descend
+from smp_motor_ident.likelihood.experiments import prepare
+from smp_motor_ident.model import structures as models
+from smp_motor_ident.model.structures import A0, A1, A2, TE, Structure
+from smp_motor_ident.record import Record
+
+SHAPED = Structure("second_order", 2, "symmetric", shape=True)
+MOTOR = models.from_physical(2.0, 4e-3, 0.05, 2e-4, 1e-6, 0.01)
+
+
+def driven() -> Record:
+    """A square wave on a motor next to all of whose damping is back-EMF; noisy angles at 2 kHz."""
+    rng = np.random.default_rng(5)
+    t = np.arange(6000) / 2000.0
+    v = np.where(np.sin(2 * np.pi * 1.1 * t) >= 0, 12.0, -12.0)
+    (te, tm, k, be), vc = models.to_internal(MOTOR, 2)[0][:4], MOTOR[models.VC_PLUS]
+    q = w = angle = 0.0
+    out, fine = np.empty(t.size), 2.5e-5
+    for n in range(t.size):
+        out[n] = angle
+        for _ in range(20):  # semi-implicit Euler, 25 us: a fortieth of a percent of L/R
+            q += fine / te * (v[min(n + 1, t.size - 1)] - q - k * w)
+            w += fine / tm * (q - be * w - vc * np.sign(w))
+            angle += fine * w
+    return Record("motor", t, v, position=out + 0.02 * rng.standard_normal(t.size))
+
+
+@pytest.mark.parametrize("share", [0.0, shape_constraint.MOST])
+def test_from_either_edge_a_descent_finds_the_bottom(share):
+    data = prepare([driven()], False)
+    start = MOTOR + 0.02 * np.eye(len(MOTOR))[A0] - 0.03 * np.eye(len(MOTOR))[A2]
+    start[TE] = shape_constraint.edge(start, share)[0]
+    noise = np.diag([4e-4, 1.0])
+
+    def bottom(z):
+        return descend(data, SHAPED, SHAPED.complete(z), data.initial, noise, 0.0, Options(), 40)
+
+    found, true = bottom(start), bottom(MOTOR)
+    assert found.converged
+    assert found.deviance < true.deviance + 4.0  # two deviations of a chi-square
+
+
+def test_the_edges_are_where_damping_is_nothing_and_all_but_a_fiftieth():
+    for share in (0.0, shape_constraint.MOST):
+        z = MOTOR.copy()
+        z[TE] = shape_constraint.edge(z, share)[0]
+        te, _, k, be = models.to_internal(z, 2)[0][:4]
+        assert be / (k + be) == pytest.approx(share, abs=1e-9)  # rounding of a difference
+        assert shape_constraint.passed(z) is None
+        assert te > 0
+
+
+def test_the_gradient_of_an_edge_is_its_slope():
+    for share in (0.0, shape_constraint.MOST):
+        z = MOTOR.copy()
+        z[TE] = shape_constraint.edge(z, share)[0]
+        for j, i in enumerate((A0, A1, A2)):
+            moved = z + 1e-6 * np.eye(len(z))[i]
+            slope = (shape_constraint.edge(moved, share)[0] - z[TE]) / 1e-6
+            # a forward difference over 1e-6 of a smooth function
+            assert shape_constraint.edge(z, share)[1][j] == pytest.approx(slope, abs=1e-4)
