@@ -32,7 +32,9 @@ from scipy.signal import lfilter
 from scipy.stats import chi2
 
 from smp_motor_ident._compile import compiled
+from smp_motor_ident.diagnosis.limits import LOOSE_QUANTITY
 from smp_motor_ident.errors import InsufficientExcitationError
+from smp_motor_ident.estimation.fitted import NORMAL_95
 from smp_motor_ident.estimation.simulation import simulate
 from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import output_of
@@ -258,7 +260,7 @@ def _uncertainty(
     jacobian = np.column_stack((design, *slopes))
     scale = np.linalg.norm(jacobian, axis=0)
     scale[scale == 0.0] = 1.0
-    inverse = np.linalg.pinv((jacobian / scale).T @ (jacobian / scale)) / np.outer(scale, scale)
+    inverse = _inverse(jacobian / scale) / np.outer(scale, scale)
     count = design.shape[1]
     keep = [0, 1, *range(count, count + theta.size)]
     covariance = inverse[np.ix_(keep, keep)] * float(residual @ residual) / residual.size
@@ -270,6 +272,27 @@ def _uncertainty(
     return names, values, turn @ covariance @ turn.T
 
 
+def _inverse(jacobian: Array) -> Array:
+    """Return the inverse of a normal matrix; what the data do not show keeps a huge variance.
+
+    A direction without effect is known to nothing, not, as a pseudo-inverse has it, exactly.
+    """
+    _, values, rows = np.linalg.svd(jacobian, full_matrices=False)
+    least = float(values[0]) * max(jacobian.shape) * float(np.finfo(np.float64).eps)
+    sizes = np.maximum(values, max(least, 1e-150))
+    known: Array = rows.astype(np.float64) / sizes[:, None]
+    return known.T @ known
+
+
+def _quantity(name: str, value: float, spread: float, largest: float) -> Quantity:
+    """Return value and interval, or that the data do not tell it."""
+    size = {"static_voltage": largest, "delay": math.inf}.get(name, abs(value))
+    if not spread < LOOSE_QUANTITY.value * size:
+        return Quantity(None, None, None, UNITS[name], "unidentifiable")
+    return Quantity(value, spread, (value - NORMAL_95 * spread, value + NORMAL_95 * spread),
+                    UNITS[name])  # fmt: skip
+
+
 def _estimate(
     rigid: Estimate,
     segments: Sequence[_Segment],
@@ -279,10 +302,12 @@ def _estimate(
 ) -> Estimate:
     names, values, covariance = found
     spread = np.sqrt(np.diag(covariance))
+    largest = max(float(np.abs(segment.voltage).max()) for segment in segments)
     combinations = {
-        n: Quantity(float(v), float(s), (float(v - 1.96 * s), float(v + 1.96 * s)), UNITS[n])
-        for n, v, s in zip(names, values, spread, strict=True)
+        n: _quantity(n, float(v), float(d), largest)
+        for n, v, d in zip(names, values, spread, strict=True)
     }
+    keep = [k for k, n in enumerate(names) if combinations[n].value is not None]
     _, residual, _ = _solve(segments, theta, np.ones(1))
     percent = _speed_percent(segments, residual)
     return replace(
@@ -290,8 +315,8 @@ def _estimate(
         model=NAME,
         parameters={},
         combinations=combinations,
-        names=names,
-        covariance=covariance,
+        names=tuple(names[k] for k in keep),
+        covariance=covariance[np.ix_(keep, keep)],
         fit_percent=FitPercent(percent, None),
         candidates=(
             *(replace(c, chosen=False) for c in rigid.candidates),

@@ -8,6 +8,7 @@ from scipy.linalg import expm
 
 from smp_motor_ident.errors import InsufficientExcitationError
 from smp_motor_ident.estimate import estimate
+from smp_motor_ident.estimation import flexible_shaft
 from smp_motor_ident.record import Hardware, Record
 
 R, L, K, J, B = 2.0, 1e-3, 0.03, 1e-5, 1e-6
@@ -69,3 +70,16 @@ def test_a_rigid_motor_shows_no_resonance() -> None:
     record, _ = two_inertias(3000.0, 0.1, 0.0, seed=5)
     with pytest.raises(InsufficientExcitationError, match="resonance"):
         estimate(record, "flexible_shaft")
+
+
+def test_what_the_data_do_not_show_has_no_certainty() -> None:
+    # Two columns alike: their sum is known, neither of them is.
+    rng = np.random.default_rng(4)
+    column = rng.standard_normal(500)
+    other = rng.standard_normal(500)
+    covariance = flexible_shaft._inverse(np.column_stack([column, column, other]))
+    assert np.all(np.diag(covariance) > 0)
+    assert covariance[2, 2] == pytest.approx(1 / 500, rel=0.3)  # of 500 squares: 6 %
+    assert covariance[0, 0] > 1e6
+    assert flexible_shaft._quantity("dc_gain", 10.0, 1e3, 12.0).status == "unidentifiable"
+    assert flexible_shaft._quantity("dc_gain", 10.0, 0.1, 12.0).value == 10.0
