@@ -29,6 +29,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import pytest
 import yaml
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -86,6 +87,8 @@ class Campaign:
         self.wheel = subprocess.Popen(
             ["wheel_pid", "--ros-args", "-r", f"__ns:=/{WHEEL}", *given],
             stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+            # A campaign under nohup would hand on that a closed terminal is to be survived.
+            preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL),
         )  # fmt: skip
 
     def close(self) -> None:
@@ -133,9 +136,15 @@ class Campaign:
             self.wheel.send_signal(signal.SIGCONT)
             self.robot.trigger(NODE, "reset")
 
+    def renew(self) -> None:
+        """Start the wheel's process anew, so that one failure is not counted twice."""
+        self.ends(signal.SIGKILL)
+        self.heal()
+        self.spin_until(self.drives, STARTS)
+
     def ends(self, number: int) -> None:
         self.wheel.send_signal(number)
-        self.wheel.wait(5.0)
+        self.wheel.wait(10.0)
 
 
 def _only(motors: Any) -> Any:
@@ -173,6 +182,9 @@ def _parameters(campaign: Campaign) -> None:
 
 
 BRAKES = 0.5 + 1.2
+AGAIN, STARTS = 20.0, 90.0
+"""Time to drive again [s]; to start a process takes three seconds of a processor that others may
+use, too."""
 FAULTS = [
     Fault("feedback lost", lambda c: setattr(c.relay, "fault", lambda m: []), 0.3),
     Fault("feedback late", lambda c: c.relay.delays(0.6), 0.7),
@@ -227,8 +239,9 @@ def trial(campaign: Campaign, faults: list[Fault], duration: float) -> str:
     ends = {"killed", "hung up", "quit"}
     if campaign.wheel.poll() is not None and not ends & {fault.name for fault in faults}:
         return f"wheel_pid is dead, exit code {campaign.wheel.returncode}"
+    again = AGAIN if campaign.wheel.poll() is None else STARTS
     campaign.heal()
-    if not campaign.spin_until(campaign.drives, 20.0):
+    if not campaign.spin_until(campaign.drives, again):
         return f"does not drive again: {campaign.robot.last_diagnosis(NODE)}"
     return ""
 
@@ -254,11 +267,17 @@ def run(minutes: float, seed: int, campaign: Campaign) -> bool:
             break
         name, duration = " + ".join(fault.name for fault in faults), draw.uniform(0.3, 3.0)
         counts.update([fault.name for fault in faults])
-        wrong = trial(campaign, faults, duration)
+        try:
+            wrong = trial(campaign, faults, duration)
+        except pytest.fail.Exception as error:  # a service that does not answer
+            wrong = str(error)
         if wrong:
             failures.append(f"{name} at {campaign.speed:+.2f} rad/s for {duration:.1f} s: {wrong}")
-            print(f"FAILED (draw {sum(counts.values())}) {failures[-1]}", flush=True)
-            campaign.heal()
+            load = os.getloadavg()[0]
+            print(
+                f"FAILED (draw {sum(counts.values())}, load {load:.1f}) {failures[-1]}", flush=True
+            )
+            campaign.renew()
     for name, number in sorted(counts.items()):
         print(f"  {number:5d} x {name}")
     print(f"seed {seed}: {sum(counts.values())} faults, {len(failures)} forbidden")
@@ -371,6 +390,7 @@ def main() -> int:
     print(f"seed {arguments.seed}", flush=True)
     if arguments.core:
         return 0 if core(arguments.core, arguments.seed) else 1
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # not without its processes
     campaign = Campaign(domain, through_relay=not arguments.parameters)
     try:
         if arguments.parameters:
