@@ -98,7 +98,9 @@ def test_stamps_that_go_on_are_late_however_late_and_no_clock_that_was_set_back(
 def test_clock_that_jumps_ahead_or_after_a_gap_is_a_jump():
     c = clock()
     feed(c, (0, 0), (5, 5))
-    assert feed(c, (1600, 10), (1605, 15)) == [Verdict.FIRST, Verdict.FRESH]
+    assert feed(c, (1600, 10)) == [Verdict.FIRST]
+    assert c.age == 0.0, "counted from the new offset on"
+    assert feed(c, (1605, 15)) == [Verdict.FRESH]
     assert c.jumps == 1 and c.offset == pytest.approx(-1.59) and c.age == pytest.approx(0.0)
     # Three seconds of silence, of which the stamps know one: more than a gap, so no queue.
     assert feed(c, (2605, 3015)) == [Verdict.FIRST]
