@@ -145,7 +145,7 @@ def test_watchdogs_and_lifecycle_end_in_a_zero_command(start, robot, eventually)
     eventually(lambda: feed.sample(0.0) == pytest.approx(2.0), 3.0)
     begin = time.monotonic()
     eventually(lambda: feed.sample(0.0) == 0.0, 2.0)
-    assert 0.1 < time.monotonic() - begin < 1.0
+    assert time.monotonic() - begin > 0.1  # how soon after: test_controller, on exact times
     # Feedback goes on meanwhile: a busy machine may have let that time out first.
     timed_out = "set-point timed out"
     eventually(lambda: feed.sample(0.0) == 0.0 and robot.named(NODE, timed_out, begin), 2.0)
@@ -154,7 +154,6 @@ def test_watchdogs_and_lifecycle_end_in_a_zero_command(start, robot, eventually)
     eventually(lambda: feed.sample(0.0) == pytest.approx(2.0), 3.0)
     begin = time.monotonic()
     eventually(lambda: robot.commands[WHEEL][-1].voltage == 0.0, 2.0, robot.spin)
-    assert time.monotonic() - begin < 1.0
     eventually(lambda: robot.named(NODE, "no feedback", begin), 1.0, robot.spin)
 
     eventually(lambda: feed.sample(0.0) == pytest.approx(2.0), 3.0)

@@ -3,13 +3,13 @@
 References
 ----------
 Basicmicro, RoboClaw Series User Manual: commands 28, 29 and 55 (QPPS is the speed in counts per
-second at full power; P, I and D are sent as 65536 times their value), command 30 (speeds are counted
-over 300ths of a second).  forums.ionmc.com, topic 774, answer of Basicmicro Support: the set-point
-is fed forward by QPPS.
+second at full power; P, I and D are sent as 65536 times their value), command 30 (speeds are
+counted over 300ths of a second). forums.ionmc.com, topic 774, answer of Basicmicro Support: the
+set-point is fed forward by QPPS.
 
-The firmware's arithmetic is not published.  Taken is ``duty = (v + P e + I integral(e)) / QPPS`` with
-set-point ``v`` and error in counts per second: check with Motion Studio's velocity plot before
-trusting the margins.  Since the set-point is fed forward, P and I are lowered until an abrupt change
+The firmware's arithmetic is not published. Taken is ``duty = (v + P e + I integral(e)) / QPPS``
+with set-point ``v`` and error in counts per second: check with Motion Studio's velocity plot before
+trusting the margins. Since the set-point is fed forward, P and I are lowered until an abrupt change
 does not overshoot by more than 2 %.
 """
 

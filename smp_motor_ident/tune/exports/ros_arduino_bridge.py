@@ -4,13 +4,15 @@ References
 ----------
 github.com/hbrobotics/ros_arduino_bridge (a960c8a), ros_arduino_firmware, ROSArduinoBridge:
 diff_controller.h, ``doPID``: ``output += (Kp e - Kd (input - input_before) + ITerm) / Ko`` in whole
-numbers, at most 255; ROSArduinoBridge.ino: ``PID_INTERVAL = 1000 / PID_RATE`` in whole milliseconds,
-33 of ``PID_RATE`` 30, and set-points in whole ticks per interval.  ros_arduino_python,
-base_controller.py: the node sends its own ``Kp``, ``Kd``, ``Ki``, ``Ko`` over those of the firmware.
+numbers, at most 255; ROSArduinoBridge.ino: ``PID_INTERVAL = 1000 / PID_RATE`` in whole
+milliseconds, 33 of ``PID_RATE`` 30, and set-points in whole ticks per interval. ros_arduino_python,
+base_controller.py: the node sends its own ``Kp``, ``Kd``, ``Ki``, ``Ko`` over those of the
+firmware.
 
 ``Kd (input - input_before)`` is a product of 16 bits on an AVR: ``Kd`` stays so small that a wheel
-blocked at full speed does not overflow it.  It is a velocity algorithm: what is called ``Kp`` integrates, ``Kd`` is proportional action on the
-measurement, ``Ki`` would integrate twice and stays 0.
+blocked at full speed does not overflow it. It is a velocity algorithm: what is called ``Kp``
+integrates, ``Kd`` is proportional action on the measurement, ``Ki`` would integrate twice and stays
+0.
 """
 
 from __future__ import annotations
@@ -69,8 +71,9 @@ def _pid_rate(milliseconds: int) -> int:
     """Return the ``PID_RATE`` that the firmware divides into an interval."""
     rate = 1000 // milliseconds
     if 1000 // rate != milliseconds:
+        nearest = 1000 / (1000 // rate)
         raise DesignError(
-            f"no PID_RATE gives an interval of {milliseconds} ms; --rate {1000 / (1000 // rate):.5g}"
+            f"no PID_RATE gives an interval of {milliseconds} ms; --rate {nearest:.5g}"
         )
     return rate
 
