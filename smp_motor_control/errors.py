@@ -5,7 +5,6 @@ Every message names the value (and the file where there is one) and says what to
 
 from __future__ import annotations
 
-
 LONGEST_MESSAGE = 1000
 """Characters of a message: of a value that is quoted from a spoilt file head and tail are shown."""
 
