@@ -268,7 +268,7 @@ def run(minutes: float, seed: int, campaign: Campaign) -> bool:
     counts: Counter[str] = Counter()
     failures = []
     campaign.robot.setpoint = campaign.speed
-    campaign.spin_until(campaign.drives, 20.0)
+    campaign.spin_until(campaign.drives, STARTS)
     end = time.monotonic() + 60.0 * minutes
     relay = [fault for fault in FAULTS if fault.of_the_relay]
     other = [f for f in FAULTS if not f.of_the_relay and f.begin is not _rival]
@@ -278,7 +278,7 @@ def run(minutes: float, seed: int, campaign: Campaign) -> bool:
             # While a wheel at fault is at rest it is free for another writer.
             faults = [draw.choice(relay), draw.choice(other)]
         campaign.speed = campaign.robot.setpoint = draw.choice([-1, 1]) * draw.uniform(0.6, 1.8)
-        if not campaign.spin_until(campaign.drives, 20.0):
+        if not campaign.spin_until(campaign.drives, STARTS):
             failures.append("before any fault: does not drive")
             break
         name, duration = " + ".join(fault.name for fault in faults), draw.uniform(0.3, 3.0)
