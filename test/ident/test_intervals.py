@@ -84,7 +84,7 @@ def test_following_a_proposal_brings_what_it_promised():
 
 
 def test_stated_deviations_are_those_of_repeated_recordings():
-    """The errors of 20 recordings in stated deviations: twice too wide fails as twice too narrow."""
+    """Errors of 20 recordings in stated deviations: twice too wide fails as twice too narrow."""
     wander = motors.record("front_left", kinds=("fourier", "square"), seconds=2.0).voltage
     truth = motors.truth("front_left", 0.3)
     names = ("dc_gain", "time_constant", "static_voltage")
