@@ -101,8 +101,8 @@ def start(robot: steps.Robot, motors: Path, rate: float) -> steps.Robot:
         processes.start(f"{wheel}.wheel_pid", "wheel_pid", *place, priority=1)
     processes.start("skid_steer", "skid_steer", priority=1)
     nodes = ["motor_plant", *robot.wheel_nodes(), "skid_steer"]
-    client.wait_for_nodes(nodes, timeout=30.0)
-    client.wait_for_wheels(robot.wheels, timeout=20.0)
+    client.wait_for_nodes(nodes, timeout=steps.PATIENCE)
+    client.wait_for_wheels(robot.wheels, timeout=steps.PATIENCE)
     robot.switch("configure")
     return robot
 
