@@ -48,6 +48,7 @@ LARGEST_OFFSET = 0.1
 INSTANT = 0.01
 MANY = 400_000
 MANY_TO_PROFILE = 20_000  # samples above which as few are followed as tell the same
+CLEARLY = 30.0  # deviance by which another way of holding the command must be better
 FAR = 100.0  # deviance on the screening subset by which a way of holding the command is out
 
 
@@ -331,6 +332,8 @@ def _hold(
         return "held", None  # how the command ran within so short an interval does not show
     others = {h: prepare(group, base.current, hold=h) for h in ("switched", "middle")}
     others = {h: d for h, d in others.items() if d.hold_end.size > plain.hold_end.size}
+    if len(others) > 1 and others["switched"].held_like(others["middle"]):
+        del others["middle"]
     if not others:
         return "held", None
     say("how the command was held between samples")
@@ -342,11 +345,15 @@ def _hold(
     part = screening_subset(plain)
     near = refine(part, best.structure, best, best.z, options) if part is not plain else best
     for other, data in others.items():
-        fitted = grow(screening_subset(data), best.structure, near, options)
-        if fitted.deviance > near.deviance + FAR and fitted.converged:
+        part = screening_subset(data)
+        allowed = near.deviance + (FAR if part is not data else -CLEARLY)
+        # From the torque noise that was found it shows soon whether this is worth a full search.
+        soon = grow(part, best.structure, near, options, near)
+        if soon.converged and soon.deviance > allowed:
             continue
+        fitted = grow(part, best.structure, near, options)
         fitted = extend(data, best.structure, fitted, options)
-        if fitted.deviance < best.deviance - 30:
+        if fitted.deviance < best.deviance - CLEARLY:
             hold, best = other, fitted
     return hold, best
 
