@@ -68,9 +68,16 @@ setup(
     package_data={"": ["py.typed", "*.jinja", "*.css", "*.js", "LICENSE"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
-        (f"share/{NAME}", ["package.xml", "LICENSE", "README.md", "CHANGELOG.rst"]),
+        (
+            f"share/{NAME}",
+            ["package.xml", "LICENSE", "README.md", "CHANGELOG.rst", "QUALITY_DECLARATION.md"],
+        ),
         (f"share/{NAME}/launch", glob("launch/*.launch.py")),
         (f"share/{NAME}/config", glob("config/*")),
+        *(
+            (f"share/{NAME}/{d}", glob(f"{d}/*.md"))
+            for d in ("docs", "docs/howto", "docs/decisions")
+        ),
     ],
     install_requires=["setuptools"],
     extras_require={"test": ["pytest", "hypothesis"]},  # by which colcon test runs pytest

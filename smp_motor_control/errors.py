@@ -5,11 +5,19 @@ Every message names the value (and the file where there is one) and says what to
 
 from __future__ import annotations
 
+LONGEST_MESSAGE = 1000
+"""Characters of a message: of a value that is quoted from a spoilt file head and tail are shown."""
+
 
 class SmpError(Exception):
     """Base of all errors of this project; its text is one line for the user."""
 
     exit_code = 2
+
+    def __str__(self) -> str:
+        """Return the message, without its middle where nobody would read that."""
+        text, half = super().__str__(), LONGEST_MESSAGE // 2
+        return text if len(text) <= LONGEST_MESSAGE else f"{text[:half]} … {text[-half:]}"
 
 
 class ParameterError(SmpError, ValueError):

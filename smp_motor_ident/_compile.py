@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+from numba.core.runtime import rtsys
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -39,7 +40,23 @@ def _stamped(dispatcher: Any) -> Any:
     own = getattr(file, "_source_stamp", None)
     if file is not None and own is not None:
         file._source_stamp = (own, STAMP)
+        dispatcher._cache.load_overload = _without_typing(dispatcher._cache)
     return dispatcher
+
+
+def _without_typing(cache: Any) -> Callable[[Any, Any], Any]:
+    """Return how a cache loads what it holds without the rules of typing and lowering.
+
+    Numba registers a few thousand of them before it looks at the disk; machine code that is
+    there needs none of them but memory, and where it is not there the compiler registers them.
+    """
+
+    def load(signature: Any, target: Any) -> Any:
+        rtsys.initialize(target)
+        with cache._guard_against_spurious_io_errors():
+            return cache._load_overload(signature, target)
+
+    return load
 
 
 def compiled(function: F) -> F:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -84,6 +84,11 @@ class Candidate:
     bic: float | None
     chosen: bool = False
     reason: str = ""
+
+    def to_document(self) -> dict[str, Any]:
+        """Return its entry of ``identification.json``."""
+        numbers = {"fit_percent": _number(self.fit_percent), "bic": _number(self.bic)}
+        return {"model": self.model, **numbers, "chosen": self.chosen, "reason": self.reason}
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,7 +238,6 @@ class Estimate:
         dict
             Of plain types; numbers that do not exist are None.
         """
-        hardware = self.hardware
         return {
             "model": self.model,
             "parameters": {n: _quantity_to_document(q) for n, q in self.parameters.items()},
@@ -244,20 +248,8 @@ class Estimate:
                 "names": list(self.names),
                 "matrix": [[_number(x) for x in row] for row in self.covariance],
             },
-            "fit_percent": {
-                "estimation": _number(self.fit_percent.estimation),
-                "validation": _number(self.fit_percent.validation),
-            },
-            "candidates": [
-                {
-                    "model": c.model,
-                    "fit_percent": _number(c.fit_percent),
-                    "bic": _number(c.bic),
-                    "chosen": c.chosen,
-                    "reason": c.reason,
-                }
-                for c in self.candidates
-            ],
+            "fit_percent": {n: _number(x) for n, x in asdict(self.fit_percent).items()},
+            "candidates": [c.to_document() for c in self.candidates],
             "residuals": {
                 "white": self.residuals.white,
                 "independent_of_input": self.residuals.independent_of_input,
@@ -270,18 +262,14 @@ class Estimate:
             "sample_time": _number(self.sample_time),
             "largest_voltage": _number(self.largest_voltage),
             "sources": list(self.sources),
-            "hardware": {
-                "gear_ratio": _number(hardware.gear_ratio),
-                "counts_per_revolution": _number(hardware.counts_per_revolution),
-                "encoder_bits": hardware.encoder_bits,
-                "supply_voltage": _number(hardware.supply_voltage),
-                "resistance": _number(hardware.resistance),
-            },
+            "hardware": {n: _number(x) for n, x in asdict(self.hardware).items()},
         }
 
 
 def _number(value: float | None) -> float | None:
-    return None if value is None or not math.isfinite(value) else float(value)
+    if value is None or isinstance(value, int):
+        return value
+    return float(value) if math.isfinite(value) else None
 
 
 def _quantity_to_document(quantity: Quantity) -> dict[str, Any]:

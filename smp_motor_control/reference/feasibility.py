@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
-from scipy.optimize import brentq
 
 from smp_motor_control.errors import ParameterError
 
@@ -71,6 +70,8 @@ def shortest_common_transition(
                 )
     if list(start) == list(target):
         return 0.0
+
+    from scipy.optimize import brentq  # takes a while to load, for tuning alone
 
     def excess(log_duration: float) -> float:
         return peak_voltage(models, start, target, math.exp(log_duration)) - voltage_limit

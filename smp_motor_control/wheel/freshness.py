@@ -8,7 +8,8 @@ from __future__ import annotations
 from enum import Enum
 
 CLOCK_JUMP = 1.0
-"""Stamps that are off by more than this [s] tell of a clock that jumped, not of a delay."""
+"""Stamps that are off by more than this [s] tell of a clock that jumped, not of a delay: unless
+they go on from the sample before, which those of a clock that was set back do not."""
 
 
 class Verdict(Enum):
@@ -67,7 +68,8 @@ class FeedbackClock:
         age = raw_age - self.offset
         last = self._last
         step = 0.0 if last is None else (stamp - last) * 1e-9
-        if step < -CLOCK_JUMP or not -CLOCK_JUMP < age < CLOCK_JUMP:
+        delayed = age >= CLOCK_JUMP and 0.0 < step <= self.max_gap
+        if step < -CLOCK_JUMP or not (-CLOCK_JUMP < age < CLOCK_JUMP or delayed):
             self.jumps += last is not None
             self.offset = raw_age if abs(raw_age) > CLOCK_JUMP else 0.0
             self.age = raw_age - self.offset

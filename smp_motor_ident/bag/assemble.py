@@ -16,6 +16,7 @@ from smp_motor_ident.bag.beat import find_beat, roughness
 from smp_motor_ident.bag.checks import impossible, is_unsigned, signed
 from smp_motor_ident.bag.clock import (
     SAME_CLOCK,
+    ClockFit,
     epochs,
     fit_clock,
     judge_stamps,
@@ -184,18 +185,20 @@ def _clock(motor: _Motor) -> dict[str, Integers]:
     if not fits:
         motor.tell("time_base", f"time: log times ({next(iter(poor.values()))})")
         return {topic: _log(table) for topic, table in tables.items()}
-    reason = "; ".join(f"{topic}: {why}" for topic, why in poor.items())
+    because = "; ".join(f"{topic}: {why}" for topic, why in poor.items())
     text = "time: header stamps moved to the recorder's clock by their offset and drift, because "
-    motor.tell("time_base", text + (reason or "the topics' clocks differ"))
-    times = {}
-    for topic, table in tables.items():
-        stamp = stamps[topic]
-        if topic in fits and stamp is not None:
-            _tell_offset(motor, topic, fits, always=True)
-            times[topic] = fits[topic].to_log(stamp)
-        else:
-            times[topic] = _log(table)
-    return times
+    motor.tell("time_base", text + (because or "the topics' clocks differ"))
+    return {topic: _to_log(motor, topic, stamps[topic], fits) for topic in tables}
+
+
+def _to_log(
+    motor: _Motor, topic: str, stamp: Integers | None, fits: Mapping[str, ClockFit]
+) -> Integers:
+    """Return a topic's stamps on the recorder's clock; its log times where it has none."""
+    if topic not in fits or stamp is None:
+        return _log(motor.tables[topic])
+    _tell_offset(motor, topic, fits, always=True)
+    return fits[topic].to_log(stamp)
 
 
 def _log(table: Table) -> Integers:
@@ -244,7 +247,9 @@ def _stamp(motor: _Motor, table: Table) -> Integers | None:
     return stamp
 
 
-def _tell_offset(motor: _Motor, topic: str, fits: Mapping[str, Any], always: bool = False) -> None:
+def _tell_offset(
+    motor: _Motor, topic: str, fits: Mapping[str, ClockFit], always: bool = False
+) -> None:
     fit = fits[topic]
     if always or abs(fit.offset) > 1e9 or abs(fit.drift) > 1e-4:
         text = (

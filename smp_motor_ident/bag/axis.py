@@ -64,21 +64,17 @@ def on_one_axis(
     if keep.sum() < 2:
         raise BagError(f"{source}: {wheel}: fewer than 2 samples have a voltage and an output")
     axis = axis[keep]
-    if alike:  # each interval has one voltage
-        values = voltage.value.copy()
-        if held == "after":
-            values[1:] = voltage.value[:-1]
-    else:
-        values = mean_held(voltage.time, voltage.value, held, axis)
+    values = _mean_voltage(voltage, axis, held, alike)
     starts = _count_starts(series, plan, hardware, keep, axis_name, findings)
     starts |= _gaps(axis, plan, alike, held, voltage, values, findings)
-    columns: dict[str, Any] = {"voltage": values}
-    for name in ("current", "velocity", "position", "count"):
-        if name in series:
-            columns[name] = _on_axis(name, series[name], axis, keep, findings)
-    outputs = [v for n, v in columns.items() if n != "voltage" and v is not None]
-    if not outputs:
+    columns: dict[str, Any] = {
+        name: _on_axis(name, series[name], axis, keep, findings)
+        for name in ("current", "velocity", "position", "count")
+        if name in series
+    }
+    if all(column is None for column in columns.values()):
         raise BagError(f"{source}: {wheel}: no output has a finite value")
+    columns["voltage"] = values
     axis, columns, starts = _without_stubs(axis, columns, starts, findings)
     if axis.size < 2:
         raise BagError(f"{source}: {wheel}: fewer than 2 samples in a row are left")
@@ -92,6 +88,16 @@ def on_one_axis(
         velocity_window=plan.velocity_window,
         **columns,
     )
+
+
+def _mean_voltage(voltage: Series, axis: Integers, held: str, alike: bool) -> Array:
+    """Return the voltage's mean over each interval that ends at an instant of the axis."""
+    if not alike:
+        return mean_held(voltage.time, voltage.value, held, axis)
+    values = voltage.value.copy()
+    if held == "after":
+        values[1:] = voltage.value[:-1]
+    return values
 
 
 def _finite(series: Series) -> Series:
@@ -181,7 +187,7 @@ def _gaps(
     steps, missing = np.diff(axis), beat.missing(axis)
     if alike and voltage.number is not None:  # the publisher counted: nothing to be guessed
         missing = np.maximum(np.diff(voltage.number) - 1, 0)
-    limit = plan.gap * 1e9 if plan.gap else beat.gap()
+    limit = plan.gap * 1e9 if plan.gap else beat.gap(averaged=alike and held == "before")
     cut = steps > limit
     if alike and not plan.gap:
         cut |= missing > BRIDGED

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.stats import f as fisher
+from scipy.special import fdtrc
 
 from smp_motor_ident.bag.decode import Progress, collect
 from smp_motor_ident.bag.mapping import SignalMap, parse
@@ -239,7 +239,7 @@ def _rest(voltage: _Candidate, motion: _Candidate) -> float | None:
         rests.append(float(np.sum((target - matrix @ solution) ** 2)) + 1e-12)
     free = target.size - _OWN - _LAGS - 1
     ratio = (rests[0] - rests[1]) / _LAGS / (rests[1] / free)
-    return rests[1] / rests[0] if fisher.sf(ratio, _LAGS, free) < EXPLAINS.value else None
+    return rests[1] / rests[0] if fdtrc(_LAGS, free, ratio) < EXPLAINS.value else None
 
 
 def _role(topic: str, path: str) -> str:

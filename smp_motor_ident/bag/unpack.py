@@ -108,9 +108,9 @@ def decompress(data: bytes, compression: str, size: int, budget: Budget) -> byte
             if whole == size or (size == 0 and 0 < whole <= 1 << 20):
                 budget.take(whole)
                 try:
-                    return _ZSTD.decompress(data)
+                    return _ZSTD.decompress(data, allow_extra_data=False)
                 except zstandard.ZstdError:
-                    budget.left += whole  # cut off: take what comes
+                    budget.left += whole  # cut off, or not the only frame: take what comes
         for piece in pieces([data], compression):
             budget.take(len(piece))
             parts.append(piece)
@@ -128,10 +128,10 @@ def unpack_file(path: Path, plain: Path, kind: str, budget: Budget) -> str:
                 out.write(piece)
     except EOFError:
         return f"{path.name}: its compression is cut off"
-    except (zstandard.ZstdError, RuntimeError, ValueError) as error:
+    except _DAMAGE as error:
+        if isinstance(error, OSError) and error.errno is not None:  # of the disk, not of bz2
+            raise BagError(f"{path}: cannot be unpacked ({error.strerror})") from None
         return f"{path.name}: its compression is damaged ({error})"
-    except OSError as error:
-        raise BagError(f"{path}: cannot be unpacked ({error.strerror})") from None
     return ""
 
 

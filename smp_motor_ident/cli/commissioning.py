@@ -38,7 +38,7 @@ def _commission(
     with connect(NAME, ros) as client, Processes(folder / "logs") as processes:
         wheels = wheels or tuple(client.find_wheels()) or WHEELS
         robot = steps.Robot(processes, client, wheels, folder, ros)
-        rates = client.wait_for_wheels(wheels, timeout=10.0)
+        rates = client.wait_for_wheels(wheels, timeout=15.0)
         print("; ".join(f"{wheel} reports at {rate:.0f} Hz" for wheel, rate in rates.items()))
         _confirm(arguments, wheels)
         with client.paused(wheels):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import gc
 import importlib
 import os
 import shlex
@@ -104,7 +105,14 @@ def run(
 def _loaded(work: Work | str) -> Work:
     if not isinstance(work, str):
         return work
-    found: Work = importlib.import_module(f"smp_motor_ident.cli.{work}").work
+    # Wheels are worked on side by side: the threads of a linear algebra of a few columns would
+    # only wait for each other.  While modules load, nothing becomes garbage.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    gc.disable()
+    try:
+        found: Work = importlib.import_module(f"smp_motor_ident.cli.{work}").work
+    finally:
+        gc.enable()
     return found
 
 

@@ -53,6 +53,9 @@ class Robot:
         self.client.change_states(self.wheel_nodes(), transition)
 
 
+PATIENCE = 60.0
+"""How long a busy machine may take to start or end a process [s]."""
+
 TOPICS = "/(.*/)?(motor_.*|pid_state|wheel_setpoints|cmd_vel|odom|joint_states|diagnostics)"
 """What is worth keeping of a robot, for ``record``."""
 
@@ -63,7 +66,7 @@ def record(robot: Robot, name: str) -> Path:
     arguments = ("--output", str(bag), "--regex", TOPICS, *robot.ros_arguments)
     robot.processes.start("record", "record", *arguments)
     topics = [f"{wheel}/motor_state" for wheel in robot.wheels]
-    robot.client.wait_for_listener("record", topics, timeout=20.0)
+    robot.client.wait_for_listener("record", topics, timeout=PATIENCE)
     return bag
 
 
@@ -78,7 +81,7 @@ def excite(robot: Robot, plan: Sequence[Excitation]) -> None:
         }
         arguments = [a for n, v in parameters.items() for a in ("-p", f"{n}:={v}")]
         robot.processes.start("excite", "excite", *robot.ros_arguments, "--ros-args", *arguments)
-        robot.processes.wait("excite", part.duration + 20.0)
+        robot.processes.wait("excite", part.duration + PATIENCE)
 
 
 def identify_wheels(bag: Path, output: Path, *options: str) -> dict[str, Estimate]:

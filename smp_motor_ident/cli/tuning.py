@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import datetime
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from smp_motor_ident.tune.case import COMMON
 from smp_motor_ident.tune.curves import curves
 from smp_motor_ident.tune.exports import FORMATS, export
 from smp_motor_ident.tune.source import choose_source
+from smp_motor_ident.tune.wheels import WheelSet
 from smp_motor_ident.tune.writing import gains_document, gains_yaml, to_json
 
 
@@ -41,17 +42,33 @@ def work(arguments: argparse.Namespace) -> int:
     files = _files(arguments)
     check_free(files, arguments.force)
     estimates = read_estimates(arguments.source)
+    wheels, reasons = _design(estimates, arguments)
+    show(wheels)
+    if files:
+        _write(files, wheels, estimates, arguments, reasons)
+    if arguments.apply:
+        return applying.apply(applying.from_designs(wheels.designs), arguments)
+    return 0
+
+
+def _targets(arguments: argparse.Namespace) -> dict[str, Any]:
+    return {n: getattr(arguments, n) for n in TARGETS if getattr(arguments, n) is not None}
+
+
+def _design(
+    estimates: Mapping[str, Estimate], arguments: argparse.Namespace
+) -> tuple[WheelSet, dict[str, list[str]]]:
+    """Return the designs, and the reasons for the delays and sources of speed that they assume."""
     measured = {} if arguments.bag is None else measure_delay(arguments.bag)
     loops = {w: loop_for(one, arguments, measured.get(w)) for w, one in estimates.items()}
-    delay_lines = tell_delays(loops, measured, arguments)
-    print("".join(f"{line}\n" for line in delay_lines), end="")
-    source_lines: list[str] = []
-    targets = {n: getattr(arguments, n) for n in TARGETS if getattr(arguments, n) is not None}
+    reasons = {"delays": tell_delays(loops, measured, arguments), "speed_sources": []}
+    print("".join(f"{line}\n" for line in reasons["delays"]), end="")
+    targets = _targets(arguments)
     method = arguments.method
     with frame.progress("tune") as say:
         if arguments.speed_source == "auto":
             say("comparing the sources of speed")
-            loops, source_lines = _choose_sources(estimates, loops, targets)
+            loops, reasons["speed_sources"] = _choose_sources(estimates, loops, targets)
         if arguments.compare:
             say("comparing the methods")
             method = _compare(estimates, loops, targets)
@@ -60,30 +77,30 @@ def work(arguments: argparse.Namespace) -> int:
         wheels = design_wheels(
             estimates, loops, method, arguments.sets, together=not arguments.alone, **targets
         )
-    print("".join(f"{line}\n" for line in source_lines), end="")
-    show(wheels)
-    if files:
-        now = datetime.datetime.now(datetime.timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
-        text = gains_yaml(
-            wheels.designs,
-            [*provenance(wheels, arguments, estimates, now), *delay_lines, *source_lines],
-        )
-        sources = sorted({s for e in estimates.values() for s in e.sources})
-        origin = {
-            "date": now,
-            "input": str(arguments.source),
-            "sources": sources,
-            "delays": delay_lines,
-            "speed_sources": source_lines,
-        }
-        document = to_json(gains_document(wheels.designs, origin, wheels.reason))
-        drawn = {w: curves(estimates[w], one) for w, one in wheels.designs.items()}
-        figure = tuning_svg(drawn, METHODS[method].required.sensitivity)
-        write_together(dict(zip(files, (text, document, figure), strict=True)), arguments.force)
-        print(f"written: {files[0]}, beside it {files[1].name} and {files[2].name}")
-    if arguments.apply:
-        return applying.apply(applying.from_designs(wheels.designs), arguments)
-    return 0
+    print("".join(f"{line}\n" for line in reasons["speed_sources"]), end="")
+    return wheels, reasons
+
+
+def _write(
+    files: Sequence[Path],
+    wheels: WheelSet,
+    estimates: Mapping[str, Estimate],
+    arguments: argparse.Namespace,
+    reasons: Mapping[str, list[str]],
+) -> None:
+    """Write parameters, document and figure, all or none."""
+    now = datetime.datetime.now(datetime.timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
+    heading = provenance(wheels, arguments, estimates, now)
+    heading += [line for lines in reasons.values() for line in lines]
+    sources = sorted({s for e in estimates.values() for s in e.sources})
+    origin = {"date": now, "input": str(arguments.source), "sources": sources, **reasons}
+    text = gains_yaml(wheels.designs, heading)
+    document = to_json(gains_document(wheels.designs, origin, wheels.reason))
+    drawn = {w: curves(estimates[w], one) for w, one in wheels.designs.items()}
+    method = next(iter(wheels.designs.values())).method
+    figure = tuning_svg(drawn, METHODS[method].required.sensitivity)
+    write_together(dict(zip(files, (text, document, figure), strict=True)), arguments.force)
+    print(f"written: {files[0]}, beside it {files[1].name} and {files[2].name}")
 
 
 def _choose_sources(
@@ -111,7 +128,7 @@ def _export(arguments: argparse.Namespace) -> int:
     arguments.difference_window = arguments.difference_window or (1 if target.counts else None)
     estimates = read_estimates(arguments.source)
     loops = {wheel: loop_for(one, arguments) for wheel, one in estimates.items()}
-    targets = {n: getattr(arguments, n) for n in TARGETS if getattr(arguments, n) is not None}
+    targets = _targets(arguments)
     with frame.progress("tune") as say:
         say(f"designing for {target.title}")
         text, _ = export(arguments.export, estimates, loops, **targets)

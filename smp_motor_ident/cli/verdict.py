@@ -99,13 +99,11 @@ def show(
         out.print(driven)
 
 
-def check(
-    truth: Mapping[str, MotorEntry],
-    estimates: Mapping[str, Estimate],
-    answers: Mapping[str, Sequence[Answer]],
+def check_estimates(
+    truth: Mapping[str, MotorEntry], estimates: Mapping[str, Estimate]
 ) -> list[Check]:
-    """Hold the results against the limits."""
-    gain, deviation, over, settled = [], [], [], []
+    """Hold the identified motors against the limits."""
+    gain, deviation = [], []
     beyond = set()
     for wheel in estimates:
         for name, true, quantity in _compared(truth[wheel], estimates[wheel]):
@@ -117,13 +115,21 @@ def check(
                 deviation.append((deviations, f"{wheel} {name}"))
                 if not deviations <= MOST_DEVIATIONS:
                     beyond.add(wheel)
-        for answer in answers[wheel]:
-            over.append((answer.overshoot, f"{wheel} {answer.segment}"))
-            settled.append((answer.settling, f"{wheel} {answer.segment}"))
     return [
         _worst("error of the DC gain", gain, MOST_GAIN_ERROR, "%"),
         _worst("error of a parameter", deviation, WORST_DEVIATIONS, "standard deviations"),
         Check("wheels with an error beyond 3", len(beyond), 1, ", ".join(beyond) or "-", "wheels"),
+    ]
+
+
+def check_drive(answers: Mapping[str, Sequence[Answer]]) -> list[Check]:
+    """Hold what the wheels did against the limits."""
+    over, settled = [], []
+    for wheel, given in answers.items():
+        for answer in given:
+            over.append((answer.overshoot, f"{wheel} {answer.segment}"))
+            settled.append((answer.settling, f"{wheel} {answer.segment}"))
+    return [
         _worst("overshoot", over, MOST_OVERSHOOT, "%"),
         _worst("settling time", settled, MOST_SETTLING, "s"),
     ]

@@ -12,6 +12,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solve_banded
 
 from smp_motor_ident.likelihood import recursion as rc
 
@@ -237,10 +238,10 @@ EFFECTS = (
 
 def _lagged(m: Motion, factor: float) -> Array:
     """Return the voltage through a first-order lag that is faster or slower than the motor's."""
-    from scipy.signal import lfilter
-
     speed, voltage = m.speed / m.fastest, m.voltage / m.top
     # The motor's own lag [sections] from how its speed follows its voltage.
     own = max(float(np.abs(voltage - speed).sum() / max(np.abs(np.diff(speed)).sum(), 1e-9)), 1.0)
     a = float(np.exp(-1.0 / max(factor * own, 0.3)))
-    return np.asarray(lfilter([1 - a], [1, -a], m.voltage))
+    # y[n] - a y[n-1] = (1 - a) v[n]: a filter as a system of equations with two bands.
+    bands = np.array([np.ones(m.voltage.size), np.full(m.voltage.size, -a)])
+    return np.asarray(solve_banded((1, 0), bands, (1 - a) * m.voltage))

@@ -75,7 +75,7 @@ def regression(data: Experiments, fit: Fit, gear: float) -> Regression | None:
             first = len(columns) - 1 - n_own
             members.append((effect, tuple(range(first, first + len(made)))))
             columns += [_stacked(data, fit, c) for c in made]
-    table = np.column_stack(columns)
+    table = np.array(columns).T  # columns stay together in memory
     if np.count_nonzero(columns[0]) < 4 * BLOCKS or not np.isfinite(table).all():
         return None
     return _projected(table, n_own, _blocks(data), members, len(fit.structure.free()))
@@ -88,7 +88,8 @@ def _projected(
     members: Sequence[tuple[Effect, tuple[int, ...]]],
     n_free: int,
 ) -> Regression:
-    own, rest = table[:, 1 : 1 + n_own], table[:, [0, *range(1 + n_own, table.shape[1])]]
+    own = table[:, 1 : 1 + n_own]
+    rest = np.asfortranarray(table[:, [0, *range(1 + n_own, table.shape[1])]])
     scale = np.sqrt(np.square(own).sum(axis=0))
     own = own / np.where(scale > 0, scale, 1.0)
     answer = np.linalg.lstsq(own.T @ own, own.T @ rest, rcond=1e-12)[0]

@@ -111,7 +111,11 @@ class _Descent:
         """Return the damped step and its length; along the edge of a motor's shapes, if there."""
         normal, gradient = self.here.normal, self.here.gradient
         bounds = self.lower, self.upper
-        step, size = damped_step(normal, gradient, damping, self.matrix, self.z, *bounds)
+        turn = _physical_steps(self.z, self.structure)
+        step, size = damped_step(
+            turn.T @ normal @ turn, turn.T @ gradient, damping, self.matrix @ turn, self.z, *bounds
+        )
+        step = turn @ step
         share = shape_constraint.passed(self.z + self.matrix @ step) if self.shaped else None
         ties = None if share is None else shape_constraint.tied(self.structure, self.z, share)
         if ties is None:
@@ -224,6 +228,25 @@ def solve(
             break
         descent.look_again(fresh)
     return descent.result()
+
+
+def _physical_steps(z: Array, structure: Structure) -> Array:
+    """Return steps of a0, tm, be and te in the free coordinates, shape (f, f).
+
+    Where L/R is far below the motor's lag, ``a1 = tm + te be`` and ``a2 = te tm`` must move
+    together to a millionth for the motor to stay one; damped each by itself they hold the
+    descent.  Damping acts on steps of these instead.
+    """
+    free = structure.free()
+    turn = np.eye(len(free))
+    if not {models.A0, models.A1, models.A2, models.TE} <= set(free):
+        return turn
+    a0, a1, a2, te = np.exp(z[[models.A0, models.A1, models.A2, models.TE]])
+    i, j, k = (free.index(c) for c in (models.A1, models.A2, models.TE))
+    tm = a2 / te
+    turn[i, i], turn[i, j], turn[i, k] = te * a0 / a1, tm / a1, 1 - tm / a1
+    turn[j, i], turn[j, j], turn[j, k] = 0.0, 1.0, 1.0
+    return turn
 
 
 def _bounds(fastest: float) -> tuple[Array, Array]:

@@ -27,9 +27,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
-from scipy.signal import lfilter
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from smp_motor_ident._compile import compiled
 from smp_motor_ident.diagnosis.limits import LOOSE_QUANTITY
@@ -90,7 +88,7 @@ def flexible_shaft(records: Sequence[Record], rigid: Estimate) -> Estimate:
         theta, _, squares = _fit(segments, [theta], ar)
     _, _, rest = _fit(segments, [stiff], ar)
     gain = sum(s.time.size for s in segments) * math.log(rest / squares)
-    least = chi2.isf(CHANCE / FREQUENCIES, 2)  # any of the frequencies may be best by chance
+    least = chdtri(2, CHANCE / FREQUENCIES)  # any of the frequencies may be best by chance
     if gain < least:
         raise InsufficientExcitationError(
             f"{rigid.wheel}: no resonance of a flexible shaft is seen (deviance {gain:.1f} lower, "
@@ -177,6 +175,8 @@ def _columns(segment: _Segment, theta: Array) -> Array:
 
 def _design(segments: Sequence[_Segment], theta: Array, ar: Array) -> tuple[Array, Array]:
     """Return the whitened columns of all segments, each with its own state, and the outputs."""
+    from scipy.signal import lfilter  # loaded only where a shaft is asked for
+
     blocks = [_columns(s, theta) for s in segments]
     own = [b.shape[0] - 2 for b in blocks]
     cut = ar.size - 1
@@ -206,6 +206,8 @@ def _fit(
     segments: Sequence[_Segment], starts: Sequence[Array], ar: Array
 ) -> tuple[Array, Array, float]:
     """Return the best of several descents, the whitening of its residuals, their squares."""
+    from scipy.optimize import least_squares
+
     best, least = starts[0], math.inf
     step = float(np.median(np.diff(segments[0].time)))
     for start in starts:

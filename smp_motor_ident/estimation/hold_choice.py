@@ -31,6 +31,8 @@ def chosen_hold(
         return "held", None  # how the command ran within so short an interval does not show
     others = {h: prepare(group, base.current, hold=h) for h in ("switched", "middle")}
     others = {h: d for h, d in others.items() if d.hold_end.size > plain.hold_end.size}
+    if len(others) > 1 and others["switched"].held_like(others["middle"]):
+        del others["middle"]
     if not others:
         return "held", None
     say("how the command was held between samples")
@@ -41,9 +43,13 @@ def chosen_hold(
     part = screening_subset(plain)
     near = refine(part, best.structure, best, best.z, options) if part is not plain else best
     for other, data in others.items():
-        fitted = grow(screening_subset(data), best.structure, near, options)
-        if fitted.deviance > near.deviance + HOLD_HOPELESS.value and fitted.converged:
+        part = screening_subset(data)
+        short = HOLD_HOPELESS.value if part is not data else -HOLD_EVIDENCE.value
+        # From the torque noise that was found it shows soon whether this is worth a full search.
+        soon = grow(part, best.structure, near, options, near)
+        if soon.converged and soon.deviance > near.deviance + short:
             continue
+        fitted = grow(part, best.structure, near, options)
         fitted = extend(data, best.structure, fitted, options)
         if fitted.deviance < best.deviance - HOLD_EVIDENCE.value:
             hold, best = other, fitted

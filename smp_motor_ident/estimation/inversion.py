@@ -9,7 +9,6 @@ from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import optimize
 
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.model import structures as models
@@ -23,6 +22,8 @@ def solved_for(
     fit: Fit, fixed: Mapping[str, float], matrix: Array, covariance: Array
 ) -> dict[str, tuple[float, Array]]:
     """Solve ``a(R, L, K, J, b) = a`` for what the user has not fixed, where that is unique."""
+    from scipy.optimize import least_squares  # takes a while to load, and is seldom needed
+
     free = [n for n in PHYSICAL[:5] if n not in fixed]
     if len(free) > len(RESPONSE) or not free:
         return {}
@@ -35,7 +36,7 @@ def solved_for(
     # The equations are quadratic: with R and b known, say, two motors answer the same.
     found: list[tuple[Array, Array]] = []
     for guess in _guesses(fit, fixed, free):
-        end = optimize.least_squares(  # type: ignore[operator]
+        end = least_squares(  # type: ignore[operator]
             lambda x: half @ (_log_coefficients(free, x, fixed) - target), guess
         )
         miss = float(np.abs(_log_coefficients(free, end.x, fixed) - target).max())

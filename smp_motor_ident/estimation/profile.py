@@ -17,7 +17,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from smp_motor_ident.diagnosis.limits import REST, SAME_LEVEL
 from smp_motor_ident.estimation.descent import Options, descend, initial_of
@@ -29,7 +29,7 @@ from smp_motor_ident.model import structures as models
 
 Array = NDArray[np.float64]
 
-RISE = float(chi2.ppf(0.95, 1))  # of the deviance at the end of a 95 % interval
+RISE = float(chdtri(1, 0.05))  # of the deviance at the end of a 95 % interval
 NONLINEAR = (models.VC_PLUS, models.A2, models.DELAY, models.WINDOW)
 """Coordinates that act other than linearly, in the order in which they are followed."""
 LOOSE = 0.1  # relative uncertainty at which that shows

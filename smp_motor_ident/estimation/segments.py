@@ -17,8 +17,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2, t
-from scipy.stats import f as f_distribution
+from scipy.special import chdtri, fdtri, stdtrit
 
 from smp_motor_ident.diagnosis.limits import HOMOGENEITY, SEGMENT_INFORMATION, SEGMENTS
 from smp_motor_ident.estimation.fit import Fit
@@ -51,15 +50,15 @@ def heterogeneous(data: Experiments, fit: Fit) -> tuple[Fit, dict[str, float]]:
     own = (scatter - drift) / (parts - 2)  # a drift is judged by its own scatter as well
     each = HOMOGENEITY.value / (3 * size)  # Bonferroni: three tests of each coordinate
     changed = (
-        (scatter / expected > chi2.isf(each, parts - 1))
-        | (drift / expected > chi2.isf(each, 1))
-        | (drift / np.maximum(own, 1e-300) > f_distribution.isf(each, 1, parts - 2))
+        (scatter / expected > chdtri(parts - 1, each))
+        | (drift / expected > chdtri(1, each))
+        | (drift / np.maximum(own, 1e-300) > fdtri(1, parts - 2, 1 - each))
     )
     if not changed.any():
         return fit, {}
     ordered = len(data.starts) - 1 < FEWEST and parts >= ORDERED  # records are not a sequence
     between, freedom = _between(middle, step, cov.mean(axis=0), ordered)
-    between = between * (t.ppf(0.975, freedom) / NORMAL_95) ** 2
+    between = between * (stdtrit(freedom, 0.975) / NORMAL_95) ** 2
     added = np.zeros((len(fit.structure.free()),) * 2)
     added[np.ix_(free, free)] = between
     std = np.sqrt(np.diag(between))

@@ -75,6 +75,12 @@ class Experiments:
         """Number of samples."""
         return int(self.time.size)
 
+    def held_like(self, other: Experiments) -> bool:
+        """Tell whether the input of others was held at the same values for the same times."""
+        return np.array_equal(self.hold_end, other.hold_end) and np.array_equal(
+            self.hold_value, other.hold_value
+        )
+
     def as_mean_speed(self) -> Experiments:
         """Return the same experiments, the speed taken for a mean over a trailing window."""
         return replace(self, kind=rc.MEAN_SPEED)

@@ -9,6 +9,7 @@ import pytest
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.wheel.faults import Fault, FaultDetector, FaultLimits, Recovery
 from smp_motor_control.wheel.freshness import FeedbackClock, Verdict
+from smp_motor_control.wheel.lease import Lease
 
 MS = 1_000_000
 START = 1_700_000_000 * 1_000_000_000
@@ -78,6 +79,95 @@ def test_zero_stamps_stand_for_the_arrival():
     c = clock()
     assert [c.accept(0, START + k * 5 * MS) for k in range(3)][-1] is Verdict.FRESH
     assert c.dt == pytest.approx(0.005)
+
+
+def test_stamps_that_go_on_are_late_however_late_and_no_clock_that_was_set_back():
+    c = clock()
+    feed(c, (0, 0), (5, 5))
+    # A queue that grows to two seconds: the samples follow on each other, their arrival does not.
+    assert set(feed(c, *((10 + 5 * k, 2010 + 5 * k) for k in range(20)))) == {Verdict.LATE}
+    assert (c.jumps, c.offset, c.age) == (0, 0.0, pytest.approx(2.0))
+    assert feed(c, (2200, 2200), (2205, 2205)) == [Verdict.FIRST, Verdict.FRESH]
+    # Until someone resets: then it is taken for the offset of another clock.
+    feed(c, (2210, 4210))
+    c.reset()
+    assert feed(c, (2215, 4215), (2220, 4220)) == [Verdict.FIRST, Verdict.FRESH]
+    assert c.offset == pytest.approx(2.0) and c.age == pytest.approx(0.0)
+
+
+def test_clock_that_jumps_ahead_or_after_a_gap_is_a_jump():
+    c = clock()
+    feed(c, (0, 0), (5, 5))
+    assert feed(c, (1600, 10)) == [Verdict.FIRST]
+    assert c.age == 0.0, "counted from the new offset on"
+    assert feed(c, (1605, 15)) == [Verdict.FRESH]
+    assert c.jumps == 1 and c.offset == pytest.approx(-1.59) and c.age == pytest.approx(0.0)
+    # Three seconds of silence, of which the stamps know one: more than a gap, so no queue.
+    assert feed(c, (2605, 3015)) == [Verdict.FIRST]
+    assert c.jumps == 2 and c.offset == 0.0 and c.age == pytest.approx(0.41)
+
+
+def test_a_new_clock_has_measured_nothing():
+    c = clock()
+    assert (c.jumps, c.offset, c.dt, c.age) == (0, 0.0, 0.0, 0.0)
+    assert c.counts == dict.fromkeys(Verdict, 0)
+    assert feed(c, (0, 50)) == [Verdict.FIRST]
+    assert (c.dt, c.age) == (0.0, pytest.approx(0.05))
+
+
+def test_samples_are_counted_by_what_they_are():
+    c = clock()
+    feed(c, (0, 0), (5, 5), (10, 10), (10, 11), (7, 12), (20, 520), (900, 900))
+    expected = {"FIRST": 2, "FRESH": 2, "DUPLICATE": 1, "REORDERED": 1, "LATE": 1}
+    assert {verdict.name: n for verdict, n in c.counts.items()} == expected
+
+
+def test_ages_and_gaps_count_up_to_their_limits():
+    c = FeedbackClock(max_age=0.25, max_gap=0.5)  # binary fractions: nothing is rounded
+    assert feed(c, (0, 250), (500, 750)) == [Verdict.FIRST, Verdict.FRESH]
+    assert feed(c, (1001, 1001), (1002, 1253)) == [Verdict.FIRST, Verdict.LATE]
+
+
+def test_after_a_reset_the_next_sample_is_a_first_one():
+    c = clock()
+    feed(c, (0, 0), (5, 5))
+    c.reset()
+    assert feed(c, (10, 10), (15, 15)) == [Verdict.FIRST, Verdict.FRESH]
+    assert c.jumps == 0
+
+
+def lease(*commands: tuple[str, float, float], timeout: float = 0.2) -> list[bool]:
+    one = Lease(timeout)
+    return [one.take(writer, voltage, now) for writer, voltage, now in commands]
+
+
+def test_a_wheel_is_its_last_drivers_for_the_time_out_and_no_longer():
+    taken = lease(
+        ("a", 1.0, 0.0), ("b", 1.0, 0.125), ("b", 0.0, 0.125), ("b", 1.0, 0.25), timeout=0.25
+    )
+    assert taken == [True, False, False, True]
+    # Zeros and what is no number take and renew nothing.
+    for value in (0.0, math.nan, math.inf):
+        assert lease(("a", value, 0.0), ("b", 1.0, 0.1)) == [True, True]
+        assert lease(("a", 1.0, 0.0), ("a", value, 0.15), ("b", 1.0, 0.21)) == [True, True, True]
+    assert lease(("a", 1.0, 0.0), ("a", -1.0, 0.15), ("b", 1.0, 0.21)) == [True, True, False]
+
+
+def test_the_owner_is_named_while_its_lease_lives_and_refused_writers_are_counted():
+    one = Lease(0.2)
+    assert one.owner(0.0) == "" and one.refused == {}
+    one.take("a", 1.0, 1.0)
+    assert [one.owner(t) for t in (1.0, 1.19, 1.2)] == ["a", "a", ""]
+    for k in range(3):
+        one.take("b", 1.0, 1.01 + 0.01 * k)
+    one.take("c", 1.0, 1.1)
+    assert one.refused == {"b": 3, "c": 1}
+
+
+def test_a_lease_ends_where_commands_never_do():
+    one = Lease(math.inf)
+    one.take("a", 1.0, 0.0)
+    assert one.owner(0.999) == "a" and one.owner(1.0) == ""
 
 
 LIMITS = FaultLimits(current_limit=3.0, current_time=0.05)

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import motors
 import numpy as np
+from scipy.stats import chi2
 
 from smp_motor_control.excitation import Fourier
 from smp_motor_ident.diagnosis.identifiability import what_next
@@ -80,3 +81,19 @@ def test_following_a_proposal_brings_what_it_promised():
         q = then.parameters[name]
         # The tones are not the trial's own, and quantisation repeats a little: half more.
         assert q.std < 1.5 * proposal.relative_std[name] * truth[name], name
+
+
+def test_stated_deviations_are_those_of_repeated_recordings():
+    """Errors of 20 recordings in stated deviations: twice too wide fails as twice too narrow."""
+    wander = motors.record("front_left", kinds=("fourier", "square"), seconds=2.0).voltage
+    truth = motors.truth("front_left", 0.3)
+    names = ("dc_gain", "time_constant", "static_voltage")
+    errors = []
+    for seed in range(20):
+        recording = motors.record("front_left", voltage=wander, torque_noise=0.5, seed=seed)
+        e = estimate(replace(recording, current=None), model="second_order")
+        errors.append([(e.value(n) - truth[n]) / e.combinations[n].std for n in names])
+    scatter = np.sqrt(np.mean(np.square(errors), axis=0))
+    # sqrt(chi2(20) / 20) lies outside of 0.54 to 1.51 in one of 500 cases.
+    low, high = np.sqrt(chi2.ppf([1e-3, 1 - 1e-3], 20) / 20)
+    assert np.all((low < scatter) & (scatter < high)), dict(zip(names, scatter, strict=True))

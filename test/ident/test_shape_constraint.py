@@ -1,4 +1,4 @@
-"""A descent that comes to the edge of what a motor can be goes on along it."""
+"""A descent goes on along the edge of what a motor can be, and where L/R is next to nothing."""
 
 from __future__ import annotations
 
@@ -16,21 +16,22 @@ SHAPED = Structure("second_order", 2, "symmetric", shape=True)
 MOTOR = models.from_physical(2.0, 4e-3, 0.05, 2e-4, 1e-6, 0.01)
 
 
-def driven() -> Record:
-    """A square wave on a motor next to all of whose damping is back-EMF; noisy angles at 2 kHz."""
+def driven(z: np.ndarray = MOTOR, rate: float = 2000.0, seconds: float = 3.0) -> Record:
+    """A square wave on a motor next to all of whose damping is back-EMF; noisy angle, current."""
     rng = np.random.default_rng(5)
-    t = np.arange(6000) / 2000.0
+    t = np.arange(int(seconds * rate)) / rate
     v = np.where(np.sin(2 * np.pi * 1.1 * t) >= 0, 12.0, -12.0)
-    (te, tm, k, be), vc = models.to_internal(MOTOR, 2)[0][:4], MOTOR[models.VC_PLUS]
+    (te, tm, k, be), vc = models.to_internal(z, 2)[0][:4], z[models.VC_PLUS]
     q = w = angle = 0.0
-    out, fine = np.empty(t.size), 2.5e-5
+    out, amps, fine = np.empty(t.size), np.empty(t.size), 2.5e-5
     for n in range(t.size):
-        out[n] = angle
-        for _ in range(20):  # semi-implicit Euler, 25 us: a fortieth of a percent of L/R
+        out[n], amps[n] = angle, q / np.exp(z[models.LN_R])
+        for _ in range(round(1 / rate / fine)):  # semi-implicit Euler
             q += fine / te * (v[min(n + 1, t.size - 1)] - q - k * w)
             w += fine / tm * (q - be * w - vc * np.sign(w))
             angle += fine * w
-    return Record("motor", t, v, position=out + 0.02 * rng.standard_normal(t.size))
+    amps += 0.02 * rng.standard_normal(t.size)
+    return Record("motor", t, v, amps, position=out + 0.02 * rng.standard_normal(t.size))
 
 
 @pytest.mark.parametrize("share", [0.0, shape_constraint.MOST])
@@ -46,6 +47,22 @@ def test_from_either_edge_a_descent_finds_the_bottom(share):
     found, true = bottom(start), bottom(MOTOR)
     assert found.converged
     assert found.deviance < true.deviance + 4.0  # two deviations of a chi-square
+
+
+def test_an_inductance_far_below_the_sampling_is_no_place_to_stay():
+    fast = models.from_physical(2.0, 1e-3, 0.05, 2e-4, 1e-5, 0.01)
+    data = prepare([driven(fast, 100.0, 10.0)], True)
+    whole = Structure("electromechanical", 2, "symmetric", current=True)
+    noise = np.diag([4e-4, 4e-4])
+    start = fast.copy()
+    start[[A2, TE]] += np.log(0.1)
+
+    def bottom(z):
+        return descend(data, whole, whole.complete(z), data.initial, noise, 0.0, Options(), 40)
+
+    found, true = bottom(start), bottom(fast)
+    assert found.converged
+    assert found.deviance < true.deviance + 1.0  # the same bottom, to a deviation
 
 
 def test_the_edges_are_where_damping_is_nothing_and_all_but_a_fiftieth():

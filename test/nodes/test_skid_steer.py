@@ -18,6 +18,7 @@ from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, JointState
 
@@ -65,7 +66,7 @@ class Peer:
         self.plain = node.create_publisher(Twist, "cmd_vel_plain", 10)
         self.imu = node.create_publisher(Imu, "imu", 10)
         self.states = {w: node.create_publisher(MotorState, f"{w}/motor_state", 10) for w in WHEELS}
-        self.position = dict.fromkeys(WHEELS, 0.0)
+        self.begun: Time | None = None
 
     def spin(self) -> None:
         self.executor.spin_once(timeout_sec=0.005)
@@ -84,13 +85,23 @@ class Peer:
         self.stamped.publish(message)
 
     def feed(self, wheel: str, position: float, velocity: float = 0.0) -> None:
-        message = MotorState(position=position, velocity=velocity)
-        message.header.stamp = self.node.get_clock().now().to_msg()
-        self.states[wheel].publish(message)
+        self._feed(wheel, position, velocity, self.node.get_clock().now())
 
     def feed_all(self, left: float, right: float) -> None:
         for wheel in WHEELS:
             self.feed(wheel, left if wheel.endswith("left") else right)
+
+    def roll(self, speed: float) -> None:
+        """Feed where wheels of this speed [rad/s] are at the instant that is stamped."""
+        now = self.node.get_clock().now()
+        self.begun = self.begun or now
+        for wheel in WHEELS:
+            self._feed(wheel, speed * (now - self.begun).nanoseconds * 1e-9, speed, now)
+
+    def _feed(self, wheel: str, position: float, velocity: float, stamp: Time) -> None:
+        message = MotorState(position=position, velocity=velocity)
+        message.header.stamp = stamp.to_msg()
+        self.states[wheel].publish(message)
 
     def speeds(self) -> dict[str, float]:
         """Newest set-points by wheel; empty before the first."""
@@ -267,11 +278,9 @@ def test_odometry_follows_simulated_time_at_half_the_pace(start, peer, eventuall
 def test_odometry_has_no_spikes_after_stalls(start, peer, eventually) -> None:
     """The reference is the speed of the wheels as they are fed: 2 rad/s, 0.2 m/s."""
     started = start()
-    begun = time.monotonic()
 
     def roll() -> None:
-        angle = 2.0 * (time.monotonic() - begun)
-        peer.feed_all(angle, angle)
+        peer.roll(2.0)
 
     repeatedly(peer, roll, lambda: len(peer.odometry) > 30, eventually)
     for pause in [0.12] * 8 + [1.0]:
@@ -325,7 +334,7 @@ def test_parameters_change_while_driving_and_nonsense_is_refused_with_its_reason
 
 
 def test_odometry_follows_the_wheels_from_any_first_position(start, peer, eventually) -> None:
-    start()
+    start("-p", "feedback_timeout:=60.0")  # travel while nothing was heard is left out
     # Wheels that start at 1000 and 2000 rad, and then roll 1 rad: 0.1 m.
     repeatedly(
         peer,
@@ -391,7 +400,9 @@ def test_lost_or_nan_feedback_is_named_and_never_reaches_the_odometry(
 
 
 def test_heading_is_held_by_the_imu_and_only_while_driving(start, peer, eventually) -> None:
-    start("-p", "heading_hold:=true", "-p", "heading_i:=0.0")
+    # A busy machine must not let the imu or the command time out: the hold would begin anew.
+    patient = ("-p", "imu_timeout:=60.0", "-p", "cmd_vel_timeout:=60.0")
+    start("-p", "heading_hold:=true", "-p", "heading_i:=0.0", *patient)
 
     def turned(yaw: float, v: float) -> None:
         message = Imu()

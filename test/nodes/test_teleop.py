@@ -6,11 +6,11 @@ import contextlib
 import fcntl
 import os
 import pty
-import select
 import signal
 import subprocess
 import sys
 import termios
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -30,7 +30,7 @@ class Terminal:
     def __init__(self, command: list[str]) -> None:
         self.master, self.slave = pty.openpty()
         self.usual = termios.tcgetattr(self.slave)
-        self.shown = ""
+        self.shown = ""  # all, ever
 
         def adopt() -> None:
             os.setsid()
@@ -43,15 +43,17 @@ class Terminal:
             stderr=self.slave,
             preexec_fn=adopt,
         )
+        # Unread, the terminal would be full after some hundred lines, and stop what it shows.
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        with contextlib.suppress(OSError):
+            while shown := os.read(self.master, 65536):
+                self.shown += shown.decode(errors="replace")
 
     def type(self, keys: str) -> None:
         os.write(self.master, keys.encode())
-
-    def look(self) -> str:
-        """Return all that was ever shown."""
-        while select.select([self.master], [], [], 0.0)[0]:
-            self.shown += os.read(self.master, 65536).decode(errors="replace")
-        return self.shown
 
     def is_usual(self) -> bool:
         return termios.tcgetattr(self.slave) == self.usual
@@ -67,9 +69,9 @@ class Terminal:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(self.process.pid, signal.SIGKILL)
         self.process.wait()
-        for fd in (self.master, self.slave):
-            with contextlib.suppress(OSError):
-                os.close(fd)
+        os.close(self.slave)
+        self._reader.join()
+        os.close(self.master)
 
 
 @pytest.fixture
@@ -131,7 +133,7 @@ def ready(terminal, robot, eventually):
     def run(*command: str) -> Terminal:
         started = terminal(*command)
         eventually(
-            lambda: robot.heard() and "hold a key" in started.look() and not started.echoes(),
+            lambda: robot.heard() and "hold a key" in started.shown and not started.echoes(),
             deadline=20.0,
             step=robot.spin,
         )
@@ -164,7 +166,7 @@ def test_held_key_drives_and_its_release_stops_then_is_silent(ready, robot, even
     count = len(robot.twists)
     robot.spin_for(0.3)
     assert len(robot.twists) == count
-    assert "stopped" in shell.look()
+    eventually(lambda: "stopped" in shell.shown)
 
 
 def test_wheel_mode_turns_the_selected_wheel_and_space_stops_it(ready, robot, eventually) -> None:
@@ -209,7 +211,7 @@ def test_leaving_stops_the_robot_and_restores_the_terminal(
     eventually(lambda: shell.process.poll() is not None, deadline=3.0, step=robot.spin)
     assert shell.process.returncode == 0
     assert shell.is_usual()
-    assert "\x1b[?25h" in shell.look()  # the cursor is back
+    eventually(lambda: "\x1b[?25h" in shell.shown)  # the cursor is back
     assert "Traceback" not in shell.shown
 
 
@@ -240,7 +242,7 @@ def test_exception_in_the_node_restores_the_terminal(terminal, eventually) -> No
     eventually(lambda: shell.process.poll() is not None, deadline=20.0)
     assert shell.process.returncode == 1
     assert shell.is_usual()
-    assert "broken" in shell.look()
+    eventually(lambda: "broken" in shell.shown)
 
 
 def test_without_a_terminal_it_says_so_in_one_line(process) -> None:
@@ -255,4 +257,4 @@ def test_impossible_speed_is_refused_and_the_terminal_left_alone(terminal, event
     eventually(lambda: shell.process.poll() is not None, deadline=20.0)
     assert shell.process.returncode == 2
     assert shell.is_usual()
-    assert "linear" in shell.look()
+    eventually(lambda: "linear" in shell.shown)

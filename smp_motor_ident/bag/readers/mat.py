@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-import scipy.io
 
 from smp_motor_ident.bag.readers.columns import ColumnFile
 from smp_motor_ident.bag.readers.format import Format
@@ -33,8 +32,10 @@ class _MatFile(ColumnFile):
 
     def __init__(self, path: Path, name: str, budget: Budget) -> None:
         data = _unpacked(path.read_bytes(), name, budget)
+        from scipy import io as scipy_io  # takes a while to load, for one of many formats
+
         try:
-            content = scipy.io.loadmat(
+            content = scipy_io.loadmat(
                 cast(Any, io.BytesIO(data)), simplify_cells=True, chars_as_strings=False
             )
         except Exception as error:  # scipy's reader raises whatever its bytes lead it to

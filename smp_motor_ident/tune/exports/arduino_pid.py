@@ -2,8 +2,9 @@
 
 References
 ----------
-github.com/br3ttb/Arduino-PID-Library, PID_v1: the sum of ``Ki T e``, with the present error, and
-the output are both kept within the limits; ``Kp`` on the error, ``Kd`` on the measurement.
+github.com/br3ttb/Arduino-PID-Library 1.2.1, PID_v1.cpp, ``Compute``, ``SetTunings``: the sum of
+``Ki T e``, with the present error, and the output are both kept within the limits; ``Kp`` on the
+error (``P_ON_E``), ``Kd`` on the measurement; ``T`` is ``SampleTime``, whole milliseconds.
 """
 
 from __future__ import annotations
@@ -11,7 +12,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from smp_motor_ident.tune.designer import Design
-from smp_motor_ident.tune.exports.target import Format, Gains, present_error, rounded
+from smp_motor_ident.tune.exports.target import (
+    Format,
+    Gains,
+    present_error,
+    rounded,
+    whole_milliseconds,
+)
 from smp_motor_ident.tune.feedback import Feedback
 
 LIMIT = 255
@@ -23,7 +30,7 @@ def _convert(design: Design) -> Gains:
     wanted = present_error(design.feedback, T)
     p, i = rounded(max(wanted.p, 0.0) * scale), rounded(wanted.i * scale)
     feedback = Feedback((p + i * T) / scale, i / scale)
-    numbers = {"Kp": p, "Ki": i, "Kd": 0.0, "SampleTime": round(1e3 * T)}
+    numbers = {"Kp": p, "Ki": i, "Kd": 0.0, "SampleTime": whole_milliseconds(loop)}
     return Gains(numbers, feedback)
 
 

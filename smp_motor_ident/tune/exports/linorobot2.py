@@ -2,9 +2,12 @@
 
 References
 ----------
-github.com/linorobot/linorobot2_hardware, firmware: configuration ``K_P``, ``K_I``, ``K_D``,
-``PWM_BITS``.  ``pwm = K_P e + K_I sum(e) + K_D (e - e_before)``, the sum with the present error and
-without a limit, the output within ``+-(2^PWM_BITS - 1)``.
+github.com/linorobot/linorobot2_hardware (8a95745): config/lino_base_config.h (``K_P``, ``K_I``,
+``K_D``, ``PWM_BITS``), firmware/lib/pid/pid.cpp, ``compute``, firmware/lib/encoder/encoder.h,
+``getRPM``, firmware/src/firmware.ino (a timer of 20 ms).
+``pwm = K_P e + K_I sum(e) + K_D (e - e_before)``, the sum with the present error and without a
+limit, emptied where set-point and error are both 0; the output is kept within ``PWM_MIN`` and
+``PWM_MAX`` (``2^PWM_BITS - 1``) and cut to a whole number.
 """
 
 from __future__ import annotations

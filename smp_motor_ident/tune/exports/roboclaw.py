@@ -2,11 +2,15 @@
 
 References
 ----------
-Basicmicro, RoboClaw Series User Manual, commands 28, 29 and 55: QPPS is the speed in counts per
-second at full power; P, I and D are sent as 65536 times their value.
+Basicmicro, RoboClaw Series User Manual: commands 28, 29 and 55 (QPPS is the speed in counts per
+second at full power; P, I and D are sent as 65536 times their value), command 30 (speeds are
+counted over 300ths of a second). forums.ionmc.com, topic 774, answer of Basicmicro Support: the
+set-point is fed forward by QPPS.
 
-The firmware's arithmetic is not published.  Taken is ``duty = (P e + I integral(e)) / QPPS`` with
-the error in counts per second: check with IonMotion's velocity plot before trusting the margins.
+The firmware's arithmetic is not published. Taken is ``duty = (v + P e + I integral(e)) / QPPS``
+with set-point ``v`` and error in counts per second: check with Motion Studio's velocity plot before
+trusting the margins. Since the set-point is fed forward, P and I are lowered until an abrupt change
+does not overshoot by more than 2 %.
 """
 
 from __future__ import annotations
@@ -15,25 +19,43 @@ from collections.abc import Mapping
 
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.tune.designer import Design
-from smp_motor_ident.tune.exports.target import Format, Gains, present_error, ticks
+from smp_motor_ident.tune.exports.target import (
+    BAND,
+    Format,
+    Gains,
+    check,
+    present_error,
+    ticks,
+    top_speed,
+)
 from smp_motor_ident.tune.feedback import Feedback
 
 UNIT = 65536
+
+SHARES = tuple(2.0 ** (-n / 2) for n in range(13))
+"""Of the designed gains, tried from the largest on: P takes one, I its square."""
 
 
 def _convert(design: Design) -> Gains:
     loop, T = design.loop, design.loop.sample_time
     if not loop.count_angle:
         raise DesignError("RoboClaw counts quadrature pulses; give --counts-per-revolution")
-    static = design.motor["static_voltage"]
-    top = design.motor["dc_gain"] * (loop.supply_voltage - static)
-    qpps = round(top * ticks(loop))
+    qpps = round(top_speed(design) * ticks(loop))
     # Share of QPPS per count per second, from volts per rad/s of the motor.
     scale = qpps / loop.supply_voltage / ticks(loop)
     wanted = present_error(design.feedback, T)
-    p, i = round(max(wanted.p, 0.0) * scale * UNIT), round(wanted.i * scale * UNIT)
-    feedback = Feedback((p + i * T) / UNIT / scale, i / UNIT / scale)
-    return Gains({"P": p, "I": i, "D": 0, "QPPS": qpps}, feedback, tracking=max(p / max(i, 1), T))
+    forward = loop.supply_voltage * ticks(loop) / qpps
+
+    def gains(share: float) -> Gains:
+        p = round(share * max(wanted.p, 0.0) * scale * UNIT)
+        i = round(share**2 * wanted.i * scale * UNIT)
+        feedback = Feedback((p + i * T) / UNIT / scale, i / UNIT / scale)
+        numbers = {"P": p, "I": i, "D": 0, "QPPS": qpps}
+        return Gains(numbers, feedback, velocity=forward, tracking=max(p / max(i, 1), T))
+
+    tried = map(gains, SHARES)
+    most = 100 * BAND
+    return next((one for one in tried if check(design, one).step.overshoot <= most), gains(0.0))
 
 
 def _render(designs: Mapping[str, Design], gains: Mapping[str, Gains]) -> str:
@@ -55,7 +77,7 @@ FORMAT = Format(
     _convert,
     _render,
     (
-        "feed-forward",
+        "feed-forward of dry friction",
         "the planned reference: use an acceleration with commands 38 to 40",
         "arithmetic and rate of the firmware, which are not published",
     ),

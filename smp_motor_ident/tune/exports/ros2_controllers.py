@@ -2,8 +2,11 @@
 
 References
 ----------
-control.ros.org/jazzy: ros2_controllers, pid_controller user documentation; control_toolbox, class
-Pid.  The integral is forward Euler and used one step later, as in the running loop of this package.
+control.ros.org/jazzy: ros2_controllers 4.42, pid_controller (src/pid_controller.yaml, src/
+pid_controller.cpp: the feed-forward is added after the clamp); control_toolbox of Jazzy,
+src/pid.cpp, ``compute_command``. The integral is forward Euler and used one step later, as in the
+running loop of this package; back-calculation adds ``T / tracking_time_constant`` of what the clamp
+took.
 """
 
 from __future__ import annotations

@@ -1,12 +1,18 @@
-"""ros_arduino_bridge: integers, ticks per interval at 30 Hz, one set for both wheels.
+"""ros_arduino_bridge: integers, ticks per interval of 33 ms, one set for both wheels.
 
 References
 ----------
-github.com/hbrobotics/ros_arduino_bridge, ROSArduinoBridge, diff_controller.h:
-``output += (Kp e - Kd (input - input_before) + ITerm) / Ko`` in whole numbers, at most 255.
+github.com/hbrobotics/ros_arduino_bridge (a960c8a), ros_arduino_firmware, ROSArduinoBridge:
+diff_controller.h, ``doPID``: ``output += (Kp e - Kd (input - input_before) + ITerm) / Ko`` in whole
+numbers, at most 255; ROSArduinoBridge.ino: ``PID_INTERVAL = 1000 / PID_RATE`` in whole
+milliseconds, 33 of ``PID_RATE`` 30, and set-points in whole ticks per interval. ros_arduino_python,
+base_controller.py: the node sends its own ``Kp``, ``Kd``, ``Ki``, ``Ko`` over those of the
+firmware.
 
-It is a velocity algorithm: what is called ``Kp`` integrates, ``Kd`` is proportional action on the
-measurement, ``Ki`` would integrate twice and stays 0.
+``Kd (input - input_before)`` is a product of 16 bits on an AVR: ``Kd`` stays so small that a wheel
+blocked at full speed does not overflow it. It is a velocity algorithm: what is called ``Kp``
+integrates, ``Kd`` is proportional action on the measurement, ``Ki`` would integrate twice and stays
+0.
 """
 
 from __future__ import annotations
@@ -15,10 +21,16 @@ from collections.abc import Mapping
 
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.tune.designer import Design
-from smp_motor_ident.tune.exports.target import Format, Gains, ticks
+from smp_motor_ident.tune.exports.target import (
+    Format,
+    Gains,
+    ticks,
+    top_speed,
+    whole_milliseconds,
+)
 from smp_motor_ident.tune.feedback import Feedback
 
-MAX_PWM, LARGEST = 255, 1000
+MAX_PWM, LARGEST, INT16 = 255, 1000, 32767
 
 
 def _convert(design: Design) -> Gains:
@@ -30,7 +42,8 @@ def _convert(design: Design) -> Gains:
     # ``Kp`` takes the present error: so much less is left to the proportional action.
     integral = design.feedback.i * T * scale
     proportional = max(design.feedback.p - design.feedback.i * T, 0.0) * scale
-    Ko = max(min(int(LARGEST / max(integral, proportional)), LARGEST), 1)
+    largest = min(LARGEST, INT16 / (top_speed(design) * ticks(loop) * T))
+    Ko = _divisor(integral, proportional, largest)
     Kp, Kd = max(round(integral * Ko), 1), round(proportional * Ko)
     kp, kd = Kp / Ko / scale, Kd / Ko / scale
     # On the measurement the present error's share is proportional action, too.
@@ -42,17 +55,43 @@ def _convert(design: Design) -> Gains:
     )
 
 
+def _divisor(integral: float, proportional: float, largest: float) -> int:
+    """Return the ``Ko`` at which two whole numbers come nearest to what they stand for."""
+    most = max(min(int(largest / max(integral, proportional)), LARGEST), 1)
+
+    def error(Ko: int) -> float:
+        one = abs(max(round(integral * Ko), 1) / (integral * Ko) - 1)
+        other = abs(round(proportional * Ko) / (proportional * Ko) - 1) if proportional else 0.0
+        return max(one, other)
+
+    return min(range(1, most + 1), key=error)
+
+
+def _pid_rate(milliseconds: int) -> int:
+    """Return the ``PID_RATE`` that the firmware divides into an interval."""
+    rate = 1000 // milliseconds
+    if 1000 // rate != milliseconds:
+        nearest = 1000 / (1000 // rate)
+        raise DesignError(
+            f"no PID_RATE gives an interval of {milliseconds} ms; --rate {nearest:.5g}"
+        )
+    return rate
+
+
 def _render(designs: Mapping[str, Design], gains: Mapping[str, Gains]) -> str:
     one, numbers = next(iter(designs.values())), next(iter(gains.values())).numbers
-    lines = [f"#define PID_RATE {round(one.loop.rate)}"]
-    return "\n".join([*lines, *(f"int {n} = {int(v)};" for n, v in numbers.items())]) + "\n"
+    milliseconds = whole_milliseconds(one.loop)
+    lines = [f"#define PID_RATE {_pid_rate(milliseconds)}  // {milliseconds} ms"]
+    lines += [f"int {n} = {int(v)};" for n, v in numbers.items()]
+    lines.append("// The ROS node sends its own over these; in arduino_params.yaml:")
+    return "\n".join([*lines, *(f"// {n}: {int(v)}" for n, v in numbers.items())]) + "\n"
 
 
 FORMAT = Format(
     "ros_arduino_bridge",
     "ros_arduino_bridge (PWM of ticks per interval, integers)",
     "github.com/hbrobotics/ros_arduino_bridge, diff_controller.h",
-    30.0,
+    1000 / 33,
     _convert,
     _render,
     (

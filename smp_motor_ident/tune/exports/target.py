@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from smp_motor_ident.errors import DesignError
 from smp_motor_ident.tune.designer import Design
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.loop import Loop
@@ -108,6 +109,9 @@ class Check:
 BAND = 0.02
 """Within which a change of set-point counts as settled."""
 
+MILLISECOND = 1e-3
+"""By which an interval in milliseconds may miss a whole number, as rates of six digits do."""
+
 
 def plant_of(design: Design, loop: Loop) -> Plant:
     """Return the sampled motor that a design is for."""
@@ -151,6 +155,22 @@ def present_error(feedback: Feedback, sample_time: float) -> Feedback:
     ``p e + I + i T e`` is ``(p + i T) e + I``: of the proportional gain so much is there.
     """
     return Feedback(feedback.p - feedback.i * sample_time, feedback.i)
+
+
+def top_speed(design: Design) -> float:
+    """Return the speed at the whole supply, friction taken off [rad/s, motor]."""
+    return design.motor["dc_gain"] * (design.loop.supply_voltage - design.motor["static_voltage"])
+
+
+def whole_milliseconds(loop: Loop) -> int:
+    """Return the interval of a target that counts milliseconds."""
+    milliseconds = 1e3 * loop.sample_time
+    if abs(milliseconds - round(milliseconds)) > MILLISECOND or milliseconds < 1:
+        raise DesignError(
+            f"the target's interval is a whole number of milliseconds, and {loop.rate:.5g} Hz is "
+            f"{milliseconds:.5g}; --rate {1e3 / max(round(milliseconds), 1):.6g}"
+        )
+    return round(milliseconds)
 
 
 def ticks(loop: Loop) -> float:

@@ -2,8 +2,10 @@
 
 References
 ----------
-docs.wpilib.org, Introduction to DC Motor Feedforward: ``V = kS sgn(v) + kV v + kA a``;
-PID Control in WPILib: ``kP`` in volts per unit of the error.
+docs.wpilib.org, Introduction to DC Motor Feedforward: ``V = kS sgn(v) + kV v + kA a``; PID Control
+in WPILib: ``kP`` in volts per unit of the error, every 20 ms; An Introduction to PID, Tuning a
+Flywheel Velocity Controller: feed-forward and kP, no integral.  wpimath,
+SimpleMotorFeedforward.hpp: of a constant set-point ``Calculate`` is ``kS sgn(v) + kV v``.
 """
 
 from __future__ import annotations

@@ -44,6 +44,7 @@ def test_a_sound_file_of_every_format_is_an_answer(tmp_path: Path, name: str) ->
 @pytest.mark.parametrize("name", list(FUZZ.SEEDS))
 @settings(
     max_examples=15,
+    derandomize=True,  # benchmarks/fuzz.py draws others
     deadline=10_000,  # ms: a hang
     phases=[Phase.generate],
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
@@ -54,6 +55,13 @@ def test_a_spoilt_file_gives_an_answer_or_one_line(tmp_path: Path, name: str, se
         FUZZ.SOUND.update({key: FUZZ.SEEDS[key][1]() for key in {name, "mcap", "sqlite"}})
     spoilt = FUZZ.spoil(FUZZ.SOUND[name], random.Random(seed))
     assert FUZZ.outcome(name, spoilt, tmp_path) in ("answer", "partial", "refused")
+
+
+def test_a_message_that_quotes_a_spoilt_value_keeps_head_and_tail() -> None:
+    long = BagError(f"a.yaml: left: {'- ' * 3000}is not SOURCE")
+    assert len(str(long)) < 1100
+    assert str(long).startswith("a.yaml: left: -") and str(long).endswith("- is not SOURCE")
+    assert str(BagError("a.yaml: " + 900 * "x")) == "a.yaml: " + 900 * "x"
 
 
 def bomb(kind: str, size: int) -> bytes:

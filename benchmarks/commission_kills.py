@@ -1,0 +1,167 @@
+"""``commission`` killed at random moments, in any of its processes: what is left of it?
+
+    python benchmarks/commission_kills.py                   # fifty kills, seed of the day
+    python benchmarks/commission_kills.py --kills 5 --seed 3
+
+Each time one of the tool's processes (the tool, ``excite``, ``record``) drawn at random is killed
+by SIGKILL.  What must hold: the motors get 0 V within 0.3 s of the last process that drove them,
+as their samples say; the controllers are active again within 5 s of the tool's end; no process of
+it is left but the guard, and that ends too; no wheel ever hears commands other than zero of two
+writers within 0.2 s.  Times are for a machine with a processor to spare: --slack gives more.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from lifecycle_msgs.srv import GetState
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "test")]
+WHEELS = ("front_left", "rear_left")
+QUIET = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "stdin": subprocess.DEVNULL}
+DURATION = 2.0
+"""Of each signal [s]; the tool starts its processes, excites three times and then computes."""
+
+
+def session(leader: int) -> dict[int, str]:
+    """Return the processes of a session by their command lines."""
+    asked = subprocess.run(
+        ["ps", "-s", str(leader), "-o", "pid=,stat=,args="], capture_output=True, text=True
+    )
+    rows = [line.split(None, 2) for line in asked.stdout.splitlines()]
+    return {int(row[0]): row[2] for row in rows if not row[1].startswith("Z")}
+
+
+class Campaign:
+    """Plant and controllers, and what is seen of them."""
+
+    def __init__(self, domain: int, slack: float) -> None:
+        from wheel_robot import WheelRobot
+
+        self.robot, self.slack = WheelRobot(domain), slack
+        self.robot.spin_for(2.0)
+        if self.robot.node.count_publishers("/front_left/motor_description"):
+            sys.exit(f"another robot runs in domain {domain}; choose another ROS_DOMAIN_ID")
+        self.processes = [subprocess.Popen(["motor_plant"], **QUIET)]  # type: ignore[call-overload]
+        for wheel in WHEELS:
+            command = ["wheel_pid", "--ros-args", "-r", f"__ns:=/{wheel}", "-p", "p:=2.0"]
+            self.processes.append(subprocess.Popen(command, **QUIET))  # type: ignore[call-overload]
+        self.clients = {
+            w: self.robot.node.create_client(GetState, f"/{w}/wheel_pid/get_state") for w in WHEELS
+        }
+        if not self.until(self.active, 120.0):
+            sys.exit("the controllers do not become active")
+
+    def close(self) -> None:
+        for process in self.processes:
+            process.kill()
+            process.wait(60.0)
+        self.robot.close()
+
+    def until(self, condition: Callable[[], object], within: float) -> bool:
+        end = time.monotonic() + within
+        while not condition():
+            if time.monotonic() > end:
+                return False
+            self.robot.spin()
+        return True
+
+    def active(self) -> bool:
+        """Ask both controllers for their state."""
+        futures = [c.call_async(GetState.Request()) for c in self.clients.values()]
+        if not self.until(lambda: all(f.done() for f in futures), 1.0):
+            return False
+        return all(f.result().current_state.label == "active" for f in futures)
+
+    def volts(self) -> float:
+        return max(abs(self.robot.states[w][-1].duty_cycle) for w in WHEELS if self.robot.states[w])
+
+    def two_writers(self) -> str:
+        """Return the writers that drove one wheel within 0.2 s, if there are two."""
+        for wheel in WHEELS:
+            last: tuple[str, float] = ("", -1.0)
+            for command in self.robot.commands[wheel]:
+                at = command.header.stamp.sec + 1e-9 * command.header.stamp.nanosec
+                writer = command.header.frame_id
+                if command.voltage != 0.0:
+                    if writer != last[0] and at - last[1] < 0.2:
+                        return f"{wheel}: {last[0]} and {writer}"
+                    last = writer, at
+            self.robot.commands[wheel].clear()
+        return ""
+
+    def kill(self, draw: random.Random) -> tuple[str, str]:
+        """Start the tool and kill a part of it; return which, and what did not hold."""
+        folder = Path(tempfile.mkdtemp(), "out")
+        given = [part for wheel in WHEELS for part in ("--wheel", wheel)]
+        tool = subprocess.Popen(
+            ["commission", "--output", str(folder), "--duration", str(DURATION), "--yes", *given],
+            start_new_session=True, **QUIET,
+        )  # type: ignore[call-overload]  # fmt: skip
+        part = draw.choice(["commission", "commission", "excite", "record"])
+        begun = lambda: any(part in args for args in session(tool.pid).values())  # noqa: E731
+        self.until(lambda: begun() or tool.poll() is not None, 120.0)
+        self.until(lambda: tool.poll() is not None, draw.uniform(0.0, 3.0 * DURATION + 6.0))
+        found = [pid for pid, args in session(tool.pid).items() if part in args]
+        for pid in found or [tool.pid]:
+            if tool.poll() is None or pid != tool.pid:
+                os.kill(pid, signal.SIGKILL)
+        moment = f"{part} killed {'at' if found else 'after'} its time"
+        return moment, self.judge(tool, bool(found) and part == "excite")
+
+    def judge(self, tool: Any, drives_no_more: bool) -> str:
+        at_rest = lambda: self.volts() == 0.0  # noqa: E731
+        if drives_no_more and not self.until(at_rest, 0.3 + self.slack):
+            return f"{12.0 * self.volts():.1f} V after 0.3 s"
+        if not self.until(lambda: tool.poll() is not None, 180.0):
+            return "the tool hangs"
+        if not self.until(at_rest, 0.3 + self.slack):
+            return f"{12.0 * self.volts():.1f} V 0.3 s after the tool's end"
+        if not self.until(self.active, 5.0 + self.slack):
+            return "controllers are not active 5 s after the tool's end"
+        if not self.until(lambda: not session(tool.pid), 5.0 + self.slack):
+            left = "; ".join(session(tool.pid).values())
+            os.killpg(tool.pid, signal.SIGKILL)
+            return f"left: {left}"
+        return self.two_writers()
+
+
+def main() -> int:
+    """Run the campaign; exit code 1 where something did not hold."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("--kills", type=int, default=50)
+    parser.add_argument("--seed", type=int, default=int(time.time()) // 86400)
+    parser.add_argument("--slack", type=float, default=0.5, help="more time [s]; default 0.5")
+    given = parser.parse_args()
+    domain = int(os.environ.setdefault("ROS_DOMAIN_ID", "97"))
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    draw, failures = random.Random(given.seed), 0
+    campaign = Campaign(domain, given.slack)
+    try:
+        for k in range(given.kills):
+            moment, wrong = campaign.kill(draw)
+            failures += bool(wrong)
+            load = os.getloadavg()[0]
+            print(f"{k + 1}: {moment}: {wrong or 'held'} (load {load:.1f})", flush=True)
+    finally:
+        campaign.close()
+    print(f"seed {given.seed}: {given.kills} kills, {failures} of them wrong")
+    return 1 if failures else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

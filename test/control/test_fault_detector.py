@@ -1,0 +1,259 @@
+"""Every limit of the fault detection to the sample; steps of 1/64 s, so that sums are exact."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import asdict, replace
+from itertools import chain, repeat
+
+import pytest
+
+from smp_motor_control.wheel.controller import WheelSettings
+from smp_motor_control.wheel.faults import Fault, FaultDetector, FaultLimits, Recovery
+
+DT = 1.0 / 64.0
+SLOW = 1.0 / 32.0
+LIMITS = FaultLimits(
+    current_limit=3.0, current_time=4 * DT, stall_voltage=4.0, stall_velocity=SLOW, stall_time=0.5,
+    runaway_time=0.25, tracking_tolerance=0.5, tracking_time=0.75,
+)  # fmt: skip
+WINDOW = 16  # samples in a third of the tracking time
+ABOVE = 1.0 + 2.0**-30
+
+
+def found(
+    samples: Iterable[tuple[float, float, float]], limits: FaultLimits = LIMITS, detector=None
+) -> tuple[int, Fault | None]:
+    """Return at which (V, rad/s, A) the detector speaks, from 1, and what it says."""
+    detector = detector or FaultDetector(limits)
+    for k, sample in enumerate(samples, 1):
+        fault = detector.step(DT, *sample)
+        if fault is not None:
+            return k, fault
+    return 0, None
+
+
+def test_limits_are_those_of_the_table_of_faults() -> None:
+    assert asdict(FaultLimits()) == {
+        "current_limit": 0.0, "current_time": 0.1, "stall_voltage": 4.0, "stall_velocity": 0.02,
+        "stall_time": 0.5, "runaway_time": 0.2, "tracking_tolerance": 0.5, "tracking_time": 0.45,
+    }  # fmt: skip
+    settings = WheelSettings()
+    assert (settings.setpoint_timeout, settings.feedback_timeout) == (0.5, 0.2)
+    assert (settings.fault_retry, settings.implausible_velocity) == (2.0, 1000.0)
+    assert Recovery().first_pause == 2.0
+
+
+@pytest.mark.parametrize("value", [-1e-9, math.inf, math.nan])
+def test_a_limit_that_is_no_limit_is_refused_and_zero_is_one(value: float) -> None:
+    for name in asdict(LIMITS):
+        with pytest.raises(ValueError, match=name):
+            replace(LIMITS, **{name: value})
+        replace(LIMITS, **{name: 0.0})
+
+
+def test_over_current_counts_above_its_limit_and_in_succession() -> None:
+    high, limit = (6.0, 1.0, -3.0 * ABOVE), (6.0, 1.0, 3.0)
+    assert found(repeat(high, 9)) == (4, Fault.OVER_CURRENT)
+    assert found(repeat(limit, 99)) == (0, None)
+    assert found([high, high, high, limit] * 9) == (0, None)
+    assert found(repeat(high, 99), replace(LIMITS, current_limit=0.0)) == (0, None)
+    assert found(repeat((6.0, 1.0, 0.6), 9), replace(LIMITS, current_limit=0.5))[0] == 4
+
+
+def test_stall_counts_at_its_voltage_below_its_speed_and_in_succession() -> None:
+    still, turns = (-4.0, 0.0, math.nan), (-4.0, -SLOW, math.nan)
+    assert found(repeat(still, 99)) == (32, Fault.NO_MOTION)
+    assert found(repeat(turns, 99)) == (0, None)
+    assert found(repeat((-4.0, -SLOW / ABOVE, math.nan), 99))[0] == 32
+    assert found(repeat((-4.0 / ABOVE, 0.0, math.nan), 99)) == (0, None)
+    assert found([*[still] * 31, turns] * 9) == (0, None)
+    assert found(repeat(still, 999), replace(LIMITS, stall_time=0.0)) == (0, None)
+
+
+def test_runaway_counts_from_half_of_the_stall_voltage_and_in_succession() -> None:
+    against = (2.0, -SLOW, 0.0)
+    assert found(repeat(against, 99)) == (16, Fault.RUNAWAY)
+    assert found(repeat((-2.0, SLOW, 0.0), 99)) == (16, Fault.RUNAWAY)
+    for no in [(2.0 / ABOVE, -1.0, 0.0), (2.0, -SLOW / ABOVE, 0.0), (2.0, 1.0, 0.0)]:
+        assert found(repeat(no, 99)) == (0, None)
+        assert found([*[against] * 15, no] * 9) == (0, None)
+    assert found(repeat(against, 999), replace(LIMITS, runaway_time=0.0)) == (0, None)
+    calm = replace(LIMITS, stall_velocity=0.0, stall_time=0.0)
+    assert found(repeat((6.0, 0.0, 0.0), 99), calm) == (0, None), "at rest it is not against"
+
+
+def test_a_wheel_that_slows_down_by_a_fifth_is_braked_and_no_runaway() -> None:
+    def braked(share: float) -> Iterable[tuple[float, float, float]]:
+        return ((6.0, -(share ** (k // 8)), 0.0) for k in range(64))
+
+    assert found(braked(0.75)) == (0, None)
+    # To 0.8 exactly within the time: not enough.  Then to 0.64: the time begins anew.
+    assert found(braked(0.8 * ABOVE))[0] == 16
+    once = chain(repeat((6.0, -1.0, 0.0), 10), repeat((6.0, -0.7, 0.0), 99))
+    assert found(once) == (10 + 16, Fault.RUNAWAY)
+
+
+@pytest.mark.parametrize(
+    ("current", "resistance", "fault"),
+    [
+        (6.8, 1.0, Fault.DEAD_ENCODER),  # 0.85 of 8 V, not above
+        (-6.8 * ABOVE, 1.0, Fault.STALL),
+        (math.nan, 1.0, Fault.NO_MOTION),
+        (6.9, math.nan, Fault.NO_MOTION),
+    ],
+)
+def test_the_current_tells_a_stall_from_a_dead_encoder(current, resistance, fault) -> None:
+    detector = FaultDetector(replace(LIMITS, current_limit=0.0), resistance)
+    assert found(repeat((-8.0, 0.0, current), 99), detector=detector) == (32, fault)
+
+
+@pytest.mark.parametrize("sample", [(6.0, 1.0, 9.0), (6.0, 0.0, 0.0), (6.0, -1.0, 0.0)])
+def test_a_reset_forgets_what_was_counted(sample: tuple[float, float, float]) -> None:
+    detector = FaultDetector(LIMITS)
+    first, fault = found(repeat(sample, 99), detector=FaultDetector(LIMITS))
+    assert found(repeat(sample, first - 1), detector=detector) == (0, None)
+    detector.reset()
+    assert found(repeat(sample, 99), detector=detector) == (first, fault)
+
+
+def followed(
+    *parts: tuple, limits: FaultLimits = LIMITS, kv: float = math.nan, static: float = 0.0
+):
+    """Return at which window the detector speaks, from 1; parts: reference, speed, V, saturated."""
+    detector = FaultDetector(limits)
+    detector.volts_per_speed, detector.static_voltage = kv, static
+    for k, part in enumerate(parts, 1):
+        for j in range(WINDOW):
+            reference, speed, voltage, saturated = (x(j) if callable(x) else x for x in part)
+            fault = detector.follow(DT, reference, speed, voltage, saturated)
+            if fault is not None:
+                assert j == WINDOW - 1, "at the end of a window"
+                return k, fault
+    return 0, None
+
+
+def test_an_error_beyond_half_and_a_little_is_a_fault_in_the_second_window() -> None:
+    slow, near = (2.0, 0.65, 6.0, False), (2.0, 0.75, 6.0, False)  # 1.3 is allowed
+    assert followed(slow, slow) == (2, Fault.NOT_FOLLOWING)
+    assert followed(near, near, near) == (0, None)
+    assert followed(slow, near, slow, near) == (0, None)
+    assert followed((-2.0, 0.2, 6.0, False), (-2.0, 0.2, 6.0, False)) == (2, Fault.WRONG_WAY)
+    assert followed((0.0, 1.0, 6.0, False), (0.0, 1.0, 6.0, False)) == (2, Fault.NOT_FOLLOWING)
+    tolerant = replace(LIMITS, tracking_tolerance=0.6)
+    assert followed(slow, slow, limits=tolerant) == (0, None)
+    assert followed(slow, slow, limits=replace(LIMITS, tracking_time=0.0)) == (0, None)
+
+
+def test_an_error_that_shrinks_by_a_twentieth_is_a_wheel_that_accelerates() -> None:
+    assert followed((2.0, 0.2, 6.0, False), (2.0, 0.28, 6.0, False))[0] == 2  # 1.8 to 1.72
+    assert followed((2.0, 0.2, 6.0, False), (2.0, 0.30, 6.0, False))[0] == 0  # 1.8 to 1.70
+
+
+def test_means_are_compared_and_not_samples() -> None:
+    swings = (2.0, lambda j: 1.9 + (-1) ** j, 6.0, False)
+    assert followed(*[swings] * 9) == (0, None)
+    swings = (2.0, lambda j: 0.6 + 9 * (-1) ** j, 6.0, False)
+    assert followed(*[swings] * 2) == (2, Fault.NOT_FOLLOWING)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_at_the_limit_of_the_voltage_only_what_it_is_good_for_is_asked(sign: float) -> None:
+    def at(speed: float) -> tuple:
+        return (sign * 10.0, sign * speed, sign * 12.0, True)
+
+    # By the model (12 - 0.5)/2 = 5.75, of which 2.875 + 0.3 may be missing.
+    assert followed(at(2.5), at(2.5), kv=2.0, static=0.5) == (2, Fault.NOT_FOLLOWING)
+    assert followed(at(2.65), at(2.65), kv=2.0, static=0.5) == (0, None)
+    # A voltage below that of friction is good for nothing.
+    weak = (sign * 10.0, 0.0, sign * 0.4, True)
+    assert followed(weak, weak, kv=2.0, static=0.5) == (0, None)
+    # Unknown: 0.7 of the set-point and 0.3 may be missing, 2.7 must be there.
+    assert followed(at(2.6), at(2.6)) == (2, Fault.NOT_FOLLOWING)
+    assert followed(at(2.8), at(2.8)) == (0, None)
+    # One sample within the limits: then all of the set-point is asked.
+    almost = (sign * 10.0, sign * 2.8, sign * 12.0, lambda j: j != 3)
+    assert followed(almost, almost) == (2, Fault.NOT_FOLLOWING)
+
+
+@pytest.mark.parametrize(
+    ("learning", "learns"),
+    [
+        ((2.0, 1.9, 6.0), True),  # 12 V are good for 3.8
+        ((-2.0, -1.9, -6.0), True),
+        ((0.4, 0.4, 0.4 * 12.0 / 3.8), True),
+        ((2.0, 1.75, 1.75 * 12.0 / 3.8), False),  # off by more than a tenth
+        ((0.28, 0.28, 0.28 * 12.0 / 3.8), False),  # too slow
+    ],
+)
+def test_volts_per_speed_are_learnt_while_the_wheel_follows(learning, learns) -> None:
+    # At 2.0: enough of 3.8, too little of 10.
+    at = (10.0, 2.0, 12.0, True)
+    assert followed((*learning, False), at, at)[0] == (0 if learns else 3)
+    # Of what is learnt, 1.9 + 0.3 may be missing.
+    if learns:
+        slow = (10.0, 1.55, 12.0, True)
+        assert followed((*learning, False), slow, slow)[0] == 3
+
+
+def test_a_wheel_that_stands_still_is_named_by_the_stall_and_not_twice() -> None:
+    for limits, named in ((LIMITS, None), (replace(LIMITS, stall_time=0.0), Fault.NOT_FOLLOWING)):
+        detector, fault = FaultDetector(limits), None
+        for _ in range(31):
+            assert detector.step(DT, 6.0, 0.0, math.nan) is None
+            fault = fault or detector.follow(DT, 2.0, 0.0, 6.0, False)
+        fault = fault or detector.follow(DT, 2.0, 0.0, 6.0, False)
+        assert fault is named
+
+
+def test_a_pause_ends_after_its_time_and_doubles() -> None:
+    recovery, now = Recovery(first_pause=1.0), 100.0
+    for pause in (1.0, 2.0, 4.0):
+        recovery.set(Fault.RUNAWAY, now)
+        assert not recovery.latched and recovery.cautious
+        assert not recovery.may_release(1.0, now + pause)
+        assert recovery.fault is Fault.RUNAWAY
+        assert recovery.may_release(1.0, now + pause + DT)
+        assert recovery.fault is None and not recovery.latched
+        now += 50.0
+    recovery.set(Fault.STALL, now)
+    assert recovery.latched and recovery.failures == 4
+    assert not recovery.may_release(0.0, now + 1e9, turns=True)
+    recovery.reset()
+    assert (recovery.fault, recovery.cautious, recovery.failures) == (None, False, 0)
+
+
+def test_a_set_point_of_zero_and_counts_release_a_wheel_before_its_pause() -> None:
+    for fault in Fault:
+        cases = [(0.0, 0.5, False), (0.0, 0.5 + DT, False), (0.1, 9.0, False), (0.1, 0.0, True)]
+        for setpoint, waited, turns in cases:
+            recovery = Recovery(first_pause=0.0)
+            recovery.set(fault, 100.0)
+            rested = setpoint == 0.0 and waited > 0.5
+            silent = fault.value.startswith("no counts")
+            released = recovery.may_release(setpoint, 100.0 + waited, turns)
+            assert released is (rested or (turns and silent))
+
+
+def test_a_try_is_trusted_after_its_time_and_proven_after_two_seconds() -> None:
+    recovery, most = Recovery(), 1.05 * 4.0
+    recovery.set(Fault.RUNAWAY, 0.0)
+    turn = lambda volts, speed: recovery.limited(volts, speed, 0.125, LIMITS)  # noqa: E731
+    assert turn(12.0, SLOW) == most and turn(-12.0, -SLOW) == -most and turn(3.0, 1.0) == 3.0
+    # 0.6 s are five samples of 0.125 s; one of standing still begins them anew.
+    assert [turn(12.0, 1.0) for _ in range(3)] == [most] * 3
+    assert turn(12.0, 0.0) == most
+    assert [turn(12.0, 1.0) for _ in range(5)] == [most] * 4 + [12.0]
+    assert turn(12.0, -1.0) == 12.0, "braking is no sign of a fault once it is trusted"
+    assert [turn(12.0, 1.0) for _ in range(10)] == [12.0] * 10 and recovery.failures == 1
+    assert turn(-12.0, -1.0) == -12.0
+    assert (recovery.failures, recovery.cautious) == (0, False)
+    recovery.set(Fault.RUNAWAY, 0.0)
+    assert turn(12.0, 1.0) == most, "what was good before the fault counts no more"
+    again = Recovery()
+    again.set(Fault.RUNAWAY, 0.0)
+    for _ in range(4):
+        again.limited(12.0, 1.0, 0.125, LIMITS)
+    again.set(Fault.RUNAWAY, 0.0)
+    assert again.limited(12.0, 1.0, 0.125, LIMITS) == most

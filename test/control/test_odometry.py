@@ -1,0 +1,213 @@
+"""Odometry step by step against the arc and the covariance written down once more."""
+
+from __future__ import annotations
+
+import math
+import random
+
+import numpy as np
+import pytest
+
+from smp_motor_control.body.odometry import Odometry
+
+B, LEFT, RIGHT = 0.5, 0.1, 0.125  # m
+TRAVEL, TURN = 3e-4, 2e-2
+ROUNDING = 1e-9
+
+
+def make(**more: float) -> Odometry:
+    return Odometry(B, LEFT, RIGHT, travel_noise=TRAVEL, turn_noise=TURN, **more)
+
+
+def arc(pose: np.ndarray, left: float, right: float) -> np.ndarray:
+    """The pose after an arc, its chord by the sine of half of the turn."""
+    turn, travel = (right - left) / B, (left + right) / 2.0
+    chord = travel * (math.sin(turn / 2.0) / (turn / 2.0) if turn else 1.0)
+    x, y, heading = pose
+    middle = heading + turn / 2.0
+    return np.array([x + chord * math.cos(middle), y + chord * math.sin(middle), heading + turn])
+
+
+def spread(p: np.ndarray, heading: float, left: float, right: float) -> np.ndarray:
+    """``F P F' + G Q G'`` by matrices: Q of both sides' travel, and of the skid in a turn."""
+    turn, travel = (right - left) / B, (left + right) / 2.0
+    cos, sin = math.cos(heading + turn / 2.0), math.sin(heading + turn / 2.0)
+    f = np.array([[1, 0, -travel * sin], [0, 1, travel * cos], [0, 0, 1]])
+    to_body = np.array([[0.5, 0.5], [-1 / B, 1 / B]])  # sides to (travel, turn)
+    q = to_body @ np.diag([TRAVEL * abs(left), TRAVEL * abs(right)]) @ to_body.T
+    q[1, 1] += TURN * abs(turn)
+    g = np.array([[cos, -travel * sin / 2], [sin, travel * cos / 2], [0, 1]])
+    return f @ p @ f.T + g @ q @ g.T
+
+
+def state(odometry: Odometry) -> np.ndarray:
+    return np.array([odometry.x, odometry.y, odometry.heading])
+
+
+def matrix(odometry: Odometry) -> np.ndarray:
+    p = odometry.covariance
+    return np.array([[p.xx, p.xy, p.xh], [p.xy, p.yy, p.yh], [p.xh, p.yh, p.hh]])
+
+
+@pytest.mark.parametrize("way", ["velocity", "position", "travel", "open loop"])
+def test_pose_and_covariance_follow_arcs_forth_and_back(way: str) -> None:
+    draw, odometry = random.Random(way), make()
+    pose, p = np.zeros(3), np.zeros((3, 3))
+    angles = [4.0, -7.0]
+    odometry.update_from_position(*angles, 0.1)
+    for _ in range(200):
+        dt, turned = draw.uniform(0.005, 0.1), [draw.uniform(-2.0, 2.0) for _ in range(2)]
+        if draw.random() < 0.2:
+            turned[1] = turned[0] * LEFT / RIGHT  # straight ahead
+        left, right = turned[0] * LEFT, turned[1] * RIGHT
+        if way == "velocity":
+            took = odometry.update_from_velocity(turned[0] / dt, turned[1] / dt, dt)
+        elif way == "position":
+            angles = [a + t for a, t in zip(angles, turned)]
+            took = odometry.update_from_position(*angles, dt)
+        elif way == "travel":
+            took = odometry.update_from_travel(*turned, 0.0, 0.0)
+        else:
+            took = odometry.update_open_loop((left + right) / 2 / dt, (right - left) / B / dt, dt)
+        assert took is True
+        p = spread(p, pose[2], left, right)
+        pose = arc(pose, left, right)
+        assert state(odometry) == pytest.approx(pose, rel=ROUNDING, abs=ROUNDING)
+        assert matrix(odometry) == pytest.approx(p, rel=ROUNDING, abs=1e-12)
+
+
+@pytest.mark.parametrize("turn", [0.0, 1e-9, 0.9e-6, 1.1e-6, 1e-5, -1e-5, 3.0])
+def test_a_turn_however_small_keeps_the_arc(turn: float) -> None:
+    odometry = make()
+    left, right = 1.0 - turn * B / 2, 1.0 + turn * B / 2
+    odometry.set_odometry(1.0, 2.0, 0.7)
+    odometry.update_from_travel(left / LEFT, right / RIGHT, 0.0, 0.0)
+    # Two sines of almost the same angle differ by their rounding over the turn: 1e-16 / 1e-6.
+    wanted = arc(np.array([1.0, 2.0, 0.7]), left, right)
+    assert state(odometry) == pytest.approx(wanted, abs=1e-9)
+
+
+def test_velocity_is_the_mean_over_its_window_and_its_variance_that_of_the_travel() -> None:
+    odometry, speeds = make(window=4), []
+    draw = random.Random(2)
+    for _ in range(10):
+        left, right = draw.uniform(-9.0, 9.0), draw.uniform(-9.0, 9.0)
+        speeds.append((left * LEFT, right * RIGHT))
+        odometry.update_from_velocity(left, right, 0.02)
+        left, right = np.mean(speeds[-4:], axis=0)
+        assert odometry.linear == pytest.approx((left + right) / 2.0)
+        assert odometry.angular == pytest.approx((right - left) / B)
+        # A side's mean speed over a span: its travel's variance over the span squared.
+        span = 0.08
+        of_sides = TRAVEL * (abs(left) + abs(right)) / span
+        linear, angular = odometry.twist_variances(span)
+        assert linear == pytest.approx(of_sides / 4.0)
+        assert angular == pytest.approx(of_sides / B**2 + TURN * abs(odometry.angular) / span)
+
+
+def test_speeds_and_commands_are_reported_as_they_are_given() -> None:
+    odometry = make()
+    odometry.update_from_travel(1.0, 1.0, 3.0, -2.0)
+    assert odometry.linear == pytest.approx((3.0 * LEFT - 2.0 * RIGHT) / 2.0)
+    assert odometry.angular == pytest.approx((-2.0 * RIGHT - 3.0 * LEFT) / B)
+    odometry.update_open_loop(0.25, -0.5, 0.1)
+    assert (odometry.linear, odometry.angular) == (0.25, -0.5)
+
+
+def test_a_pose_that_is_set_is_without_doubt_and_a_reset_forgets_all() -> None:
+    odometry = make()
+    odometry.update_from_position(0.0, 0.0, 0.1)
+    odometry.update_from_position(1.0, 2.0, 0.1)
+    odometry.set_odometry(3.0, -2.0, 7.0)
+    assert state(odometry).tolist() == [3.0, -2.0, 7.0] and not matrix(odometry).any()
+    odometry.update_from_position(2.0, 3.0, 0.1)
+    odometry.reset()
+    assert not state(odometry).any() and not matrix(odometry).any()
+    assert (odometry.linear, odometry.angular) == (0.0, 0.0)
+    assert not odometry.update_from_position(50.0, 50.0, 0.1), "the first position is no motion"
+    assert not state(odometry).any()
+    odometry.update_from_velocity(10.0, 8.0, 0.1)
+    assert odometry.linear == pytest.approx(1.0), "no speed of before the reset is in the mean"
+    odometry.forget_positions()
+    assert not odometry.update_from_position(90.0, 90.0, 0.1)
+
+
+BAD = [math.nan, math.inf, -math.inf]
+
+
+@pytest.mark.parametrize("bad", BAD)
+def test_what_is_not_finite_changes_nothing(bad: float) -> None:
+    odometry = make()
+    odometry.update_from_position(0.0, 0.0, 0.1)
+    odometry.update_from_velocity(1.0, 2.0, 0.1)
+    before, known = state(odometry).tolist(), (odometry.linear, odometry.angular)
+    velocity, position = odometry.update_from_velocity, odometry.update_from_position
+    command, travel = odometry.update_open_loop, odometry.update_from_travel
+    for update in (velocity, position, command):
+        for given in ((bad, 0.0, 0.1), (0.0, bad, 0.1), (0.0, 0.0, bad), (0.0, 0.0, 0.9e-6)):
+            assert update(*given) is False
+    assert velocity(1e308, 1e308, 1e9) is False and velocity(-1e308, 1e308, 1e9) is False
+    for j in range(4):
+        assert travel(*(bad if k == j else 0.0 for k in range(4))) is False
+    assert state(odometry).tolist() == before
+    assert (odometry.linear, odometry.angular) == known
+    assert odometry.update_from_velocity(1.0, 1.0, 1e-6) is True, "a microsecond is the least"
+    assert odometry.update_open_loop(1.0, 1.0, 1e-6) is True
+    assert odometry.update_from_position(1e-9, 1e-9, 1e-6) is True
+
+
+@pytest.mark.parametrize("side", [0, 1])
+def test_positions_of_a_wheel_that_would_be_too_fast_are_no_motion(side: int) -> None:
+    odometry = make(max_wheel_speed=8.0)
+    at = lambda angle: tuple(angle if k == side else 0.0 for k in range(2))  # noqa: E731
+    odometry.update_from_position(*at(0.0), 0.125)
+    assert odometry.update_from_position(*at(1.0), 0.125) is True, "at its limit"
+    assert odometry.update_from_position(*at(2.0 + 2.0**-20), 0.125) is False
+    assert odometry.update_from_position(*at(1.0), 0.125) is False
+    assert odometry.update_from_position(*at(1.5), 0.125) is True
+    radius = (LEFT, RIGHT)[side]
+    assert odometry.heading == pytest.approx((1.0 + 0.5) * radius / B * (1 if side else -1))
+
+
+@pytest.mark.parametrize("name", ["wheel_separation", "left_radius", "right_radius"])
+@pytest.mark.parametrize("value", [0.0, -0.1, math.nan, math.inf])
+def test_a_length_that_is_none_is_refused_by_name(name: str, value: float) -> None:
+    lengths = {"wheel_separation": B, "left_radius": LEFT, "right_radius": RIGHT, name: value}
+    with pytest.raises(ValueError, match=f"{name} is"):
+        Odometry(**lengths)
+
+
+@pytest.mark.parametrize("name", ["travel_noise", "turn_noise"])
+def test_a_noise_may_be_zero_but_no_less(name: str) -> None:
+    Odometry(B, LEFT, RIGHT, **{name: 0.0})
+    for value in (-1e-9, math.nan, math.inf):
+        with pytest.raises(ValueError, match=f"{name} is"):
+            Odometry(B, LEFT, RIGHT, **{name: value})
+
+
+def test_a_window_and_a_speed_that_leave_nothing_are_refused() -> None:
+    with pytest.raises(ValueError, match="window is 0"):
+        make(window=0)
+    for value in (0.0, math.nan):
+        with pytest.raises(ValueError, match="max_wheel_speed is"):
+            make(max_wheel_speed=value)
+    make(window=1, max_wheel_speed=1e-3)
+    plain = Odometry(B, LEFT, RIGHT)
+    for k in range(12):  # ten steps are the mean, 1e-4 and 1e-2 the noise, by default
+        plain.update_from_velocity(10.0 * k, 8.0 * k, 0.1)
+    assert plain.linear == pytest.approx(np.mean(range(2, 12)))
+    plain.update_from_travel(0.0, 0.0, 10.0, 0.0)
+    of_sides = 1e-4 * 1.0
+    assert plain.twist_variances(1.0) == pytest.approx((of_sides / 4, of_sides / B**2 + 1e-2 * 2.0))
+
+
+def test_a_new_geometry_counts_from_the_next_step_on() -> None:
+    odometry = make()
+    odometry.update_from_travel(1.0, 0.8, 0.0, 0.0)
+    odometry.configure(1.0, 0.2, 0.3, 0.0, 0.0)
+    before = matrix(odometry)
+    odometry.update_from_travel(1.0, 2.0 / 3.0, 0.0, 0.0)
+    assert odometry.x == pytest.approx(0.1 + 0.2)
+    # Noise of zero: what is known is only carried along.
+    carried = np.array([[1, 0, 0], [0, 1, 0.2], [0, 0, 1]])
+    assert matrix(odometry) == pytest.approx(carried @ before @ carried.T, abs=1e-15)

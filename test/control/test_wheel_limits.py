@@ -1,0 +1,276 @@
+"""The limits of a wheel's controller to the sample; steps of 1/64 s, so that times are exact."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import pytest
+
+from smp_motor_control.encoder import Encoder
+from smp_motor_control.motor.parameters import Gearbox
+from smp_motor_control.pid import PidGains
+from smp_motor_control.wheel.controller import State, WheelController, WheelSettings
+from smp_motor_control.wheel.faults import Fault, FaultLimits
+from smp_motor_control.wheel.loop import LoopSettings
+
+DT = 1.0 / 64.0
+EPOCH = 1_700_000_000 * 10**9
+NO_FAULTS = FaultLimits(stall_time=0.0, runaway_time=0.0, tracking_time=0.0)
+GAINS = PidGains(p=2.0, u_clamp_min=-12.0, u_clamp_max=12.0)
+SETTINGS = WheelSettings(
+    loop=LoopSettings(gains=GAINS), faults=NO_FAULTS, setpoint_timeout=0.5, feedback_timeout=0.25,
+    fault_retry=1.0, implausible_velocity=100.0,
+)  # fmt: skip
+
+
+@dataclass
+class Sample:
+    voltage: float = 0.0
+    current: float = math.nan
+    velocity: float = 0.0
+    encoder_count: int = 0
+
+
+class Feed:
+    """Passes samples to a controller, 64 a second; the voltage is left to the test."""
+
+    def __init__(self, settings: WheelSettings = SETTINGS, active: bool = True) -> None:
+        self.wheel, self.now = WheelController(settings), 100.0
+        if active:
+            self.wheel.activate(self.now)
+        self.give()
+
+    def give(self, velocity: float = 0.0, dt: float = DT, age: float = 0.0, **more: float):
+        self.now += dt
+        arrival = EPOCH + round(self.now * 1e9)
+        sample = Sample(velocity=velocity, **more)
+        stamp = arrival - round(age * 1e9)
+        return self.wheel.take_feedback(sample, stamp, arrival, self.now)
+
+    def ask(self, value: float, age: float = 0.0) -> None:
+        self.wheel.take_setpoint(value, self.now, age)
+
+
+def test_a_set_point_as_old_as_its_time_out_counts_and_an_older_one_does_not() -> None:
+    for age, counts in ((0.5, True), (0.5 + 2.0**-20, False), (-9.0, True)):
+        feed = Feed()
+        feed.ask(1.0, age)
+        assert feed.give() == (2.0 if counts else 0.0)
+        assert feed.wheel.state is (State.DRIVING if counts else State.WAITING)
+        assert sum(feed.wheel.refused.values()) == (not counts)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_set_point_up_to_its_limit_counts(sign: float) -> None:
+    feed = Feed()
+    feed.ask(sign * 1.0001e4)
+    assert feed.give() == 0.0
+    feed.ask(sign * 1e4)
+    assert feed.give() == sign * 12.0
+
+
+def test_a_set_point_holds_for_its_time_out_and_then_the_wheel_is_braked() -> None:
+    feed = Feed()
+    feed.ask(1.0)
+    for k in range(1, 33):  # half a second
+        assert feed.give(1.5) == -1.0, k
+        assert feed.wheel.state is State.DRIVING
+    assert feed.give(1.5) == -3.0
+    assert feed.wheel.state is State.TIMED_OUT
+
+
+@pytest.mark.parametrize(("transition", "longest"), [(0.0, 1.0), (0.25, 1.5)])
+def test_a_wheel_that_cannot_be_braked_gets_nothing_after_a_second(transition, longest) -> None:
+    loop = LoopSettings(gains=GAINS, transition_time=transition)
+    feed = Feed(replace(SETTINGS, loop=loop))
+    feed.ask(1.0)
+    asked = feed.now
+    while (voltage := feed.give(1.5)) != 0.0 or feed.now <= asked + 0.5:
+        pass
+    assert feed.now - asked == 0.5 + longest + DT
+    assert feed.wheel.state is State.TIMED_OUT and voltage == 0.0
+    assert feed.give(1.5) == 0.0 and feed.wheel.setpoint is None
+
+
+@pytest.mark.parametrize(("speed", "at_rest"), [(0.049, True), (-0.049, True), (0.05, False)])
+def test_a_wheel_at_rest_needs_no_brake(speed: float, at_rest: bool) -> None:
+    feed = Feed()
+    feed.ask(0.0)
+    while feed.wheel.state is not State.TIMED_OUT:
+        voltage = feed.give(speed)
+    assert (voltage == 0.0) is at_rest
+
+
+def test_a_wheel_that_is_braked_along_its_profile_is_not_let_go_before_its_end() -> None:
+    gains = replace(GAINS, p=1.0, feedforward_velocity=1.0)
+    feed = Feed(replace(SETTINGS, loop=LoopSettings(gains=gains, transition_time=0.5)))
+    feed.ask(1.0)
+    for _ in range(32):
+        feed.give(0.0)
+    # The sensor says standstill, the reference is still on its way to zero.
+    assert feed.give(0.0) > 0.5
+
+
+def test_silence_as_long_as_its_time_out_is_none_and_its_kind_is_named() -> None:
+    feed = Feed()
+    feed.ask(1.0)
+    feed.give()
+    assert feed.wheel.tick(feed.now + 0.25) is None
+    assert feed.wheel.tick(feed.now + 0.25 + DT) == 0.0
+    assert feed.wheel.state is State.NO_FEEDBACK
+    for put, state in (
+        ({"age": 0.5}, State.LATE_FEEDBACK),
+        ({"velocity": math.nan}, State.BAD_FEEDBACK),
+    ):
+        feed = Feed()
+        feed.ask(1.0)
+        feed.give()
+        feed.now += 0.5  # so that the stamps of what is late go on
+        for _ in range(20):
+            feed.give(**put)
+            tick = feed.wheel.tick(feed.now)
+        assert (tick, feed.wheel.state) == (0.0, state)
+        # When that has ceased as well there is nothing at all.
+        assert feed.wheel.tick(feed.now + 0.25) == 0.0 and feed.wheel.state is state
+        assert feed.wheel.tick(feed.now + 0.25 + DT) == 0.0
+        assert feed.wheel.state is State.NO_FEEDBACK
+
+
+def test_after_silence_the_loop_starts_anew_from_the_speed_that_is() -> None:
+    loop = LoopSettings(gains=replace(GAINS, i=64.0), transition_time=1.0)
+    for gap in ("silence", "late", "owner"):
+        feed = Feed(replace(SETTINGS, loop=loop))
+        feed.ask(1.0)
+        for _ in range(16):
+            feed.ask(1.0)
+            feed.give(0.0)
+        assert feed.wheel.loop.pid.i_term > 0.5
+        if gap == "silence":
+            feed.now += 1.0
+            assert feed.wheel.tick(feed.now) == 0.0
+            assert feed.give(0.75) == 0.0, "the first sample after a gap has no interval"
+        elif gap == "late":
+            assert feed.give(0.75, dt=0.5 + DT, age=0.5) == 0.0
+            feed.give(0.75)
+        else:
+            feed.wheel.owner = "/excite#1"
+            assert feed.give(0.75) == 0.0 and feed.wheel.state is State.NOT_OURS
+            feed.wheel.owner = ""
+        feed.ask(1.0)
+        feed.give(0.75)
+        assert feed.wheel.loop.reference.velocity == pytest.approx(0.75, abs=0.01), gap
+        assert abs(feed.wheel.loop.pid.i_term) < 0.1
+
+
+def test_speeds_up_to_the_implausible_count_in_both_directions() -> None:
+    for sign in (1.0, -1.0):
+        feed = Feed()
+        feed.ask(0.0)
+        assert feed.give(sign * 100.0) == -sign * 12.0
+        assert feed.give(sign * 100.01) is None
+        assert feed.wheel.refused == {"feedback velocity that is not a number or implausible": 1}
+
+
+def test_a_count_that_jumps_is_left_out_and_the_speed_begins_anew() -> None:
+    loop = LoopSettings(gains=GAINS, speed_source="difference", difference_window=1)
+    feed = Feed(replace(SETTINGS, loop=loop))
+    feed.wheel.set_hardware(Gearbox(1.0), Encoder(64.0), 12.0)
+    feed.ask(0.0)
+    per_count = 2.0 * math.pi  # rad/s of one count a sample
+    feed.give(encoder_count=0)
+    assert feed.give(encoder_count=1) == pytest.approx(-12.0)
+    assert feed.give(encoder_count=1 + int(101 / per_count) + 1) is None
+    assert feed.wheel.refused == {"feedback count that jumps": 1}
+    assert feed.give(encoder_count=5000) is None, "the first of a new window has no speed"
+    assert feed.give(encoder_count=5000) == 0.0
+
+
+def test_the_voltage_that_is_no_number_is_taken_to_be_the_one_that_was_asked_for() -> None:
+    feed = Feed()
+    seen: list[float] = []
+    feed.wheel.loop.speed = lambda dt, velocity, count, voltage: seen.append(voltage) or velocity
+    feed.ask(1.0)
+    feed.give(0.0, voltage=7.0)
+    for voltage in (math.nan, math.inf, -3.0):
+        feed.give(0.5, voltage=voltage)
+    assert seen == [7.0, 2.0, 1.0, -3.0]
+
+
+def test_of_a_gap_between_samples_no_more_than_a_tenth_of_a_second_is_evidence() -> None:
+    limits = replace(NO_FAULTS, stall_time=0.5, stall_voltage=4.0)
+    feed, found = Feed(replace(SETTINGS, faults=limits)), []
+    for _ in range(12):
+        feed.ask(6.0)
+        feed.give(0.0, dt=0.1875)
+        found.append(feed.wheel.recovery.fault)
+    # The first answer has nothing to judge; five tenths of a second of the samples after it.
+    assert found.index(Fault.NO_MOTION) == 5
+
+
+def test_the_stall_voltage_is_the_one_that_is_set() -> None:
+    gains = replace(GAINS, p=1.0, u_clamp_min=-3.0, u_clamp_max=3.0)
+    for stall_voltage, named in ((2.0, Fault.NO_MOTION), (4.0, None)):
+        limits = replace(NO_FAULTS, stall_time=0.25, stall_voltage=stall_voltage)
+        feed = Feed(replace(SETTINGS, loop=LoopSettings(gains=gains), faults=limits))
+        for _ in range(32):
+            feed.ask(5.0)
+            feed.give(0.0)
+        assert feed.wheel.recovery.fault is named
+    changed = Feed(SETTINGS)
+    changed.wheel.configure(replace(SETTINGS, faults=replace(limits, stall_voltage=2.0)))
+    for _ in range(32):
+        changed.ask(5.0)
+        changed.give(0.0)
+    assert changed.wheel.recovery.fault is Fault.NO_MOTION
+
+
+def test_an_inactive_wheel_answers_nothing_and_a_reset_forgets_its_set_point() -> None:
+    feed = Feed(active=False)
+    feed.ask(1.0)
+    assert feed.give() is None and feed.wheel.tick(feed.now + 9.0) is None
+    assert feed.wheel.state is State.INACTIVE and feed.wheel.output == 0.0
+    feed.wheel.activate(feed.now)
+    assert feed.wheel.state is State.WAITING and feed.wheel.tick(feed.now + 0.25) is None
+    feed.ask(1.0)
+    feed.give()
+    feed.give()
+    assert feed.wheel.output == 2.0 and feed.wheel.steps == 1
+    feed.wheel.reset(feed.now)
+    assert feed.wheel.output == 0.0 and feed.wheel.answer is None and feed.wheel.setpoint is None
+    feed.give()
+    assert feed.give() == 0.0
+    feed.ask(1.0)
+    feed.give()
+    feed.wheel.deactivate()
+    assert (feed.wheel.output, feed.wheel.answer, feed.wheel.active) == (0.0, None, False)
+
+
+def test_what_an_answer_was_made_of_is_told() -> None:
+    feed = Feed()
+    feed.ask(1.0)
+    assert feed.give(0.25) == 1.5
+    wheel = feed.wheel
+    assert (wheel.target, wheel.measurement, wheel.output, wheel.steps) == (1.0, 0.25, 1.5, 1)
+    assert wheel.answer is not None and wheel.answer.p_term == 1.5
+    feed.give(0.25, dt=0.0)  # a duplicate has no answer
+    assert wheel.answer is None
+
+
+@pytest.mark.parametrize("supply", [0.0, -12.0, math.nan, math.inf])
+def test_a_supply_that_is_none_is_refused_and_the_old_one_stays(supply: float) -> None:
+    feed = Feed()
+    feed.wheel.set_hardware(Gearbox(1.0), Encoder(), 5.0)
+    with pytest.raises(ValueError, match="supply_voltage"):
+        feed.wheel.set_hardware(Gearbox(1.0), Encoder(), supply)
+    feed.ask(9.0)
+    feed.give()
+    assert feed.give() == 5.0
+    for low, high in ((6.0, 8.0), (-8.0, -6.0)):
+        gains = replace(GAINS, u_clamp_min=low, u_clamp_max=high)
+        with pytest.raises(ValueError, match="clamp"):
+            LoopSettings(gains=gains).within(5.0)
+    within = LoopSettings(gains=GAINS).within(5.0).gains
+    assert (within.u_clamp_min, within.u_clamp_max) == (-5.0, 5.0)
+    within = LoopSettings(gains=GAINS).within(50.0).gains
+    assert (within.u_clamp_min, within.u_clamp_max) == (-12.0, 12.0)

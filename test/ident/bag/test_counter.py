@@ -1,0 +1,190 @@
+"""Counters that wrap, of every width, and counters that start again: by the test's own counting."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from smp_motor_ident.bag.counter import unwrap, unwrap_angle
+
+
+def turning(samples: int = 400, most: int = 90, seed: int = 3) -> np.ndarray:
+    """Whole counts of a motor that goes both ways, by at most so many from sample to sample."""
+    steps = np.random.default_rng(seed).integers(-most // 3, most + 1, samples)
+    return np.cumsum(steps).astype(np.int64)
+
+
+def shown(count: np.ndarray, bits: int) -> np.ndarray:
+    """What a two's complement counter of that width shows: -2^(bits-1) to 2^(bits-1) - 1."""
+    half = 2 ** (bits - 1)
+    return (count + half) % 2**bits - half
+
+
+@pytest.mark.parametrize("bits", [8, 10, 16, 31])
+@pytest.mark.parametrize("signed", [True, False])
+def test_a_known_width_is_undone_to_the_count(bits: int, signed: bool) -> None:
+    most = min(2 ** (bits - 1) - 1, 10**6)
+    true = turning(most=most, seed=bits)
+    raw = shown(true, bits) if signed else true % 2**bits
+    found = unwrap(raw, bits)
+    assert np.array_equal(found.count - raw[0], true - true[0])
+    assert found.resets.size == 0 and found.findings == []
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+def test_the_longest_step_of_a_width_is_half_of_its_range_and_counts_backwards(bits: int) -> None:
+    half = 2 ** (bits - 1)
+    for step, expected in ((half - 1, half - 1), (-half, -half), (half, -half)):
+        raw = shown(np.array([0, 0, step, step]), bits)
+        assert unwrap(raw, bits).count.tolist() == [0, 0, expected, expected]
+
+
+@pytest.mark.parametrize("bits", [8, 10, 11, 12, 13, 14, 15, 16, 17, 18, 20, 24, 32])
+def test_an_unknown_width_is_seen_from_the_jumps_and_told(bits: int) -> None:
+    most = 6 if bits < 10 else 15  # so that a wrap is far beyond ten usual steps and 100
+    true = turning(samples=4000, most=most, seed=bits)
+    true += 2 ** (bits - 1) - true[2000]  # it wraps in the middle
+    raw = shown(true, bits)
+    assert np.abs(np.diff(raw)).max() > 2 ** (bits - 1) - most
+    found = unwrap(raw, None)
+    assert np.array_equal(found.count - raw[0], true - true[0])
+    (finding,) = found.findings
+    assert (finding.code, finding.evidence) == ("counter_wraps", {"bits": bits})
+
+
+def test_a_width_of_zero_and_a_counter_that_never_jumps_stay_as_they_are() -> None:
+    true = turning()
+    for bits in (0, None):
+        found = unwrap(true, bits)
+        assert np.array_equal(found.count, true)
+        assert found.resets.size == 0 and found.findings == []
+    raw = shown(turning(samples=4000, most=15) * 8, 12)
+    assert np.array_equal(unwrap(raw, 0).count, raw)
+
+
+@pytest.mark.parametrize("raw", [[], [7]])
+def test_a_counter_of_one_sample_is_what_it_is(raw: list[int]) -> None:
+    found = unwrap(np.array(raw, np.int64), 16)
+    assert found.count.tolist() == raw and found.resets.size == 0
+    assert unwrap(np.array([5, 260]), 8).count.tolist() == [5, 4]
+
+
+def test_a_measured_speed_says_how_often_a_narrow_counter_went_round() -> None:
+    steps = np.random.default_rng(1).integers(300, 500, 200)  # more than a turn of eight bits
+    true = np.concatenate([[0], np.cumsum(steps)])
+    expected = steps + np.random.default_rng(2).uniform(-100.0, 100.0, steps.size)
+    expected[7] = np.nan
+    raw = shown(true, 8)
+    found = unwrap(raw, 8, expected)
+    wrong = np.flatnonzero(np.diff(found.count) != steps)
+    assert wrong.tolist() == [7], "where nothing was measured the nearest way is taken"
+
+
+@pytest.mark.parametrize("measured", [True, False])
+def test_a_reset_is_no_motion_and_the_counts_before_and_after_stay(measured: bool) -> None:
+    true = turning(samples=400, most=20) + 50_000
+    raw = true.copy()
+    raw[120:] -= true[120]  # starts at zero again
+    raw[320:] -= raw[320] - 3
+    found = unwrap(raw, 0, np.diff(true).astype(float) if measured else None)
+    told = [120, 320]
+    assert found.resets.tolist() == told
+    for begin, end in zip([0, *told], [*told, raw.size]):
+        assert np.array_equal(found.count[begin:end], raw[begin:end])
+    (finding,) = found.findings
+    assert (finding.code, finding.severity) == ("counter_reset", "warning")
+    assert finding.evidence == {"times": 2}
+
+
+def test_a_count_that_jumps_to_and_fro_is_noise_and_no_reset() -> None:
+    raw = turning(samples=300, most=20) + 50_000
+    raw[100] = 0
+    found = unwrap(raw, 0)
+    assert found.resets.size == 0 and np.array_equal(found.count, raw)
+
+
+def test_resets_by_the_dozen_are_no_resets() -> None:
+    # Three, or a hundredth of the samples: more are some other fault of the counter.
+    saw = np.tile(np.arange(0, 40_000, 1000), 10)
+    found = unwrap(saw.astype(np.int64), 0, np.full(saw.size - 1, 1000.0))
+    assert found.resets.size == 0 and np.array_equal(found.count, saw)
+    few = np.concatenate([np.arange(0, 100_000, 1000)] * 4).astype(np.int64)
+    found = unwrap(few, 0, np.full(few.size - 1, 1000.0))
+    assert found.resets.tolist() == [100, 200, 300]
+
+
+def test_an_angle_within_one_turn_is_unwrapped_and_any_other_left() -> None:
+    true = 0.05 * turning(samples=500, most=9)
+    wrapped = np.angle(np.exp(1j * true))
+    gaps = wrapped.copy()
+    gaps[[40, 41, 90]] = np.nan
+    for raw in (wrapped, gaps):
+        result, undone = unwrap_angle(raw)
+        sound = np.isfinite(raw)
+        # Angles of 2 pi and less, through a complex exponential: rounding alone.
+        assert undone and result[sound] - result[0] == pytest.approx(
+            (true - true[0])[sound], abs=1e-9
+        )
+        assert np.array_equal(np.isnan(result), ~sound)
+    for left in (true, 0.3 * np.sin(true), np.array([1.0]), np.array([np.nan, 1.0])):
+        result, undone = unwrap_angle(left)
+        assert not undone and result is left
+
+
+@pytest.mark.parametrize("measured", [True, False])
+def test_a_counter_that_wraps_starts_again_at_what_it_shows(measured: bool) -> None:
+    true = turning(samples=600, most=90, seed=8) + 20_000
+    true[250:] -= true[250] - 5
+    true[450:] += 15_000 - true[450]
+    true[451:] -= true[451] + 3  # a second reset, to just below zero
+    raw = shown(true, 16)
+    raw[100:200] += 0
+    expected = np.diff(true).astype(float)
+    expected[[249, 449, 450]] = 30.0  # by a sensor of its own the motor goes on
+    found = unwrap(raw, 16, expected if measured else None)
+    assert found.resets.tolist()[0] == 250
+    assert np.array_equal(found.count[:250] - raw[0], true[:250] - true[0])
+    assert np.array_equal(found.count[250:450], true[250:450])
+    after = found.resets[-1]
+    assert found.count[after] == raw[after]
+
+
+def test_a_motor_at_speed_wraps_an_unknown_width_that_its_speed_tells() -> None:
+    steps = np.random.default_rng(6).integers(55, 66, 3000)
+    true = np.concatenate([[0], np.cumsum(steps)])
+    raw = shown(true, 11)
+    found = unwrap(raw, None, steps.astype(float))
+    assert np.array_equal(found.count, true) and found.findings[0].evidence == {"bits": 11}
+
+
+@pytest.mark.parametrize("at", [1, 199])
+def test_a_fall_at_either_end_is_a_wrong_sample_and_no_reset(at: int) -> None:
+    raw = turning(samples=200, most=20) + 50_000
+    raw[at:] -= raw[at]
+    found = unwrap(raw, 0)
+    assert found.resets.size == 0 and np.array_equal(found.count, raw)
+
+
+def test_a_spike_beside_zero_is_no_reset() -> None:
+    raw = turning(samples=300, most=20) % 50
+    raw[100] = 50_000
+    assert unwrap(raw, 0).resets.size == 0
+
+
+def test_without_a_speed_a_reset_falls_further_than_the_largest_steps() -> None:
+    steps = np.full(400, 5)
+    steps[::40] = 400  # a few large ones: the bound of usual steps is 150
+    for height, told in ((1500, False), (4500, True)):
+        raw = np.cumsum(steps) - int(np.cumsum(steps)[221]) + height
+        raw[222:] -= raw[222]
+        assert unwrap(raw, 0).resets.tolist() == ([222] if told else [])
+        measured = np.diff(raw).astype(float)
+        measured[221] = 5.0
+        assert unwrap(raw, 0, measured).resets.tolist() == [222]
+
+
+@pytest.mark.parametrize(("times", "told"), [(3, 3), (4, 0)])
+def test_three_resets_of_a_short_record_are_told_and_four_are_not(times: int, told: int) -> None:
+    raw = np.tile(np.arange(0, 40_000, 1000), times + 1)
+    found = unwrap(raw.astype(np.int64), 0, np.full(raw.size - 1, 1000.0))
+    assert found.resets.size == told

@@ -1,0 +1,158 @@
+"""Decompression: every frame, every kind, what is cut off, and never more than the limit."""
+
+from __future__ import annotations
+
+import bz2
+import math
+import random
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import lz4.frame
+import numpy as np
+import pytest
+import zstandard
+
+from smp_motor_ident.bag.storage import Channel, join
+from smp_motor_ident.bag.unpack import (
+    Budget,
+    decompress,
+    decompress_messages,
+    pieces,
+    unpack_file,
+)
+from smp_motor_ident.errors import BagError
+
+PACK: dict[str, Callable[[bytes], bytes]] = {
+    "zstd": zstandard.compress,
+    "lz4": lz4.frame.compress,
+    "bz2": bz2.compress,
+}
+DRAW = random.Random(9)
+PLAIN = DRAW.randbytes(30_000) + bytes(3_000_000) + DRAW.randbytes(30_000)
+PARTS = (PLAIN[:20_000], PLAIN[20_000:40_000], PLAIN[40_000:])
+
+
+@pytest.fixture
+def budget(monkeypatch: pytest.MonkeyPatch) -> Budget:
+    monkeypatch.delenv("SMP_BAG_UNPACKED", raising=False)
+    return Budget("a.mcap", 1000)
+
+
+@pytest.mark.parametrize("kind", PACK)
+@pytest.mark.parametrize("size", [0, len(PLAIN)], ids=["size unknown", "size known"])
+def test_all_frames_of_a_block_are_unpacked_and_counted(kind, size, budget) -> None:
+    one, many = PACK[kind](PLAIN), b"".join(PACK[kind](part) for part in PARTS)
+    for packed in (one, many):
+        before = budget.left
+        assert decompress(packed, kind, size, budget) == PLAIN
+        assert before - budget.left == len(PLAIN)
+    assert decompress(PLAIN, "", 0, budget) == decompress(PLAIN, "none", 0, budget) == PLAIN
+
+
+@pytest.mark.parametrize("kind", PACK)
+def test_frames_come_out_whole_whatever_the_blocks_they_are_read_in(kind) -> None:
+    packed = b"".join(PACK[kind](part) for part in PARTS)
+    for length in (1, 7, 1023, 1024, 1025, 1 << 16):
+        if length == 1 and kind == "bz2":
+            continue  # slow and no other way
+        blocks = [packed[k : k + length] for k in range(0, len(packed), length)]
+        assert b"".join(pieces(blocks, kind)) == PLAIN
+    biggest = max(len(piece) for piece in pieces([packed], kind))
+    # 1024 bytes of zstd stand for at most 256 blocks of 128 KiB; the others come by the MiB.
+    assert biggest <= (256 << 17 if kind == "zstd" else 1 << 20)
+    with pytest.raises(EOFError):
+        list(pieces([], kind))
+    with pytest.raises(EOFError):
+        list(pieces([packed[:-20]], kind))
+
+
+@pytest.mark.parametrize("kind", PACK)
+def test_what_comes_before_the_end_of_a_block_that_is_cut_off_is_kept(kind, budget) -> None:
+    packed = PACK[kind](PARTS[0]) + PACK[kind](PARTS[1])[:-300]
+    kept = decompress(packed, kind, 0, budget)
+    assert PLAIN.startswith(kept) and len(kept) >= len(PARTS[0])
+    assert budget.limit - budget.left == len(kept)
+    cut = decompress(PACK[kind](PLAIN)[:-40], kind, len(PLAIN), budget)
+    # Small frames come as a whole or not at all, of large ones what was complete.
+    assert PLAIN.startswith(cut)
+    assert decompress(b"no frame at all", kind, 0, budget) == b""
+
+
+def test_the_memory_of_a_cut_off_frame_of_zstd_is_given_back(budget) -> None:
+    packed = zstandard.compress(PLAIN)[:-40]
+    kept = decompress(packed, "zstd", len(PLAIN), budget)
+    assert budget.limit - budget.left == len(kept) < len(PLAIN)
+
+
+def test_an_unknown_compression_is_named(budget) -> None:
+    with pytest.raises(BagError, match="'snappy' is not supported; use zstd, lz4 or bz2"):
+        decompress(b"", "snappy", 0, budget)
+
+
+@pytest.mark.parametrize(
+    ("given", "limit"),
+    [("", 256e6), ("1000", 1000), ("2k", 2048), ("3M", 3 * 2**20), (" 1.5G ", 1.5 * 2**30)],
+)
+def test_the_limit_is_what_the_file_may_hold_or_what_the_user_says(given, limit, monkeypatch):
+    monkeypatch.setenv("SMP_BAG_UNPACKED", given)
+    budget = Budget("a.mcap", 100_000)
+    assert budget.limit == budget.left == limit
+    big = Budget("a.mcap", 100_000_000)
+    assert big.limit == (limit if given else 5e9)  # 50 times what is packed
+    for wrong in ("much", "inf", "K"):
+        monkeypatch.setenv("SMP_BAG_UNPACKED", wrong)
+        with pytest.raises(BagError, match="give bytes, or such as 512M or 8G"):
+            Budget("a.mcap", 1)
+
+
+def test_the_limit_itself_may_be_taken_and_not_a_byte_more(monkeypatch) -> None:
+    monkeypatch.setenv("SMP_BAG_UNPACKED", "3000000")
+    budget = Budget("a.mcap", 1)
+    budget.take(2_999_999)
+    budget.take(1)
+    with pytest.raises(BagError, match=r"a\.mcap: unpacks to more than 3 MB"):
+        budget.take(1)
+    for kind, pack in PACK.items():
+        for size in (0, len(PLAIN)):
+            budget = Budget("a.mcap", 1)
+            with pytest.raises(BagError, match="SMP_BAG_UNPACKED=8G"):
+                decompress(pack(PLAIN), kind, size, budget)
+        assert len(PLAIN) > 3_000_000 and math.isfinite(budget.limit)
+
+
+@pytest.mark.parametrize("kind", PACK)
+def test_a_file_is_unpacked_and_what_is_amiss_is_told(kind, budget, tmp_path: Path) -> None:
+    path, plain = tmp_path / "a.mcap.x", tmp_path / "a.mcap"
+    path.write_bytes(b"".join(map(PACK[kind], PARTS)))
+    assert unpack_file(path, plain, kind, budget) == ""
+    assert plain.read_bytes() == PLAIN
+    assert budget.limit - budget.left == len(PLAIN)
+    path.write_bytes(PACK[kind](PARTS[0]) + PACK[kind](PARTS[1])[:-99])
+    assert unpack_file(path, plain, kind, budget) == "a.mcap.x: its compression is cut off"
+    assert plain.read_bytes().startswith(PARTS[0])
+    path.write_bytes(PACK[kind](PARTS[0]) + b"and then something else, for long enough")
+    assert "its compression is damaged" in unpack_file(path, plain, kind, budget)
+    with pytest.raises(BagError, match="cannot be unpacked"):
+        unpack_file(tmp_path / "none", plain, kind, budget)
+
+
+def test_messages_that_were_packed_one_by_one_are_unpacked_and_the_lost_counted(budget) -> None:
+    channel = Channel(1, "/a", "std_msgs/msg/String")
+    blobs = [b"", b"abc", b"plain and long", zstandard.compress(b"one" * 50),
+             lz4.frame.compress(b"two" * 50), zstandard.compress(b"three" * 50)[:9]]  # fmt: skip
+    batch = join(channel, blobs, np.arange(6, dtype=np.int64))
+    batch = replace(batch, sequence=np.arange(10, 16))
+    unpacked, lost = decompress_messages(batch, budget)
+    kept = [b"abc", b"plain and long", b"one" * 50, b"two" * 50]
+    assert [unpacked.message(k) for k in range(len(unpacked))] == kept
+    assert lost == 2
+    assert unpacked.log_time.tolist() == [1, 2, 3, 4]
+    assert unpacked.sequence is not None and unpacked.sequence.tolist() == [11, 12, 13, 14]
+    for plain in ([b"plain and long"], [b"abc", b""], [b"abc", b"long enough"]):
+        same = join(channel, plain, np.arange(len(plain), dtype=np.int64))
+        assert decompress_messages(same, budget) == (same, 0)
+    alone = join(channel, [lz4.frame.compress(b"x")], np.zeros(1, np.int64))
+    unpacked, lost = decompress_messages(alone, budget)
+    assert unpacked.message(0) == b"x" and unpacked.sequence is None and lost == 0

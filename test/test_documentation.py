@@ -1,0 +1,347 @@
+"""Every command that is printed is run, or is marked with what it needs and names what exists.
+
+A fence is ``bash`` where its commands run here, page by page in their order, and ``sh`` where they
+need what tests have not: its first line says what.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import shlex
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import yaml
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from smp_motor_control import WHEELS
+from smp_motor_control.motor import Motor
+from smp_motor_control.motor.file import load_motors
+from smp_motor_ident.bag.writer import BagWriter
+from smp_motor_ident.cli import commission, demo, identify, tune, tune_arguments
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [
+    "README.md",
+    *sorted(str(p.relative_to(ROOT)) for p in ROOT.glob("docs/**/*.md") if "_build" not in p.parts),
+]
+TOOLS = {"identify": identify.main, "tune": tune.main}
+PARSERS = {
+    "identify": identify.parser,
+    "tune": tune_arguments.parser,
+    "commission": commission.parser,
+    "demo": demo.parser,
+}
+NODES = ("wheel_pid", "motor_plant", "skid_steer", "teleop_wheels", "excite", "serial_driver",
+         "record", "play", "identifier")  # fmt: skip
+LANGUAGES = {"bash", "sh", "python", "yaml", "xml", "json", "cpp", "text", "", "{toctree}",
+             "{eval-rst}"}  # fmt: skip
+
+
+def blocks(page: str) -> Iterator[tuple[str, list[str]]]:
+    """Return language and lines of each fence of a page."""
+    inside = None
+    for line in (ROOT / page).read_text(encoding="utf-8").splitlines():
+        if inside is None and (fence := re.match(r"\s*```([\w{}-]*)\s*$", line)):
+            inside = (fence[1], [])
+        elif inside is not None and line.strip() == "```":
+            yield inside
+            inside = None
+        elif inside is not None:
+            inside[1].append(line)
+    assert inside is None, f"{page}: a fence is not closed"
+
+
+def commands(lines: list[str]) -> list[list[str]]:
+    """Return the commands of a block as words."""
+    text = "\n".join(lines).replace("\\\n", " ")
+    return [words for line in text.splitlines() if (words := shlex.split(line, comments=True))]
+
+
+def of_language(language: str) -> list[tuple[str, list[str]]]:
+    return [(page, lines) for page in PAGES for name, lines in blocks(page) if name == language]
+
+
+def program(page: str, language: str) -> str:
+    """Return the one block of a page in a language."""
+    (lines,) = [lines for name, lines in blocks(page) if name == language]
+    return "\n".join(lines) + "\n"
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_fences_say_whether_their_commands_run_here(page):
+    for language, lines in blocks(page):
+        assert language in LANGUAGES, f"{page}: ```{language}"
+        if language == "sh":
+            assert lines[0].strip().startswith("# needs "), f"{page}: {lines[0]}: say what it needs"
+        if language in ("", "text"):
+            for line in lines:
+                command = re.match(
+                    rf"\s*({'|'.join([*PARSERS, *NODES])}|make|ros2|colcon) [\w-]", line
+                )
+                assert not command, f"{page}: a command in a block without language: {line}"
+
+
+@pytest.mark.parametrize(("page", "lines"), of_language("sh"))
+def test_commands_that_do_not_run_here_name_what_exists(page, lines):
+    for words in commands(lines):
+        name, arguments = words[0], words[1:]
+        if name == "ros2" and words[1:3] == ["run", "smp_motor_control"]:
+            name, arguments = words[3], words[4:]
+            assert name in {*PARSERS, *NODES}, f"{page}: {words}"
+        if "--help" in arguments:
+            continue
+        if name in PARSERS:
+            assert PARSERS[name]().parse_args(arguments), f"{page}: {words}"
+        elif name in NODES and "--ros-args" in arguments and name not in ("record", "play"):
+            parameters = known(name)
+            for given in re.findall(r"(?<=-p )([\w.]+):=", " ".join(arguments)):
+                assert given in parameters, f"{page}: {name} has no parameter {given}"
+        elif name == "make":
+            targets = re.findall(r"^(\w+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+            assert set(arguments) <= set(targets), f"{page}: {words}"
+        elif words[:4] == ["ros2", "launch", "smp_motor_control", "smp.launch.py"]:
+            declared = re.findall(
+                r'^    "(\w+)": \(', (ROOT / "launch/smp.launch.py").read_text(), re.M
+            )
+            given = [word.partition(":=")[0] for word in words[4:] if ":=" in word]
+            assert set(given) <= set(declared), f"{page}: {words}"
+
+
+def known(node: str) -> set[str]:
+    """Return the parameters that a node declares."""
+    import importlib
+
+    from smp_motor_control.nodes.settings import _entries
+
+    package = "smp_motor_ident" if node == "identifier" else "smp_motor_control"
+    return {*_entries(importlib.import_module(f"{package}.nodes.{node}").Settings), "use_sim_time"}
+
+
+# The recordings that the pages speak of.
+
+STEP, RATIO, COUNTS = 0.01, 65.5, 500.0
+PARTS, WINDOW = 5, 16
+"""Steps of 2 ms; one log's speed is averaged over 32 ms."""
+
+
+def motion(seed: int, seconds: float = 12.0) -> SimpleNamespace:
+    """One of the paper's motors under random steps, its encoder read at 100 Hz."""
+    motor = Motor(load_motors(ROOT / "config/motors_paper.yaml")["front_left"].parameters)
+    n = round(seconds / STEP)
+    rng = np.random.default_rng(seed)
+    voltage = np.repeat(rng.uniform(-9.0, 9.0, n // 12 + 1), 12)[:n]
+    fine = np.zeros(WINDOW + PARTS * n)
+    for k in range(PARTS * n):
+        fine[WINDOW + k] = motor.angle
+        motor.step(voltage[k // PARTS], STEP / PARTS)
+    angle = fine[WINDOW::PARTS]
+    averaged = (angle - fine[: PARTS * n : PARTS]) / (WINDOW * STEP / PARTS)
+    count = np.floor(angle * COUNTS / (2 * math.pi)).astype(int)
+    speed = np.diff(count, prepend=0) * 2 * math.pi / COUNTS / STEP  # [rad/s], motor
+    return SimpleNamespace(
+        t=STEP * np.arange(n), u=voltage, count=count, w=speed, averaged=averaged
+    )
+
+
+def store():
+    types = get_typestore(Stores.ROS2_JAZZY)
+    for name in ("MotorState", "MotorDescription"):
+        text = (ROOT / f"smp_interfaces/msg/{name}.msg").read_text()
+        types.register(get_types_from_msg(text, f"smp_interfaces/msg/{name}"))
+    return types
+
+
+def write_bag(path: Path, one: SimpleNamespace, own: bool) -> None:
+    """Write our messages, or PWM and joint states as other robots have them."""
+    types = store()
+
+    def put(bag: BagWriter, topic: str, kind: str, seconds: float, **fields: object) -> None:
+        stamp = 1_700_000_000_000_000_000 + round(1e9 * seconds)
+        if "header" in fields:
+            time = types.types["builtin_interfaces/msg/Time"](*divmod(stamp, 1_000_000_000))
+            fields["header"] = types.types["std_msgs/msg/Header"](time, str(fields["header"]))
+        data = types.serialize_cdr(types.types[kind](**fields), kind)
+        bag.write(topic, kind, bytes(data), stamp)
+
+    state, description = "smp_interfaces/msg/MotorState", "smp_interfaces/msg/MotorDescription"
+    with BagWriter(path) as bag:
+        topics = (
+            {"/front_left/motor_state": state, "/front_left/motor_description": description}
+            if own
+            else {"/pwm": "std_msgs/msg/Float64", "/joint_states": "sensor_msgs/msg/JointState"}
+        )
+        for topic, kind in topics.items():
+            bag.add_topic(topic, kind)
+        if own:
+            put(bag, "/front_left/motor_description", description, 0.0,
+                joint_name="front_left_wheel_joint", gear_ratio=RATIO, counts_per_revolution=COUNTS,
+                encoder_bits=0, supply_voltage=12.0, resistance=math.nan)  # fmt: skip
+        before = 0.0
+        for t, u, count, w in zip(one.t, one.u, one.count, one.w, strict=True):
+            if own:
+                put(bag, "/front_left/motor_state", state, t, header="front_left_wheel_joint",
+                    voltage=before, current=math.nan, velocity=w / RATIO,
+                    position=count * 2 * math.pi / COUNTS / RATIO, encoder_count=int(count),
+                    duty_cycle=0.0)  # fmt: skip
+                before = float(u)
+            else:
+                put(bag, "/joint_states", topics["/joint_states"], t, header="",
+                    name=["left_wheel_joint"], position=np.zeros(0), velocity=np.array([w]),
+                    effort=np.zeros(0))  # fmt: skip
+                put(bag, "/pwm", topics["/pwm"], t, data=u * 255 / 12)
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The recordings, and the result that one page works on."""
+    folder = tmp_path_factory.mktemp("documentation")
+    for seed, name in enumerate(("my_bag", "monday", "tuesday", "wednesday"), 1):
+        write_bag(folder / name, motion(seed), own=True)
+    one = motion(5)
+    write_bag(folder / "robot_bag", one, own=False)
+    degrees = np.degrees(one.w)
+    for name in ("log.csv", "prbs_2026-08-14.csv"):
+        np.savetxt(folder / name, np.column_stack((one.t, one.u, degrees)), delimiter=",",
+                   header="t,u,y", comments="", fmt="%.9g")  # fmt: skip
+    columns = (1e3 * one.t, one.u * 5319 / 12 + 1, one.averaged * 30 / math.pi + 1.24)
+    np.savetxt(folder / "log_20260601161631.csv", np.column_stack(columns), delimiter=",",
+               header="Timestamp(ms),Commanded_PWM,Motor_Speed(RPM)", comments="",
+               fmt="%.9g")  # fmt: skip
+    assert identify.main([str(folder / "my_bag"), "--output", str(folder / "result"), "-q"]) == 0
+    return folder
+
+
+@pytest.mark.parametrize("page", dict.fromkeys(page for page, _ in of_language("bash")))
+def test_commands_run_in_the_order_of_their_page(page, inputs, tmp_path, monkeypatch, capsys):
+    made = {words[3] for name, lines in blocks(page) if name == "bash"
+            for words in commands(lines) if words[2:3] == ["--output"]}  # fmt: skip
+    for entry in inputs.iterdir():
+        if entry.name not in made:
+            (tmp_path / entry.name).symlink_to(entry)
+    monkeypatch.chdir(tmp_path)
+    for name, lines in blocks(page):
+        if name != "bash":
+            continue
+        for words in commands(lines):
+            assert words[0] in TOOLS, f"{page}: {words[0]} does not run here; mark the block sh"
+            code = TOOLS[words[0]](words[1:])
+            assert code == 0, f"{page}: {shlex.join(words)}: {capsys.readouterr().err}"
+
+
+def test_the_driver_of_the_page_publishes_what_its_board_counts_and_obeys():
+    rclpy = pytest.importorskip("rclpy")
+    names: dict[str, object] = {}
+    exec(compile(program("docs/howto/your-hardware.md", "python"), "your-hardware", "exec"), names)
+    counts, applied = iter((2**15 - 1, -(2**15))), []
+    board = SimpleNamespace(read_count=lambda: next(counts), apply=applied.append)
+    rclpy.init()
+    try:
+        node = names["Driver"](board)
+        published = []
+        node.states = SimpleNamespace(publish=published.append)
+        node.sample()
+        node.obey(names["MotorCommand"](voltage=3.0))
+        node.sample()
+        node.destroy_node()
+    finally:
+        rclpy.try_shutdown()
+    assert applied == [0.0, 3.0]
+    # One count of a 16-bit counter that wraps between two samples, 10 ms apart, behind 1:30.
+    assert published[1].velocity == pytest.approx(2 * math.pi / 48 / 30 / 0.01)
+    assert [one.voltage for one in published] == [0.0, 3.0]
+
+
+BOARD = """
+#include <cstdio>
+#include <cstdlib>
+#include <cstring>
+#include <algorithm>
+enum { LOW, HIGH, INPUT_PULLUP, OUTPUT, CHANGE, A0 = 14 };
+static unsigned long clock_us = 0;
+static char fed[256];
+static int at = 0, size = 0;
+struct { void begin(long) {} int available() { return size - at; } char read() { return fed[at++]; }
+         void print(const char *text) { fputs(text, stdout); } } Serial;
+unsigned long micros() { return clock_us; }
+int digitalRead(int) { return 0; }
+int analogRead(int) { return 818; }
+void digitalWrite(int, int) {}
+void analogWrite(int pin, int value) { printf("pwm %d %d\\n", pin, value); }
+void pinMode(int, int) {}
+void interrupts() {}
+void noInterrupts() {}
+int digitalPinToInterrupt(int pin) { return pin; }
+void attachInterrupt(int, void (*)(), int) {}
+long constrain(long x, long low, long high) { return std::min(std::max(x, low), high); }
+#include "sketch.ino"
+int main() {
+  setup();
+  while (fgets(fed, sizeof fed, stdin)) {
+    at = 0; size = strlen(fed);
+    if (fed[0] == '+') { size = 0; clock_us += atol(fed); } else clock_us += 10000;
+    loop();
+  }
+}
+"""
+
+
+def test_the_firmware_of_the_page_speaks_the_protocol_and_stops_on_silence(tmp_path):
+    from smp_motor_control.serial_protocol import decode_state, encode_voltages
+
+    compiler = shutil.which("c++")
+    if compiler is None:
+        pytest.skip("no C++ compiler")
+    (tmp_path / "sketch.ino").write_text(program("docs/howto/micro-controller.md", "cpp"))
+    (tmp_path / "board.cpp").write_text(BOARD)
+    build = [compiler, "-Wall", "-Werror", "-o", "board", "board.cpp"]
+    subprocess.run(build, cwd=tmp_path, check=True, timeout=120)
+    good = encode_voltages([3.0, -6.0]).decode()
+    said = f"{good}{good.replace('3000', '9000')}+150000\n+150000\n"
+    ran = subprocess.run([tmp_path / "board"], input=said, capture_output=True, text=True,
+                         check=True, timeout=60)  # fmt: skip
+    lines = ran.stdout.splitlines()
+    states = [decode_state(line, 2) for line in lines if line.startswith("S")]
+    # 818 of 1023 at 15 V full scale.
+    assert states[0].battery == pytest.approx(818 * 15 / 1023, abs=1e-3)
+    assert len(states) == 4
+    duty = [int(line.split()[2]) for line in lines if line.startswith("pwm 5")]
+    # The spoilt line of 9 V changes nothing; after 0.3 s of silence the motor is off.
+    assert duty == [63, 63, 63, 0]
+
+
+def test_layouts_draw_what_the_wheels_publish():
+    text = (ROOT / "smp_interfaces/msg/PidState.msg").read_text()
+    fields = {line.split()[1] for line in text.splitlines() if line and line[0] not in "#"}
+    topics = {f"/{wheel}/pid_state" for wheel in WHEELS}
+    tree = ElementTree.parse(ROOT / "config/plotjuggler_wheels.xml")
+    drawn = [tuple(c.attrib["name"].rsplit("/", 1)) for c in tree.iter("curve")]
+    layout = json.loads((ROOT / "config/foxglove_wheels.json").read_text())
+    drawn += [tuple(path["value"].split(".")) for plot in layout["configById"].values()
+              for path in plot["paths"]]  # fmt: skip
+    assert {topic for topic, _ in drawn} == topics
+    assert {field for _, field in drawn} <= fields
+
+
+def test_our_names_in_the_table_of_ros2_controllers_are_parameters():
+    text = (ROOT / "docs/howto/ros2-controllers.md").read_text()
+    for node, part in zip(("skid_steer", "wheel_pid"), text.split("\n## ")[1:], strict=True):
+        rows = [line.split("|") for line in part.splitlines() if line.startswith("| ")][1:]
+        ours = {name for row in rows for name in re.findall(r"`([\w.]+)`", row[2])}
+        assert ours - {"pid_state", "---"} <= known(node)
+        assert all(row[2].strip() or row[3].strip() for row in rows)  # nothing without a reason
+
+
+def test_data_blocks_are_what_they_say():
+    for _, lines in of_language("yaml"):
+        assert yaml.safe_load("\n".join(lines))
+    for _, lines in of_language("xml"):
+        ElementTree.fromstring("\n".join(lines))
