@@ -214,6 +214,10 @@ def solve(
     re-estimated from the residuals until it stays (concentrated likelihood).
     """
     widest = _bounds(FASTEST * data.step if data.current.size else 0.0)
+    if (
+        data.quantum > 0
+    ):  # a speed in coarse steps is a difference of counts: over a sample, at least
+        widest[0][models.WINDOW] = data.step
     lower = widest[0] if lower is None else lower
     upper = widest[1] if upper is None else upper
     descent = _Descent(data, structure, z, initial, noise, noise_ratio, huber, priors, lower, upper)
