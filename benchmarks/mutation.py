@@ -45,7 +45,7 @@ TESTS = {
     CONTROL + "wheel.faults": "control/test_fault_detector.py control/test_supervision.py",
     CONTROL + "wheel.lease": "control/test_supervision.py",
     CONTROL + "wheel.controller": "control/test_wheel_limits.py "
-                                "control/test_wheel_controller.py",
+                                "control/test_fault_detector.py control/test_wheel_controller.py",
     CONTROL + "wheel.loop": "control/test_wheel_limits.py control/test_wheel_controller.py",
     CONTROL + "wheel.acceptance": "control/test_acceptance.py",
     CONTROL + "body.odometry": "control/test_odometry.py",
