@@ -130,7 +130,7 @@ class Campaign:
         return abs(self.true_speed() - self.speed) < 0.15 * abs(self.speed) + 0.05
 
     def drives_within(self, seconds: float) -> bool:
-        """Wait until the wheel drives; time in which this relay is behind itself is not the wheel's."""
+        """Wait until the wheel drives; time in which this relay is late itself does not count."""
         left = seconds
         for _ in range(round(10.0 * seconds)):
             if self.spin_until(self.drives, 1.0):
