@@ -51,6 +51,7 @@ TESTS = {
     CONTROL + "body.odometry": "control/test_odometry.py",
     CONTROL + "body.wheel_travel": "control/test_wheel_feedback.py",
     CONTROL + "body.command": "control/test_body_command.py",
+    "smp_motor_ident.estimation.choice": "ident/test_structure_choice.py",
     BAG + "counter": "ident/bag/test_counter.py",
     BAG + "salvage": "ident/bag/test_salvage.py",
     BAG + "unpack": "ident/bag/test_unpack.py",
