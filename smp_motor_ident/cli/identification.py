@@ -32,7 +32,7 @@ from smp_motor_ident.errors import (
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.estimation.simulation import simulate
 from smp_motor_ident.record import Record
-from smp_motor_ident.report import words
+from smp_motor_ident.report import history, words
 from smp_motor_ident.report.document import (
     check_free,
     identification_document,
@@ -206,12 +206,14 @@ def _contents(
         ),
     }
     estimates = {wheel: one.estimate for wheel, one in outcomes.items() if one.estimate}
+    since = history.read(Path(arguments.history)) if arguments.history else {}
     report = Report(
         estimates,
         {wheel: one.comparisons for wheel, one in outcomes.items()},
         {wheel: str(one.failure) for wheel, one in outcomes.items() if one.failure},
         provenance,
         tunings,
+        {wheel: history.history_charts(wheel, entries) for wheel, entries in since.items()},
     )
     document = identification_document(estimates)
     head = [f"Identified {now} by {NAME} from {provenance['Recordings']}.", "SI, motor shaft."]

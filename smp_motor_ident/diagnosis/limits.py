@@ -323,3 +323,35 @@ CANDIDATE_WEIGHT = Limit(
     "a structure that explains the data best less often than that is rejected at the 5 % level",
     "test_averaging.py: a lag that may be a delay",
 )
+
+# A commissioned motor that is followed while it drives.
+RESISTANCE_BAND = Limit(
+    0.15,
+    "of the commissioned value",
+    "38 K of copper: a motor at work warms by less, and its insulation bears twice that",
+    "test_monitor.py: a winding that heats",
+)
+MOTOR_CONSTANT_BAND = Limit(
+    0.03,
+    "of the commissioned value",
+    "15 K of ferrite at 0.2 %/K, what magnets warm by beside a winding at the end of its band",
+    "test_monitor.py: a magnet that weakens is told from heat",
+)
+FRICTION_BAND = Limit(
+    1.0,
+    "of the commissioned value",
+    "a floor instead of blocks adds its rolling resistance, about as much again",
+    "test_monitor.py: half an hour of ordinary driving",
+)
+OUTSIDE = Limit(
+    2.0,
+    "standard deviations",
+    "2.3 % of chance for one look at one value, which must stay outside besides",
+    "test_monitor.py: half an hour of ordinary driving",
+)
+LEFT_BAND = Limit(
+    3.0,
+    "s of motion outside of a band",
+    "a single load or a bad sample is over by then; a motor that burns takes longer",
+    "test_monitor.py: half an hour of ordinary driving",
+)
