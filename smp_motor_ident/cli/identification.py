@@ -11,6 +11,7 @@ from datetime import datetime, timezone
 from functools import partial
 from importlib import metadata
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -41,6 +42,9 @@ from smp_motor_ident.report.document import (
 )
 from smp_motor_ident.report.series import Comparison, Role
 from smp_motor_ident.result import UNITS, Estimate
+
+if TYPE_CHECKING:
+    from smp_motor_ident.report.tuning_page import Tuning
 
 COMPILED = Path(likelihood.__file__).parent / "__pycache__"
 """Where numba keeps what it has compiled, unless NUMBA_CACHE_DIR says otherwise."""
@@ -91,8 +95,9 @@ def work(arguments: argparse.Namespace) -> int:
         }
         outcomes = in_parallel(jobs, say, cold)
         if any(outcome.estimate for outcome in outcomes.values()):
+            tunings = _tunings(outcomes, say) if arguments.tuning else {}
             say("writing the report")
-            contents = _contents(outcomes, arguments)
+            contents = _contents(outcomes, arguments, tunings)
             write_together(dict(zip(paths, contents, strict=True)), arguments.force)
     return _conclude(outcomes, paths, arguments)
 
@@ -169,7 +174,28 @@ def _compare(found: Estimate, record: Record, role: Role) -> Comparison:
     return Comparison(role, record.source, record.time, record.voltage, measured, simulated)
 
 
-def _contents(outcomes: Mapping[str, Outcome], arguments: argparse.Namespace) -> list[str]:
+def _tunings(outcomes: Mapping[str, Outcome], say: Callable[..., None]) -> dict[str, Tuning]:
+    """Design controllers for the tuning page, as `tune` does without arguments."""
+    from smp_motor_ident.cli import tune_arguments
+    from smp_motor_ident.report import tuning_page
+
+    usual = tune_arguments.parser().parse_args(["identification"])
+
+    def one(found: Estimate, _: Callable[[str], None]) -> Tuning:
+        try:
+            return tuning_page.tuning_of(found, tune_arguments.loop_for(found, usual))
+        except ParameterError as error:  # of a motor whose supply nobody told
+            return tuning_page.Tuning(found.wheel, reason=str(error))
+
+    known = {wheel: out.estimate for wheel, out in outcomes.items() if out.estimate}
+    return in_parallel({wheel: partial(one, found) for wheel, found in known.items()}, say)
+
+
+def _contents(
+    outcomes: Mapping[str, Outcome],
+    arguments: argparse.Namespace,
+    tunings: Mapping[str, Tuning],
+) -> list[str]:
     """Return the three files' texts, in the order of :data:`OUTPUTS`."""
     from smp_motor_ident.report.html import Report, render
 
@@ -190,6 +216,7 @@ def _contents(outcomes: Mapping[str, Outcome], arguments: argparse.Namespace) ->
         {wheel: one.comparisons for wheel, one in outcomes.items()},
         {wheel: str(one.failure) for wheel, one in outcomes.items() if one.failure},
         provenance,
+        tunings,
     )
     document = identification_document(estimates)
     head = [f"Identified {now} by {NAME} from {provenance['Recordings']}.", "SI, motor shaft."]

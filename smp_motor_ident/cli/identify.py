@@ -55,6 +55,7 @@ def parser() -> argparse.ArgumentParser:
         help="the recording has set-points (--map setpoint=...) instead of voltages: of this loop",
     )  # fmt: skip
     add("--topics", action="store_true", help="list what the bag offers, suggest a mapping")
+    add("--tuning", action="store_true", help="add the tuning page to the report (takes longer)")
     add("--what-next", action="store_true", help="propose the next recording")
     add("--accuracy", type=number(0, 1), default=0.01, help="wanted by --what-next; default 0.01")
     add("--quiet", "-q", action="store_true", help="print errors only")

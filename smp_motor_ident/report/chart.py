@@ -76,16 +76,16 @@ class Chart:
         return {
             "name": self.name,
             "labels": [self.x_label, self.y_label],
-            "x": _packed(self.x),
+            "x": packed(self.x),
             "curves": [
                 {
                     "name": c.name,
                     "color": c.color,
                     "kind": c.kind,
-                    "y": _packed(c.y),
+                    "y": packed(c.y),
                     "band": None
                     if c.low is None or c.high is None
-                    else [_packed(c.low), _packed(c.high)],
+                    else [packed(c.low), packed(c.high)],
                 }
                 for c in self.curves
             ],
@@ -97,7 +97,7 @@ class Chart:
         }
 
 
-def _packed(values: Array) -> str:
+def packed(values: Array) -> str:
     """Return numbers as base64 of little-endian float32: 5 bytes each, and quick to read."""
     return base64.b64encode(np.asarray(values, dtype="<f4").tobytes()).decode()
 

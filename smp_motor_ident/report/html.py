@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import resources
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jinja2
 import numpy as np
@@ -16,9 +16,13 @@ from markupsafe import Markup
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.report import figures, words
 from smp_motor_ident.report.alike import same_response
+from smp_motor_ident.report.chart import Chart
 from smp_motor_ident.report.drawing import svg
 from smp_motor_ident.report.series import Comparison
 from smp_motor_ident.result import Candidate, Estimate, Quantity
+
+if TYPE_CHECKING:
+    from smp_motor_ident.report.tuning_page import Tuning
 
 POOR_FIT = 80.0
 """Below, a fifth of the motion is unexplained [%]: a loop designed on it meets another motor."""
@@ -38,12 +42,15 @@ class Report:
         Wheels that could not be identified, each with the reason.
     provenance : mapping of str to str
         How the page came about: command, sources, date, versions.
+    tunings : mapping of str to Tuning
+        By wheel what the tuning page offers; empty for a report without one.
     """
 
     estimates: Mapping[str, Estimate]
     comparisons: Mapping[str, Sequence[Comparison]] = field(default_factory=dict)
     failures: Mapping[str, str] = field(default_factory=dict)
     provenance: Mapping[str, str] = field(default_factory=dict)
+    tunings: Mapping[str, Tuning] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -76,19 +83,35 @@ def render(report: Report) -> str:
         wheel: _motor(estimate, report.comparisons.get(wheel, ()))
         for wheel, estimate in report.estimates.items()
     }
-    charts = [chart for motor in motors.values() for chart in motor["charts"]]
-    data = json.dumps([chart.to_document() for chart in charts], separators=(",", ":"))
+    tuning_charts, tuning_data = _tuning_page(report.tunings)
+    charts = [*tuning_charts, *(c for motor in motors.values() for c in motor["charts"])]
     return environment.get_template("report.html.jinja").render(
         report=report,
         style=Markup(_text("uplot/uPlot.min.css") + _text("colors.css") + _text("report.css")),
         library=Markup(_text("uplot/uPlot.iife.min.js")),
         licence=_text("uplot/LICENSE"),
         script=Markup(_text("plots.js")),
-        data=Markup(data.replace("<", "\\u003c")),
+        data=_json([chart.to_document() for chart in charts]),
+        tuning_charts=tuning_charts,
+        tuning_data=tuning_data,
+        tuning_json=_json(tuning_data),
         draw=lambda chart: Markup(svg(chart)),
         wheels=_side_by_side(report.estimates) if len(report.estimates) > 1 else (),
         motors=motors,
     )
+
+
+def _json(content: Any) -> Markup:
+    """Return data for a script element, which nothing in it may end."""
+    return Markup(json.dumps(content, separators=(",", ":")).replace("<", "\\u003c"))
+
+
+def _tuning_page(tunings: Mapping[str, Tuning]) -> tuple[list[Chart], dict[str, Any]]:
+    if not tunings:
+        return [], {}
+    from smp_motor_ident.report import tuning_page  # loads all of tune, which few reports need
+
+    return tuning_page.page_charts(tunings), tuning_page.page_data(tunings)
 
 
 def _text(name: str) -> str:

@@ -52,7 +52,7 @@
         bands.push({series: [series.length - 1, series.length - 2], fill: () => color(curve.color) + "30"});
       }
     }
-    const axis = {stroke: () => color("muted"), grid: {stroke: () => color("grid"), width: 1}, ticks: {show: false}};
+    const axis = {stroke: () => color("muted"), grid: {stroke: () => color("grid"), width: 1}, ticks: {show: false}, values: (u, marks) => marks.map(v => v == null ? "" : shown(v))};
     const scale = name => chart.log.includes(name) ? {distr: 3} : {};
     const y = scale("y");
     if (chart.lines.length && !y.distr) {
@@ -93,7 +93,7 @@
       data.push(unpack(curve.y));
       if (curve.band) data.push(...curve.band.map(unpack));
     }
-    const plot = {group: chart.group, figure, place};
+    const plot = {name: chart.name, group: chart.group, figure, place};
     plot.u = new uPlot(options(chart, place.clientWidth), data, place);
     plots.push(plot);
     let passing = false;
@@ -114,6 +114,50 @@
     });
     for (const button of figure.querySelectorAll("button")) button.addEventListener("click", keys[button.dataset.key]);
     figure.classList.add("ready");
+  }
+
+  // The tuning page: the sliders choose among designs that were computed beforehand.
+  const tuning = JSON.parse(document.getElementById("tuning-data").textContent);
+  const part = name => document.getElementById(`tuning-${name}`);
+  if (part("wheel")) {
+    const show = () => {
+      const {choices} = tuning.wheels[part("wheel").value];
+      const at = Number(part("margin").value) * tuning.shares.length + Number(part("bandwidth").value);
+      const one = choices[at];
+      part("reason").textContent = one ? one.reason || "" : tuning.wheels[part("wheel").value].reason;
+      const cell = (text, kind) => Object.assign(document.createElement("td"), {textContent: text, className: kind});
+      part("bandwidth-shown").textContent = one ? `${one.bandwidth} rad/s` : "";
+      part("margin-shown").textContent = one ? `${one.margin}°` : "";
+      part("bandwidth").setAttribute("aria-valuetext", part("bandwidth-shown").textContent);
+      part("margin").setAttribute("aria-valuetext", part("margin-shown").textContent);
+      part("rows").replaceChildren(...(one && one.rows || []).map(([name, value, band]) => {
+        const row = document.createElement("tr");
+        row.append(cell(name, ""), cell(value, "num strong"), cell(band, "num"));
+        return row;
+      }));
+      part("yaml").textContent = one && one.yaml || "";
+      part("copy").disabled = !part("yaml").textContent;
+      part("copied").textContent = "";
+      for (const plot of plots) if (one && one.charts && one.charts[plot.name]) plot.u.setData(one.charts[plot.name].map(unpack));
+    };
+    const choose = () => {
+      const {chosen} = tuning.wheels[part("wheel").value];
+      part("bandwidth").value = Math.max(chosen, 0) % tuning.shares.length;
+      part("margin").value = Math.floor(Math.max(chosen, 0) / tuning.shares.length);
+      show();
+    };
+    for (const name of ["bandwidth", "margin"]) part(name).addEventListener("input", show);
+    part("wheel").addEventListener("change", choose);
+    part("copy").addEventListener("click", async () => {
+      try {
+        await navigator.clipboard.writeText(part("yaml").textContent);
+        part("copied").textContent = "copied";
+      } catch {
+        getSelection().selectAllChildren(part("yaml"));
+        part("copied").textContent = "marked: press Ctrl-C";
+      }
+    });
+    choose();
   }
 
   const redraw = () => plots.forEach(plot => plot.u.redraw(false, true));

@@ -14,8 +14,8 @@ from smp_motor_ident.tune.arrays import Array
 from smp_motor_ident.tune.curves import Curves
 
 
-def tuning_charts(wheels: Mapping[str, Curves], limit: float) -> list[Chart]:
-    """Return the charts of the designs of all wheels."""
+def tuning_charts(wheels: Mapping[str, Curves], limit: float, prefix: str = "") -> list[Chart]:
+    """Return the charts of the designs of all wheels, each name with a prefix."""
     # Wheels of different time constants are computed over different lengths and bands.
     longest = max(wheels.values(), key=lambda c: float(c.time[-1]))
     time = longest.time
@@ -37,7 +37,7 @@ def tuning_charts(wheels: Mapping[str, Curves], limit: float) -> list[Chart]:
         if kind == "step":
             curves += (Curve("reference", _on(x, longest.time, longest.reference), "muted"),)
         return Chart(
-            name=kind, title=title, y_label=y_label, log=log, lines=lines, curves=curves,
+            name=prefix + kind, title=title, y_label=y_label, log=log, lines=lines, curves=curves,
             x_label="time [ms]" if timed else "frequency [rad/s]",
             x=1e3 * x if timed else x,
             summary=f"{title}, of {', '.join(map(label, wheels))}",
@@ -49,6 +49,7 @@ def tuning_charts(wheels: Mapping[str, Curves], limit: float) -> list[Chart]:
         chart("gain", "Loop gain: magnitude", "magnitude", "xy", (1.0,)),
         chart("phase", "Loop gain: phase", "phase [deg]", "x", (-180.0,)),
         chart("sensitivity", f"Sensitivity (line: Ms {limit:g})", "|S|", "x", (limit,)),
+        chart("noise", "Control noise", "density [V]", "xy"),
     ]
 
 

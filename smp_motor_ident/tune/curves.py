@@ -13,6 +13,7 @@ from smp_motor_ident.tune.designer import Design
 from smp_motor_ident.tune.margins import frequencies
 from smp_motor_ident.tune.motors import draw_motors, motors_of
 from smp_motor_ident.tune.plant import sample
+from smp_motor_ident.tune.problem import noise_density
 from smp_motor_ident.tune.reference import CHANGE, controller_for, planned_change
 from smp_motor_ident.tune.simulation import Controller, simulate
 
@@ -39,6 +40,9 @@ class Curves:
         Of the loop gain.
     sensitivity : ndarray, shape (3, f)
         Magnitude of the sensitivity [-].
+    noise : ndarray, shape (3, f), [V]
+        Density of the control noise, scaled so that its mean square over the frequencies up to
+        Nyquist is that of the controller's output.
     """
 
     time: Array
@@ -49,6 +53,7 @@ class Curves:
     gain: Array
     phase: Array
     sensitivity: Array
+    noise: Array
 
 
 def curves(estimate: Estimate, design: Design) -> Curves:
@@ -74,7 +79,9 @@ def curves(estimate: Estimate, design: Design) -> Curves:
     )
     omega = frequencies(T, 1 / slow, 120)
     shown = slice(None, None, math.ceil(time.size / 200))
-    loop_gain = plant.response(omega) * design.feedback.response(omega, T)
+    control = design.feedback.response(omega, T)
+    loop_gain = plant.response(omega) * control
+    through = np.abs(control / (1 + loop_gain))
     return Curves(
         time=time[shown],
         reference=planned.reference[shown] / ratio,
@@ -84,6 +91,7 @@ def curves(estimate: Estimate, design: Design) -> Curves:
         gain=_band(np.abs(loop_gain)),
         phase=_band(np.rad2deg(np.unwrap(np.angle(loop_gain), axis=1))),
         sensitivity=_band(np.abs(1 / (1 + loop_gain))),
+        noise=_band(through * np.sqrt(noise_density(plant, loop, omega))),
     )
 
 

@@ -179,13 +179,17 @@ def measured_lag(plant: Plant, delay: float) -> float:
 
 
 def noise_filter(problem: Problem, omega: Array) -> Array:
+    """Return the noise density of the measured speed of a problem's own plant."""
+    return noise_density(problem.plant, problem.loop, omega)
+
+
+def noise_density(plant: Plant, loop: Loop, omega: Array) -> Array:
     """Return the noise density of the measured speed.
 
     Quantisation of the count is taken as white and uniform over one count, then differenced or
     observed.
     """
-    loop = problem.loop
-    density: Array = problem.plant.angle_noise(omega) * loop.count_angle**2 / 12
+    density: Array = plant.angle_noise(omega) * loop.count_angle**2 / 12
     return density + loop.speed_noise**2
 
 

@@ -8,6 +8,7 @@ import re
 from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from smp_motor_control.parameter_file import read_parameters
 from smp_motor_ident.errors import BagError, ParameterError
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.record import Hardware
+from smp_motor_ident.report import tuning_page
 from smp_motor_ident.report.chart import thin
 from smp_motor_ident.report.document import (
     identification_document,
@@ -39,6 +41,7 @@ from smp_motor_ident.result import (
     Quantity,
     ResidualTests,
 )
+from smp_motor_ident.tune import Loop
 from smp_motor_ident.tune.curves import Curves
 
 PHYSICAL = {
@@ -200,6 +203,46 @@ def test_a_browser_draws_every_chart_zooms_and_asks_nobody(page: str, tmp_path: 
         assert (begin, end) == pytest.approx((10.0, 30.0), abs=0.1)
         assert browser.complaints == []
         assert set(browser.requests) == {file.as_uri()}
+
+
+def test_sliders_of_the_tuning_page_choose_designs_that_tune_has_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tuning_page, "SHARES", (0.5, 1.0))
+    monkeypatch.setattr(tuning_page, "MARGINS", (60.0,))
+    monkeypatch.setattr(tuning_page, "SAMPLES", 20)
+    loop = Loop(sample_time=0.005, gear_ratio=65.5, counts_per_revolution=500, supply_voltage=12.0)
+    tuning = tuning_page.tuning_of(estimate(), loop)
+    soft, own = tuning.choices
+    assert soft.design is not None and own.design is not None
+    assert tuning.chosen == 1
+    crossovers = [one.design.margins.crossover for one in (soft, own) if one.design]
+    # A design at a bandwidth keeps it to the 5 % that the method allows itself.
+    assert crossovers[0] == pytest.approx(0.5 * crossovers[1], rel=0.05)
+    (held,) = page_wheels({"front_left": tuning})
+    assert [f"p: {one.design.gains.p}" in shown["yaml"]
+            for one, shown in zip((soft, own), held["choices"])
+            if one.design] == [True, True]  # fmt: skip
+
+    if not CHROMIUM:
+        pytest.skip("no Chromium on this machine")
+    file = tmp_path / "report.html"
+    file.write_text(render(Report({"front_left": estimate()}, tunings={"front_left": tuning})))
+    with Browser(tmp_path / "profile") as browser:
+        browser.open(file, 390, dark=True)
+        yaml = "document.getElementById('tuning-yaml').textContent"
+        assert browser.value(yaml) == held["choices"][1]["yaml"]
+        slider = "document.getElementById('tuning-bandwidth')"
+        browser.value(f"{slider}.value = 0, {slider}.dispatchEvent(new Event('input'))")
+        assert browser.value(yaml) == held["choices"][0]["yaml"]
+        assert browser.value("document.documentElement.scrollWidth") <= 390
+        assert browser.complaints == []
+        assert set(browser.requests) == {file.as_uri()}
+
+
+def page_wheels(tunings: dict[str, tuning_page.Tuning]) -> list[dict[str, Any]]:
+    """What the page's script is given of each wheel."""
+    return list(tuning_page.page_data(tunings)["wheels"].values())
 
 
 def test_document_reads_back_as_the_same_estimates(tmp_path: Path) -> None:
@@ -386,7 +429,8 @@ def test_wheels_of_different_time_constants_share_the_axes_of_a_tuning():
         band = np.ones((3, n))
         return Curves(
             time=np.linspace(0.0, slow, n), reference=np.ones(n), step=band, load=band,
-            omega=np.geomspace(1 / slow, 100.0, n), gain=band, phase=band, sensitivity=band,
+            omega=np.geomspace(1 / slow, 100.0, n), gain=band, phase=band,
+            sensitivity=band, noise=band,
         )  # fmt: skip
 
     charts = tuning_charts({"fast": curves(20, 0.2), "slow": curves(31, 0.5)}, 1.4)

@@ -1,0 +1,184 @@
+"""The tuning page: designs over bandwidth and phase margin, computed beforehand by `tune`.
+
+Nothing of control is computed in the page; its sliders choose among these designs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from smp_motor_ident.errors import SmpError
+from smp_motor_ident.report.chart import Chart, packed
+from smp_motor_ident.report.tuning_figures import tuning_charts
+from smp_motor_ident.report.words import number
+from smp_motor_ident.result import Estimate
+from smp_motor_ident.tune import METHODS, Design, Loop, design
+from smp_motor_ident.tune.curves import Curves, curves
+from smp_motor_ident.tune.specification import Band
+from smp_motor_ident.tune.writing import gains_yaml
+
+SHARES = (0.3, 0.45, 0.65, 0.85, 1.0)
+"""Of the bandwidth that the method chooses by itself, which is the largest integral gain's."""
+
+MARGINS = (45.0, 60.0, 70.0)
+"""Phase margins that are offered [deg]: lively, usual, calm."""
+
+LIMIT = METHODS["margin"].required.sensitivity
+
+SAMPLES = 100
+"""Motors that the bands of a choice are over: their ends are the least and largest."""
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """One design of the page, or why there is none at this place of the sliders.
+
+    Attributes
+    ----------
+    bandwidth : float
+        Asked for [rad/s].
+    phase_margin : float
+        Asked for [deg].
+    design : Design, optional
+    curves : Curves, optional
+    reason : str
+        Why there is no design.
+    """
+
+    bandwidth: float
+    phase_margin: float
+    design: Design | None = None
+    curves: Curves | None = None
+    reason: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Tuning:
+    """What the page offers for one wheel.
+
+    Attributes
+    ----------
+    wheel : str
+        Name of the wheel.
+    choices : sequence of Choice
+        Margin after margin, the bandwidths of each in rising order; empty without a design.
+    chosen : int
+        Index of what `tune` chooses by itself, -1 without a design.
+    reason : str
+        Why there is no design at all.
+    """
+
+    wheel: str
+    choices: Sequence[Choice] = ()
+    chosen: int = -1
+    reason: str = ""
+
+
+def tuning_of(estimate: Estimate, loop: Loop) -> Tuning:
+    """Design one wheel's controller at every place of the sliders.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        Of the motor.
+    loop : Loop
+        That will run.
+
+    Returns
+    -------
+    Tuning
+    """
+    try:
+        own = design(estimate, loop, samples=SAMPLES)
+    except SmpError as error:
+        return Tuning(estimate.wheel, reason=str(error))
+    choices = []
+    for margin in MARGINS:
+        for share in SHARES:
+            bandwidth = share * own.margins.crossover
+            usual = share == 1.0 and margin == 60.0
+            choices.append(_choice(estimate, loop, bandwidth, margin, own if usual else None))
+    chosen = MARGINS.index(60.0) * len(SHARES) + len(SHARES) - 1
+    return Tuning(estimate.wheel, choices, chosen)
+
+
+def _choice(
+    estimate: Estimate, loop: Loop, bandwidth: float, margin: float, made: Design | None
+) -> Choice:
+    try:
+        found = made or design(
+            estimate, loop, bandwidth=bandwidth, phase_margin=margin, samples=SAMPLES
+        )
+    except SmpError as error:
+        return Choice(bandwidth, margin, reason=str(error))
+    return Choice(bandwidth, margin, found, curves(estimate, found))
+
+
+def page_charts(tunings: Mapping[str, Tuning]) -> list[Chart]:
+    """Return the charts as they stand before a slider is moved: of the first wheel."""
+    for tuning in tunings.values():
+        if tuning.choices:
+            one = tuning.choices[tuning.chosen]
+            assert one.curves is not None and one.design is not None
+            return tuning_charts({tuning.wheel: one.curves}, LIMIT, "tuning-")
+    return []
+
+
+def page_data(tunings: Mapping[str, Tuning]) -> dict[str, Any]:
+    """Return what the page's script shows: by wheel the designs at every place of the sliders."""
+    return {
+        "shares": SHARES,
+        "margins": MARGINS,
+        "wheels": {
+            wheel: {
+                "chosen": tuning.chosen,
+                "reason": tuning.reason,
+                "choices": [_document(one) for one in tuning.choices],
+            }
+            for wheel, tuning in tunings.items()
+        },
+    }
+
+
+def _document(one: Choice) -> dict[str, Any]:
+    asked = {"bandwidth": number(one.bandwidth), "margin": f"{one.phase_margin:g}"}
+    if one.design is None or one.curves is None:
+        return {**asked, "reason": one.reason}
+    found = one.design
+    charts = tuning_charts({found.wheel: one.curves}, LIMIT, "tuning-")
+    head = [
+        f"margin, bandwidth {found.margins.crossover:.4g} rad/s, phase margin "
+        f"{found.margins.phase:.3g} deg; chosen on the tuning page of the report"
+    ]
+    return {
+        **asked,
+        "rows": _rows(found),
+        "yaml": gains_yaml({found.wheel: found}, head),
+        "charts": {
+            chart.name: [packed(chart.x)]
+            + [packed(y) for c in chart.curves for y in (c.y, c.low, c.high) if y is not None]
+            for chart in charts
+        },
+    }
+
+
+def _rows(found: Design) -> list[tuple[str, str, str]]:
+    """Return name, value and band of what the design keeps."""
+    told, gains = found.specification, found.gains
+    return [
+        ("Crossover", f"{found.margins.crossover:.4g} rad/s", ""),
+        ("Phase margin", *_banded(told.phase_margin, 1.0, "°")),
+        ("Gain margin", *_banded(told.gain_margin, 1.0, "")),
+        ("Largest sensitivity Ms", *_banded(told.sensitivity, 1.0, "")),
+        ("Overshoot", *_banded(told.overshoot, 1.0, " %")),
+        ("Settling to 2 %", *_banded(told.settling, 1e3, " ms")),
+        ("Control noise", f"{1e3 * found.performance.control_noise:.3g} mV", ""),
+        ("p, i, d", f"{gains.p:.4g}, {gains.i:.4g}, {gains.d:.4g}", "V per wheel rad/s"),
+    ]
+
+
+def _banded(band: Band, scale: float, unit: str) -> tuple[str, str]:
+    value, low, high = (f"{round(scale * v, 3):.3g}" for v in (band.value, band.low, band.high))
+    return f"{value}{unit}", f"{low} … {high}{unit}"
