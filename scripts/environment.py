@@ -226,9 +226,10 @@ def make_venv(ros: str, lock: IO[str]) -> None:
 
 
 def install_packages(ros: str, lock: IO[str]) -> None:
-    """Install the lock file as it stands; every transitive dependency is in it."""
+    """Install the lock file as it stands; every transitive dependency is in it, with its hashes."""
     lockfile = requirements(ros)
     options = ["--no-deps", "--no-input", "--disable-pip-version-check", "--progress-bar=off"]
+    options.append("--require-hashes")
     run(
         [f"{VENV}/bin/python", "-m", "pip", "install", *options, "-r", str(lockfile)],
         environment(ros),

@@ -7,13 +7,20 @@ command -v uv >/dev/null || { echo "lock: uv not found: pip install uv" >&2; exi
 lock() {
   output=$1 python=$2
   shift 2
-  uv pip compile --quiet --universal --no-annotate --no-header --python-version "$python" "$@" --output-file "$output"
-  sed -i "/sys_platform == 'win32'/d; s/ ; sys_platform != 'win32'\$//; s/ ; sys_platform == 'linux'\$//" "$output"
+  uv pip compile --quiet --universal --generate-hashes --no-annotate --no-header --python-version "$python" "$@" \
+    --output-file "$output"
+  without "$output" "sys_platform == 'win32'"
+  sed -i -E "s/ ; sys_platform (!= 'win32'|== 'linux')( \\\\)?\$/\2/" "$output"
+}
+# A pin is a line and the lines of its hashes, which are indented.
+without() {
+  awk -v pattern="$2" '/^[^ ]/ { kept = $0 !~ pattern } kept' "$1" >"$1.partial"
+  mv "$1.partial" "$1"
 }
 lock wheels.txt 3.10 ros.in base.in dev.in "$@"
 # With ROS 2 Jazzy the rest comes from apt, at apt's versions, and must not be hidden by others.
 lock jazzy.txt 3.12 base.in colcon.in dev.in "$@" --override jazzy-apt.in
 packaged=$(sed -n 's/^\([a-z0-9-]*\)==.*/\1/p' jazzy-apt.in | paste -sd '|')
-sed -i -E "/^($packaged)==/d" jazzy.txt
+without jazzy.txt "^($packaged)=="
 sed -i "1i # What Ubuntu 24.04 with ROS 2 Jazzy lacks; made by \`make lock\` from base.in, colcon.in, dev.in less jazzy-apt.in." jazzy.txt
 sed -i "1i # All that is needed without ROS, Python 3.10 to 3.13; made by \`make lock\` from ros.in, base.in, dev.in." wheels.txt

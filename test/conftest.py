@@ -14,7 +14,12 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import IO
 
+import hypothesis
 import pytest
+
+# Examples are drawn alike in every run, and may take their time on a busy machine.
+hypothesis.settings.register_profile("suite", derandomize=True, deadline=None)
+hypothesis.settings.load_profile("suite")
 
 # Where the workspace's setup was sourced (colcon test), its executables are not on PATH.
 for _prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):

@@ -187,7 +187,7 @@ def _gaps(
     steps, missing = np.diff(axis), beat.missing(axis)
     if alike and voltage.number is not None:  # the publisher counted: nothing to be guessed
         missing = np.maximum(np.diff(voltage.number) - 1, 0)
-    limit = plan.gap * 1e9 if plan.gap else beat.gap()
+    limit = plan.gap * 1e9 if plan.gap else beat.gap(averaged=alike and held == "before")
     cut = steps > limit
     if alike and not plan.gap:
         cut |= missing > BRIDGED

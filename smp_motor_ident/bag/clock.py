@@ -136,9 +136,13 @@ class Rhythm:
         number[late] = np.clip(lasting, 0, number[late])
         return number
 
-    def gap(self) -> float:
-        """Return the interval [ns] beyond which two samples have nothing in common."""
-        if self.regular:
+    def gap(self, averaged: bool = False) -> float:
+        """Return the interval [ns] beyond which two samples have nothing in common.
+
+        A log that is written on change is irregular and holds its voltage for long; but an
+        ``averaged`` voltage does not tell when within a long interval it changed.
+        """
+        if self.regular or averaged:
             return max(20 * self.interval, 0.02 * _SECOND)
         return max(100 * self.interval, 1.0 * _SECOND)
 

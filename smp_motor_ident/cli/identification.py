@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from smp_motor_ident import bag, likelihood
+from smp_motor_ident.cli import known_loop
 from smp_motor_ident.cli.frame import progress
 from smp_motor_ident.cli.identify import NAME
 from smp_motor_ident.cli.tables import console, estimate_table
@@ -69,9 +70,10 @@ class Outcome:
 
 def work(arguments: argparse.Namespace) -> int:
     """Do what the arguments say."""
-    mapping = signal_map(arguments)
     if arguments.topics:
         return list_topics(arguments.bags, arguments.msg, NAME)
+    loop = None if arguments.controller is None else known_loop.reconstruction(arguments)
+    mapping = signal_map(arguments) if loop is None else known_loop.signal_map(arguments)
     if not arguments.output:
         raise ParameterError("--output DIR is missing: where shall the results go?")
     fixed = fixed_parameters(arguments.fix)
@@ -84,6 +86,9 @@ def work(arguments: argparse.Namespace) -> int:
         say("reading")
         records = _read(arguments.bags, mapping, arguments.wheel)
         kept = _read(arguments.validate, mapping, list(records)) if arguments.validate else {}
+        if loop is not None:
+            records = {wheel: list(map(loop, group)) for wheel, group in records.items()}
+            kept = {wheel: list(map(loop, group)) for wheel, group in kept.items()}
         jobs = {
             wheel: partial(identify_wheel, group, kept.get(wheel, ()), arguments.model, fixed)
             for wheel, group in records.items()

@@ -50,6 +50,10 @@ def parser() -> argparse.ArgumentParser:
     add("--map", action="append", nargs="+", default=[], metavar="KEY=VALUE", help="see below")
     add("--mapping", metavar="FILE", help="the same as YAML file")
     add("--msg", action="append", default=[], metavar="FILE", help=".msg file of an unknown type")
+    add(
+        "--controller", nargs="+", metavar=("FORMAT", "GAIN=VALUE"),
+        help="the recording has set-points (--map setpoint=...) instead of voltages: of this loop",
+    )  # fmt: skip
     add("--topics", action="store_true", help="list what the bag offers, suggest a mapping")
     add("--history", metavar="FILE", help="draw what identifier has seen since, from its history")
     add("--tuning", action="store_true", help="add the tuning page to the report (takes longer)")

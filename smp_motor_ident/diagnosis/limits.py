@@ -355,3 +355,23 @@ LEFT_BAND = Limit(
     "a single load or a bad sample is over by then; a motor that burns takes longer",
     "test_monitor.py: half an hour of ordinary driving",
 )
+
+# Loops whose commands are reconstructed.
+COMMAND_RESOLUTION = Limit(
+    1 / 255,
+    "of the supply, rms",
+    "one step of an 8-bit PWM: a command that is known closer is known as well as it was given",
+    "test_known_loop.py: a speed that was logged in coarse steps",
+)
+LOOP_RATE = Limit(
+    0.02,
+    "of the interval",
+    "clocks of boards are within 2 %; a log at another rate leaves commands out",
+    "test_known_loop.py: a log at another rate",
+)
+TICK_FIT = Limit(
+    0.05,
+    "of a tick",
+    "digits that put 95 % of speeds within a twentieth of a whole tick leave no doubt which",
+    "test_known_loop.py: the command is reconstructed",
+)

@@ -66,3 +66,84 @@ def test_impossible_encoder_is_refused(bad):
         Encoder(**bad)
     with pytest.raises(ParameterError, match="window"):
         DifferencedSpeed(Encoder(), 0)
+
+
+@pytest.mark.parametrize("bits", [2, 8, 16, 63])
+def test_a_counter_shows_twos_complement_at_the_ends_of_its_range(bits):
+    half = 2 ** (bits - 1)
+    shows = {half - 1: half - 1, half: -half, -half: -half, -half - 1: half - 1, 2 * half: 0}
+    for count, expected in shows.items():
+        assert wrap(count, bits) == expected
+        assert wrap(count, 0) == count
+        # One step to there from zero, by the shortest way.
+        for unwrapped in (Unwrapper(bits), Unwrapper(0)):
+            assert unwrapped(0) == 0
+        one = Unwrapper(bits)
+        one(0)
+        assert one(count if bits < 63 else expected) == expected
+        assert Encoder(500.0, bits).bits == bits
+
+
+@pytest.mark.parametrize("bits", [-1, 1, 64, 2.5])
+def test_a_width_that_no_counter_has_is_refused_wherever_it_is_given(bits):
+    for make in (lambda: Encoder(bits=bits), lambda: Unwrapper(bits), lambda: unwrap([0, 1], bits)):
+        with pytest.raises(ParameterError, match="encoder_bits"):
+            make()
+
+
+def test_what_never_wraps_and_what_is_empty_comes_back_as_a_copy():
+    counts = np.array([0, 200, -300, 2**40])
+    for bits, shown in ((0, counts), (8, counts[:0])):
+        result = unwrap(shown, bits)
+        assert np.array_equal(result, shown) and result is not shown
+    result = unwrap(counts, 0)
+    result[0] = 7
+    assert counts[0] == 0
+    assert unwrap([1], 8).tolist() == [1]
+
+
+def test_a_counter_that_is_reset_begins_where_it_stands():
+    one = Unwrapper(8)
+    assert [one(c) for c in (100, 127, -128)] == [100, 127, 128]
+    one.reset()
+    assert [one(c) for c in (-100, -90)] == [-100, -90]
+
+
+@pytest.mark.parametrize("window", [1, 2, 5])
+def test_speed_is_the_count_over_exactly_its_window(window):
+    speed, counts = DifferencedSpeed(Encoder(64.0), window), [0, 3, 4, 4, 9, 2, 30, 31]
+    assert speed.total == 0
+    times = np.cumsum([0.5, 0.25, 0.125, 0.5, 1.0, 0.25, 0.125, 2.0])
+    for k, (time, count) in enumerate(zip(times, counts)):
+        value, first = speed.step(float(time), count), max(k - window, 0)
+        assert speed.total == count
+        if k == 0:
+            assert math.isnan(value)
+        else:
+            moved = (count - counts[first]) * 2.0 * math.pi / 64.0
+            assert value == pytest.approx(moved / (times[k] - times[first]))
+    assert math.isnan(DifferencedSpeed(Encoder()).step(1.0, 5))
+    again = DifferencedSpeed(Encoder(64.0), 1)
+    again.step(1.0, 5)
+    assert math.isnan(again.step(1.0, 9)), "no time has passed"
+    plain = DifferencedSpeed(Encoder(64.0))  # a window of one
+    for k in range(3):
+        value = plain.step(float(k), k * k)
+    assert value == pytest.approx(3.0 * 2.0 * math.pi / 64.0)
+
+
+def test_a_reset_forgets_counter_and_window():
+    speed = DifferencedSpeed(Encoder(64.0, 8), window=2)
+    speed.step(0.0, 100)
+    speed.step(1.0, 120)
+    speed.reset()
+    assert math.isnan(speed.step(2.0, -100)) and speed.total == -100
+
+
+def test_counts_per_revolution_have_their_limits_and_their_default():
+    assert Encoder().counts_per_revolution == 500.0 and Encoder().bits == 0
+    for value in (1e-3, 1e9):
+        assert Encoder(value).angle_per_count == pytest.approx(2.0 * math.pi / value)
+    for value in (0.9e-3, 1.1e9, math.nan, -500.0):
+        with pytest.raises(ParameterError, match="counts_per_revolution"):
+            Encoder(value)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -111,6 +112,18 @@ def test_failed_installation_is_not_taken_as_done(clone):
     assert_refused(result, clone, "package index cannot be reached", "setup.log")
     shell = run(clone, os.environ["PATH"], command=("bash", "-uc", ". ./setup.bash"))
     assert_refused(shell, clone, "not set up yet", "make -C")
+
+
+@pytest.mark.parametrize("name", ["wheels.txt", "jazzy.txt"])
+def test_every_pin_is_exact_and_has_the_hashes_of_its_files(name):
+    lines = [x for x in (ROOT / "requirements" / name).read_text().splitlines() if x[:1] != "#"]
+    pins = [k for k, line in enumerate(lines) if not line.startswith(" ")]
+    assert len(pins) > 50
+    for begin, end in zip(pins, [*pins[1:], len(lines)]):
+        assert re.fullmatch(r"[A-Za-z0-9._-]+==[^ ;]+( ; [^\\]+)? \\", lines[begin]), lines[begin]
+        assert end - begin > 1, f"{lines[begin]}: no hash"
+        for line in lines[begin + 1 : end]:
+            assert re.fullmatch(r" {4}--hash=sha256:[0-9a-f]{64}( \\)?", line), line
 
 
 def keys(clone):

@@ -129,3 +129,62 @@ def test_an_angle_within_one_turn_is_unwrapped_and_any_other_left() -> None:
     for left in (true, 0.3 * np.sin(true), np.array([1.0]), np.array([np.nan, 1.0])):
         result, undone = unwrap_angle(left)
         assert not undone and result is left
+
+
+@pytest.mark.parametrize("measured", [True, False])
+def test_a_counter_that_wraps_starts_again_at_what_it_shows(measured: bool) -> None:
+    true = turning(samples=600, most=90, seed=8) + 20_000
+    true[250:] -= true[250] - 5
+    true[450:] += 15_000 - true[450]
+    true[451:] -= true[451] + 3  # a second reset, to just below zero
+    raw = shown(true, 16)
+    raw[100:200] += 0
+    expected = np.diff(true).astype(float)
+    expected[[249, 449, 450]] = 30.0  # by a sensor of its own the motor goes on
+    found = unwrap(raw, 16, expected if measured else None)
+    assert found.resets.tolist()[0] == 250
+    assert np.array_equal(found.count[:250] - raw[0], true[:250] - true[0])
+    assert np.array_equal(found.count[250:450], true[250:450])
+    after = found.resets[-1]
+    assert found.count[after] == raw[after]
+
+
+def test_a_motor_at_speed_wraps_an_unknown_width_that_its_speed_tells() -> None:
+    steps = np.random.default_rng(6).integers(55, 66, 3000)
+    true = np.concatenate([[0], np.cumsum(steps)])
+    raw = shown(true, 11)
+    found = unwrap(raw, None, steps.astype(float))
+    assert np.array_equal(found.count, true) and found.findings[0].evidence == {"bits": 11}
+
+
+@pytest.mark.parametrize("at", [1, 199])
+def test_a_fall_at_either_end_is_a_wrong_sample_and_no_reset(at: int) -> None:
+    raw = turning(samples=200, most=20) + 50_000
+    raw[at:] -= raw[at]
+    found = unwrap(raw, 0)
+    assert found.resets.size == 0 and np.array_equal(found.count, raw)
+
+
+def test_a_spike_beside_zero_is_no_reset() -> None:
+    raw = turning(samples=300, most=20) % 50
+    raw[100] = 50_000
+    assert unwrap(raw, 0).resets.size == 0
+
+
+def test_without_a_speed_a_reset_falls_further_than_the_largest_steps() -> None:
+    steps = np.full(400, 5)
+    steps[::40] = 400  # a few large ones: the bound of usual steps is 150
+    for height, told in ((1500, False), (4500, True)):
+        raw = np.cumsum(steps) - int(np.cumsum(steps)[221]) + height
+        raw[222:] -= raw[222]
+        assert unwrap(raw, 0).resets.tolist() == ([222] if told else [])
+        measured = np.diff(raw).astype(float)
+        measured[221] = 5.0
+        assert unwrap(raw, 0, measured).resets.tolist() == [222]
+
+
+@pytest.mark.parametrize(("times", "told"), [(3, 3), (4, 0)])
+def test_three_resets_of_a_short_record_are_told_and_four_are_not(times: int, told: int) -> None:
+    raw = np.tile(np.arange(0, 40_000, 1000), times + 1)
+    found = unwrap(raw.astype(np.int64), 0, np.full(raw.size - 1, 1000.0))
+    assert found.resets.size == told

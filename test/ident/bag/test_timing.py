@@ -141,6 +141,19 @@ def test_a_reset_counter_begins_a_new_segment(tmp_path: Path, corpus: SimpleName
     assert "reset 1 times" in " ".join(f.message for f in record.findings)
 
 
+def test_a_mean_voltage_over_a_long_interval_of_irregular_samples_begins_a_segment(
+    tmp_path: Path, corpus: SimpleNamespace
+) -> None:
+    """The mean does not tell when within 0.4 s, where 10 ms are usual, the voltage changed."""
+    truth = corpus.motion(n=200)
+    steps = np.where(np.arange(200) % 3, 10_000_000, 19_000_000)
+    steps[120] = 400_000_000
+    truth = replaced(truth, time=corpus.START + np.cumsum(steps))
+    record = read(tmp_path / "bag.mcap", corpus, truth.messages())
+    assert record.starts == (0, 120)
+    assert "1 gaps of up to 0.4 s" in " ".join(f.message for f in record.findings)
+
+
 def test_a_few_lost_samples_are_bridged_and_more_begin_a_segment(
     tmp_path: Path, corpus: SimpleNamespace
 ) -> None:

@@ -1,0 +1,112 @@
+"""security/policy.xml allows every node what it really uses, and the motors' commands to few."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable
+from pathlib import Path
+from unittest.mock import Mock
+
+import pytest
+import rclpy
+from rclpy.node import Node
+
+from smp_motor_control import WHEELS
+from smp_motor_control.nodes import teleop_wheels
+from smp_motor_control.nodes.excite import Excite
+from smp_motor_control.nodes.motor_plant import MotorPlant
+from smp_motor_control.nodes.serial_driver import SerialDriver
+from smp_motor_control.nodes.skid_steer import SkidSteerNode
+from smp_motor_control.nodes.wheel_pid import WheelPid
+from smp_motor_ident.nodes.identifier import Identifier
+
+POLICY = ElementTree.parse(Path(__file__).resolve().parents[2] / "security" / "policy.xml")
+Allowed = dict[str, set[str]]
+
+
+def wheel_pid() -> Node:
+    node = WheelPid()
+    node.trigger_configure()
+    return node
+
+
+NODES: list[tuple[str, Callable[[], Node]]] = [
+    *((f"/{wheel}", wheel_pid) for wheel in WHEELS),
+    ("/", SkidSteerNode), ("/", teleop_wheels.TeleopWheels), ("/", SerialDriver), ("/", MotorPlant),
+    ("/", Excite), ("/", Identifier),
+]  # fmt: skip
+
+
+def allowed() -> dict[str, Allowed]:
+    """What the policy allows, full names by the node's path and by the kind of access."""
+    result: dict[str, Allowed] = {}
+    for context in POLICY.iter("context"):
+        (profile,) = context.iter("profile")
+        namespace, name = profile.attrib["ns"].rstrip("/"), profile.attrib["node"]
+        path = f"{namespace}/{name}"
+        assert context.attrib["path"] == path
+        access: Allowed = {"publish": set(), "subscribe": set(), "reply": set(), "request": set()}
+        for group in profile:
+            ((kind, rule),) = group.attrib.items()
+            assert rule == "ALLOW" and group.tag in ("topics", "services")
+            for entry in group:
+                text = str(entry.text).replace("~", path)
+                access[kind].add(text if text.startswith("/") else f"{namespace}/{text}")
+        result[path] = access
+    return result
+
+
+def used(make: Callable[[], Node], namespace: str, domain: int) -> tuple[str, Allowed]:
+    """Make a node and return what it publishes, hears and answers."""
+    rclpy.init(args=["--ros-args", "-r", f"__ns:={namespace}"], domain_id=domain)
+    try:
+        node = make()
+        access = {
+            "publish": {p.topic_name for p in node.publishers},
+            "subscribe": {s.topic_name for s in node.subscriptions},
+            "reply": {node.resolve_service_name(s.srv_name) for s in node.services},
+        }
+        path = f"{node.get_namespace().rstrip('/')}/{node.get_name()}"
+        node.destroy_node()
+        return path, access
+    finally:
+        rclpy.shutdown()
+
+
+@pytest.mark.parametrize(("namespace", "make"), NODES[3:], ids=lambda x: getattr(x, "__name__", ""))
+def test_a_node_is_allowed_what_it_uses(namespace, make, ros_domain, monkeypatch) -> None:
+    monkeypatch.setattr(teleop_wheels, "Terminal", Mock())  # there is none
+    path, access = used(make, namespace, ros_domain)
+    rules = allowed()[path]
+    for kind, names in access.items():
+        assert names <= rules[kind], f"{path} may not {kind} {names - rules[kind]}"
+    # And no more, but what rcl adds, or a package that is not installed here would.
+    always = {"/clock", "/parameter_events", "/rosout", "/tf"}
+    for kind in ("publish", "subscribe"):
+        spare = {n for n in rules[kind] - access[kind] - always if "transition_event" not in n}
+        assert not spare, f"{path} never uses {spare}"
+
+
+def test_the_wheels_may_do_alike_and_few_may_command_them() -> None:
+    rules = allowed()
+    wheels = [
+        {
+            k: {n.replace(f"/{w}/", "/wheel/") for n in v}
+            for k, v in rules[f"/{w}/wheel_pid"].items()
+        }
+        for w in WHEELS
+    ]
+    assert all(one == wheels[0] for one in wheels)
+
+    def publishers(topic: str) -> set[str]:
+        return {path for path, rule in rules.items() if topic in rule["publish"]}
+
+    for wheel in WHEELS:
+        assert publishers(f"/{wheel}/motor_command") == {f"/{wheel}/wheel_pid", "/excite"}
+        assert publishers(f"/{wheel}/motor_state") == {"/serial_driver", "/motor_plant"}
+        askers = {
+            p for p, rule in rules.items() if f"/{wheel}/wheel_pid/change_state" in rule["request"]
+        }
+        assert askers == {"/commission", "/tune", "/robot_guard"}
+    assert publishers("/wheel_setpoints") == {"/skid_steer", "/teleop_wheels"}
+    assert publishers("/cmd_vel") == {"/teleop_wheels"}
