@@ -77,6 +77,12 @@ def work(arguments: argparse.Namespace) -> int:
     if not arguments.output:
         raise ParameterError("--output DIR is missing: where shall the results go?")
     fixed = fixed_parameters(arguments.fix)
+    if arguments.fleet:
+        if loop is not None or arguments.validate:
+            raise ParameterError("--fleet goes without --controller and --validate")
+        from smp_motor_ident.cli import fleet
+
+        return fleet.work(arguments, mapping, fixed)
     paths = [Path(arguments.output) / name for name in OUTPUTS]
     check_free(paths, arguments.force)
     with progress(NAME, arguments.quiet) as say:
