@@ -190,7 +190,7 @@ def _tunings(outcomes: Mapping[str, Outcome], say: Callable[..., None]) -> dict[
     def one(found: Estimate, _: Callable[[str], None]) -> Tuning:
         try:
             return tuning_page.tuning_of(found, tune_arguments.loop_for(found, usual))
-        except ParameterError as error:  # of a motor whose supply nobody told
+        except ParameterError as error:  # of a motor whose supply is not known
             return tuning_page.Tuning(found.wheel, reason=str(error))
 
     known = {wheel: out.estimate for wheel, out in outcomes.items() if out.estimate}
