@@ -227,7 +227,7 @@ FAULTS = [
 
 
 def unseen(commands: list[Any]) -> float:
-    """Return the time that no sample told the controller of [s].
+    """Return the time of which no sample reached the controller [s].
 
     Of a gap between samples it takes 0.1 s for evidence and no more, so that on a processor which
     it does not get a fault is found later by that.

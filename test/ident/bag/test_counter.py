@@ -87,9 +87,9 @@ def test_a_reset_is_no_motion_and_the_counts_before_and_after_stay(measured: boo
     raw[120:] -= true[120]  # starts at zero again
     raw[320:] -= raw[320] - 3
     found = unwrap(raw, 0, np.diff(true).astype(float) if measured else None)
-    told = [120, 320]
-    assert found.resets.tolist() == told
-    for begin, end in zip([0, *told], [*told, raw.size]):
+    found_at = [120, 320]
+    assert found.resets.tolist() == found_at
+    for begin, end in zip([0, *found_at], [*found_at, raw.size]):
         assert np.array_equal(found.count[begin:end], raw[begin:end])
     (finding,) = found.findings
     assert (finding.code, finding.severity) == ("counter_reset", "warning")
@@ -174,20 +174,20 @@ def test_a_spike_beside_zero_is_no_reset() -> None:
 def test_without_a_speed_a_reset_falls_further_than_the_largest_steps() -> None:
     steps = np.full(400, 5)
     steps[::40] = 400  # a few large ones: the bound of usual steps is 150
-    for height, told in ((1900, False), (2100, True)):
+    for height, found_at in ((1900, False), (2100, True)):
         raw = np.cumsum(steps) - int(np.cumsum(steps)[221]) + height
         raw[222:] -= raw[222]
-        assert unwrap(raw, 0).resets.tolist() == ([222] if told else [])
+        assert unwrap(raw, 0).resets.tolist() == ([222] if found_at else [])
         measured = np.diff(raw).astype(float)
         measured[221] = 5.0
         assert unwrap(raw, 0, measured).resets.tolist() == [222]
 
 
-@pytest.mark.parametrize(("times", "told"), [(3, 3), (4, 0)])
-def test_three_resets_of_a_short_record_are_told_and_four_are_not(times: int, told: int) -> None:
+@pytest.mark.parametrize(("times", "found_at"), [(3, 3), (4, 0)])
+def test_three_resets_of_a_short_record_count_and_four_do_not(times: int, found_at: int) -> None:
     raw = np.tile(np.arange(0, 40_000, 1000), times + 1)
     found = unwrap(raw.astype(np.int64), 0, np.full(raw.size - 1, 1000.0))
-    assert found.resets.size == told
+    assert found.resets.size == found_at
 
 
 def test_a_narrow_counter_that_turns_as_fast_as_may_be_told_is_told() -> None:
@@ -216,11 +216,13 @@ def test_a_motor_that_turns_back_to_zero_is_not_reset_there() -> None:
         assert unwrap(raw, 0, expected).resets.size == 0
 
 
-@pytest.mark.parametrize(("length", "blocks", "told"), [(100, 11, 10), (80, 10, 0)])
-def test_a_hundredth_of_a_long_record_may_be_resets(length: int, blocks: int, told: int) -> None:
+@pytest.mark.parametrize(("length", "blocks", "found_at"), [(100, 11, 10), (80, 10, 0)])
+def test_a_hundredth_of_a_long_record_may_be_resets(
+    length: int, blocks: int, found_at: int
+) -> None:
     raw = np.tile(np.arange(0, 1000 * length, 1000), blocks)
     found = unwrap(raw, 0, np.full(raw.size - 1, 1000.0))
-    assert found.resets.size == told
+    assert found.resets.size == found_at
 
 
 def test_an_angle_that_leaves_one_turn_was_never_wrapped() -> None:
