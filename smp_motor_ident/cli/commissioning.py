@@ -8,7 +8,10 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from smp_motor_control import WHEELS
+from smp_motor_control.excitation import SIGNALS as SHAPES
 from smp_motor_ident.cli import steps
 from smp_motor_ident.cli.commission import NAME
 from smp_motor_ident.cli.processes import ProcessError, Processes, connect
@@ -16,10 +19,16 @@ from smp_motor_ident.errors import ParameterError
 
 SIGNALS = ("sine", "square", "fourier")
 
+DRAWN, COLUMNS, BLOCKS = 4.0, 72, "▁▂▃▄▅▆▇█"
+"""So many seconds of a signal are drawn, on so many columns, with these levels."""
+
 
 def work(arguments: argparse.Namespace) -> int:
     """Do what the arguments say."""
     folder, wheels, plan = _checked(arguments)
+    if arguments.dry_run:
+        print("\n".join(drawn(plan)))
+        return 0
     try:
         return _commission(arguments, folder, wheels, plan)
     finally:
@@ -44,7 +53,7 @@ def _commission(
         with client.paused(wheels):
             bag = _excited(robot, plan)
             results = folder / "identification"
-            steps.identify_wheels(bag, results)
+            steps.identify_wheels(bag, results, *(["--tuning"] if arguments.tuning else []))
             gains = steps.tune_wheels(results, folder / "gains.yaml")
             if arguments.apply:
                 steps.set_gains(robot, gains)
@@ -69,6 +78,24 @@ def _checked(
         for signal in SIGNALS
     ]
     return folder, wheels, plan
+
+
+def drawn(plan: Sequence[steps.Excitation]) -> list[str]:
+    """Return the plan in words, each signal with its first seconds as a line of blocks."""
+    lines, begin = [], 0.0
+    for part in plan:
+        signal = SHAPES[part.signal](amplitude=part.amplitude)
+        shown = min(part.duration, DRAWN)
+        level = signal(np.arange(COLUMNS, dtype=np.float64) * (shown / COLUMNS)) / part.amplitude
+        bars = "".join(BLOCKS[round((1 + float(v)) / 2 * (len(BLOCKS) - 1))] for v in level)
+        lines.append(
+            f"from {begin:5.1f} s: {part.signal}, up to {part.amplitude:g} V either way, "
+            f"{part.duration:g} s; its first {shown:g} s:"
+        )
+        lines.append(f"  {bars}")
+        begin += part.duration
+    lines.append(f"then: identify, tune; {begin:g} s of motion in all. Nothing was moved.")
+    return lines
 
 
 def _confirm(arguments: argparse.Namespace, wheels: Sequence[str]) -> None:

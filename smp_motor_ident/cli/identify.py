@@ -55,6 +55,9 @@ def parser() -> argparse.ArgumentParser:
         help="the recording has set-points (--map setpoint=...) instead of voltages: of this loop",
     )  # fmt: skip
     add("--topics", action="store_true", help="list what the bag offers, suggest a mapping")
+    add("--fleet", action="store_true", help="each recording by itself, compared in one table")
+    add("--scheduler", metavar="ADDRESS", help="with --fleet: of a Dask cluster that works")
+    add("--history", metavar="FILE", help="draw what identifier has seen since, from its history")
     add("--tuning", action="store_true", help="add the tuning page to the report (takes longer)")
     add("--what-next", action="store_true", help="propose the next recording")
     add("--accuracy", type=number(0, 1), default=0.01, help="wanted by --what-next; default 0.01")
