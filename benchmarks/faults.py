@@ -414,7 +414,7 @@ def main() -> int:
     parser.add_argument("--parameters", type=int, metavar="N", help="sets through the service")
     parser.add_argument("--core", type=int, metavar="N", help="sets without processes")
     arguments = parser.parse_args()
-    domain = int(os.environ.setdefault("ROS_DOMAIN_ID", "97"))
+    domain = int(os.environ.setdefault("ROS_DOMAIN_ID", "105"))
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     print(f"seed {arguments.seed}", flush=True)
     if arguments.core:
