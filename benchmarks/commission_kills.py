@@ -50,6 +50,7 @@ class Campaign:
         from wheel_robot import WheelRobot
 
         self.robot, self.slack = WheelRobot(domain), slack
+        self.tool: subprocess.Popen[bytes] | None = None
         self.robot.spin_for(2.0)
         if self.robot.node.count_publishers("/front_left/motor_description"):
             sys.exit(f"another robot runs in domain {domain}; choose another ROS_DOMAIN_ID")
@@ -64,6 +65,8 @@ class Campaign:
             sys.exit("the controllers do not become active")
 
     def close(self) -> None:
+        if self.tool is not None and session(self.tool.pid):
+            os.killpg(self.tool.pid, signal.SIGKILL)
         for process in self.processes:
             process.kill()
             process.wait(60.0)
@@ -105,7 +108,7 @@ class Campaign:
         """Start the tool and kill a part of it; return which, and what did not hold."""
         folder = Path(tempfile.mkdtemp(), "out")
         given = [part for wheel in WHEELS for part in ("--wheel", wheel)]
-        tool = subprocess.Popen(
+        self.tool = tool = subprocess.Popen(
             ["commission", "--output", str(folder), "--duration", str(DURATION), "--yes", *given],
             start_new_session=True, **QUIET,
         )  # type: ignore[call-overload]  # fmt: skip
@@ -146,7 +149,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=int(time.time()) // 86400)
     parser.add_argument("--slack", type=float, default=0.5, help="more time [s]; default 0.5")
     given = parser.parse_args()
-    domain = int(os.environ.setdefault("ROS_DOMAIN_ID", "97"))
+    domain = int(os.environ.setdefault("ROS_DOMAIN_ID", "105"))
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     draw, failures = random.Random(given.seed), 0

@@ -9,16 +9,23 @@ With ``hardware:=external`` something else must publish ``<wheel>/motor_state`` 
 ``<wheel>/motor_description`` and take ``<wheel>/motor_command`` in the robot's namespace.
 """
 
-from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from pathlib import Path
+
+from ament_index_python import get_search_paths
+from launch.actions import DeclareLaunchArgument, LogInfo, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
 from launch import LaunchDescription
 from smp_motor_control import LEFT, RIGHT
-from smp_motor_control.parameter_file import require_nodes
+from smp_motor_control.body.description import robot_description
+from smp_motor_control.parameter_file import read_parameters, require_nodes
 
 PACKAGE = "smp_motor_control"
+STATE_PUBLISHER = "share/robot_state_publisher"
+SIZES = {"wheel_separation": "separation", "wheel_radius": "radius"}
 CONFIG = [FindPackageShare(PACKAGE), "/config/"]
 
 ARGUMENTS = {
@@ -31,6 +38,7 @@ ARGUMENTS = {
     "motors": ([*CONFIG, "motors_paper.yaml"], "Motors of the simulation"),
     "rate": ("200.0", "Samples per second of the simulation"),
     "skid_steer": ("true", "Whether to start skid_steer"),
+    "description": ("true", "Whether robot_state_publisher, where it is installed, gets a URDF"),
     "use_stamped_vel": ("true", "Whether TwistStamped goes before Twist where both are published"),
     "autostart": ("true", "Whether the wheels' controllers activate themselves"),
     "use_sim_time": ("false", "Take the time from /clock"),
@@ -78,7 +86,29 @@ def start(context, *_) -> list:
             "use_stamped_vel": is_true(given, "use_stamped_vel"),
         }
         nodes.append(node("skid_steer", [given["body"], body]))
+        if is_true(given, "description"):
+            nodes += describe(sides, given["body"], robot, common)
     return nodes
+
+
+def describe(sides: list, body: str, robot: str, common: dict) -> list:
+    """Return what turns joint_states into the frames of the wheels."""
+    if not any(Path(p, STATE_PUBLISHER).is_dir() for p in get_search_paths()):
+        return [LogInfo(msg="robot_state_publisher is not installed: no frames of the wheels")]
+    named = {}
+    for node, parameters in read_parameters(body).items():
+        named.update(parameters if node.endswith("skid_steer") else {})
+    sizes = {to: named[name] for name, to in SIZES.items() if name in named}
+    text = ParameterValue(robot_description(*sides, **sizes), value_type=str)
+    prefix = f"{robot.strip('/')}/" if robot else ""
+    return [
+        Node(
+            package="robot_state_publisher",
+            executable="robot_state_publisher",
+            namespace=robot,
+            parameters=[{"robot_description": text, "frame_prefix": prefix}, common],
+        )
+    ]
 
 
 def is_true(given: dict, name: str) -> bool:

@@ -34,7 +34,7 @@ fi
 if colcon build "${options[@]}" >plain.log 2>&1; then
   [ -d install/smp_interfaces ] || fail "plain colcon build made a silent half"
 else
-  grep -h "colcon build --base-paths" -r plain.log log/latest_build | tail -1 || fail "plain colcon build does not say what to type"
+  grep -rhoE "type: colcon build --base-paths [^ ]+ [^ '\\]+" plain.log log/latest_build | head -1 | grep . || fail "plain colcon build does not say what to type"
 fi
 say "plain colcon build: whole, or one line"
 

@@ -200,6 +200,23 @@ def write_bag(path: Path, one: SimpleNamespace, own: bool) -> None:
                 put(bag, "/pwm", topics["/pwm"], t, data=u * 255 / 12)
 
 
+def driven_by_pid_v1(seconds: float) -> np.ndarray:
+    """The same motor under PID_v1 (Kp 15, Ki 150, 10 ms, 255 is 12 V): t, set-point, speed."""
+    motor = Motor(load_motors(ROOT / "config/motors_paper.yaml")["front_left"].parameters)
+    n = round(seconds / STEP)
+    targets = np.repeat(np.random.default_rng(7).uniform(-2.5, 2.5, n // 30 + 1), 30)[:n]
+    targets[:30] = 0.0
+    rows, total, before = [], 0.0, 0
+    for k, target in enumerate(targets):
+        count = math.floor(motor.angle * COUNTS / (2 * math.pi))
+        speed, before = (count - before) * 2 * math.pi / COUNTS / STEP / RATIO, count
+        total = min(max(total + 150 * STEP * (target - speed), -255), 255)
+        pwm = int(min(max(15 * (target - speed) + total, -255), 255))
+        rows.append((k * STEP, target, speed))
+        motor.step(pwm / 255 * 12.0, STEP)
+    return np.array(rows)
+
+
 @pytest.fixture(scope="module")
 def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The recordings, and the result that one page works on."""
@@ -215,6 +232,9 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     columns = (1e3 * one.t, one.u * 5319 / 12 + 1, one.averaged * 30 / math.pi + 1.24)
     np.savetxt(folder / "log_20260601161631.csv", np.column_stack(columns), delimiter=",",
                header="Timestamp(ms),Commanded_PWM,Motor_Speed(RPM)", comments="",
+               fmt="%.9g")  # fmt: skip
+    loop = driven_by_pid_v1(seconds=12.0)
+    np.savetxt(folder / "loop.csv", loop, delimiter=",", header="t,target,speed", comments="",
                fmt="%.9g")  # fmt: skip
     assert identify.main([str(folder / "my_bag"), "--output", str(folder / "result"), "-q"]) == 0
     return folder

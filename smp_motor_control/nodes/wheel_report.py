@@ -9,6 +9,7 @@ from rclpy.node import Node
 
 from smp_interfaces.msg import PidState
 from smp_motor_control.nodes import runtime
+from smp_motor_control.pid import PidGains
 from smp_motor_control.wheel.controller import State, WheelController
 from smp_motor_control.wheel.freshness import Verdict
 
@@ -21,6 +22,14 @@ _LEVELS = {
 }
 
 
+UNTUNED = "p, i and d are the defaults, made for no motor: load a parameter file that tune wrote"
+
+
+def untuned(gains: PidGains) -> bool:
+    """Return whether nobody has given gains."""
+    return (gains.p, gains.i, gains.d) == (PidGains().p, PidGains().i, PidGains().d)
+
+
 class WheelReport:
     """Assesses one wheel for ``/diagnostics``, every second and on every change of its state."""
 
@@ -31,6 +40,8 @@ class WheelReport:
         self.shown: State | None = None
         self._log = node.get_logger()
         self._diagnostics = runtime.Diagnostics(node, self._assess, joint)
+        if untuned(wheel.settings.loop.gains):
+            self._log.warning(UNTUNED)
 
     def close(self) -> None:
         """Fall silent."""
@@ -71,6 +82,8 @@ class WheelReport:
         advice = [self._wheel.advice] if self._wheel.advice else []
         if advice:
             level = max(level, runtime.WARN)
+        if untuned(self._wheel.settings.loop.gains):
+            advice.append(UNTUNED)
         if self._diagnostics.due:
             self._reported = totals
             runtime.collect_garbage()

@@ -209,7 +209,7 @@ class WheelController:
     def take_feedback(self, sample: Sample, stamp: int, arrival: int, now: float) -> float | None:
         """Take in a sample, stamped and arrived at [ns]; return its answer [V] or None."""
         self.answer = None
-        verdict = self.clock.accept(stamp, arrival)
+        verdict = self.clock.accept(stamp, arrival, now)
         if verdict is not _FRESH:
             return self._not_fresh(verdict, now)
         velocity, voltage, dt = sample.velocity, sample.voltage, self.clock.dt

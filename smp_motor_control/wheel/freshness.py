@@ -5,11 +5,15 @@ Pure logic on numbers; times are seconds on a steady clock unless they are stamp
 
 from __future__ import annotations
 
+import math
 from enum import Enum
 
 CLOCK_JUMP = 1.0
 """Stamps that are off by more than this [s] tell of a clock that jumped, not of a delay: unless
 they go on from the sample before, which those of a clock that was set back do not."""
+
+_CLOCKS_AGREE = 0.1
+"""Between readings of one instant on two clocks of a computer no more than this passes [s]."""
 
 
 class Verdict(Enum):
@@ -52,23 +56,30 @@ class FeedbackClock:
         self.dt = 0.0
         self.age = 0.0
         self._last: int | None = None
+        self._heard = -math.inf
 
     def reset(self) -> None:
         """Take the next sample as a first one."""
         self._last = None
 
-    def accept(self, stamp: int, now: int) -> Verdict:
-        """Judge a sample by its stamp and its arrival [ns]; a stamp of 0 stands for the arrival."""
-        verdict = self._judge(stamp or now, now)
+    def accept(self, stamp: int, now: int, steady: float | None = None) -> Verdict:
+        """Judge a sample by its stamp and its arrival [ns]; a stamp of 0 stands for the arrival.
+
+        ``steady`` is the arrival on a clock that nobody sets [s].
+        """
+        verdict = self._judge(stamp or now, now, now * 1e-9 if steady is None else steady)
         self.counts[verdict] += 1
         return verdict
 
-    def _judge(self, stamp: int, now: int) -> Verdict:
+    def _judge(self, stamp: int, now: int, steady: float) -> Verdict:
         raw_age = (now - stamp) * 1e-9
         age = raw_age - self.offset
         last = self._last
         step = 0.0 if last is None else (stamp - last) * 1e-9
-        delayed = age >= CLOCK_JUMP and 0.0 < step <= self.max_gap
+        # No sample ages by more than the time that has passed: else our own clock was set.
+        aged = age - self.age <= steady - self._heard + _CLOCKS_AGREE
+        self._heard = steady
+        delayed = age >= CLOCK_JUMP and 0.0 < step <= self.max_gap and aged
         if step < -CLOCK_JUMP or not (-CLOCK_JUMP < age < CLOCK_JUMP or delayed):
             self.jumps += last is not None
             self.offset = raw_age if abs(raw_age) > CLOCK_JUMP else 0.0

@@ -105,7 +105,7 @@ def decompress(data: bytes, compression: str, size: int, budget: Budget) -> byte
     try:
         if compression == "zstd":
             whole = zstandard.get_frame_parameters(data).content_size
-            if whole == size or (size == 0 and 0 < whole <= 1 << 20):
+            if 0 < whole <= max(size, _PIECE):
                 budget.take(whole)
                 try:
                     return _ZSTD.decompress(data, allow_extra_data=False)

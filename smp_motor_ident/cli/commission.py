@@ -25,6 +25,9 @@ def parser() -> argparse.ArgumentParser:
     add("--amplitude", type=number(0), default=6.0, help="largest voltage [V]; default 6")
     add("--duration", type=number(0), default=15.0, help="of each of three signals [s]; default 15")
     add("--apply", action="store_true", help="set the gains in the running controllers")
+    add("--resume", action="store_true", help="go on in DIR where an earlier run was cut off")
+    add("--dry-run", action="store_true", help="print and draw what would be done, and end")
+    add("--tuning", action="store_true", help="add the tuning page to the report (takes longer)")
     add("--yes", "-y", action="store_true", help="do not ask before the wheels move")
     return made
 

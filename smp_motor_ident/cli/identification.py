@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from smp_motor_ident import bag, likelihood
+from smp_motor_ident.cli import known_loop
 from smp_motor_ident.cli.frame import progress
 from smp_motor_ident.cli.identify import NAME
 from smp_motor_ident.cli.tables import console, estimate_table
@@ -32,7 +33,7 @@ from smp_motor_ident.errors import (
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.estimation.simulation import simulate
 from smp_motor_ident.record import Record
-from smp_motor_ident.report import words
+from smp_motor_ident.report import history, words
 from smp_motor_ident.report.document import (
     check_free,
     identification_document,
@@ -69,12 +70,19 @@ class Outcome:
 
 def work(arguments: argparse.Namespace) -> int:
     """Do what the arguments say."""
-    mapping = signal_map(arguments)
     if arguments.topics:
         return list_topics(arguments.bags, arguments.msg, NAME)
+    loop = None if arguments.controller is None else known_loop.reconstruction(arguments)
+    mapping = signal_map(arguments) if loop is None else known_loop.signal_map(arguments)
     if not arguments.output:
         raise ParameterError("--output DIR is missing: where shall the results go?")
     fixed = fixed_parameters(arguments.fix)
+    if arguments.fleet:
+        if loop is not None or arguments.validate:
+            raise ParameterError("--fleet goes without --controller and --validate")
+        from smp_motor_ident.cli import fleet
+
+        return fleet.work(arguments, mapping, fixed)
     paths = [Path(arguments.output) / name for name in OUTPUTS]
     check_free(paths, arguments.force)
     with progress(NAME, arguments.quiet) as say:
@@ -84,6 +92,9 @@ def work(arguments: argparse.Namespace) -> int:
         say("reading")
         records = _read(arguments.bags, mapping, arguments.wheel)
         kept = _read(arguments.validate, mapping, list(records)) if arguments.validate else {}
+        if loop is not None:
+            records = {wheel: list(map(loop, group)) for wheel, group in records.items()}
+            kept = {wheel: list(map(loop, group)) for wheel, group in kept.items()}
         jobs = {
             wheel: partial(identify_wheel, group, kept.get(wheel, ()), arguments.model, fixed)
             for wheel, group in records.items()
@@ -179,7 +190,7 @@ def _tunings(outcomes: Mapping[str, Outcome], say: Callable[..., None]) -> dict[
     def one(found: Estimate, _: Callable[[str], None]) -> Tuning:
         try:
             return tuning_page.tuning_of(found, tune_arguments.loop_for(found, usual))
-        except ParameterError as error:  # of a motor whose supply nobody told
+        except ParameterError as error:  # of a motor whose supply is not known
             return tuning_page.Tuning(found.wheel, reason=str(error))
 
     known = {wheel: out.estimate for wheel, out in outcomes.items() if out.estimate}
@@ -206,12 +217,14 @@ def _contents(
         ),
     }
     estimates = {wheel: one.estimate for wheel, one in outcomes.items() if one.estimate}
+    since = history.read(Path(arguments.history)) if arguments.history else {}
     report = Report(
         estimates,
         {wheel: one.comparisons for wheel, one in outcomes.items()},
         {wheel: str(one.failure) for wheel, one in outcomes.items() if one.failure},
         provenance,
         tunings,
+        {wheel: history.history_charts(wheel, entries) for wheel, entries in since.items()},
     )
     document = identification_document(estimates)
     head = [f"Identified {now} by {NAME} from {provenance['Recordings']}.", "SI, motor shaft."]

@@ -50,7 +50,14 @@ def parser() -> argparse.ArgumentParser:
     add("--map", action="append", nargs="+", default=[], metavar="KEY=VALUE", help="see below")
     add("--mapping", metavar="FILE", help="the same as YAML file")
     add("--msg", action="append", default=[], metavar="FILE", help=".msg file of an unknown type")
+    add(
+        "--controller", nargs="+", metavar=("FORMAT", "GAIN=VALUE"),
+        help="the recording has set-points (--map setpoint=...) instead of voltages: of this loop",
+    )  # fmt: skip
     add("--topics", action="store_true", help="list what the bag offers, suggest a mapping")
+    add("--fleet", action="store_true", help="each recording by itself, compared in one table")
+    add("--scheduler", metavar="ADDRESS", help="with --fleet: of a Dask cluster that works")
+    add("--history", metavar="FILE", help="draw what identifier has seen since, from its history")
     add("--tuning", action="store_true", help="add the tuning page to the report (takes longer)")
     add("--what-next", action="store_true", help="propose the next recording")
     add("--accuracy", type=number(0, 1), default=0.01, help="wanted by --what-next; default 0.01")

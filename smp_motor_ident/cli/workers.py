@@ -34,7 +34,7 @@ def in_parallel(
     say(f"estimating {', '.join(jobs)}")
     _JOBS.update(jobs)
     fork = multiprocessing.get_context("fork")
-    pool = ProcessPoolExecutor(cores, mp_context=fork, initializer=_end_with_parent)
+    pool = ProcessPoolExecutor(cores, mp_context=fork, initializer=end_with_parent)
     try:
         futures: dict[Future[Result], str] = {pool.submit(_do, name): name for name in jobs}
         done = {}
@@ -60,7 +60,7 @@ def _do(name: str) -> Any:
     return _JOBS[name](lambda text: None)
 
 
-def _end_with_parent() -> None:
+def end_with_parent() -> None:
     """Leave Ctrl-C to the parent, and end when it does, however that ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     for number in (signal.SIGTERM, signal.SIGHUP):

@@ -380,3 +380,75 @@ CANDIDATE_WEIGHT = Limit(
     "a structure that explains the data best less often than that is rejected at the 5 % level",
     "test_averaging.py: a lag that may be a delay",
 )
+
+# A commissioned motor that is followed while it drives.
+RESISTANCE_BAND = Limit(
+    0.15,
+    "of the commissioned value",
+    "38 K of copper: a motor at work warms by less, and its insulation bears twice that",
+    "test_monitor.py: a winding that heats",
+)
+MOTOR_CONSTANT_BAND = Limit(
+    0.03,
+    "of the commissioned value",
+    "15 K of ferrite at 0.2 %/K, what magnets warm by beside a winding at the end of its band",
+    "test_monitor.py: a magnet that weakens is told from heat",
+)
+FRICTION_BAND = Limit(
+    1.0,
+    "of the commissioned value",
+    "a floor instead of blocks adds its rolling resistance, about as much again",
+    "test_monitor.py: half an hour of ordinary driving",
+)
+OUTSIDE = Limit(
+    2.0,
+    "standard deviations",
+    "2.3 % of chance for one look at one value, which must stay outside besides",
+    "test_monitor.py: half an hour of ordinary driving",
+)
+LEFT_BAND = Limit(
+    3.0,
+    "s of motion outside of a band",
+    "a single load or a bad sample is over by then; a motor that burns takes longer",
+    "test_monitor.py: half an hour of ordinary driving",
+)
+
+# Loops whose commands are reconstructed.
+COMMAND_RESOLUTION = Limit(
+    1 / 255,
+    "of the supply, rms",
+    "one step of an 8-bit PWM: a command that is known closer is known as well as it was given",
+    "test_known_loop.py: a speed that was logged in coarse steps",
+)
+LOOP_RATE = Limit(
+    0.02,
+    "of the interval",
+    "clocks of boards are within 2 %; a log at another rate leaves commands out",
+    "test_known_loop.py: a log at another rate",
+)
+TICK_FIT = Limit(
+    0.05,
+    "of a tick",
+    "digits that put 95 % of speeds within a twentieth of a whole tick leave no doubt which",
+    "test_known_loop.py: the command is reconstructed",
+)
+
+# Many robots.
+FLEET_DRIFT = Limit(
+    4.0,
+    "standard deviations of the slope",
+    "6 in 100,000 by chance: a thousand robots of four wheels and five quantities raise one",
+    "test_fleet.py: a motor that drifts",
+)
+FLEET_OUTLIER = Limit(
+    5.0,
+    "scatters of the robots",
+    "motors of one batch scatter with longer tails than a normal distribution has",
+    "test_fleet.py: a motor unlike the others",
+)
+FLEET_SIZE = Limit(
+    5,
+    "robots",
+    "with fewer, the median deviation itself is uncertain by half",
+    "test_fleet.py: a motor unlike the others",
+)

@@ -5,14 +5,20 @@ callbacks, and publishes ``MotorParameters``.  Before a window has seen enough (
 levels and changes of voltage, both directions) the message has no numbers and its ``status``
 begins with ``collecting`` and says what is missing; else it begins with ``valid`` or, with the
 reason, ``unreliable``, or ``refused`` with the reason.
+
+With ``commissioned`` it follows resistance, motor constant and friction of the motors of an
+identification besides, warns on ``/diagnostics`` when one has left its band and why, and adds a
+line a wheel to ``history`` every minute, which ``identify --history`` draws.  It changes no gains.
 """
 
 from __future__ import annotations
 
+import math
 import sys
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 
 from builtin_interfaces.msg import Time
 from rclpy.node import Node
@@ -24,8 +30,14 @@ from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.settings import Parameters, described, nested
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.estimation.live import Demands, Window, missing
+from smp_motor_ident.estimation.monitor import Monitor, commissioned_of
 from smp_motor_ident.record import Hardware, Record
+from smp_motor_ident.report import history
+from smp_motor_ident.report.document import read_identification
 from smp_motor_ident.result import Estimate
+
+MINUTE = 60.0
+"""Between two lines of a history [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,6 +52,10 @@ class Settings:
         5.0, "Interval between two estimates of a wheel [s].", minimum=0.5, read_only=True
     )
     model: str = described("auto", "Model to fit; auto chooses the simplest that holds.")
+    commissioned: str = described(
+        "", "identification.json, or its folder, of the motors to watch.", read_only=True
+    )
+    history: str = described("", "File that what is seen of them is added to.", read_only=True)
     demands: Demands = nested(  # noqa: RUF009 (returns a field)
         Demands(),
         {
@@ -65,8 +81,11 @@ class Settings:
 class Wheel:
     """One wheel's window, topics and last answer."""
 
-    def __init__(self, node: Node, name: str, length: float) -> None:
+    def __init__(self, node: Node, name: str, length: float, monitor: Monitor | None) -> None:
         self.window = Window(name, length)
+        self.monitor = monitor
+        self._count: int | None = None
+        self._position = math.nan
         self.joint_name = joint_of(name)
         self.stamp = Time()
         self.status = "collecting: no motor_state yet"
@@ -81,6 +100,13 @@ class Wheel:
 
     def _on_state(self, message: MotorState) -> None:
         self.stamp = message.header.stamp
+        if self.monitor is not None:
+            self.monitor.add(
+                runtime.seconds(message.header.stamp),
+                message.voltage,
+                message.current,
+                self._turned(message),
+            )
         self.window.add(
             runtime.seconds(message.header.stamp),
             message.voltage,
@@ -89,6 +115,21 @@ class Wheel:
             message.position,
             message.encoder_count,
         )
+
+    def _turned(self, message: MotorState) -> float:
+        """Return the motor's angle since the sample before [rad]; NaN where it is not known."""
+        hardware = self.window.hardware
+        before, self._count = self._count, message.encoder_count
+        angle, self._position = self._position, message.position
+        if hardware.counts_per_revolution is None:
+            return (message.position - angle) * hardware.gear_ratio
+        if before is None:
+            return math.nan
+        counts = message.encoder_count - before
+        if hardware.encoder_bits:
+            half = 1 << (hardware.encoder_bits - 1)
+            counts = (counts + half) % (2 * half) - half
+        return counts * 2 * math.pi / hardware.counts_per_revolution
 
     def _on_description(self, message: MotorDescription) -> None:
         self.joint_name = message.joint_name or self.joint_name
@@ -127,11 +168,16 @@ class Identifier(Node):
         super().__init__("identifier")
         self._given = Parameters(self, Settings)
         settings = self._given.settings
-        self._wheels = {name: Wheel(self, name, settings.window) for name in settings.wheels}
+        monitors = _monitors(settings)
+        self._wheels = {
+            name: Wheel(self, name, settings.window, monitors.get(name)) for name in settings.wheels
+        }
         self._worker = ThreadPoolExecutor(max_workers=1)
         self._diagnostics = runtime.Diagnostics(self, self._assess)
         runtime.steady_timer(self, settings.period, self._begin_all)
         runtime.steady_timer(self, 0.1, self._publish_finished)
+        if settings.history:
+            runtime.steady_timer(self, MINUTE, self._add_history)
 
     def _begin_all(self) -> None:
         """Hand every window that shows enough to the worker."""
@@ -163,14 +209,50 @@ class Identifier(Node):
                 wheel.tell(f"refused: the estimator failed with {error!r}")
 
     def _assess(self) -> tuple[bytes, str, dict[str, object]]:
-        states = {name: wheel.status for name, wheel in self._wheels.items()}
-        valid = sum(text.startswith("valid") for text in states.values())
+        states: dict[str, object] = {name: wheel.status for name, wheel in self._wheels.items()}
+        valid = sum(wheel.status.startswith("valid") for wheel in self._wheels.values())
         level = runtime.OK if valid == len(states) else runtime.WARN
-        return level, f"{valid} of {len(states)} wheels identified", dict(states)
+        message = f"{valid} of {len(states)} wheels identified"
+        watched = {n: w.monitor for n, w in self._wheels.items() if w.monitor is not None}
+        if watched:  # then a wheel that has nothing to say of itself is no warning
+            level, message = runtime.OK, f"{len(watched)} wheels watched; {message}"
+        for name, monitor in watched.items():
+            now = monitor.values()
+            for key, (state, why) in monitor.validity().items():
+                value, std = now[key]
+                text = f"{value:.4g} ± {1.96 * std:.2g}" if state == "estimated" else why
+                states[f"{name} {key}"] = f"{state}: {text}"
+            for finding in monitor.findings():
+                level = runtime.WARN
+                message = f"{name}: {finding.message}"
+                states[f"{name} {finding.code}"] = f"{finding.message}; {finding.advice}"
+        return level, message, states
+
+    def _add_history(self) -> None:
+        """Add a line of every watched wheel that is known by now."""
+        entries = [
+            history.entry_of(runtime.seconds(wheel.stamp), name, wheel.monitor)
+            for name, wheel in self._wheels.items()
+            if wheel.monitor is not None
+        ]
+        try:
+            history.append(Path(self._given.settings.history), [e for e in entries if e.values])
+        except OSError as error:
+            self.get_logger().error(f"{self._given.settings.history}: {error.strerror}")
 
     def on_stop(self) -> None:
         """Do not wait for an estimate that nobody will hear of."""
         self._worker.shutdown(wait=False, cancel_futures=True)
+
+
+def _monitors(settings: Settings) -> dict[str, Monitor]:
+    """Return a monitor of every wheel that was commissioned; refuse one that cannot be watched."""
+    if not settings.commissioned:
+        if settings.history:
+            raise ParameterError("history needs commissioned: whose history shall it be?")
+        return {}
+    found = read_identification(Path(settings.commissioned))
+    return {n: Monitor(commissioned_of(found[n])) for n in settings.wheels if n in found}
 
 
 def _positive(value: float) -> float | None:

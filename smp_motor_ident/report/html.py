@@ -44,6 +44,8 @@ class Report:
         How the page came about: command, sources, date, versions.
     tunings : mapping of str to Tuning
         By wheel what the tuning page offers; empty for a report without one.
+    history : mapping of str to sequence of Chart
+        By wheel what `identifier` has seen since.
     """
 
     estimates: Mapping[str, Estimate]
@@ -51,6 +53,7 @@ class Report:
     failures: Mapping[str, str] = field(default_factory=dict)
     provenance: Mapping[str, str] = field(default_factory=dict)
     tunings: Mapping[str, Tuning] = field(default_factory=dict)
+    history: Mapping[str, Sequence[Chart]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -80,7 +83,7 @@ def render(report: Report) -> str:
     )
     environment.filters |= {"label": words.label, "number": words.number}
     motors = {
-        wheel: _motor(estimate, report.comparisons.get(wheel, ()))
+        wheel: _motor(estimate, report.comparisons.get(wheel, ()), report.history.get(wheel, ()))
         for wheel, estimate in report.estimates.items()
     }
     tuning_charts, tuning_data = _tuning_page(report.tunings)
@@ -118,7 +121,9 @@ def _text(name: str) -> str:
     return resources.files("smp_motor_ident.report").joinpath(name).read_text("utf-8")
 
 
-def _motor(estimate: Estimate, parts: Sequence[Comparison]) -> dict[str, Any]:
+def _motor(
+    estimate: Estimate, parts: Sequence[Comparison], since: Sequence[Chart]
+) -> dict[str, Any]:
     """Return what the template shows of one motor."""
     wheel, found = estimate.wheel, words.findings(estimate)
     fit = figures.fit_charts(wheel, parts) if parts else []
@@ -142,7 +147,8 @@ def _motor(estimate: Estimate, parts: Sequence[Comparison]) -> dict[str, Any]:
         "alike": _alike(estimate),
         "candidates": _ranked(estimate.candidates),
         "correlations": _correlations(estimate),
-        "charts": [*fit, *residuals, *frequency],
+        "charts": [*fit, *residuals, *frequency, *since],
+        "history": since,
         "fit": fit,
         "residuals": residuals,
         "frequency": frequency,

@@ -166,14 +166,14 @@ def _document(one: Choice) -> dict[str, Any]:
 
 def _rows(found: Design) -> list[tuple[str, str, str]]:
     """Return name, value and band of what the design keeps."""
-    told, gains = found.specification, found.gains
+    bands, gains = found.specification, found.gains
     return [
         ("Crossover", f"{found.margins.crossover:.4g} rad/s", ""),
-        ("Phase margin", *_banded(told.phase_margin, 1.0, "°")),
-        ("Gain margin", *_banded(told.gain_margin, 1.0, "")),
-        ("Largest sensitivity Ms", *_banded(told.sensitivity, 1.0, "")),
-        ("Overshoot", *_banded(told.overshoot, 1.0, " %")),
-        ("Settling to 2 %", *_banded(told.settling, 1e3, " ms")),
+        ("Phase margin", *_banded(bands.phase_margin, 1.0, "°")),
+        ("Gain margin", *_banded(bands.gain_margin, 1.0, "")),
+        ("Largest sensitivity Ms", *_banded(bands.sensitivity, 1.0, "")),
+        ("Overshoot", *_banded(bands.overshoot, 1.0, " %")),
+        ("Settling to 2 %", *_banded(bands.settling, 1e3, " ms")),
         ("Control noise", f"{1e3 * found.performance.control_noise:.3g} mV", ""),
         ("p, i, d", f"{gains.p:.4g}, {gains.i:.4g}, {gains.d:.4g}", "V per wheel rad/s"),
     ]

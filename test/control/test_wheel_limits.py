@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import pytest
 
 from smp_motor_control.encoder import Encoder
+from smp_motor_control.motor.model import MotorModel
 from smp_motor_control.motor.parameters import Gearbox
 from smp_motor_control.pid import PidGains
 from smp_motor_control.wheel.controller import State, WheelController, WheelSettings
@@ -274,3 +275,78 @@ def test_a_supply_that_is_none_is_refused_and_the_old_one_stays(supply: float) -
     assert (within.u_clamp_min, within.u_clamp_max) == (-5.0, 5.0)
     within = LoopSettings(gains=GAINS).within(50.0).gains
     assert (within.u_clamp_min, within.u_clamp_max) == (-12.0, 12.0)
+
+
+def test_a_change_is_judged_where_it_is_one_of_the_loop() -> None:
+    bad = replace(SETTINGS, loop=LoopSettings(gains=replace(GAINS, i=-1.0)))
+    with pytest.raises(ValueError, match="i is -1"):
+        WheelController(SETTINGS).check(bad)
+    given = WheelController(bad)  # as it was started
+    given.check(replace(bad, fault_retry=9.0))
+    with pytest.raises(ValueError, match="i is -2"):
+        given.check(replace(bad, loop=LoopSettings(gains=replace(GAINS, i=-2.0))))
+
+
+def test_what_the_voltage_is_good_for_is_what_the_feed_forward_says() -> None:
+    # (12 - 0.5)/2 = 5.75 rad/s, of which 2.875 + 0.3 may be missing.
+    gains = replace(GAINS, p=9.0, feedforward_velocity=2.0, feedforward_static=0.5)
+    follow = replace(NO_FAULTS, tracking_time=0.75)
+    known = replace(SETTINGS, loop=LoopSettings(gains=gains), faults=follow)
+    for settings in (known, replace(SETTINGS, faults=follow)):
+        for speed, fault in ((2.5, Fault.NOT_FOLLOWING), (2.65, None)):
+            feed = Feed(settings)
+            feed.wheel.configure(known)
+            for _ in range(64):
+                feed.ask(10.0)
+                feed.give(speed)
+            assert feed.wheel.recovery.fault is fault
+
+
+def test_new_parameters_end_what_the_old_could_not_compute_and_no_other_fault() -> None:
+    for fault in Fault:
+        feed = Feed()
+        feed.wheel.recovery.set(fault, feed.now)
+        feed.wheel.configure(SETTINGS)
+        assert feed.wheel.recovery.fault is (None if fault is Fault.COMPUTATION else fault)
+    assert WheelController(replace(SETTINGS, fault_retry=7.0)).recovery.first_pause == 7.0
+
+
+def test_hardware_that_does_not_suit_the_clamps_changes_nothing() -> None:
+    gains = replace(GAINS, u_clamp_min=6.0, u_clamp_max=8.0)
+    wheel = WheelController(replace(SETTINGS, loop=LoopSettings(gains=gains)))
+    with pytest.raises(ValueError, match="clamp"):
+        wheel.set_hardware(Gearbox(1.0), Encoder(), 5.0)
+    assert wheel.supply == math.inf
+    assert WheelController(SETTINGS).advice == "" and WheelController(SETTINGS).output == 0.0
+
+
+def test_advice_is_given_once_the_rate_is_known_and_taken_back_with_new_gains() -> None:
+    # At 1/64 s, one sample late and averaged over one, a first-order motor takes no such p.
+    model = MotorModel(dc_gain=1.0, time_constant=0.05)
+    rough = replace(SETTINGS, loop=LoopSettings(gains=replace(GAINS, p=50.0), model=model))
+    feed = Feed(rough)
+    feed.wheel.set_hardware(Gearbox(1.0), Encoder(), 12.0)
+    for k in range(1, 40):
+        feed.give()
+        feed.wheel.tick(feed.now)
+        assert bool(feed.wheel.advice) is (k >= 20)
+    assert "intervals of 15.6 ms" in feed.wheel.advice
+    feed.wheel.configure(SETTINGS)
+    assert feed.wheel.advice == ""
+
+
+def test_a_fault_of_the_arithmetic_is_counted_held_and_silent_where_the_wheel_is_not_active() -> (
+    None
+):
+    for active in (True, False):
+        feed = Feed(active=active)
+        feed.wheel.loop.speed = lambda *_: 1 // 0
+        feed.ask(1.0)
+        assert feed.give() == (0.0 if active else None)
+        assert feed.wheel.refused == {"computation: ZeroDivisionError": 1}
+        assert (feed.wheel.recovery.fault is Fault.COMPUTATION) is active
+    feed = Feed()
+    feed.ask(1.0)
+    out = feed.wheel.loop.step(1.0, 0.0, DT)._replace(output=math.nan)
+    feed.wheel.loop.step = lambda *_: out
+    assert feed.give() == 0.0 and feed.wheel.refused == {"output that is not a number": 1}

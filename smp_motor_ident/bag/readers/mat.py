@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import io
 import struct
+import subprocess
+import sys
 import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -26,12 +28,28 @@ _DEEPEST = 16
 _WIDEST = 64
 """Columns of a matrix that are taken as signals; a wider one is something else."""
 
+_PROBE = """
+import io, sys
+from scipy.io import loadmat
+loadmat(io.BytesIO(sys.stdin.buffer.read()), simplify_cells=True, chars_as_strings=False)
+"""
+
+
+def _check_survivable(data: bytes, name: str) -> None:
+    """Refuse bytes of which scipy's compiled reader dies: a process of its own tries first."""
+    nowhere = subprocess.DEVNULL
+    command = [sys.executable, "-c", _PROBE]
+    done = subprocess.run(command, input=data, stdout=nowhere, stderr=nowhere, check=False)
+    if done.returncode < 0:
+        raise BagError(f"{name}: damaged MATLAB file (scipy's reader ends by {-done.returncode})")
+
 
 class _MatFile(ColumnFile):
     """One file of version 5."""
 
     def __init__(self, path: Path, name: str, budget: Budget) -> None:
         data = _unpacked(path.read_bytes(), name, budget)
+        _check_survivable(data, name)
         from scipy import io as scipy_io  # takes a while to load, for one of many formats
 
         try:

@@ -9,6 +9,7 @@ error (``P_ON_E``), ``Kd`` on the measurement; ``T`` is ``SampleTime``, whole mi
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 from smp_motor_ident.tune.designer import Design
@@ -20,6 +21,7 @@ from smp_motor_ident.tune.exports.target import (
     whole_milliseconds,
 )
 from smp_motor_ident.tune.feedback import Feedback
+from smp_motor_ident.tune.known_loop import KnownLoop, Setting, Step
 
 LIMIT = 255
 
@@ -32,6 +34,20 @@ def _convert(design: Design) -> Gains:
     feedback = Feedback((p + i * T) / scale, i / scale)
     numbers = {"Kp": p, "Ki": i, "Kd": 0.0, "SampleTime": whole_milliseconds(loop)}
     return Gains(numbers, feedback)
+
+
+def _start(setting: Setting) -> Step:
+    n, T = setting.numbers, setting.sample_time
+    total = before = 0.0
+
+    def step(setpoint: float, speed: float) -> float:
+        nonlocal total, before
+        error, slope, before = setpoint - speed, speed - before, speed
+        total = min(max(total + n["Ki"] * T * error, -LIMIT), LIMIT)
+        pwm = n["Kp"] * error + total - n["Kd"] / T * slope
+        return int(min(max(pwm, -LIMIT), LIMIT)) / LIMIT * setting.supply
+
+    return step
 
 
 def _render(designs: Mapping[str, Design], gains: Mapping[str, Gains]) -> str:
@@ -56,4 +72,9 @@ FORMAT = Format(
     _convert,
     _render,
     ("feed-forward", "the planned reference", "anti-windup beyond limits of the sum"),
+    known=KnownLoop(
+        {"Kp": math.nan, "Ki": math.nan, "Kd": 0.0, "SampleTime": math.nan},
+        _start,
+        lambda numbers: 1e-3 * numbers["SampleTime"],
+    ),
 )

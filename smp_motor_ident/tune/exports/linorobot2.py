@@ -18,6 +18,7 @@ from collections.abc import Mapping
 from smp_motor_ident.tune.designer import Design
 from smp_motor_ident.tune.exports.target import Format, Gains, present_error, rounded
 from smp_motor_ident.tune.feedback import Feedback
+from smp_motor_ident.tune.known_loop import KnownLoop, Setting, Step
 
 PWM_BITS = 10
 
@@ -30,6 +31,22 @@ def _convert(design: Design) -> Gains:
     p, i = rounded(max(wanted.p, 0.0) * scale), rounded(wanted.i * T * scale)
     feedback = Feedback((p + i) / scale, i / T / scale)
     return Gains({"K_P": p, "K_I": i, "K_D": 0.0}, feedback)
+
+
+def _start(setting: Setting) -> Step:
+    n, full = setting.numbers, 2 ** setting.numbers["PWM_BITS"] - 1
+    total = before = 0.0
+
+    def step(setpoint: float, speed: float) -> float:
+        nonlocal total, before
+        error = setpoint - speed * 60 / (2 * math.pi)
+        total, slope, before = total + error, error - before, error
+        if setpoint == 0.0 and error == 0.0:
+            total = slope = 0.0
+        pwm = n["K_P"] * error + n["K_I"] * total + n["K_D"] * slope
+        return int(min(max(pwm, -full), full)) / full * setting.supply
+
+    return step
 
 
 def _render(designs: Mapping[str, Design], gains: Mapping[str, Gains]) -> str:
@@ -47,4 +64,9 @@ FORMAT = Format(
     _render,
     ("feed-forward", "anti-windup", "the planned reference"),
     one_set=True,
+    known=KnownLoop(
+        {"K_P": math.nan, "K_I": math.nan, "K_D": 0.0, "PWM_BITS": PWM_BITS},
+        _start,
+        lambda numbers: 0.02,
+    ),
 )

@@ -19,6 +19,7 @@ import yaml
 from smp_motor_ident.tune.designer import Design
 from smp_motor_ident.tune.exports.target import Format, Gains, rounded
 from smp_motor_ident.tune.feedback import Feedback
+from smp_motor_ident.tune.known_loop import KnownLoop, Setting, Step
 
 
 def _convert(design: Design) -> Gains:
@@ -31,6 +32,24 @@ def _convert(design: Design) -> Gains:
     }  # fmt: skip
     feedback = Feedback(p / ratio, i / ratio)
     return Gains(numbers, feedback, tracking=tracking)
+
+
+def _start(setting: Setting) -> Step:
+    n, T = setting.numbers, setting.sample_time
+    high, low = min(n["u_clamp_max"], setting.supply), max(n["u_clamp_min"], -setting.supply)
+    back = 1 / n["tracking_time_constant"] if n["tracking_time_constant"] else 0.0
+    integral = before = 0.0
+
+    def step(setpoint: float, speed: float) -> float:
+        nonlocal integral, before
+        error = setpoint - speed
+        wanted = n["p"] * error + integral + n["d"] * (error - before) / T
+        command = min(max(wanted, n["u_clamp_min"]), n["u_clamp_max"])
+        integral += T * (n["i"] * error + back * (command - wanted))
+        before = error
+        return min(max(command + n["feedforward_gain"] * setpoint, low), high)
+
+    return step
 
 
 def _render(designs: Mapping[str, Design], gains: Mapping[str, Gains]) -> str:
@@ -63,4 +82,16 @@ FORMAT = Format(
     _render,
     ("the planned reference, and without it feed-forward: an abrupt one would overshoot",),
     counts=False,
+    known=KnownLoop(
+        {
+            "p": math.nan,
+            "i": math.nan,
+            "d": 0.0,
+            "u_clamp_max": math.inf,
+            "u_clamp_min": -math.inf,
+            "tracking_time_constant": 0.0,
+            "feedforward_gain": 0.0,
+        },
+        _start,
+    ),
 )

@@ -17,9 +17,10 @@ integrates, ``Kd`` is proportional action on the measurement, ``Ki`` would integ
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
-from smp_motor_ident.errors import DesignError
+from smp_motor_ident.errors import DesignError, SignalError
 from smp_motor_ident.tune.designer import Design
 from smp_motor_ident.tune.exports.target import (
     Format,
@@ -29,6 +30,7 @@ from smp_motor_ident.tune.exports.target import (
     whole_milliseconds,
 )
 from smp_motor_ident.tune.feedback import Feedback
+from smp_motor_ident.tune.known_loop import KnownLoop, Setting, Step
 
 MAX_PWM, LARGEST, INT16 = 255, 1000, 32767
 
@@ -53,6 +55,28 @@ def _convert(design: Design) -> Gains:
     return Gains(
         {"Kp": Kp, "Kd": Kd, "Ki": 0, "Ko": Ko}, feedback, weight, tracking=T, resting_error=rest
     )
+
+
+def _start(setting: Setting) -> Step:
+    if math.isnan(setting.ticks):
+        raise SignalError("ros_arduino_bridge counts ticks; give counts_per_revolution")
+    n, per_interval = setting.numbers, setting.ticks * setting.sample_time
+    output = before = term = 0
+
+    def step(setpoint: float, speed: float) -> float:
+        nonlocal output, before, term
+        if setpoint == 0.0:
+            output = before = term = 0
+            return 0.0
+        turned = round(speed * per_interval)
+        error = round(setpoint) - turned
+        output += int((n["Kp"] * error - n["Kd"] * (turned - before) + term) / n["Ko"])
+        if abs(output) < MAX_PWM:
+            term += int(n["Ki"] * error)
+        output, before = min(max(output, -MAX_PWM), MAX_PWM), turned
+        return output / MAX_PWM * setting.supply
+
+    return step
 
 
 def _divisor(integral: float, proportional: float, largest: float) -> int:
@@ -100,4 +124,9 @@ FORMAT = Format(
         "errors below Ko/Kp ticks an interval, which whole numbers round to nothing",
     ),
     one_set=True,
+    known=KnownLoop(
+        {"Kp": math.nan, "Kd": math.nan, "Ki": 0.0, "Ko": math.nan},
+        _start,
+        lambda numbers: 0.033,
+    ),
 )

@@ -11,6 +11,7 @@ import numpy as np
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.tune.designer import Design
 from smp_motor_ident.tune.feedback import Feedback
+from smp_motor_ident.tune.known_loop import KnownLoop
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.margins import Margins, loop_margins
 from smp_motor_ident.tune.motors import Motors
@@ -70,6 +71,8 @@ class Format:
         Whether all wheels share their numbers.
     targets : mapping of str to str
         What the method is asked for.
+    known : KnownLoop or None
+        Its arithmetic; None where that is not published.
     """
 
     name: str
@@ -84,6 +87,7 @@ class Format:
     targets: Mapping[str, str] = field(
         default_factory=lambda: {"structure": "pi", "focus": "tracking"}
     )
+    known: KnownLoop | None = None
 
 
 @dataclass(frozen=True)

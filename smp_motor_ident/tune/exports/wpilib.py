@@ -10,6 +10,7 @@ SimpleMotorFeedforward.hpp: of a constant set-point ``Calculate`` is ``kS sgn(v)
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -18,6 +19,7 @@ from smp_motor_ident.errors import DesignError
 from smp_motor_ident.tune.designer import Design
 from smp_motor_ident.tune.exports.target import Format, Gains, plant_of, rounded
 from smp_motor_ident.tune.feedback import Feedback
+from smp_motor_ident.tune.known_loop import KnownLoop, Setting, Step
 from smp_motor_ident.tune.margins import batch_margins, grid_for
 
 PHASE, GAIN, SENSITIVITY, PEAK = 60.0, 2.0, 1.4, 1.01
@@ -52,6 +54,17 @@ def _convert(design: Design) -> Gains:
     return Gains(numbers, feedback, static=numbers["kS"], velocity=numbers["kV"] / ratio)
 
 
+def _start(setting: Setting) -> Step:
+    n = setting.numbers
+
+    def step(setpoint: float, speed: float) -> float:
+        static = math.copysign(n["kS"], setpoint) if setpoint else 0.0
+        volts = static + n["kV"] * setpoint + n["kP"] * (setpoint - speed)
+        return min(max(volts, -setting.supply), setting.supply)
+
+    return step
+
+
 def _render(designs: Mapping[str, Design], gains: Mapping[str, Gains]) -> str:
     lines = ["# volts, rad/s of the wheel; times 2 pi per rotation"]
     for wheel, one in gains.items():
@@ -68,4 +81,7 @@ FORMAT = Format(
     _render,
     ("an integral: a load is held by kP alone", "anti-windup"),
     counts=False,
+    known=KnownLoop(
+        {"kS": 0.0, "kV": math.nan, "kP": math.nan}, _start, lambda numbers: 0.02, remembers=False
+    ),
 )

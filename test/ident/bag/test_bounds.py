@@ -64,6 +64,16 @@ def test_a_message_that_quotes_a_spoilt_value_keeps_head_and_tail() -> None:
     assert str(BagError("a.yaml: " + 900 * "x")) == "a.yaml: " + 900 * "x"
 
 
+def test_a_file_of_which_the_reader_of_matlab_dies_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a.mat"
+    path.write_bytes(FUZZ.SEEDS["mat"][1]())
+    monkeypatch.setattr("smp_motor_ident.bag.readers.mat._PROBE", "import os; os.abort()")
+    with pytest.raises(BagError, match=r"a\.mat: damaged MATLAB file"):
+        read_records(path, FUZZ.COLUMNS)
+
+
 def bomb(kind: str, size: int) -> bytes:
     """Return a compressed MCAP file of zeros behind its magic."""
     head = b"\x89MCAP0\r\n"

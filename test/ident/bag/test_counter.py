@@ -87,9 +87,9 @@ def test_a_reset_is_no_motion_and_the_counts_before_and_after_stay(measured: boo
     raw[120:] -= true[120]  # starts at zero again
     raw[320:] -= raw[320] - 3
     found = unwrap(raw, 0, np.diff(true).astype(float) if measured else None)
-    told = [120, 320]
-    assert found.resets.tolist() == told
-    for begin, end in zip([0, *told], [*told, raw.size]):
+    found_at = [120, 320]
+    assert found.resets.tolist() == found_at
+    for begin, end in zip([0, *found_at], [*found_at, raw.size]):
         assert np.array_equal(found.count[begin:end], raw[begin:end])
     (finding,) = found.findings
     assert (finding.code, finding.severity) == ("counter_reset", "warning")
@@ -133,12 +133,12 @@ def test_an_angle_within_one_turn_is_unwrapped_and_any_other_left() -> None:
 
 @pytest.mark.parametrize("measured", [True, False])
 def test_a_counter_that_wraps_starts_again_at_what_it_shows(measured: bool) -> None:
-    true = turning(samples=600, most=90, seed=8) + 20_000
+    true = turning(samples=600, most=90, seed=8) + 30_000  # it wraps before the first reset
     true[250:] -= true[250] - 5
     true[450:] += 15_000 - true[450]
     true[451:] -= true[451] + 3  # a second reset, to just below zero
     raw = shown(true, 16)
-    raw[100:200] += 0
+    assert np.abs(np.diff(raw[:250])).max() > 60_000
     expected = np.diff(true).astype(float)
     expected[[249, 449, 450]] = 30.0  # by a sensor of its own the motor goes on
     found = unwrap(raw, 16, expected if measured else None)
@@ -174,17 +174,61 @@ def test_a_spike_beside_zero_is_no_reset() -> None:
 def test_without_a_speed_a_reset_falls_further_than_the_largest_steps() -> None:
     steps = np.full(400, 5)
     steps[::40] = 400  # a few large ones: the bound of usual steps is 150
-    for height, told in ((1500, False), (4500, True)):
+    for height, found_at in ((1900, False), (2100, True)):
         raw = np.cumsum(steps) - int(np.cumsum(steps)[221]) + height
         raw[222:] -= raw[222]
-        assert unwrap(raw, 0).resets.tolist() == ([222] if told else [])
+        assert unwrap(raw, 0).resets.tolist() == ([222] if found_at else [])
         measured = np.diff(raw).astype(float)
         measured[221] = 5.0
         assert unwrap(raw, 0, measured).resets.tolist() == [222]
 
 
-@pytest.mark.parametrize(("times", "told"), [(3, 3), (4, 0)])
-def test_three_resets_of_a_short_record_are_told_and_four_are_not(times: int, told: int) -> None:
+@pytest.mark.parametrize(("times", "found_at"), [(3, 3), (4, 0)])
+def test_three_resets_of_a_short_record_count_and_four_do_not(times: int, found_at: int) -> None:
     raw = np.tile(np.arange(0, 40_000, 1000), times + 1)
     found = unwrap(raw.astype(np.int64), 0, np.full(raw.size - 1, 1000.0))
-    assert found.resets.size == told
+    assert found.resets.size == found_at
+
+
+def test_a_narrow_counter_that_turns_as_fast_as_may_be_told_is_told() -> None:
+    # Ten usual steps of 13 and 100 are 230; around the wrap it moves by 256 less 14 at the least.
+    true = turning(samples=4000, most=14, seed=5)
+    raw = shown(true, 8)
+    found = unwrap(raw, None)
+    assert np.array_equal(found.count - raw[0], true - true[0])
+    assert found.findings[0].evidence == {"bits": 8}
+
+
+@pytest.mark.parametrize("measured", [True, False])
+def test_a_jump_that_is_no_width_and_ends_elsewhere_is_left(measured: bool) -> None:
+    raw = turning(samples=300, most=20) + 50_000
+    expected = np.diff(raw).astype(float) if measured else None
+    raw[150:] += 5000
+    raw[200:] -= 30_000
+    found = unwrap(raw, None, expected)
+    assert np.array_equal(found.count, raw)
+    assert found.resets.size == 0 and found.findings == []
+
+
+def test_a_motor_that_turns_back_to_zero_is_not_reset_there() -> None:
+    raw = np.arange(1000, -1000, -5)
+    for expected in (None, np.full(raw.size - 1, -5.0)):
+        assert unwrap(raw, 0, expected).resets.size == 0
+
+
+@pytest.mark.parametrize(("length", "blocks", "found_at"), [(100, 11, 10), (80, 10, 0)])
+def test_a_hundredth_of_a_long_record_may_be_resets(
+    length: int, blocks: int, found_at: int
+) -> None:
+    raw = np.tile(np.arange(0, 1000 * length, 1000), blocks)
+    found = unwrap(raw, 0, np.full(raw.size - 1, 1000.0))
+    assert found.resets.size == found_at
+
+
+def test_an_angle_that_leaves_one_turn_was_never_wrapped() -> None:
+    for beyond, undone in ((0.0, True), (0.003, True), (0.2, False)):
+        edge = np.pi + beyond
+        raw = np.array([edge - 0.1, edge, -edge, -edge + 0.1])
+        assert unwrap_angle(raw)[1] is undone
+    assert unwrap_angle(np.array([2.0, -2.0]))[1] is True
+    assert unwrap_angle(np.array([1.5, -1.5]))[1] is False

@@ -141,13 +141,14 @@ def test_a_file_is_unpacked_and_what_is_amiss_is_told(kind, budget, tmp_path: Pa
 def test_messages_that_were_packed_one_by_one_are_unpacked_and_the_lost_counted(budget) -> None:
     channel = Channel(1, "/a", "std_msgs/msg/String")
     blobs = [b"", b"abc", b"plain and long", zstandard.compress(b"one" * 50),
-             lz4.frame.compress(b"two" * 50), zstandard.compress(b"three" * 50)[:9]]  # fmt: skip
-    batch = join(channel, blobs, np.arange(6, dtype=np.int64))
-    batch = replace(batch, sequence=np.arange(10, 16))
+             lz4.frame.compress(b"two" * 50), zstandard.compress(b"three" * 50)[:9],
+             b"\x28\xb5\x2f\xfd"]  # fmt: skip
+    batch = join(channel, blobs, np.arange(7, dtype=np.int64))
+    batch = replace(batch, sequence=np.arange(10, 17))
     unpacked, lost = decompress_messages(batch, budget)
     kept = [b"abc", b"plain and long", b"one" * 50, b"two" * 50]
     assert [unpacked.message(k) for k in range(len(unpacked))] == kept
-    assert lost == 2
+    assert lost == 3
     assert unpacked.log_time.tolist() == [1, 2, 3, 4]
     assert unpacked.sequence is not None and unpacked.sequence.tolist() == [11, 12, 13, 14]
     for plain in ([b"plain and long"], [b"abc", b""], [b"abc", b"long enough"]):

@@ -1,0 +1,50 @@
+"""The robot as URDF: a box on its wheels, whatever their number, for robot_state_publisher."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element, SubElement
+
+from smp_motor_control import joint_of
+
+WIDTH = 0.4
+"""Of a wheel, in radii; of the box's height, too: proportions of a picture, used by nothing."""
+
+
+def robot_description(
+    left: Sequence[str], right: Sequence[str], *, separation: float = 0.4, radius: float = 0.1
+) -> str:
+    """Return a URDF whose joints are those of ``joint_states``.
+
+    ``base_link`` is on the wheels' axes, between the sides; the wheels of a side stand three radii
+    apart, the first in front.
+
+    Examples
+    --------
+    >>> text = robot_description(["left"], ["right"], separation=0.3)
+    >>> '<joint name="left_wheel_joint" type="continuous">' in text, 'xyz="0 0.15 0"' in text
+    (True, True)
+    """
+    robot = Element("robot", name="wheels")
+    longest = 3 * radius * max(len(left), len(right))
+    size = f"{longest:g} {separation - WIDTH * radius:g} {WIDTH * radius:g}"
+    _visual(SubElement(robot, "link", name="base_link"), "box", size=size)
+    for names, side in ((left, 0.5), (right, -0.5)):
+        for k, wheel in enumerate(names):
+            ahead = 3 * radius * ((len(names) - 1) / 2 - k)
+            link = SubElement(robot, "link", name=f"{wheel}_wheel")
+            rolled = f"{1.5707963:g} 0 0"  # a cylinder stands on z, a wheel turns about y
+            _visual(link, "cylinder", rolled, radius=f"{radius:g}", length=f"{WIDTH * radius:g}")
+            joint = SubElement(robot, "joint", name=joint_of(wheel), type="continuous")
+            SubElement(joint, "parent", link="base_link")
+            SubElement(joint, "child", link=f"{wheel}_wheel")
+            SubElement(joint, "origin", xyz=f"{ahead:g} {side * separation:g} 0")
+            SubElement(joint, "axis", xyz="0 1 0")
+    return ElementTree.tostring(robot, encoding="unicode")
+
+
+def _visual(link: Element, shape: str, rpy: str = "0 0 0", **size: str) -> None:
+    visual = SubElement(link, "visual")
+    SubElement(visual, "origin", rpy=rpy)
+    SubElement(SubElement(visual, "geometry"), shape, size)

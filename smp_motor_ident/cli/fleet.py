@@ -1,0 +1,197 @@
+"""``identify --fleet``: every recording by itself, over all cores or a cluster, in one table.
+
+Each recording's result is kept in ``DIR/done`` under what it depends on: names, sizes and times
+of its files, the options, and the version.  What is there is not computed again, so that a run that
+was cut off goes on where it was; a recording that fails is a row with its reason.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import math
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from importlib import metadata
+from pathlib import Path
+from typing import Any, cast
+
+from smp_motor_ident import bag
+from smp_motor_ident.cli.workers import end_with_parent
+from smp_motor_ident.errors import BagError, ParameterError, SmpError
+from smp_motor_ident.estimate import estimate
+from smp_motor_ident.report import fleet
+from smp_motor_ident.report.document import check_free, write_together
+
+TRIES = 2
+"""How often a recording is begun that takes its worker with it."""
+
+
+def work(
+    arguments: argparse.Namespace, mapping: bag.SignalMap | None, fixed: Mapping[str, float]
+) -> int:
+    """Identify every recording by itself, and write the table."""
+    folder = Path(arguments.output)
+    name, _ = fleet.table([])
+    check_free([folder / name, folder / "fleet.html"], arguments.force)
+    done = folder / "done"
+    done.mkdir(parents=True, exist_ok=True)
+    options = json.dumps([repr(mapping), arguments.model, sorted(arguments.fix)])
+    files = {path: done / f"{_key(Path(path), options)}.json" for path in arguments.bags}
+    left = [path for path, file in files.items() if not file.exists()]
+    if not arguments.quiet:
+        print(f"{len(files) - len(left)} of {len(files)} recordings are known already")
+    results = {p: json.loads(f.read_text()) for p, f in files.items() if f.exists()}
+    settings = (mapping, arguments.model, dict(fixed))
+    for path, result in _results(left, settings, arguments.scheduler):
+        results[path] = result
+        if not result.get("lost"):  # what was not its fault is tried again by the next run
+            _write(files[path], result)
+        if not arguments.quiet:
+            print(f"{path}: {result['failure'] or ', '.join(result['motors'])}", flush=True)
+    rows = [row for path in files for row in _rows(path, results[path])]
+    marks = [*fleet.drifts(rows), *fleet.outliers(rows)]
+    name, content = fleet.table(rows)
+    pages: dict[Path, str | bytes] = {
+        folder / name: content,
+        folder / "fleet.html": fleet.page(rows, marks),
+    }
+    write_together(pages, arguments.force)
+    if not arguments.quiet:
+        for mark in marks:
+            print(f"{mark.kind}: {mark.robot} {mark.wheel} {mark.quantity}: {mark.text}")
+        print(f"written: {', '.join(map(str, pages))}")
+    return int(any(row.failure or row.unreliable for row in rows))
+
+
+def _key(path: Path, options: str) -> str:
+    """Return what a result depends on, as a name."""
+    if not path.exists():
+        raise BagError(f"{path}: no such file or folder")
+    parts = sorted(path.rglob("*")) if path.is_dir() else [path]
+    seen = [(str(p), p.stat().st_size, p.stat().st_mtime_ns) for p in parts if p.is_file()]
+    text = json.dumps([str(path.resolve()), seen, options, metadata.version("smp_motor_control")])
+    return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+def identify_one(path: str, settings: tuple[Any, ...]) -> dict[str, Any]:
+    """Return what came out for one recording, as a document; a failure is one too."""
+    mapping, model, fixed = settings
+    motors: dict[str, Any] = {}
+    try:
+        for wheel, records in bag.read_experiments([path], mapping).items():
+            try:
+                found = estimate(records, model, fixed=fixed)
+            except SmpError as error:
+                motors[wheel] = {"failure": str(error)}
+                continue
+            held = {**found.combinations, **found.parameters}
+            fit = found.fit_percent.validation
+            motors[wheel] = {
+                "values": {
+                    name: [q.value, q.std or 0.0]
+                    for name, q in held.items()
+                    if name in fleet.QUANTITIES and q.value is not None
+                },
+                "fit_percent": fit,
+                "unreliable": found.unreliable,
+            }
+    except SmpError as error:
+        return {"failure": str(error), "motors": {}}
+    except Exception as error:  # whatever is wrong with one recording, the others go on
+        return {"failure": f"{path}: {type(error).__name__}: {error}", "motors": {}}
+    return {"failure": "", "motors": motors}
+
+
+def _results(
+    paths: Sequence[str], settings: tuple[Any, ...], scheduler: str | None
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield results as they come; a worker that dies takes nothing with it but its own try."""
+    if scheduler:
+        yield from _on_cluster(paths, settings, scheduler)
+        return
+    fork = multiprocessing.get_context("fork")
+    tries = dict.fromkeys(paths, 0)
+    while tries:
+        cores = min(len(os.sched_getaffinity(0)), len(tries))
+        with ProcessPoolExecutor(cores, mp_context=fork, initializer=end_with_parent) as pool:
+            try:
+                for path, result in _gathered(pool, tries, settings):
+                    del tries[path]
+                    yield path, result
+            except BrokenProcessPool:
+                # Which one it was is not known: those under way are tried again, one at a time.
+                for path in list(tries)[: 1 if cores == 1 else cores]:
+                    tries[path] += 1
+        for path in [p for p, n in tries.items() if n >= TRIES]:
+            del tries[path]
+            yield path, {"failure": f"{path}: its worker was ended, perhaps for its memory",
+                         "motors": {}, "lost": True}  # fmt: skip
+
+
+def _gathered(
+    pool: Executor, paths: Sequence[str] | dict[str, int], settings: tuple[Any, ...]
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    futures: dict[Future[dict[str, Any]], str] = {
+        pool.submit(identify_one, path, settings): path for path in paths
+    }
+    for future in as_completed(futures):
+        yield futures[future], future.result()
+
+
+def _on_cluster(
+    paths: Sequence[str], settings: tuple[Any, ...], address: str
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    try:
+        from dask import distributed
+    except ImportError:
+        raise ParameterError(
+            "--scheduler needs Dask (pip install distributed); without it, all local cores work"
+        ) from None
+    call = cast(Callable[..., Any], distributed.as_completed)
+    try:
+        client = distributed.Client(address, timeout="10s")
+    except OSError as error:
+        raise ParameterError(f"--scheduler {address}: nobody answers there ({error})") from None
+    with client:
+        futures = {client.submit(identify_one, p, settings, pure=False): p for p in paths}
+        for future in call(futures):
+            path = futures[future]
+            lost = future.exception()
+            yield path, future.result() if lost is None else {
+                "failure": f"{path}: {lost}", "motors": {}, "lost": True
+            }  # fmt: skip
+
+
+def _write(file: Path, result: dict[str, Any]) -> None:
+    draft = file.with_suffix(".part")
+    draft.write_text(json.dumps(result, allow_nan=False))
+    os.replace(draft, file)
+
+
+def _rows(path: str, result: dict[str, Any]) -> list[fleet.Row]:
+    """Return the rows of one recording; the robot is the folder that it lies in."""
+    where = Path(path).resolve()
+    robot, date = where.parent.name, where.stat().st_mtime
+    if result["failure"]:
+        return [fleet.Row(robot, "", where.name, date, {}, failure=result["failure"])]
+    rows = []
+    for wheel, one in result["motors"].items():
+        fit = one.get("fit_percent")
+        rows.append(
+            fleet.Row(
+                robot,
+                wheel,
+                where.name,
+                date,
+                {name: (v, s) for name, (v, s) in one.get("values", {}).items()},
+                math.nan if fit is None else fit,
+                one.get("unreliable", False),
+                one.get("failure", ""),
+            )
+        )
+    return rows

@@ -1,0 +1,186 @@
+"""Many recordings in one table: robots, wheels and dates, what drifts and what stands out."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import resources
+
+import jinja2
+import numpy as np
+from markupsafe import Markup
+
+from smp_motor_ident.diagnosis.limits import FLEET_DRIFT, FLEET_OUTLIER, FLEET_SIZE
+from smp_motor_ident.report import words
+
+QUANTITIES = ("dc_gain", "time_constant", "static_voltage", "resistance", "motor_constant")
+"""What is compared, where the recordings tell it."""
+
+DAY = 86400.0
+
+
+@dataclass(frozen=True)
+class Row:
+    """One motor in one recording.
+
+    Attributes
+    ----------
+    robot, wheel, source : str
+        Whose it is, and the recording.
+    date : float
+        When it was recorded [s since 1970].
+    values : mapping of str to (float, float)
+        Value and standard deviation by name.
+    fit_percent : float
+        Of the speed in held-out data; NaN where there is none.
+    unreliable : bool
+        Whether the identification calls itself so.
+    failure : str
+        Why there are no values.
+    """
+
+    robot: str
+    wheel: str
+    source: str
+    date: float
+    values: Mapping[str, tuple[float, float]]
+    fit_percent: float = math.nan
+    unreliable: bool = False
+    failure: str = ""
+
+
+@dataclass(frozen=True)
+class Mark:
+    """Something that stands out: a drift of one motor, or a motor unlike the others.
+
+    Attributes
+    ----------
+    kind : {'drift', 'outlier'}
+    robot, wheel, quantity : str
+    text : str
+        In words, with the numbers.
+    """
+
+    kind: str
+    robot: str
+    wheel: str
+    quantity: str
+    text: str
+
+
+def drifts(rows: Sequence[Row]) -> list[Mark]:
+    """Return which motors change with time, by a straight line through their values.
+
+    The deviation of the slope is the larger of that from the stated deviations and that from the
+    scatter around the line.
+    """
+    marks = []
+    for (robot, wheel, name), held in _grouped(rows, lambda r: r.robot).items():
+        day = np.array([r.date / DAY for r in held])
+        value, std = np.array([r.values[name] for r in held]).T
+        if len(held) < 3 or np.ptp(day) == 0 or not np.all(std > 0):
+            continue
+        weight = 1 / std**2
+        middle = np.average(day, weights=weight)
+        moment = float(np.sum(weight * (day - middle) ** 2))
+        mean = float(np.average(value, weights=weight))
+        slope = float(np.sum(weight * (day - middle) * (value - mean))) / moment
+        rest = value - mean - slope * (day - middle)
+        scatter = max(1.0, float(np.sum(weight * rest**2)) / (len(held) - 2))
+        if abs(slope) > FLEET_DRIFT.value * math.sqrt(scatter / moment):
+            share = 100 * slope * 30 / mean
+            text = f"{share:+.2g} % in 30 days, over {len(held)} recordings"
+            marks.append(Mark("drift", robot, wheel, name, text))
+    return marks
+
+
+def outliers(rows: Sequence[Row]) -> list[Mark]:
+    """Return which motors differ from the same wheel of the other robots.
+
+    Each robot's last value against the median of the robots, in units of their scatter
+    (1.4826 times the median deviation, and no less than what is stated of the value itself).
+    """
+    marks = []
+    for (_, wheel, name), held in _grouped(rows, lambda r: "").items():
+        last = list({r.robot: r for r in sorted(held, key=lambda r: r.date)}.values())
+        if len(last) < FLEET_SIZE.value:
+            continue
+        value, std = np.array([r.values[name] for r in last]).T
+        middle = float(np.median(value))
+        spread = np.hypot(1.4826 * np.median(np.abs(value - middle)), std)
+        for row, one, wide in zip(last, value, spread, strict=True):
+            if wide > 0 and abs(one - middle) > FLEET_OUTLIER.value * wide:
+                share = 100 * (one / middle - 1)
+                text = f"{share:+.2g} % from the median of {len(last)} robots"
+                marks.append(Mark("outlier", row.robot, wheel, name, text))
+    return marks
+
+
+def _grouped(
+    rows: Sequence[Row], robot_of: Callable[[Row], str]
+) -> dict[tuple[str, str, str], list[Row]]:
+    found: dict[tuple[str, str, str], list[Row]] = defaultdict(list)
+    for row in rows:
+        if not row.unreliable:
+            for name in row.values:
+                found[robot_of(row), row.wheel, name].append(row)
+    return found
+
+
+def columns(rows: Sequence[Row]) -> dict[str, list[object]]:
+    """Return the table by columns; a number that does not exist is None."""
+    out: dict[str, list[object]] = {
+        "robot": [r.robot for r in rows],
+        "wheel": [r.wheel for r in rows],
+        "date": [r.date for r in rows],
+        "source": [r.source for r in rows],
+    }
+    for name in QUANTITIES:
+        pairs = [r.values.get(name) for r in rows]
+        out[name] = [p[0] if p else None for p in pairs]
+        out[f"{name}_std"] = [p[1] if p else None for p in pairs]
+    out["fit_percent"] = [None if math.isnan(r.fit_percent) else r.fit_percent for r in rows]
+    out["unreliable"] = [r.unreliable for r in rows]
+    out["failure"] = [r.failure for r in rows]
+    return out
+
+
+def table(rows: Sequence[Row]) -> tuple[str, bytes]:
+    """Return the name and content of the table: Parquet where pyarrow is installed, else CSV."""
+    held = columns(rows)
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError:
+        text = io.StringIO(newline="")
+        writer = csv.writer(text)
+        writer.writerow(held)
+        writer.writerows(zip(*held.values(), strict=True))
+        return "fleet.csv", text.getvalue().encode()
+    sink = pyarrow.BufferOutputStream()
+    pyarrow.parquet.write_table(pyarrow.table(held), sink)
+    return "fleet.parquet", sink.getvalue().to_pybytes()
+
+
+def page(rows: Sequence[Row], marks: Sequence[Mark]) -> str:
+    """Return the table as a page that stands alone."""
+    folder = resources.files("smp_motor_ident.report")
+    style = "".join(folder.joinpath(n).read_text("utf-8") for n in ("colors.css", "report.css"))
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("smp_motor_ident.report", "."),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+    )
+    environment.filters |= {"label": words.label, "number": words.number}
+    return environment.get_template("fleet.html.jinja").render(
+        rows=rows, marks=marks, quantities=QUANTITIES, style=Markup(style),
+        robots=len({r.robot for r in rows}), day=_day,
+    )  # fmt: skip
+
+
+def _day(date: float) -> str:
+    return str(np.datetime64(round(date), "s")).replace("T", " ")

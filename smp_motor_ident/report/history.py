@@ -1,0 +1,121 @@
+"""What `identifier` has seen of commissioned motors over the days: lines of a file, and charts.
+
+Each line is a JSON object: stamp [s], wheel, values (by name value and standard deviation),
+validity and codes of findings.  A file is only ever added to, so a crash loses a line at most.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from smp_motor_ident.errors import BagError
+from smp_motor_ident.estimation.monitor import Monitor
+from smp_motor_ident.report.chart import Chart, Curve
+from smp_motor_ident.report.words import label
+
+SHOWN = {
+    "resistance": "resistance [ohm]",
+    "motor_constant": "motor constant [V s/rad]",
+    "friction": "friction [times the commissioned]",
+}
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One wheel at one time.
+
+    Attributes
+    ----------
+    stamp : float
+        [s].
+    wheel : str
+    values : mapping of str to (float, float)
+        Value and standard deviation by name, of what was estimated then.
+    findings : tuple of str
+        Codes.
+    """
+
+    stamp: float
+    wheel: str
+    values: Mapping[str, tuple[float, float]]
+    findings: tuple[str, ...] = ()
+
+
+def entry_of(stamp: float, wheel: str, monitor: Monitor) -> Entry:
+    """Return what a monitor knows now."""
+    known = {name for name, (state, _) in monitor.validity().items() if state == "estimated"}
+    values = {name: one for name, one in monitor.values().items() if name in known}
+    return Entry(stamp, wheel, values, tuple(f.code for f in monitor.findings()))
+
+
+def append(path: Path, entries: Sequence[Entry]) -> None:
+    """Add entries to a file."""
+    with path.open("a", encoding="utf-8") as file:
+        for one in entries:
+            document = {
+                "stamp": one.stamp,
+                "wheel": one.wheel,
+                "values": {name: list(pair) for name, pair in one.values.items()},
+                "findings": list(one.findings),
+            }
+            file.write(json.dumps(document, allow_nan=False) + "\n")
+
+
+def read(path: Path) -> dict[str, list[Entry]]:
+    """Return the entries of each wheel in the order of their stamps.
+
+    Raises
+    ------
+    BagError
+        Where a line other than a cut last one is no entry.
+    """
+    out: dict[str, list[Entry]] = {}
+    lines = path.read_text("utf-8").splitlines()
+    for number, line in enumerate(lines, 1):
+        try:
+            raw = json.loads(line)
+            values = {str(k): (float(v), float(s)) for k, (v, s) in raw["values"].items()}
+            one = Entry(float(raw["stamp"]), str(raw["wheel"]), values, tuple(raw["findings"]))
+            if not all(map(math.isfinite, (one.stamp, *(x for p in values.values() for x in p)))):
+                raise ValueError("a number is not finite")
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            if number == len(lines):
+                break  # the power went while it was written
+            raise BagError(f"{path}: line {number} is no entry of a history ({error})") from None
+        out.setdefault(one.wheel, []).append(one)
+    return {wheel: sorted(entries, key=lambda e: e.stamp) for wheel, entries in out.items()}
+
+
+def history_charts(wheel: str, entries: Sequence[Entry]) -> list[Chart]:
+    """Return a chart of each value over the hours since the first entry, with 95 % bands."""
+    if len(entries) < 2:
+        return []
+    hours = np.array([(e.stamp - entries[0].stamp) / 3600 for e in entries])
+    charts = []
+    for name, title in SHOWN.items():
+        pairs = np.array([e.values.get(name, (math.nan, math.nan)) for e in entries])
+        if not np.isfinite(pairs[:, 0]).any():
+            continue
+        value, wide = pairs[:, 0], 1.96 * pairs[:, 1]
+        charts.append(
+            Chart(
+                name=f"history-{name}-{wheel}",
+                title=f"Since commissioning: {label(name).lower()}",
+                x_label="time [h]",
+                y_label=title,
+                x=hours,
+                curves=(
+                    Curve("live, 95 % band", value, "measured", "line", value - wide, value + wide),
+                ),
+                group=f"history-{wheel}",
+                height=220,
+                summary=f"{title} of {label(wheel)} over {hours[-1]:.3g} hours.",
+            )
+        )
+    return charts

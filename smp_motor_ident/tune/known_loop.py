@@ -1,0 +1,198 @@
+"""The command of a known loop, reconstructed from set-points and speeds that a robot logged.
+
+A loop's arithmetic is deterministic: run on the set-points and the speeds that it had, from a
+state that is known, it gives the commands that it gave.  At rest with a set-point of 0 the state
+is known.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smp_motor_ident.diagnosis.limits import COMMAND_RESOLUTION, LOOP_RATE, TICK_FIT
+from smp_motor_ident.errors import SignalError
+from smp_motor_ident.finding import Finding
+from smp_motor_ident.record import Record
+
+Array = NDArray[np.float64]
+
+Step = Callable[[float, float], float]
+"""From set-point, in the target's unit, and speed of the wheel [rad/s] to the command [V]."""
+
+REGULAR = 0.5
+"""Of an interval: a step that is longer by so much lost a sample."""
+
+DITHERS = 4
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What a loop's arithmetic takes from its robot.
+
+    Attributes
+    ----------
+    numbers : mapping of str to float
+        Gains, by the target's names.
+    sample_time : float
+        [s].
+    supply : float
+        Voltage of a full command [V].
+    ticks : float
+        Counts of a radian of the wheel; NaN where they are not known.
+    """
+
+    numbers: Mapping[str, float]
+    sample_time: float
+    supply: float
+    ticks: float
+
+
+@dataclass(frozen=True)
+class KnownLoop:
+    """The arithmetic of a target.
+
+    Attributes
+    ----------
+    defaults : mapping of str to float
+        Its numbers; NaN for those that must be given.
+    start : callable
+        From a setting to the step of a loop that begins at rest.
+    interval : callable
+        From the numbers to the loop's interval [s]; NaN where it is that of the log.
+    remembers : bool
+        Whether a command depends on what was before.
+    """
+
+    defaults: Mapping[str, float]
+    start: Callable[[Setting], Step]
+    interval: Callable[[Mapping[str, float]], float] = lambda numbers: math.nan
+    remembers: bool = True
+
+
+def reconstruct(record: Record, loop: KnownLoop, numbers: Mapping[str, float]) -> Record:
+    """Return a record with the voltages that the loop commanded.
+
+    Parameters
+    ----------
+    record : Record
+        Whose ``voltage`` holds the set-points, in the target's unit.
+    loop : KnownLoop
+        That ran.
+    numbers : mapping of str to float
+        Its gains.
+
+    Returns
+    -------
+    Record
+        Up to the first lost sample, with a finding that says where its voltages are from.
+
+    Raises
+    ------
+    SignalError
+        When the commands cannot be known: no speed or supply, another rate than the loop's, a
+        start that is not at rest, speeds that were rounded too coarsely.
+    """
+    where = f"{record.source}: {record.wheel}"
+    supply, velocity = record.hardware.supply_voltage, record.velocity
+    if velocity is None or not np.all(np.isfinite(velocity)):
+        raise SignalError(f"{where}: the loop's speed is not there at every sample; map velocity")
+    if supply is None:
+        raise SignalError(
+            f"{where}: supply_voltage is not known, so neither is a command's voltage"
+        )
+    T = _interval(record, loop, numbers)
+    record = _unbroken(record, T)
+    assert record.velocity is not None
+    if loop.remembers and (record.voltage[1] != 0.0 or record.velocity[0] != 0.0):
+        raise SignalError(
+            f"{where}: begins while the loop is at work, with an integral that is not known; "
+            "record from rest, before the first set-point"
+        )
+    per_turn = record.hardware.counts_per_revolution
+    ticks = math.nan if per_turn is None else per_turn * record.hardware.gear_ratio / (2 * math.pi)
+    setting = Setting(numbers, T, supply, ticks)
+    speed = record.velocity / record.hardware.gear_ratio
+    speed, step = _as_the_loop_had_it(speed, setting)
+    volts = _run(loop.start(setting), record.voltage, speed)
+    error = _error(loop, setting, record.voltage, speed, step)
+    if error > COMMAND_RESOLUTION.value * supply:
+        raise SignalError(
+            f"{where}: the speed was logged in steps of {step:.3g} rad/s, so that the command is "
+            f"known to {error:.2g} V only; log more digits, or give counts_per_revolution if this "
+            "is a tick of the encoder"
+        )
+    note = Finding(
+        "reconstructed_voltage",
+        "note",
+        f"voltage: reconstructed by the loop that ran ({len(record)} samples); as right as its "
+        f"gains and the supply of {supply:g} V",
+        {"error": error},
+    )
+    return replace(record, voltage=volts, findings=(*record.findings, note))
+
+
+def _interval(record: Record, loop: KnownLoop, numbers: Mapping[str, float]) -> float:
+    """Return the loop's interval, which is the log's [s]."""
+    logged, T = record.sample_time, loop.interval(numbers)
+    if math.isnan(T):
+        return logged
+    if abs(logged / T - 1) > LOOP_RATE.value:
+        raise SignalError(
+            f"{record.source}: {record.wheel}: logged every {1e3 * logged:.4g} ms, and the loop "
+            f"ran every {1e3 * T:.4g} ms: commands between two rows are not known; log every step"
+        )
+    return T
+
+
+def _unbroken(record: Record, T: float) -> Record:
+    """Return what is before the first lost sample."""
+    lost = np.flatnonzero(np.diff(record.time) > (1 + REGULAR) * T)
+    end = min([len(record), *record.starts[1:], *(lost[:1] + 1)])
+    if end < len(record):
+        if end < 2:
+            raise SignalError(f"{record.source}: {record.wheel}: lost its second sample")
+        text = f"the loop is known up to a lost sample, {record.time[end - 1]:.4g} s; no further"
+        note = Finding("lost_loop", "warning", text, {"samples": float(end)})
+        record = record.slice(0, int(end))
+        record = replace(record, findings=(*record.findings, note))
+    return record
+
+
+def _as_the_loop_had_it(speed: Array, setting: Setting) -> tuple[Array, float]:
+    """Return the speed in whole ticks where it is that, and the step in which it was logged."""
+    if math.isfinite(setting.ticks):
+        exact = speed * setting.ticks * setting.sample_time
+        if np.mean(np.abs(exact - np.rint(exact)) < TICK_FIT.value) > 1 - TICK_FIT.value:
+            return np.rint(exact) / setting.ticks / setting.sample_time, 0.0
+    gaps = np.diff(np.unique(np.abs(speed)))
+    gaps = gaps[gaps > 1e-9 * np.abs(speed).max(initial=1e-9)]
+    step = float(gaps.min()) if gaps.size else 0.0
+    on_grid = step > 0 and np.abs(speed / step - np.rint(speed / step)).max() < 0.1
+    return speed, step if on_grid else 0.0
+
+
+def _run(step: Step, setpoints: Array, speed: Array) -> Array:
+    """Return the voltages over the intervals that end at the samples."""
+    volts = np.zeros(speed.size)
+    for k in range(speed.size - 1):
+        volts[k + 1] = step(float(setpoints[k + 1]), float(speed[k]))
+    return volts
+
+
+def _error(loop: KnownLoop, setting: Setting, setpoints: Array, speed: Array, step: float) -> float:
+    """Return what rounding of the logged speed makes of the command, rms [V]."""
+    if step == 0.0:
+        return 0.0
+    rng: Any = np.random.default_rng(0)
+    plain = _run(loop.start(setting), setpoints, speed)
+    errors = []
+    for _ in range(DITHERS):
+        other = speed + rng.uniform(-0.5, 0.5, speed.size) * step
+        errors.append(_run(loop.start(setting), setpoints, other) - plain)
+    return float(np.sqrt(np.mean(np.square(errors))))

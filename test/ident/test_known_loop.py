@@ -1,0 +1,169 @@
+"""A loop that is known gives its commands back from set-points and speeds alone."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from smp_motor_ident.cli.identify import main
+from smp_motor_ident.errors import SignalError
+from smp_motor_ident.record import Hardware, Record
+from smp_motor_ident.tune.exports import FORMATS
+from smp_motor_ident.tune.known_loop import reconstruct
+
+ROOT = Path(__file__).resolve().parents[2]
+GAIN, LAG, FAST, SUPPLY = 25.0, 0.09, 1e-4, 12.0
+"""Of the motor [rad/s/V], [s], [s], and its supply [V]."""
+
+LOOPS = {
+    "linorobot2": (0.02, {"K_P": 20.0, "K_I": 4.0, "K_D": 0.0, "PWM_BITS": 10}, 60 / (2 * math.pi)),
+    "ros_arduino_bridge": (0.033, {"Kp": 3, "Kd": 10, "Ki": 0, "Ko": 25}, 0.0),
+    "arduino_pid": (0.01, {"Kp": 15.0, "Ki": 150.0, "Kd": 0.0, "SampleTime": 10}, 1.0),
+    "ros2_controllers": (
+        0.01,
+        {"p": 0.8, "i": 9.0, "d": 0.0, "u_clamp_max": 12.0, "u_clamp_min": -12.0,
+         "tracking_time_constant": 0.1, "feedforward_gain": 0.0},
+        1.0,
+    ),
+    "wpilib": (0.02, {"kS": 0.2, "kV": 1.1, "kP": 0.5}, 1.0),
+}  # fmt: skip
+"""Interval, gains, and the target's unit of a wheel's rad/s."""
+
+
+@pytest.fixture(scope="module")
+def laws():
+    """Return the laws of the benchmark, written from the targets' documentation."""
+    sys.path.insert(0, str(ROOT / "benchmarks"))
+    try:
+        bench = importlib.import_module("exports")
+        # The laws are of the paper's gearbox and encoder; speeds of this motor's stand for theirs.
+        return bench.LAWS, bench.RATIO, bench.COUNTS
+    finally:
+        sys.path.remove(str(ROOT / "benchmarks"))
+
+
+def drive(laws, name: str, seconds: float = 20.0, seed: int = 3):
+    """Drive the motor by the benchmark's law; return set-points, speeds and voltages."""
+    (table, ratio, counts), (T, numbers, unit) = laws, LOOPS[name]
+    unit = unit or counts * ratio / (2 * math.pi) * T
+    A = np.zeros((4, 4))
+    A[0, 1], A[2, 0] = 1.0, 1.0
+    A[1] = (-1 / (LAG * FAST), -(LAG + FAST) / (LAG * FAST), 0.0, GAIN / (LAG * FAST))
+    advance = expm(A * T)
+    law, rng = table[name](numbers, T), np.random.default_rng(seed)
+    n = round(seconds / T)
+    targets = np.repeat(rng.uniform(-150.0, 150.0, n // 20 + 1), 20)[:n] / ratio
+    if name == "ros_arduino_bridge":  # whole ticks, and none that is 0, which stops this board
+        targets = np.rint(targets * unit)
+        targets[targets == 0] = 1.0
+        targets = (targets + 0.01 * np.sign(targets)) / unit  # what the law cuts to that
+    targets[:3] = 0.0
+    x, before, volts = np.zeros(4), 0, np.zeros(n)
+    speed = np.zeros(n)
+    for k in range(n):
+        count = math.floor(x[2] * counts / (2 * math.pi))
+        turned, before = count - before, count
+        speed[k] = turned / T * 2 * math.pi / counts / ratio  # [rad/s], wheel
+        x[3] = law(targets[k] * ratio, speed[k] * ratio, turned) if k > 2 else 0.0
+        volts[k] = x[3]
+        x = advance @ x
+    logged = np.rint(targets * unit) if name == "ros_arduino_bridge" else targets * unit
+    return T * np.arange(n), logged, speed, volts
+
+
+def record(laws, time, setpoints, speed, **hardware) -> Record:
+    """Return the record as the reader gives it: a set-point holds from its row on."""
+    _, ratio, counts = laws
+    known = {"gear_ratio": ratio, "counts_per_revolution": counts, "supply_voltage": SUPPLY}
+    held = np.concatenate(([0.0], setpoints[:-1]))
+    return Record("left", time, held, velocity=speed * ratio, hardware=Hardware(**known | hardware))
+
+
+def given(name: str) -> dict[str, float]:
+    return dict(FORMATS[name].known.defaults) | LOOPS[name][1]
+
+
+@pytest.mark.parametrize("name", LOOPS)
+def test_the_command_is_reconstructed(laws, name):
+    time, setpoints, speed, volts = drive(laws, name)
+    # Nine digits, as logs have them.
+    rounded = np.array([float(f"{v:.9g}") for v in speed])
+    got = reconstruct(record(laws, time, setpoints, rounded), FORMATS[name].known, given(name))
+    # Of two independent writings of the rule; a whole number may fall to the other side once.
+    assert np.mean(np.abs(got.voltage[1:] - volts[:-1]) > 0.05) < 0.01
+    assert [f.code for f in got.findings] == ["reconstructed_voltage"]
+
+
+@pytest.mark.parametrize("name", ["linorobot2", "arduino_pid"])
+def test_the_motor_is_identified_through_the_loop(laws, name, tmp_path):
+    time, setpoints, speed, _ = drive(laws, name)
+    log = tmp_path / "log.csv"
+    np.savetxt(log, np.column_stack((time, setpoints, speed)), delimiter=",", comments="",
+               header="t,target,speed", fmt="%.9g")  # fmt: skip
+    _, ratio, counts = laws
+    numbers = [f"{k}={v}" for k, v in LOOPS[name][1].items()]
+    code = main([str(log), "--controller", name, *numbers, "--quiet", "--output",
+                 str(tmp_path / "r"), "--map", "time=t", "setpoint=target", "velocity=speed",
+                 f"gear_ratio={ratio}", f"counts_per_revolution={counts}",
+                 f"supply_voltage={SUPPLY}"])  # fmt: skip
+    assert code == 0
+    document = json.loads((tmp_path / "r" / "identification.json").read_text())
+    (motor,) = document["motors"].values()
+    for key, truth in (("dc_gain", GAIN), ("time_constant", LAG + FAST)):
+        found = motor["combinations"][key]
+        # Four standard deviations: 1 in 16,000 by chance, and the seed is fixed.
+        assert abs(found["value"] - truth) < 4 * found["std"]
+        assert found["std"] < 0.02 * truth
+    assert "reconstructed_voltage" in [f["code"] for f in motor["findings"]]
+
+
+def test_what_is_not_known_is_refused(laws):
+    loop, numbers = FORMATS["arduino_pid"].known, given("arduino_pid")
+    time, setpoints, speed, _ = drive(laws, "arduino_pid", 6.0)
+    whole = record(laws, time, setpoints, speed)
+    with pytest.raises(SignalError, match="begins while the loop is at work"):
+        reconstruct(whole.slice(100, 400), loop, numbers)
+    with pytest.raises(SignalError, match="ran every 20 ms"):
+        reconstruct(whole, loop, numbers | {"SampleTime": 20})
+    with pytest.raises(SignalError, match="supply_voltage is not known"):
+        reconstruct(record(laws, time, setpoints, speed, supply_voltage=None), loop, numbers)
+    coarse = record(laws, time, setpoints, np.round(speed, 1), counts_per_revolution=None)
+    with pytest.raises(SignalError, match=r"logged in steps of 0\.1 rad/s.*log more digits"):
+        reconstruct(coarse, loop, numbers)
+
+
+def test_a_lost_sample_ends_what_is_known_of_the_loop(laws):
+    time, setpoints, speed, volts = drive(laws, "arduino_pid", 6.0)
+    kept = np.arange(time.size) != 300
+    one = record(laws, time[kept], setpoints[kept], speed[kept])
+    got = reconstruct(one, FORMATS["arduino_pid"].known, given("arduino_pid"))
+    assert len(got) == 300
+    assert "lost_loop" in [f.code for f in got.findings]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["roboclaw"], "not published"),
+        (["linorobot2", "K_P=1"], "give K_I=..."),
+        (["linorobot2", "K_P=1", "K_I=1", "K_X=1"], "takes K_P, K_I"),
+        (["arduino", "Kp=1"], "must be one of"),
+    ],
+)
+def test_a_loop_that_is_not_given_whole_is_refused(arguments, complaint, tmp_path, capsys):
+    assert main(["log.csv", "--controller", *arguments, "--output", str(tmp_path / "r")]) == 2
+    assert complaint in capsys.readouterr().err
+
+
+def test_set_points_of_another_topic_are_refused(tmp_path, capsys):
+    code = main(["bag", "--controller", "wpilib", "kV=1", "kP=1", "--output", str(tmp_path / "r"),
+                 "--map", "setpoint=/cmd.data", "velocity=/state.speed"])  # fmt: skip
+    assert code == 2
+    assert "one message or row" in capsys.readouterr().err

@@ -1,0 +1,45 @@
+"""What wheel_pid says of itself, without a process."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+
+from smp_motor_control.nodes import runtime, wheel_report
+from smp_motor_control.pid import PidGains
+from smp_motor_control.wheel.controller import WheelController, WheelSettings
+from smp_motor_control.wheel.loop import LoopSettings
+
+
+@pytest.fixture
+def said(monkeypatch):
+    """Return the log and the assessment of a wheel with these gains."""
+
+    def ask(gains: PidGains) -> tuple[list[str], bytes, str]:
+        assessments, log = [], []
+        diagnostics = lambda node, assess, joint: (  # noqa: E731
+            assessments.append(assess) or SimpleNamespace(due=False, publish=lambda: None)
+        )
+        monkeypatch.setattr(runtime, "Diagnostics", diagnostics)
+        node = SimpleNamespace(get_logger=lambda: SimpleNamespace(warning=log.append))
+        wheel = WheelController(WheelSettings(loop=LoopSettings(gains=gains)))
+        wheel_report.WheelReport(node, wheel, "left_wheel_joint")
+        level, message, _ = assessments[0]()
+        return log, level, message
+
+    return ask
+
+
+def test_a_wheel_on_default_gains_says_so_in_log_and_diagnostics(said):
+    log, level, message = said(PidGains())
+    assert log == [wheel_report.UNTUNED]
+    assert wheel_report.UNTUNED in message
+    assert level == runtime.OK  # nothing is wrong as long as it rests
+
+
+def test_a_wheel_with_gains_says_nothing_of_them(said):
+    log, _, message = said(PidGains(p=2.0, i=30.0))
+    assert log == []
+    assert "gains" not in message
+    assert "defaults" not in message
