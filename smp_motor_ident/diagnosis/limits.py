@@ -25,7 +25,7 @@ LOOSE_QUANTITY = Limit(
     0.5,
     "of its value",
     "a quantity known no better than to a factor of two (95 %) decides nothing",
-    "test_estimate.py: a single level of voltage gives one combination",
+    "test_poor_records.py: a single level of voltage gives one combination",
 )
 NEGLIGIBLE_FRICTION = Limit(
     0.05,
@@ -55,13 +55,13 @@ REST = Limit(
     0.05,
     "of the largest voltage",
     "a motor that does not move at a twentieth of the voltage shows what it shows at none",
-    "test_estimate.py: rest before the excitation changes nothing",
+    "test_poor_records.py: rest before the excitation changes nothing",
 )
 SAME_LEVEL = Limit(
     0.02,
     "of a voltage",
     "levels closer than a voltmeter and a battery under load hold them are one level",
-    "test_estimate.py: a single level of voltage gives one combination",
+    "test_poor_records.py: a single level of voltage gives one combination",
 )
 CURRENT_THERE = Limit(
     0.3,
@@ -112,7 +112,7 @@ LEAST_FIT = Limit(
     -100.0,
     "% of the speed",
     "an error twice the motion is no fit to compare: a descent that left the motor behind",
-    "test_estimate.py",
+    "test_estimate.py: a candidate that left the motor behind has no fit",
 )
 PROFILED = Limit(
     20_000,
@@ -126,67 +126,67 @@ UNPACKED_LEAST = Limit(
     256e6,
     "byte",
     "cost: what any machine that runs ROS can spare; a smaller file may always unpack to it",
-    "test/ident/bag/test_bounds.py",
+    "test_bounds.py",
 )
 UNPACKED_RATIO = Limit(
     50.0,
     "1",
     "cost: 1 GB at most for a file of 10 MB, half of it unpacked bytes; telemetry packs 3 to 20",
-    "test/ident/bag/test_bounds.py",
+    "test_bounds.py",
 )
 STRAY_ROWS = Limit(
     0.05,
     "1",
     "cost: an estimate without one row in twenty keeps its value; with more it is no table",
-    "test/ident/bag/test_csv.py",
+    "test_csv.py",
 )
 BEAT_FLOOR = Limit(
     0.5,
     "sample",
     "physical: a later beat than half a sample is the next one; the least latency stays below it",
-    "test/ident/bag/test_beat.py",
+    "test_beat.py",
 )
 BEAT_JITTER = Limit(
     0.02,
     "sample",
     "cost: instants that are off by less change an estimate less than their rounding",
-    "test/ident/bag/test_beat.py",
+    "test_beat.py",
 )
 BEAT_LOST = Limit(
     0.02,
     "1",
     "cost: with more samples lost the number of a sample, and with it its instant, is a guess",
-    "test/ident/bag/test_beat.py",
+    "test_beat.py",
 )
 JUMP_SPAN = Limit(
     20.0,
     "1",
     "physical: no signal leaves twenty times the range of 98 % of its values for single samples",
-    "test/ident/bag/test_checks.py",
+    "test_checks.py",
 )
 JUMP_STEP = Limit(
     20.0,
     "1",
     "physical: what has inertia does not step to and fro by twenty times all but 1 % of its steps",
-    "test/ident/bag/test_checks.py",
+    "test_checks.py",
 )
 UNSIGNED_CURRENT = Limit(
     2.0,
     "1",
     "physical: an armature's means in both directions cancel but for an offset; a size's add up",
-    "test/ident/bag/test_checks.py",
+    "test_checks.py",
 )
 SMOOTHER = Limit(
     0.9,
     "1",
     "cost: stamps are kept unless the motion is evidently smoother on the beat that they keep",
-    "test/ident/bag/test_beat.py",
+    "test_beat.py",
 )
 EXPLAINS = Limit(
     1e-6,
     "1",
     "significance: with a thousand pairs of fields tried, one in a thousand listings is wrong",
-    "test/ident/bag/test_propose.py",
+    "test_propose.py",
 )
 
 # Assessment of a fit.
@@ -352,27 +352,27 @@ FRICTION_KNOWN = Limit(
     "share of the supply",
     "an error of the friction's feed-forward by this changes the speed by as much of its largest "
     "value as the band in which a change counts as settled",
-    "test/ident/test_tune_truth.py",
+    "test_tune_truth.py",
 )
 FRICTION_RANGE = Limit(
     0.5,
     "share of the supply",
     "with half of the supply unknown the speed that the motor reaches is not known to a factor 2",
-    "test/ident/test_tune_truth.py",
+    "test_tune_truth.py",
 )
 UNRELIABLE_SPREAD = Limit(
     0.1,
     "relative standard deviation",
     "least that numbers of an unreliable estimate are drawn with; more where the fit on held-out "
     "data leaves more of the motion unexplained",
-    "test/ident/test_tune_truth.py",
+    "test_tune_truth.py",
 )
 SPEED_NOISE = Limit(
     2.5e-3,
     "share of the top speed, rms",
     "four times this is 2 % of half the top speed: with more, counts shake the wheel out of the "
     "band in which the specification calls a change settled",
-    "test/ident/test_tune_methods.py",
+    "test_tune_methods.py",
 )
 CANDIDATE_WEIGHT = Limit(
     0.05,
@@ -418,13 +418,13 @@ COMMAND_RESOLUTION = Limit(
     1 / 255,
     "of the supply, rms",
     "one step of an 8-bit PWM: a command that is known closer is known as well as it was given",
-    "test_known_loop.py: a speed that was logged in coarse steps",
+    "test_known_loop.py: what is not known is refused",
 )
 LOOP_RATE = Limit(
     0.02,
     "of the interval",
     "clocks of boards are within 2 %; a log at another rate leaves commands out",
-    "test_known_loop.py: a log at another rate",
+    "test_known_loop.py: what is not known is refused",
 )
 TICK_FIT = Limit(
     0.05,

@@ -7,6 +7,7 @@ import motors
 import numpy as np
 import pytest
 
+from smp_motor_ident.diagnosis import validation
 from smp_motor_ident.diagnosis.identifiability import structural, what_next
 from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.estimate import estimate
@@ -142,6 +143,26 @@ def test_resistance_and_friction_fixed_leave_two_motors_and_are_refused():
     result = estimate(recording, model="second_order", fixed=known)
     # K^2 - a0 K + R b = 0 has two positive solutions, each with its own J and L.
     assert set(result.unidentifiable) >= {"motor_constant", "inertia", "inductance"}
+
+
+def test_a_current_that_is_rarely_there_is_not_used():
+    recording = motors.record("rear_left")
+    rare = np.where(np.arange(len(recording)) % 5 == 0, recording.current, np.nan)
+    result = estimate(replace(recording, current=rare), model="second_order")
+    assert "resistance" in result.unidentifiable
+    check(result, motors.truth("rear_left", 0.3), ("dc_gain", "time_constant"))
+
+
+def test_a_candidate_that_left_the_motor_behind_has_no_fit(monkeypatch):
+    found = validation.speed_fit
+
+    def far(records, data, fit, *more):
+        return -1.4e6 if fit.structure.order == 1 else found(records, data, fit, *more)
+
+    monkeypatch.setattr(validation, "speed_fit", far)
+    candidates = estimate(motors.record("rear_left", current=False)).candidates
+    assert candidates[0].fit_percent is None
+    assert candidates[-1].fit_percent > 95.0
 
 
 def test_fixed_resistance_with_current_is_kept():
