@@ -169,7 +169,8 @@ def rubbing(data: Experiments, near: Fit, value: float) -> tuple[Array, list[Arr
     may also have begun at rest.
     """
     full = float(np.abs(data.hold_value).max())
-    scale = (full - value) / max(full - near.z[models.VC_PLUS], 1e-9)
+    least = 1e-9 * full  # friction of all the voltage and more leaves a motor that stands
+    scale = max(full - value, least) / max(full - near.z[models.VC_PLUS], least)
     z = near.z.copy()
     z[[models.A0, models.A1, models.A2]] += np.log(scale)
     z[[models.VC_PLUS, models.VC_MINUS]] = value
