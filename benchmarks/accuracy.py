@@ -116,13 +116,11 @@ def tuning_table() -> Figures:
 
 def tuning_figures(outcomes: list[dict]) -> Figures:
     done = [o for o in outcomes if o["designed"]]
-    held = ("stable", "gain_margin", "delay_margin", "promise", "draws_stable")
+    held = ("stable", "gain_margin", "delay_margin", "required", "draws_stable")
     best = [o for o in done if o["method"] == tuning.RECOMMENDED]
     return {
         "designed": count(len(done), len(outcomes)),
-        "as specified": count(
-            sum(all(o.get(n, o.get("specification")) for n in held) for o in done), len(done)
-        ),
+        "as specified": count(sum(all(o[n] for n in held) for o in done), len(done)),
         "settling of the recommended method [s]": {
             "figure": float(np.nanmedian([o["settling"] for o in best]))
         },
