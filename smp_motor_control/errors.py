@@ -15,8 +15,9 @@ class SmpError(Exception):
     exit_code = 2
 
     def __str__(self) -> str:
-        """Return the message, without its middle where nobody would read that."""
+        """Return the message in one line, without its middle where nobody would read that."""
         text, half = super().__str__(), LONGEST_MESSAGE // 2
+        text = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
         return text if len(text) <= LONGEST_MESSAGE else f"{text[:half]} … {text[-half:]}"
 
 

@@ -57,6 +57,10 @@ def test_a_spoilt_file_gives_an_answer_or_one_line(tmp_path: Path, name: str, se
     assert FUZZ.outcome(name, spoilt, tmp_path) in ("answer", "partial", "refused")
 
 
+def test_a_message_that_quotes_a_spoilt_name_is_one_line() -> None:
+    assert str(BagError("has /joint_sta\nes\x1b[2J")) == "has /joint_sta\ufffdes\ufffd[2J"
+
+
 def test_a_message_that_quotes_a_spoilt_value_keeps_head_and_tail() -> None:
     long = BagError(f"a.yaml: left: {'- ' * 3000}is not SOURCE")
     assert len(str(long)) < 1100
