@@ -392,7 +392,7 @@ MOTOR_CONSTANT_BAND = Limit(
     0.03,
     "of the commissioned value",
     "15 K of ferrite at 0.2 %/K, what magnets warm by beside a winding at the end of its band",
-    "test_monitor.py: a magnet that weakens is told from heat",
+    "test_monitor.py: a magnet that weakens is separated from heat",
 )
 FRICTION_BAND = Limit(
     1.0,

@@ -49,7 +49,7 @@ class Request:
 
     @property
     def options(self) -> Options:
-        """What a descent is told."""
+        """Return what a descent needs of it."""
         return Options(huber=LOSSES[self.loss])
 
     @property

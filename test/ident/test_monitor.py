@@ -138,7 +138,7 @@ def test_a_winding_that_heats_is_flagged_within_twenty_seconds_of_leaving_its_ba
     assert hot.evidence["warmer"] == pytest.approx(51, abs=13)
 
 
-def test_a_magnet_that_weakens_is_told_from_heat() -> None:
+def test_a_magnet_that_weakens_is_separated_from_heat() -> None:
     def weaken(motor: Motor, time: float) -> bool:
         motor.constant = MOTOR.motor_constant * (1 - 0.05 * min(max(time - 30, 0) / 60, 1))
         return 30 <= time <= 91
