@@ -3,7 +3,6 @@
     python benchmarks/faults.py                         # one hour, seed of the day
     python benchmarks/faults.py --minutes 2 --seed 7
     python benchmarks/faults.py --parameters 5000       # sets through the service of a live wheel
-    python benchmarks/faults.py --core 5000             # the same without processes
 
 Faults come singly or in pairs, at set-points drawn too.  What is allowed is the table of
 docs/decisions/when-a-wheel-stops.md: a fault that stops must have done so in its time, with half
@@ -32,6 +31,7 @@ from typing import Any
 
 import pytest
 import yaml
+from parameter_sets import GAINS, random_parameters, usual
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "test"), str(ROOT / "test" / "control")]
@@ -41,13 +41,6 @@ SUPPLY, SLACK = 12.0, 0.5
 FASTEST = 5.0
 """Speed of this wheel at its supply [rad/s], and what a coarse mean may add."""
 TRY_VOLTAGE = 1.05 * 4.0 + 0.02  # and a step of the PWM
-GAINS = {
-    "p": 1.5, "i": 20.0, "u_clamp_min": -SUPPLY, "u_clamp_max": SUPPLY, "fault_retry": 0.5,
-    "antiwindup_strategy": "back_calculation", "max_acceleration": 15.0, "feedback_timeout": 0.3,
-    "feedforward_velocity": 2.6, "feedforward_acceleration": 0.13, "feedforward_static": 0.4,
-    "model.dc_gain": 25.55, "model.time_constant": 0.051, "model.static_voltage": 0.45,
-}  # fmt: skip
-"""With the model of the wheel, so that sets of parameters are judged by it."""
 
 
 @dataclass(frozen=True)
@@ -192,7 +185,7 @@ def _parameters(campaign: Campaign) -> None:
     draw = campaign.draw
     values = random_parameters(draw)
     campaign.robot.set(NODE, **values)
-    campaign.robot.set(NODE, **_usual(values))
+    campaign.robot.set(NODE, **usual(values))
 
 
 BRAKES = 0.5 + 1.2
@@ -313,41 +306,6 @@ def run(minutes: float, seed: int, campaign: Campaign) -> bool:
     return not failures
 
 
-def random_parameters(draw: random.Random) -> dict[str, Any]:
-    """Return a set of parameters of wheel_pid around usual values and at the boundaries."""
-    usual = {
-        "p": 2.0, "i": 60.0, "d": 0.02, "u_clamp_max": 12.0, "i_clamp_max": 12.0,
-        "setpoint_weight_p": 0.5, "setpoint_weight_d": 0.2, "error_deadband": 1e-3,
-        "derivative_filter_time_constant": 0.005, "feedforward_static": 0.4,
-        "feedforward_velocity": 2.6, "feedforward_acceleration": 0.13,
-        "model__dc_gain": 25.5, "model__time_constant": 0.05, "model__static_voltage": 0.45,
-        "model__time_constant_product": 8e-4, "model__delay": 0.005, "observer__load": 1.0,
-        "observer__voltage": 0.005, "observer__count": 0.3, "max_acceleration": 15.0,
-        "max_jerk": 300.0, "transition_time": 0.2, "reference_delay": 0.0075,
-        "drive__top_speed": 3.0, "drive__time_constant": 0.05,
-    }  # fmt: skip
-    values: dict[str, Any] = {}
-    for name in draw.sample(sorted(usual), draw.randint(1, 6)):
-        boundary = [0.0, 5e-324, 1e-300, 1.7e308, -1.7e308, 1e9, math.nan, math.inf, -1.0]
-        spread = usual[name] * 10.0 ** draw.gauss(0.0, 1.0)
-        values[name] = draw.choice(boundary) if draw.random() < 0.15 else spread
-    if draw.random() < 0.3:
-        values["speed_source"] = draw.choice(["measured", "difference", "observer"])
-    return values
-
-
-def _usual(values: dict[str, Any]) -> dict[str, Any]:
-    """Return what takes a random set back."""
-    none = {name: 0.0 for name in values if name.startswith(("model__", "drive__"))}
-    rest = {
-        "max_jerk": 0.0, "transition_time": 0.0, "reference_delay": 0.0, "d": 0.0,
-        "i_clamp_max": math.inf, "setpoint_weight_p": 1.0, "setpoint_weight_d": 0.0,
-        "error_deadband": 0.0, "derivative_filter_time_constant": 0.0, "observer__load": 1.0,
-        "observer__voltage": 0.005, "observer__count": 0.3, "speed_source": "measured",
-    }  # fmt: skip
-    return {**rest, **none, **{name.replace(".", "__"): value for name, value in GAINS.items()}}
-
-
 def parameters(count: int, seed: int, campaign: Campaign) -> bool:
     """Set parameters of a live wheel through its service; return whether it lives and follows."""
     draw = random.Random(seed)
@@ -375,33 +333,10 @@ def parameters(count: int, seed: int, campaign: Campaign) -> bool:
             if campaign.wheel.poll() is not None:
                 campaign.start_wheel()
         campaign.heal()
-        if not campaign.robot.set(NODE, **_usual(values))[0]:
+        if not campaign.robot.set(NODE, **usual(values))[0]:
             print(f"FAILED set {k}: the usual parameters are refused")
             wrong += 1
         campaign.spin_until(campaign.drives, 5.0)
-    print(f"seed {seed}: {count} sets, {accepted} accepted, {wrong} wrong")
-    return not wrong
-
-
-def core(count: int, seed: int) -> bool:
-    """Judge sets without processes; return whether all that are accepted follow."""
-    from test_acceptance import RATIO, WHEEL, drives, random_settings
-
-    from smp_motor_control.errors import ParameterError
-    from smp_motor_control.wheel.acceptance import check
-
-    draw, accepted, wrong = random.Random(seed), 0, 0
-    for _ in range(count):
-        try:
-            given = random_settings(draw)
-            check(given, WHEEL)
-        except ParameterError:
-            continue
-        accepted += 1
-        share = drives(given, RATIO)
-        if not share < 2.5:
-            wrong += 1
-            print(f"FAILED {share:.2f} set-points: {given}")
     print(f"seed {seed}: {count} sets, {accepted} accepted, {wrong} wrong")
     return not wrong
 
@@ -412,13 +347,10 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--seed", type=int, default=int(time.time()) // 86400)
     parser.add_argument("--parameters", type=int, metavar="N", help="sets through the service")
-    parser.add_argument("--core", type=int, metavar="N", help="sets without processes")
     arguments = parser.parse_args()
     domain = int(os.environ.setdefault("ROS_DOMAIN_ID", "105"))
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     print(f"seed {arguments.seed}", flush=True)
-    if arguments.core:
-        return 0 if core(arguments.core, arguments.seed) else 1
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # not without its processes
     campaign = Campaign(domain, through_relay=not arguments.parameters)
     try:
