@@ -12,13 +12,11 @@ from numpy.typing import NDArray
 
 from smp_motor_ident.estimation.descent import (
     SCREENING_SAMPLES,
-    Options,
     bandwidth,
-    descend,
     initial_of,
     noise_ratio_of,
 )
-from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.estimation.fit import Fit, Options, solve
 from smp_motor_ident.estimation.ridge import along_friction
 from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments
@@ -50,7 +48,7 @@ def grow(
         found = min(found, again, key=lambda f: f.deviance)
     if found.noise_ratio > 0 and found.noise[0, 0] < FLOOR * part.quantum**2 / 12:
         # It came from afar on innovations; in free run nothing is left for torque noise.
-        free_run = descend(part, structure, found.z, found.initial, found.noise, 0.0, options, 40)
+        free_run = solve(part, structure, found.at(found.z, noise_ratio=0.0), options, 40)
         if free_run.noise[0, 0] < FLOOR * part.quantum**2 / 12:
             found = along_friction(part, structure, free_run, options)
     best = found
@@ -66,20 +64,9 @@ def extend(data: Experiments, structure: Structure, best: Fit, options: Options)
     # The last stretch is at most six times the one before, as those in between are.
     while 1.5 * samples < data.size and best.noise_ratio == 0:
         longer = data.data_window(samples * data.step)
-        best = descend(
-            longer,
-            structure,
-            best.z,
-            initial_of(longer, best),
-            best.noise,
-            best.noise_ratio,
-            options,
-            8,
-        )
+        best = solve(longer, structure, best.at(best.z, initial_of(longer, best)), options, 8)
         samples *= 6
-    return descend(
-        data, structure, best.z, initial_of(data, best), best.noise, best.noise_ratio, options, 25
-    )
+    return solve(data, structure, best.at(best.z, initial_of(data, best)), options, 25)
 
 
 def _find_noise_ratio(
@@ -88,8 +75,8 @@ def _find_noise_ratio(
     """Walk from following to free run; keep the likeliest process-to-measurement noise ratio."""
 
     def fitted(near: Fit, noise_ratio: float, passes: int) -> Fit:
-        initial = initial_of(part, near)
-        one = descend(part, structure, near.z, initial, near.noise, noise_ratio, options, passes)
+        start = near.at(near.z, initial_of(part, near), noise_ratio)
+        one = solve(part, structure, start, options, passes)
         return _at_rest(part, structure, one, options)
 
     # A speed output survives torque noise in free run, and free run has no bias where the
@@ -162,5 +149,5 @@ def _at_rest(data: Experiments, structure: Structure, fit: Fit, options: Options
         return fit
     initial = fit.initial.copy()
     initial[slow, 1] = 0.0
-    other = descend(data, structure, fit.z, initial, fit.noise, fit.noise_ratio, options, 12)
+    other = solve(data, structure, fit.at(fit.z, initial), options, 12)
     return other if other.deviance < fit.deviance else fit

@@ -11,8 +11,7 @@ from smp_motor_ident.estimation import data_window, descent, prediction
 from smp_motor_ident.estimation.candidate_starts import from_richer, from_rivals, no_worse, of_kind
 from smp_motor_ident.estimation.choice import FittedCandidate, label, needed, sandwich_factor, size
 from smp_motor_ident.estimation.delay_and_averaging import with_averaging, with_delay
-from smp_motor_ident.estimation.descent import Options
-from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.estimation.fit import Fit, Options, solve
 from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.estimation.profile import RISE, one_level, rubbing
 from smp_motor_ident.estimation.ridge import random_restart
@@ -117,11 +116,9 @@ def _may_rub(data: Experiments, fit: Fit, options: Options) -> bool:
     fixed = {**fit.structure.fixed, "vc_plus": little}
     rubs = fit.structure.with_(friction="symmetric", fixed=fixed)
     other = min(
-        (descent.descend(data, rubs, rubs.complete(z), initial, fit.noise, fit.noise_ratio,
-                         options, 12)
-         for initial in initials),
+        (solve(data, rubs, fit.at(rubs.complete(z), i), options, 12) for i in initials),
         key=lambda f: f.deviance,
-    )  # fmt: skip
+    )
     return other.deviance - fit.deviance < RISE * sandwich_factor(fit)
 
 

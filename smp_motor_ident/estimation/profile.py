@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from smp_motor_ident.diagnosis.limits import REST, SAME_LEVEL
-from smp_motor_ident.estimation.descent import Options, descend, initial_of
-from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.estimation.descent import initial_of
+from smp_motor_ident.estimation.fit import Fit, Options, solve
 from smp_motor_ident.estimation.fitted import NORMAL_95, Profile
 from smp_motor_ident.estimation.prediction import simulate
 from smp_motor_ident.likelihood.experiments import Experiments
@@ -95,9 +95,7 @@ def _followed(
     size = max(value, 0.02 * high) if coordinate != models.A2 else 1.0
     first = float(np.clip(NORMAL_95 * std, 0.05 * size, size))
     target *= data.size / fit.samples
-    here = descend(
-        data, fit.structure, fit.z, initial_of(data, fit), fit.noise, fit.noise_ratio, options, 6
-    )
+    here = solve(data, fit.structure, fit.at(fit.z, initial_of(data, fit)), options, 6)
     ends = [_end(data, here, coordinate, end, first, target, options) for end in (low, high)]
     shift = fit.z - here.z
     return Profile(coordinate, (ends[0] + shift, ends[1] + shift))
@@ -154,11 +152,8 @@ def _fixed_at(data: Experiments, near: Fit, coordinate: int, value: float, optio
     else:
         z, initials = near.z.copy(), [near.initial]
     z[coordinate] = value
-    tried = [
-        descend(data, structure, structure.complete(z), initial, near.noise, near.noise_ratio,
-                options, 10, 0.05)
-        for initial in initials
-    ]  # fmt: skip
+    z = structure.complete(z)
+    tried = [solve(data, structure, near.at(z, i), options, 10, 0.05) for i in initials]
     return min(tried, key=lambda f: f.deviance)
 
 

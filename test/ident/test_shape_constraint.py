@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from smp_motor_ident.estimation import shape_constraint
-from smp_motor_ident.estimation.descent import Options, descend
+from smp_motor_ident.estimation.fit import Start, solve
 from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import A0, A1, A2, TE, Structure
@@ -42,7 +42,7 @@ def test_from_either_edge_a_descent_finds_the_bottom(share):
     noise = np.diag([4e-4, 1.0])
 
     def bottom(z):
-        return descend(data, SHAPED, SHAPED.complete(z), data.initial, noise, 0.0, Options(), 40)
+        return solve(data, SHAPED, Start(SHAPED.complete(z), data.initial, noise))
 
     found, true = bottom(start), bottom(MOTOR)
     assert found.converged
@@ -58,7 +58,7 @@ def test_an_inductance_far_below_the_sampling_is_no_place_to_stay():
     start[[A2, TE]] += np.log(0.1)
 
     def bottom(z):
-        return descend(data, whole, whole.complete(z), data.initial, noise, 0.0, Options(), 40)
+        return solve(data, whole, Start(whole.complete(z), data.initial, noise))
 
     found, true = bottom(start), bottom(fast)
     assert found.converged
