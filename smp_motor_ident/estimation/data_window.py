@@ -10,6 +10,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from smp_motor_ident.diagnosis.limits import TORQUE_NOISE
 from smp_motor_ident.estimation.descent import (
     SCREENING_SAMPLES,
     bandwidth,
@@ -29,7 +30,6 @@ FLOOR = 1.3  # residual variance over that of quantisation, below which there is
 WALK = 0.6  # step of the logarithm of the bandwidth while its best is not bracketed
 CLOSE = 0.15  # spacing of the same at which the best is known well enough
 MOST = 5.0  # farthest from the motor's own bandwidth
-PRICE = 12.0  # deviance that torque noise must explain before it is believed
 
 
 def grow(
@@ -43,7 +43,7 @@ def grow(
     part = data.data_window(min(SCREENING_SAMPLES * data.step, 60.0))
     best = _find_noise_ratio(part, structure, first, options, near)
     found = along_friction(part, structure, best, options)
-    if found.noise_ratio > 0 and found.deviance < best.deviance - PRICE:
+    if found.noise_ratio > 0 and found.deviance < best.deviance - TORQUE_NOISE.value:
         again = _find_noise_ratio(part, structure, found, options, found)
         found = min(found, again, key=lambda f: f.deviance)
     if found.noise_ratio > 0 and found.noise[0, 0] < FLOOR * part.quantum**2 / 12:
@@ -99,7 +99,9 @@ def _find_noise_ratio(
         x = float(np.log((near.noise_ratio / part.step) ** 0.25 / band))
         path[x] = fitted(first, near.noise_ratio, 20)
         best = _likeliest(path, walked)
-        return min(free_run, best, key=lambda f: f.deviance + PRICE * (f.noise_ratio > 0))
+        return min(
+            free_run, best, key=lambda f: f.deviance + TORQUE_NOISE.value * (f.noise_ratio > 0)
+        )
     for factor in (1.0, 0.3, 0.1, 0.03, 0.01):
         here = fitted(here, noise_ratio_of(band * factor, part.step, part.kind), 20)
         path[float(np.log(factor))] = here
@@ -108,7 +110,7 @@ def _find_noise_ratio(
             break
     else:
         free_run = min(free_run, fitted(here, 0.0, 20), key=lambda f: f.deviance)
-    if free_run.deviance < min(f.deviance for f in path.values()) + PRICE:
+    if free_run.deviance < min(f.deviance for f in path.values()) + TORQUE_NOISE.value:
         return free_run
     return _likeliest(path, walked)
 
