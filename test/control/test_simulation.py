@@ -8,6 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from wheel_simulation import (
+    DriveSettings,
+    Timing,
+    simulate_closed_loop,
+    simulate_open_loop,
+)
 
 from smp_motor_control import WHEELS
 from smp_motor_control.errors import ParameterError
@@ -16,12 +22,6 @@ from smp_motor_control.motor.file import load_motors
 from smp_motor_control.motor.model import MotorModel
 from smp_motor_control.pid import PidGains
 from smp_motor_control.wheel.loop import LoopSettings, WheelLoop
-from smp_motor_control.wheel.simulation import (
-    DriveSettings,
-    Timing,
-    simulate_closed_loop,
-    simulate_open_loop,
-)
 
 MOTORS = load_motors(Path(__file__).parents[2] / "config" / "motors_paper.yaml")
 GAINS = PidGains(p=2.5, i=80.0, d=0.05, derivative_filter_time_constant=0.005)
