@@ -145,7 +145,7 @@ def section(namespace: str, make: Callable[[], Node]) -> str:
 
 def page() -> str:
     """Return all nodes as a page of Markdown."""
-    teleop_wheels.Terminal = Mock()  # type: ignore[misc]  # there is none
+    teleop_wheels.Terminal = Mock()  # there is none
     return "\n".join([HEAD, *(section(*node) for node in NODES)])
 
 
