@@ -16,8 +16,9 @@ LAUNCH = Path(__file__).parents[2] / "launch" / "smp.launch.py"
 
 def test_launch_file_starts_plant_wheels_and_body_of_any_robot():
     pytest.importorskip("launch_ros", reason="ros2 launch is not among the wheels")
-    from launch import LaunchContext
     from launch_ros.actions import Node
+
+    from launch import LaunchContext
 
     spec = importlib.util.spec_from_file_location("smp_launch", LAUNCH)
     module = importlib.util.module_from_spec(spec)
