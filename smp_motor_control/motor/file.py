@@ -49,30 +49,15 @@ _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*\Z")
 
 @dataclass(frozen=True)
 class MotorEntry:
-    """One motor of a file, with what is around it.
+    """One motor of a file, with what is around it."""
 
-    Attributes
-    ----------
-    parameters : MotorParameters
-        At the motor shaft.
-    gearbox : Gearbox
-        Between motor and wheel.
-    encoder : Encoder
-        On the motor shaft.
-    supply_voltage : float
-        [V].
-    delay : float
-        From a commanded voltage to its effect [s].
-    resistance : float
-        As the file gives it [ohm]; NaN where it gives combinations alone, and then neither
-        currents nor torques of ``parameters`` mean anything.
-    """
-
-    parameters: MotorParameters
-    gearbox: Gearbox
-    encoder: Encoder
-    supply_voltage: float
-    delay: float = 0.0
+    parameters: MotorParameters  # at the motor shaft
+    gearbox: Gearbox  # between motor and wheel
+    encoder: Encoder  # on the motor shaft
+    supply_voltage: float  # [V]
+    delay: float = 0.0  # from a commanded voltage to its effect [s]
+    # As the file gives it [ohm]; NaN where it gives combinations alone, and then neither currents
+    # nor torques of ``parameters`` mean anything
     resistance: float = math.nan
 
     @property

@@ -27,27 +27,16 @@ TRADED = ("dc_gain", "static_voltage", "static_voltage_reverse", "load_voltage")
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """Quantities of one fit.
+    """Quantities of one fit."""
 
-    Attributes
-    ----------
-    parameters, combinations : dict of str to Quantity
-        As in `result.Estimate`.
-    names : tuple of str
-        Of the covariance.
-    covariance : ndarray, shape (p, p)
-        Joint, over parameters and combinations.
-    loose : tuple of str
-        Parameters that the structure has but these data do not identify.
-    level : float
-        The voltage [V] that ``steady_speed`` belongs to, 0 where that is not reported.
-    """
-
+    # parameters, combinations: as in `result.Estimate`
     parameters: dict[str, Quantity]
     combinations: dict[str, Quantity]
-    names: tuple[str, ...]
-    covariance: Array
+    names: tuple[str, ...]  # of the covariance
+    covariance: Array  # shape (p, p): joint, over parameters and combinations
+    # Parameters that the structure has but these data do not identify
     loose: tuple[str, ...] = field(default=())
+    # The voltage [V] that ``steady_speed`` belongs to, 0 where that is not reported
     level: float = 0.0
 
 
