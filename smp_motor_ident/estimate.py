@@ -167,7 +167,7 @@ def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) 
         *assess(final, chosen, FitPercent(fitted, common), tests),
         *adequacy(final, chosen, stated(chosen, result), group[0].hardware.gear_ratio, tests),
         *advise(chosen, result, request.known),
-        *scope(result, change, alike),
+        *scope(final, result, change, alike),
     ]
     return Estimate(
         wheel=group[0].wheel,
