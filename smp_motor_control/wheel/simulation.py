@@ -7,6 +7,7 @@ is what ``motor_plant`` simulates, :class:`~smp_motor_control.wheel.loop.WheelLo
 
 from __future__ import annotations
 
+import itertools
 import math
 import random
 from collections.abc import Callable
@@ -37,11 +38,16 @@ class Timing:
         From a sample to the arrival of the command that answers it [s].
     jitter : float
         Standard deviation of the intervals between samples [s].
+    instants, delays : tuple of float
+        In place of all that, what a recording shows: when samples were taken, and when they
+        were answered [s]; NaN where one was not.
     """
 
     sample_time: float = 0.005
     delay: float = 0.0
     jitter: float = 0.0
+    instants: tuple[float, ...] = ()
+    delays: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         if not 0.0 < self.sample_time < math.inf:
@@ -111,6 +117,8 @@ class _Tape:
 
 
 def _instants(duration: float, timing: Timing, seed: int) -> list[float]:
+    if timing.instants:
+        return list(timing.instants)
     draw = random.Random(seed)
     shortest = 0.1 * timing.sample_time
     time, instants = 0.0, [0.0]
@@ -169,20 +177,25 @@ def simulate_closed_loop(
         1.5 * entry.supply_voltage,
     )
     tape = _Tape()
-    before = None
-    for time in _instants(duration, timing, seed):
+    before, command, arrival = None, 0.0, -math.inf
+    instants = _instants(duration, timing, seed)
+    delays = timing.delays or itertools.repeat(timing.delay, len(instants))
+    for time, delay in zip(instants, delays, strict=True):
         sample = plant.sample(time)
-        target, command, measurement = setpoint(time), 0.0, math.nan
-        if before is not None:
+        target, measurement = setpoint(time), math.nan
+        answered = not math.isnan(delay)
+        if answered and before is not None:
             dt = time - before
             measurement = loop.speed(dt, sample.velocity, sample.encoder_count, sample.voltage)
-            if not math.isnan(measurement):
-                command = loop.step(target, measurement, dt).output
-        before = time
+            known = not math.isnan(measurement)
+            command = loop.step(target, measurement, dt).output if known else 0.0
+        before = time if answered else before
         row = (target, loop.reference.velocity, measurement)
         tape.write(time, row, plant, sample, command)
         _put_load(plant, time, load)
-        plant.command(time + timing.delay, command)
+        if answered:
+            arrival = max(arrival, time + delay)
+            plant.command(arrival, command)
     return tape.run()
 
 

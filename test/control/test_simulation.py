@@ -159,3 +159,18 @@ def test_counts_without_known_hardware_fall_back_to_the_reported_speed():
 def test_loop_settings_that_make_no_sense_are_refused(bad):
     with pytest.raises(ParameterError):
         LoopSettings(**bad)
+
+
+def test_recorded_instants_are_simulated_as_they_were():
+    entry, settings = MOTORS["rear_left"], settings_of("rear_left")
+    even = simulate_closed_loop(entry, settings, lambda t: 1.0, 0.6, timing=Timing(delay=0.002))
+    as_recorded = Timing(instants=tuple(even.time), delays=(0.002,) * even.time.size)
+    again = simulate_closed_loop(entry, settings, lambda t: 1.0, 0.6, timing=as_recorded)
+    assert np.array_equal(again.velocity, even.velocity)
+    # From 0.1 s on nobody answers for 50 ms: the voltage stays what it was.
+    lost = tuple(math.nan if 0.1 <= t < 0.15 else 0.002 for t in even.time)
+    silent = simulate_closed_loop(
+        entry, settings, lambda t: 1.0, 0.6, timing=replace(as_recorded, delays=lost)
+    )
+    inside = (even.time > 0.11) & (even.time < 0.15)
+    assert np.ptp(silent.voltage[inside]) == 0.0 and np.ptp(even.voltage[inside]) > 0.1
