@@ -18,7 +18,7 @@ from known_motors import TABLE_1, recording, table
 from smp_motor_ident.errors import SmpError
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.estimation import fit
-from smp_motor_ident.estimation.descent import Options
+from smp_motor_ident.estimation.fit import Options
 from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.model import structures as models
@@ -52,9 +52,7 @@ def minimum(record, z, current: bool, friction: bool) -> dict:
     spent = time.perf_counter() - begun
     if found is None:
         return {"right": False, "seconds": spent}
-    near = fit.solve(
-        data, structure, structure.complete(z), np.zeros((1, 4)), found.noise, found.noise_ratio
-    )
+    near = fit.solve(data, structure, found.at(structure.complete(z), np.zeros((1, 4))))
     # At or below the deviance that a start from the truth reaches; 0.1 % of noise.
     above = found.deviance - near.deviance
     return {"right": bool(above <= max(10.0, 1e-3 * data.size)), "above": above, "seconds": spent}

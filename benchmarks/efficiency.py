@@ -20,7 +20,7 @@ from smp_motor_ident.errors import SmpError
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import prepare
-from smp_motor_ident.likelihood.noise import kalman_gain
+from smp_motor_ident.likelihood.noise import NoiseModel, kalman_gain
 from smp_motor_ident.likelihood.passes import evaluate
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import PHYSICAL, Structure
@@ -46,7 +46,7 @@ def bound(record, z, current: bool, torque: float) -> dict[str, tuple[float, flo
         noise = scale * noise[0, 0] if current else np.diag([scale[0, 0] * noise[0, 0], 1.0])
     z = structure.complete(z)
     start = np.zeros((1, 4))
-    here = evaluate(data, structure, z, start, start, gain, noise)
+    here = evaluate(data, structure, z, start, start, NoiseModel(noise, gain))
     cov = np.linalg.inv(here.normal)
     m = structure.matrix()
     values, gradients = models.combinations(z, 2)

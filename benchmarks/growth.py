@@ -14,7 +14,7 @@ import numpy as np
 from known_motors import TABLE_1, recording, table
 
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.estimation.descent import Options
+from smp_motor_ident.estimation.fit import Options
 from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.model.structures import Structure

@@ -19,7 +19,8 @@ from smp_motor_ident.diagnosis.limits import LOOSE_QUANTITY
 from smp_motor_ident.errors import SmpError
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.likelihood.experiments import prepare
-from smp_motor_ident.likelihood.passes import NO_GAIN, evaluate
+from smp_motor_ident.likelihood.noise import NoiseModel
+from smp_motor_ident.likelihood.passes import evaluate
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import PHYSICAL, Structure
 
@@ -44,7 +45,7 @@ def least_certain(record, z, current: bool, known: tuple[str, ...]) -> float:
     data = prepare([record], current)
     noise = np.diag([QUANTUM**2 / 12, CURRENT_NOISE**2])
     start = np.zeros((1, 4))
-    here = evaluate(data, structure, structure.complete(z), start, start, NO_GAIN, noise)
+    here = evaluate(data, structure, structure.complete(z), start, start, NoiseModel(noise))
     cov = np.linalg.inv(here.normal)
     values, gradients = models.physical(z)
     rows = {n: gradients[n] @ structure.matrix() for n in PHYSICAL[:5] if n not in known}

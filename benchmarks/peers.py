@@ -12,7 +12,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.signal import cont2discrete, lfilter
 
-from smp_motor_ident.estimation.fit import solve
+from smp_motor_ident.estimation.fit import Start, solve
 from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.model.structures import Structure
 from smp_motor_ident.record import Record
@@ -71,7 +71,10 @@ def cost(record: Record, x: np.ndarray) -> float:
     fixed = dict(zip(("ln_a0", "ln_a1", "ln_a2", "vc_plus"), map(float, x)))
     structure = Structure("speed", friction="symmetric" if len(x) > 3 else "none", fixed=fixed)
     data = prepare([record], False)
-    return solve(data, structure, np.zeros(11), data.initial, NOISE * np.eye(2)).objective * NOISE
+    return (
+        solve(data, structure, Start(np.zeros(11), data.initial, NOISE * np.eye(2))).objective
+        * NOISE
+    )
 
 
 def _ahead(record: Record) -> np.ndarray:

@@ -28,7 +28,7 @@ from growth import growth  # noqa: E402
 from known_motors import TABLE_1, recording, table  # noqa: E402
 
 from smp_motor_ident.estimate import estimate  # noqa: E402
-from smp_motor_ident.estimation.descent import Options  # noqa: E402
+from smp_motor_ident.estimation.fit import Options  # noqa: E402
 from smp_motor_ident.estimation.initialisation import initial_fit  # noqa: E402
 from smp_motor_ident.likelihood.experiments import prepare  # noqa: E402
 from smp_motor_ident.model.structures import Structure  # noqa: E402

@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import sys
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -30,13 +31,6 @@ from smp_motor_control.motor.file import MotorEntry, load_motors
 from smp_motor_control.motor.model import MotorModel
 from smp_motor_control.pid import PidGains
 from smp_motor_control.wheel.loop import LoopSettings
-from smp_motor_control.wheel.simulation import (
-    DriveSettings,
-    Run,
-    Timing,
-    simulate_closed_loop,
-    simulate_open_loop,
-)
 from smp_motor_ident.bag import read_records
 from smp_motor_ident.bag.writer import BagWriter
 from smp_motor_ident.estimate import estimate
@@ -44,6 +38,15 @@ from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune import Loop, design
 
 ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT / "test"))
+from wheel_simulation import (  # noqa: E402
+    DriveSettings,
+    Run,
+    Timing,
+    simulate_closed_loop,
+    simulate_open_loop,
+)
+
 ENTRIES = load_motors(ROOT / "config" / "motors_paper.yaml")
 """The paper's motors."""
 

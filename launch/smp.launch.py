@@ -77,7 +77,7 @@ def start(context, *_) -> list:
     gains = [given["params_file"], autostart]
     nodes = [node("wheel_pid", gains, f"/{wheel}", **again) for wheel in wheels]
     if given["hardware"] == "simulated":
-        plant = {"motors_file": given["motors"], "rate": float(given["rate"])}
+        plant = {"motors_file": given["motors"], "rate": number(given, "rate")}
         nodes.append(node("motor_plant", [plant]))
     if is_true(given, "skid_steer"):
         body = {
@@ -109,6 +109,14 @@ def describe(sides: list, body: str, robot: str, common: dict) -> list:
             parameters=[{"robot_description": text, "frame_prefix": prefix}, common],
         )
     ]
+
+
+def number(given: dict, name: str) -> float:
+    """Return a number."""
+    try:
+        return float(given[name])
+    except ValueError:
+        raise RuntimeError(f"{name} is {given[name]!r}; it must be a number") from None
 
 
 def is_true(given: dict, name: str) -> bool:

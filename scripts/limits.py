@@ -1,28 +1,38 @@
-"""Print every limit of the diagnosis as a page: ``python scripts/limits.py > docs/limits.md``."""
+"""Print every limit as a page: ``python scripts/limits.py > docs/limits.md``."""
 
 from __future__ import annotations
 
 import sys
 
-from smp_motor_ident.diagnosis import limits
+from smp_motor_ident.bag import limits as recordings
+from smp_motor_ident.diagnosis import limits as estimates
+from smp_motor_ident.diagnosis import wheel_limits as wheels
+from smp_motor_ident.tune import limits as gains
+
+TABLES = {
+    "Recordings": recordings,
+    "Estimates": estimates,
+    "Wheels on blocks": wheels,
+    "Gains and loops": gains,
+}
 
 
-def table() -> str:
+def page() -> str:
     """Return all limits as a page of Markdown."""
     lines = [
         "# Limits",
         "",
         "Every threshold of a decision; printed by `python scripts/limits.py`.",
-        "",
-        "| limit | value | unit | reason | shown by |",
-        "| --- | --- | --- | --- | --- |",
     ]
-    for name, limit in vars(limits).items():
-        if isinstance(limit, limits.Limit):
-            cells = (f"`{name}`", f"{limit.value:g}", limit.unit, limit.reason, f"`{limit.test}`")
-            lines.append("| " + " | ".join(cells) + " |")
+    for title, table in TABLES.items():
+        lines += ["", f"## {title}", "", "| limit | value | unit | reason | shown by |"]
+        lines += ["| --- | --- | --- | --- | --- |"]
+        for name, one in vars(table).items():
+            if isinstance(one, estimates.Limit):
+                cells = (f"`{name}`", f"{one.value:g}", one.unit, one.reason, f"`{one.test}`")
+                lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
 
 
 if __name__ == "__main__":
-    sys.stdout.write(table())
+    sys.stdout.write(page())

@@ -11,6 +11,7 @@ import math
 import re
 import shlex
 import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -345,6 +346,14 @@ def test_layouts_draw_what_the_wheels_publish():
               for path in plot["paths"]]  # fmt: skip
     assert {topic for topic, _ in drawn} == topics
     assert {field for _, field in drawn} <= fields
+
+
+def test_the_page_of_nodes_is_what_the_nodes_say():
+    made = subprocess.run(
+        [sys.executable, ROOT / "scripts/nodes.py"], check=True, capture_output=True, text=True
+    )
+    page = (ROOT / "docs/nodes.md").read_text()
+    assert page == made.stdout, "python scripts/nodes.py > docs/nodes.md"
 
 
 def test_our_names_in_the_table_of_ros2_controllers_are_parameters():

@@ -21,11 +21,13 @@ from rcl_interfaces.msg import ParameterType
 from rcl_interfaces.srv import GetParameters, SetParametersAtomically
 from rclpy.context import Context
 from rclpy.parameter import Parameter, parameter_value_to_python
+from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
+from std_msgs.msg import String
 
 from smp_interfaces.msg import MotorState, PidState
 from smp_motor_control.errors import SmpError
-from smp_motor_control.nodes.conventions import STREAM_SUBSCRIBER, seconds, steady_timer
+from smp_motor_control.nodes.conventions import LATCHED, STREAM_SUBSCRIBER, seconds, steady_timer
 from smp_motor_control.nodes.executor import LeanExecutor
 from smp_motor_control.nodes.guard import Guard
 
@@ -41,6 +43,9 @@ LOOK = 0.02
 
 STANDSTILL = 1.0
 """Standstill that is commanded before a drive at least [s]."""
+
+UNKNOWN = "_NODE_NAME_UNKNOWN_"
+"""What the middleware calls the node of an endpoint that it discovered before the node."""
 
 GET, SET = "get_parameters", "set_parameters_atomically"
 
@@ -122,10 +127,15 @@ class RobotClient:
         self.until(lambda: False, duration)
 
     @contextlib.contextmanager
-    def listen(self, kind: Any, topics: Mapping[str, Callable[[Any], None]]) -> Any:
+    def listen(
+        self,
+        kind: Any,
+        topics: Mapping[str, Callable[[Any], None]],
+        quality: QoSProfile = STREAM_SUBSCRIBER,
+    ) -> Any:
         """Hand messages to callables, by topic, inside the block."""
         made = [
-            self.node.create_subscription(kind, topic, take, STREAM_SUBSCRIBER)
+            self.node.create_subscription(kind, topic, take, quality)
             for topic, take in topics.items()
         ]
         try:
@@ -304,23 +314,44 @@ class RobotClient:
 
     @contextlib.contextmanager
     def paused(self, wheels: Sequence[str]) -> Any:
-        """Deactivate the wheels' active controllers inside the block."""
-        self.spin(1.0)  # who is discovered together with the wheel is not so at the same instant
-        for wheel in wheels:
-            if rival := self.strangers(wheel):
-                raise RobotError(
-                    f"{self._full(wheel)}/motor_command: {', '.join(rival)} commands the wheel, "
-                    "and is no wheel_pid that can be paused; end it first"
-                )
-        nodes = [controller(wheel) for wheel in wheels if "wheel_pid" in self._commanders(wheel)]
-        active = [node for node, state in self.get_states(nodes).items() if state == "active"]
-        self.owe(active=active)
-        self.change_states(active, "deactivate")
+        """Deactivate the wheels' active controllers inside the block, and see the wheels free."""
+        owners: dict[str, str] = {}
+        topics = {
+            f"{wheel}/motor_owner": lambda m, wheel=wheel: owners.update({wheel: m.data})
+            for wheel in wheels
+        }
+        with self.listen(String, topics, LATCHED):
+            self.spin(1.0)  # what is discovered together with the wheel is not so at one instant
+            self.until(lambda: all(self._found(w, w in owners) for w in wheels), PATIENCE)
+            for wheel in wheels:
+                if rival := self.strangers(wheel):
+                    raise RobotError(
+                        f"{self._full(wheel)}/motor_command: {', '.join(rival)} commands the "
+                        "wheel, and is no wheel_pid that can be paused; end it first"
+                    )
+            nodes = [controller(w) for w in wheels if self._controlled(w, owners.get(w, ""))]
+            active = [node for node, state in self.get_states(nodes).items() if state == "active"]
+            self.owe(active=active)
+            self.change_states(active, "deactivate")
+            # The driver's word: whoever commands a wheel holds it until its lease ends.
+            if not self.until(lambda: not any(owners.values()), PATIENCE):
+                held = ", ".join(f"{self._full(w)} by {name}" for w, name in owners.items() if name)
+                raise RobotError(f"still driven after {PATIENCE:g} s: {held}; end it first")
         try:
             yield
         finally:
             self.give_back(self.owed)
             self.owe()
+
+    def _found(self, wheel: str, owner_known: bool) -> bool:
+        """Whether discovery is whole: every writer has its name, and the driver said who drives."""
+        if UNKNOWN in self._commanders(wheel):
+            return False
+        return owner_known or self.node.count_publishers(f"{wheel}/motor_owner") == 0
+
+    def _controlled(self, wheel: str, owner: str) -> bool:
+        """Whether a controller is there, by the graph or the driver."""
+        return "wheel_pid" in self._commanders(wheel) or "/wheel_pid#" in owner
 
     # Driving -------------------------------------------------------------------------------
 

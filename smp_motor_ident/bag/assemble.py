@@ -23,10 +23,10 @@ from smp_motor_ident.bag.clock import (
     rhythm,
 )
 from smp_motor_ident.bag.counter import unwrap_angle
+from smp_motor_ident.bag.limits import SMOOTHER
 from smp_motor_ident.bag.mapping import MotorMap, Signal
 from smp_motor_ident.bag.storage import Table, found
 from smp_motor_ident.bag.units import FACTORS, check_unit, factor
-from smp_motor_ident.diagnosis.limits import SMOOTHER
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.finding import Finding, Severity
 from smp_motor_ident.record import Hardware, Record

@@ -16,8 +16,8 @@ import numpy as np
 from scipy.ndimage import minimum_filter1d
 
 from smp_motor_ident.bag.clock import rhythm
+from smp_motor_ident.bag.limits import BEAT_FLOOR, BEAT_JITTER, BEAT_LOST
 from smp_motor_ident.bag.storage import Array, Integers
-from smp_motor_ident.diagnosis.limits import BEAT_FLOOR, BEAT_JITTER, BEAT_LOST
 
 _LEAST = 50
 """Samples below which a beat is not looked for."""

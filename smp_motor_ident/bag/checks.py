@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from smp_motor_ident.bag.axis import Series
+from smp_motor_ident.bag.limits import JUMP_SPAN, JUMP_STEP, UNSIGNED_CURRENT
 from smp_motor_ident.bag.storage import Array
-from smp_motor_ident.diagnosis.limits import JUMP_SPAN, JUMP_STEP, UNSIGNED_CURRENT
 from smp_motor_ident.errors import BagError
 
 _LEAST = 50

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.special import fdtrc
 
 from smp_motor_ident.bag.decode import Progress, collect
+from smp_motor_ident.bag.limits import EXPLAINS
 from smp_motor_ident.bag.mapping import SignalMap, parse
 from smp_motor_ident.bag.offers import Listing, Offer, offers_of
 from smp_motor_ident.bag.read import STATE, one_line, read_recording
@@ -24,7 +25,6 @@ from smp_motor_ident.bag.storage import Array, found
 from smp_motor_ident.bag.tables import TIME_NAMES, time_unit
 from smp_motor_ident.bag.types import Types
 from smp_motor_ident.bag.units import check_unit
-from smp_motor_ident.diagnosis.limits import EXPLAINS
 from smp_motor_ident.errors import BagError
 
 _ROLES = {

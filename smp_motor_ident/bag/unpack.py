@@ -18,8 +18,8 @@ import lz4.frame
 import numpy as np
 import zstandard
 
+from smp_motor_ident.bag.limits import UNPACKED_LEAST, UNPACKED_RATIO
 from smp_motor_ident.bag.storage import Batch, gather, join
-from smp_motor_ident.diagnosis.limits import UNPACKED_LEAST, UNPACKED_RATIO
 from smp_motor_ident.errors import BagError
 
 VARIABLE = "SMP_BAG_UNPACKED"

@@ -239,7 +239,7 @@ def _least_squares(data: Experiments, fit: Fit, z: Array) -> float:
     z = fit.structure.complete(z)
     if shape_constraint.applies(fit.structure):
         z = shape_constraint.within(z)
-    there = evaluate(data, fit.structure, z, fit.initial, fit.initial, fit.gain, fit.noise)
+    there = evaluate(data, fit.structure, z, fit.initial, fit.initial, fit.noise_model())
     return float(there.objective - there.local_decrease)
 
 

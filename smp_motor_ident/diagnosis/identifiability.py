@@ -19,6 +19,7 @@ from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import prepare
+from smp_motor_ident.likelihood.noise import NO_GAIN
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import PHYSICAL, Structure
 from smp_motor_ident.record import Hardware, Record
@@ -192,8 +193,9 @@ def _family(estimate: Estimate, current_noise: float) -> tuple[list[Fit], bool]:
         z = z.copy()
         z[models.TE] = np.log(te)
         fits.append(
-            Fit(structure, z, np.zeros((1, 4)), noise, 0.0, np.zeros((3, 2)), 0.0, 0.0, np.eye(f),
-                np.zeros((0, f)), 0, True, 0, rc.ANGLE)
+            Fit(z, np.zeros((1, 4)), noise, structure=structure, gain=NO_GAIN, objective=0.0,
+                deviance=0.0, information=np.eye(f), scores=np.zeros((0, f)), passes=0,
+                converged=True, samples=0, kind=rc.ANGLE)
         )  # fmt: skip
     return fits, not estimate.model.startswith("electromechanical")
 

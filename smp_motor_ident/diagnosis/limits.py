@@ -1,6 +1,8 @@
-"""Every threshold of a decision about data and estimates, with its unit and its reason.
+"""Every threshold of a decision about estimates, with its unit and its reason.
 
-``docs/limits.md`` is this table, printed: ``python scripts/limits.py > docs/limits.md``.
+Those about recordings stand in `smp_motor_ident.bag.limits`, those about gains in
+`smp_motor_ident.tune.limits`; ``docs/limits.md`` prints all of them:
+``python scripts/limits.py > docs/limits.md``.
 A limit's reason is a significance level, a cost or a physical limit; that some record came out
 right is none.
 """
@@ -121,72 +123,57 @@ PROFILED = Limit(
     "test_intervals.py",
 )
 
-# Reading recordings (smp_motor_ident.bag).
-UNPACKED_LEAST = Limit(
-    256e6,
-    "byte",
-    "cost: what any machine that runs ROS can spare; a smaller file may always unpack to it",
-    "test_bounds.py",
+# Choice of a candidate structure.
+PRIOR_ODDS = Limit(
+    4.0,
+    "deviance per parameter",
+    "significance: prior odds of e^2 to 1 against any addition, because many are tried",
+    "test_structure_choice.py",
 )
-UNPACKED_RATIO = Limit(
-    50.0,
-    "1",
-    "cost: 1 GB at most for a file of 10 MB, half of it unpacked bytes; telemetry packs 3 to 20",
-    "test_bounds.py",
+SURE_GAIN = Limit(
+    3.0,
+    "prices",
+    "significance: a gain of three times the price rejects the simpler structure (5e-14 for one "
+    "parameter of 500 samples), whatever the richer one leaves loose",
+    "test_structure_choice.py",
 )
-STRAY_ROWS = Limit(
-    0.05,
-    "1",
-    "cost: an estimate without one row in twenty keeps its value; with more it is no table",
-    "test_csv.py",
+SUBSET_HOPELESS = Limit(
+    40.0,
+    "deviance",
+    "cost: odds of e^20 to 1 on the screening subset are not made up for by more data",
+    "test_estimate.py: a candidate that left the motor behind has no fit",
 )
-BEAT_FLOOR = Limit(
-    0.5,
-    "sample",
-    "physical: a later beat than half a sample is the next one; the least latency stays below it",
-    "test_beat.py",
-)
-BEAT_JITTER = Limit(
-    0.02,
-    "sample",
-    "cost: instants that are off by less change an estimate less than their rounding",
-    "test_beat.py",
-)
-BEAT_LOST = Limit(
-    0.02,
-    "1",
-    "cost: with more samples lost the number of a sample, and with it its instant, is a guess",
-    "test_beat.py",
-)
-JUMP_SPAN = Limit(
+SECOND_LAG = Limit(
     20.0,
-    "1",
-    "physical: no signal leaves twenty times the range of 98 % of its values for single samples",
-    "test_checks.py",
+    "deviance",
+    "physical: every motor has a second lag, few have a delay: of two that explain alike (odds of "
+    "e^10 to 1) the lag is believed",
+    "test_averaging.py: a lag that may be a delay",
 )
-JUMP_STEP = Limit(
-    20.0,
-    "1",
-    "physical: what has inertia does not step to and fro by twenty times all but 1 % of its steps",
-    "test_checks.py",
+LITTLE_FRICTION = Limit(
+    0.02,
+    "of the largest voltage",
+    "physical: friction below a fiftieth of what drives changes a gain by less than that",
+    "test_estimate.py: a linear motor is recovered without friction",
 )
-UNSIGNED_CURRENT = Limit(
-    2.0,
-    "1",
-    "physical: an armature's means in both directions cancel but for an offset; a size's add up",
-    "test_checks.py",
+TORQUE_NOISE = Limit(
+    12.0,
+    "deviance",
+    "significance: odds of e^6 to 1 for a load that nobody recorded",
+    "test_intervals.py",
 )
-SMOOTHER = Limit(
-    0.9,
-    "1",
-    "cost: stamps are kept unless the motion is evidently smoother on the beat that they keep",
-    "test_beat.py",
+MOST_FRICTION = Limit(
+    0.98,
+    "of what drives",
+    "physical: beyond it, of a0 by viscous or of the largest voltage by Coulomb friction, the "
+    "motor would not have turned",
+    "test_shape_constraint.py",
 )
-EXPLAINS = Limit(
-    1e-6,
-    "1",
-    "significance: with a thousand pairs of fields tried, one in a thousand listings is wrong",
-    "test_propose.py",
+PROFILE_FROM = Limit(
+    0.1,
+    "relative standard deviation",
+    "physical: a coordinate that acts as its exponential is a tenth off its parabola there",
+    "test_intervals.py",
 )
 
 # Assessment of a fit.
@@ -344,36 +331,6 @@ RELEVANT_BIAS = Limit(
     "test_adequacy.py",
 )
 
-
-# Tuning: what may be designed on, and how far gains may go.
-
-FRICTION_KNOWN = Limit(
-    0.02,
-    "share of the supply",
-    "an error of the friction's feed-forward by this changes the speed by as much of its largest "
-    "value as the band in which a change counts as settled",
-    "test_tune_truth.py",
-)
-FRICTION_RANGE = Limit(
-    0.5,
-    "share of the supply",
-    "with half of the supply unknown the speed that the motor reaches is not known to a factor 2",
-    "test_tune_truth.py",
-)
-UNRELIABLE_SPREAD = Limit(
-    0.1,
-    "relative standard deviation",
-    "least that numbers of an unreliable estimate are drawn with; more where the fit on held-out "
-    "data leaves more of the motion unexplained",
-    "test_tune_truth.py",
-)
-SPEED_NOISE = Limit(
-    2.5e-3,
-    "share of the top speed, rms",
-    "four times this is 2 % of half the top speed: with more, counts shake the wheel out of the "
-    "band in which the specification calls a change settled",
-    "test_tune_methods.py",
-)
 CANDIDATE_WEIGHT = Limit(
     0.05,
     "probability",
@@ -413,26 +370,6 @@ LEFT_BAND = Limit(
     "test_monitor.py: half an hour of ordinary driving",
 )
 
-# Loops whose commands are reconstructed.
-COMMAND_RESOLUTION = Limit(
-    1 / 255,
-    "of the supply, rms",
-    "one step of an 8-bit PWM: a command that is known closer is known as well as it was given",
-    "test_known_loop.py: what is not known is refused",
-)
-LOOP_RATE = Limit(
-    0.02,
-    "of the interval",
-    "clocks of boards are within 2 %; a log at another rate leaves commands out",
-    "test_known_loop.py: what is not known is refused",
-)
-TICK_FIT = Limit(
-    0.05,
-    "of a tick",
-    "digits that put 95 % of speeds within a twentieth of a whole tick leave no doubt which",
-    "test_known_loop.py: the command is reconstructed",
-)
-
 # Many robots.
 FLEET_DRIFT = Limit(
     4.0,
@@ -451,103 +388,4 @@ FLEET_SIZE = Limit(
     "robots",
     "with fewer, the median deviation itself is uncertain by half",
     "test_fleet.py: a motor unlike the others",
-)
-
-# Commissioning: a robot on blocks.
-FEEDBACK_RATE = Limit(
-    40.0,
-    "samples per second",
-    "a motor of 50 ms is then seen twice in its time constant; below, none of it is left to see",
-    "test_wheel_checks.py: feedback that comes too seldom",
-)
-FEEDBACK_AGE = Limit(
-    0.2,
-    "s on arrival",
-    "wheel_pid takes feedback that is older for lost, and stops the wheel",
-    "test_wheel_checks.py: feedback that comes too seldom",
-)
-BREAKAWAY_COUNTS = Limit(
-    10.0,
-    "counts in one direction",
-    "an encoder on an edge trembles by a count or two; what has counted ten has turned",
-    "test_wheel_checks.py: a trembling encoder",
-)
-FRICTION_SHARE = Limit(
-    0.1,
-    "of the voltage",
-    "where friction takes more, its error and not the motor decides the gain",
-    "test_wheel_checks.py: the voltage grows until",
-)
-ANSWER_COUNTS = Limit(
-    100.0,
-    "counts while a voltage is held",
-    "a steady speed that is resolved to one percent",
-    "test_wheel_checks.py: the voltage grows until",
-)
-VELOCITY_RATIO = Limit(
-    0.05,
-    "of the speed from counts",
-    "one encoder tells both, so only rounding may differ; gear ratios on offer differ by more",
-    "test_wheel_checks.py: a gear ratio",
-)
-EXPECTED_GAIN = Limit(
-    1.5,
-    "times the data sheet's",
-    "motors of one type differ by a tenth or two; counted edges or gears by a factor of two",
-    "test_wheel_checks.py: a gear ratio",
-)
-DEAD_ZONE = Limit(
-    0.05,
-    "of the supply",
-    "what feed-forward cannot know must be filled by the integral; a twentieth takes it one "
-    "transition",
-    "test_wheel_checks.py: a dead zone",
-)
-SUPPLY_SHORTFALL = Limit(
-    0.1,
-    "of the commanded voltage",
-    "cost: the loop is slower, and its feed-forward short, by as much; batteries in order sag less",
-    "test_wheel_checks.py: a weak battery",
-)
-SISTERS = Limit(
-    3.0,
-    "times the median of the other wheels",
-    "frictions of one type of motor scatter by a half; three times is a brake",
-    "test_wheel_checks.py: a wheel that drags",
-)
-SETTLED = Limit(
-    0.02,
-    "of a change of set-point",
-    "the field's usual band of a settling time",
-    "test_verification.py: a wheel that does as designed",
-)
-OVERSHOOT = Limit(
-    0.01,
-    "of a change of set-point",
-    "what the reference is planned to overshoot at most: a load or a count may use it up",
-    "test_verification.py: a wheel that does as designed",
-)
-SILENCE = Limit(
-    0.1,
-    "s without an answer",
-    "half of what lets wheel_pid stop the wheel: such a drive shows the computer, not the gains",
-    "test_verification.py: a drive without control",
-)
-STEADY_ERROR = Limit(
-    0.02,
-    "of a change of set-point",
-    "the same band: integral action leaves no error, only what has not settled",
-    "test_verification.py: a speed that stays off",
-)
-VALIDATION_LEVEL = Limit(
-    0.01,
-    "significance level",
-    "one sound wheel in a hundred may be said to be worse on data that no fit has seen",
-    "test_validation_run.py: a motor that did not change",
-)
-VALIDATION_SHARE = Limit(
-    0.05,
-    "of the speed's scatter",
-    "cost: margins bear a gain that is off by more; a twentieth that is unexplained moves none",
-    "test_validation_run.py: a motor that changed",
 )

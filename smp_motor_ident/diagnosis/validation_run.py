@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from smp_motor_ident.diagnosis.limits import VALIDATION_LEVEL, VALIDATION_SHARE
+from smp_motor_ident.diagnosis.wheel_limits import VALIDATION_LEVEL, VALIDATION_SHARE
 from smp_motor_ident.finding import Finding
 
 Array = NDArray[np.float64]

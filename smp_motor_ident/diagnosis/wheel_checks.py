@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from smp_motor_ident.diagnosis.limits import (
+from smp_motor_ident.diagnosis.wheel_limits import (
     BREAKAWAY_COUNTS,
     DEAD_ZONE,
     EXPECTED_GAIN,

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from smp_motor_ident.diagnosis.limits import ANSWER_COUNTS, BREAKAWAY_COUNTS, FRICTION_SHARE
+from smp_motor_ident.diagnosis.wheel_limits import ANSWER_COUNTS, BREAKAWAY_COUNTS, FRICTION_SHARE
 from smp_motor_ident.record import Hardware
 
 Array = NDArray[np.float64]

@@ -9,8 +9,7 @@ import numpy as np
 
 from smp_motor_ident.estimation import descent
 from smp_motor_ident.estimation.choice import size
-from smp_motor_ident.estimation.descent import Options
-from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.estimation.fit import Fit, Options
 from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model import structures as models

@@ -6,12 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from smp_motor_ident.diagnosis.limits import PRIOR_ODDS, SURE_GAIN
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import Structure
-
-SCEPSIS = 4.0  # deviance of prior odds of e^2 to 1 against any addition: many are tried
-SURELY = 3.0  # times the price: a gain that rejects the simpler model whatever is left loose
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,8 +69,8 @@ def needed(simple: Fit, rich: Fit) -> tuple[bool, str]:
     """
     more = size(rich.structure) - size(simple.structure)
     gained = (simple.deviance - rich.deviance) / float(rich.sandwich_factors().max())
-    price = more * (float(np.log(simple.samples)) + SCEPSIS)
-    if not rich.converged and gained < SURELY * price:
+    price = more * (float(np.log(simple.samples)) + PRIOR_ODDS.value)
+    if not rich.converged and gained < SURE_GAIN.value * price:
         return False, "did not converge"
     if gained <= price:
         return (
@@ -80,7 +78,7 @@ def needed(simple: Fit, rich: Fit) -> tuple[bool, str]:
             f"no better than {label(simple.structure)} (gain {gained:.0f}, price {price:.0f})",
         )
     loose = _loose(simple, rich)
-    if loose and gained < SURELY * price:
+    if loose and gained < SURE_GAIN.value * price:
         return False, f"its {loose} is not identifiable from these data"
     return True, f"{label(simple.structure)} is rejected (gain {gained:.0f}, price {price:.0f})"
 

@@ -10,15 +10,14 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from smp_motor_ident.diagnosis.limits import TORQUE_NOISE
 from smp_motor_ident.estimation.descent import (
     SCREENING_SAMPLES,
-    Options,
     bandwidth,
-    descend,
     initial_of,
     noise_ratio_of,
 )
-from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.estimation.fit import Fit, Options, solve
 from smp_motor_ident.estimation.ridge import along_friction
 from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments
@@ -31,7 +30,6 @@ FLOOR = 1.3  # residual variance over that of quantisation, below which there is
 WALK = 0.6  # step of the logarithm of the bandwidth while its best is not bracketed
 CLOSE = 0.15  # spacing of the same at which the best is known well enough
 MOST = 5.0  # farthest from the motor's own bandwidth
-PRICE = 12.0  # deviance that torque noise must explain before it is believed
 
 
 def grow(
@@ -45,12 +43,12 @@ def grow(
     part = data.data_window(min(SCREENING_SAMPLES * data.step, 60.0))
     best = _find_noise_ratio(part, structure, first, options, near)
     found = along_friction(part, structure, best, options)
-    if found.noise_ratio > 0 and found.deviance < best.deviance - PRICE:
+    if found.noise_ratio > 0 and found.deviance < best.deviance - TORQUE_NOISE.value:
         again = _find_noise_ratio(part, structure, found, options, found)
         found = min(found, again, key=lambda f: f.deviance)
     if found.noise_ratio > 0 and found.noise[0, 0] < FLOOR * part.quantum**2 / 12:
         # It came from afar on innovations; in free run nothing is left for torque noise.
-        free_run = descend(part, structure, found.z, found.initial, found.noise, 0.0, options, 40)
+        free_run = solve(part, structure, found.at(found.z, noise_ratio=0.0), options, 40)
         if free_run.noise[0, 0] < FLOOR * part.quantum**2 / 12:
             found = along_friction(part, structure, free_run, options)
     best = found
@@ -66,20 +64,9 @@ def extend(data: Experiments, structure: Structure, best: Fit, options: Options)
     # The last stretch is at most six times the one before, as those in between are.
     while 1.5 * samples < data.size and best.noise_ratio == 0:
         longer = data.data_window(samples * data.step)
-        best = descend(
-            longer,
-            structure,
-            best.z,
-            initial_of(longer, best),
-            best.noise,
-            best.noise_ratio,
-            options,
-            8,
-        )
+        best = solve(longer, structure, best.at(best.z, initial_of(longer, best)), options, 8)
         samples *= 6
-    return descend(
-        data, structure, best.z, initial_of(data, best), best.noise, best.noise_ratio, options, 25
-    )
+    return solve(data, structure, best.at(best.z, initial_of(data, best)), options, 25)
 
 
 def _find_noise_ratio(
@@ -88,8 +75,8 @@ def _find_noise_ratio(
     """Walk from following to free run; keep the likeliest process-to-measurement noise ratio."""
 
     def fitted(near: Fit, noise_ratio: float, passes: int) -> Fit:
-        initial = initial_of(part, near)
-        one = descend(part, structure, near.z, initial, near.noise, noise_ratio, options, passes)
+        start = near.at(near.z, initial_of(part, near), noise_ratio)
+        one = solve(part, structure, start, options, passes)
         return _at_rest(part, structure, one, options)
 
     # A speed output survives torque noise in free run, and free run has no bias where the
@@ -112,7 +99,9 @@ def _find_noise_ratio(
         x = float(np.log((near.noise_ratio / part.step) ** 0.25 / band))
         path[x] = fitted(first, near.noise_ratio, 20)
         best = _likeliest(path, walked)
-        return min(free_run, best, key=lambda f: f.deviance + PRICE * (f.noise_ratio > 0))
+        return min(
+            free_run, best, key=lambda f: f.deviance + TORQUE_NOISE.value * (f.noise_ratio > 0)
+        )
     for factor in (1.0, 0.3, 0.1, 0.03, 0.01):
         here = fitted(here, noise_ratio_of(band * factor, part.step, part.kind), 20)
         path[float(np.log(factor))] = here
@@ -121,7 +110,7 @@ def _find_noise_ratio(
             break
     else:
         free_run = min(free_run, fitted(here, 0.0, 20), key=lambda f: f.deviance)
-    if free_run.deviance < min(f.deviance for f in path.values()) + PRICE:
+    if free_run.deviance < min(f.deviance for f in path.values()) + TORQUE_NOISE.value:
         return free_run
     return _likeliest(path, walked)
 
@@ -162,5 +151,5 @@ def _at_rest(data: Experiments, structure: Structure, fit: Fit, options: Options
         return fit
     initial = fit.initial.copy()
     initial[slow, 1] = 0.0
-    other = descend(data, structure, fit.z, initial, fit.noise, fit.noise_ratio, options, 12)
+    other = solve(data, structure, fit.at(fit.z, initial), options, 12)
     return other if other.deviance < fit.deviance else fit

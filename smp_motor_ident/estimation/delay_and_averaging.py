@@ -8,8 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from smp_motor_ident.estimation import descent, start
-from smp_motor_ident.estimation.descent import Options
-from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.estimation.fit import Fit, Options
 from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model import structures as models

@@ -1,13 +1,13 @@
-"""One descent and its surroundings: what the user asked, the noise guessed, where to begin."""
+"""Around one descent: data to look at first, the noise guessed, where to begin."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident.estimation.fit import Fit, Prior, solve
+from smp_motor_ident.estimation.fit import Fit, Options, solve
 from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model import structures as models
@@ -16,26 +16,6 @@ from smp_motor_ident.model.structures import Structure
 Array = NDArray[np.float64]
 
 SCREENING_SAMPLES = 12_000  # samples on which candidates and noise levels are compared
-
-
-@dataclass(frozen=True)
-class Options:
-    """What the user asked of a fit.
-
-    Attributes
-    ----------
-    huber : float
-        Bound of the robust loss [standard deviations]; infinite for least squares.
-    priors : tuple of Prior
-        Physical parameters that are known.
-    lower, upper : ndarray, shape (11,), optional
-        Bounds of z.
-    """
-
-    huber: float = np.inf
-    priors: tuple[Prior, ...] = ()
-    lower: Array | None = None
-    upper: Array | None = None
 
 
 def screening_subset(data: Experiments) -> Experiments:
@@ -82,42 +62,12 @@ def initial_of(data: Experiments, fit: Fit) -> Array:
     return initial
 
 
-def descend(
-    data: Experiments,
-    structure: Structure,
-    z: Array,
-    initial: Array,
-    noise: Array,
-    noise_ratio: float,
-    options: Options,
-    iterations: int,
-    tolerance: float = 1e-2,
-) -> Fit:
-    """Run `fit.solve` with the user's options."""
-    return solve(
-        data,
-        structure,
-        z,
-        initial,
-        noise,
-        noise_ratio,
-        options.huber,
-        options.priors,
-        iterations,
-        tolerance,
-        lower=options.lower,
-        upper=options.upper,
-    )
-
-
 def refine(data: Experiments, structure: Structure, near: Fit, z: Array, options: Options) -> Fit:
     """Fit a structure from another's answer on the same data."""
-    return descend(
-        data, structure, z, initial_of(data, near), near.noise, near.noise_ratio, options, 30
-    )
+    return solve(data, structure, near.at(z, initial_of(data, near)), options, 30)
 
 
 def restate(data: Experiments, structure: Structure, fit: Fit, options: Options) -> Fit:
     """Return a fit's coordinates as the answer of a structure in which more is free."""
-    once = descend(data, structure, fit.z, fit.initial, fit.noise, fit.noise_ratio, options, 1)
+    once = solve(data, structure, fit, options, 1)
     return replace(once, z=fit.z, initial=fit.initial, converged=fit.converged)

@@ -7,20 +7,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident.estimation import shape_constraint
-from smp_motor_ident.estimation.fitted import Fit, Prior
+from smp_motor_ident.estimation.fitted import Fit, Options, Prior, Start
 from smp_motor_ident.likelihood.experiments import Experiments
-from smp_motor_ident.likelihood.noise import deviance, gain_for, proper, renewed
+from smp_motor_ident.likelihood.noise import NoiseModel, deviance, gain_for, proper, renewed
 from smp_motor_ident.likelihood.normal_equations import damped_step
 from smp_motor_ident.likelihood.passes import Pass, evaluate, own_columns
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import Structure
 
-__all__ = ["Fit", "Prior", "solve"]
+__all__ = ["Fit", "Options", "Prior", "Start", "solve"]
 
 Array = NDArray[np.float64]
 
@@ -39,61 +40,55 @@ class _Descent:
         self,
         data: Experiments,
         structure: Structure,
-        z: Array,
-        initial: Array,
-        noise: Array,
-        noise_ratio: float,
-        huber: float,
-        priors: Sequence[Prior],
-        lower: Array,
-        upper: Array,
+        start: Start,
+        options: Options,
+        bounds: tuple[Array, Array],
     ) -> None:
-        self.data, self.structure, self.huber, self.priors = data, structure, huber, priors
-        self.noise_ratio = noise_ratio
-        self.lower, self.upper = lower, upper
+        self.data, self.structure, self.options = data, structure, options
+        self.noise_ratio, self.bounds = start.noise_ratio, bounds
         self.matrix = structure.matrix()
         self.own = own_columns(data, structure)
         self.current = data.current.size > 0
-        self.z = structure.complete(np.minimum(np.maximum(z, lower), upper))
         self.shaped = shape_constraint.applies(structure)
-        if self.shaped:
-            self.z = shape_constraint.within(self.z)
-        self.start, self.initial = initial.copy(), initial.copy()
+        self.z = self._allowed(start.z)
+        self.start, self.initial = start.initial.copy(), start.initial.copy()
         self.smooth = structure.friction == "none" and not structure.delay
-        self.only_scale = not self.current and huber == math.inf and noise_ratio == 0
+        self.only_scale = not self.current and options.huber == math.inf and start.noise_ratio == 0
         self.damping, self.passes, self.converged = 1e-3, 0, False
-        self.look(proper(noise))
+        self.look(proper(start.noise))
+
+    def _allowed(self, z: Array) -> Array:
+        """Return coordinates brought within the bounds and to a motor that can be."""
+        z = self.structure.complete(np.minimum(np.maximum(z, self.bounds[0]), self.bounds[1]))
+        return shape_constraint.within(z) if self.shaped else z
 
     def _pass(self, z: Array, initial: Array) -> Pass:
         self.passes += 1
         return evaluate(
-            self.data, self.structure, z, initial, self.start, self.gain, self.noise, self.huber,
-            _linearise(self.priors, z, self.matrix),
+            self.data, self.structure, z, initial, self.start, self.noise,
+            _linearise(self.options.priors, z, self.matrix),
         )  # fmt: skip
 
-    def look(self, noise: Array) -> None:
+    def look(self, covariance: Array) -> None:
         """Pass where it is, with this noise and the gain that goes with it."""
-        self.noise = noise
-        self.gain = gain_for(self.z, self.structure.order, self.data.kind, self.data.step,
-                             self.noise_ratio, noise, self.current)  # fmt: skip
+        gain = gain_for(self.z, self.structure.order, self.data.kind, self.data.step,
+                        self.noise_ratio, covariance, self.current)  # fmt: skip
+        self.noise = NoiseModel(covariance, gain, self.options.huber)
         self.here: Pass = self._pass(self.z, self.initial)
 
-    def look_again(self, noise: Array) -> None:
+    def look_again(self, covariance: Array) -> None:
         """Do the same for another noise; where it is but another scale, without a pass."""
-        if self.only_scale and not self.priors:
-            self.here = self.here.scaled(float(self.noise[0, 0] / noise[0, 0]))
-            self.noise = noise
+        if self.only_scale and not self.options.priors:
+            self.here = self.here.scaled(float(self.noise.covariance[0, 0] / covariance[0, 0]))
+            self.noise = replace(self.noise, covariance=covariance)
         else:
-            self.look(noise)
+            self.look(covariance)
 
     def step(self) -> tuple[Array, Array, float]:
         """Return where the damped step leads, and its length in standard deviations."""
         here = self.here
         step, size = self._solved(self.damping)
-        z = np.minimum(np.maximum(self.z + self.matrix @ step, self.lower), self.upper)
-        z = self.structure.complete(z)
-        if self.shaped:
-            z = shape_constraint.within(z)
+        z = self._allowed(self.z + self.matrix @ step)
         moved = self.initial.copy()
         moved[:, list(self.own)] += here.local_step - here.local_gain @ step
         return z, moved, size
@@ -110,10 +105,14 @@ class _Descent:
     def _solved(self, damping: float) -> tuple[Array, float]:
         """Return the damped step and its length; along the edge of a motor's shapes, if there."""
         normal, gradient = self.here.normal, self.here.gradient
-        bounds = self.lower, self.upper
         turn = _physical_steps(self.z, self.structure)
         step, size = damped_step(
-            turn.T @ normal @ turn, turn.T @ gradient, damping, self.matrix @ turn, self.z, *bounds
+            turn.T @ normal @ turn,
+            turn.T @ gradient,
+            damping,
+            self.matrix @ turn,
+            self.z,
+            *self.bounds,
         )
         step = turn @ step
         share = shape_constraint.passed(self.z + self.matrix @ step) if self.shaped else None
@@ -123,7 +122,7 @@ class _Descent:
         along, first = ties
         short, _ = damped_step(
             along.T @ normal @ along, along.T @ (gradient - normal @ first), damping,
-            self.matrix @ along, self.z, *bounds,
+            self.matrix @ along, self.z, *self.bounds,
         )  # fmt: skip
         step = along @ short + first
         return step, math.sqrt(max(float(step @ normal @ step), 0.0))
@@ -169,12 +168,13 @@ class _Descent:
 
     def result(self) -> Fit:
         """Return the fit as it stands."""
-        here, noise, information, scores = self.here, self.noise, self.here.normal, self.here.scores
+        here, noise = self.here, self.noise.covariance
+        information, scores = here.normal, here.scores
         value = math.inf
         if math.isfinite(here.objective):
-            noise, value = renewed(here.spread, self.noise, self.current), deviance(here.spread)
+            noise, value = renewed(here.spread, noise, self.current), deviance(here.spread)
             if not self.current:
-                grow = self.noise[0, 0] / noise[0, 0]
+                grow = self.noise.covariance[0, 0] / noise[0, 0]
                 information, scores = information * grow, scores * grow
         return Fit(
             structure=self.structure,
@@ -182,7 +182,7 @@ class _Descent:
             initial=self.initial,
             noise=noise,
             noise_ratio=self.noise_ratio,
-            gain=self.gain,
+            gain=self.noise.gain,
             objective=here.objective,
             deviance=value,
             information=information,
@@ -197,36 +197,32 @@ class _Descent:
 def solve(
     data: Experiments,
     structure: Structure,
-    z: Array,
-    initial: Array,
-    noise: Array,
-    noise_ratio: float = 0.0,
-    huber: float = np.inf,
-    priors: Sequence[Prior] = (),
+    start: Start,
+    options: Options | None = None,
     iterations: int = 40,
     tolerance: float = 1e-2,
-    lower: Array | None = None,
-    upper: Array | None = None,
 ) -> Fit:
     """Minimise the innovations' sum of squares from a start, noise covariance included.
 
     Levenberg-Marquardt in z with the initial states eliminated; the noise covariance is
     re-estimated from the residuals until it stays (concentrated likelihood).
     """
-    widest = _bounds(FASTEST * data.step if data.current.size else 0.0)
-    if (
-        data.quantum > 0
-    ):  # a speed in coarse steps is a difference of counts: over a sample, at least
-        widest[0][models.WINDOW] = data.step
-    lower = widest[0] if lower is None else lower
-    upper = widest[1] if upper is None else upper
-    descent = _Descent(data, structure, z, initial, noise, noise_ratio, huber, priors, lower, upper)
+    options = options or Options()
+    lower, upper = _bounds(FASTEST * data.step if data.current.size else 0.0)
+    if data.quantum > 0:  # a speed in coarse steps is a difference of counts, over a sample or more
+        lower[models.WINDOW] = data.step
+    bounds = (
+        lower if options.lower is None else options.lower,
+        upper if options.upper is None else options.upper,
+    )
+    descent = _Descent(data, structure, start, options, bounds)
     for n in range(ROUNDS):
         if not math.isfinite(descent.here.objective):
             break
         descent.descend(iterations, tolerance, n == 0)
-        fresh = renewed(descent.here.spread, descent.noise, descent.current)
-        same = np.abs(np.log(np.diag(fresh) / np.diag(descent.noise))).max() < 2e-2
+        before = descent.noise.covariance
+        fresh = renewed(descent.here.spread, before, descent.current)
+        same = np.abs(np.log(np.diag(fresh) / np.diag(before))).max() < 2e-2
         done = descent.converged and (same or descent.only_scale)
         if descent.passes >= iterations or done or n + 1 == ROUNDS:
             break

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from smp_motor_ident.likelihood.noise import NoiseModel
 from smp_motor_ident.model.structures import Structure
 
 Array = NDArray[np.float64]
@@ -46,14 +47,32 @@ class Profile:
     ends: tuple[Array, Array]
 
 
-@dataclass(frozen=True, eq=False)
-class Fit:
-    """A structure fitted to experiments.
+@dataclass(frozen=True)
+class Options:
+    """What the user asked of a fit.
 
     Attributes
     ----------
-    structure : Structure
-        What was free.
+    huber : float
+        Bound of the robust loss [standard deviations]; infinite for least squares.
+    priors : tuple of Prior
+        Physical parameters that are known.
+    lower, upper : ndarray, shape (11,), optional
+        Bounds of z.
+    """
+
+    huber: float = np.inf
+    priors: tuple[Prior, ...] = ()
+    lower: Array | None = None
+    upper: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """Where a descent begins: a motor, how it moved at first, and the noise that is believed.
+
+    Attributes
+    ----------
     z : ndarray, shape (11,)
         Coordinates.
     initial : ndarray, shape (g, 4)
@@ -62,6 +81,31 @@ class Fit:
         Covariance of the innovations of (output, current).
     noise_ratio : float
         Intensity of the torque noise over the output's noise variance.
+    """
+
+    z: Array
+    initial: Array
+    noise: Array
+    noise_ratio: float = 0.0
+
+    def at(self, z: Array, initial: Array | None = None, noise_ratio: float | None = None) -> Start:
+        """Return the same start at other coordinates."""
+        return Start(
+            z,
+            self.initial if initial is None else initial,
+            self.noise,
+            self.noise_ratio if noise_ratio is None else noise_ratio,
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Fit(Start):
+    """A structure fitted to experiments, which other descents may start from.
+
+    Attributes
+    ----------
+    structure : Structure
+        What was free.
     gain : ndarray, shape (3, 2)
         Innovation gain.
     objective : float
@@ -87,10 +131,6 @@ class Fit:
     """
 
     structure: Structure
-    z: Array
-    initial: Array
-    noise: Array
-    noise_ratio: float
     gain: Array
     objective: float
     deviance: float
@@ -103,6 +143,10 @@ class Fit:
     widen: Array | None = None
     added: Array | None = None
     profiles: tuple[Profile, ...] = ()
+
+    def noise_model(self) -> NoiseModel:
+        """Return how the residuals weigh."""
+        return NoiseModel(self.noise, self.gain)
 
     def covariance(self) -> Array:
         """Return the covariance of the free coordinates, shape (f, f).

@@ -8,8 +8,8 @@ import numpy as np
 
 from smp_motor_ident.diagnosis.limits import HOLD_COST, HOLD_EVIDENCE, HOLD_HOPELESS, INSTANT
 from smp_motor_ident.estimation.data_window import extend, grow
-from smp_motor_ident.estimation.descent import Options, refine, screening_subset
-from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.estimation.descent import refine, screening_subset
+from smp_motor_ident.estimation.fit import Fit, Options
 from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.estimation.thinning import thinned
 from smp_motor_ident.likelihood import recursion as rc

@@ -10,20 +10,19 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident.estimation import prediction, start
+from smp_motor_ident.estimation import start
 from smp_motor_ident.estimation.data_window import grow
 from smp_motor_ident.estimation.descent import (
     SCREENING_SAMPLES,
-    Options,
     bandwidth,
-    descend,
     first_noise,
     noise_ratio_of,
 )
-from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.estimation.fit import Fit, Options, Start, solve
 from smp_motor_ident.estimation.ridge import better, shapes
 from smp_motor_ident.likelihood.experiments import Experiments
-from smp_motor_ident.likelihood.noise import deviance, kalman_gain
+from smp_motor_ident.likelihood.noise import NoiseModel, deviance, kalman_gain
+from smp_motor_ident.likelihood.passes import gather
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import Structure
 
@@ -80,7 +79,8 @@ def initial_fit(
             continue
         tried.append(z)
         noise_ratio = noise_ratio_of(bandwidth(z, subset), subset.step, subset.kind)
-        one = descend(subset, structure, z, subset.initial, noise, noise_ratio, options, 25, 0.1)
+        begun = Start(z, subset.initial, noise, noise_ratio)
+        one = solve(subset, structure, begun, options, 25, 0.1)
         again = best is not None and abs(one.deviance - best.deviance) < 0.1
         if best is None or better(one, best):
             best = one
@@ -111,8 +111,7 @@ def _elsewhere(subset: Experiments, structure: Structure, best: Fit, options: Op
             z = best.z.copy()
             for i, power in change.items():
                 z[i] += power * np.log(factor)
-            other = descend(subset, structure, structure.complete(z), best.initial, best.noise,
-                            best.noise_ratio, options, 25, 0.1)  # fmt: skip
+            other = solve(subset, structure, best.at(structure.complete(z)), options, 25, 0.1)
             if other.deviance < best.deviance - 1:
                 best = other
     return best
@@ -137,6 +136,8 @@ def _score(subset: Experiments, structure: Structure, z: Array, noise: Array) ->
     noise_ratio = noise_ratio_of(bandwidth(z, subset), subset.step, subset.kind)
     relative = noise[1, 1] / noise[0, 0] if subset.current.size else 0.0
     gain, _ = kalman_gain(z, structure.order, subset.kind, subset.step, noise_ratio, relative)
-    spread = prediction.run_spread(subset, structure, z, gain, noise)
-    value = deviance(spread)
+    sums = gather(
+        subset, structure, z, subset.initial, NoiseModel(noise, gain), differentiate=False
+    )
+    value = deviance(sums.spread)
     return value if np.isfinite(value) else np.inf

@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from smp_motor_ident.diagnosis.limits import LITTLE_FRICTION, SECOND_LAG, SUBSET_HOPELESS
 from smp_motor_ident.estimation import data_window, descent, prediction
 from smp_motor_ident.estimation.candidate_starts import from_richer, from_rivals, no_worse, of_kind
 from smp_motor_ident.estimation.choice import FittedCandidate, label, needed, sandwich_factor, size
 from smp_motor_ident.estimation.delay_and_averaging import with_averaging, with_delay
-from smp_motor_ident.estimation.descent import Options
-from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.estimation.fit import Fit, Options, solve
 from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.estimation.profile import RISE, one_level, rubbing
 from smp_motor_ident.estimation.ridge import random_restart
@@ -21,10 +21,6 @@ from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import Structure
-
-HOPELESS = 40.0  # deviance on the screening subset by which a candidate is out for good
-RIVAL = 20.0  # deviance by which a delay must do better than a second lag
-LITTLE = 0.02  # of the largest voltage: friction below it may be left out
 
 Say = Callable[[str], None]
 
@@ -101,7 +97,14 @@ def _friction_shows(data: Experiments, fit: Fit, surely_small: bool) -> bool:
     found = max(float(step[i]), 0.0)
     if not np.isfinite(found) or (found / std) ** 2 > 0.5 * np.log(fit.samples):
         return True
-    return surely_small and found + 2 * std > LITTLE * float(np.abs(data.hold_value).max())
+    return surely_small and found + 2 * std > LITTLE_FRICTION.value * float(
+        np.abs(data.hold_value).max()
+    )
+
+
+def _little(data: Experiments) -> float:
+    """Return the friction [V] below which there is next to none."""
+    return LITTLE_FRICTION.value * float(np.abs(data.hold_value).max())
 
 
 def _may_rub(data: Experiments, fit: Fit, options: Options) -> bool:
@@ -112,16 +115,14 @@ def _may_rub(data: Experiments, fit: Fit, options: Options) -> bool:
     """
     if one_level(data, fit) or _friction_shows(data, fit, True):
         return True
-    little = LITTLE * float(np.abs(data.hold_value).max())
+    little = _little(data)
     z, initials = rubbing(data, fit, little)
     fixed = {**fit.structure.fixed, "vc_plus": little}
     rubs = fit.structure.with_(friction="symmetric", fixed=fixed)
     other = min(
-        (descent.descend(data, rubs, rubs.complete(z), initial, fit.noise, fit.noise_ratio,
-                         options, 12)
-         for initial in initials),
+        (solve(data, rubs, fit.at(rubs.complete(z), i), options, 12) for i in initials),
         key=lambda f: f.deviance,
-    )  # fmt: skip
+    )
     return other.deviance - fit.deviance < RISE * sandwich_factor(fit)
 
 
@@ -149,7 +150,7 @@ def _orders(
     best: Fit | None = None
     for fitted in tried:
         if part is not data:
-            if fitted.deviance > least + HOPELESS * sandwich_factor(fitted):
+            if fitted.deviance > least + SUBSET_HOPELESS.value * sandwich_factor(fitted):
                 candidates.append(
                     FittedCandidate(
                         _projected(data, fitted), f"rejected on {part.size} samples", whole=False
@@ -172,7 +173,7 @@ def _orders(
             # Every motor has a second lag, few have a delay: alike, the lag is believed.
             lag = fitted.structure.order > best.structure.order
             verdict = fitted.deviance < best.deviance + (
-                RIVAL * sandwich_factor(fitted) if lag else 0.0
+                SECOND_LAG.value * sandwich_factor(fitted) if lag else 0.0
             )
             reason = f"fits {'better' if verdict else 'worse'} than {label(best.structure)}"
         else:
@@ -296,7 +297,7 @@ def _without_friction(
     if subset.size < data.size:
         with_it = descent.refine(subset, s, best, best.z, options)
         without = descent.refine(subset, smooth, with_it, best.z, options)
-        if without.deviance > with_it.deviance + HOPELESS * sandwich_factor(with_it):
+        if without.deviance > with_it.deviance + SUBSET_HOPELESS.value * sandwich_factor(with_it):
             return best
     plain = descent.refine(data, smooth, best, best.z, options)
     if plain.deviance < best.deviance:  # then friction has led astray

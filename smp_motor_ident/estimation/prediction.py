@@ -12,18 +12,12 @@ from numpy.typing import NDArray
 
 from smp_motor_ident.estimation.fit import Fit, solve
 from smp_motor_ident.likelihood.experiments import Experiments
-from smp_motor_ident.likelihood.passes import NO_GAIN, Pass, evaluate, gather
+from smp_motor_ident.likelihood.noise import NO_GAIN, NoiseModel
+from smp_motor_ident.likelihood.passes import Pass, evaluate, gather
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import Structure
 
 Array = NDArray[np.float64]
-
-
-def run_spread(
-    data: Experiments, structure: Structure, z: Array, gain: Array, noise: Array
-) -> Array:
-    """Return the sums of squared residuals of coordinates as they are."""
-    return gather(data, structure, z, data.initial, gain, noise, differentiate=False).spread
 
 
 def simulate(data: Experiments, fit: Fit, gain: bool = False) -> Array:
@@ -38,14 +32,14 @@ def outputs(data: Experiments, fit: Fit, gain: bool = False) -> Array:
 
 def _predict(data: Experiments, fit: Fit, gain: bool, columns: int) -> Array:
     predicted = np.empty((data.size, columns))
-    gather(data, fit.structure, fit.z, fit.initial, fit.gain if gain else NO_GAIN, fit.noise,
-           predicted=predicted, differentiate=False)  # fmt: skip
+    noise = NoiseModel(fit.noise, fit.gain if gain else NO_GAIN)
+    gather(data, fit.structure, fit.z, fit.initial, noise, predicted, differentiate=False)
     return predicted
 
 
 def _again(data: Experiments, structure: Structure, fit: Fit) -> Pass:
     z = structure.complete(fit.z)
-    return evaluate(data, structure, z, fit.initial, fit.initial, fit.gain, fit.noise)
+    return evaluate(data, structure, z, fit.initial, fit.initial, fit.noise_model())
 
 
 def inverse(normal: Array, rcond: float = 1e-13) -> Array:
@@ -85,5 +79,5 @@ def settle(data: Experiments, fit: Fit, iterations: int = 12) -> Fit:
     if fit.structure.friction == "symmetric":
         fixed["vc_minus"] = float(fit.z[models.VC_MINUS])
     structure = fit.structure.with_(fixed=fixed, own_load=True)
-    done = solve(data, structure, fit.z, data.initial, fit.noise, iterations=iterations)
+    done = solve(data, structure, fit.at(fit.z, data.initial, 0.0), iterations=iterations)
     return replace(done, structure=fit.structure, z=fit.z)

@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from smp_motor_ident.diagnosis.limits import REST, SAME_LEVEL
-from smp_motor_ident.estimation.descent import Options, descend, initial_of
-from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.diagnosis.limits import MOST_FRICTION, PROFILE_FROM, REST, SAME_LEVEL
+from smp_motor_ident.estimation.descent import initial_of
+from smp_motor_ident.estimation.fit import Fit, Options, solve
 from smp_motor_ident.estimation.fitted import NORMAL_95, Profile
 from smp_motor_ident.estimation.prediction import simulate
 from smp_motor_ident.likelihood.experiments import Experiments
@@ -32,10 +32,8 @@ Array = NDArray[np.float64]
 RISE = float(chdtri(1, 0.05))  # of the deviance at the end of a 95 % interval
 NONLINEAR = (models.VC_PLUS, models.A2, models.DELAY, models.WINDOW)
 """Coordinates that act other than linearly, in the order in which they are followed."""
-LOOSE = 0.1  # relative uncertainty at which that shows
 NEAR = 3.0  # standard deviations to a bound within which no parabola is trusted
 STEPS = 8  # points on each side
-MOST_FRICTION = 0.98  # of the largest voltage: with more the motor would not have turned
 FARTHEST = 4.0  # e-folds
 
 
@@ -56,7 +54,7 @@ def profiled(data: Experiments, fit: Fit, options: Options) -> Fit:
             found.append(Profile(coordinate, (both[0], both[1])))
             continue
         value = float(fit.z[coordinate])
-        loose = std[i] > LOOSE * (1.0 if coordinate == models.A2 else abs(value))
+        loose = std[i] > PROFILE_FROM.value * (1.0 if coordinate == models.A2 else abs(value))
         if not loose and (coordinate == models.A2 or value > NEAR * std[i]):
             continue
         # Coloured residuals and repeating counts scale the deviance as they do variances.
@@ -95,9 +93,7 @@ def _followed(
     size = max(value, 0.02 * high) if coordinate != models.A2 else 1.0
     first = float(np.clip(NORMAL_95 * std, 0.05 * size, size))
     target *= data.size / fit.samples
-    here = descend(
-        data, fit.structure, fit.z, initial_of(data, fit), fit.noise, fit.noise_ratio, options, 6
-    )
+    here = solve(data, fit.structure, fit.at(fit.z, initial_of(data, fit)), options, 6)
     ends = [_end(data, here, coordinate, end, first, target, options) for end in (low, high)]
     shift = fit.z - here.z
     return Profile(coordinate, (ends[0] + shift, ends[1] + shift))
@@ -107,7 +103,7 @@ def _range(data: Experiments, fit: Fit, coordinate: int) -> tuple[float, float]:
     if coordinate == models.A2:
         return float(fit.z[models.A2] - FARTHEST), float(fit.z[models.A2] + FARTHEST)
     if coordinate == models.VC_PLUS:
-        return 0.0, MOST_FRICTION * float(np.abs(data.hold_value).max())
+        return 0.0, MOST_FRICTION.value * float(np.abs(data.hold_value).max())
     return (1e-9 if coordinate == models.WINDOW else 0.0), float(np.ptp(data.time))
 
 
@@ -154,11 +150,8 @@ def _fixed_at(data: Experiments, near: Fit, coordinate: int, value: float, optio
     else:
         z, initials = near.z.copy(), [near.initial]
     z[coordinate] = value
-    tried = [
-        descend(data, structure, structure.complete(z), initial, near.noise, near.noise_ratio,
-                options, 10, 0.05)
-        for initial in initials
-    ]  # fmt: skip
+    z = structure.complete(z)
+    tried = [solve(data, structure, near.at(z, i), options, 10, 0.05) for i in initials]
     return min(tried, key=lambda f: f.deviance)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from smp_motor_ident.diagnosis.limits import CURRENT_THERE
 from smp_motor_ident.errors import ParameterError
-from smp_motor_ident.estimation.descent import Options
+from smp_motor_ident.estimation.fit import Options
 from smp_motor_ident.model.structures import MODELS, PHYSICAL, Structure
 from smp_motor_ident.record import Record
 

@@ -8,8 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident.estimation.descent import Options, descend
-from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.estimation.fit import Fit, Options, solve
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import Structure
@@ -101,8 +100,7 @@ def shapes(z: Array) -> list[Array]:
 
 def _from(z: Array, part: Experiments, structure: Structure, best: Fit, options: Options) -> Fit:
     """Descend from other coordinates in the surroundings of the best fit so far."""
-    start = structure.complete(z)
-    return descend(part, structure, start, best.initial, best.noise, best.noise_ratio, options, 30)
+    return solve(part, structure, best.at(structure.complete(z)), options, 30)
 
 
 def _along_lag(part: Experiments, structure: Structure, best: Fit, options: Options) -> Fit:
@@ -141,8 +139,8 @@ def _scan_friction(
             z = near.z.copy()
             z[models.A0] += np.log((full - level) / max(full - _level(near), 1e-9))
             fixed = structure.with_(fixed={**structure.fixed, "vc_plus": level})
-            profile[level] = descend(part, fixed, fixed.complete(z), near.initial, near.noise,
-                                    best.noise_ratio, options, 12, 0.1)  # fmt: skip
+            start = near.at(fixed.complete(z), noise_ratio=best.noise_ratio)
+            profile[level] = solve(part, fixed, start, options, 12, 0.1)
         return profile[level]
 
     grid = sorted({_level(best), *(full * np.array([0.003, 0.008, 0.016, 0.025, 0.04, 0.08]))})
@@ -157,9 +155,7 @@ def _scan_friction(
     least = min(profile.values(), key=lambda f: f.deviance)
     if least.deviance >= best.deviance - 1:
         return best
-    return descend(
-        part, structure, least.z, least.initial, least.noise, best.noise_ratio, options, 30
-    )
+    return solve(part, structure, least.at(least.z, noise_ratio=best.noise_ratio), options, 30)
 
 
 def _level(fit: Fit) -> float:

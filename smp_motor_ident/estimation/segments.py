@@ -91,7 +91,7 @@ def _steps(data: Experiments, fit: Fit) -> tuple[Array, Array, Array, list[int]]
     """Return time (of the whole, 0 in the middle), step and covariance of each part."""
     structure, f = fit.structure, len(fit.structure.free())
     cut = _parted(data, fit, int(SEGMENTS.value))
-    sums = gather(cut, structure, fit.z, cut.initial, fit.gain, fit.noise)
+    sums = gather(cut, structure, fit.z, cut.initial, fit.noise_model())
     common = [i for i, c in enumerate(structure.free()) if c in COMPARED]
     factors = np.sqrt(_fast_factors(fit))
     plausible = np.diag(PLAUSIBLE[list(structure.free())])
@@ -143,8 +143,9 @@ def _parted(data: Experiments, fit: Fit, parts: int) -> Experiments:
     first = np.empty(starts.size - 1, dtype=np.int64)
     initial = np.zeros((starts.size - 1, 4))
     predicted = np.empty((data.size, 2))
-    gather(data, fit.structure, fit.z, fit.initial, fit.gain, fit.noise, predicted=predicted,
-           differentiate=False)  # fmt: skip
+    gather(
+        data, fit.structure, fit.z, fit.initial, fit.noise_model(), predicted, differentiate=False
+    )
     for n, (begin, g) in enumerate(zip(starts[:-1], owner, strict=True)):
         a = int(data.hold_start[g])
         last = int(data.hold_start[g + 1]) if g + 2 < data.starts.size else data.hold_end.size

@@ -1,8 +1,8 @@
 """Keep back-EMF and damping of one sign where voltage and speed alone give the shape.
 
 With te = L/R, ``be = (a1 - a2/te)/te`` is what viscous friction takes of a0 and ``K = a0 - be`` the
-rest: ``0 <= be <= MOST a0``.  At either edge ``share a0 te^2 - a1 te + a2 = 0`` ties te to the
-coefficients of the response; a step that would leave is taken along the edge (active set).
+rest: ``0 <= be <= MOST_FRICTION a0``.  At either edge ``share a0 te^2 - a1 te + a2 = 0`` ties te to
+the coefficients of the response; a step that would leave is taken along the edge (active set).
 
 References
 ----------
@@ -16,11 +16,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from smp_motor_ident.diagnosis.limits import MOST_FRICTION
 from smp_motor_ident.model.structures import A0, A1, A2, TE, Structure
 
 Array = NDArray[np.float64]
 
-MOST = 0.98  # of a0 that viscous friction may take: beyond it the motor is none
 HAIR = 1e-9  # of a0 by which rounding may pass an edge
 
 
@@ -35,7 +35,8 @@ def passed(z: Array) -> float | None:
     share = float((a1 - a2 / te) / te / a0)
     if share < -HAIR:
         return 0.0
-    return MOST if share > MOST + HAIR else None
+    most = MOST_FRICTION.value
+    return most if share > most + HAIR else None
 
 
 def edge(z: Array, share: float) -> tuple[float, Array] | None:

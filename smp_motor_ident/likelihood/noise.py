@@ -9,6 +9,7 @@ The Riccati equation is solved by doubling (Anderson and Moore, Optimal Filterin
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,27 @@ from smp_motor_ident.likelihood.propagator import BE, TE, TM, WIDTH, K, first_or
 from smp_motor_ident.model.structures import LN_R, to_internal
 
 Array = NDArray[np.float64]
+
+NO_GAIN = np.zeros((3, 2))
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseModel:
+    """How residuals come about and weigh.
+
+    Attributes
+    ----------
+    covariance : ndarray, shape (2, 2)
+        Of the innovations of (output, current).
+    gain : ndarray, shape (3, 2)
+        Innovation gain; zero for output error.
+    huber : float
+        Bound of the robust loss [standard deviations]; infinite for least squares.
+    """
+
+    covariance: Array = field(default_factory=lambda: np.eye(2))
+    gain: Array = field(default_factory=lambda: NO_GAIN)
+    huber: float = math.inf
 
 
 @compiled
@@ -145,7 +167,7 @@ def gain_for(
 ) -> Array:
     """Return the innovation gain that goes with a covariance of the innovations."""
     if noise_ratio <= 0:
-        return np.zeros((3, 2))
+        return NO_GAIN
     relative = float(noise[1, 1] / noise[0, 0]) if current else 0.0
     gain, innovation = kalman_gain(z, order, kind, step, noise_ratio, relative)
     for _ in range(3):  # noise holds innovations; the ratio of the sensors' own is wanted

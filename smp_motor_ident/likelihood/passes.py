@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from smp_motor_ident.likelihood import recursion
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.linear_pass import run_sliding, squares_sliding
-from smp_motor_ident.likelihood.noise import whitening
+from smp_motor_ident.likelihood.noise import NoiseModel, whitening
 from smp_motor_ident.likelihood.normal_equations import eliminate
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import Structure, to_internal
@@ -23,7 +23,6 @@ from smp_motor_ident.model.structures import Structure, to_internal
 Array = NDArray[np.float64]
 
 BLOCKS = 60  # runs of samples whose scores are summed, for the covariance of coloured residuals
-NO_GAIN = np.zeros((3, 2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,14 +100,12 @@ def gather(
     structure: Structure,
     z: Array,
     initial: Array,
-    gain: Array = NO_GAIN,
-    noise: Array | None = None,
-    huber: float = np.inf,
+    noise: NoiseModel | None = None,
     predicted: Array | None = None,
     differentiate: bool = True,
 ) -> Sums:
     """Run over the data once."""
-    noise = np.eye(2) if noise is None else noise
+    noise = NoiseModel() if noise is None else noise
     par, internal = to_internal(z, structure.order)
     slope = (
         np.ascontiguousarray(internal @ structure.matrix()) if differentiate else internal[:, :0]
@@ -121,7 +118,7 @@ def gather(
     normal, gradient, cost = np.empty((segments, p, p)), np.empty((segments, p)), np.zeros(segments)
     spread = np.zeros(6)
     angle = data.kind == recursion.ANGLE
-    if predicted is None and _slides(data, structure, z, gain, huber):
+    if predicted is None and _slides(data, structure, z, noise):
         if p == 0:
             spread[0], spread[3] = squares_sliding(
                 data.time,
@@ -137,15 +134,15 @@ def gather(
         else:
             used = run_sliding(
                 data.time, data.starts, data.hold_value, data.output, angle, par, slope,
-                initial, own, data.jittered, 1 / math.sqrt(noise[0, 0]), normal, gradient, cost,
-                spread, length, scores, owner,
+                initial, own, data.jittered, 1 / math.sqrt(noise.covariance[0, 0]), normal,
+                gradient, cost, spread, length, scores, owner,
             )  # fmt: skip
     else:
         used = recursion.run(
             data.time, data.starts, data.hold_end, data.hold_value, data.hold_start,
             data.output, data.current, data.kind, structure.friction != "none", par, slope,
-            initial, own, gain, whitening(noise), huber, normal, gradient, cost, spread,
-            length, scores, owner, _ring(data, par, p),
+            initial, own, noise.gain, whitening(noise.covariance), noise.huber, normal, gradient,
+            cost, spread, length, scores, owner, _ring(data, par, p),
             np.zeros((0, 3)) if predicted is None else predicted, data.jittered,
         )  # fmt: skip
     return Sums(normal, gradient, cost, spread, scores[:used], owner[:used])
@@ -162,7 +159,7 @@ def _ring(data: Experiments, par: Array, p: int) -> Array:
     return np.zeros((min(depth, data.size + 1), 3 + 2 * p))
 
 
-def _slides(data: Experiments, structure: Structure, z: Array, gain: Array, huber: float) -> bool:
+def _slides(data: Experiments, structure: Structure, z: Array, noise: NoiseModel) -> bool:
     """Tell whether `cascade.run_sliding` does: nothing happens between the samples."""
     return bool(
         structure.friction == "none"
@@ -170,8 +167,8 @@ def _slides(data: Experiments, structure: Structure, z: Array, gain: Array, hube
         and z[models.DELAY] == 0.0
         and data.kind != recursion.MEAN_SPEED
         and not data.current.size
-        and huber == math.inf
-        and not gain.any()
+        and noise.huber == math.inf
+        and not noise.gain.any()
         and data.plain
     )
 
@@ -182,13 +179,11 @@ def evaluate(
     z: Array,
     initial: Array,
     start: Array,
-    gain: Array,
-    noise: Array,
-    huber: float = np.inf,
+    noise: NoiseModel,
     priors: Sequence[tuple[Array, float]] = (),
 ) -> Pass:
     """Run, add what is known beforehand, and eliminate the initial states."""
-    sums = gather(data, structure, z, initial, gain, noise, huber)
+    sums = gather(data, structure, z, initial, noise)
     own = own_columns(data, structure)
     segments, f, o = len(sums.cost), structure.matrix().shape[1], len(own)
     common, score = np.zeros((f, f)), np.zeros(f)

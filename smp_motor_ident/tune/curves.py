@@ -15,7 +15,7 @@ from smp_motor_ident.tune.motors import draw_motors, motors_of
 from smp_motor_ident.tune.plant import sample
 from smp_motor_ident.tune.problem import noise_density
 from smp_motor_ident.tune.reference import CHANGE, controller_for, planned_change
-from smp_motor_ident.tune.simulation import Controller, simulate
+from smp_motor_ident.tune.simulation import Controller, Inputs, simulate
 
 DRAWS = 200
 QUANTILES = (0.01, 0.5, 0.99)
@@ -71,12 +71,9 @@ def curves(estimate: Estimate, design: Design) -> Curves:
     plan = sample(nominal, usual)
     planned = planned_change(plan, design.reference, change, time)
     as_usual = sample(plant.motors, usual, believed=nominal)
-    step = simulate(
-        as_usual, controller, planned.low, high=planned.high, forward=planned.forward
-    ).speed
-    pushed = simulate(
-        plant, Controller(design.feedback), np.zeros(time.size), load=np.ones(time.size)
-    )
+    step = simulate(as_usual, controller, planned.inputs).speed
+    push = Inputs(np.zeros(time.size), load=np.ones(time.size))
+    pushed = simulate(plant, Controller(design.feedback), push)
     omega = frequencies(T, 1 / slow, 120)
     shown = slice(None, None, math.ceil(time.size / 200))
     control = design.feedback.response(omega, T)

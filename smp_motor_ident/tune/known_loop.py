@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident.diagnosis.limits import COMMAND_RESOLUTION, LOOP_RATE, TICK_FIT
 from smp_motor_ident.errors import SignalError
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.record import Record
+from smp_motor_ident.tune.limits import COMMAND_RESOLUTION, LOOP_RATE, TICK_FIT
 
 Array = NDArray[np.float64]
 

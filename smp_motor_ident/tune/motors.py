@@ -7,11 +7,11 @@ from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
-from smp_motor_ident.diagnosis.limits import FRICTION_KNOWN, FRICTION_RANGE, UNRELIABLE_SPREAD
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.result import Estimate, Quantity
 from smp_motor_ident.tune.arrays import Array
+from smp_motor_ident.tune.limits import FRICTION_KNOWN, FRICTION_RANGE, UNRELIABLE_SPREAD
 
 PHYSICAL = ("resistance", "inductance", "motor_constant", "inertia", "viscous_friction")
 COMBINATIONS = ("dc_gain", "time_constant", "time_constant_product")

@@ -54,6 +54,9 @@ class ObserverModel:
         return found[:, SPEED, 0], found[:, SPEED, 1]
 
 
+NO_OBSERVER = ObserverModel(np.zeros((0, 0)), np.zeros(0), np.zeros(0), np.zeros(0))
+
+
 def observer_model(
     model: MotorModel, sample_time: float, quantum: float, noise: ObserverNoise, loop_delay: float
 ) -> ObserverModel:

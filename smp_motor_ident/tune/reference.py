@@ -26,7 +26,7 @@ from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.plant import Plant, sample
 from smp_motor_ident.tune.problem import measured_lag
-from smp_motor_ident.tune.simulation import Controller, minimum_jerk, simulate, step_figures
+from smp_motor_ident.tune.simulation import Controller, Inputs, minimum_jerk, simulate, step_figures
 
 HEADROOM = 0.92
 """Share of the supply that a constant speed may use; the rest is left to the feedback."""
@@ -103,6 +103,11 @@ class Change:
     high: Array
     forward: Array
     duration: float
+
+    @property
+    def inputs(self) -> Inputs:
+        """What the loop gets of it."""
+        return Inputs(self.low, self.high, self.forward)
 
 
 def planned_change(plant: Plant, plan: Reference, distance: float, time: Array) -> Change:
@@ -227,7 +232,7 @@ def _overshoot(plant: Plant, controller: Controller, plan: Reference) -> float:
     time = T * np.arange(int((plan.transition_time + plan.lag + 3 * slow) / T) + 2)
     small = replace(plan, drive=replace(plan.drive, top_speed=1e9))
     change = planned_change(plant, small, 1.0, time)
-    run = simulate(plant, controller, change.low, high=change.high, forward=change.forward)
+    run = simulate(plant, controller, change.inputs)
     return step_figures(time, run.speed[0], run.voltage[0], 1.0).overshoot
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from smp_motor_ident._compile import compiled
 from smp_motor_ident.tune.arrays import Array
 from smp_motor_ident.tune.feedback import Feedback
-from smp_motor_ident.tune.observer_model import SPEED
+from smp_motor_ident.tune.observer_model import NO_OBSERVER, SPEED
 from smp_motor_ident.tune.plant import Plant
 
 
@@ -60,53 +60,52 @@ class Response:
     voltage: Array
 
 
+@dataclass(frozen=True, eq=False)
+class Inputs:
+    """What comes into the loop at the sampling instants, each of shape (k,).
+
+    Attributes
+    ----------
+    low, high : ndarray, [rad/s]
+        Between which the measurement is left alone; one reference where there is no ``high``.
+    forward : ndarray, optional, [V]
+        Feed-forward.
+    load : ndarray, optional, [V]
+        What a load takes.
+    """
+
+    low: Array
+    high: Array | None = None
+    forward: Array | None = None
+    load: Array | None = None
+
+
 def simulate(
     plant: Plant,
     controller: Controller,
-    reference: Array,
+    inputs: Inputs,
     *,
-    high: Array | None = None,
-    forward: Array | None = None,
-    load: Array | None = None,
     count_angle: float = 0.0,
     friction: Array | None = None,
     modelled: float = 0.0,
 ) -> Response:
-    """Run the closed loop from rest."""
-    n, steps, fb = len(plant), reference.size, controller.feedback
-    numbers = (
-        fb.p,
-        fb.i,
-        fb.d,
-        fb.filter_time,
-        controller.weight,
-        controller.weight_d,
-        controller.limit,
-        1.0 / np.asarray(controller.tracking),
-    )
-    observer = plant.observer
-    none = np.zeros((0, 0))
+    """Run the closed loop from rest; ``modelled`` is the friction [V] that the observer knows."""
+    n, steps, fb = len(plant), inputs.low.size, controller.feedback
+    back = 1.0 / np.asarray(controller.tracking)
+    numbers = (fb.p, fb.i, fb.d, fb.filter_time, controller.weight, controller.weight_d,
+               controller.limit, back)  # fmt: skip
+    observer, none = plant.observer or NO_OBSERVER, np.zeros(steps)
     speed, voltage = _run(
-        plant.phi,
-        plant.taps,
-        plant.phi_angle,
-        plant.taps_angle,
-        plant.sample_time,
-        plant.sensor,
-        plant.average,
-        none if observer is None else observer.advance,
-        none.ravel() if observer is None else observer.by_angle,
-        none.ravel() if observer is None else observer.by_voltage,
-        none.ravel() if observer is None else observer.taps,
+        plant.phi, plant.taps, plant.phi_angle, plant.taps_angle, plant.sample_time, plant.sensor,
+        plant.average, observer.advance, observer.by_angle, observer.by_voltage, observer.taps,
         np.stack([np.broadcast_to(np.asarray(x, dtype=np.float64), n) for x in numbers], axis=1),
-        np.asarray(reference, dtype=np.float64),
-        np.asarray(reference if high is None else high, dtype=np.float64),
-        np.zeros(steps) if forward is None else forward,
-        np.zeros(steps) if load is None else load,
+        np.asarray(inputs.low, dtype=np.float64),
+        np.asarray(inputs.low if inputs.high is None else inputs.high, dtype=np.float64),
+        none if inputs.forward is None else inputs.forward,
+        none if inputs.load is None else inputs.load,
         np.zeros(n) if friction is None else np.ascontiguousarray(friction),
-        modelled,
-        count_angle,
-    )
+        modelled, count_angle,
+    )  # fmt: skip
     return Response(plant.sample_time * np.arange(steps), speed, voltage)
 
 

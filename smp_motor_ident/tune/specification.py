@@ -16,6 +16,7 @@ from smp_motor_ident.tune.problem import Problem
 from smp_motor_ident.tune.reference import CHANGE, Reference, planned_change
 from smp_motor_ident.tune.simulation import (
     Controller,
+    Inputs,
     load_figures,
     simulate,
     step_figures,
@@ -70,13 +71,14 @@ def measure(
     change = CHANGE * reference.max_velocity
     time = _instants(problem, fb, reference)
     plan = planned_change(usual, reference, change, time)
-    run = simulate(usual, controller, plan.low, high=plan.high, forward=plan.forward)
+    run = simulate(usual, controller, plan.inputs)
     planned = step_figures(time, run.speed[0], run.voltage[0], change)
     # Small, so that saturation does not hide the loop.
     alone = Controller(fb)
-    run_step = simulate(problem.plant, alone, np.ones(time.size))
+    run_step = simulate(problem.plant, alone, Inputs(np.ones(time.size)))
     abrupt = step_figures(time, run_step.speed[0], run_step.voltage[0], 1.0)
-    pushed = simulate(problem.plant, alone, np.zeros(time.size), load=np.ones(time.size))
+    push = Inputs(np.zeros(time.size), load=np.ones(time.size))
+    pushed = simulate(problem.plant, alone, push)
     load = load_figures(time, pushed.speed[0])
     return Performance(
         rise=planned.rise,
@@ -159,9 +161,7 @@ def specify(
     run = simulate(
         plant,
         controller,
-        plan.low,
-        high=plan.high,
-        forward=plan.forward + known * np.sign(plan.reference + plan.forward),
+        replace(plan.inputs, forward=plan.forward + known * np.sign(plan.reference + plan.forward)),
         count_angle=0.0 if np.any(plant.motors.sensor_lag > 0) else loop.count_angle,
         friction=drawn.static_voltage if case.drawn else np.array([known]),
         modelled=known,

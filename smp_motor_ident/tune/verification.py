@@ -17,13 +17,12 @@ from scipy.signal import savgol_filter
 from smp_motor_control.encoder import Encoder
 from smp_motor_control.motor.file import MotorEntry
 from smp_motor_control.motor.friction import Gearbox, MotorParameters
-from smp_motor_control.motor.hardware import DriveSettings
+from smp_motor_control.motor.hardware import DrivenMotor, DriveSettings
 from smp_motor_control.motor.model import MotorModel
 from smp_motor_control.pid import PidGains
 from smp_motor_control.reference.profile import Drive, ProfileLimits
-from smp_motor_control.wheel.loop import LoopSettings
-from smp_motor_control.wheel.simulation import Timing, simulate_closed_loop
-from smp_motor_ident.diagnosis.limits import OVERSHOOT, SETTLED, SILENCE, STEADY_ERROR
+from smp_motor_control.wheel.loop import LoopSettings, WheelLoop
+from smp_motor_ident.tune.limits import OVERSHOOT, SETTLED, SILENCE, STEADY_ERROR
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune.arrays import Array
@@ -170,28 +169,38 @@ def predicted(
         As the recorded encoder would have shown it.
     """
     instants, ages = answers
-    step, begin = float(loop["sample_time"]), float(instants[0]) - 1e-6
-    least = float(loop.get("usual_delay") or loop["delay"])
-    timing = Timing(
-        sample_time=step,
-        instants=tuple((instants - begin).tolist()),
-        delays=tuple(np.maximum(ages, least).tolist()),
-    )
+    step = float(loop["sample_time"])
+    delays = np.maximum(ages, float(loop.get("usual_delay") or loop["delay"]))
     settings = loop_settings(parameters)
     rows = []
     for entry in _motors(estimate, float(loop["supply_voltage"])):
-        run = simulate_closed_loop(
-            entry,
-            settings,
-            lambda t: setpoint if t + begin >= 0.0 else 0.0,
-            float(instants[-1]) - begin,
-            timing=timing,
-            drive=DriveSettings(command_timeout=math.inf),
-        )
-        turn = entry.gearbox.to_wheel(entry.encoder.angle_per_count)
-        even, speed = smoothed(run.time, turn * run.count, step)
-        rows.append(np.interp(time, even + begin, speed))
+        angle = _run(entry, settings, setpoint, instants, delays)
+        even, speed = smoothed(instants, angle, step)
+        rows.append(np.interp(time, even, speed))
     return np.array(rows)
+
+
+def _run(
+    entry: MotorEntry, settings: LoopSettings, setpoint: float, instants: Array, delays: Array
+) -> Array:
+    """Return the wheel's angle as its encoder shows it, from rest, with a change at time zero."""
+    begin = float(instants[0])
+    plant = DrivenMotor(entry, DriveSettings(command_timeout=math.inf), start=begin)
+    limit = entry.supply_voltage
+    loop = WheelLoop(settings.within(limit), entry.gearbox, entry.encoder, 1.5 * limit)
+    turn = entry.gearbox.to_wheel(entry.encoder.angle_per_count)
+    angle, before, arrival = np.empty(instants.size), begin, begin
+    for k, (time, delay) in enumerate(zip(instants.tolist(), delays.tolist(), strict=True)):
+        sample = plant.sample(time)
+        angle[k] = turn * sample.encoder_count
+        if time == begin or math.isnan(delay):
+            continue
+        dt, before = time - before, time
+        speed = loop.speed(dt, sample.velocity, sample.encoder_count, sample.voltage)
+        if not math.isnan(speed):
+            arrival = max(arrival, time + delay)
+            plant.command(arrival, loop.step(setpoint if time >= 0.0 else 0.0, speed, dt).output)
+    return angle
 
 
 def bands_of(

@@ -8,6 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from wheel_simulation import (
+    DriveSettings,
+    Timing,
+    simulate_closed_loop,
+    simulate_open_loop,
+)
 
 from smp_motor_control import WHEELS
 from smp_motor_control.errors import ParameterError
@@ -16,12 +22,6 @@ from smp_motor_control.motor.file import load_motors
 from smp_motor_control.motor.model import MotorModel
 from smp_motor_control.pid import PidGains
 from smp_motor_control.wheel.loop import LoopSettings, WheelLoop
-from smp_motor_control.wheel.simulation import (
-    DriveSettings,
-    Timing,
-    simulate_closed_loop,
-    simulate_open_loop,
-)
 
 MOTORS = load_motors(Path(__file__).parents[2] / "config" / "motors_paper.yaml")
 GAINS = PidGains(p=2.5, i=80.0, d=0.05, derivative_filter_time_constant=0.005)
@@ -159,18 +159,3 @@ def test_counts_without_known_hardware_fall_back_to_the_reported_speed():
 def test_loop_settings_that_make_no_sense_are_refused(bad):
     with pytest.raises(ParameterError):
         LoopSettings(**bad)
-
-
-def test_recorded_instants_are_simulated_as_they_were():
-    entry, settings = MOTORS["rear_left"], settings_of("rear_left")
-    even = simulate_closed_loop(entry, settings, lambda t: 1.0, 0.6, timing=Timing(delay=0.002))
-    as_recorded = Timing(instants=tuple(even.time), delays=(0.002,) * even.time.size)
-    again = simulate_closed_loop(entry, settings, lambda t: 1.0, 0.6, timing=as_recorded)
-    assert np.array_equal(again.velocity, even.velocity)
-    # From 0.1 s on nobody answers for 50 ms: the voltage stays what it was.
-    lost = tuple(math.nan if 0.1 <= t < 0.15 else 0.002 for t in even.time)
-    silent = simulate_closed_loop(
-        entry, settings, lambda t: 1.0, 0.6, timing=replace(as_recorded, delays=lost)
-    )
-    inside = (even.time > 0.11) & (even.time < 0.15)
-    assert np.ptp(silent.voltage[inside]) == 0.0 and np.ptp(even.voltage[inside]) > 0.1

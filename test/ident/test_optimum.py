@@ -11,11 +11,11 @@ from scipy.signal import lfilter
 
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.estimation import prediction
-from smp_motor_ident.estimation.descent import Options, first_noise
-from smp_motor_ident.estimation.fit import solve
+from smp_motor_ident.estimation.descent import first_noise
+from smp_motor_ident.estimation.fit import Options, Start, solve
 from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.likelihood.experiments import prepare
-from smp_motor_ident.likelihood.noise import proper, renewed, whitening
+from smp_motor_ident.likelihood.noise import NoiseModel, proper, renewed, whitening
 from smp_motor_ident.likelihood.normal_equations import cholesky_solve, damped_step, eliminate
 from smp_motor_ident.likelihood.passes import gather
 from smp_motor_ident.model import structures as models
@@ -93,9 +93,9 @@ def test_one_copy_of_the_motor_gives_the_sums_of_the_general_recursion(kind, ext
     initial = data.initial + rng.uniform(-1, 1, (2, 4))
     noise = np.diag([0.3, 1.0])
     z = structure.complete(z)
-    fast = gather(data, structure, z, initial, noise=noise)
+    fast = gather(data, structure, z, initial, NoiseModel(noise))
     # A bound on the residuals that none reaches sends the same through the general recursion.
-    slow = gather(data, structure, z, initial, noise=noise, huber=1e9)
+    slow = gather(data, structure, z, initial, NoiseModel(noise, huber=1e9))
     for name in ("normal", "gradient", "cost", "spread", "scores"):
         a, b = getattr(fast, name), getattr(slow, name)
         # Two orders of summation of a thousand products each.
@@ -167,7 +167,7 @@ def test_a_start_outside_the_bounds_is_taken_to_them():
     structure = Structure("x", friction="none", window=True)
     z = np.log([0.03, 1e-3, 1e-5, 1e-2, 1, 1, 1, 1, 1, 1, 1])
     z[models.WINDOW], z[models.TE] = -0.1, 1e4
-    fit = solve(data, structure, z, data.initial, first_noise(data), iterations=3)
+    fit = solve(data, structure, Start(z, data.initial, first_noise(data)), iterations=3)
     assert fit.z[models.WINDOW] > 0
     assert np.all(np.isfinite(fit.z))
 
@@ -216,7 +216,7 @@ def test_tabulated_propagators_of_jittered_stamps_are_the_exact_ones(order, fric
     exact.__dict__["jittered"] = 0.0
     structure = Structure("x", order, friction)
     z = structure.complete(models.from_physical(3.3, 0.064, 0.03, 1.4e-5, 5.5e-5, 2e-3))
-    a, b = (gather(d, structure, z, data.initial, noise=np.eye(2)) for d in (data, exact))
+    a, b = (gather(d, structure, z, data.initial) for d in (data, exact))
     # The polynomial is exact to 1e-13; sums cancel by some orders more.
     np.testing.assert_allclose(a.cost, b.cost, rtol=1e-9)
     np.testing.assert_allclose(a.normal, b.normal, rtol=1e-8, atol=1e-10 * np.abs(b.normal).max())

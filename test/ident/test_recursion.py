@@ -9,17 +9,15 @@ import pytest
 
 from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import prepare
-from smp_motor_ident.likelihood.noise import kalman_gain
+from smp_motor_ident.likelihood.noise import NO_GAIN, NoiseModel, kalman_gain
 from smp_motor_ident.likelihood.passes import gather
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import Structure
 
-NO_GAIN = np.zeros((3, 2))
-
 
 def predict(data, structure, z, gain=NO_GAIN):
     out = np.zeros((data.size, 3))
-    gather(data, structure, z, data.initial, gain, predicted=out, differentiate=False)
+    gather(data, structure, z, data.initial, NoiseModel(gain=gain), out, differentiate=False)
     return out
 
 
@@ -63,7 +61,7 @@ def test_gradient_is_that_of_finite_differences_through_all_events(delay, with_g
         gain, _ = kalman_gain(z, 2, rc.ANGLE, data.step, 1e7, 0.5)
 
     def run(at):
-        return gather(data, structure, at, data.initial, gain, np.diag([1e-4, 1e-4]))
+        return gather(data, structure, at, data.initial, NoiseModel(np.diag([1e-4, 1e-4]), gain))
 
     gradient = run(z).gradient
     for j in range(matrix.shape[1]):

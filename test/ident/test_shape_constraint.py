@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from smp_motor_ident.diagnosis.limits import MOST_FRICTION
 from smp_motor_ident.estimation import shape_constraint
-from smp_motor_ident.estimation.descent import Options, descend
+from smp_motor_ident.estimation.fit import Start, solve
 from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import A0, A1, A2, TE, Structure
@@ -34,7 +35,7 @@ def driven(z: np.ndarray = MOTOR, rate: float = 2000.0, seconds: float = 3.0) ->
     return Record("motor", t, v, amps, position=out + 0.02 * rng.standard_normal(t.size))
 
 
-@pytest.mark.parametrize("share", [0.0, shape_constraint.MOST])
+@pytest.mark.parametrize("share", [0.0, MOST_FRICTION.value])
 def test_from_either_edge_a_descent_finds_the_bottom(share):
     data = prepare([driven()], False)
     start = MOTOR + 0.02 * np.eye(len(MOTOR))[A0] - 0.03 * np.eye(len(MOTOR))[A2]
@@ -42,7 +43,7 @@ def test_from_either_edge_a_descent_finds_the_bottom(share):
     noise = np.diag([4e-4, 1.0])
 
     def bottom(z):
-        return descend(data, SHAPED, SHAPED.complete(z), data.initial, noise, 0.0, Options(), 40)
+        return solve(data, SHAPED, Start(SHAPED.complete(z), data.initial, noise))
 
     found, true = bottom(start), bottom(MOTOR)
     assert found.converged
@@ -58,7 +59,7 @@ def test_an_inductance_far_below_the_sampling_is_no_place_to_stay():
     start[[A2, TE]] += np.log(0.1)
 
     def bottom(z):
-        return descend(data, whole, whole.complete(z), data.initial, noise, 0.0, Options(), 40)
+        return solve(data, whole, Start(whole.complete(z), data.initial, noise))
 
     found, true = bottom(start), bottom(fast)
     assert found.converged
@@ -66,7 +67,7 @@ def test_an_inductance_far_below_the_sampling_is_no_place_to_stay():
 
 
 def test_the_edges_are_where_damping_is_nothing_and_all_but_a_fiftieth():
-    for share in (0.0, shape_constraint.MOST):
+    for share in (0.0, MOST_FRICTION.value):
         z = MOTOR.copy()
         z[TE] = shape_constraint.edge(z, share)[0]
         te, _, k, be = models.to_internal(z, 2)[0][:4]
@@ -76,7 +77,7 @@ def test_the_edges_are_where_damping_is_nothing_and_all_but_a_fiftieth():
 
 
 def test_the_gradient_of_an_edge_is_its_slope():
-    for share in (0.0, shape_constraint.MOST):
+    for share in (0.0, MOST_FRICTION.value):
         z = MOTOR.copy()
         z[TE] = shape_constraint.edge(z, share)[0]
         for j, i in enumerate((A0, A1, A2)):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from wheel_simulation import Timing, simulate_closed_loop
 
 from smp_motor_control.motor.file import load_motors
 from smp_motor_control.motor.hardware import DriveSettings
@@ -14,7 +15,6 @@ from smp_motor_control.motor.model import MotorModel
 from smp_motor_control.reference.profile import ProfileLimits, Reference
 from smp_motor_control.reference.time_optimal import VoltageLimited
 from smp_motor_control.wheel.loop import LoopSettings, WheelLoop
-from smp_motor_control.wheel.simulation import Timing, simulate_closed_loop
 from smp_motor_ident.cli.tuning import read_estimates
 from smp_motor_ident.tune import Loop, design, design_wheels
 from smp_motor_ident.tune.motors import motors_of

@@ -14,7 +14,7 @@ from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.margins import batch_margins, grid_for, loop_margins
 from smp_motor_ident.tune.motors import Motors
 from smp_motor_ident.tune.plant import sample
-from smp_motor_ident.tune.simulation import Controller, minimum_jerk, simulate
+from smp_motor_ident.tune.simulation import Controller, Inputs, minimum_jerk, simulate
 
 # Motor 1 of the paper's Table 1, and a first-order motor.
 MOTOR_1 = (0.039142, 0.0019981, 3.1755e-5)
@@ -60,7 +60,7 @@ def test_sampled_motor_with_any_delay_and_window_is_exact(coefficients, delay, w
         motors(*coefficients), Loop(sample_time=T, delay=delay, difference_window=window)
     )
     # A controller that is nothing but feed-forward plays the inputs into the loop.
-    run = simulate(plant, Controller(Feedback(0.0, 0.0)), np.zeros(25), forward=inputs)
+    run = simulate(plant, Controller(Feedback(0.0, 0.0)), Inputs(np.zeros(25), forward=inputs))
     # 1e-7 of the largest speed: the ODE solver's own tolerance, accumulated.
     np.testing.assert_allclose(run.speed[0], speed[:-1], atol=1e-7 * np.abs(speed).max())
     measured = speed.copy()
@@ -87,7 +87,7 @@ def test_closed_loop_matrix_and_simulation_agree_on_the_decay(window):
     plant = sample(motors(*MOTOR_1), Loop(sample_time=0.005, delay=0.008, difference_window=window))
     feedback = Feedback(0.03, 0.9, 0.0008, 0.004)
     eigenvalues = np.linalg.eigvals(closed_loop(plant, feedback)[0])
-    run = simulate(plant, Controller(feedback), np.ones(400))
+    run = simulate(plant, Controller(feedback), Inputs(np.ones(400)))
     left = np.abs(run.speed[0] - 1)
     # The slowest mode alone is left after 100 samples; 3 % for what the others still add.
     slope = (left[360:].max() / left[100:140].max()) ** (1 / 260)
@@ -103,7 +103,7 @@ def test_simulated_controller_is_the_running_one():
     time = T * np.arange(300)
     reference, rate, _ = minimum_jerk(100.0, 0.1, time)
     forward = 0.03 * reference + 0.001 * rate
-    run = simulate(plant, controller, reference, forward=forward)
+    run = simulate(plant, controller, Inputs(reference, forward=forward))
     pid = Pid(
         PidGains(
             p=0.05, i=1.2, d=0.0009, u_clamp_min=-limit, u_clamp_max=limit,

@@ -7,19 +7,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from wheel_simulation import Timing, simulate_closed_loop
 
 from smp_motor_control.motor.file import load_motors
 from smp_motor_control.motor.hardware import DriveSettings
 from smp_motor_control.motor.model import MotorModel
 from smp_motor_control.wheel.loop import LoopSettings
-from smp_motor_control.wheel.simulation import Timing, simulate_closed_loop
 from smp_motor_ident.cli.tune import main
 from smp_motor_ident.cli.tuning import read_estimates
 from smp_motor_ident.tune import Loop, design
 from smp_motor_ident.tune.feedback import spectral_radius
 from smp_motor_ident.tune.motors import Motors, motors_of
 from smp_motor_ident.tune.plant import sample
-from smp_motor_ident.tune.simulation import Controller, simulate
+from smp_motor_ident.tune.simulation import Controller, Inputs, simulate
 from smp_motor_ident.tune.source import choose_source
 
 MOTORS = Path(__file__).resolve().parents[2] / "config" / "motors_paper.yaml"
@@ -60,7 +60,7 @@ def test_the_response_of_a_wrong_model_is_that_of_the_simulated_loop(estimates):
     for factor, grows in ((0.97, False), (1.03, True)):
         trial = feedback.scaled(factor * ultimate)
         assert (spectral_radius(plant, trial)[0] > 1) == grows
-        speed = simulate(plant, Controller(trial), np.ones(1500)).speed[0]
+        speed = simulate(plant, Controller(trial), Inputs(np.ones(1500))).speed[0]
         off = np.abs(speed - 1)
         assert (off[-300:].max() > off[600:900].max()) == grows
 

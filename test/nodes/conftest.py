@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 import rclpy
+from body_peer import GEOMETRY, Peer
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -23,3 +24,28 @@ def node(ros_domain: int) -> Iterator[Node]:
     executor.shutdown()
     made.destroy_node()
     rclpy.shutdown(context=context)
+
+
+@pytest.fixture
+def peer(ros_domain: int) -> Iterator[Peer]:
+    peer = Peer(ros_domain)
+    yield peer
+    peer.executor.shutdown()
+    peer.node.destroy_node()
+    rclpy.shutdown(context=peer.context)
+
+
+@pytest.fixture
+def skid_steer(process, peer, eventually):
+    def run(*more: str, listens: str = "cmd_vel"):
+        started = process("skid_steer", "--ros-args", *GEOMETRY, *more)
+        eventually(
+            lambda: peer.node.count_subscribers(listens) and peer.setpoints_found(),
+            deadline=20.0,
+            step=peer.spin,
+            message=started.output,
+        )
+        return started
+
+    peer.setpoints_found = lambda: peer.node.count_publishers("wheel_setpoints")
+    return run

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from smp_motor_ident.bag.limits import STRAY_ROWS
 from smp_motor_ident.bag.storage import found
 from smp_motor_ident.bag.units import written_unit
-from smp_motor_ident.diagnosis.limits import STRAY_ROWS
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.finding import Finding
 

@@ -17,7 +17,7 @@ from smp_motor_ident.tune.margins import Margins, loop_margins
 from smp_motor_ident.tune.motors import Motors
 from smp_motor_ident.tune.plant import Plant, sample
 from smp_motor_ident.tune.reference import CHANGE
-from smp_motor_ident.tune.simulation import Controller, StepFigures, simulate, step_figures
+from smp_motor_ident.tune.simulation import Controller, Inputs, StepFigures, simulate, step_figures
 
 
 @dataclass(frozen=True)
@@ -135,11 +135,10 @@ def check(design: Design, gains: Gains) -> Check:
     controller = Controller(
         gains.feedback, weight=gains.weight, limit=loop.supply_voltage, tracking=gains.tracking
     )
-    forward = np.full(time.size, gains.static + gains.velocity * target)
+    given = gains.static + gains.velocity * target
+    inputs = Inputs(np.full(time.size, target), forward=np.full(time.size, given))
     friction = np.array([design.motor["static_voltage"]])
-    run = simulate(
-        plant, controller, np.full(time.size, target), forward=forward, friction=friction
-    )
+    run = simulate(plant, controller, inputs, friction=friction)
     step = step_figures(time, run.speed[0], run.voltage[0], target)
     if gains.resting_error > BAND * target:
         step = replace(step, settling=math.nan)

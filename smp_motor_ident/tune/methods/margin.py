@@ -17,10 +17,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from smp_motor_ident.diagnosis.limits import SPEED_NOISE
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.tune.arrays import Array, Complex
 from smp_motor_ident.tune.feedback import Feedback, spectral_radius
+from smp_motor_ident.tune.limits import SPEED_NOISE
 from smp_motor_ident.tune.margins import loop_margins
 from smp_motor_ident.tune.methods.simc import SIMC
 from smp_motor_ident.tune.problem import Method, Problem, RequiredMargins, noise_filter

@@ -24,7 +24,7 @@ from smp_motor_ident.tune.feedback import Feedback, spectral_radius
 from smp_motor_ident.tune.methods.simc import SIMC
 from smp_motor_ident.tune.plant import Plant
 from smp_motor_ident.tune.problem import Method, Problem, RequiredMargins, noise_filter
-from smp_motor_ident.tune.simulation import Controller, simulate
+from smp_motor_ident.tune.simulation import Controller, Inputs, simulate
 
 POPULATION, ELITE, GENERATIONS = 48, 10, 14
 REQUIRED = RequiredMargins(phase=45.0, gain=2.0, sensitivity=1.6)
@@ -81,10 +81,9 @@ class _Cost:
             limited = Controller(
                 gains, limit=self.problem.loop.supply_voltage, tracking=cast(Any, p / i)
             )
-            step = simulate(plant, limited, self.step).speed / self.step
-            load = simulate(
-                plant, Controller(gains), np.zeros(self.time.size), load=np.ones(self.time.size)
-            ).speed
+            step = simulate(plant, limited, Inputs(self.step)).speed / self.step
+            push = Inputs(np.zeros(self.time.size), load=np.ones(self.time.size))
+            load = simulate(plant, Controller(gains), push).speed
             errors = np.stack([np.abs(1 - step) @ self.time, np.abs(load) @ self.time])
         over = np.maximum(step.max(axis=1) - 1, 0)
         return errors / self.scale[:, None], over

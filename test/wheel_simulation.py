@@ -7,23 +7,20 @@ is what ``motor_plant`` simulates, :class:`~smp_motor_control.wheel.loop.WheelLo
 
 from __future__ import annotations
 
-import itertools
 import math
 import random
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_control.errors import ParameterError
 from smp_motor_control.motor.file import MotorEntry
 from smp_motor_control.motor.hardware import DrivenMotor, DriveSettings, Sample, Supply
 from smp_motor_control.wheel.loop import LoopSettings, WheelLoop
 
 Array = NDArray[np.float64]
-
-__all__ = ["DriveSettings", "Run", "Supply", "Timing", "simulate_closed_loop", "simulate_open_loop"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,25 +35,11 @@ class Timing:
         From a sample to the arrival of the command that answers it [s].
     jitter : float
         Standard deviation of the intervals between samples [s].
-    instants, delays : tuple of float
-        In place of all that, what a recording shows: when samples were taken, and when they
-        were answered [s]; NaN where one was not.
     """
 
     sample_time: float = 0.005
     delay: float = 0.0
     jitter: float = 0.0
-    instants: tuple[float, ...] = ()
-    delays: tuple[float, ...] = ()
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.sample_time < math.inf:
-            raise ParameterError(f"sample_time is {self.sample_time!r} s; it must be positive")
-        for name in ("delay", "jitter"):
-            if not 0.0 <= getattr(self, name) < math.inf:
-                raise ParameterError(
-                    f"{name} is {getattr(self, name)!r} s; it must be zero or positive"
-                )
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,8 +100,6 @@ class _Tape:
 
 
 def _instants(duration: float, timing: Timing, seed: int) -> list[float]:
-    if timing.instants:
-        return list(timing.instants)
     draw = random.Random(seed)
     shortest = 0.1 * timing.sample_time
     time, instants = 0.0, [0.0]
@@ -131,28 +112,16 @@ def _instants(duration: float, timing: Timing, seed: int) -> list[float]:
     return instants
 
 
+Answer = Callable[[float, float, Sample], tuple[float, tuple[float, float, float]]]
+"""From time, interval and sample to the command, and set-point, reference and measurement."""
+
+
 def simulate_open_loop(
-    entry: MotorEntry,
-    voltage: Callable[[float], float],
-    duration: float,
-    *,
-    timing: Timing | None = None,
-    drive: DriveSettings | None = None,
-    load: Callable[[float], float] | None = None,
-    supply: Supply | None = None,
-    seed: int = 0,
+    entry: MotorEntry, voltage: Callable[[float], float], duration: float, **world: Any
 ) -> Run:
     """Drive a motor with a voltage."""
-    timing = timing or Timing()
-    plant = DrivenMotor(entry, drive or _ideal(), supply, seed=seed)
-    tape = _Tape()
-    for time in _instants(duration, timing, seed):
-        sample = plant.sample(time)
-        command = voltage(time)
-        tape.write(time, (0.0, 0.0, math.nan), plant, sample, command)
-        _put_load(plant, time, load)
-        plant.command(time + timing.delay, command)
-    return tape.run()
+    nothing = 0.0, 0.0, math.nan
+    return _simulate(entry, lambda time, dt, sample: (voltage(time), nothing), duration, **world)
 
 
 def simulate_closed_loop(
@@ -160,6 +129,27 @@ def simulate_closed_loop(
     settings: LoopSettings,
     setpoint: Callable[[float], float],
     duration: float,
+    **world: Any,
+) -> Run:
+    """Let a wheel's loop follow set-points."""
+    limit = 1.5 * entry.supply_voltage
+    loop = WheelLoop(settings.within(entry.supply_voltage), entry.gearbox, entry.encoder, limit)
+
+    def answer(time: float, dt: float, sample: Sample) -> tuple[float, tuple[float, float, float]]:
+        target, command, measurement = setpoint(time), 0.0, math.nan
+        if dt > 0.0:
+            measurement = loop.speed(dt, sample.velocity, sample.encoder_count, sample.voltage)
+            if not math.isnan(measurement):
+                command = loop.step(target, measurement, dt).output
+        return command, (target, loop.reference.velocity, measurement)
+
+    return _simulate(entry, answer, duration, **world)
+
+
+def _simulate(
+    entry: MotorEntry,
+    answer: Answer,
+    duration: float,
     *,
     timing: Timing | None = None,
     drive: DriveSettings | None = None,
@@ -167,42 +157,17 @@ def simulate_closed_loop(
     supply: Supply | None = None,
     seed: int = 0,
 ) -> Run:
-    """Let a wheel's loop follow set-points."""
     timing = timing or Timing()
-    plant = DrivenMotor(entry, drive or _ideal(), supply, seed=seed)
-    loop = WheelLoop(
-        settings.within(entry.supply_voltage),
-        entry.gearbox,
-        entry.encoder,
-        1.5 * entry.supply_voltage,
-    )
+    drive = drive or DriveSettings(command_timeout=math.inf)
+    plant = DrivenMotor(entry, drive, supply, seed=seed)
     tape = _Tape()
-    before, command, arrival = None, 0.0, -math.inf
-    instants = _instants(duration, timing, seed)
-    delays = timing.delays or itertools.repeat(timing.delay, len(instants))
-    for time, delay in zip(instants, delays, strict=True):
+    before = 0.0
+    for time in _instants(duration, timing, seed):
         sample = plant.sample(time)
-        target, measurement = setpoint(time), math.nan
-        answered = not math.isnan(delay)
-        if answered and before is not None:
-            dt = time - before
-            measurement = loop.speed(dt, sample.velocity, sample.encoder_count, sample.voltage)
-            known = not math.isnan(measurement)
-            command = loop.step(target, measurement, dt).output if known else 0.0
-        before = time if answered else before
-        row = (target, loop.reference.velocity, measurement)
+        command, row = answer(time, time - before, sample)
+        before = time
         tape.write(time, row, plant, sample, command)
-        _put_load(plant, time, load)
-        if answered:
-            arrival = max(arrival, time + delay)
-            plant.command(arrival, command)
+        if load is not None:
+            plant.load(time, load(time))
+        plant.command(time + timing.delay, command)
     return tape.run()
-
-
-def _ideal() -> DriveSettings:
-    return DriveSettings(command_timeout=math.inf)
-
-
-def _put_load(plant: DrivenMotor, time: float, load: Callable[[float], float] | None) -> None:
-    if load is not None:
-        plant.load(time, load(time))

@@ -1,0 +1,153 @@
+"""Print the nodes' topics, services and parameters: ``python scripts/nodes.py > docs/nodes.md``.
+
+Each node is made as its executable makes it, and asked.
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+import sys
+from array import array
+from collections.abc import Callable
+from typing import Any
+from unittest.mock import Mock
+
+import rclpy
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+from smp_motor_control import WHEELS
+from smp_motor_control.nodes import teleop_wheels
+from smp_motor_control.nodes.excite import Excite
+from smp_motor_control.nodes.motor_plant import MotorPlant
+from smp_motor_control.nodes.serial_driver import SerialDriver
+from smp_motor_control.nodes.skid_steer import SkidSteerNode
+from smp_motor_control.nodes.wheel_pid import WheelPid
+from smp_motor_ident.nodes.identifier import Identifier
+
+NODES: tuple[tuple[str, Callable[[], Node]], ...] = (
+    ("/front_left", WheelPid),
+    ("/", SkidSteerNode),
+    ("/", MotorPlant),
+    ("/", SerialDriver),
+    ("/", Excite),
+    ("/", teleop_wheels.TeleopWheels),
+    ("/", Identifier),
+)
+
+EVERY_NODES = (
+    "/parameter_events",
+    "/rosout",
+    "/clock",
+    "use_sim_time",
+    "start_type_description_service",
+)
+PARAMETER_SERVICES = ("rcl_interfaces/", "type_description_interfaces/")
+
+HEAD = """# Nodes
+
+Topics, services and parameters of every node, as the node itself says them; printed by
+`python scripts/nodes.py`. Names are relative to the robot's namespace (`-r __ns:=/robot1`);
+`wheel_pid` runs in its wheel's (`-r __ns:=/robot1/front_left`). Units are SI. All nodes have
+`use_sim_time`, answer the usual parameter services, and write to `/rosout`. `skid_steer` hears
+`cmd_vel` as `geometry_msgs/msg/Twist` too once somebody publishes that. `record` and `play` have
+the topics that their arguments name (`--help`).
+"""
+
+
+def type_name(kind: Any) -> str:
+    """Return the name that ``ros2 topic`` and ``ros2 service`` print."""
+    package, folder, *_ = kind.__module__.split(".")
+    return f"{package}/{folder}/{kind.__name__}"
+
+
+def quality(profile: QoSProfile) -> str:
+    """Return what a peer must match."""
+    best_effort = profile.reliability == ReliabilityPolicy.BEST_EFFORT
+    latched = profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+    return ("best effort" if best_effort else "reliable") + (", transient local" if latched else "")
+
+
+def relative(name: str, node: Node) -> str:
+    """Return a full name as within the robot's namespace, for any of its wheels."""
+    own = f"{node.get_namespace().rstrip('/')}/{node.get_name()}/"
+    if name.startswith(own):
+        return "~/" + name.removeprefix(own)
+    first, slash, rest = name.lstrip("/").partition("/")
+    return f"<wheel>/{rest}" if slash and first in WHEELS else name.lstrip("/")
+
+
+def topics(node: Node) -> list[str]:
+    """Return rows of topics and services."""
+    rows = [
+        (relative(end.topic_name, node), way, type_name(end.msg_type), quality(end.qos_profile))
+        for way, ends in (("publishes", node.publishers), ("subscribes", node.subscriptions))
+        for end in ends
+        if end.topic_name not in EVERY_NODES
+    ]
+    rows += [
+        (relative(node.resolve_service_name(s.srv_name), node), "serves", type_name(s.srv_type), "")
+        for s in node.services
+        if not type_name(s.srv_type).startswith(PARAMETER_SERVICES)
+    ]
+    return ["| name | | type | quality of service |", "| --- | --- | --- | --- |"] + [
+        f"| `{name}` | {way} | `{kind}` | {how} |" for name, way, kind, how in sorted(set(rows))
+    ]
+
+
+def limits(descriptor: ParameterDescriptor) -> str:
+    """Return the range of a parameter."""
+    for one in (*descriptor.floating_point_range, *descriptor.integer_range):
+        low, high = (
+            f"{end:g}" if math.isfinite(end) and abs(end) < 1e300 else ""
+            for end in (float(one.from_value), float(one.to_value))
+        )
+        return (
+            f"{low} to {high}" if low and high else f"at least {low}" if low else f"at most {high}"
+        )
+    return ""
+
+
+def parameters(node: Node) -> list[str]:
+    """Return rows of parameters."""
+    own = {
+        name: parameter.value
+        for name, parameter in node.get_parameters_by_prefix("").items()
+        if name not in EVERY_NODES and not name.startswith(("motors.", "qos_overrides."))
+    }
+    rows = ["| parameter | default | range | |", "| --- | --- | --- | --- |"]
+    for name, value in own.items():
+        descriptor = node.describe_parameter(name)
+        fixed = "; fixed at start" if descriptor.read_only else ""
+        text = descriptor.description.rstrip(".") + fixed
+        default = list(value) if isinstance(value, array) else value
+        rows.append(f"| `{name}` | `{default!r}` | {limits(descriptor)} | {text} |")
+    return rows
+
+
+def section(namespace: str, make: Callable[[], Node]) -> str:
+    """Return the part of one node."""
+    rclpy.init(args=["--ros-args", "-r", f"__ns:={namespace}", "--log-level", "fatal"])
+    try:
+        node = make()
+        if isinstance(node, WheelPid):
+            node.trigger_configure()
+        module = sys.modules[type(node).__module__]
+        first = str(inspect.getdoc(module)).split("\n")[0]
+        lines = [f"## {node.get_name()}", "", first, "", *topics(node), "", *parameters(node)]
+        node.destroy_node()
+        return "\n".join(lines) + "\n"
+    finally:
+        rclpy.shutdown()
+
+
+def page() -> str:
+    """Return all nodes as a page of Markdown."""
+    teleop_wheels.Terminal = Mock()  # there is none
+    return "\n".join([HEAD, *(section(*node) for node in NODES)])
+
+
+if __name__ == "__main__":
+    sys.stdout.write(page())

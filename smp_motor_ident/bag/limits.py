@@ -1,0 +1,75 @@
+"""Every threshold of a decision about recordings, with its unit and its reason.
+
+Printed with the others in ``docs/limits.md``.
+"""
+
+from __future__ import annotations
+
+from smp_motor_ident.diagnosis.limits import Limit
+
+UNPACKED_LEAST = Limit(
+    256e6,
+    "byte",
+    "cost: what any machine that runs ROS can spare; a smaller file may always unpack to it",
+    "test_bounds.py",
+)
+UNPACKED_RATIO = Limit(
+    50.0,
+    "1",
+    "cost: 1 GB at most for a file of 10 MB, half of it unpacked bytes; telemetry packs 3 to 20",
+    "test_bounds.py",
+)
+STRAY_ROWS = Limit(
+    0.05,
+    "1",
+    "cost: an estimate without one row in twenty keeps its value; with more it is no table",
+    "test_csv.py",
+)
+BEAT_FLOOR = Limit(
+    0.5,
+    "sample",
+    "physical: a later beat than half a sample is the next one; the least latency stays below it",
+    "test_beat.py",
+)
+BEAT_JITTER = Limit(
+    0.02,
+    "sample",
+    "cost: instants that are off by less change an estimate less than their rounding",
+    "test_beat.py",
+)
+BEAT_LOST = Limit(
+    0.02,
+    "1",
+    "cost: with more samples lost the number of a sample, and with it its instant, is a guess",
+    "test_beat.py",
+)
+JUMP_SPAN = Limit(
+    20.0,
+    "1",
+    "physical: no signal leaves twenty times the range of 98 % of its values for single samples",
+    "test_checks.py",
+)
+JUMP_STEP = Limit(
+    20.0,
+    "1",
+    "physical: what has inertia does not step to and fro by twenty times all but 1 % of its steps",
+    "test_checks.py",
+)
+UNSIGNED_CURRENT = Limit(
+    2.0,
+    "1",
+    "physical: an armature's means in both directions cancel but for an offset; a size's add up",
+    "test_checks.py",
+)
+SMOOTHER = Limit(
+    0.9,
+    "1",
+    "cost: stamps are kept unless the motion is evidently smoother on the beat that they keep",
+    "test_beat.py",
+)
+EXPLAINS = Limit(
+    1e-6,
+    "1",
+    "significance: with a thousand pairs of fields tried, one in a thousand listings is wrong",
+    "test_propose.py",
+)

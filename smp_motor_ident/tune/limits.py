@@ -1,0 +1,83 @@
+"""Every threshold of a decision about gains and loops, with its unit and its reason.
+
+Printed with the others in ``docs/limits.md``.
+"""
+
+from __future__ import annotations
+
+from smp_motor_ident.diagnosis.limits import Limit
+
+# What may be designed on, and how far gains may go.
+FRICTION_KNOWN = Limit(
+    0.02,
+    "share of the supply",
+    "an error of the friction's feed-forward by this changes the speed by as much of its largest "
+    "value as the band in which a change counts as settled",
+    "test_tune_truth.py",
+)
+FRICTION_RANGE = Limit(
+    0.5,
+    "share of the supply",
+    "with half of the supply unknown the speed that the motor reaches is not known to a factor 2",
+    "test_tune_truth.py",
+)
+UNRELIABLE_SPREAD = Limit(
+    0.1,
+    "relative standard deviation",
+    "least that numbers of an unreliable estimate are drawn with; more where the fit on held-out "
+    "data leaves more of the motion unexplained",
+    "test_tune_truth.py",
+)
+SPEED_NOISE = Limit(
+    2.5e-3,
+    "share of the top speed, rms",
+    "four times this is 2 % of half the top speed: with more, counts shake the wheel out of the "
+    "band in which the specification calls a change settled",
+    "test_tune_methods.py",
+)
+
+# Loops whose commands are reconstructed.
+COMMAND_RESOLUTION = Limit(
+    1 / 255,
+    "of the supply, rms",
+    "one step of an 8-bit PWM: a command that is known closer is known as well as it was given",
+    "test_known_loop.py: what is not known is refused",
+)
+LOOP_RATE = Limit(
+    0.02,
+    "of the interval",
+    "clocks of boards are within 2 %; a log at another rate leaves commands out",
+    "test_known_loop.py: what is not known is refused",
+)
+TICK_FIT = Limit(
+    0.05,
+    "of a tick",
+    "digits that put 95 % of speeds within a twentieth of a whole tick leave no doubt which",
+    "test_known_loop.py: the command is reconstructed",
+)
+
+# A drive on new gains.
+SETTLED = Limit(
+    0.02,
+    "of a change of set-point",
+    "the field's usual band of a settling time",
+    "test_verification.py: a wheel that does as designed",
+)
+OVERSHOOT = Limit(
+    0.01,
+    "of a change of set-point",
+    "what the reference is planned to overshoot at most: a load or a count may use it up",
+    "test_verification.py: a wheel that does as designed",
+)
+SILENCE = Limit(
+    0.1,
+    "s without an answer",
+    "half of what lets wheel_pid stop the wheel: such a drive shows the computer, not the gains",
+    "test_verification.py: a drive without control",
+)
+STEADY_ERROR = Limit(
+    0.02,
+    "of a change of set-point",
+    "the same band: integral action leaves no error, only what has not settled",
+    "test_verification.py: a speed that stays off",
+)

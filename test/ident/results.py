@@ -1,0 +1,64 @@
+"""A result of identification as the tests of reports and documents need it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from smp_motor_ident.finding import Finding
+from smp_motor_ident.record import Hardware
+from smp_motor_ident.result import (
+    Candidate,
+    Correlation,
+    Estimate,
+    FitPercent,
+    Quantity,
+    ResidualTests,
+)
+
+PHYSICAL = {
+    "resistance": (12.919, "ohm"),
+    "inductance": (0.30994, "H"),
+    "motor_constant": (0.011029, "N m/A"),
+    "inertia": (1.13e-6, "kg m^2"),
+    "viscous_friction": (2.4e-5, "N m s/rad"),
+    "coulomb_friction": (1e-4, "N m"),
+}
+
+
+def correlation(*values: float) -> Correlation:
+    """With a band of 0.1."""
+    return Correlation(np.arange(1.0, 1 + len(values)), np.array(values), 0.1)
+
+
+def estimate(wheel: str = "front_left", *, current: bool = True) -> Estimate:
+    """One motor's result, with current measured or from voltage and speed alone."""
+    known = {n: Quantity(v, v / 100, (0.98 * v, 1.02 * v), u) for n, (v, u) in PHYSICAL.items()}
+    hidden = {n: Quantity(None, unit=u, status="unidentifiable") for n, (_, u) in PHYSICAL.items()}
+    combinations = {
+        "dc_gain": Quantity(25.5, 0.1, (25.3, 25.7), "rad/s/V"),
+        "time_constant": Quantity(0.04, 1e-4, (0.0398, 0.0402), "s"),
+    }
+    return Estimate(
+        wheel=wheel,
+        model="electromechanical" if current else "second_order",
+        parameters=known if current else hidden,
+        combinations=combinations,
+        names=("dc_gain", "time_constant"),
+        covariance=np.array([[1e-2, 5e-6], [5e-6, 1e-8]]),
+        fit_percent=FitPercent(97.2, 96.8),
+        candidates=(Candidate("first_order", 91.0, -10.0, False, "slower lag <b>missed</b>"),),
+        residuals=ResidualTests(True, False, correlation(0.01, 0.02), correlation(0.3, 0.1)),
+        findings=(
+            Finding(
+                "alike",
+                "warning",
+                "The delay & the inductance look alike at 100 Hz.",
+                advice="Measure the current.",
+            ),
+        ),
+        samples=1000,
+        duration=10.0,
+        sample_time=0.01,
+        sources=("<script>alert('bag')</script>",),
+        hardware=Hardware(65.5, 500.0, 16, 12.0, None),
+    )

@@ -1,0 +1,156 @@
+"""Documents of results: they read back, spoilt ones are named, files appear all or none."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import yaml
+from results import PHYSICAL, estimate
+
+from smp_motor_control.parameter_file import read_parameters
+from smp_motor_ident.errors import BagError, ParameterError
+from smp_motor_ident.report.document import (
+    identification_document,
+    motors_yaml,
+    read_identification,
+    write_together,
+)
+
+
+def test_document_reads_back_as_the_same_estimates(tmp_path: Path) -> None:
+    wheels = {"front_left": estimate(), "rear_left": estimate("rear_left", current=False)}
+    path = tmp_path / "identification.json"
+    path.write_text(json.dumps(identification_document(wheels), allow_nan=False))
+    again = read_identification(tmp_path)
+    assert identification_document(again) == identification_document(wheels)
+
+
+def test_motors_file_has_parameters_where_known_and_combinations_where_not() -> None:
+    wheels = {"front_left": estimate(), "rear_left": estimate("rear_left", current=False)}
+    text = motors_yaml(wheels, ["from a bag"])
+    motors = yaml.safe_load(text)["/**/motor_plant"]["ros__parameters"]["motors"]
+    assert text.startswith("# from a bag\n")
+    assert motors["front_left"]["inertia"] == PHYSICAL["inertia"][0]
+    assert "dc_gain" not in motors["front_left"]
+    assert motors["rear_left"]["dc_gain"] == 25.5
+    assert "inertia" not in motors["rear_left"]
+    assert motors["rear_left"]["gear_ratio"] == 65.5
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [("{", "is not JSON"), ("[]", "schema"), ('{"schema": 1, "motors": {"a": {}}}', "damaged")],
+)
+def test_a_damaged_document_is_named_with_its_reason(
+    tmp_path: Path, text: str, reason: str
+) -> None:
+    path = tmp_path / "identification.json"
+    path.write_text(text)
+    with pytest.raises(BagError, match=reason) as error:
+        read_identification(path)
+    assert str(path) in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("junk", [None, True, -1, 1e308, 10**400, "x", [], {}, [[]], {"a": {}}])
+def test_whatever_stands_anywhere_in_a_document_it_is_read_or_refused_in_a_line(
+    tmp_path: Path, junk: object
+) -> None:
+    whole = json.dumps(identification_document({"w": estimate()}))
+
+    def places(node: object, way: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
+        items = node.items() if isinstance(node, dict) else enumerate(node)  # type: ignore[call-overload]
+        for key, value in items:
+            yield (*way, key)
+            if isinstance(value, (dict, list)):
+                yield from places(value, (*way, key))
+
+    path = tmp_path / "identification.json"
+    for *way, last in places(json.loads(whole)):
+        document = node = json.loads(whole)
+        for key in way:
+            node = node[key]
+        node[last] = junk
+        path.write_text(json.dumps(document))
+        said = f"{path}: read"
+        try:
+            read_identification(path)
+        except BagError as error:
+            said = str(error)
+        assert said.startswith(f"{path}: ")
+        assert "\n" not in said
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"schema": 1, "motors": ' + '{"a":' * 100_000])
+def test_a_document_nested_without_end_is_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "identification.json").write_text(text)
+    with pytest.raises(BagError, match="is not JSON"):
+        read_identification(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("[" * 100_000, "nested"),
+        ("a: " * 3, "is not YAML"),
+        ("{" * 40 + "}" * 40, "nested|is not YAML"),
+        ("a: &a [x,x,x,x,x,x,x,x,x,x]\n" + "".join(
+            f"{chr(98 + k)}: &{chr(98 + k)} [{','.join([f'*{chr(97 + k)}'] * 10)}]\n"
+            for k in range(8)
+        ), "values"),
+        ("x" * 1_000_001, "larger"),
+        ("front_left: 3", "no ROS parameter file"),
+        ("\xff", "is not YAML"),
+    ],
+)  # fmt: skip
+def test_a_parameter_file_that_is_none_is_refused_in_a_line(
+    tmp_path: Path, text: str, reason: str
+) -> None:
+    path = tmp_path / "gains.yaml"
+    path.write_bytes(text.encode("latin-1"))
+    with pytest.raises(ParameterError, match=reason) as error:
+        read_parameters(path)
+    assert str(path) in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_files_appear_together_and_nothing_is_overwritten_without_force(tmp_path: Path) -> None:
+    folder = tmp_path / "a" / "b"
+    files: dict[Path, str | bytes] = {folder / "x.json": "1", folder / "y.yaml": b"2"}
+    write_together(files)
+    assert sorted(p.name for p in folder.iterdir()) == ["x.json", "y.yaml"]
+    with pytest.raises(ParameterError, match="--force"):
+        write_together({folder / "z": "3", folder / "y.yaml": "4"})
+    assert sorted(p.name for p in folder.iterdir()) == ["x.json", "y.yaml"]
+    assert (folder / "y.yaml").read_text() == "2"
+    write_together({folder / "y.yaml": "4"}, force=True)
+    assert (folder / "y.yaml").read_text() == "4"
+
+
+def test_a_failure_half_way_restores_what_was_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_together({tmp_path / "a": "old a", tmp_path / "c": "old c"})
+    rename = os.replace
+
+    def full(source: Path, target: Path) -> None:
+        if Path(target).name == "c" and Path(source).read_text() == "new c":
+            raise OSError(28, "No space left on device")
+        rename(source, target)
+
+    monkeypatch.setattr(os, "replace", full)
+    new: dict[Path, str | bytes] = {tmp_path / n: f"new {n}" for n in ("a", "b", "c")}
+    with pytest.raises(ParameterError, match="No space left"):
+        write_together(new, force=True)
+    kept = {p.name: p.read_text() for p in tmp_path.iterdir()}
+    assert kept == {"a": "old a", "c": "old c"}
+
+
+def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ParameterError, match="cannot be written"):
+        write_together({tmp_path / "file" / "sub" / "x": "1"})
