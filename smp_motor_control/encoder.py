@@ -18,13 +18,6 @@ MAX_BITS = 63
 class Encoder:
     """An incremental encoder on the motor shaft.
 
-    Attributes
-    ----------
-    counts_per_revolution : float
-        Counts (after quadrature decoding) per revolution of the motor, positive.
-    bits : int
-        Width of the hardware's counter, read as two's complement; 0 never wraps.
-
     Raises
     ------
     ParameterError
@@ -36,8 +29,9 @@ class Encoder:
     -126
     """
 
+    # Counts (after quadrature decoding) per revolution of the motor, positive
     counts_per_revolution: float = 500.0
-    bits: int = 0
+    bits: int = 0  # width of the hardware's counter, read as two's complement; 0 never wraps
 
     def __post_init__(self) -> None:
         check_range("counts_per_revolution", self.counts_per_revolution, 1e-3, 1e9)

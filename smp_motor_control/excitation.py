@@ -31,18 +31,13 @@ _GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 class Excitation(ABC):
     """Base of all signals: bounded by ``amplitude`` and zero before time zero.
 
-    Attributes
-    ----------
-    amplitude : float
-        Largest absolute value [V], positive.
-
     Raises
     ------
     ParameterError
         When a value makes no signal.
     """
 
-    amplitude: float
+    amplitude: float  # largest absolute value [V], positive
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -89,22 +84,13 @@ class Square(Excitation):
 
 @dataclass(frozen=True, kw_only=True)
 class Fourier(Excitation):
-    """A sum of incommensurate tones, its rare peaks clipped.
+    """A sum of incommensurate tones, its rare peaks clipped."""
 
-    Attributes
-    ----------
-    lowest, highest : float
-        Range of the tones [Hz], spaced evenly on a logarithmic scale.
-    tones : int
-        Their number.
-    seed : int
-        Of the phases; different seeds give signals that hardly correlate.
-    """
-
+    # lowest, highest: range of the tones [Hz], spaced evenly on a logarithmic scale
     lowest: float = 0.1
     highest: float = 20.0
-    tones: int = 24
-    seed: int = 0
+    tones: int = 24  # their number
+    seed: int = 0  # of the phases; different seeds give signals that hardly correlate
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -164,19 +150,12 @@ def _multisine(lowest: float, highest: float, tones: int, seed: int) -> tuple[Ar
 
 @dataclass(frozen=True, kw_only=True)
 class Chirp(Excitation):
-    """A sine whose frequency rises exponentially and falls again, over and over.
+    """A sine whose frequency rises exponentially and falls again, over and over."""
 
-    Attributes
-    ----------
-    lowest, highest : float
-        Range of the frequency [Hz].
-    sweep : float
-        Time from the lowest to the highest frequency [s].
-    """
-
+    # lowest, highest: range of the frequency [Hz]
     lowest: float = 0.1
     highest: float = 20.0
-    sweep: float = 20.0
+    sweep: float = 20.0  # time from the lowest to the highest frequency [s]
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -199,18 +178,10 @@ class Chirp(Excitation):
 
 @dataclass(frozen=True, kw_only=True)
 class Prbs(Excitation):
-    """Pseudo-random binary voltage.
+    """Pseudo-random binary voltage."""
 
-    Attributes
-    ----------
-    hold : float
-        Nominal shortest time between two changes of sign [s].
-    seed : int
-        Of the sequence.
-    """
-
-    hold: float = 0.05
-    seed: int = 0
+    hold: float = 0.05  # nominal shortest time between two changes of sign [s]
+    seed: int = 0  # of the sequence
 
     def _shape(self, time: Array) -> Array:
         index = (time * DETUNING / self.hold).astype(np.int64)
@@ -220,18 +191,10 @@ class Prbs(Excitation):
 
 @dataclass(frozen=True, kw_only=True)
 class Steps(Excitation):
-    """Steps to random voltages of either sign, each held.
+    """Steps to random voltages of either sign, each held."""
 
-    Attributes
-    ----------
-    hold : float
-        Nominal length of a step [s].
-    seed : int
-        Of the sequence.
-    """
-
-    hold: float = 1.0
-    seed: int = 0
+    hold: float = 1.0  # nominal length of a step [s]
+    seed: int = 0  # of the sequence
 
     def _shape(self, time: Array) -> Array:
         index = (time * DETUNING / self.hold).astype(np.int64)
@@ -249,15 +212,9 @@ def _random_levels(seed: int) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class Ramp(Excitation):
-    """A triangle through zero, slow enough to show where the motor starts and stops.
+    """A triangle through zero, slow enough to show where the motor starts and stops."""
 
-    Attributes
-    ----------
-    period : float
-        Nominal time [s] from zero over both peaks back to zero.
-    """
-
-    period: float = 20.0
+    period: float = 20.0  # nominal time [s] from zero over both peaks back to zero
 
     def _shape(self, time: Array) -> Array:
         phase = (time / (self.period * DETUNING) + 0.75) % 1.0
@@ -267,22 +224,12 @@ class Ramp(Excitation):
 
 @dataclass(frozen=True, kw_only=True)
 class Bounded(Excitation):
-    """Another signal, faded in and out and zero outside its time.
-
-    Attributes
-    ----------
-    signal : Excitation
-        What is sent.
-    duration : float
-        Length [s].
-    fade : float
-        Time over which it grows and shrinks [s].
-    """
+    """Another signal, faded in and out and zero outside its time."""
 
     amplitude: float = field(default=math.inf, init=False)
-    signal: Excitation
-    duration: float
-    fade: float = 0.0
+    signal: Excitation  # what is sent
+    duration: float  # length [s]
+    fade: float = 0.0  # time over which it grows and shrinks [s]
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.duration) and self.duration > 0):

@@ -58,26 +58,18 @@ def keys_of(text: str) -> list[str]:
 class Speeds:
     """What a held key asks for.
 
-    Attributes
-    ----------
-    linear, angular, wheel : float
-        [m/s], [rad/s] of the body, [rad/s] of a wheel.
-    step : float
-        Share by which + and - change them all.
-    timeout : float
-        Time without a repeat after which the key counts as released [s].
-
     Raises
     ------
     ParameterError
         When a speed, the step or the time-out is not positive and finite.
     """
 
+    # linear, angular, wheel: [m/s], [rad/s] of the body, [rad/s] of a wheel
     linear: float = 0.2
     angular: float = 0.6
     wheel: float = 1.5
-    step: float = 0.1
-    timeout: float = 0.6
+    step: float = 0.1  # share by which + and - change them all
+    timeout: float = 0.6  # time without a repeat after which the key counts as released [s]
 
     def __post_init__(self) -> None:
         for name in ("linear", "angular", "wheel", "step", "timeout"):

@@ -47,25 +47,18 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(6)
 class ObserverNoise:
     """How far the observer trusts the model and the counts.
 
-    Attributes
-    ----------
-    load : float
-        How much the load, as an armature voltage, wanders in one second [V/sqrt(s)].
-        Raises the bandwidth with which changes of the load are seen.
-    voltage : float
-        White noise of the voltage and of what the model leaves out [V sqrt(s)].
-    count : float
-        Standard deviation of the encoder's error [counts]; ``1/sqrt(12)`` is quantisation
-        alone.
-
     Raises
     ------
     ParameterError
         When a value is not positive, or beyond what the arithmetic can hold.
     """
 
+    # How much the load, as an armature voltage, wanders in one second [V/sqrt(s)]. Raises the
+    # bandwidth with which changes of the load are seen.
     load: float = 1.0
+    # White noise of the voltage and of what the model leaves out [V sqrt(s)]
     voltage: float = 0.005
+    # Standard deviation of the encoder's error [counts]; ``1/sqrt(12)`` is quantisation alone
     count: float = 1.0 / math.sqrt(12.0)
 
     def __post_init__(self) -> None:
@@ -74,21 +67,14 @@ class ObserverNoise:
 
 
 class SteadyGain(NamedTuple):
-    """Kalman gain in the steady state, per radian of innovation.
+    """Kalman gain in the steady state, per radian of innovation."""
 
-    Attributes
-    ----------
-    angle, speed, acceleration, load : float
-        [-], [1/s], [1/s^2], [V/rad].
-    variance : float
-        Of the innovation [rad^2].
-    """
-
+    # angle, speed, acceleration, load: [-], [1/s], [1/s^2], [V/rad]
     angle: float
     speed: float
     acceleration: float
     load: float
-    variance: float
+    variance: float  # of the innovation [rad^2]
 
 
 def prediction(model: MotorModel, intervals: Array) -> tuple[Array, Array]:

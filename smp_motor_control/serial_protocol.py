@@ -29,24 +29,12 @@ CLOCK = 1 << 32
 
 
 class BoardState(NamedTuple):
-    """What a board reported at one instant.
+    """What a board reported at one instant."""
 
-    Attributes
-    ----------
-    clock : int
-        [us], wraps.
-    battery : float
-        [V].
-    counts : tuple of int
-        Of each motor's encoder.
-    currents : tuple of float
-        [A]; NaN where not measured.
-    """
-
-    clock: int
-    battery: float
-    counts: tuple[int, ...]
-    currents: tuple[float, ...]
+    clock: int  # [us], wraps
+    battery: float  # [V]
+    counts: tuple[int, ...]  # of each motor's encoder
+    currents: tuple[float, ...]  # [A]; NaN where not measured
 
 
 def checksum(text: str) -> str:

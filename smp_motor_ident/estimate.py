@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from smp_motor_ident.diagnosis import validation as validate
 from smp_motor_ident.diagnosis.adequacy import adequacy, stated
 from smp_motor_ident.diagnosis.advice import advise, assess
+from smp_motor_ident.diagnosis.beat import on_beat
 from smp_motor_ident.diagnosis.bunched import merge_bunches
 from smp_motor_ident.diagnosis.current_kind import ARMATURE, current_kind
 from smp_motor_ident.diagnosis.limits import CANDIDATE_WEIGHT, LEAST_FIT, PROFILED
@@ -102,7 +103,7 @@ def estimate(
         rigid = estimate(group, "second_order", fixed=fixed, loss=loss, progress=progress)
         return flexible_shaft.flexible_shaft(group, rigid)
     request = checked(group, model, fixed, bounds, loss, validation, progress)
-    group = [merge_bunches(r) for r in group]
+    group = [merge_bunches(on_beat(r)) for r in group]
     kind = current_kind(group) if request.may_leave_current else ARMATURE
     if kind != ARMATURE:
         group, request = request.without_current(group)

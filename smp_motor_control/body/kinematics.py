@@ -31,14 +31,9 @@ __all__ = [
 
 
 class SideSpeeds(NamedTuple):
-    """Speeds of the wheels of both sides [rad/s].
+    """Speeds of the wheels of both sides [rad/s]."""
 
-    Attributes
-    ----------
-    left, right : float
-        Positive forward.
-    """
-
+    # left, right: positive forward
     left: float
     right: float
 

@@ -10,18 +10,10 @@ from smp_motor_control.errors import ParameterError
 
 
 class Limited(NamedTuple):
-    """A limited command.
+    """A limited command."""
 
-    Attributes
-    ----------
-    value : float
-        What may be commanded, in the unit of the command.
-    factor : float
-        Its share of what was asked; 1 where nothing was asked.
-    """
-
-    value: float
-    factor: float
+    value: float  # what may be commanded, in the unit of the command
+    factor: float  # its share of what was asked; 1 where nothing was asked
 
 
 def _clamp(value: float, lower: float, upper: float) -> float:

@@ -13,35 +13,22 @@ LONGEST_GUESS = 0.1
 
 
 class WheelSample(NamedTuple):
-    """One wheel at one instant.
+    """One wheel at one instant."""
 
-    Attributes
-    ----------
-    stamp : float
-        Instant of sampling [s].
-    position, velocity : float
-        [rad], [rad/s].
-    """
-
-    stamp: float
+    stamp: float  # instant of sampling [s]
+    # position, velocity: [rad], [rad/s]
     position: float
     velocity: float
 
 
 class SideTravel(NamedTuple):
-    """How far the wheels of both sides turned, and how fast they turn.
+    """How far the wheels of both sides turned, and how fast they turn."""
 
-    Attributes
-    ----------
-    left, right : float
-        Mean over the side's wheels since it was last asked for [rad].
-    left_speed, right_speed : float
-        Mean over the side's wheels [rad/s]; of each its travel over a window, over the time
-        between the stamps of the window's ends.
-    """
-
+    # left, right: mean over the side's wheels since it was last asked for [rad]
     left: float
     right: float
+    # left_speed, right_speed: mean over the side's wheels [rad/s]; of each its travel over a
+    # window, over the time between the stamps of the window's ends
     left_speed: float
     right_speed: float
 

@@ -52,27 +52,12 @@ _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*\Z")
 
 @dataclass(frozen=True)
 class Wiring:
-    """What may be wrong between a motor and its driver, for simulations.
+    """What may be wrong between a motor and its driver, for simulations."""
 
-    Attributes
-    ----------
-    leads, encoder : int
-        1, or -1 where the motor's leads, or the encoder's channels, are swapped.
-    dead_zone : float
-        Commands up to so much give nothing [V].
-    described_gear_ratio : float
-        What the hardware's description says of the gearbox; 0: the truth.
-
-    Raises
-    ------
-    ParameterError
-        When a sign is not 1 or -1, or a number is negative.
-    """
-
-    leads: int = 1
-    encoder: int = 1
-    dead_zone: float = 0.0
-    described_gear_ratio: float = 0.0
+    leads: int = 1  # -1 where the motor's leads are swapped
+    encoder: int = 1  # -1 where the encoder's channels are
+    dead_zone: float = 0.0  # commands up to so much give nothing [V]
+    described_gear_ratio: float = 0.0  # what the description says of the gearbox; 0: the truth
 
     def __post_init__(self) -> None:
         for name in ("leads", "encoder"):
@@ -89,34 +74,17 @@ class Wiring:
 
 @dataclass(frozen=True)
 class MotorEntry:
-    """One motor of a file, with what is around it.
+    """One motor of a file, with what is around it."""
 
-    Attributes
-    ----------
-    parameters : MotorParameters
-        At the motor shaft.
-    gearbox : Gearbox
-        Between motor and wheel.
-    encoder : Encoder
-        On the motor shaft.
-    supply_voltage : float
-        [V].
-    delay : float
-        From a commanded voltage to its effect [s].
-    resistance : float
-        As the file gives it [ohm]; NaN where it gives combinations alone, and then neither
-        currents nor torques of ``parameters`` mean anything.
-    wiring : Wiring
-        What is wrong with it, where it is simulated.
-    """
-
-    parameters: MotorParameters
-    gearbox: Gearbox
-    encoder: Encoder
-    supply_voltage: float
-    delay: float = 0.0
+    parameters: MotorParameters  # at the motor shaft
+    gearbox: Gearbox  # between motor and wheel
+    encoder: Encoder  # on the motor shaft
+    supply_voltage: float  # [V]
+    delay: float = 0.0  # from a commanded voltage to its effect [s]
+    # As the file gives it [ohm]; NaN where it gives combinations alone, and then neither currents
+    # nor torques of ``parameters`` mean anything
     resistance: float = math.nan
-    wiring: Wiring = Wiring()
+    wiring: Wiring = Wiring()  # what is wrong with it, where it is simulated
 
     @property
     def knows_current(self) -> bool:

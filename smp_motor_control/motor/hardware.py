@@ -20,52 +20,20 @@ from smp_motor_control.motor.friction import Motor
 
 
 class Sample(NamedTuple):
-    """What the hardware reports at one instant; fields as in ``MotorState``.
+    """What the hardware reports at one instant; fields as in ``MotorState``."""
 
-    Attributes
-    ----------
-    voltage : float
-        Mean armature voltage since the sample before [V].
-    current : float
-        [A]; NaN where it is not measured.
-    velocity, position : float
-        Of the wheel, from counts [rad/s], [rad].
-    encoder_count : int
-        Of the encoder at the motor shaft, as the counter shows it.
-    duty : float
-        Duty cycle in force [-1..1].
-    """
-
-    voltage: float
-    current: float
+    voltage: float  # mean armature voltage since the sample before [V]
+    current: float  # [A]; NaN where it is not measured
+    # velocity, position: of the wheel, from counts [rad/s], [rad]
     velocity: float
     position: float
-    encoder_count: int
-    duty: float
+    encoder_count: int  # of the encoder at the motor shaft, as the counter shows it
+    duty: float  # duty cycle in force [-1..1]
 
 
 @dataclass(frozen=True, kw_only=True)
 class DriveSettings:
     """What is between a command and a motor, and between a motor and its report.
-
-    Attributes
-    ----------
-    pwm_steps : int
-        Steps of the duty cycle from 0 to 1; 0 for a continuous one.
-    command_timeout : float
-        Time [s] after the last command at which the voltage goes to zero.
-    current_sensor : bool
-        Whether the current is measured at all.
-    current_noise : float
-        Standard deviation of the measured current [A].
-    torque_noise : float
-        Intensity of a random load at the motor shaft [N m sqrt(s)]: over an interval of dt its
-        mean has the standard deviation ``torque_noise / sqrt(dt)``.
-    velocity_window : int
-        Samples over which the reported speed is averaged; 0 reports the true one.
-    latch : bool
-        Whether a command waits for the next sampling instant, as in firmware whose loop has a
-        fixed rate: every reported voltage was then constant over its interval.
 
     Raises
     ------
@@ -73,12 +41,18 @@ class DriveSettings:
         When a value is negative or not finite.
     """
 
-    pwm_steps: int = 0
+    pwm_steps: int = 0  # steps of the duty cycle from 0 to 1; 0 for a continuous one
+    # Time [s] after the last command at which the voltage goes to zero
     command_timeout: float = 0.2
-    current_sensor: bool = True
-    current_noise: float = 0.0
+    current_sensor: bool = True  # whether the current is measured at all
+    current_noise: float = 0.0  # standard deviation of the measured current [A]
+    # Intensity of a random load at the motor shaft [N m sqrt(s)]: over an interval of dt its mean
+    # has the standard deviation ``torque_noise / sqrt(dt)``
     torque_noise: float = 0.0
+    # Samples over which the reported speed is averaged; 0 reports the true one
     velocity_window: int = 1
+    # Whether a command waits for the next sampling instant, as in firmware whose loop has a fixed
+    # rate: every reported voltage was then constant over its interval
     latch: bool = False
 
     def __post_init__(self) -> None:

@@ -20,30 +20,17 @@ LONGEST_DELAY = 2.0
 class MotorModel:
     """The combinations of motor parameters that fix the response from voltage to speed.
 
-    Attributes
-    ----------
-    dc_gain : float
-        [rad/s/V], positive.
-    time_constant : float
-        [s], positive.
-    time_constant_product : float
-        [s^2]; 0 for a motor of first order.
-    static_voltage : float
-        What dry friction takes [V].
-    delay : float
-        From the voltage to its effect [s].
-
     Raises
     ------
     ParameterError
         When a value is not finite, or is one that no motor has.
     """
 
-    dc_gain: float
-    time_constant: float
-    time_constant_product: float = 0.0
-    static_voltage: float = 0.0
-    delay: float = 0.0
+    dc_gain: float  # [rad/s/V], positive
+    time_constant: float  # [s], positive
+    time_constant_product: float = 0.0  # [s^2]; 0 for a motor of first order
+    static_voltage: float = 0.0  # what dry friction takes [V]
+    delay: float = 0.0  # from the voltage to its effect [s]
 
     def __post_init__(self) -> None:
         check_range("dc_gain of the model", self.dc_gain, 1e-9, 1e9, "rad/s/V")

@@ -137,11 +137,6 @@ class MotorParameters:
 class Gearbox:
     """The one place that converts between motor shaft and wheel.
 
-    Attributes
-    ----------
-    ratio : float
-        Motor revolutions per wheel revolution; positive.
-
     Raises
     ------
     ParameterError
@@ -153,7 +148,7 @@ class Gearbox:
     131.0
     """
 
-    ratio: float = 1.0
+    ratio: float = 1.0  # motor revolutions per wheel revolution; positive
 
     def __post_init__(self) -> None:
         check_range("gear ratio", self.ratio, 1e-6, 1e6)

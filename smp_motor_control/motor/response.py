@@ -37,18 +37,12 @@ NEGLIGIBLE = 1e-14
 
 
 class Coefficients(NamedTuple):
-    """Free response after a time t: ``e(t) = g e(0) + h e'(0)``, and its rate's.
+    """Free response after a time t: ``e(t) = g e(0) + h e'(0)``, and its rate's."""
 
-    Attributes
-    ----------
-    g, h : float
-        Of the response.
-    g_rate, h_rate : float
-        Of its rate.
-    """
-
+    # g, h: of the response
     g: float
     h: float
+    # g_rate, h_rate: of its rate
     g_rate: float
     h_rate: float
 
@@ -138,19 +132,12 @@ class HeldResponse(NamedTuple):
     """A batch of n motors over intervals of constant voltage u, state ``x = (w, w')``.
 
     ``x <- transition x + forced u`` and ``angle += angle_transition x + angle_forced u``.
-
-    Attributes
-    ----------
-    transition : ndarray, shape (n, 2, 2)
-    forced : ndarray, shape (n, 2)
-    angle_transition : ndarray, shape (n, 2)
-    angle_forced : ndarray, shape (n,)
     """
 
-    transition: Array
-    forced: Array
-    angle_transition: Array
-    angle_forced: Array
+    transition: Array  # shape (n, 2, 2)
+    forced: Array  # shape (n, 2)
+    angle_transition: Array  # shape (n, 2)
+    angle_forced: Array  # shape (n,)
 
 
 def zero_order_hold(

@@ -123,20 +123,11 @@ def _swing(values: list[float]) -> float:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a trial.
+    """What became of a trial."""
 
-    Attributes
-    ----------
-    reason : str
-        Why the gains were taken back; empty where they are kept.
-    after : float
-        Time until that was done in the wheels that answered [s].
-    missing : tuple of str
-        Wheels that did not return: they go on with the new gains if they do.
-    """
-
-    reason: str
-    after: float
+    reason: str  # why the gains were taken back; empty where they are kept
+    after: float  # time until that was done in the wheels that answered [s]
+    # Wheels that did not return: they go on with the new gains if they do
     missing: tuple[str, ...] = ()
 
 

@@ -23,38 +23,24 @@ MOST_BETWEEN = 0.5
 
 @dataclass(frozen=True)
 class Relay:
-    """What switches.
+    """What switches."""
 
-    Attributes
-    ----------
-    bias, amplitude : float
-        It switches between ``bias - amplitude`` and ``bias + amplitude`` [V].
-    hysteresis : float
-        The speed must pass this on either side before it switches [rad/s, wheel].
-    """
-
+    # bias, amplitude: it switches between ``bias - amplitude`` and ``bias + amplitude`` [V]
     bias: float
     amplitude: float
-    hysteresis: float
+    hysteresis: float  # the speed must pass this on either side before it switches [rad/s, wheel]
 
 
 @dataclass
 class Oscillation:
-    """What was recorded, around its rest.
+    """What was recorded, around its rest."""
 
-    Attributes
-    ----------
-    time : list of float
-        By the stamps [s].
-    voltage, applied : list of float
-        Asked for after each sample, and mean over the interval before it [V].
-    speed, angle : list of float
-        [rad/s], [rad], wheel; ``applied`` and ``angle`` are NaN where the hardware tells none.
-    """
-
-    time: list[float] = field(default_factory=list)
+    time: list[float] = field(default_factory=list)  # by the stamps [s]
+    # voltage, applied: asked for after each sample, and mean over the interval before it [V]
     voltage: list[float] = field(default_factory=list)
     applied: list[float] = field(default_factory=list)
+    # speed, angle: [rad/s], [rad], wheel; ``applied`` and ``angle`` are NaN where the hardware
+    # tells none
     speed: list[float] = field(default_factory=list)
     angle: list[float] = field(default_factory=list)
 

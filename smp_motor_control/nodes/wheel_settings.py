@@ -62,13 +62,7 @@ def _drive(name: str, description: str) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """Parameters of the node.
-
-    Attributes
-    ----------
-    wheel : WheelSettings
-        What they make of the controller.
-    """
+    """Parameters of the node."""
 
     joint_name: str = described(
         "", "Joint to control; empty for <namespace>_wheel_joint.", read_only=True
@@ -132,7 +126,7 @@ class Settings:
     cpu_affinity: tuple[int, ...] = described(
         (-1,), "Processors to run on; -1 for any.", read_only=True
     )
-    wheel: WheelSettings = field(init=False, repr=False)
+    wheel: WheelSettings = field(init=False, repr=False)  # what they make of the controller
 
     def __post_init__(self) -> None:
         limits = ProfileLimits.from_parameters(

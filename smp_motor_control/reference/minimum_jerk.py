@@ -32,31 +32,16 @@ PEAK_JERK = 10.0 / math.sqrt(3.0)
 
 
 class Reference(NamedTuple):
-    """The reference at one instant.
+    """The reference at one instant."""
 
-    Attributes
-    ----------
-    velocity : float
-        [rad/s].
-    acceleration : float
-        [rad/s^2].
-    jerk : float
-        [rad/s^3].
-    """
-
-    velocity: float
-    acceleration: float
-    jerk: float
+    velocity: float  # [rad/s]
+    acceleration: float  # [rad/s^2]
+    jerk: float  # [rad/s^3]
 
 
 @dataclass(frozen=True, kw_only=True)
 class ProfileLimits:
     """What a reference must keep to; infinite where there is no limit.
-
-    Attributes
-    ----------
-    velocity, acceleration, jerk : float
-        [rad/s], [rad/s^2], [rad/s^3], all positive.
 
     Raises
     ------
@@ -64,6 +49,7 @@ class ProfileLimits:
         When a limit is neither infinite nor a number from 1e-6 to 1e12.
     """
 
+    # velocity, acceleration, jerk: [rad/s], [rad/s^2], [rad/s^3], all positive
     velocity: float = math.inf
     acceleration: float = math.inf
     jerk: float = math.inf

@@ -30,24 +30,15 @@ _FIRST_ORDER = 1e-6
 class Drive:
     """What a motor can do with the voltage that a change of speed may use.
 
-    Attributes
-    ----------
-    top_speed : float
-        That this voltage, less what dry friction takes, would hold for ever [rad/s].
-    time_constant : float
-        Sum of the motor's time constants [s].
-    time_constant_product : float
-        Their product [s^2]; 0 for a motor of first order.
-
     Raises
     ------
     ParameterError
         When a value is not finite, or is one that no motor has.
     """
 
-    top_speed: float
-    time_constant: float
-    time_constant_product: float = 0.0
+    top_speed: float  # that this voltage, less what dry friction takes, would hold for ever [rad/s]
+    time_constant: float  # sum of the motor's time constants [s]
+    time_constant_product: float = 0.0  # their product [s^2]; 0 for a motor of first order
 
     def __post_init__(self) -> None:
         tau = check_range("time_constant of the drive", self.time_constant, 1e-7, 1e5, "s")

@@ -52,24 +52,12 @@ _LARGEST = {
 
 @dataclass(frozen=True)
 class Circumstances:
-    """What is known of the wheel that the settings are for.
+    """What is known of the wheel that the settings are for."""
 
-    Attributes
-    ----------
-    sample_time : float
-        Usual interval of feedback [s]; NaN before it is known.
-    supply : float
-        [V]; infinite where unknown.
-    gearbox : Gearbox or None
-        None where unknown.
-    encoder : Encoder or None
-        None where unknown.
-    """
-
-    sample_time: float = math.nan
-    supply: float = math.inf
-    gearbox: Gearbox | None = None
-    encoder: Encoder | None = None
+    sample_time: float = math.nan  # usual interval of feedback [s]; NaN before it is known
+    supply: float = math.inf  # [V]; infinite where unknown
+    gearbox: Gearbox | None = None  # none where unknown
+    encoder: Encoder | None = None  # none where unknown
 
 
 def check(settings: LoopSettings, wheel: Circumstances | None = None) -> None:

@@ -55,30 +55,14 @@ class Sample(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class WheelSettings:
-    """Everything that shapes a wheel's controller.
+    """Everything that shapes a wheel's controller."""
 
-    Attributes
-    ----------
-    loop : LoopSettings
-        Of the speed loop.
-    faults : FaultLimits
-        When the wheel misbehaves.
-    setpoint_timeout : float
-        Silence of set-points after which the wheel is braked [s].
-    feedback_timeout : float
-        Silence or age of feedback after which the voltage is zero [s].
-    fault_retry : float
-        Pause before the first try of a wheel at fault [s].
-    implausible_velocity : float
-        Feedback beyond it is left out [rad/s, wheel].
-    """
-
-    loop: LoopSettings = field(default_factory=LoopSettings)
-    faults: FaultLimits = field(default_factory=FaultLimits)
-    setpoint_timeout: float = 0.5
-    feedback_timeout: float = 0.2
-    fault_retry: float = 2.0
-    implausible_velocity: float = 1000.0
+    loop: LoopSettings = field(default_factory=LoopSettings)  # of the speed loop
+    faults: FaultLimits = field(default_factory=FaultLimits)  # when the wheel misbehaves
+    setpoint_timeout: float = 0.5  # silence of set-points after which the wheel is braked [s]
+    feedback_timeout: float = 0.2  # silence or age of feedback after which the voltage is zero [s]
+    fault_retry: float = 2.0  # pause before the first try of a wheel at fault [s]
+    implausible_velocity: float = 1000.0  # feedback beyond it is left out [rad/s, wheel]
 
 
 class WheelController:

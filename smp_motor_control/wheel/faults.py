@@ -55,35 +55,18 @@ class Fault(Enum):
 
 @dataclass(frozen=True, kw_only=True)
 class FaultLimits:
-    """When a motor misbehaves.
+    """When a motor misbehaves."""
 
-    Attributes
-    ----------
-    current_limit : float
-        [A]; 0 for none.
-    current_time : float
-        Time [s] above the limit before it counts.
-    stall_voltage : float
-        Least voltage [V] at which the wheel must turn.
-    stall_velocity : float
-        Least speed [rad/s, wheel] that counts as turning.
-    stall_time : float
-        Time [s] without turning before it counts; 0 switches the detection off.
-    runaway_time : float
-        Time [s] of turning the wrong way, without slowing down, before it counts; 0: off.
-    tracking_tolerance : float
-        Share of the reference by which the speed may be off for long.
-    tracking_time : float
-        Time [s] of being off by more, without coming nearer, before it counts; 0: off.
-    """
-
-    current_limit: float = 0.0
-    current_time: float = 0.1
-    stall_voltage: float = 4.0
-    stall_velocity: float = 0.02
+    current_limit: float = 0.0  # [A]; 0 for none
+    current_time: float = 0.1  # time [s] above the limit before it counts
+    stall_voltage: float = 4.0  # least voltage [V] at which the wheel must turn
+    stall_velocity: float = 0.02  # least speed [rad/s, wheel] that counts as turning
+    # Time [s] without turning before it counts; 0 switches the detection off
     stall_time: float = 0.5
+    # Time [s] of turning the wrong way, without slowing down, before it counts; 0: off
     runaway_time: float = 0.2
-    tracking_tolerance: float = 0.5
+    tracking_tolerance: float = 0.5  # share of the reference by which the speed may be off for long
+    # Time [s] of being off by more, without coming nearer, before it counts; 0: off
     tracking_time: float = 0.45
 
     def __post_init__(self) -> None:

@@ -26,46 +26,27 @@ _LEARNING = 20
 
 @dataclass(frozen=True, kw_only=True)
 class LoopSettings:
-    """Everything that shapes the loop.
+    """Everything that shapes the loop."""
 
-    Attributes
-    ----------
-    gains : PidGains
-        Volts of wheel speeds.
-    limits : ProfileLimits
-        Of the reference, at the wheel.
-    transition_time : float
-        Duration of every change of set-point [s]; 0: as fast as the limits allow.
-    speed_source : {'measured', 'difference', 'observer'}
-        What is fed back: the speed that the hardware reports, counts differenced, or the
-        observer's.
-    difference_window : int
-        Samples to difference over.
-    model : MotorModel or None
-        Of the motor, for the observer, and for the jerk in the feed-forward.
-    noise : ObserverNoise
-        What the observer expects.
-    reference_delay : float
-        How much later than the reference the measured speed can show it [s]: delay and
-        averaging of the loop.  The error is taken from the reference of that long ago, so that
-        a wheel that does what its model says is left alone; 0: from the present one.
-    reference_doubt : float
-        By which that delay may be wrong [s]: there is no error while the measurement is what
-        the reference was within so much of it.
-    drive : Drive or None
-        Motor and voltage that changes of set-point keep to, in wheel rad/s; see
-        :class:`~smp_motor_control.reference.profile.Profile`.
-    """
-
-    gains: PidGains = field(default_factory=PidGains)
-    limits: ProfileLimits = field(default_factory=ProfileLimits)
+    gains: PidGains = field(default_factory=PidGains)  # volts of wheel speeds
+    limits: ProfileLimits = field(default_factory=ProfileLimits)  # of the reference, at the wheel
+    # Duration of every change of set-point [s]; 0: as fast as the limits allow
     transition_time: float = 0.0
+    # What is fed back: the speed that the hardware reports, counts differenced, or the observer's
     speed_source: str = "measured"
-    difference_window: int = 4
+    difference_window: int = 4  # samples to difference over
+    # Of the motor, for the observer, and for the jerk in the feed-forward
     model: MotorModel | None = None
-    noise: ObserverNoise = field(default_factory=ObserverNoise)
+    noise: ObserverNoise = field(default_factory=ObserverNoise)  # what the observer expects
+    # How much later than the reference the measured speed can show it [s]: delay and averaging of
+    # the loop.  The error is taken from the reference of that long ago, so that a wheel that does
+    # what its model says is left alone; 0: from the present one.
     reference_delay: float = 0.0
+    # By which that delay may be wrong [s]: there is no error while the measurement is what the
+    # reference was within so much of it
     reference_doubt: float = 0.0
+    # Motor and voltage that changes of set-point keep to, in wheel rad/s; see
+    # :class:`~smp_motor_control.reference.profile.Profile`
     drive: Drive | None = None
 
     def __post_init__(self) -> None:

@@ -19,21 +19,11 @@ SAME_CLOCK = 50_000_000
 
 @dataclass(frozen=True)
 class ClockFit:
-    """Recorder's time against a topic's stamps: ``log = stamp + offset + drift (stamp - origin)``.
+    """Recorder's time against stamps: ``log = stamp + offset + drift (stamp - origin)``."""
 
-    Attributes
-    ----------
-    offset : float
-        [ns] at ``origin``, without the latency that the fastest messages had too.
-    drift : float
-        Seconds per second.
-    origin : int
-        Stamp [ns].
-    """
-
-    offset: float
-    drift: float
-    origin: int
+    offset: float  # [ns] at ``origin``, without the latency that the fastest messages had too
+    drift: float  # seconds per second
+    origin: int  # stamp [ns]
 
     def to_log(self, stamp: Integers) -> Integers:
         """Return stamps on the recorder's clock."""
@@ -103,18 +93,10 @@ def epochs(time: Integers) -> list[tuple[int, int]]:
 
 @dataclass(frozen=True)
 class Rhythm:
-    """How regularly samples come.
+    """How regularly samples come."""
 
-    Attributes
-    ----------
-    interval : float
-        Median interval [ns].
-    regular : bool
-        Whether four of five intervals are within a quarter of it.
-    """
-
-    interval: float
-    regular: bool
+    interval: float  # median interval [ns]
+    regular: bool  # whether four of five intervals are within a quarter of it
 
     def missing(self, time: Integers) -> Integers:
         """Return how many samples are missing before each but the first.

@@ -18,18 +18,12 @@ from smp_motor_ident.errors import BagError
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """Fields of one topic.
+    """Fields of one topic."""
 
-    Attributes
-    ----------
-    time : ndarray, shape (n,), [s]
-        Header stamps where the messages have them, else when they were recorded; since 1970.
-    fields : dict of str to ndarray, shape (n,)
-        By field path.
-    """
-
+    # shape (n,), [s]: header stamps where the messages have them, else when they were recorded;
+    # since 1970
     time: NDArray[np.float64]
-    fields: Mapping[str, NDArray[Any]]
+    fields: Mapping[str, NDArray[Any]]  # shape (n,): by field path
 
 
 def read_columns(path: Path, wanted: Mapping[str, Sequence[str]]) -> dict[str, Columns]:

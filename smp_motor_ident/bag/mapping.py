@@ -52,89 +52,44 @@ _TOPIC = re.compile(r"(?P<topic>/[\w/-]+)\.(?P<field>.+)")
 
 @dataclass(frozen=True)
 class Signal:
-    """Where one signal comes from; its value is ``(raw * scale + offset)`` in ``unit``.
+    """Where one signal comes from; its value is ``(raw * scale + offset)`` in ``unit``."""
 
-    Attributes
-    ----------
-    topic : str
-        Empty for a column of a file; ``/STEM`` where several files are one recording.
-    field : str
-        Path of the field, or name of the column.
-    scale, offset : float
-        Applied in this order, before the unit.
-    unit : str
-        One that `smp_motor_ident.bag.units` knows; empty where the file may say it.
-    shaft : {'', 'wheel', 'motor'}
-        Where velocity and position are measured; empty for the motor's choice.
-    """
-
-    topic: str
-    field: str
+    topic: str  # empty for a column of a file; ``/STEM`` where several files are one recording
+    field: str  # path of the field, or name of the column
+    # scale, offset: applied in this order, before the unit
     scale: float = 1.0
     offset: float = 0.0
-    unit: str = ""
-    shaft: str = ""
+    unit: str = ""  # one that `smp_motor_ident.bag.units` knows; empty where the file may say it
+    shaft: str = ""  # where velocity and position are measured; empty for the motor's choice
 
 
 @dataclass(frozen=True)
 class MotorMap:
-    """Signals of one motor and what is known of its hardware.
+    """Signals of one motor and what is known of its hardware."""
 
-    Attributes
-    ----------
-    signals : mapping of str to Signal
-        By the names in `SIGNALS`.
-    hardware : mapping of str to float
-        Any of `HARDWARE`; what is given here goes before the bag's own description.
-    held : {'', 'after', 'before'}
-        Whether a voltage holds from its instant on, or held up to it.
-    clock : {'auto', 'header', 'log'}
-        Which time the samples have.
-    shaft : {'wheel', 'motor'}
-        Where velocity and position are measured, unless a signal says so itself.
-    gap : float
-        [s]; a longer interval without samples begins a new segment; 0: chosen by the data.
-    sample_time : float
-        [s]; of a file that has no time; 0 where it has.
-    velocity_window : float
-        [s]; over which the velocity is known to be averaged.
-    wheel_radius : float
-        [m]; for velocities and positions of the rim.
-    pwm_full_scale : float
-        What a voltage in ``pwm`` is at 100 %; it is never guessed.
-    own : bool
-        Whether these are our own messages, of which nothing has to be guessed.
-    """
-
-    signals: Mapping[str, Signal] = field(default_factory=dict)
+    signals: Mapping[str, Signal] = field(default_factory=dict)  # by the names in `SIGNALS`
+    # Any of `HARDWARE`; what is given here goes before the bag's own description
     hardware: Mapping[str, float] = field(default_factory=dict)
-    held: str = ""
-    clock: str = "auto"
-    shaft: str = "wheel"
+    held: str = ""  # whether a voltage holds from its instant on, or held up to it
+    clock: str = "auto"  # which time the samples have
+    shaft: str = "wheel"  # where velocity and position are measured, unless a signal says so itself
+    # [s]; a longer interval without samples begins a new segment; 0: chosen by the data
     gap: float = 0.0
-    sample_time: float = 0.0
-    velocity_window: float = 0.0
-    wheel_radius: float = 0.0
-    pwm_full_scale: float = 0.0
-    own: bool = False
+    sample_time: float = 0.0  # [s]; of a file that has no time; 0 where it has
+    velocity_window: float = 0.0  # [s]; over which the velocity is known to be averaged
+    wheel_radius: float = 0.0  # [m]; for velocities and positions of the rim
+    pwm_full_scale: float = 0.0  # what a voltage in ``pwm`` is at 100 %; it is never guessed
+    own: bool = False  # whether these are our own messages, of which nothing has to be guessed
 
 
 @dataclass(frozen=True)
 class SignalMap:
-    """A whole mapping.
+    """A whole mapping."""
 
-    Attributes
-    ----------
-    motors : mapping of str to MotorMap
-        By the name of the wheel.
-    defaults : MotorMap
-        What holds for all motors, also those that the bag describes itself.
-    msg_files : tuple of str
-        ``.msg`` files or folders of them for types that the bag does not define.
-    """
-
-    motors: Mapping[str, MotorMap] = field(default_factory=dict)
+    motors: Mapping[str, MotorMap] = field(default_factory=dict)  # by the name of the wheel
+    # What holds for all motors, also those that the bag describes itself
     defaults: MotorMap = field(default_factory=MotorMap)
+    # ``.msg`` files or folders of them for types that the bag does not define
     msg_files: tuple[str, ...] = ()
 
     @property

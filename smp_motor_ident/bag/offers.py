@@ -28,62 +28,31 @@ _LISTED = 12
 
 @dataclass
 class Offer:
-    """One topic, or the columns of a table.
+    """One topic, or the columns of a table."""
 
-    Attributes
-    ----------
-    topic, type : str
-        Empty for the only table of a file.
-    count : int
-        Messages that can be read; rows of a table are not counted (0).
-    rate : float
-        [Hz], mean over the recording; 0 for less than two messages.
-    fields : list of str
-        Paths of its numbers, as a mapping takes them.
-    remark : str
-        Why its fields are unknown.
-    table : bool
-        Whether it is of a file of columns.
-    units : mapping of str to str
-        What the file says of its columns' units.
-    """
-
+    # topic, type: empty for the only table of a file
     topic: str
     type: str
-    count: int = 0
-    rate: float = 0.0
-    fields: list[str] = field(default_factory=list)
-    remark: str = ""
-    table: bool = False
+    count: int = 0  # messages that can be read; rows of a table are not counted (0)
+    rate: float = 0.0  # [Hz], mean over the recording; 0 for less than two messages
+    fields: list[str] = field(default_factory=list)  # paths of its numbers, as a mapping takes them
+    remark: str = ""  # why its fields are unknown
+    table: bool = False  # whether it is of a file of columns
+    # What the file says of its columns' units
     units: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass
 class Listing:
-    """What a recording offers.
+    """What a recording offers."""
 
-    Attributes
-    ----------
-    name : str
-        Of the recording.
-    offers : list of Offer
-        By topic.
-    suggestion : list of str
-        Items for ``--map``, tried on the recording; empty where nothing fits or is needed.
-    asked : list of str
-        What the user must add to them, such as the full scale of a PWM.
-    needs_mapping : bool
-        False where the recording holds our own messages.
-    findings : list of Finding
-        What is missing or damaged.
-    """
-
-    name: str
-    offers: list[Offer]
+    name: str  # of the recording
+    offers: list[Offer]  # by topic
+    # Items for ``--map``, tried on the recording; empty where nothing fits or is needed
     suggestion: list[str]
-    asked: list[str]
-    needs_mapping: bool
-    findings: list[Finding]
+    asked: list[str]  # what the user must add to them, such as the full scale of a PWM
+    needs_mapping: bool  # false where the recording holds our own messages
+    findings: list[Finding]  # what is missing or damaged
 
 
 def offers_of(recording: Recording, types: Types, progress: Progress | None) -> list[Offer]:

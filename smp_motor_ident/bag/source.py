@@ -38,29 +38,15 @@ _DAMAGE = (ValueError, AttributeError, OSError, RecursionError, MemoryError)
 
 @dataclass
 class Recording:
-    """One experiment: a bag with its files in order, or tables.
+    """One experiment: a bag with its files in order, or tables."""
 
-    Attributes
-    ----------
-    name : str
-        What to call it in messages and results.
-    files : list of Path
-        In the order in which they were written.
-    promised : dict of str to int, or None
-        Messages by topic as metadata.yaml counts them.
-    distribution : str
-        ROS distribution that wrote it, where known.
-    findings : list of Finding
-        What was found amiss, grows while the files are read.
-    one_of_many : bool
-        Whether it was found in a folder with others, so that nobody asked for it by name.
-    """
-
-    name: str
-    files: list[Path]
-    promised: dict[str, int] | None = None
-    distribution: str = ""
+    name: str  # what to call it in messages and results
+    files: list[Path]  # in the order in which they were written
+    promised: dict[str, int] | None = None  # messages by topic as metadata.yaml counts them
+    distribution: str = ""  # ROS distribution that wrote it, where known
+    # What was found amiss, grows while the files are read
     findings: list[Finding] = field(default_factory=list)
+    # Whether it was found in a folder with others, so that nobody asked for it by name
     one_of_many: bool = False
     _sources: dict[Path, Messages | Tables | None] = field(default_factory=dict, repr=False)
     _folder: tempfile.TemporaryDirectory[str] | None = field(default=None, repr=False)

@@ -88,36 +88,20 @@ class Batch:
 
 @dataclass(eq=False)
 class Table:
-    """Samples of one topic, or rows of a file, in the order of the file.
+    """Samples of one topic, or rows of a file, in the order of the file."""
 
-    Attributes
-    ----------
-    log : ndarray of int64, shape (n,), [ns], or None
-        When the recorder got them; None where the file has no time but in its columns.
-        Where ``clocked``, the file's own column of time.
-    stamp : ndarray of int64, shape (n,), [ns], or None
-        What their header says.
-    columns : dict of str to ndarray, shape (n,)
-        By field path, in the type of the message.
-    present : dict of str to ndarray of bool
-        For columns that some messages lacked.
-    number : ndarray of int64, shape (n,), or None
-        The publisher's own count, where the recorder kept it for every message.
-    findings : list of Finding
-        What was found amiss.
-    clocked : bool
-        Whether ``log`` is the file's own time of each sample.
-    exact : set of str
-        Columns of whole nanoseconds, whatever unit is mapped: they were written as dates.
-    """
-
+    # shape (n,), [ns]: when the recorder got them; None where the file has no time but in its
+    # columns. Where ``clocked``, the file's own column of time.
     log: Integers | None
-    stamp: Integers | None
-    columns: dict[str, NDArray[Any]]
+    stamp: Integers | None  # shape (n,), [ns]: what their header says
+    columns: dict[str, NDArray[Any]]  # shape (n,): by field path, in the type of the message
+    # For columns that some messages lacked
     present: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
+    # shape (n,): the publisher's own count, where the recorder kept it for every message
     number: Integers | None = None
-    findings: list[Finding] = field(default_factory=list)
-    clocked: bool = False
+    findings: list[Finding] = field(default_factory=list)  # what was found amiss
+    clocked: bool = False  # whether ``log`` is the file's own time of each sample
+    # Columns of whole nanoseconds, whatever unit is mapped: they were written as dates
     exact: frozenset[str] = frozenset()
 
 

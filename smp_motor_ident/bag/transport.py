@@ -37,24 +37,12 @@ EXPLAINED = 0.3
 
 @dataclass(frozen=True)
 class TransportDelay:
-    """From the stamp of a sample to the arrival of the command that answers it.
+    """From the stamp of a sample to the arrival of the command that answers it."""
 
-    Attributes
-    ----------
-    usual : float
-        Median [s].
-    longest : float
-        That 95 % of the commands keep [s].
-    latched : bool
-        Whether the driver keeps a command until its next sample.
-    answers : int
-        Commands that this was measured from.
-    """
-
-    usual: float
-    longest: float
-    latched: bool
-    answers: int
+    usual: float  # median [s]
+    longest: float  # that 95 % of the commands keep [s]
+    latched: bool  # whether the driver keeps a command until its next sample
+    answers: int  # commands that this was measured from
 
     def until_applied(self, sample_time: float) -> tuple[float, float]:
         """Return usual and longest delay until the voltage is applied."""

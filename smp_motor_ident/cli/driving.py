@@ -27,26 +27,16 @@ LEAST_CHANGE = 0.8
 
 @dataclass(frozen=True)
 class Answer:
-    """One wheel's answer to one change of ``cmd_vel``.
+    """One wheel's answer to one change of ``cmd_vel``."""
 
-    Attributes
-    ----------
-    segment : str
-        Name of the manoeuvre that began.
-    before, after : float
-        Speed before, and set-point [rad/s, wheel].
-    rise, settling : float
-        10 to 90 %, and until within 2 % of the change [s]; NaN where it did not.
-    overshoot : float
-        Beyond the set-point [% of the change].
-    """
-
-    segment: str
+    segment: str  # name of the manoeuvre that began
+    # before, after: speed before, and set-point [rad/s, wheel]
     before: float
     after: float
+    # rise, settling: 10 to 90 %, and until within 2 % of the change [s]; NaN where it did not
     rise: float
     settling: float
-    overshoot: float
+    overshoot: float  # beyond the set-point [% of the change]
 
 
 def read_answers(

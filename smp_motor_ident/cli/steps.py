@@ -17,21 +17,11 @@ from smp_motor_ident.result import Estimate
 
 @dataclass(frozen=True)
 class Excitation:
-    """One signal that all wheels are excited with.
+    """One signal that all wheels are excited with."""
 
-    Attributes
-    ----------
-    signal : str
-        As the node ``excite`` names it.
-    duration : float
-        [s].
-    amplitude : float
-        [V].
-    """
-
-    signal: str
-    duration: float
-    amplitude: float
+    signal: str  # as the node ``excite`` names it
+    duration: float  # [s]
+    amplitude: float  # [V]
 
 
 @dataclass(frozen=True)

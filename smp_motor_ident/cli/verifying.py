@@ -15,11 +15,11 @@ from smp_motor_control.encoder import unwrap
 from smp_motor_control.motor.friction import Gearbox
 from smp_motor_ident.bag.columns import Columns, read_columns
 from smp_motor_ident.cli import steps
-from smp_motor_ident.tune.limits import SILENCE
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune import verification
+from smp_motor_ident.tune.limits import SILENCE
 from smp_motor_ident.tune.verification import STEADY, Change
 
 LEAST = 1.0

@@ -50,27 +50,13 @@ ROUNDS = 3  # effects that are named at most
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """One effect held against the model's error.
+    """One effect held against the model's error."""
 
-    Attributes
-    ----------
-    effect : Effect
-        What was tried.
-    p_value : float
-        Of no such effect.
-    gain : float
-        Deviance that the effect explains.
-    shift : ndarray, shape (f,)
-        What it did to the free coordinates.
-    columns : tuple of int
-        Of the regressors.
-    """
-
-    effect: Effect
-    p_value: float
-    gain: float
-    shift: Array
-    columns: tuple[int, ...]
+    effect: Effect  # what was tried
+    p_value: float  # of no such effect
+    gain: float  # deviance that the effect explains
+    shift: Array  # shape (f,): what it did to the free coordinates
+    columns: tuple[int, ...]  # of the regressors
 
 
 def adequacy(

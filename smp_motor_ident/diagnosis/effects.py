@@ -22,40 +22,22 @@ Place = Literal["voltage", "output", "current"]
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """The model's free run, at the sections of the input or at the samples.
+    """The model's free run, at the sections of the input or at the samples."""
 
-    Attributes
-    ----------
-    share : ndarray
-        Position in the record, -1 to 1.
-    step : ndarray
-        Length of the section or sampling interval [s].
-    voltage, speed, angle, output : ndarray
-        [V], [rad/s], [rad], what is measured.
-    drop : ndarray
-        ``v - K w`` [V]: the winding's current by its resistance.
-    current : ndarray
-        [A], empty where none is measured.
-    top, fastest : float
-        Largest voltage and speed.
-    gear : float
-        Motor revolutions a wheel revolution.
-    kind : int
-        Of the output.
-    """
-
-    share: Array
-    step: Array
+    share: Array  # position in the record, -1 to 1
+    step: Array  # length of the section or sampling interval [s]
+    # voltage, speed, angle, output: [V], [rad/s], [rad], what is measured
     voltage: Array
     speed: Array
     angle: Array
     output: Array
-    drop: Array
-    current: Array
+    drop: Array  # ``v - K w`` [V]: the winding's current by its resistance
+    current: Array  # [A], empty where none is measured
+    # top, fastest: largest voltage and speed
     top: float
     fastest: float
-    gear: float
-    kind: int
+    gear: float  # motor revolutions a wheel revolution
+    kind: int  # of the output
 
 
 @dataclass(frozen=True)

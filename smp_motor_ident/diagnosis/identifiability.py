@@ -36,20 +36,11 @@ TRIAL = 10.0
 
 @dataclass(frozen=True, eq=False)
 class Rank:
-    """Structural identifiability of a set of parameters.
+    """Structural identifiability of a set of parameters."""
 
-    Attributes
-    ----------
-    singular_values : ndarray
-        Of the sensitivities by the logarithms of the parameters, largest 1.
-    rank : int
-        Of them above ``tolerance``.
-    blind : tuple of dict
-        Directions in which the response does not change: parameter to exponent.
-    """
-
-    singular_values: Array
-    rank: int
+    singular_values: Array  # of the sensitivities by the logarithms of the parameters, largest 1
+    rank: int  # of them above ``tolerance``
+    # Directions in which the response does not change: parameter to exponent
     blind: tuple[Mapping[str, float], ...]
 
 
@@ -100,30 +91,15 @@ def _response(p: Mapping[str, float], frequency: Array, current: bool) -> Array:
 
 @dataclass(frozen=True)
 class Proposal:
-    """An excitation that would bring a quantity to a wanted accuracy.
+    """An excitation that would bring a quantity to a wanted accuracy."""
 
-    Attributes
-    ----------
-    amplitude : float
-        [V].
-    band : tuple of float
-        Lowest and highest frequency [Hz] of a Fourier voltage with incommensurate tones.
-    duration : float
-        [s].
-    relative_std : mapping of str to float
-        What it would leave uncertain, as a fraction of the value.
-    measure_current : bool
-        Whether the current must be recorded for it.
-    words : str
-        The advice in one sentence.
-    """
-
-    amplitude: float
+    amplitude: float  # [V]
+    # Lowest and highest frequency [Hz] of a Fourier voltage with incommensurate tones
     band: tuple[float, float]
-    duration: float
-    relative_std: Mapping[str, float]
-    measure_current: bool
-    words: str
+    duration: float  # [s]
+    relative_std: Mapping[str, float]  # what it would leave uncertain, as a fraction of the value
+    measure_current: bool  # whether the current must be recorded for it
+    words: str  # the advice in one sentence
 
 
 def what_next(

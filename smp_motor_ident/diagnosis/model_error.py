@@ -32,30 +32,15 @@ SEGMENTS = 20  # beyond which only the angle's offset of each is projected out
 
 @dataclass(frozen=True, eq=False)
 class Regression:
-    """Residuals and regressors of one fit, the model's own coordinates projected out.
+    """Residuals and regressors of one fit, the model's own coordinates projected out."""
 
-    Attributes
-    ----------
-    residual : ndarray, shape (n,)
-        Of unit variance; the current's after the output's.
-    regressors : ndarray, shape (n, r)
-        Responses to effects, the model's own coordinates projected out.
-    whole : ndarray, shape (n, r)
-        The same as they are.
-    shifts : ndarray, shape (f, r)
-        Change of the free coordinates for a unit of each.
-    block : ndarray of int, shape (n,)
-        Which stretch of time a row belongs to.
-    members : sequence of (Effect, columns)
-        Which columns are whose.
-    """
-
-    residual: Array
+    residual: Array  # shape (n,): of unit variance; the current's after the output's
+    # shape (n, r): responses to effects, the model's own coordinates projected out
     regressors: Array
-    whole: Array
-    shifts: Array
-    block: NDArray[np.int64]
-    members: Sequence[tuple[Effect, tuple[int, ...]]]
+    whole: Array  # shape (n, r): the same as they are
+    shifts: Array  # shape (f, r): change of the free coordinates for a unit of each
+    block: NDArray[np.int64]  # shape (n,): which stretch of time a row belongs to
+    members: Sequence[tuple[Effect, tuple[int, ...]]]  # which columns are whose
 
 
 def regression(data: Experiments, fit: Fit, gear: float) -> Regression | None:

@@ -27,28 +27,15 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class RecordScatter:
-    """One quantity over several records of one motor.
+    """One quantity over several records of one motor."""
 
-    Attributes
-    ----------
-    name : str
-        Quantity.
-    mean, std : float
-        Over the records, with the scatter between them as part of its uncertainty.
-    between : float
-        Standard deviation of the quantity from record to record.
-    p_value : float
-        Of so much scatter from the records' own uncertainties alone.
-    farthest : int
-        Index of the record that lies farthest from the others, in its own deviations.
-    """
-
-    name: str
+    name: str  # quantity
+    # mean, std: over the records, with the scatter between them as part of its uncertainty
     mean: float
     std: float
-    between: float
-    p_value: float
-    farthest: int
+    between: float  # standard deviation of the quantity from record to record
+    p_value: float  # of so much scatter from the records' own uncertainties alone
+    farthest: int  # index of the record that lies farthest from the others, in its own deviations
 
 
 def between_records(estimates: Sequence[Estimate]) -> list[RecordScatter]:

@@ -118,27 +118,13 @@ def split(records: Sequence[Record], share: float = 0.7) -> tuple[list[Record], 
 
 @dataclass(frozen=True)
 class Comparison:
-    """One quantity across wheels.
+    """One quantity across wheels."""
 
-    Attributes
-    ----------
-    name : str
-        Quantity.
-    mean : float
-        Over the wheels.
-    spread : float
-        Largest minus smallest over the mean.
-    outlier : str or None
-        Wheel that stands out most from the others.
-    sigmas : float
-        By how many standard deviations of the difference.
-    """
-
-    name: str
-    mean: float
-    spread: float
-    outlier: str | None
-    sigmas: float
+    name: str  # quantity
+    mean: float  # over the wheels
+    spread: float  # largest minus smallest over the mean
+    outlier: str | None  # wheel that stands out most from the others
+    sigmas: float  # by how many standard deviations of the difference
 
 
 def compare(estimates: Mapping[str, Estimate]) -> list[Comparison]:

@@ -22,6 +22,10 @@ PLAUSIBLE = np.array([1e-2, 1e-2, 1e-2, 0.25, 1e-4, 1e-4, 1e-4, 1e-2, 1e-4, 1e-2
 """Inverse squares of how far each coordinate z could be from any value at all."""
 
 
+ROUNDING = 1e-13
+"""Share of the information in which sums over thousands of samples are exact."""
+
+
 @dataclass(frozen=True)
 class Prior:
     """A statement of the user, ``row z = value`` within ``std``, linear around the estimate."""
@@ -33,60 +37,33 @@ class Prior:
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """A coordinate followed to both ends of its 95 % interval, all others fitted again.
+    """A coordinate followed to both ends of its 95 % interval, all others fitted again."""
 
-    Attributes
-    ----------
-    coordinate : int
-        Index into z.
-    ends : tuple of ndarray, shape (11,) each
-        Coordinates of the whole motor at the lower and the upper end.
-    """
-
-    coordinate: int
+    coordinate: int  # index into z
+    # shape (11,) each: coordinates of the whole motor at the lower and the upper end
     ends: tuple[Array, Array]
 
 
 @dataclass(frozen=True)
 class Options:
-    """What the user asked of a fit.
+    """What the user asked of a fit."""
 
-    Attributes
-    ----------
-    huber : float
-        Bound of the robust loss [standard deviations]; infinite for least squares.
-    priors : tuple of Prior
-        Physical parameters that are known.
-    lower, upper : ndarray, shape (11,), optional
-        Bounds of z.
-    """
-
+    # Bound of the robust loss [standard deviations]; infinite for least squares
     huber: float = np.inf
-    priors: tuple[Prior, ...] = ()
+    priors: tuple[Prior, ...] = ()  # physical parameters that are known
+    # lower, upper: shape (11,): bounds of z
     lower: Array | None = None
     upper: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """Where a descent begins: a motor, how it moved at first, and the noise that is believed.
+    """Where a descent begins: a motor, how it moved at first, and the noise that is believed."""
 
-    Attributes
-    ----------
-    z : ndarray, shape (11,)
-        Coordinates.
-    initial : ndarray, shape (g, 4)
-        q, w, angle, load of each segment.
-    noise : ndarray, shape (2, 2)
-        Covariance of the innovations of (output, current).
-    noise_ratio : float
-        Intensity of the torque noise over the output's noise variance.
-    """
-
-    z: Array
-    initial: Array
-    noise: Array
-    noise_ratio: float = 0.0
+    z: Array  # shape (11,): coordinates
+    initial: Array  # shape (g, 4): q, w, angle, load of each segment
+    noise: Array  # shape (2, 2): covariance of the innovations of (output, current)
+    noise_ratio: float = 0.0  # intensity of the torque noise over the output's noise variance
 
     def at(self, z: Array, initial: Array | None = None, noise_ratio: float | None = None) -> Start:
         """Return the same start at other coordinates."""
@@ -100,48 +77,25 @@ class Start:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Fit(Start):
-    """A structure fitted to experiments, which other descents may start from.
+    """A structure fitted to experiments, which other descents may start from."""
 
-    Attributes
-    ----------
-    structure : Structure
-        What was free.
-    gain : ndarray, shape (3, 2)
-        Innovation gain.
-    objective : float
-        Weighted sum of squares.
-    deviance : float
-        -2 log likelihood, up to a constant of the data.
-    information : ndarray, shape (f, f)
-        Normal matrix of the free coordinates, initial states eliminated.
-    scores : ndarray, shape (blocks, f)
-        Scores summed over runs of samples.
-    passes : int
-        Runs over the data that it took.
-    converged : bool
-        Whether the last step was small.
-    samples, kind : int
-        Of the data.
-    widen : ndarray, shape (f,), optional
-        Factors on the standard deviations, see `quantisation.widened`.
-    added : ndarray, shape (f, f), optional
-        Covariance of what the likelihood does not see: `consider`, `segments`.
-    profiles : tuple of Profile
-        Coordinates whose interval was followed, not extrapolated, see `profile`.
-    """
-
-    structure: Structure
-    gain: Array
-    objective: float
-    deviance: float
+    structure: Structure  # what was free
+    gain: Array  # shape (3, 2): innovation gain
+    objective: float  # weighted sum of squares
+    deviance: float  # -2 log likelihood, up to a constant of the data
+    # shape (f, f): normal matrix of the free coordinates, initial states eliminated
     information: Array
-    scores: Array
-    passes: int
-    converged: bool
+    scores: Array  # shape (blocks, f): scores summed over runs of samples
+    passes: int  # runs over the data that it took
+    converged: bool  # whether the last step was small
+    # samples, kind: of the data
     samples: int
     kind: int
+    # shape (f,): factors on the standard deviations, see `quantisation.widened`
     widen: Array | None = None
+    # shape (f, f): covariance of what the likelihood does not see: `consider`, `segments`
     added: Array | None = None
+    # Coordinates whose interval was followed, not extrapolated, see `profile`
     profiles: tuple[Profile, ...] = ()
 
     def noise_model(self) -> NoiseModel:
@@ -195,5 +149,8 @@ class Fit(Start):
         scale = np.sqrt(np.diag(information))
         values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
         vectors = vectors / scale[:, None]
-        cov: Array = (vectors / np.maximum(values, 1e-15)) @ vectors.T
+        # What rounding leaves of a direction's information is no information.
+        plausible = np.diag(PLAUSIBLE[list(self.structure.free())])
+        alone = np.einsum("ij,ik,kj->j", vectors, plausible, vectors)
+        cov: Array = (vectors / np.where(values > ROUNDING, values, alone)) @ vectors.T
         return cov

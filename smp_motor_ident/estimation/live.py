@@ -107,29 +107,16 @@ class Window:
 
 @dataclass(frozen=True)
 class Demands:
-    """What a window must have seen before an estimate is made of it.
+    """What a window must have seen before an estimate is made of it."""
 
-    Attributes
-    ----------
-    duration : float
-        Seconds of data.
-    moving : float
-        Seconds in which the motor turned.
-    bins, filled : int
-        The range of voltages that occurred is cut into `bins`; `filled` of them must hold
-        at least 2 % of the samples each.
-    changes : int
-        How often the voltage must have crossed its mean.
-    both_directions : bool
-        Whether the motor must have turned forward and backward.
-    """
-
-    duration: float = 5.0
-    moving: float = 3.0
+    duration: float = 5.0  # seconds of data
+    moving: float = 3.0  # seconds in which the motor turned
+    # bins, filled: the range of voltages that occurred is cut into `bins`; `filled` of them must
+    # hold at least 2 % of the samples each
     bins: int = 8
     filled: int = 3
-    changes: int = 6
-    both_directions: bool = True
+    changes: int = 6  # how often the voltage must have crossed its mean
+    both_directions: bool = True  # whether the motor must have turned forward and backward
 
 
 def missing(record: Record | None, demands: Demands) -> list[str]:

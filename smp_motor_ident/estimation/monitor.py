@@ -61,25 +61,17 @@ COPPER = 0.00393
 
 @dataclass(frozen=True)
 class Commissioned:
-    """A motor as it was when it was commissioned, at the motor shaft, SI.
+    """A motor as it was when it was commissioned, at the motor shaft, SI."""
 
-    Attributes
-    ----------
-    resistance, inductance, motor_constant, inertia : float
-        [ohm, H, N m/A, kg m^2].
-    viscous_friction, coulomb_friction : float
-        [N m s/rad, N m].
-    supply_voltage : float
-        [V], the scale of what a contradiction is.
-    """
-
+    # resistance, inductance, motor_constant, inertia: [ohm, H, N m/A, kg m^2]
     resistance: float
     inductance: float
     motor_constant: float
     inertia: float
+    # viscous_friction, coulomb_friction: [N m s/rad, N m]
     viscous_friction: float
     coulomb_friction: float
-    supply_voltage: float = 12.0
+    supply_voltage: float = 12.0  # [V], the scale of what a contradiction is
 
     def __post_init__(self) -> None:
         """Refuse what is no motor."""

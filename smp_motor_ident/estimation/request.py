@@ -19,33 +19,16 @@ FIXABLE = (*PHYSICAL, "delay", "averaging_window")
 
 @dataclass(frozen=True)
 class Request:
-    """The arguments of `estimate`, checked.
+    """The arguments of `estimate`, checked."""
 
-    Attributes
-    ----------
-    model : str
-        ``auto`` or a candidate structure.
-    known : mapping of str to float
-        What the user holds fixed, the ohmmeter's resistance among it where nothing measures it.
-    bounds : mapping of str to (float, float)
-        Limits of physical parameters.
-    loss : str
-        One of `LOSSES`.
-    validation : sequence of Record, optional
-        Held-out records.
-    say : callable
-        Receives in words what is being done.
-    use_current : bool
-        Whether the current is an output of the model.
-    """
-
-    model: str
+    model: str  # ``auto`` or a candidate structure
+    # What the user holds fixed, the ohmmeter's resistance among it where nothing measures it
     known: Mapping[str, float]
-    bounds: Mapping[str, tuple[float, float]]
-    loss: str
-    validation: Sequence[Record] | None
-    say: Callable[[str], None]
-    use_current: bool
+    bounds: Mapping[str, tuple[float, float]]  # limits of physical parameters
+    loss: str  # one of `LOSSES`
+    validation: Sequence[Record] | None  # Held-out records
+    say: Callable[[str], None]  # receives in words what is being done
+    use_current: bool  # whether the current is an output of the model
 
     @property
     def options(self) -> Options:

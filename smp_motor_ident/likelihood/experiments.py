@@ -25,37 +25,21 @@ FEW = 2_000
 
 @dataclass(frozen=True, eq=False)
 class Experiments:
-    """Arrays as `recursion.run` takes them.
+    """Arrays as `recursion.run` takes them."""
 
-    Attributes
-    ----------
-    time, output, current : ndarray
-        As in `recursion.run`; ``current`` of shape (0,) where there is none.
-    starts : ndarray of int, shape (g + 1,)
-        Segment boundaries.
-    hold_end, hold_value, hold_start : ndarray
-        The input.
-    kind : int
-        SPEED, ANGLE or MEAN_SPEED.
-    step : float
-        Median sampling interval [s].
-    quantum : float
-        Resolution of the output [rad or rad/s]; 0 where it has none.
-    initial : ndarray, shape (g, 4)
-        First guess of q (0), speed, angle and load of each segment.
-    """
-
+    # time, output, current: as in `recursion.run`; ``current`` of shape (0,) where there is none
     time: Array
     output: Array
     current: Array
-    starts: Integers
+    starts: Integers  # shape (g + 1,): segment boundaries
+    # hold_end, hold_value, hold_start: the input
     hold_end: Array
     hold_value: Array
     hold_start: Integers
-    kind: int
-    step: float
-    quantum: float
-    initial: Array
+    kind: int  # SPEED, ANGLE or MEAN_SPEED
+    step: float  # median sampling interval [s]
+    quantum: float  # resolution of the output [rad or rad/s]; 0 where it has none
+    initial: Array  # shape (g, 4): first guess of q (0), speed, angle and load of each segment
 
     @property
     def plain(self) -> bool:

@@ -26,20 +26,13 @@ NO_GAIN = np.zeros((3, 2))
 
 @dataclass(frozen=True, eq=False)
 class NoiseModel:
-    """How residuals come about and weigh.
+    """How residuals come about and weigh."""
 
-    Attributes
-    ----------
-    covariance : ndarray, shape (2, 2)
-        Of the innovations of (output, current).
-    gain : ndarray, shape (3, 2)
-        Innovation gain; zero for output error.
-    huber : float
-        Bound of the robust loss [standard deviations]; infinite for least squares.
-    """
-
+    # shape (2, 2): of the innovations of (output, current)
     covariance: Array = field(default_factory=lambda: np.eye(2))
+    # shape (3, 2): innovation gain; zero for output error
     gain: Array = field(default_factory=lambda: NO_GAIN)
+    # Bound of the robust loss [standard deviations]; infinite for least squares
     huber: float = math.inf
 
 

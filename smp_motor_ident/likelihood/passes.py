@@ -27,54 +27,35 @@ BLOCKS = 60  # runs of samples whose scores are summed, for the covariance of co
 
 @dataclass(frozen=True, eq=False)
 class Sums:
-    """What the loop over the samples gathered.
+    """What the loop over the samples gathered."""
 
-    Attributes
-    ----------
-    normal, gradient, cost : ndarray, shapes (g, p, p), (g, p), (g,)
-        Of each segment; the common columns before its own.
-    spread : ndarray, shape (6,)
-        Sums of squares and product of the raw residuals, and their numbers.
-    scores, owner : ndarray, shapes (blocks, p) and (blocks,)
-        Scores summed over runs of samples, and the segments of these.
-    """
-
+    # normal, gradient, cost: shapes (g, p, p), (g, p), (g,): of each segment; the common columns
+    # before its own
     normal: Array
     gradient: Array
     cost: Array
-    spread: Array
+    spread: Array  # shape (6,): sums of squares and product of the raw residuals, and their numbers
+    # scores, owner: shapes (blocks, p) and (blocks,): scores summed over runs of samples, and the
+    # segments of these
     scores: Array
     owner: NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
 class Pass:
-    """What one run over the data gave, the initial states eliminated.
+    """What one run over the data gave, the initial states eliminated."""
 
-    Attributes
-    ----------
-    objective : float
-        Weighted sum of squares.
-    normal, gradient : ndarray, shapes (f, f) and (f,)
-        Of the common columns.
-    local_step, local_gain : ndarray, shapes (g, l) and (g, l, f)
-        Step of the own columns, and by how much it is less per common step.
-    local_decrease : float
-        By how much the own steps alone lower the objective.
-    spread : ndarray, shape (6,)
-        As in `Sums`.
-    scores : ndarray, shape (blocks, f)
-        Scores summed over runs of samples.
-    """
-
-    objective: float
+    objective: float  # weighted sum of squares
+    # normal, gradient: shapes (f, f) and (f,): of the common columns
     normal: Array
     gradient: Array
+    # local_step, local_gain: shapes (g, l) and (g, l, f): step of the own columns, and by how much
+    # it is less per common step
     local_step: Array
     local_gain: Array
-    local_decrease: float
-    spread: Array
-    scores: Array
+    local_decrease: float  # by how much the own steps alone lower the objective
+    spread: Array  # shape (6,): as in `Sums`
+    scores: Array  # shape (blocks, f): scores summed over runs of samples
 
     def scaled(self, factor: float) -> Pass:
         """Return the same under residuals that weigh otherwise."""

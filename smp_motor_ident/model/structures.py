@@ -60,38 +60,21 @@ MODELS = ("static_gain", "first_order", "second_order", "electromechanical")
 
 @dataclass(frozen=True)
 class Structure:
-    """Which coordinates are free, and how the others hang on them.
+    """Which coordinates are free, and how the others hang on them."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the candidate structure.
-    order : int
-        1 (no inductance) or 2.
-    friction : {'none', 'symmetric', 'asymmetric'}
-        Coulomb friction.
-    current : bool
-        Whether current is an output; R is a coordinate then.
-    shape : bool
-        Whether te is a coordinate; if not, be = 0 (te = a2/a1), the motor of equal response.
-    load, delay, window, offset : bool
-        Whether these are coordinates.
-    own_load : bool
-        Whether every segment has a constant load of its own.
-    fixed : mapping of str to float
-        Coordinates fixed at a value (by name of `Z_NAMES`).
-    """
-
-    name: str
-    order: int = 2
-    friction: str = "symmetric"
-    current: bool = False
+    name: str  # name of the candidate structure
+    order: int = 2  # 1 (no inductance) or 2
+    friction: str = "symmetric"  # coulomb friction
+    current: bool = False  # whether current is an output; R is a coordinate then
+    # Whether te is a coordinate; if not, be = 0 (te = a2/a1), the motor of equal response
     shape: bool = False
+    # load, delay, window, offset: whether these are coordinates
     load: bool = False
     delay: bool = False
     window: bool = False
     offset: bool = False
-    own_load: bool = False
+    own_load: bool = False  # whether every segment has a constant load of its own
+    # Coordinates fixed at a value (by name of `Z_NAMES`)
     fixed: Mapping[str, float] = field(default_factory=dict)
 
     def free(self) -> tuple[int, ...]:

@@ -14,62 +14,35 @@ Array = NDArray[np.floating[Any]]
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """One line, row of points or row of bars over the chart's x.
+    """One line, row of points or row of bars over the chart's x."""
 
-    Attributes
-    ----------
-    name : str
-        In the legend.
-    y : ndarray, shape (n,)
-        NaN where there is nothing.
-    color : str
-        CSS variable of the page.
-    low, high : ndarray, shape (n,), or None
-        Band around the line.
-    """
-
-    name: str
-    y: Array
-    color: str
+    name: str  # in the legend
+    y: Array  # shape (n,): NaN where there is nothing
+    color: str  # CSS variable of the page
     kind: Literal["line", "points", "bars"] = "line"
+    # low, high: shape (n,): band around the line
     low: Array | None = None
     high: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Chart:
-    """Curves over one x.
+    """Curves over one x."""
 
-    Attributes
-    ----------
-    name : str
-        Identifier in the page.
-    title, x_label, y_label : str
-        In words, with units.
-    x : ndarray, shape (n,)
-        Increasing.
-    lines : tuple of float
-        Levels that are marked.
-    spans : tuple of (float, float, str)
-        Stretches of x with the CSS variable that shades them.
-    group : str
-        Charts of one group share cursor and zoom in x.
-    summary : str
-        What the chart shows, for those who cannot see it.
-    """
-
-    name: str
+    name: str  # identifier in the page
+    # title, x_label, y_label: in words, with units
     title: str
     x_label: str
     y_label: str
-    x: Array
+    x: Array  # shape (n,): increasing
     curves: tuple[Curve, ...]
     log: str = ""
-    lines: tuple[float, ...] = ()
+    lines: tuple[float, ...] = ()  # levels that are marked
+    # Stretches of x with the CSS variable that shades them
     spans: tuple[tuple[float, float, str], ...] = ()
-    group: str = ""
+    group: str = ""  # charts of one group share cursor and zoom in x
     height: int = 260
-    summary: str = ""
+    summary: str = ""  # what the chart shows, for those who cannot see it
 
     def to_document(self) -> dict[str, Any]:
         """Return what the page's script draws."""

@@ -25,51 +25,28 @@ DAY = 86400.0
 
 @dataclass(frozen=True)
 class Row:
-    """One motor in one recording.
+    """One motor in one recording."""
 
-    Attributes
-    ----------
-    robot, wheel, source : str
-        Whose it is, and the recording.
-    date : float
-        When it was recorded [s since 1970].
-    values : mapping of str to (float, float)
-        Value and standard deviation by name.
-    fit_percent : float
-        Of the speed in held-out data; NaN where there is none.
-    unreliable : bool
-        Whether the identification calls itself so.
-    failure : str
-        Why there are no values.
-    """
-
+    # robot, wheel, source: whose it is, and the recording
     robot: str
     wheel: str
     source: str
-    date: float
-    values: Mapping[str, tuple[float, float]]
-    fit_percent: float = math.nan
-    unreliable: bool = False
-    failure: str = ""
+    date: float  # when it was recorded [s since 1970]
+    values: Mapping[str, tuple[float, float]]  # value and standard deviation by name
+    fit_percent: float = math.nan  # of the speed in held-out data; NaN where there is none
+    unreliable: bool = False  # whether the identification calls itself so
+    failure: str = ""  # why there are no values
 
 
 @dataclass(frozen=True)
 class Mark:
-    """Something that stands out: a drift of one motor, or a motor unlike the others.
-
-    Attributes
-    ----------
-    kind : {'drift', 'outlier'}
-    robot, wheel, quantity : str
-    text : str
-        In words, with the numbers.
-    """
+    """Something that stands out: a drift of one motor, or a motor unlike the others."""
 
     kind: str
     robot: str
     wheel: str
     quantity: str
-    text: str
+    text: str  # in words, with the numbers
 
 
 def drifts(rows: Sequence[Row]) -> list[Mark]:

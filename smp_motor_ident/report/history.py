@@ -28,23 +28,13 @@ SHOWN = {
 
 @dataclass(frozen=True)
 class Entry:
-    """One wheel at one time.
+    """One wheel at one time."""
 
-    Attributes
-    ----------
-    stamp : float
-        [s].
-    wheel : str
-    values : mapping of str to (float, float)
-        Value and standard deviation by name, of what was estimated then.
-    findings : tuple of str
-        Codes.
-    """
-
-    stamp: float
+    stamp: float  # [s]
     wheel: str
+    # Value and standard deviation by name, of what was estimated then
     values: Mapping[str, tuple[float, float]]
-    findings: tuple[str, ...] = ()
+    findings: tuple[str, ...] = ()  # codes
 
 
 def entry_of(stamp: float, wheel: str, monitor: Monitor) -> Entry:

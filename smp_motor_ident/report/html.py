@@ -30,29 +30,18 @@ POOR_FIT = 80.0
 
 @dataclass(frozen=True)
 class Report:
-    """All that the page tells.
+    """All that the page tells."""
 
-    Attributes
-    ----------
-    estimates : mapping of str to Estimate
-        By wheel.
-    comparisons : mapping of str to sequence of Comparison
-        Measured and simulated speed by wheel.
-    failures : mapping of str to str
-        Wheels that could not be identified, each with the reason.
-    provenance : mapping of str to str
-        How the page came about: command, sources, date, versions.
-    tunings : mapping of str to Tuning
-        By wheel what the tuning page offers; empty for a report without one.
-    history : mapping of str to sequence of Chart
-        By wheel what `identifier` has seen since.
-    """
-
-    estimates: Mapping[str, Estimate]
+    estimates: Mapping[str, Estimate]  # by wheel
+    # Measured and simulated speed by wheel
     comparisons: Mapping[str, Sequence[Comparison]] = field(default_factory=dict)
+    # Wheels that could not be identified, each with the reason
     failures: Mapping[str, str] = field(default_factory=dict)
+    # How the page came about: command, sources, date, versions
     provenance: Mapping[str, str] = field(default_factory=dict)
+    # By wheel what the tuning page offers; empty for a report without one
     tunings: Mapping[str, Tuning] = field(default_factory=dict)
+    # By wheel what `identifier` has seen since
     history: Mapping[str, Sequence[Chart]] = field(default_factory=dict)
 
 

@@ -14,23 +14,13 @@ Role = Literal["estimation", "validation"]
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Measured against simulated motor speed over one stretch of data.
+    """Measured against simulated motor speed over one stretch of data."""
 
-    Attributes
-    ----------
-    role : {'estimation', 'validation'}
-        Whether the model was fitted to this stretch or only judged by it.
-    source : str
-        Name of the bag.
-    time : ndarray, shape (n,), [s]
-        From the stretch's start.
-    voltage, measured, simulated : ndarray, shape (n,), [V, rad/s, rad/s]
-        At the motor shaft; NaN where nothing was measured.
-    """
-
-    role: Role
-    source: str
-    time: Array
+    role: Role  # whether the model was fitted to this stretch or only judged by it
+    source: str  # name of the bag
+    time: Array  # shape (n,), [s]: from the stretch's start
+    # voltage, measured, simulated: shape (n,), [V, rad/s, rad/s]: at the motor shaft; NaN where
+    # nothing was measured
     voltage: Array
     measured: Array
     simulated: Array

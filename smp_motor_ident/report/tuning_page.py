@@ -33,47 +33,24 @@ SAMPLES = 100
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """One design of the page, or why there is none at this place of the sliders.
+    """One design of the page, or why there is none at this place of the sliders."""
 
-    Attributes
-    ----------
-    bandwidth : float
-        Asked for [rad/s].
-    phase_margin : float
-        Asked for [deg].
-    design : Design, optional
-    curves : Curves, optional
-    reason : str
-        Why there is no design.
-    """
-
-    bandwidth: float
-    phase_margin: float
+    bandwidth: float  # asked for [rad/s]
+    phase_margin: float  # asked for [deg]
     design: Design | None = None
     curves: Curves | None = None
-    reason: str = ""
+    reason: str = ""  # why there is no design
 
 
 @dataclass(frozen=True, eq=False)
 class Tuning:
-    """What the page offers for one wheel.
+    """What the page offers for one wheel."""
 
-    Attributes
-    ----------
-    wheel : str
-        Name of the wheel.
-    choices : sequence of Choice
-        Margin after margin, the bandwidths of each in rising order; empty without a design.
-    chosen : int
-        Index of what `tune` chooses by itself, -1 without a design.
-    reason : str
-        Why there is no design at all.
-    """
-
-    wheel: str
+    wheel: str  # name of the wheel
+    # Margin after margin, the bandwidths of each in rising order; empty without a design
     choices: Sequence[Choice] = ()
-    chosen: int = -1
-    reason: str = ""
+    chosen: int = -1  # index of what `tune` chooses by itself, -1 without a design
+    reason: str = ""  # why there is no design at all
 
 
 def tuning_of(estimate: Estimate, loop: Loop) -> Tuning:

@@ -41,36 +41,16 @@ COMMON = (
 
 @dataclass(frozen=True)
 class Case:
-    """One motor, one loop, one method: what is needed to judge and to finish a design.
+    """One motor, one loop, one method: what is needed to judge and to finish a design."""
 
-    Attributes
-    ----------
-    wheel : str
-        Whose motor.
-    method : Method
-        The method that was asked for.
-    problem : Problem
-        The nominal motor and the targets.
-    required : RequiredMargins
-        What the gains must keep.
-    ensemble : UncertaintyEnsemble
-        The motors that the data allow.
-    drawn : bool
-        Whether these were drawn; else the ensemble is the nominal motor alone.
-    friction : Friction
-        What is known of it.
-    findings : tuple of Finding
-        What is to be said of the estimate.
-    """
-
-    wheel: str
-    method: Method
-    problem: Problem
-    required: RequiredMargins
-    ensemble: UncertaintyEnsemble
-    drawn: bool
-    friction: Friction
-    findings: tuple[Finding, ...]
+    wheel: str  # whose motor
+    method: Method  # the method that was asked for
+    problem: Problem  # the nominal motor and the targets
+    required: RequiredMargins  # what the gains must keep
+    ensemble: UncertaintyEnsemble  # the motors that the data allow
+    drawn: bool  # whether these were drawn; else the ensemble is the nominal motor alone
+    friction: Friction  # what is known of it
+    findings: tuple[Finding, ...]  # what is to be said of the estimate
 
 
 def prepare(estimate: Estimate, loop: Loop, method: str, targets: dict[str, Any]) -> Case:

@@ -23,36 +23,18 @@ QUANTILES = (0.01, 0.5, 0.99)
 
 @dataclass(frozen=True, eq=False)
 class Curves:
-    """What to draw of one design; bands are rows for 1 %, 50 % and 99 % of the motors.
+    """What to draw of one design; bands are rows for 1 %, 50 % and 99 % of the motors."""
 
-    Attributes
-    ----------
-    time : ndarray, shape (k,), [s]
-    reference : ndarray, shape (k,), [rad/s, wheel]
-    step : ndarray, shape (3, k), [rad/s, wheel]
-        Answer to a planned change of the set-point.
-    load : ndarray, shape (3, k), [rad/s, wheel]
-        Answer to a load that takes 1 V.
-    omega : ndarray, shape (f,), [rad/s]
-    gain : ndarray, shape (3, f)
-        Magnitude of the loop gain [-].
-    phase : ndarray, shape (3, f), [deg]
-        Of the loop gain.
-    sensitivity : ndarray, shape (3, f)
-        Magnitude of the sensitivity [-].
-    noise : ndarray, shape (3, f), [V]
-        Density of the control noise, scaled so that its mean square over the frequencies up to
-        Nyquist is that of the controller's output.
-    """
-
-    time: Array
-    reference: Array
-    step: Array
-    load: Array
-    omega: Array
-    gain: Array
-    phase: Array
-    sensitivity: Array
+    time: Array  # shape (k,), [s]
+    reference: Array  # shape (k,), [rad/s, wheel]
+    step: Array  # shape (3, k), [rad/s, wheel]: answer to a planned change of the set-point
+    load: Array  # shape (3, k), [rad/s, wheel]: answer to a load that takes 1 V
+    omega: Array  # shape (f,), [rad/s]
+    gain: Array  # shape (3, f): magnitude of the loop gain [-]
+    phase: Array  # shape (3, f), [deg]: of the loop gain
+    sensitivity: Array  # shape (3, f): magnitude of the sensitivity [-]
+    # shape (3, f), [V]: density of the control noise, scaled so that its mean square over the
+    # frequencies up to Nyquist is that of the controller's output
     noise: Array
 
 

@@ -18,23 +18,12 @@ SHARE = 0.99
 
 @dataclass(frozen=True)
 class Robustness:
-    """What the gains do over the distribution of the estimate.
+    """What the gains do over the distribution of the estimate."""
 
-    Attributes
-    ----------
-    samples : int
-        Motors drawn; 0 where the estimate has no uncertainty.
-    stable : float
-        Share with a stable loop [0..1].
-    holds : float
-        Share that keeps every required margin [0..1].
-    phase, gain, sensitivity : float
-        Phase margin [deg], gain margin [-] and Ms [-] that 99 % keep.
-    """
-
-    samples: int
-    stable: float
-    holds: float
+    samples: int  # motors drawn; 0 where the estimate has no uncertainty
+    stable: float  # share with a stable loop [0..1]
+    holds: float  # share that keeps every required margin [0..1]
+    # phase, gain, sensitivity: phase margin [deg], gain margin [-] and Ms [-] that 99 % keep
     phase: float
     gain: float
     sensitivity: float

@@ -17,24 +17,12 @@ from smp_motor_ident.tune.plant import Plant
 
 @dataclass(frozen=True)
 class Feedback:
-    """Gains that act on the measurement.
+    """Gains that act on the measurement."""
 
-    Attributes
-    ----------
-    p : float
-        [V s/rad].
-    i : float
-        [V/rad].
-    d : float
-        [V s^2/rad].
-    filter_time : float
-        Time constant of the derivative's filter [s].
-    """
-
-    p: float
-    i: float
-    d: float = 0.0
-    filter_time: float = 0.0
+    p: float  # [V s/rad]
+    i: float  # [V/rad]
+    d: float = 0.0  # [V s^2/rad]
+    filter_time: float = 0.0  # time constant of the derivative's filter [s]
 
     def scaled(self, factor: float) -> Feedback:
         """Return the same controller with every gain multiplied by ``factor``."""

@@ -33,46 +33,23 @@ DITHERS = 4
 
 @dataclass(frozen=True)
 class Setting:
-    """What a loop's arithmetic takes from its robot.
+    """What a loop's arithmetic takes from its robot."""
 
-    Attributes
-    ----------
-    numbers : mapping of str to float
-        Gains, by the target's names.
-    sample_time : float
-        [s].
-    supply : float
-        Voltage of a full command [V].
-    ticks : float
-        Counts of a radian of the wheel; NaN where they are not known.
-    """
-
-    numbers: Mapping[str, float]
-    sample_time: float
-    supply: float
-    ticks: float
+    numbers: Mapping[str, float]  # gains, by the target's names
+    sample_time: float  # [s]
+    supply: float  # voltage of a full command [V]
+    ticks: float  # counts of a radian of the wheel; NaN where they are not known
 
 
 @dataclass(frozen=True)
 class KnownLoop:
-    """The arithmetic of a target.
+    """The arithmetic of a target."""
 
-    Attributes
-    ----------
-    defaults : mapping of str to float
-        Its numbers; NaN for those that must be given.
-    start : callable
-        From a setting to the step of a loop that begins at rest.
-    interval : callable
-        From the numbers to the loop's interval [s]; NaN where it is that of the log.
-    remembers : bool
-        Whether a command depends on what was before.
-    """
-
-    defaults: Mapping[str, float]
-    start: Callable[[Setting], Step]
+    defaults: Mapping[str, float]  # its numbers; NaN for those that must be given
+    start: Callable[[Setting], Step]  # from a setting to the step of a loop that begins at rest
+    # From the numbers to the loop's interval [s]; NaN where it is that of the log
     interval: Callable[[Mapping[str, float]], float] = lambda numbers: math.nan
-    remembers: bool = True
+    remembers: bool = True  # whether a command depends on what was before
 
 
 def reconstruct(record: Record, loop: KnownLoop, numbers: Mapping[str, float]) -> Record:

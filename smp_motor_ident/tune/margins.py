@@ -23,30 +23,14 @@ from smp_motor_ident.tune.plant import Plant
 
 @dataclass(frozen=True)
 class Margins:
-    """How far the sampled loop is from instability.
+    """How far the sampled loop is from instability."""
 
-    Attributes
-    ----------
-    phase : float
-        Phase margin [deg].
-    gain : float
-        Gain margin as a factor [-]; infinite where the phase never crosses -180 deg.
-    delay : float
-        Additional delay that the loop bears [s].
-    sensitivity : float
-        Peak Ms of ``|1 / (1 + L)|`` [-].
-    crossover : float
-        Frequency at which the loop gain is 1 [rad/s].
-    spectral_radius : float
-        Largest closed-loop eigenvalue magnitude [-]; stable below 1.
-    """
-
-    phase: float
-    gain: float
-    delay: float
-    sensitivity: float
-    crossover: float
-    spectral_radius: float
+    phase: float  # phase margin [deg]
+    gain: float  # gain margin as a factor [-]; infinite where the phase never crosses -180 deg
+    delay: float  # additional delay that the loop bears [s]
+    sensitivity: float  # peak Ms of ``|1 / (1 + L)|`` [-]
+    crossover: float  # frequency at which the loop gain is 1 [rad/s]
+    spectral_radius: float  # largest closed-loop eigenvalue magnitude [-]; stable below 1
 
     @property
     def stable(self) -> bool:

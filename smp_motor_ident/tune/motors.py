@@ -27,28 +27,18 @@ def _zero() -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Motors:
-    """What fixes the response from voltage to reported speed, for a batch of motors.
+    """What fixes the response from voltage to reported speed, for a batch of motors."""
 
-    Attributes
-    ----------
-    a0, a1, a2 : ndarray, shape (n,)
-        Coefficients [V s/rad], [V s^2/rad], [V s^3/rad] of ``a2 s^2 + a1 s + a0``.
-    delay : ndarray, shape (n,), [s]
-        The motor's own delay, from applied voltage to reported speed.
-    static_voltage : ndarray, shape (n,), [V]
-        What Coulomb friction takes.
-    averaging_window : ndarray, shape (n,), [s]
-        Over which the reported speed is averaged; 0 where none was identified.
-    sensor_lag : ndarray, shape (n,), [s]
-        Time constant of the filter of the reported speed.
-    """
-
+    # a0, a1, a2: shape (n,): coefficients [V s/rad], [V s^2/rad], [V s^3/rad] of ``a2 s^2 + a1 s +
+    # a0``
     a0: Array
     a1: Array
     a2: Array
-    delay: Array
-    static_voltage: Array
+    delay: Array  # shape (n,), [s]: the motor's own delay, from applied voltage to reported speed
+    static_voltage: Array  # shape (n,), [V]: what Coulomb friction takes
+    # shape (n,), [s]: over which the reported speed is averaged; 0 where none was identified
     averaging_window: Array = field(default_factory=_zero)
+    # shape (n,), [s]: time constant of the filter of the reported speed
     sensor_lag: Array = field(default_factory=_zero)
 
     def __len__(self) -> int:
@@ -62,22 +52,13 @@ class Motors:
 
 @dataclass(frozen=True)
 class Friction:
-    """What is known of dry friction, as a voltage.
+    """What is known of dry friction, as a voltage."""
 
-    Attributes
-    ----------
-    known : float
-        What surely is there, which feed-forward may overcome [V].
-    low, high : float
-        Within what it lies [V].
-    finding : Finding or None
-        What is to be said of it.
-    """
-
-    known: float
+    known: float  # what surely is there, which feed-forward may overcome [V]
+    # low, high: within what it lies [V]
     low: float
     high: float
-    finding: Finding | None = None
+    finding: Finding | None = None  # what is to be said of it
 
     @property
     def planned(self) -> float:

@@ -30,20 +30,14 @@ SPEED = 1
 
 @dataclass(frozen=True, eq=False)
 class ObserverModel:
-    """The observer as a filter, the same for every motor that it may meet.
+    """The observer as a filter, the same for every motor that it may meet."""
 
-    Attributes
-    ----------
-    advance : ndarray, shape (q, q)
-    by_angle, by_voltage : ndarray, shape (q,)
-    taps : ndarray, shape (m,)
-        Shares of the last controller outputs in the mean voltage of a sample, as the observer
-        gets it and shifts it by the delay of its model.
-    """
-
-    advance: Array
+    advance: Array  # shape (q, q)
+    # by_angle, by_voltage: shape (q,)
     by_angle: Array
     by_voltage: Array
+    # shape (m,): shares of the last controller outputs in the mean voltage of a sample, as the
+    # observer gets it and shifts it by the delay of its model
     taps: Array
 
     def transfer(self, z: Complex) -> tuple[Complex, Complex]:

@@ -37,33 +37,19 @@ class Plant:
     ``x[k+1] = phi x[k] + sum_j taps[j] u[k-j]`` with ``x = (speed, acceleration)``, last
     the filtered speed where the sensor has a lag; the angle run through in the step is
     ``phi_angle x[k] + sum_j taps_angle[j] u[k-j]``.
-
-    Attributes
-    ----------
-    phi : ndarray, shape (n, s, s)
-        State transition over one sample.
-    taps : ndarray, shape (n, m, s)
-        Effect of the last ``m`` controller outputs.
-    phi_angle : ndarray, shape (n, s)
-    taps_angle : ndarray, shape (n, m)
-    sample_time : float
-        [s].
-    average : ndarray, shape (n, q), [1/s]
-        Weights of the angles run through in the last ``q`` steps, whose sum is the measured speed;
-        with ``q`` 0 it is the last state of a sensor with lag, else the speed itself.
-    motors : Motors
-        What was sampled.
-    observer : ObserverModel or None
-        The observer whose speed is fed back, where there is one; then ``q`` is 0.
     """
 
-    phi: Array
-    taps: Array
-    phi_angle: Array
-    taps_angle: Array
-    sample_time: float
+    phi: Array  # shape (n, s, s): state transition over one sample
+    taps: Array  # shape (n, m, s): effect of the last ``m`` controller outputs
+    phi_angle: Array  # shape (n, s)
+    taps_angle: Array  # shape (n, m)
+    sample_time: float  # [s]
+    # shape (n, q), [1/s]: weights of the angles run through in the last ``q`` steps, whose sum is
+    # the measured speed; with ``q`` 0 it is the last state of a sensor with lag, else the speed
+    # itself
     average: Array
-    motors: Motors
+    motors: Motors  # what was sampled
+    # The observer whose speed is fed back, where there is one; then ``q`` is 0
     observer: ObserverModel | None = None
 
     def __len__(self) -> int:

@@ -20,57 +20,30 @@ from smp_motor_ident.tune.plant import Plant
 
 @dataclass(frozen=True)
 class RequiredMargins:
-    """Margins that a method's gains keep on the loop that runs.
+    """Margins that a method's gains keep on the loop that runs."""
 
-    Attributes
-    ----------
-    phase : float
-        Least phase margin [deg].
-    gain : float
-        Least gain margin, as a factor [-].
-    sensitivity : float
-        Largest Ms [-].
-    """
-
-    phase: float
-    gain: float
-    sensitivity: float
+    phase: float  # least phase margin [deg]
+    gain: float  # least gain margin, as a factor [-]
+    sensitivity: float  # largest Ms [-]
 
 
 @dataclass(frozen=True)
 class FirstOrderDelay:
-    """``gain e^{-delay s} / (time_constant s + 1)``: what the classical rules start from.
+    """``gain e^{-delay s} / (time_constant s + 1)``: what the classical rules start from."""
 
-    Attributes
-    ----------
-    gain : float
-        [rad/s/V].
-    time_constant, delay : float
-        [s].
-    """
-
-    gain: float
+    gain: float  # [rad/s/V]
+    # time_constant, delay: [s]
     time_constant: float
     delay: float
 
 
 @dataclass(frozen=True)
 class Problem:
-    """One motor in one loop, and what is asked of it.
+    """One motor in one loop, and what is asked of it."""
 
-    Attributes
-    ----------
-    plant : Plant
-        The sampled motor, a batch of one.
-    loop : Loop
-        The loop that will run.
-    targets : mapping of str to Any
-        What the caller asks of the method.
-    """
-
-    plant: Plant
-    loop: Loop
-    targets: Mapping[str, Any] = field(default_factory=dict)
+    plant: Plant  # the sampled motor, a batch of one
+    loop: Loop  # the loop that will run
+    targets: Mapping[str, Any] = field(default_factory=dict)  # what the caller asks of the method
 
     @cached_property
     def omega(self) -> Array:
@@ -148,26 +121,15 @@ def checked(targets: Mapping[str, Any], name: str, least: float = 0.0) -> float 
 
 @dataclass(frozen=True)
 class Method:
-    """One way of choosing gains.
+    """One way of choosing gains."""
 
-    Attributes
-    ----------
-    name, title, source : str
-        Keyword, words for the table, and where it was published.
-    required : RequiredMargins
-        What its gains keep; scaled back where the rule alone would not.
-    solve : callable
-        From the problem to the feedback gains.
-    targets : tuple of str
-        Keywords that it understands beside the common ones.
-    """
-
+    # name, title, source: keyword, words for the table, and where it was published
     name: str
     title: str
     source: str
-    required: RequiredMargins
-    solve: Callable[[Problem], Feedback]
-    targets: tuple[str, ...] = ()
+    required: RequiredMargins  # what its gains keep; scaled back where the rule alone would not
+    solve: Callable[[Problem], Feedback]  # from the problem to the feedback gains
+    targets: tuple[str, ...] = ()  # keywords that it understands beside the common ones
 
 
 def measured_lag(plant: Plant, delay: float) -> float:

@@ -43,30 +43,15 @@ PEAK_RATE = 1.875
 
 @dataclass(frozen=True)
 class Reference:
-    """How a change of set-point is asked of a motor; at the motor shaft.
+    """How a change of set-point is asked of a motor; at the motor shaft."""
 
-    Attributes
-    ----------
-    max_velocity : float
-        [rad/s].
-    max_acceleration : float
-        [rad/s^2]; infinite where voltage alone limits.
-    transition_time : float
-        Duration of every minimum-jerk change [s]; larger ones are made as fast as limits allow.
-    lag : float
-        By which the measured speed follows the reference [s].
-    doubt : float
-        By which that may be wrong without the feedback taking it for an error [s].
-    drive : Drive
-        Motor and voltage that large changes keep to.
-    """
-
-    max_velocity: float
-    max_acceleration: float
+    max_velocity: float  # [rad/s]
+    max_acceleration: float  # [rad/s^2]; infinite where voltage alone limits
+    # Duration of every minimum-jerk change [s]; larger ones are made as fast as limits allow
     transition_time: float
-    lag: float
-    doubt: float
-    drive: Drive
+    lag: float  # by which the measured speed follows the reference [s]
+    doubt: float  # by which that may be wrong without the feedback taking it for an error [s]
+    drive: Drive  # motor and voltage that large changes keep to
 
     def profile(self) -> Profile:
         """Return the reference as the running loop leads it, at rest at zero."""
@@ -86,23 +71,15 @@ def controller_for(loop: Loop, feedback: Feedback) -> Controller:
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """A planned change of set-point from rest, at the sampling instants; each of shape (k,).
+    """A planned change of set-point from rest, at the sampling instants; each of shape (k,)."""
 
-    Attributes
-    ----------
-    low, reference, high : ndarray, [rad/s]
-        What the measurement is compared with, and between what it is left alone.
-    forward : ndarray, [V]
-        Feed-forward without dry friction.
-    duration : float
-        [s].
-    """
-
+    # low, reference, high: [rad/s]: what the measurement is compared with, and between what it is
+    # left alone
     low: Array
     reference: Array
     high: Array
-    forward: Array
-    duration: float
+    forward: Array  # [V]: Feed-forward without dry friction
+    duration: float  # [s]
 
     @property
     def inputs(self) -> Inputs:

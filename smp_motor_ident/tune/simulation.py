@@ -21,63 +21,35 @@ from smp_motor_ident.tune.plant import Plant
 
 @dataclass(frozen=True, eq=False)
 class Controller:
-    """A complete controller at the motor shaft; every number may be an array of shape (n,).
+    """A complete controller at the motor shaft; every number may be an array of shape (n,)."""
 
-    Attributes
-    ----------
-    feedback : Feedback
-        Gains that act on the measurement.
-    weight, weight_d : float
-        Set-point weights of the proportional and the derivative action [-].
-    limit : float
-        Clamp of the output [V].
-    tracking : float
-        Time constant of back-calculation [s]; infinite switches it off.
-    """
-
-    feedback: Feedback
+    feedback: Feedback  # gains that act on the measurement
+    # weight, weight_d: Set-point weights of the proportional and the derivative action [-]
     weight: float = 1.0
     weight_d: float = 0.0
-    limit: float = math.inf
-    tracking: float = math.inf
+    limit: float = math.inf  # clamp of the output [V]
+    tracking: float = math.inf  # time constant of back-calculation [s]; infinite switches it off
 
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """What the loop did; arrays of shape (n, k) at the sampling instants.
+    """What the loop did; arrays of shape (n, k) at the sampling instants."""
 
-    Attributes
-    ----------
-    time : ndarray, shape (k,), [s]
-    speed : ndarray, shape (n, k), [rad/s]
-        True speed of the motor.
-    voltage : ndarray, shape (n, k), [V]
-        Output of the controller.
-    """
-
-    time: Array
-    speed: Array
-    voltage: Array
+    time: Array  # shape (k,), [s]
+    speed: Array  # shape (n, k), [rad/s]: true speed of the motor
+    voltage: Array  # shape (n, k), [V]: output of the controller
 
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """What comes into the loop at the sampling instants, each of shape (k,).
+    """What comes into the loop at the sampling instants, each of shape (k,)."""
 
-    Attributes
-    ----------
-    low, high : ndarray, [rad/s]
-        Between which the measurement is left alone; one reference where there is no ``high``.
-    forward : ndarray, optional, [V]
-        Feed-forward.
-    load : ndarray, optional, [V]
-        What a load takes.
-    """
-
+    # low, high: [rad/s]: between which the measurement is left alone; one reference where there is
+    # no ``high``
     low: Array
     high: Array | None = None
-    forward: Array | None = None
-    load: Array | None = None
+    forward: Array | None = None  # [V]: Feed-forward
+    load: Array | None = None  # [V]: what a load takes
 
 
 def simulate(
@@ -249,24 +221,12 @@ def minimum_jerk(distance: float, duration: float, time: Array) -> tuple[Array, 
 
 @dataclass(frozen=True)
 class StepFigures:
-    """Figures of a step response.
+    """Figures of a step response."""
 
-    Attributes
-    ----------
-    rise : float
-        From 10 to 90 % [s].
-    settling : float
-        Until it stays within 2 % [s]; NaN where it does not.
-    overshoot : float
-        Beyond the final value [%].
-    peak_voltage : float
-        Largest magnitude [V].
-    """
-
-    rise: float
-    settling: float
-    overshoot: float
-    peak_voltage: float
+    rise: float  # from 10 to 90 % [s]
+    settling: float  # until it stays within 2 % [s]; NaN where it does not
+    overshoot: float  # beyond the final value [%]
+    peak_voltage: float  # largest magnitude [V]
 
 
 def step_figures(time: Array, speed: Array, voltage: Array, final: float) -> StepFigures:
@@ -287,21 +247,11 @@ def step_figures(time: Array, speed: Array, voltage: Array, final: float) -> Ste
 
 @dataclass(frozen=True)
 class LoadFigures:
-    """Figures of the response to a load step, per volt that the load takes.
+    """Figures of the response to a load step, per volt that the load takes."""
 
-    Attributes
-    ----------
-    peak : float
-        Largest loss of speed [rad/s/V].
-    integral : float
-        Integral of the magnitude of the error [rad/V].
-    recovery : float
-        Until the loss stays within a tenth of its peak [s]; NaN where it does not.
-    """
-
-    peak: float
-    integral: float
-    recovery: float
+    peak: float  # largest loss of speed [rad/s/V]
+    integral: float  # integral of the magnitude of the error [rad/V]
+    recovery: float  # until the loss stays within a tenth of its peak [s]; NaN where it does not
 
 
 def load_figures(time: Array, speed: Array) -> LoadFigures:

@@ -28,22 +28,12 @@ DRAWS = 200
 
 @dataclass(frozen=True)
 class Trial:
-    """What one source allows.
+    """What one source allows."""
 
-    Attributes
-    ----------
-    loop : Loop
-        With the source.
-    integral : float
-        Integral gain within the margins [V/rad, wheel]; the error that a load leaves is its
-        inverse.
-    control_noise : float
-        Voltage from quantisation [V rms].
-    """
-
-    loop: Loop
+    loop: Loop  # with the source
+    # Integral gain within the margins [V/rad, wheel]; the error that a load leaves is its inverse
     integral: float
-    control_noise: float
+    control_noise: float  # voltage from quantisation [V rms]
 
     @property
     def name(self) -> str:

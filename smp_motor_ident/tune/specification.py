@@ -25,38 +25,21 @@ from smp_motor_ident.tune.simulation import (
 
 @dataclass(frozen=True)
 class Performance:
-    """What the simulated loop does; speeds at the motor shaft.
+    """What the simulated loop does; speeds at the motor shaft."""
 
-    Attributes
-    ----------
-    rise, settling : float
-        Of a set-point step through the reference [s]: 10 to 90 %, and until within 2 %.
-    overshoot : float
-        Of the same [%].
-    step_settling, step_overshoot : float
-        The same for an abrupt step with the feedback gains alone.
-    load_peak : float
-        Speed lost per volt of load [rad/s/V].
-    load_integral : float
-        Integral of the magnitude of the error per volt of load [rad/V].
-    load_recovery : float
-        Until a tenth of the loss is left [s].
-    peak_voltage : float
-        Largest voltage of the set-point step [V].
-    control_noise : float
-        Voltage from quantisation at constant speed [V rms].
-    """
-
+    # rise, settling: of a set-point step through the reference [s]: 10 to 90 %, and until within
+    # 2 %
     rise: float
     settling: float
-    overshoot: float
+    overshoot: float  # of the same [%]
+    # step_settling, step_overshoot: the same for an abrupt step with the feedback gains alone
     step_settling: float
     step_overshoot: float
-    load_peak: float
-    load_integral: float
-    load_recovery: float
-    peak_voltage: float
-    control_noise: float
+    load_peak: float  # speed lost per volt of load [rad/s/V]
+    load_integral: float  # integral of the magnitude of the error per volt of load [rad/V]
+    load_recovery: float  # until a tenth of the loss is left [s]
+    peak_voltage: float  # largest voltage of the set-point step [V]
+    control_noise: float  # voltage from quantisation at constant speed [V rms]
 
 
 def measure(
@@ -96,14 +79,10 @@ def measure(
 
 @dataclass(frozen=True)
 class Band:
-    """A figure of the nominal loop, and the least and largest over the motors that may be.
+    """A figure of the nominal loop, and the least and largest over the motors that may be."""
 
-    Attributes
-    ----------
-    value, low, high : float
-        NaN where there is none, such as a settling time of a loop that does not settle.
-    """
-
+    # value, low, high: NaN where there is none, such as a settling time of a loop that does not
+    # settle
     value: float
     low: float
     high: float
@@ -115,25 +94,13 @@ class Specification:
 
     Simulated with counts, dry friction and the usual delay, over draws of all that the estimate
     leaves open; the margins bear the longest delay.
-
-    Attributes
-    ----------
-    samples : int
-        Motors that the bands are over; 0 where the estimate has no uncertainty.
-    change : float
-        Of the set-point [rad/s, motor].
-    overshoot : Band
-        [%].
-    settling : Band
-        Until within 2 % [s].
-    phase_margin, gain_margin, sensitivity : Band
-        [deg], [-], [-].
     """
 
-    samples: int
-    change: float
-    overshoot: Band
-    settling: Band
+    samples: int  # motors that the bands are over; 0 where the estimate has no uncertainty
+    change: float  # of the set-point [rad/s, motor]
+    overshoot: Band  # [%]
+    settling: Band  # until within 2 % [s]
+    # phase_margin, gain_margin, sensitivity: [deg], [-], [-]
     phase_margin: Band
     gain_margin: Band
     sensitivity: Band

@@ -22,10 +22,10 @@ from smp_motor_control.motor.model import MotorModel
 from smp_motor_control.pid import PidGains
 from smp_motor_control.reference.profile import Drive, ProfileLimits
 from smp_motor_control.wheel.loop import LoopSettings, WheelLoop
-from smp_motor_ident.tune.limits import OVERSHOOT, SETTLED, SILENCE, STEADY_ERROR
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune.arrays import Array
+from smp_motor_ident.tune.limits import OVERSHOOT, SETTLED, SILENCE, STEADY_ERROR
 
 SMOOTHING = 0.05
 """Length [s] of the parabola whose slope is taken as the speed."""

@@ -27,21 +27,12 @@ WORTH = 1.1
 
 @dataclass(frozen=True)
 class WheelSet:
-    """Designs of all wheels, made to move together.
+    """Designs of all wheels, made to move together."""
 
-    Attributes
-    ----------
-    designs : mapping of str to Design
-        By wheel; every one has the same duration and limits of its reference.
-    one_set : bool
-        Whether all share their feedback gains.
-    reason : str
-        Why one or each, and which motor sets the pace.
-    """
-
+    # By wheel; every one has the same duration and limits of its reference
     designs: Mapping[str, Design]
-    one_set: bool
-    reason: str
+    one_set: bool  # whether all share their feedback gains
+    reason: str  # why one or each, and which motor sets the pace
 
 
 def design_wheels(

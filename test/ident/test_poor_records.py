@@ -6,7 +6,7 @@ import motors
 import numpy as np
 import pytest
 
-from smp_motor_ident.errors import DesignError
+from smp_motor_ident.errors import DesignError, SignalError
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.record import Record
 from smp_motor_ident.tune import Loop, design
@@ -71,3 +71,15 @@ def test_rest_before_the_excitation_changes_nothing():
     for name in ("dc_gain", "time_constant", "static_voltage"):
         a, b = with_it.combinations[name], without.combinations[name]
         assert abs(a.value - b.value) < b.std, name
+
+
+def test_an_angle_that_is_given_as_a_speed_is_recognised():
+    rng = np.random.default_rng(11)
+    rate, turns = 50.0, np.array([0.6, 0.0, -0.7, 0.0, 0.5, -0.6])
+    voltage = 2.5 * np.repeat(turns, 60) + 0.2 * np.repeat(rng.standard_normal(72), 5)
+    speed = _record(np.abs(voltage) + 2.0, rate, 0.0).velocity * np.sign(voltage)
+    angle = np.cumsum(speed) / rate
+    t = np.arange(voltage.size) / rate
+    noisy = angle + 0.01 * rng.standard_normal(t.size)
+    with pytest.raises(SignalError, match="map it as position"):
+        estimate(Record("motor", t, voltage, velocity=noisy))

@@ -12,25 +12,13 @@ from smp_motor_ident.bag.unpack import Budget
 
 @dataclass(frozen=True)
 class Format:
-    """A kind of file: how it is recognised, and what opens it.
+    """A kind of file: how it is recognised, and what opens it."""
 
-    Attributes
-    ----------
-    name : str
-        For messages.
-    suffixes : tuple of str
-        Names of such files end so, in lower case.
-    magic : bytes
-        How they begin; a file that begins otherwise is none, whatever its name.  Empty for
-        plain text, which only its name tells.
-    open : callable
-        ``open(path, name, budget)`` gives a `Messages` or a `Tables`; raises `BagError`.
-    tables : bool
-        Whether it holds columns of numbers instead of serialized messages.
-    """
-
-    name: str
-    suffixes: tuple[str, ...]
+    name: str  # for messages
+    suffixes: tuple[str, ...]  # names of such files end so, in lower case
+    # How they begin; a file that begins otherwise is none, whatever its name.  Empty for plain
+    # text, which only its name tells.
     magic: bytes
+    # ``open(path, name, budget)`` gives a `Messages` or a `Tables`; raises `BagError`
     open: Callable[[Path, str, Budget], Any]
-    tables: bool = True
+    tables: bool = True  # whether it holds columns of numbers instead of serialized messages

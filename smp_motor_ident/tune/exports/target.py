@@ -22,92 +22,50 @@ from smp_motor_ident.tune.simulation import Controller, Inputs, StepFigures, sim
 
 @dataclass(frozen=True)
 class Gains:
-    """Numbers in a target's own units, and what they are at the motor shaft.
+    """Numbers in a target's own units, and what they are at the motor shaft."""
 
-    Attributes
-    ----------
-    numbers : mapping of str to float
-        As the target takes them.
-    feedback : Feedback
-        The same, as rounded, as the feedback of the running loop.
-    weight : float
-        Of the set-point in the proportional action [-].
-    static, velocity : float
-        Feed-forward [V], [V s/rad].
-    tracking : float
-        Time constant of anti-windup that comes nearest to the target's [s].
-    resting_error : float
-        Below which whole numbers let an error be [rad/s, motor].
-    """
-
-    numbers: Mapping[str, float]
-    feedback: Feedback
-    weight: float = 1.0
+    numbers: Mapping[str, float]  # as the target takes them
+    feedback: Feedback  # the same, as rounded, as the feedback of the running loop
+    weight: float = 1.0  # of the set-point in the proportional action [-]
+    # static, velocity: Feed-forward [V], [V s/rad]
     static: float = 0.0
     velocity: float = 0.0
+    # Time constant of anti-windup that comes nearest to the target's [s]
     tracking: float = math.inf
-    resting_error: float = 0.0
+    resting_error: float = 0.0  # below which whole numbers let an error be [rad/s, motor]
 
 
 @dataclass(frozen=True)
 class Format:
-    """One loop that others run.
+    """One loop that others run."""
 
-    Attributes
-    ----------
-    name, title, source : str
-        Keyword, words for people, and where its arithmetic is documented.
-    rate : float
-        Steps per second, unless the user says otherwise [Hz].
-    convert : callable
-        From a design to the target's numbers.
-    render : callable
-        From the numbers of all wheels to the text that the target takes.
-    missing : tuple of str
-        What of a design it cannot express.
-    counts : bool
-        Whether it makes its speed from counts, over one of its intervals.
-    one_set : bool
-        Whether all wheels share their numbers.
-    targets : mapping of str to str
-        What the method is asked for.
-    known : KnownLoop or None
-        Its arithmetic; None where that is not published.
-    """
-
+    # name, title, source: keyword, words for people, and where its arithmetic is documented
     name: str
     title: str
     source: str
-    rate: float
-    convert: Callable[[Design], Gains]
+    rate: float  # steps per second, unless the user says otherwise [Hz]
+    convert: Callable[[Design], Gains]  # from a design to the target's numbers
+    # From the numbers of all wheels to the text that the target takes
     render: Callable[[Mapping[str, Design], Mapping[str, Gains]], str]
-    missing: tuple[str, ...]
-    counts: bool = True
-    one_set: bool = False
+    missing: tuple[str, ...]  # what of a design it cannot express
+    counts: bool = True  # whether it makes its speed from counts, over one of its intervals
+    one_set: bool = False  # whether all wheels share their numbers
+    # What the method is asked for
     targets: Mapping[str, str] = field(
         default_factory=lambda: {"structure": "pi", "focus": "tracking"}
     )
-    known: KnownLoop | None = None
+    known: KnownLoop | None = None  # its arithmetic; None where that is not published
 
 
 @dataclass(frozen=True)
 class Check:
-    """What exported numbers do in the target's loop.
+    """What exported numbers do in the target's loop."""
 
-    Attributes
-    ----------
-    margins : Margins
-        Of that loop.
-    step : StepFigures
-        Of an abrupt change of set-point from rest by half of the largest speed; no settling time
-        where it may rest beyond 2 %.
-    resting_error : float
-        Share of that change by which it may rest beside it [-].
-    """
-
-    margins: Margins
+    margins: Margins  # of that loop
+    # Of an abrupt change of set-point from rest by half of the largest speed; no settling time
+    # where it may rest beyond 2 %
     step: StepFigures
-    resting_error: float
+    resting_error: float  # share of that change by which it may rest beside it [-]
 
 
 BAND = 0.02
