@@ -84,7 +84,8 @@ class Wheel:
     def __init__(self, node: MotorPlant, name: str, motor: DrivenMotor) -> None:
         self.name = name
         self.motor = motor
-        self.rejected = 0
+        self._clock = node.get_clock()
+        self.rejected = self.late = 0
         self.lease = Lease(motor.settings.command_timeout)
         self._owner = "?"
         self._owners = node.create_publisher(String, f"{name}/motor_owner", runtime.LATCHED)
@@ -121,7 +122,8 @@ class Wheel:
 
     def _command(self, message: MotorCommand) -> None:
         now = time.monotonic()
-        if not self.lease.take(message.header.frame_id, message.voltage, now):
+        stamps = runtime.nanoseconds(message.header.stamp), self._clock.now().nanoseconds
+        if not self.lease.take(message.header.frame_id, message.voltage, now, *stamps):
             return
         if not self.motor.command(now, message.voltage):
             self.rejected += 1
@@ -196,7 +198,7 @@ class MotorPlant(Node):
         self._supply.open_voltage = settings.battery_voltage or self._nominal
         for wheel in self._wheels:
             wheel.motor.settings = settings.drive
-            wheel.lease.timeout = Lease(settings.drive.command_timeout).timeout
+            wheel.lease.set_timeout(settings.drive.command_timeout)
 
     def _tick(self) -> None:
         now, stamp = self._instant()
@@ -229,6 +231,7 @@ class MotorPlant(Node):
             values[f"{wheel.name} refused messages"] = wheel.rejected
             values[f"{wheel.name} owner"] = wheel.lease.owner(time.monotonic()) or "none"
             values[f"{wheel.name} refused writers"] = wheel.lease.refused or "none"
+            values[f"{wheel.name} late commands"] = wheel.lease.late
         refused = [wheel.name for wheel in self._wheels if wheel.rejected]
         rivals = {w.name: sorted(w.lease.refused) for w in self._wheels if w.lease.refused}
         if rivals:
@@ -236,6 +239,13 @@ class MotorPlant(Node):
             level, message = runtime.WARN, f"not yours, refused on {listed}"
             for wheel in self._wheels:
                 wheel.lease.refused = {}
+        if late := [wheel.name for wheel in self._wheels if wheel.lease.late > wheel.late]:
+            level, message = (
+                runtime.WARN,
+                f"refused commands that come late by their stamps: {late}",
+            )
+        for wheel in self._wheels:
+            wheel.late = wheel.lease.late
         if refused:
             level, message = runtime.WARN, f"refused messages that are no numbers: {refused}"
         return level, message, values
