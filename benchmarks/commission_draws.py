@@ -6,8 +6,8 @@
 Each robot has four motors drawn at random and, in turn, one of the cases: sound, an encoder or
 the leads of a motor swapped, a wrong gear ratio, a dead zone, a weak battery, a load on one wheel.
 ``commission --yes --apply`` runs against live ``motor_plant`` and ``wheel_pid``.  The end is right
-where gains passed the verification drive and the true robot's case allows it, or where it stopped
-with the diagnosis of the case.
+where gains passed the verification drive and the case allows it, or where it stopped with the
+diagnosis of the case, at the wheel that has it.
 """
 
 from __future__ import annotations
@@ -23,23 +23,22 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import Any
 
 import yaml
 
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 SILENT = {"stdin": subprocess.DEVNULL, "stderr": subprocess.STDOUT}
 
-RIGHT: dict[str, tuple[str, ...]] = {
-    "sound": ("passed",),
-    "encoder swapped": ("reversed",),
-    "leads swapped": ("reversed",),
-    "wrong gear ratio": ("gear_ratio",),
-    "dead zone": ("passed", "dead_zone"),
-    "weak battery": ("supply_low",),
-    "load on one wheel": ("unlike_sisters",),
+RIGHT: dict[str, tuple[bool, str]] = {
+    "sound": (True, ""),
+    "encoder swapped": (False, "reversed"),
+    "leads swapped": (False, "reversed"),
+    "wrong gear ratio": (False, "gear_ratio"),
+    "dead zone": (True, "dead_zone"),
+    "weak battery": (False, "supply_low"),
+    "load on one wheel": (False, "unlike_sisters"),
 }
-"""How each case should end: with gains that pass, or with the finding that it is stopped at."""
+"""By case whether gains may pass, and the finding, of the spoilt wheel, that else is the reason."""
 
 
 def motors(draw: random.Random) -> dict[str, dict[str, float]]:
@@ -66,9 +65,8 @@ def motors(draw: random.Random) -> dict[str, dict[str, float]]:
     return drawn
 
 
-def spoil(case: str, robot: dict[str, Any], draw: random.Random) -> list[str]:
-    """Make one case of a robot; return what the plant needs to be told besides."""
-    wheel = robot[draw.choice(WHEELS)]
+def spoil(case: str, wheel: dict[str, float], draw: random.Random) -> list[str]:
+    """Make one case of a robot's wheel; return what the plant needs to be told besides."""
     if case == "encoder swapped":
         wheel["encoder"] = -1
     elif case == "leads swapped":
@@ -112,10 +110,11 @@ def _firmware() -> None:
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
 
 
-def run(case: str, folder: Path, draw: random.Random, duration: float) -> tuple[str, str]:
-    """Commission one robot; return how it ended, and its last line."""
-    robot = motors(draw)
-    told = spoil(case, robot, draw)
+def run(case: str, folder: Path, draw: random.Random, duration: float) -> tuple[bool, str, str]:
+    """Commission one robot; return whether it ended rightly, how, and its last line."""
+    robot, spoilt = motors(draw), draw.choice(WHEELS)
+    told = spoil(case, robot[spoilt], draw)
+    may_pass, reason = RIGHT[case]
     tree = {"/**/motor_plant": {"ros__parameters": {"motors": robot}}}
     (folder / "motors.yaml").write_text(yaml.safe_dump(tree))
     nodes = Nodes(folder, told)
@@ -129,13 +128,20 @@ def run(case: str, folder: Path, draw: random.Random, duration: float) -> tuple[
         nodes.close()
     said = (folder / "commission.log").read_text(errors="replace").strip().splitlines()
     document = folder / "out" / "commissioning.json"
+    words = said[-1] if said else ""
     if not document.is_file():
-        return f"exit {tool.returncode}", said[-1] if said else ""
+        return False, f"exit {tool.returncode}", words
     found = json.loads(document.read_text())
     if tool.returncode == 0 and found["passed"]:
-        return "passed", found["verdict"]
-    codes = [f["code"] for f in found.get("findings", []) if f["severity"] == "refused"]
-    return ", ".join(dict.fromkeys(codes)) or f"exit {tool.returncode}", said[-1] if said else ""
+        return may_pass, "passed", words
+    at = {f["code"] for f in found.get("findings", []) if f["severity"] == "refused"}
+    named = {
+        f["code"]
+        for f in found.get("findings", [])
+        if f["severity"] != "note" and f["evidence"].get("wheel") in (spoilt, None)
+    }
+    stopped = at <= {reason, "verification"} and reason in named
+    return stopped, ", ".join(sorted(at)) or f"exit {tool.returncode}", words
 
 
 def main() -> int:
@@ -159,8 +165,7 @@ def main() -> int:
         folder = Path(given.keep or tempfile.mkdtemp(), f"draw_{k}").resolve()
         folder.mkdir(parents=True)
         begun = time.monotonic()
-        end, words = run(case, folder, draw, given.duration)
-        right = end in RIGHT[case]
+        right, end, words = run(case, folder, draw, given.duration)
         wrong += not right
         took = time.monotonic() - begun
         print(

@@ -30,15 +30,10 @@ Counter = Callable[[MotorState], float]
 
 @dataclass
 class Tape:
-    """What one wheel's hardware reported, a row for each sample.
+    """What one wheel's hardware reported, a row for each sample."""
 
-    Attributes
-    ----------
-    rows : list of tuple
-        Of :data:`COLUMNS`: stamp [s], its age on arrival [s], what had been commanded [V], what
-        was reported [V], [rad/s], [rad], [counts], and the number of the phase.
-    """
-
+    # of :data:`COLUMNS`: stamp [s], its age on arrival [s], what had been commanded [V], what
+    # was reported [V], [rad/s], [rad], [counts], and the number of the phase
     rows: list[tuple[float, ...]] = field(default_factory=list)
 
     def turned(self, since: int) -> float:

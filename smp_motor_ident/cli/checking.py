@@ -47,21 +47,11 @@ TURNED = 12.0
 
 @dataclass(frozen=True)
 class Checked:
-    """What the checks came to.
+    """What the checks came to."""
 
-    Attributes
-    ----------
-    findings : tuple of Finding
-        In the order of the checks.
-    figures : mapping of str to Figures
-        By wheel.
-    amplitude : float
-        Voltage at which every wheel answers well, as far as the limit allows [V].
-    """
-
-    findings: tuple[Finding, ...]
-    figures: Mapping[str, Figures]
-    amplitude: float
+    findings: tuple[Finding, ...]  # in the order of the checks
+    figures: Mapping[str, Figures]  # by wheel
+    amplitude: float  # voltage at which every wheel answers well, as far as the limit allows [V]
 
 
 @dataclass
@@ -91,7 +81,9 @@ class _Way:
             self.limit / rate,
             lambda: tape.turned(first) >= TURNED,
         )
-        level = min(FIRST[0] * abs(start) + FIRST[1] * self.supply, self.limit)
+        # Two levels at least tell friction from gain.
+        level = FIRST[0] * abs(start) + FIRST[1] * self.supply
+        level = min(level, 0.5 * (abs(start) + self.limit))
         while tape.turned(first) >= TURNED:
             before = len(tape.rows)
             self.phase("hold", _constant(sign * level), LONGEST_HOLD, self._steady(before))

@@ -158,6 +158,7 @@ def _verify(
         trial.kept = arguments.apply and not refused
     if refused:
         print("the gains were taken back")
+        refused += protocol.warned_of({f.evidence.get("wheel") for f in refused})
     protocol.stop(refused)
     return "The wheels did as designed" + (
         "; the gains are set in the running controllers."

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -71,6 +71,14 @@ class Protocol:
         for finding in new:
             print(f"{finding.severity}: {finding.message}", flush=True)
         return [f for f in new if f.severity == "refused" and f.code not in self._accepted]
+
+    def warned_of(self, wheels: Container[object]) -> list[Finding]:
+        """Return what earlier steps warned of these wheels: it may be the reason."""
+        return [
+            Finding(f["code"], "warning", f["message"], f["evidence"], f["advice"])
+            for f in self.document["findings"]
+            if f["severity"] == "warning" and f["evidence"].get("wheel") in wheels
+        ]
 
     def stop(self, findings: Sequence[Finding]) -> None:
         """Write the verdict and raise, where there is something to stop at."""

@@ -57,21 +57,11 @@ def on_trial(client: Any, gains: Mapping[str, Mapping[str, Any]]) -> Iterator[Tr
 
 @dataclass(frozen=True)
 class Designed:
-    """What a drive is judged by, by wheel.
+    """What a drive is judged by, by wheel."""
 
-    Attributes
-    ----------
-    estimates : mapping of str to Estimate
-        The motors.
-    gains : mapping of str to mapping
-        Parameters of ``wheel_pid``, as in ``gains.yaml``.
-    document : mapping of str to mapping
-        As in ``gains.json``.
-    """
-
-    estimates: Mapping[str, Estimate]
-    gains: Mapping[str, Mapping[str, Any]]
-    document: Mapping[str, Mapping[str, Any]]
+    estimates: Mapping[str, Estimate]  # the motors
+    gains: Mapping[str, Mapping[str, Any]]  # parameters of ``wheel_pid``, as in ``gains.yaml``
+    document: Mapping[str, Mapping[str, Any]]  # as in ``gains.json``
 
     def plan(self) -> list[tuple[str, float, float]]:
         """Return the steps of the drive: name, set-point [rad/s] and duration [s]."""
@@ -132,7 +122,7 @@ def read_changes(
     """
     wheels = list(designed.document)
     wanted = {f"{namespace}/{w}/motor_state": ["encoder_count", "position"] for w in wheels}
-    wanted |= {f"{namespace}/{w}/pid_state": ["setpoint", "age"] for w in wheels}
+    wanted |= {f"{namespace}/{w}/pid_state": ["setpoint", "age", "dt"] for w in wheels}
     read = read_columns(bag, wanted)
     changes, silence = [], 0.0
     for wheel in wheels:
@@ -141,8 +131,9 @@ def read_changes(
         for name, setpoint, lasts in plan:
             if setpoint:
                 changes.append(_change(wheel, name, setpoint, lasts, designed, state, answers))
-        gap = float(np.diff(answers.time).max(initial=0.0))
-        silence = max(silence, gap, float(np.max(answers.fields["age"])))
+        # The first interval is that since another drive.
+        late = (answers.fields["dt"][1:], answers.fields["age"][1:])
+        silence = max(silence, *(float(np.max(one, initial=0.0)) for one in late))
     return changes, silence
 
 

@@ -21,17 +21,11 @@ BLOCK = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Simulated:
-    """Measured and simulated motor speed of one stretch of data.
+    """Measured and simulated motor speed of one stretch of data."""
 
-    Attributes
-    ----------
-    time, measured, simulated : ndarray, shape (n,), [s], [rad/s], [rad/s]
-        NaN where nothing was measured.
-    """
-
-    time: Array
-    measured: Array
-    simulated: Array
+    time: Array  # [s]
+    measured: Array  # [rad/s]; NaN where nothing was measured
+    simulated: Array  # [rad/s]
 
     def powers(self) -> Array:
         """Return the mean square of the error in each block [(rad/s)^2]."""

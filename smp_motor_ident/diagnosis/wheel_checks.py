@@ -29,30 +29,16 @@ from smp_motor_ident.record import Hardware
 
 @dataclass(frozen=True)
 class Robot:
-    """What the checks are of.
+    """What the checks are of."""
 
-    Attributes
-    ----------
-    figures : mapping of str to Figures
-        By wheel.
-    hardware : mapping of str to Hardware
-        As the robot describes itself.
-    moved : mapping of str to mapping of str to float
-        By driven wheel how far every wheel turned meanwhile [counts].
-    gains : mapping of str to float
-        Known motor speeds per volt, as from a motor file; empty where none is known [rad/s/V].
-    ratios : mapping of str to float
-        Known gear ratios.
-    battery : float
-        Voltage that the battery reports [V]; NaN where it does not.
-    """
-
-    figures: Mapping[str, Figures]
-    hardware: Mapping[str, Hardware]
+    figures: Mapping[str, Figures]  # by wheel
+    hardware: Mapping[str, Hardware]  # as the robot describes itself
+    # by driven wheel how far every wheel turned meanwhile [counts]
     moved: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    # known motor speeds per volt, as from a motor file; empty where none is known [rad/s/V]
     gains: Mapping[str, float] = field(default_factory=dict)
-    ratios: Mapping[str, float] = field(default_factory=dict)
-    battery: float = math.nan
+    ratios: Mapping[str, float] = field(default_factory=dict)  # known gear ratios
+    battery: float = math.nan  # voltage that the battery reports [V]; NaN where it does not
 
 
 Check = Callable[[Robot], list[Finding]]
@@ -66,7 +52,7 @@ def feedback(robot: Robot) -> list[Finding]:
             found.append(Finding(
                 "feedback_rate", "refused",
                 f"{wheel}: motor_state comes {one.rate:.3g} times a second",
-                {"rate": one.rate, "least": FEEDBACK_RATE.value},
+                {"wheel": wheel, "rate": one.rate, "least": FEEDBACK_RATE.value},
                 "publish motor_state 100 times a second or more, stamped when it was sampled",
             ))  # fmt: skip
         if abs(one.age) > FEEDBACK_AGE.value:
@@ -74,7 +60,7 @@ def feedback(robot: Robot) -> list[Finding]:
                 "feedback_age", "refused",
                 f"{wheel}: stamps of motor_state are {abs(one.age):.3g} s "
                 f"{'old on arrival' if one.age > 0 else 'ahead of this clock'}",
-                {"age": one.age, "limit": FEEDBACK_AGE.value},
+                {"wheel": wheel, "age": one.age, "limit": FEEDBACK_AGE.value},
                 "stamp when it is sampled, on a clock that is synchronised with this one (chrony), "
                 "or run this tool with use_sim_time where the robot does",
             ))  # fmt: skip
@@ -82,7 +68,7 @@ def feedback(robot: Robot) -> list[Finding]:
             found.append(Finding(
                 "repeated_stamps", "warning",
                 f"{wheel}: {one.repeated} stamps do not grow",
-                {"stamps": one.repeated},
+                {"wheel": wheel, "stamps": one.repeated},
                 "stamp every sample with the instant at which it was taken",
             ))  # fmt: skip
     return found
@@ -96,7 +82,7 @@ def motion(robot: Robot) -> list[Finding]:
             found.append(Finding(
                 "turns_at_rest", "refused",
                 f"{wheel}: turned by {one.at_rest:.0f} counts under zero voltage",
-                {"counts": one.at_rest, "limit": BREAKAWAY_COUNTS.value},
+                {"wheel": wheel, "counts": one.at_rest, "limit": BREAKAWAY_COUNTS.value},
                 "see that nothing else drives or turns the wheel, and that the encoder counts "
                 "only motion",
             ))  # fmt: skip
@@ -107,7 +93,7 @@ def motion(robot: Robot) -> list[Finding]:
             found.append(Finding(
                 "crossed_wheels", "refused",
                 f"{wheel}: commanding it turns {', '.join(others)} instead",
-                {"counts": max(moved[w] for w in others)},
+                {"wheel": wheel, "counts": max(moved[w] for w in others)},
                 "motors or encoders of these wheels are exchanged: swap their plugs, or their "
                 "names in the driver",
             ))  # fmt: skip
@@ -117,7 +103,7 @@ def motion(robot: Robot) -> list[Finding]:
             found.append(Finding(
                 "coupled_wheels", "warning",
                 f"{wheel}: {', '.join(others)} turned with it",
-                {"counts": max(moved[w] for w in others)},
+                {"wheel": wheel, "counts": max(moved[w] for w in others)},
                 "lift the robot so that every wheel is free; wheels that a belt couples are one "
                 "motor's load, commission one of them with --wheel",
             ))  # fmt: skip
@@ -135,7 +121,7 @@ def _motionless(wheel: str, one: Figures) -> Finding:
     return Finding(
         "no_motion", "refused",
         f"{wheel}: did not turn in both directions at up to {one.level:.3g} V",
-        {"voltage": one.level, "applied": _known(one.applied)},
+        {"wheel": wheel, "voltage": one.level, "applied": _known(one.applied)},
         f"{where}; or allow more with --amplitude",
     )  # fmt: skip
 
@@ -148,7 +134,7 @@ def signs(robot: Robot) -> list[Finding]:
             found.append(Finding(
                 "reported_voltage_sign", "refused",
                 f"{wheel}: the driver reports {one.applied:.2f} times the commanded voltage",
-                {"applied": one.applied},
+                {"wheel": wheel, "applied": one.applied},
                 "change the sign of the command or of the reported voltage in the driver",
             ))  # fmt: skip
         if one.direction < 0:
@@ -156,7 +142,7 @@ def signs(robot: Robot) -> list[Finding]:
                 "reversed", "refused",
                 f"{wheel}: positive voltage makes its counts shrink: the encoder's channels A and "
                 "B are swapped, or the motor's leads; these look alike from here",
-                {"direction": one.direction},
+                {"wheel": wheel, "direction": one.direction},
                 "look at the wheel under positive voltage: if it turns forward, swap the encoder's "
                 "channels (or change the sign of counts, position and velocity in the driver); if "
                 "it turns backward, swap the motor's leads (or change the sign of its command "
@@ -166,7 +152,7 @@ def signs(robot: Robot) -> list[Finding]:
             found.append(Finding(
                 "velocity_sign", "refused",
                 f"{wheel}: velocity has the opposite sign of what encoder_count shows",
-                {"ratio": one.velocity_ratio},
+                {"wheel": wheel, "ratio": one.velocity_ratio},
                 "give both the same sign in the driver",
             ))  # fmt: skip
     return found
@@ -185,7 +171,7 @@ def gear_ratio(robot: Robot) -> list[Finding]:
                 "gear_ratio", "refused",
                 f"{wheel}: reported velocity is {ratio:.3g} times what counts show with {told} "
                 f"and {described.counts_per_revolution or 0:g} counts per revolution",
-                {"ratio": ratio, "described": described.gear_ratio},
+                {"wheel": wheel, "ratio": ratio, "described": described.gear_ratio},
                 f"one of these numbers is wrong in motor_description or in the driver; with the "
                 f"driver's a gear ratio of {described.gear_ratio / ratio:.4g} would fit",
             ))  # fmt: skip
@@ -193,14 +179,14 @@ def gear_ratio(robot: Robot) -> list[Finding]:
             found.append(Finding(
                 "gear_ratio", "refused",
                 f"{wheel}: describes itself with {told}, the motor file has {known:g}",
-                {"described": described.gear_ratio, "known": known},
+                {"wheel": wheel, "described": described.gear_ratio, "known": known},
                 "correct the one that is wrong",
             ))  # fmt: skip
         if abs(math.log(gain)) > math.log(EXPECTED_GAIN.value) if gain > 0 else False:
             found.append(Finding(
                 "unexpected_gain", "refused",
                 f"{wheel}: turns at {gain:.3g} times the speed per volt that the motor file has",
-                {"gain": one.gain, "expected": robot.gains[wheel]},
+                {"wheel": wheel, "gain": one.gain, "expected": robot.gains[wheel]},
                 "it is another motor, or counts_per_revolution is wrong (at the motor shaft, four "
                 "counts a line); --accept unexpected_gain where it is meant to differ",
             ))  # fmt: skip
@@ -230,7 +216,7 @@ def dead_zone(robot: Robot) -> list[Finding]:
                 f"{wheel}: starts to turn at {one.breakaway:.2f} V and keeps turning at "
                 f"{max(one.friction, 0.0):.2f} V: a dead zone of its driver, or a gearbox that "
                 "sticks",
-                {"breakaway": one.breakaway, "friction": one.friction},
+                {"wheel": wheel, "breakaway": one.breakaway, "friction": one.friction},
                 "a wheel will hesitate wherever it starts or reverses: switch the driver to "
                 "another PWM frequency or mode, or oil the gearbox",
             ))  # fmt: skip
@@ -246,7 +232,7 @@ def supply(robot: Robot) -> list[Finding]:
             found.append(Finding(
                 "voltage_not_reported", "refused",
                 f"{wheel}: turns, but motor_state reports no voltage",
-                {"applied": one.applied},
+                {"wheel": wheel, "applied": one.applied},
                 "publish the mean voltage of the interval before the stamp, duty cycle times "
                 "supply where nothing measures it",
             ))  # fmt: skip
@@ -255,7 +241,7 @@ def supply(robot: Robot) -> list[Finding]:
                 "supply_low", "refused",
                 f"{wheel}: gets {one.applied:.0%} of the commanded voltage, as from a battery of "
                 f"{one.applied * nominal:.3g} V in place of {nominal:g} V",
-                {"applied": one.applied, "nominal": _known(nominal)},
+                {"wheel": wheel, "applied": one.applied, "nominal": _known(nominal)},
                 "charge or change the battery, or correct supply_voltage in motor_description",
             ))  # fmt: skip
     rated = max((h.supply_voltage or math.nan for h in robot.hardware.values()), default=math.nan)
@@ -274,6 +260,8 @@ def sisters(robot: Robot) -> list[Finding]:
     found = []
     for name, words in (("friction", "friction"), ("coast", "time to come to rest")):
         values = {w: getattr(one, name) for w, one in robot.figures.items()}
+        if name == "friction":  # which is below what starts the wheel, where nothing else is known
+            values = {w: v if v > 0 else robot.figures[w].breakaway for w, v in values.items()}
         values = {w: v for w, v in values.items() if v > 0}
         for wheel, value in values.items():
             others = [v for w, v in values.items() if w != wheel]
@@ -283,7 +271,7 @@ def sisters(robot: Robot) -> list[Finding]:
                     "unlike_sisters", "refused",
                     f"{wheel}: its {words} is {value / usual:.3g} times its sisters': it drags, "
                     "brakes, carries something or is another motor",
-                    {"value": value, "sisters": usual},
+                    {"wheel": wheel, "value": value, "sisters": usual},
                     "turn it by hand beside the others: free what rubs, lift what touches the "
                     "ground; --accept unlike_sisters where it is meant to differ",
                 ))  # fmt: skip

@@ -16,33 +16,22 @@ from smp_motor_ident.record import Hardware
 
 Array = NDArray[np.float64]
 
+TREMBLE = 1.0
+"""An encoder that stands on an edge counts up and down by so much."""
+
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """What one wheel's hardware reported while wheels were tested; arrays of shape (n,).
+    """What one wheel's hardware reported while wheels were tested; arrays of shape (n,)."""
 
-    Attributes
-    ----------
-    time, age : ndarray, [s]
-        Stamps, and how old they were on arrival.
-    command, voltage : ndarray, [V]
-        What was commanded, and what the hardware reported.
-    velocity, position : ndarray, [rad/s], [rad]
-        Of the wheel, as reported.
-    count : ndarray, [counts]
-        Total ones; the motor's angle [rad] where nothing counts.
-    phase : ndarray
-        Number of the phase.
-    """
-
-    time: Array
-    age: Array
-    command: Array
-    voltage: Array
-    velocity: Array
-    position: Array
-    count: Array
-    phase: Array
+    time: Array  # stamps [s]
+    age: Array  # of the stamps on arrival [s]
+    command: Array  # what was commanded when the sample was taken [V]
+    voltage: Array  # as reported [V]
+    velocity: Array  # of the wheel, as reported [rad/s]
+    position: Array  # of the wheel, as reported [rad]
+    count: Array  # total counts; the motor's angle [rad] where nothing counts
+    phase: Array  # number of the phase
 
     @classmethod
     def of(cls, rows: ArrayLike) -> Trace:
@@ -58,72 +47,35 @@ class Trace:
 
 @dataclass(frozen=True)
 class Phase:
-    """One part of the test of a wheel.
+    """One part of the test of a wheel."""
 
-    Attributes
-    ----------
-    wheel : str
-        The one that is driven.
-    number : int
-        As in :class:`Trace`.
-    kind : {'rest', 'ramp', 'hold', 'coast'}
-        Zero voltage before, growing voltage, constant voltage, zero voltage behind it.
-    level : float
-        Voltage at the end, with its sign [V].
-    """
-
-    wheel: str
-    number: int
+    wheel: str  # the one that is driven
+    number: int  # as in :class:`Trace`
+    # zero voltage before, growing voltage, constant voltage, zero voltage behind it
     kind: Literal["rest", "ramp", "hold", "coast"]
-    level: float = 0.0
+    level: float = 0.0  # voltage at the end, with its sign [V]
 
 
 @dataclass(frozen=True)
 class Figures:
-    """What the test showed of one wheel; NaN for what it did not show.
+    """What the test showed of one wheel; NaN for what it did not show."""
 
-    Attributes
-    ----------
-    rate : float
-        Samples per second [Hz].
-    age : float
-        Of the stamps on arrival, median [s].
-    repeated : int
-        Stamps that do not grow.
-    at_rest : float
-        Turned under zero voltage [counts].
-    breakaway : float
-        Command at which it began to turn, the larger of both directions [V].
-    direction : float
-        1 where positive commands make counts grow, -1 where they make them shrink, 0 where
-        nothing turned.
-    applied : float
-        Reported over commanded voltage.
-    velocity_ratio : float
-        Reported over counted speed of the wheel.
-    gain : float
-        Steady motor speed per volt beyond friction [rad/s/V].
-    friction : float
-        Voltage that keeps it turning slowly [V].
-    coast : float
-        Angle of the coast over the speed before it [s]: the time constant, less what friction
-        takes of it.
-    level : float
-        Largest commanded voltage [V].
-    """
-
-    rate: float
-    age: float
-    repeated: int
-    at_rest: float
-    breakaway: float
+    rate: float  # samples per second [Hz]
+    age: float  # of the stamps on arrival, median [s]
+    repeated: int  # stamps that do not grow
+    at_rest: float  # turned under zero voltage [counts]
+    breakaway: float  # command at which it began to turn, the larger of both directions [V]
+    # 1 where positive commands make counts grow, -1 where they make them shrink, 0 where
+    # nothing turned
     direction: float
-    applied: float
-    velocity_ratio: float
-    gain: float
-    friction: float
+    applied: float  # reported over commanded voltage
+    velocity_ratio: float  # reported over counted speed of the wheel
+    gain: float  # steady motor speed per volt beyond friction [rad/s/V]
+    friction: float  # voltage that keeps it turning slowly [V]
+    # angle of the coast over the speed before it [s]: the time constant, less what friction
+    # takes of it
     coast: float
-    level: float
+    level: float  # largest commanded voltage [V]
 
 
 def answers_well(level: float, breakaway: float, counts: float) -> bool:
@@ -229,7 +181,7 @@ def _breakaway(ramp: Trace) -> float:
     turned = np.abs(ramp.count - ramp.count[0])
     if turned[-1] < BREAKAWAY_COUNTS.value:
         return math.nan
-    still = np.flatnonzero(turned < 0.5 * BREAKAWAY_COUNTS.value)
+    still = np.flatnonzero(turned <= TREMBLE)
     return float(abs(ramp.command[still[-1]]))
 
 

@@ -43,68 +43,36 @@ SIGMAS = 3.0
 
 @dataclass(frozen=True)
 class Reading:
-    """One change of set-point as its record shows it.
+    """One change of set-point as its record shows it."""
 
-    Attributes
-    ----------
-    settling : float
-        Until it stays within a tolerance [s]; infinite where it does not.
-    overshoot : float
-        Beyond the set-point [% of the change].
-    error : float
-        Mean distance from the set-point at the end [% of the change].
-    """
-
-    settling: float
-    overshoot: float
-    error: float
+    settling: float  # until it stays within a tolerance [s]; infinite where it does not
+    overshoot: float  # beyond the set-point [% of the change]
+    error: float  # mean distance from the set-point at the end [% of the change]
 
 
 @dataclass(frozen=True)
 class Bands:
-    """What a change may be at most, with what its record cannot resolve.
+    """What a change may be at most, with what its record cannot resolve."""
 
-    Attributes
-    ----------
-    settling, overshoot, error : float
-        [s], [% of the change], [% of the change].
-    """
-
-    settling: float
-    overshoot: float
-    error: float
+    settling: float  # [s]
+    overshoot: float  # [% of the change]
+    error: float  # [% of the change]
 
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """One change of set-point of one wheel: what was predicted, and what happened.
+    """One change of set-point of one wheel: what was predicted, and what happened."""
 
-    Attributes
-    ----------
-    wheel, name : str
-        Whose, and which.
-    setpoint : float
-        From rest [rad/s, wheel].
-    time, speed : ndarray, shape (n,), [s], [rad/s]
-        Since the change, as measured.
-    low, nominal, high : ndarray, shape (n,), [rad/s]
-        As predicted.
-    reading : Reading
-        Of the measured speed.
-    bands : Bands
-        Of the design.
-    """
-
-    wheel: str
-    name: str
-    setpoint: float
-    time: Array
-    speed: Array
-    low: Array
-    nominal: Array
-    high: Array
-    reading: Reading
-    bands: Bands
+    wheel: str  # whose
+    name: str  # of the change in the drive
+    setpoint: float  # from rest [rad/s, wheel]
+    time: Array  # since the change [s]
+    speed: Array  # as measured [rad/s, wheel]
+    low: Array  # least of the predictions [rad/s]
+    nominal: Array  # as predicted for the motor as identified [rad/s]
+    high: Array  # largest of the predictions [rad/s]
+    reading: Reading  # of the measured speed
+    bands: Bands  # of the design
 
 
 def smoothed(time: Array, angle: Array, step: float) -> tuple[Array, Array]:
@@ -273,7 +241,8 @@ def judge(changes: Sequence[Change]) -> list[Finding]:
                     "verification", "refused",
                     f"{one.wheel}: {one.name} to {one.setpoint:.3g} rad/s {words} {text}; the "
                     f"design allows {most:.3g} {unit}",
-                    {"value": value if math.isfinite(value) else None, "limit": most},
+                    {"wheel": one.wheel, "value": value if math.isfinite(value) else None,
+                     "limit": most},
                     "look at the curves in the report: a wheel that touches something, a battery "
                     "that sags or a motor that changed since; then commission again",
                 ))  # fmt: skip

@@ -175,6 +175,9 @@ def test_a_wheel_that_drags_is_told_from_motors_that_scatter() -> None:
     assert codes(replace(GOOD, friction=5 * FRICTION))["unlike_sisters"] == "refused"
     assert codes(replace(GOOD, coast=5 * GOOD.coast))["unlike_sisters"] == "refused"
     assert "unlike_sisters" not in codes(replace(GOOD, friction=1.8 * FRICTION))
+    # A load that leaves room for one level only: friction is not told from gain.
+    heavy = replace(GOOD, friction=math.nan, gain=math.nan, breakaway=3.3)
+    assert codes(heavy)["unlike_sisters"] == "refused"
     # Two wheels cannot tell which of them is the odd one.
     two = {"a": GOOD, "b": replace(GOOD, friction=9 * FRICTION)}
     found = judge(Robot(two, dict.fromkeys(two, HARDWARE)))
