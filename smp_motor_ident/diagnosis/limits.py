@@ -269,12 +269,6 @@ SIGN_SURE = Limit(
     "lags exceeds it by chance once in 2000 records of a standing motor",
     "test_screening.py",
 )
-SAME_MOTOR = Limit(
-    0.01,
-    "probability",
-    "that records of one motor differ by so much by chance in any quantity",
-    "test_records.py",
-)
 SIGN_ALIKE = Limit(
     0.5,
     "correlation",
