@@ -6,9 +6,15 @@ import sys
 
 from smp_motor_ident.bag import limits as recordings
 from smp_motor_ident.diagnosis import limits as estimates
+from smp_motor_ident.diagnosis import wheel_limits as wheels
 from smp_motor_ident.tune import limits as gains
 
-TABLES = {"Recordings": recordings, "Estimates": estimates, "Gains and loops": gains}
+TABLES = {
+    "Recordings": recordings,
+    "Estimates": estimates,
+    "Wheels on blocks": wheels,
+    "Gains and loops": gains,
+}
 
 
 def page() -> str:

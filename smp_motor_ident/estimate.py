@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from smp_motor_ident.diagnosis import validation as validate
 from smp_motor_ident.diagnosis.adequacy import adequacy, stated
 from smp_motor_ident.diagnosis.advice import advise, assess
+from smp_motor_ident.diagnosis.beat import on_beat
 from smp_motor_ident.diagnosis.bunched import merge_bunches
 from smp_motor_ident.diagnosis.current_kind import ARMATURE, current_kind
 from smp_motor_ident.diagnosis.limits import CANDIDATE_WEIGHT, LEAST_FIT, PROFILED
@@ -103,7 +104,7 @@ def estimate(
         rigid = estimate(group, "second_order", fixed=fixed, loss=loss, progress=progress)
         return flexible_shaft.flexible_shaft(group, rigid)
     request = checked(group, model, fixed, bounds, loss, validation, progress)
-    group = [merge_bunches(r) for r in group]
+    group = [merge_bunches(on_beat(r)) for r in group]
     kind = current_kind(group) if request.may_leave_current else ARMATURE
     if kind != ARMATURE:
         group, request = request.without_current(group)
@@ -167,7 +168,7 @@ def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) 
         *assess(final, chosen, FitPercent(fitted, common), tests),
         *adequacy(final, chosen, stated(chosen, result), group[0].hardware.gear_ratio, tests),
         *advise(chosen, result, request.known),
-        *scope(result, change, alike),
+        *scope(final, result, change, alike),
     ]
     return Estimate(
         model=_name(chosen.structure),

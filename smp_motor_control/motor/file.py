@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -43,8 +43,33 @@ HARDWARE = {
 }
 """What may stand beside the motor's parameters, and what holds where it does not."""
 
+FAULTS = {"leads": 1, "encoder": 1, "dead_zone": 0.0, "described_gear_ratio": 0.0}
+"""What may be wrong with a motor that is simulated; see :class:`Wiring`."""
+
 _OPTIONAL = ("coulomb_friction", "time_constant_product", "static_voltage")
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*\Z")
+
+
+@dataclass(frozen=True)
+class Wiring:
+    """What may be wrong between a motor and its driver, for simulations."""
+
+    leads: int = 1  # -1 where the motor's leads are swapped
+    encoder: int = 1  # -1 where the encoder's channels are
+    dead_zone: float = 0.0  # commands up to so much give nothing [V]
+    described_gear_ratio: float = 0.0  # what the description says of the gearbox; 0: the truth
+
+    def __post_init__(self) -> None:
+        for name in ("leads", "encoder"):
+            if getattr(self, name) not in (1, -1):
+                raise ParameterError(
+                    f"{name} is {getattr(self, name)!r}; it must be 1, or -1 where swapped"
+                )
+        for name in ("dead_zone", "described_gear_ratio"):
+            if not getattr(self, name) >= 0:
+                raise ParameterError(
+                    f"{name} is {getattr(self, name)!r}; it must be zero or positive"
+                )
 
 
 @dataclass(frozen=True)
@@ -59,6 +84,7 @@ class MotorEntry:
     # As the file gives it [ohm]; NaN where it gives combinations alone, and then neither currents
     # nor torques of ``parameters`` mean anything
     resistance: float = math.nan
+    wiring: Wiring = Wiring()  # what is wrong with it, where it is simulated
 
     @property
     def knows_current(self) -> bool:
@@ -128,7 +154,7 @@ def _entry(values: Any, where: str) -> MotorEntry:
         raise ParameterError(f"{where}: is {values!r}; expected the motor's parameters")
     combined = any(name in values for name in COMBINATIONS)
     names = (*COMBINATIONS, "resistance") if combined else PHYSICAL
-    known = (*names, *HARDWARE)
+    known = (*names, *HARDWARE, *FAULTS)
     for key in values:
         if key not in known:
             raise ParameterError(f"{where}: unknown key {key!r}; known are {', '.join(known)}")
@@ -138,12 +164,14 @@ def _entry(values: Any, where: str) -> MotorEntry:
             raise ParameterError(f"{where}: {name} is missing")
     numbers = {key: _number(value, f"{where}: {key}") for key, value in values.items()}
     hardware = {key: numbers.pop(key, default) for key, default in HARDWARE.items()}
+    faults = {key: numbers.pop(key) for key in FAULTS if key in numbers}
     try:
         if combined:
             parameters = MotorParameters.from_combinations(**numbers)
         else:
             parameters = MotorParameters(**numbers)
-        return _with_hardware(parameters, numbers.get("resistance", math.nan), hardware)
+        entry = _with_hardware(parameters, numbers.get("resistance", math.nan), hardware)
+        return replace(entry, wiring=Wiring(**faults))  # type: ignore[arg-type]
     except ParameterError as error:
         raise ParameterError(f"{where}: {error}") from None
 

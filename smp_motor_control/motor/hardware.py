@@ -81,7 +81,7 @@ class Supply:
         """Return the voltage under the present currents [V], never below zero."""
         if self.resistance == 0.0:
             return self.open_voltage
-        drawn = sum(m.duty * m.motor.current for m in self.motors)
+        drawn = sum(m.duty * m.entry.wiring.leads * m.motor.current for m in self.motors)
         return max(0.0, self.open_voltage - self.resistance * drawn)
 
 
@@ -174,6 +174,8 @@ class DrivenMotor:
 
     def _set_duty(self, voltage: float) -> None:
         # The driver knows the nominal voltage; under sag it delivers less than asked.
+        if abs(voltage) <= self.entry.wiring.dead_zone:
+            voltage = 0.0
         duty = min(max(voltage / self.entry.supply_voltage, -1.0), 1.0)
         steps = self.settings.pwm_steps
         self.duty = round(duty * steps) / steps if steps else duty
@@ -186,7 +188,7 @@ class DrivenMotor:
         load = self._load
         if self.settings.torque_noise > 0:
             load += self._random.gauss(0.0, self.settings.torque_noise / math.sqrt(dt))
-        self.motor.step(voltage, dt, load)
+        self.motor.step(self.entry.wiring.leads * voltage, dt, load)
         self._volt_seconds += voltage * dt
         self._now = until
 
@@ -202,19 +204,20 @@ class DrivenMotor:
             self._pending.append((time + self.entry.delay, self._latched))
             self._latched = None
         entry, settings = self.entry, self.settings
-        count = entry.encoder.count(self.motor.angle)
+        leads, turned = entry.wiring.leads, entry.wiring.encoder
+        count = entry.encoder.count(turned * self.motor.angle)
         current = math.nan
         if settings.current_sensor and entry.knows_current:
-            current = self.motor.current + self._random.gauss(0.0, settings.current_noise)
+            current = leads * self.motor.current + self._random.gauss(0.0, settings.current_noise)
         if settings.velocity_window == 0:
-            velocity = self.motor.speed
+            velocity = turned * self.motor.speed
         else:
             velocity = self._speed.step(time, count)
             velocity = self._last_velocity if math.isnan(velocity) else velocity
             self._last_velocity = velocity
         angle = self._speed.total * entry.encoder.angle_per_count
         if settings.velocity_window == 0:
-            angle = self.motor.angle
+            angle = turned * self.motor.angle
         gearbox = entry.gearbox
         return Sample(
             self._last_voltage,

@@ -85,6 +85,11 @@ def share(path: str) -> Path:
     raise SmpError(f"{path} of smp_motor_control is not installed; build the package again")
 
 
+def nanoseconds(stamp: Any) -> int:
+    """Return a stamp in whole nanoseconds; 0 where none was given."""
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
 def seconds(stamp: Any) -> float:
     """Return a ``builtin_interfaces/Time`` as seconds."""
     return float(stamp.sec + 1e-9 * stamp.nanosec)

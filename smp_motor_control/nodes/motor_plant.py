@@ -3,8 +3,10 @@
 Subscribes ``<wheel>/motor_command``, of one writer at a time, and ``<wheel>/load_torque``
 (``std_msgs/Float64``, [N m] at the wheel, positive against forward turning); publishes
 ``<wheel>/motor_state``, ``<wheel>/motor_owner`` on every change and, once,
-``<wheel>/motor_description``.  Physics runs on the steady clock over the real intervals;
-only the stamps are ROS time.
+``<wheel>/motor_description``.  A motor of the file may have faults, such as swapped leads
+(``leads: -1``; see :class:`~smp_motor_control.motor.file.Wiring`).
+
+Physics runs on the steady clock over the real intervals; only the stamps are ROS time.
 """
 
 from __future__ import annotations
@@ -59,6 +61,9 @@ class Settings:
     supply_resistance: float = described(
         0.0, "Inner resistance of the battery that all motors share [ohm].", minimum=0.0
     )
+    battery_voltage: float = described(
+        0.0, "Of the battery without load [V]; 0: the supply_voltage of the motors.", minimum=0.0
+    )
     ohmmeter: bool = described(
         True, "Whether the description tells the resistance, as measured.", read_only=True
     )
@@ -69,6 +74,9 @@ SHORTEST_INTERVAL = 0.5
 """Of two samples, in periods: a timer that was late makes up for it, a microcontroller does not.
 A speed that is differenced over a sliver of a period would be all quantisation."""
 
+SAME_INSTANT, READINGS = 1e-4, 5
+"""Clocks that are read within so much [s] are read at once; else they are read again, so often."""
+
 
 class Wheel:
     """One motor and its topics."""
@@ -76,7 +84,8 @@ class Wheel:
     def __init__(self, node: MotorPlant, name: str, motor: DrivenMotor) -> None:
         self.name = name
         self.motor = motor
-        self.rejected = 0
+        self._clock = node.get_clock()
+        self.rejected = self.late = 0
         self.lease = Lease(motor.settings.command_timeout)
         self._owner = "?"
         self._owners = node.create_publisher(String, f"{name}/motor_owner", runtime.LATCHED)
@@ -103,7 +112,7 @@ class Wheel:
         self._description.publish(
             MotorDescription(
                 joint_name=self.state.header.frame_id,
-                gear_ratio=entry.gearbox.ratio,
+                gear_ratio=entry.wiring.described_gear_ratio or entry.gearbox.ratio,
                 counts_per_revolution=entry.encoder.counts_per_revolution,
                 encoder_bits=entry.encoder.bits,
                 supply_voltage=entry.supply_voltage,
@@ -113,7 +122,8 @@ class Wheel:
 
     def _command(self, message: MotorCommand) -> None:
         now = time.monotonic()
-        if not self.lease.take(message.header.frame_id, message.voltage, now):
+        stamps = runtime.nanoseconds(message.header.stamp), self._clock.now().nanoseconds
+        if not self.lease.take(message.header.frame_id, message.voltage, now, *stamps):
             return
         if not self.motor.command(now, message.voltage):
             self.rejected += 1
@@ -148,7 +158,8 @@ class MotorPlant(Node):
         settings = self._given.settings
         entries = self._motors(settings)
         self._supply = Supply(0.0, settings.supply_resistance)
-        self._supply.open_voltage = max(entry.supply_voltage for entry in entries.values())
+        self._nominal = max(entry.supply_voltage for entry in entries.values())
+        self._supply.open_voltage = settings.battery_voltage or self._nominal
         start = time.monotonic()
         self._wheels = [
             Wheel(
@@ -184,13 +195,13 @@ class MotorPlant(Node):
 
     def _change(self, settings: Settings) -> None:
         self._supply.resistance = settings.supply_resistance
+        self._supply.open_voltage = settings.battery_voltage or self._nominal
         for wheel in self._wheels:
             wheel.motor.settings = settings.drive
-            wheel.lease.timeout = Lease(settings.drive.command_timeout).timeout
+            wheel.lease.set_timeout(settings.drive.command_timeout)
 
     def _tick(self) -> None:
-        stamp = self.get_clock().now().to_msg()
-        now = time.monotonic()
+        now, stamp = self._instant()
         if now - self._last < SHORTEST_INTERVAL * self._period:
             return
         self._late += now - self._last > 1.5 * self._period
@@ -198,6 +209,16 @@ class MotorPlant(Node):
         self._samples += 1
         for wheel in self._wheels:
             wheel.publish(now, stamp)
+
+    def _instant(self) -> tuple[float, Any]:
+        """Return one instant on both clocks: hardware stamps when it samples, however busy."""
+        for _ in range(READINGS):
+            before = time.monotonic()
+            stamp = self.get_clock().now()
+            after = time.monotonic()
+            if after - before < SAME_INSTANT:
+                break
+        return 0.5 * (before + after), stamp.to_msg()
 
     def _assess(self) -> tuple[bytes, str, Mapping[str, object]]:
         values: dict[str, object] = {"samples": self._samples, "late samples": self._late}
@@ -210,6 +231,7 @@ class MotorPlant(Node):
             values[f"{wheel.name} refused messages"] = wheel.rejected
             values[f"{wheel.name} owner"] = wheel.lease.owner(time.monotonic()) or "none"
             values[f"{wheel.name} refused writers"] = wheel.lease.refused or "none"
+            values[f"{wheel.name} late commands"] = wheel.lease.late
         refused = [wheel.name for wheel in self._wheels if wheel.rejected]
         rivals = {w.name: sorted(w.lease.refused) for w in self._wheels if w.lease.refused}
         if rivals:
@@ -217,6 +239,13 @@ class MotorPlant(Node):
             level, message = runtime.WARN, f"not yours, refused on {listed}"
             for wheel in self._wheels:
                 wheel.lease.refused = {}
+        if late := [wheel.name for wheel in self._wheels if wheel.lease.late > wheel.late]:
+            level, message = (
+                runtime.WARN,
+                f"refused commands that come late by their stamps: {late}",
+            )
+        for wheel in self._wheels:
+            wheel.late = wheel.lease.late
         if refused:
             level, message = runtime.WARN, f"refused messages that are no numbers: {refused}"
         return level, message, values

@@ -83,6 +83,7 @@ class Wheel:
 
     def __init__(self, node: Node, name: str, settings: Settings) -> None:
         self.settings, self.voltage, self.commanded = settings, 0.0, -math.inf
+        self._clock = node.get_clock()
         self.lease = Lease(settings.command_timeout)
         self._owner = "?"
         self._gearbox = Gearbox(settings.gear_ratio)
@@ -115,8 +116,9 @@ class Wheel:
 
     def _command(self, message: MotorCommand) -> None:
         now = time.monotonic()
-        voltage = message.voltage
-        if math.isfinite(voltage) and self.lease.take(message.header.frame_id, voltage, now):
+        voltage, writer = message.voltage, message.header.frame_id
+        stamps = runtime.nanoseconds(message.header.stamp), self._clock.now().nanoseconds
+        if math.isfinite(voltage) and self.lease.take(writer, voltage, now, *stamps):
             self.voltage, self.commanded = voltage, now
 
     def wanted(self, now: float, battery: float) -> float:
@@ -262,6 +264,7 @@ class SerialDriver(Node):
             "resets of the board": self._resets,
             "openings": self._openings,
             "last problem": self._problem or "none",
+            "late commands": sum(wheel.lease.late for wheel in self._wheels),
         }
         if self._fd is None:
             return runtime.ERROR, f"{self._settings.device}: {self._problem}", values

@@ -136,7 +136,7 @@ class WheelPid(LifecycleNode):
 
     def _hear(self, message: MotorState) -> None:
         wheel, stamp = self._wheel, message.header.stamp
-        nanoseconds = stamp.sec * 1_000_000_000 + stamp.nanosec
+        nanoseconds = runtime.nanoseconds(stamp)
         voltage = wheel.take_feedback(message, nanoseconds, self._now(), time.monotonic())
         if voltage is not None:
             self._writer.send(voltage, stamp)

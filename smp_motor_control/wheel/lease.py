@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import math
 
+from smp_motor_control.wheel.freshness import FeedbackClock, Verdict
+
 LONGEST = 1.0
 """Of a lease whose wheel's commands never expire [s]."""
+
+MOST_WRITERS = 64
+"""Whose clocks are kept; more are no robot's."""
 
 
 class Lease:
@@ -13,12 +18,16 @@ class Lease:
 
     Every command other than 0 V takes the wheel, where it is free, or renews the lease of its
     owner.  Zero commands renew nothing, so that a writer which rests, ends or dies gives the
-    wheel back by itself after ``timeout``; until then all others are refused.
+    wheel back by itself after ``timeout``; until then all others are refused.  A command that is
+    late by ``timeout``, by its stamp, was meant for another moment: it is refused unless it is 0 V.
+    Drivers that stood still find such in their queues.
 
     Attributes
     ----------
     refused : dict of str to int
         How many commands of each writer were refused.
+    late : int
+        How many commands came late.
 
     Examples
     --------
@@ -30,19 +39,43 @@ class Lease:
     """
 
     def __init__(self, timeout: float) -> None:
-        self.timeout = min(timeout, LONGEST)
+        self.set_timeout(timeout)
         self.refused: dict[str, int] = {}
+        self.late = 0
         self._owner = ""
         self._until = -math.inf
+        self._clocks: dict[str, FeedbackClock] = {}
 
-    def take(self, writer: str, voltage: float, now: float) -> bool:
-        """Judge a command."""
+    def set_timeout(self, timeout: float) -> None:
+        """Set the age at which commands expire [s]."""
+        self.timeout, self._expire = min(timeout, LONGEST), timeout
+        self._clocks = {}
+
+    def take(
+        self, writer: str, voltage: float, now: float, stamp: int = 0, arrival: int = 0
+    ) -> bool:
+        """Judge a command by its writer, its arrival on a steady clock [s], and its stamp [ns].
+
+        ``arrival`` is read from the stamp's clock [ns]; a stamp of 0 tells nothing.
+        """
+        late = self._is_late(writer, now, stamp, arrival)
         if writer != self._owner and now < self._until:
             self.refused[writer] = self.refused.get(writer, 0) + 1
+            return False
+        if late and voltage != 0.0:
+            self.late += 1
             return False
         if voltage != 0.0 and math.isfinite(voltage):
             self._owner, self._until = writer, now + self.timeout
         return True
+
+    def _is_late(self, writer: str, now: float, stamp: int, arrival: int) -> bool:
+        clock = self._clocks.get(writer)
+        if clock is None:
+            if len(self._clocks) >= MOST_WRITERS:
+                self._clocks.clear()
+            clock = self._clocks[writer] = FeedbackClock(self._expire, math.inf)
+        return clock.accept(stamp, arrival, now) is Verdict.LATE
 
     def owner(self, now: float) -> str:
         """Return who owns the wheel; empty where nobody does, or nobody that says its name."""

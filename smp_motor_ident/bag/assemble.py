@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from smp_motor_control.motor.friction import Gearbox
 from smp_motor_ident.bag.axis import Series, on_one_axis
-from smp_motor_ident.bag.beat import find_beat, roughness
 from smp_motor_ident.bag.checks import impossible, is_unsigned, signed
 from smp_motor_ident.bag.clock import (
     SAME_CLOCK,
@@ -23,10 +22,11 @@ from smp_motor_ident.bag.clock import (
     rhythm,
 )
 from smp_motor_ident.bag.counter import unwrap_angle
-from smp_motor_ident.bag.limits import SMOOTHER
 from smp_motor_ident.bag.mapping import MotorMap, Signal
 from smp_motor_ident.bag.storage import Table, found
 from smp_motor_ident.bag.units import FACTORS, check_unit, factor
+from smp_motor_ident.diagnosis.beat import find_beat, roughness
+from smp_motor_ident.diagnosis.limits import SMOOTHER
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.finding import Finding, Severity
 from smp_motor_ident.record import Hardware, Record

@@ -25,24 +25,6 @@ STRAY_ROWS = Limit(
     "cost: an estimate without one row in twenty keeps its value; with more it is no table",
     "test_csv.py",
 )
-BEAT_FLOOR = Limit(
-    0.5,
-    "sample",
-    "physical: a later beat than half a sample is the next one; the least latency stays below it",
-    "test_beat.py",
-)
-BEAT_JITTER = Limit(
-    0.02,
-    "sample",
-    "cost: instants that are off by less change an estimate less than their rounding",
-    "test_beat.py",
-)
-BEAT_LOST = Limit(
-    0.02,
-    "1",
-    "cost: with more samples lost the number of a sample, and with it its instant, is a guess",
-    "test_beat.py",
-)
 JUMP_SPAN = Limit(
     20.0,
     "1",
@@ -60,12 +42,6 @@ UNSIGNED_CURRENT = Limit(
     "1",
     "physical: an armature's means in both directions cancel but for an offset; a size's add up",
     "test_checks.py",
-)
-SMOOTHER = Limit(
-    0.9,
-    "1",
-    "cost: stamps are kept unless the motion is evidently smoother on the beat that they keep",
-    "test_beat.py",
 )
 EXPLAINS = Limit(
     1e-6,

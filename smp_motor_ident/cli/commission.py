@@ -10,9 +10,10 @@ from smp_motor_ident.cli.frame import Parser, number, run
 NAME = "commission"
 
 DESCRIPTION = """\
-Excite the wheels of the running robot, record them, identify the motors, design gains and, with
---apply, set them in the running wheel_pid nodes. Put the robot on blocks first: the wheels turn.
-Controllers that are active are switched off meanwhile and on again at the end.
+Check the wheels of the running robot, excite and record them, identify the motors, judge them by a
+run that no fit has seen, design gains, and drive with these on trial. With --apply gains that pass
+stay. Put the robot on blocks first: the wheels turn. Controllers that are active are switched off
+meanwhile and on again at the end.
 """
 
 
@@ -24,7 +25,9 @@ def parser() -> argparse.ArgumentParser:
     add("--wheel", action="append", metavar="NAME", help="only this; default: all that report")
     add("--amplitude", type=number(0), default=6.0, help="largest voltage [V]; default 6")
     add("--duration", type=number(0), default=15.0, help="of each of three signals [s]; default 15")
-    add("--apply", action="store_true", help="set the gains in the running controllers")
+    add("--motors", metavar="FILE", help="what is known of the motors, to check gearing by")
+    add("--accept", action="append", default=[], metavar="CODE", help="do not stop at this finding")
+    add("--apply", action="store_true", help="leave gains that pass in the running controllers")
     add("--resume", action="store_true", help="go on in DIR where an earlier run was cut off")
     add("--dry-run", action="store_true", help="print and draw what would be done, and end")
     add("--tuning", action="store_true", help="add the tuning page to the report (takes longer)")

@@ -383,3 +383,29 @@ FLEET_SIZE = Limit(
     "with fewer, the median deviation itself is uncertain by half",
     "test_fleet.py: a motor unlike the others",
 )
+
+# Stamps of arrival, put back on the beat of their sender.
+BEAT_FLOOR = Limit(
+    0.5,
+    "sample",
+    "physical: a later beat than half a sample is the next one; the least latency stays below it",
+    "test_beat.py",
+)
+BEAT_JITTER = Limit(
+    0.02,
+    "sample",
+    "cost: instants that are off by less change an estimate less than their rounding",
+    "test_beat.py",
+)
+BEAT_LOST = Limit(
+    0.02,
+    "1",
+    "cost: with more samples lost the number of a sample, and with it its instant, is a guess",
+    "test_beat.py",
+)
+SMOOTHER = Limit(
+    0.9,
+    "1",
+    "cost: stamps are kept unless the motion is evidently smoother on the beat that they keep",
+    "test_beat.py",
+)

@@ -42,11 +42,26 @@ def refuse(group: Sequence[Record], fit: Fit, result: Answer, fitted: float) -> 
         and (q.std or 0) > LOOSE_QUANTITY.value * abs(q.value or 1)
     ]
     if loose:
+        _refuse_integral(group, fit)
         raise InsufficientExcitationError(
             f"{where(group)}: the data do not tell {' and '.join(loose)}; record a longer "
             "excitation with several frequencies, in both directions and well above the friction"
         )
     _refuse_offset(group, fit)
+
+
+def _refuse_integral(group: Sequence[Record], fit: Fit) -> None:
+    """Name a speed that never becomes steady: an angle, or a record that ends too soon."""
+    longest = max(r.duration for r in group)
+    if fit.z[models.A1] - fit.z[models.A0] < np.log(longest) or any(
+        r.velocity is None for r in group
+    ):
+        return
+    raise SignalError(
+        f"{where(group)}: velocity changes for as long as there is a voltage and is never steady "
+        f"within {longest:.3g} s, as an angle does; if it is an angle, map it as position, else "
+        "record until the speed is steady"
+    )
 
 
 def _refuse_offset(group: Sequence[Record], fit: Fit) -> None:

@@ -22,6 +22,10 @@ PLAUSIBLE = np.array([1e-2, 1e-2, 1e-2, 0.25, 1e-4, 1e-4, 1e-4, 1e-2, 1e-4, 1e-2
 """Inverse squares of how far each coordinate z could be from any value at all."""
 
 
+ROUNDING = 1e-13
+"""Share of the information in which sums over thousands of samples are exact."""
+
+
 @dataclass(frozen=True)
 class Prior:
     """A statement of the user, ``row z = value`` within ``std``, linear around the estimate."""
@@ -145,5 +149,8 @@ class Fit(Start):
         scale = np.sqrt(np.diag(information))
         values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
         vectors = vectors / scale[:, None]
-        cov: Array = (vectors / np.maximum(values, 1e-15)) @ vectors.T
+        # What rounding leaves of a direction's information is no information.
+        plausible = np.diag(PLAUSIBLE[list(self.structure.free())])
+        alone = np.einsum("ij,ik,kj->j", vectors, plausible, vectors)
+        cov: Array = (vectors / np.where(values > ROUNDING, values, alone)) @ vectors.T
         return cov

@@ -19,7 +19,7 @@ from smp_motor_ident.estimation.descent import (
     noise_ratio_of,
 )
 from smp_motor_ident.estimation.fit import Fit, Options, Start, solve
-from smp_motor_ident.estimation.ridge import better, shapes
+from smp_motor_ident.estimation.ridge import better, shapes, slower_winding
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.noise import NoiseModel, deviance, kalman_gain
 from smp_motor_ident.likelihood.passes import gather
@@ -30,6 +30,7 @@ Array = NDArray[np.float64]
 
 SHAPES = 6  # of the same linear response that are refined
 OPEN = 0.02  # standard deviation of ln L/R or ln R above which other starts are tried
+WINDING = 0.2  # of a sample: a shorter L/R has settled to a hundredth when the current is read
 
 
 def candidates(data: Experiments, structure: Structure) -> list[Array]:
@@ -108,10 +109,21 @@ def _elsewhere(subset: Experiments, structure: Structure, best: Fit, options: Op
             z = best.z.copy()
             for i, power in change.items():
                 z[i] += power * np.log(factor)
-            other = solve(subset, structure, best.at(structure.complete(z)), options, 25, 0.1)
-            if other.deviance < best.deviance - 1:
-                best = other
+            best = _likelier(subset, z, best, options)
+    if best.z[models.TE] > np.log(WINDING * subset.step):
+        return best
+    # Below that L/R shows in nothing: what a descent left behind on its way there shows.
+    slow = float(np.exp(best.z[models.A1] - best.z[models.A0]))
+    for te in np.geomspace(WINDING * subset.step, max(WINDING * subset.step, 0.2 * slow), 4):
+        best = _likelier(subset, slower_winding(best.z, float(np.log(te))), best, options)
     return best
+
+
+def _likelier(subset: Experiments, z: Array, best: Fit, options: Options) -> Fit:
+    """Return the better of a fit and of a descent from other coordinates."""
+    s = best.structure
+    other = solve(subset, s, best.at(s.complete(z)), options, 25, 0.1)
+    return other if other.deviance < best.deviance - 1 else best
 
 
 def _distinct(ranked: Sequence[Array], step: float, keep: int) -> list[Array]:

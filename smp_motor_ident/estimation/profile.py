@@ -24,8 +24,10 @@ from smp_motor_ident.estimation.descent import initial_of
 from smp_motor_ident.estimation.fit import Fit, Options, solve
 from smp_motor_ident.estimation.fitted import NORMAL_95, Profile
 from smp_motor_ident.estimation.prediction import simulate
+from smp_motor_ident.estimation.ridge import slower_winding
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model import structures as models
+from smp_motor_ident.model.structures import to_internal
 
 Array = NDArray[np.float64]
 
@@ -45,6 +47,7 @@ def profiled(data: Experiments, fit: Fit, options: Options) -> Fit:
     std = np.sqrt(np.diag(fit.covariance()))
     white = np.sqrt(np.diag(fit.white()))
     found: list[Profile] = []
+    held = fit
     for coordinate in NONLINEAR:
         if coordinate not in free:
             continue
@@ -52,6 +55,12 @@ def profiled(data: Experiments, fit: Fit, options: Options) -> Fit:
         if coordinate == models.VC_PLUS and one_level(data, fit):
             both = [rubbing(data, fit, f)[0] for f in _range(data, fit, coordinate)]
             found.append(Profile(coordinate, (both[0], both[1])))
+            # The others are followed at this friction: along it the motors are all alike.
+            alike = replace(fit, profiles=tuple(found))
+            std = np.sqrt(np.maximum(np.diag(alike.conditional()), 0.0))
+            white = np.minimum(white, np.maximum(std, 1e-12))
+            friction = {**fit.structure.fixed, "vc_plus": float(fit.z[coordinate])}
+            held = replace(fit, structure=fit.structure.with_(fixed=friction))
             continue
         value = float(fit.z[coordinate])
         loose = std[i] > PROFILE_FROM.value * (1.0 if coordinate == models.A2 else abs(value))
@@ -59,7 +68,7 @@ def profiled(data: Experiments, fit: Fit, options: Options) -> Fit:
             continue
         # Coloured residuals and repeating counts scale the deviance as they do variances.
         target = RISE * float((std[i] / white[i]) ** 2)
-        found.append(_followed(data, fit, coordinate, float(std[i]), target, options))
+        found.append(_followed(data, held, coordinate, float(std[i]), target, options))
     return replace(fit, profiles=tuple(found))
 
 
@@ -101,9 +110,17 @@ def _followed(
 
 def _range(data: Experiments, fit: Fit, coordinate: int) -> tuple[float, float]:
     if coordinate == models.A2:
-        return float(fit.z[models.A2] - FARTHEST), float(fit.z[models.A2] + FARTHEST)
+        slowest = float(2 * fit.z[models.A1] - fit.z[models.A0])  # a winding as slow as the rotor
+        value = float(fit.z[models.A2])
+        return value - FARTHEST, max(value + FARTHEST, slowest)
     if coordinate == models.VC_PLUS:
-        return 0.0, MOST_FRICTION.value * float(np.abs(data.hold_value).max())
+        full = float(np.abs(data.hold_value).max())
+        if not fit.structure.current:
+            return 0.0, MOST_FRICTION.value * full
+        # The current tells the back-EMF: friction is what viscous friction may be, at most.
+        back = _back_emf(fit.z) / float(np.exp(fit.z[models.A0]))
+        value = float(fit.z[coordinate])
+        return 0.0, min(MOST_FRICTION.value * full, value + (1 - back) * max(full - value, 0.0))
     return (1e-9 if coordinate == models.WINDOW else 0.0), float(np.ptp(data.time))
 
 
@@ -149,10 +166,17 @@ def _fixed_at(data: Experiments, near: Fit, coordinate: int, value: float, optio
         z, initials = rubbing(data, near, value)
     else:
         z, initials = near.z.copy(), [near.initial]
+        if coordinate == models.A2 and structure.current:
+            z = slower_winding(z, z[models.TE] + value - z[models.A2])
     z[coordinate] = value
     z = structure.complete(z)
     tried = [solve(data, structure, near.at(z, i), options, 10, 0.05) for i in initials]
     return min(tried, key=lambda f: f.deviance)
+
+
+def _back_emf(z: Array) -> float:
+    """Return K [V s/rad], between none and all of a0."""
+    return float(np.clip(to_internal(z, 2)[0][2], 0.0, np.exp(z[models.A0])))
 
 
 def rubbing(data: Experiments, near: Fit, value: float) -> tuple[Array, list[Array]]:
@@ -166,6 +190,10 @@ def rubbing(data: Experiments, near: Fit, value: float) -> tuple[Array, list[Arr
     scale = max(full - value, least) / max(full - near.z[models.VC_PLUS], least)
     z = near.z.copy()
     z[[models.A0, models.A1, models.A2]] += np.log(scale)
+    if near.structure.current:  # which tells the back-EMF, so that it does not scale
+        te, a1 = np.exp(near.z[[models.TE, models.A1]])
+        more = scale * a1 + te * _back_emf(near.z) * (scale - 1)
+        z[models.A1] = np.log(max(more, 1e-3 * scale * a1))
     z[[models.VC_PLUS, models.VC_MINUS]] = value
     moving = near.initial.copy()
     sign = np.sign(near.initial[:, 1])

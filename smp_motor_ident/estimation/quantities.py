@@ -54,15 +54,15 @@ class _Values:
         joint = rows @ conditional @ rows.T
         for k in range(len(next(iter(self.ends.values()), []))):
             pairs = np.array([self.ends[n][k] for n in self.value])
-            # The end at which the quantities move most, measured by their own values.
-            size = np.abs(pairs) / np.maximum(np.abs(list(self.value.values())), 1e-12)[:, None]
-            secant = pairs[:, int(np.argmax(size.sum(axis=0)))] / NORMAL_95
+            # Each quantity to the end at which it moves most; the ends lie on opposite sides.
+            farther = np.argmax(np.abs(pairs), axis=1)
+            secant = pairs[np.arange(len(pairs)), farther] * (1.0 - 2.0 * farther) / NORMAL_95
             joint = joint + np.outer(secant, secant)
         return np.asarray(joint)
 
     def interval(self, name: str, conditional: Array) -> tuple[float, float]:
         """Return the 95 % interval: the ends of all profiles and the rest, in quadrature."""
-        rest = NORMAL_95**2 * float(self.row[name] @ conditional @ self.row[name])
+        rest = NORMAL_95**2 * max(float(self.row[name] @ conditional @ self.row[name]), 0.0)
         low = high = rest
         for pair in self.ends[name]:
             low += min(0.0, *pair) ** 2
@@ -123,8 +123,10 @@ def _values(fit: Fit, fixed: Mapping[str, float], reported: list[str], level: fl
         sides = []
         for z in profile.ends:
             moved, _ = _at(z, fit.structure, level)
+            if fit.structure.current and fit.structure.order == 2:
+                moved |= models.physical(z)[0]
             step = (z - fit.z)[free]
-            sides.append({n: moved[n] - there[n] if n in reported else row[n] @ step
+            sides.append({n: moved[n] - value[n] if n in moved else row[n] @ step
                           for n in value})  # fmt: skip
         for n in value:
             ends[n].append((float(sides[0][n]), float(sides[1][n])))

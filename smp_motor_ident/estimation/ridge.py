@@ -98,6 +98,18 @@ def shapes(z: Array) -> list[Array]:
     return out or [z]
 
 
+def slower_winding(z: Array, ln_te: float) -> Array:
+    """Return the coordinates of the same rotor under another L/R."""
+    before, after = np.exp(z[models.TE]), np.exp(ln_te)
+    a1, a2 = np.exp(z[[models.A1, models.A2]])
+    tm = a2 / before
+    damping = float(np.clip((a1 - tm) / before, 0.0, np.exp(z[models.A0])))
+    moved = z.copy()
+    moved[models.A1], moved[models.A2] = np.log(tm + after * damping), np.log(after * tm)
+    moved[models.TE] = ln_te
+    return moved
+
+
 def _from(z: Array, part: Experiments, structure: Structure, best: Fit, options: Options) -> Fit:
     """Descend from other coordinates in the surroundings of the best fit so far."""
     return solve(part, structure, best.at(structure.complete(z)), options, 30)

@@ -55,3 +55,29 @@ TICK_FIT = Limit(
     "digits that put 95 % of speeds within a twentieth of a whole tick leave no doubt which",
     "test_known_loop.py: the command is reconstructed",
 )
+
+# A drive on new gains.
+SETTLED = Limit(
+    0.02,
+    "of a change of set-point",
+    "the field's usual band of a settling time",
+    "test_verification.py: a wheel that does as designed",
+)
+OVERSHOOT = Limit(
+    0.01,
+    "of a change of set-point",
+    "what the reference is planned to overshoot at most: a load or a count may use it up",
+    "test_verification.py: a wheel that does as designed",
+)
+SILENCE = Limit(
+    0.1,
+    "s without an answer",
+    "half of what lets wheel_pid stop the wheel: such a drive shows the computer, not the gains",
+    "test_verification.py: a drive without control",
+)
+STEADY_ERROR = Limit(
+    0.02,
+    "of a change of set-point",
+    "the same band: integral action leaves no error, only what has not settled",
+    "test_verification.py: a speed that stays off",
+)

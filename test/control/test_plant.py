@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from smp_motor_control.errors import ParameterError
-from smp_motor_control.motor.file import load_motors
+from smp_motor_control.motor.file import Wiring, load_motors, parse_motors
 from smp_motor_control.motor.friction import Motor
 from smp_motor_control.motor.hardware import DrivenMotor, DriveSettings, Supply
 
@@ -156,3 +156,43 @@ def test_a_latched_command_waits_for_the_next_sample():
     plant.command(0.017, 6.0)  # the later one counts
     assert plant.sample(0.02).voltage == 0.0
     assert plant.sample(0.03).voltage == pytest.approx(6.0, rel=1e-12)  # rounding of a mean
+
+
+@pytest.mark.parametrize(
+    ("faults", "turns", "counts"),
+    [
+        ({}, 1, 1),
+        ({"leads": -1}, -1, -1),
+        ({"encoder": -1}, 1, -1),
+        ({"leads": -1, "encoder": -1}, -1, 1),
+    ],
+)
+def test_swapped_leads_turn_the_motor_and_a_swapped_encoder_what_it_shows(faults, turns, counts):
+    entry = dataclasses.replace(ENTRY, wiring=Wiring(**faults))
+    plant = DrivenMotor(entry, IDEAL)
+    plant.command(0.0, 6.0)
+    plant.sample(0.1)
+    sample = plant.sample(0.5)
+    assert math.copysign(1, plant.motor.speed) == turns
+    for value in (sample.encoder_count, sample.velocity, sample.position):
+        assert math.copysign(1, value) == counts
+    # The driver knows of neither: it reports the voltage and the current that it gave.
+    assert sample.voltage == pytest.approx(6.0, rel=1e-12) and sample.current > 0
+
+
+def test_nothing_arrives_of_a_command_within_the_dead_zone():
+    plant = DrivenMotor(dataclasses.replace(ENTRY, wiring=Wiring(dead_zone=2.0)), IDEAL)
+    plant.command(0.0, -2.0)
+    assert plant.sample(0.5).voltage == 0.0
+    plant.command(0.5, -2.01)
+    assert plant.sample(1.0).voltage == pytest.approx(-2.01, rel=1e-12)
+    assert plant.motor.speed < 0
+
+
+def test_faults_stand_in_a_motor_file_and_are_checked():
+    motor = {"dc_gain": 25.0, "time_constant": 0.05, "leads": -1, "described_gear_ratio": 30.0}
+    wiring = parse_motors({"left": motor}, "file")["left"].wiring
+    assert wiring == Wiring(leads=-1, described_gear_ratio=30.0)
+    for name, value in (("leads", 0), ("encoder", 2), ("dead_zone", -1.0)):
+        with pytest.raises(ParameterError, match=name):
+            parse_motors({"left": motor | {name: value}}, "file")

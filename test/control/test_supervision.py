@@ -183,6 +183,25 @@ def test_a_lease_ends_where_commands_never_do():
     assert one.owner(0.999) == "a" and one.owner(1.0) == ""
 
 
+def test_a_command_that_waited_in_a_queue_takes_no_wheel_but_zero_always_does():
+    one = Lease(0.2)
+    ms = 1_000_000
+
+    def at(now_ms: int, voltage: float, stamp_ms: int, writer: str = "a") -> bool:
+        return one.take(writer, voltage, 1e-3 * now_ms, stamp_ms * ms, now_ms * ms)
+
+    assert at(1000, 3.0, 995)
+    # The driver stood still; what it finds then was meant for another moment.
+    assert not at(1900, 3.0, 1005)
+    assert at(1900, 0.0, 1005)
+    assert not at(4800, 3.0, 1910)
+    assert at(4801, 3.0, 4800)
+    assert one.late == 2
+    # A writer whose clock is elsewhere is judged by its own; one that stamps nothing not at all.
+    assert at(6000, 3.0, 50_000, "b") and not at(6600, 3.0, 50_300, "b")
+    assert at(7000, 3.0, 0, "c") and at(9000, 3.0, 0, "c")
+
+
 LIMITS = FaultLimits(current_limit=3.0, current_time=0.05)
 
 

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Sequence
+import json
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from smp_motor_ident.cli import commissioning, steps
+from smp_motor_ident.cli import checking, commissioning, steps
 from smp_motor_ident.cli.commission import main
+from smp_motor_ident.diagnosis.wheel_test import Figures
+from smp_motor_ident.finding import Finding
 
 
 def test_a_dry_run_prints_and_draws_the_plan_and_touches_nothing(
@@ -21,10 +26,12 @@ def test_a_dry_run_prints_and_draws_the_plan_and_touches_nothing(
     lines = capsys.readouterr().out.splitlines()
     assert [line.split(",")[0] for line in lines if line.startswith("from")] == [
         "from   0.0 s: sine", "from  10.0 s: square", "from  20.0 s: fourier",
+        "from  30.0 s: steps",
     ]  # fmt: skip
+    assert "slowly until it turns" in lines[0] and "8 V" in lines[0]
     # A square is at one of its ends: three quarters of 8 V either way.
-    assert set(lines[3].strip()) == {"▁", "█"}
-    assert "6 V" in lines[2] and "30 s" in lines[-1]
+    assert set(lines[4].strip()) == {"▁", "█"}
+    assert "6 V" in lines[3] and "35 s" in lines[-1]
     assert not folder.exists()
 
 
@@ -47,43 +54,89 @@ class Client:
         return contextlib.nullcontext()
 
 
+FIGURES = Figures(200.0, 0.001, 0, 0.0, 0.5, 1.0, 1.0, 1.0, 25.0, 0.4, 0.05, 5.0)
+STOP = Finding("reversed", "refused", "left: positive voltage makes its counts shrink", {}, "swap")
+
+
+class Steps:
+    """The steps of a commissioning, each noted; the one that is called ``cut`` is interrupted."""
+
+    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.folder, self.done = folder, list[str]()
+        self.cut, self.found = "", tuple[Finding, ...]()
+        monkeypatch.setattr(commissioning, "connect", lambda *_: Client())
+        monkeypatch.setattr(steps, "record", self.record)
+        for owner, name, called in (
+            (steps, "excite", "excite"),
+            (steps, "identify", "identify_wheels"),
+            (commissioning, "validate", "validated"),
+            (commissioning, "verify", "_verify"),
+        ):
+            monkeypatch.setattr(owner, called, partial(self.step, name))
+        monkeypatch.setattr(steps, "tune_wheels", self.tune)
+        monkeypatch.setattr(checking, "check_wheels", self.check)
+
+    def step(self, name: str, *_: object) -> Any:
+        self.done.append(name)
+        if name == self.cut:
+            raise KeyboardInterrupt
+        return {"identify": {}, "validate": [], "verify": "as designed"}.get(name)
+
+    def check(self, *_: object) -> checking.Checked:
+        self.step("check")
+        return checking.Checked(self.found, {"left": FIGURES}, 4.0)
+
+    def record(self, robot: object, name: str) -> Path:
+        (self.folder / name).mkdir()  # as record does, which refuses a folder that is there
+        return self.folder / name
+
+    def tune(self, *_: object) -> dict[str, object]:
+        self.step("tune")
+        (self.folder / "gains.json").write_text('{"wheels": {}}')
+        return {}
+
+
+@pytest.fixture
+def robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Steps:
+    return Steps(tmp_path / "robot", monkeypatch)
+
+
 def test_what_was_cut_off_while_it_moved_moves_again_and_afterwards_does_not(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, robot: Steps
 ) -> None:
-    done: list[str] = []
-    cut = ["excite", "identify", ""]
-    folder = tmp_path / "robot"
-
-    def step(name: str) -> Callable[..., object]:
-        def do(*_: object) -> dict[str, object]:
-            done.append(name)
-            if name == cut[0]:
-                raise KeyboardInterrupt
-            return {}
-
-        return do
-
-    def record(*_: object) -> Path:
-        (folder / "excitation").mkdir()  # as record does, which refuses a folder that is there
-        return folder / "excitation"
-
-    monkeypatch.setattr(commissioning, "connect", lambda *_: Client())
-    monkeypatch.setattr(steps, "record", record)
-    for name, called in (
-        ("excite", "excite"), ("identify", "identify_wheels"), ("tune", "tune_wheels"),
-    ):  # fmt: skip
-        monkeypatch.setattr(steps, called, step(name))
-    given = ["--output", str(folder), "--yes"]
+    given = ["--output", str(robot.folder), "--yes"]
     other = tmp_path / "other"
     other.mkdir()
     (other / "diary").touch()
     assert main(["--output", str(other), "--yes", "--resume"]) == 2  # nothing of ours
     assert (other / "diary").exists()
+    robot.cut = "excite"
     assert main(given) == 130
     assert main(given) == 2  # a folder that is there is not overwritten unasked
-    cut.pop(0)
+    robot.cut = "identify"
     assert main([*given, "--resume"]) == 130
-    cut.pop(0)
+    robot.cut = ""
     assert main([*given, "--resume"]) == 0
-    # Cut off in the first signal; then in identify after all three; then no wheel moves again.
-    assert done == ["excite", *["excite"] * 3, "identify", "identify", "tune"]
+    # Cut off in the first signal; then in identify after all four; then no wheel moves again.
+    moved = ["check", *["excite"] * 4]
+    ended = ["identify", "validate", "tune", "verify"]
+    assert robot.done == ["check", "excite", *moved, "identify", *ended]
+    document = json.loads((robot.folder / "commissioning.json").read_text())
+    assert document["passed"] and document["checks"]["left"]["gain"] == 25.0
+
+
+def test_a_wrong_wire_stops_before_the_excitation_unless_it_is_accepted(
+    robot: Steps, capsys: pytest.CaptureFixture[str]
+) -> None:
+    robot.found = (STOP,)
+    given = ["--output", str(robot.folder), "--yes"]
+    assert main(given) == 1
+    said = capsys.readouterr().err
+    assert STOP.message in said and STOP.advice in said
+    assert robot.done == ["check"]
+    page = (robot.folder / "report.html").read_text()
+    assert "Not passed." in page and STOP.message in page and STOP.advice in page
+    # The wire is mended, or it is so on purpose: the same folder goes on.
+    assert main([*given, "--resume", "--accept", "reversed"]) == 0
+    page = (robot.folder / "report.html").read_text()
+    assert "Passed." in page and "accepted" in page

@@ -13,6 +13,7 @@ import pytest
 
 from smp_motor_ident.bag import limits as recordings
 from smp_motor_ident.diagnosis import limits
+from smp_motor_ident.diagnosis import wheel_limits as wheels
 from smp_motor_ident.diagnosis.advice import _fit
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.finding import Finding
@@ -20,6 +21,7 @@ from smp_motor_ident.result import FitPercent, ResidualTests
 from smp_motor_ident.tune import limits as gains
 
 ROOT = Path(__file__).resolve().parents[2]
+TABLES = (limits, recordings, gains, wheels)
 
 
 def test_the_page_of_limits_is_the_table() -> None:
@@ -32,7 +34,7 @@ def test_the_page_of_limits_is_the_table() -> None:
 
 def test_every_limit_names_a_test_that_exists() -> None:
     files = {path.name: path.read_text() for path in (ROOT / "test").rglob("test_*.py")}
-    for limit in (one for table in (limits, recordings, gains) for one in vars(table).values()):
+    for limit in (one for table in TABLES for one in vars(table).values()):
         if isinstance(limit, limits.Limit):
             assert limit.reason and limit.unit
             for named in limit.test.split("; "):

@@ -6,7 +6,7 @@ import motors
 import numpy as np
 import pytest
 
-from smp_motor_ident.errors import DesignError
+from smp_motor_ident.errors import DesignError, SignalError
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.record import Record
 from smp_motor_ident.tune import Loop, design
@@ -71,3 +71,31 @@ def test_rest_before_the_excitation_changes_nothing():
     for name in ("dc_gain", "time_constant", "static_voltage"):
         a, b = with_it.combinations[name], without.combinations[name]
         assert abs(a.value - b.value) < b.std, name
+
+
+def test_an_angle_that_is_given_as_a_speed_is_recognised():
+    rng = np.random.default_rng(11)
+    rate, turns = 50.0, np.array([0.6, 0.0, -0.7, 0.0, 0.5, -0.6])
+    voltage = 2.5 * np.repeat(turns, 60) + 0.2 * np.repeat(rng.standard_normal(72), 5)
+    speed = _record(np.abs(voltage) + 2.0, rate, 0.0).velocity * np.sign(voltage)
+    angle = np.cumsum(speed) / rate
+    t = np.arange(voltage.size) / rate
+    noisy = angle + 0.01 * rng.standard_normal(t.size)
+    with pytest.raises(SignalError, match="map it as position"):
+        estimate(Record("motor", t, voltage, velocity=noisy))
+
+
+@pytest.mark.parametrize(("levels", "said"), [([8.0, -8.0], True), ([8.0, -8.0, 4.0], False)])
+def test_a_voltage_of_one_size_says_that_a_clip_would_not_show(levels, said):
+    rng = np.random.default_rng(12)
+    rate, keep = 200.0, np.exp(-1 / 200.0 / TRUTH["time_constant"])
+    voltage = np.repeat(rng.choice(levels, 40), 30)
+    put_out = np.clip(voltage, -7.0, 7.0)  # the driver's supply
+    w = np.zeros(voltage.size)
+    for k in range(1, w.size):
+        w[k] = keep * w[k - 1] + (1 - keep) * TRUTH["dc_gain"] * put_out[k]
+    t = np.arange(w.size) / rate
+    noisy = w + 0.3 * rng.standard_normal(w.size)
+    found = estimate(Record("motor", t, voltage, velocity=noisy))
+    assert ("one_size_of_voltage" in [f.code for f in found.findings]) is said
+    assert said or found.unreliable  # with another size the clip itself shows

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -31,12 +32,18 @@ def test_it_identifies_tunes_and_sets_the_gains_of_the_running_robot(
         process("wheel_pid", "--ros-args", "-r", f"__ns:=/{wheel}")
     eventually(lambda: all(robot.states[w] for w in WHEELS), 30.0, robot.spin, "no robot")
     tool = process("commission", "--output", "r", "--duration", "4", "--yes", "--apply")
-    assert tool.wait(240.0) == 0, tool.output
+    assert tool.wait(420.0) == 0, tool.output
     estimates = read_identification(tmp_path / "r" / "identification")
     assert set(estimates) == set(WHEELS)
     # Motor 1 of Table 1; short signals on a busy machine still tell it to a percent.
     assert estimates["front_left"].value("dc_gain") == pytest.approx(25.548, rel=0.01)
     assert (tmp_path / "r" / "gains.yaml").is_file()
+    document = json.loads((tmp_path / "r" / "commissioning.json").read_text())
+    assert document["passed"]
+    # Every wheel was checked, judged by a run of its own, and driven forward and in reverse.
+    assert set(document["checks"]) == set(WHEELS)
+    assert sum(f["code"] == "validation_run" for f in document["findings"]) == len(WHEELS)
+    assert len(document["changes"]) == 2 * len(WHEELS)
     # The controllers, switched off meanwhile, run again with the new gains.
     for _ in range(100):
         robot.send_setpoint(1.0)

@@ -6,9 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from independent import simulate
 
 from smp_motor_ident.bag import read_records
-from smp_motor_ident.bag.beat import find_beat
+from smp_motor_ident.diagnosis.beat import find_beat, on_beat
+from smp_motor_ident.estimate import estimate
+from smp_motor_ident.record import Hardware, Record
 
 T = 10_000_000  # ns
 
@@ -82,3 +85,38 @@ def test_honest_stamps_with_jitter_are_kept(tmp_path: Path) -> None:
     (tmp_path / "log.csv").write_text("t,u,y\n" + "\n".join(rows))
     record = read_records(tmp_path / "log.csv", ["voltage=u velocity=y time=t"])["motor"]
     assert "arrival_beat" not in [finding.code for finding in record.findings]
+
+
+def _late_motor(kind: str, seed: int) -> tuple[Record, float]:
+    """Return a chirp's record with arrival stamps, and the motor's L/R [s]."""
+    rng = np.random.default_rng(seed)
+    r, l, k, j, b, tc = 0.84, 1.75e-3, 0.0508, 8e-4, 2.06e-4, 0.02
+    t = np.arange(8000) * 1e-3
+    v = 9.0 * np.sin(2 * np.pi * (0.2 * t + 0.15 * t * t))
+    out = simulate(t, v, r, l, k, j, b, tc, np.zeros(t.size), 4)
+    stamp = t + rng.exponential(0.7e-3, t.size)
+    if kind == "bursts":
+        stamp = t[np.minimum((np.arange(t.size) // 4 + 1) * 4, t.size - 1)]
+    stamp = np.maximum.accumulate(stamp) + 1e-9 * np.arange(t.size)
+    count = np.floor(out[:, 2] * 500 / (2 * np.pi)).astype(np.int64)
+    current = out[:, 0] + 0.02 * rng.standard_normal(t.size)
+    hardware = Hardware(1.0, 500.0)
+    return Record("m", stamp - stamp[0], v, current, count=count, hardware=hardware), l / r
+
+
+@pytest.mark.parametrize("kind", ["exponential", "bursts"])
+def test_a_record_with_arrival_stamps_is_estimated_on_the_beat(kind: str) -> None:
+    record, electric = _late_motor(kind, 8)
+    found = estimate(record)
+    assert "arrival_beat" in [finding.code for finding in found.findings]
+    assert not found.unreliable
+    ratio = found.parameters["inductance"].value / found.parameters["resistance"].value
+    # A tenth: the beat is known to a twentieth of a sample, L/R here is two samples.
+    assert ratio == pytest.approx(electric, rel=0.1)
+
+
+def test_a_record_with_stamps_of_its_own_keeps_them() -> None:
+    rng = np.random.default_rng(9)
+    time = np.sort(1e-2 * np.arange(2000) + rng.uniform(0, 0.8e-2, 2000))
+    record = Record("m", time, np.sin(time), velocity=np.sin(2 * np.pi * time))
+    assert on_beat(record) is record

@@ -9,16 +9,28 @@ repeated stamps, which round a regular time down, lie above such a line, too.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter1d
 
-from smp_motor_ident.bag.clock import rhythm
-from smp_motor_ident.bag.limits import BEAT_FLOOR, BEAT_JITTER, BEAT_LOST
-from smp_motor_ident.bag.storage import Array, Integers
+from smp_motor_ident.diagnosis.limits import (
+    BEAT_FLOOR,
+    BEAT_JITTER,
+    BEAT_LOST,
+    BUNCHED,
+    SMOOTHER,
+)
+from smp_motor_ident.finding import Finding
+from smp_motor_ident.record import Record
 
+Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+_PAUSE = 20_000_000
+"""Shortest silence [ns] that divides arrivals."""
 _LEAST = 50
 """Samples below which a beat is not looked for."""
 
@@ -43,7 +55,7 @@ def find_beat(arrival: Integers) -> Beat | None:
         return None
     # Pauses divide the arrivals: each part has a phase of its own.
     usual = (arrival[-1] - arrival[0]) / (arrival.size - 1)
-    pause = max(20 * usual, rhythm(arrival).gap() if rhythm(arrival).regular else 0.0)
+    pause = max(20 * usual, _PAUSE)
     edges = [0, *(np.flatnonzero(np.diff(arrival) > pause) + 1).tolist(), arrival.size]
     time, periods, late = arrival.copy(), [], []
     for begin, end in pairwise(edges):
@@ -58,7 +70,7 @@ def find_beat(arrival: Integers) -> Beat | None:
     latency, period = np.concatenate(late), float(np.median(periods))
     if np.std(latency) < BEAT_JITTER.value * period or np.any(np.diff(time) <= 0):
         return None
-    repeated = float(np.mean(np.diff(arrival) < 0.02 * period)) > BEAT_LOST.value
+    repeated = float(np.mean(np.diff(arrival) < BUNCHED.value * period)) > BEAT_LOST.value
     return Beat(time, period, float(np.median(latency)), repeated)
 
 
@@ -68,7 +80,7 @@ def _fit(arrival: Integers) -> tuple[Array, float] | None:
     usual = since[-1] / (since.size - 1)
     if usual <= 0:
         return None
-    apart = np.flatnonzero(np.diff(since, prepend=-np.inf, append=np.inf) > 0.02 * usual)
+    apart = np.flatnonzero(np.diff(since, prepend=-np.inf, append=np.inf) > BUNCHED.value * usual)
     longest = int(np.diff(apart).max(initial=1))  # samples that came at once
     window = max(32, 4 * longest)
     if 4 * window > since.size:
@@ -141,3 +153,39 @@ def roughness(time: Integers, value: Array) -> float:
     weight = (since[1:-1] - since[:-2])[good] / span[good]
     middle = value[:-2][good] * (1 - weight) + value[2:][good] * weight
     return float(np.mean(np.sort(np.abs(value[1:-1][good] - middle))[: int(0.95 * good.sum())]))
+
+
+def on_beat(record: Record) -> Record:
+    """Return a record whose stamps came late on the beat of its sender; any other as it is.
+
+    Stamps of one's own may be the samples' instants: the smoother motion is the true one.
+    """
+    steps = np.diff(record.time)
+    if np.ptp(steps) < BEAT_JITTER.value * float(np.median(steps)):
+        return record
+    arrival = np.rint(record.time * 1e9).astype(np.int64)
+    motion = next(
+        np.asarray(m, dtype=np.float64)
+        for m in (record.count, record.position, record.velocity)
+        if m is not None
+    )
+    beat = find_beat(arrival)
+    if beat is None:
+        return record
+    kept, put_back = roughness(arrival, motion), roughness(beat.time, motion)
+    if not beat.repeated and not put_back <= SMOOTHER.value * kept:
+        return record
+    period, latency = beat.period * 1e-9, beat.latency * 1e-9
+    finding = Finding(
+        "arrival_beat",
+        "note",
+        f"stamps put back on their beat of {1e3 * period:.5g} ms (median latency "
+        f"{1e3 * latency:.3g} ms)",
+        {"period": period, "latency": latency},
+        "stamp each sample where it is measured",
+    )
+    return replace(
+        record,
+        time=(beat.time - beat.time[0]) * 1e-9,
+        findings=(*record.findings, finding),
+    )

@@ -1,0 +1,147 @@
+"""A small, bounded test of wheels whose controllers are paused: a voltage for every sample.
+
+Commands answer samples, so that a wheel that no longer reports is no longer driven; whatever
+ends the test, the last command is zero.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+from sensor_msgs.msg import BatteryState
+
+from smp_interfaces.msg import MotorDescription, MotorState
+from smp_motor_control.encoder import Unwrapper
+from smp_motor_control.nodes.conventions import LATCHED, seconds
+from smp_motor_control.nodes.motor_writer import MotorWriter
+from smp_motor_control.nodes.robot_client import RobotClient, RobotError
+
+COLUMNS = ("time", "age", "command", "voltage", "velocity", "position", "count", "phase")
+
+Law = Callable[[float], float]
+"""From the time since a phase began [s] to a voltage [V]."""
+
+Counter = Callable[[MotorState], float]
+
+
+@dataclass
+class Tape:
+    """What one wheel's hardware reported, a row for each sample."""
+
+    # of :data:`COLUMNS`: stamp [s], its age on arrival [s], what had been commanded [V], what
+    # was reported [V], [rad/s], [rad], [counts], and the number of the phase
+    rows: list[tuple[float, ...]] = field(default_factory=list)
+
+    def turned(self, since: int) -> float:
+        """Return by how many counts the wheel has turned since a row."""
+        if len(self.rows) <= since:
+            return 0.0
+        return abs(self.rows[-1][6] - self.rows[since][6])
+
+
+class WheelTest:
+    """The test of some wheels; all are heard, one or all are driven.
+
+    Parameters
+    ----------
+    client : RobotClient
+        Whose wheels are paused.
+    counters : mapping of str to callable
+        By wheel that is heard, from a ``MotorState`` to the total count.
+    """
+
+    def __init__(self, client: RobotClient, counters: Mapping[str, Counter]) -> None:
+        self._client, self._counters = client, counters
+        self.tapes = {wheel: Tape() for wheel in counters}
+        self._commands = dict.fromkeys(counters, 0.0)
+        self._laws: Mapping[str, Law] = {}
+        self._phase = 0
+        self._begun = 0.0
+        self._writers: dict[str, MotorWriter] = {}
+
+    @contextlib.contextmanager
+    def open(self) -> Iterator[WheelTest]:
+        """Hear and drive inside the block."""
+        topics = {
+            f"{wheel}/motor_state": lambda message, wheel=wheel: self._answer(wheel, message)
+            for wheel in self.tapes
+        }
+        self._writers = {w: MotorWriter(self._client.node, f"{w}/") for w in self.tapes}
+        try:
+            with self._client.listen(MotorState, topics):
+                yield self
+        finally:
+            for writer in self._writers.values():
+                writer.stop()
+                writer.destroy()
+
+    def run(
+        self, laws: Mapping[str, Law], duration: float, until: Callable[[], bool] | None = None
+    ) -> tuple[int, float]:
+        """Drive wheels for a while, or until something is seen; return phase and time taken."""
+        self._phase += 1
+        self._begun, self._laws = time.monotonic(), laws
+        self._client.until(until or (lambda: False), duration)
+        taken = time.monotonic() - self._begun
+        for wheel in laws:
+            if rival := self._writers[wheel].owner:
+                raise RobotError(f"{wheel}: {rival} drives this wheel; end it first")
+        return self._phase, taken
+
+    def _answer(self, wheel: str, message: MotorState) -> None:
+        stamp = seconds(message.header.stamp)
+        age = self._client.node.get_clock().now().nanoseconds * 1e-9 - stamp
+        self.tapes[wheel].rows.append((
+            stamp, age, self._commands[wheel], message.voltage, message.velocity,
+            message.position, self._counters[wheel](message), float(self._phase),
+        ))  # fmt: skip
+        law = self._laws.get(wheel)
+        if law is not None:
+            self._commands[wheel] = law(time.monotonic() - self._begun)
+            self._writers[wheel].send(self._commands[wheel], message.header.stamp)
+        else:
+            self._commands[wheel] = 0.0
+
+
+def counter(counts_per_revolution: float, bits: int, gear_ratio: float) -> Counter:
+    """Return what gives total counts; where nothing counts, the motor's angle [rad]."""
+    if not counts_per_revolution:
+        return lambda message: float(message.position * gear_ratio)
+    unwrapped = Unwrapper(bits)
+    return lambda message: float(unwrapped(message.encoder_count))
+
+
+def descriptions(
+    client: RobotClient, wheels: Sequence[str], patience: float
+) -> dict[str, MotorDescription]:
+    """Return what the hardware says of itself; wheels that say nothing in time are left out."""
+    found: dict[str, MotorDescription] = {}
+    made = [
+        client.node.create_subscription(
+            MotorDescription,
+            f"{wheel}/motor_description",
+            lambda message, wheel=wheel: found.update({wheel: message}),
+            LATCHED,
+        )
+        for wheel in wheels
+    ]
+    try:
+        client.until(lambda: len(found) == len(wheels), patience)
+    finally:
+        for subscription in made:
+            client.node.destroy_subscription(subscription)
+    return found
+
+
+def battery(client: RobotClient, patience: float = 1.0) -> float:
+    """Return what ``battery_state`` says [V]; NaN where nobody publishes it."""
+    if not client.node.count_publishers("battery_state"):
+        return math.nan
+    heard: list[float] = []
+    with client.listen(BatteryState, {"battery_state": lambda m: heard.append(m.voltage)}):
+        client.until(lambda: bool(heard), patience)
+    return heard[-1] if heard else math.nan

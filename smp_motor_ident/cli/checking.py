@@ -1,0 +1,169 @@
+"""The small test of every wheel that ``commission`` begins with: live part of the checks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from smp_motor_control.motor.file import MotorEntry
+from smp_motor_ident.diagnosis.wheel_checks import Robot, judge
+from smp_motor_ident.diagnosis.wheel_test import (
+    Figures,
+    Phase,
+    Trace,
+    answers_well,
+    figures,
+    moved_with,
+)
+from smp_motor_ident.finding import Finding
+from smp_motor_ident.record import Hardware
+
+REST, COAST = 0.3, 0.4
+"""Zero voltage before and behind [s]; a coast of a few time constants."""
+
+HOLD = 0.4
+"""A voltage is held for so long [s], ..."""
+
+LONGEST_HOLD = 2.0
+"""... or for so long where the wheel is slow [s]."""
+
+RAMP = 0.15
+"""Growth of the voltage until the wheel turns [of the supply per second]."""
+
+GROWTH = 2.0
+"""Of the voltage from one level to the next."""
+
+FIRST = (1.5, 0.05)
+"""First level: so many times what started the wheel, and so much of the supply more."""
+
+PATIENCE = 5.0
+"""How long descriptions are waited for [s]."""
+
+TURNED = 12.0
+"""Counts after which a ramp ends: the wheel turns."""
+
+
+@dataclass(frozen=True)
+class Checked:
+    """What the checks came to."""
+
+    findings: tuple[Finding, ...]  # in the order of the checks
+    figures: Mapping[str, Figures]  # by wheel
+    amplitude: float  # voltage at which every wheel answers well, as far as the limit allows [V]
+
+
+@dataclass
+class _Way:
+    """A wheel under test: what drives it, and the phases that it has been through."""
+
+    test: Any
+    wheel: str
+    supply: float
+    limit: float
+    phases: list[Phase] = field(default_factory=list)
+
+    def phase(self, kind: Any, law: Callable[[float], float], duration: float, until: Any) -> float:
+        """Drive for a while; return the last voltage."""
+        number, taken = self.test.run({self.wheel: law}, duration, until)
+        level = law(taken)
+        self.phases.append(Phase(self.wheel, number, kind, level))
+        return level
+
+    def test_direction(self, sign: float) -> None:
+        """Ramp until it turns, then hold growing levels until it answers well, then coast."""
+        tape = self.test.tapes[self.wheel]
+        rate, first = RAMP * self.supply, len(tape.rows)
+        start = self.phase(
+            "ramp",
+            lambda t: sign * min(rate * t, self.limit),
+            self.limit / rate,
+            lambda: tape.turned(first) >= TURNED,
+        )
+        # Two levels at least tell friction from gain.
+        level = FIRST[0] * abs(start) + FIRST[1] * self.supply
+        level = min(level, 0.5 * (abs(start) + self.limit))
+        while tape.turned(first) >= TURNED:
+            before = len(tape.rows)
+            self.phase("hold", _constant(sign * level), LONGEST_HOLD, self._steady(before))
+            if level >= self.limit or answers_well(level, abs(start), tape.turned(before)):
+                break
+            level = min(GROWTH * level, self.limit)
+        self.phase("coast", lambda t: 0.0, COAST, None)
+
+    def _steady(self, since: int) -> Callable[[], bool]:
+        """Return whether the wheel turned as far in the last third as in the one before."""
+        tape = self.test.tapes[self.wheel]
+
+        def steady() -> bool:
+            n = len(tape.rows) - since
+            span = tape.rows[-1][0] - tape.rows[since][0] if n > 8 else 0.0
+            if span < HOLD:
+                return False
+            last, before = tape.turned(-(n // 3)), tape.turned(-2 * (n // 3))
+            return bool(abs(before - 2 * last) <= max(0.02 * before, 2.0))
+
+        return steady
+
+
+def check_wheels(
+    client: Any,
+    wheels: Sequence[str],
+    limit: float,
+    known: Mapping[str, MotorEntry],
+    say: Callable[[str], None],
+) -> Checked:
+    """Test the wheels one after the other, at most at ``limit`` volts, and judge what they did."""
+    from smp_motor_control.nodes import wheel_test
+
+    hardware = _described(wheel_test.descriptions(client, wheels, PATIENCE), wheels)
+    phases: list[Phase] = []
+    counters = {
+        wheel: wheel_test.counter(
+            one.counts_per_revolution or 0.0, one.encoder_bits, one.gear_ratio
+        )
+        for wheel, one in hardware.items()
+    }
+    with wheel_test.WheelTest(client, counters).open() as test:
+        for wheel in wheels:
+            say(f"checking {wheel}: slowly until it turns, both ways")
+            way = _Way(test, wheel, hardware[wheel].supply_voltage or 12.0, limit)
+            way.phase("rest", lambda t: 0.0, REST, None)
+            way.test_direction(1.0)
+            way.test_direction(-1.0)
+            phases += way.phases
+    traces = {wheel: Trace.of(tape.rows) for wheel, tape in test.tapes.items()}
+    found = {
+        wheel: figures(traces[wheel], [p for p in phases if p.wheel == wheel], hardware[wheel])
+        for wheel in wheels
+    }
+    robot = Robot(
+        found,
+        hardware,
+        moved_with(traces, phases),
+        {w: known[w].parameters.dc_gain for w in wheels if w in known},
+        {w: known[w].gearbox.ratio for w in wheels if w in known},
+        wheel_test.battery(client),
+    )
+    levels = [one.level for one in found.values() if math.isfinite(one.level)]
+    return Checked(tuple(judge(robot)), found, max(levels, default=limit))
+
+
+def _described(found: Mapping[str, Any], wheels: Sequence[str]) -> dict[str, Hardware]:
+    """Return what each wheel's hardware says of itself, or the defaults."""
+    return {
+        wheel: Hardware(
+            gear_ratio=found[wheel].gear_ratio or 1.0,
+            counts_per_revolution=found[wheel].counts_per_revolution or None,
+            encoder_bits=found[wheel].encoder_bits,
+            supply_voltage=found[wheel].supply_voltage or None,
+        )
+        if wheel in found
+        else Hardware()
+        for wheel in wheels
+    }
+
+
+def _constant(voltage: float) -> Callable[[float], float]:
+    return lambda t: voltage

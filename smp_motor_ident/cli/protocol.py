@@ -1,0 +1,108 @@
+"""What a commissioning has found so far: written after every step, and what it stops at."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Container, Iterable, Mapping, Sequence
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+from smp_motor_ident.cli.processes import ProcessError
+from smp_motor_ident.diagnosis.wheel_test import Figures
+from smp_motor_ident.finding import Finding
+from smp_motor_ident.report import commissioning as page
+from smp_motor_ident.report.document import write_together
+from smp_motor_ident.tune.verification import Change
+
+SCHEMA = 1
+NAME, REPORT = "commissioning.json", "report.html"
+
+
+class Protocol:
+    """Findings, figures and verdict of a commissioning, in ``commissioning.json`` and a page.
+
+    Parameters
+    ----------
+    folder : Path
+        Where both files are; a protocol that is there already is gone on with.
+    accepted : sequence of str
+        Codes of findings that stop nothing.
+    """
+
+    def __init__(self, folder: Path, accepted: Sequence[str] = ()) -> None:
+        self._folder, self._accepted = folder, tuple(accepted)
+        self._changes: list[Change] = []
+        self.document: dict[str, Any] = {"schema": SCHEMA}
+        if (folder / NAME).is_file():
+            self.document = json.loads((folder / NAME).read_text("utf-8"))
+        self.document |= {"passed": None, "verdict": "It was cut off.", "accepted": [*accepted]}
+
+    def begin(self, wheels: Sequence[str]) -> None:
+        """Forget what was found before: the wheels move anew."""
+        self.document |= {"wheels": list(wheels), "findings": [], "changes": []}
+
+    def checks(self, figures: Mapping[str, Figures], amplitude: float) -> None:
+        """Note what the test of the wheels showed."""
+        shown = {wheel: _plain(dataclasses.asdict(one)) for wheel, one in figures.items()}
+        self.document |= {"checks": shown, "amplitude": amplitude}
+
+    def changes(self, changes: Sequence[Change]) -> None:
+        """Note what a drive showed."""
+        self._changes = list(changes)
+        self.document["changes"] = [
+            {
+                "wheel": one.wheel,
+                "name": one.name,
+                "setpoint": one.setpoint,
+                "reading": _plain(dataclasses.asdict(one.reading)),
+                "allowed": _plain(dataclasses.asdict(one.bands)),
+            }
+            for one in changes
+        ]
+
+    def add(self, step: str, findings: Iterable[Finding]) -> list[Finding]:
+        """Note and print findings; return those that a commissioning stops at."""
+        new = list(findings)
+        kept = [f for f in self.document.get("findings", []) if f["step"] != step]
+        self.document["findings"] = kept + [{"step": step, **f.to_document()} for f in new]
+        for finding in new:
+            print(f"{finding.severity}: {finding.message}", flush=True)
+        return [f for f in new if f.severity == "refused" and f.code not in self._accepted]
+
+    def warned_of(self, wheels: Container[object]) -> list[Finding]:
+        """Return what earlier steps warned of these wheels: it may be the reason."""
+        return [
+            Finding(f["code"], "warning", f["message"], f["evidence"], f["advice"])
+            for f in self.document["findings"]
+            if f["severity"] == "warning" and f["evidence"].get("wheel") in wheels
+        ]
+
+    def stop(self, findings: Sequence[Finding]) -> None:
+        """Write the verdict and raise, where there is something to stop at."""
+        if findings:
+            what = "; ".join(dict.fromkeys(f.message for f in findings))
+            advice = "; ".join(dict.fromkeys(f.advice for f in findings if f.advice))
+            self.end(False, f"stopped: {what}")
+            raise ProcessError(f"stopped: {what}. What to do: {advice}")
+
+    def end(self, passed: bool, verdict: str) -> None:
+        """Write the verdict."""
+        self.document |= {"passed": passed, "verdict": verdict}
+        self.write()
+
+    def write(self) -> None:
+        """Write both files, or none."""
+        now = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
+        self.document["date"] = now
+        files: dict[Path, str | bytes] = {
+            self._folder / NAME: json.dumps(self.document, indent=2, allow_nan=False) + "\n",
+            self._folder / REPORT: page.render(self.document, self._changes),
+        }
+        write_together(files, force=True)
+
+
+def _plain(values: Mapping[str, float]) -> dict[str, float | None]:
+    return {name: value if math.isfinite(value) else None for name, value in values.items()}

@@ -1,0 +1,184 @@
+"""New gains on trial: a drive of all wheels, held against what the design predicted of it."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from smp_motor_control.encoder import unwrap
+from smp_motor_control.motor.friction import Gearbox
+from smp_motor_ident.bag.columns import Columns, read_columns
+from smp_motor_ident.cli import steps
+from smp_motor_ident.errors import BagError
+from smp_motor_ident.finding import Finding
+from smp_motor_ident.result import Estimate
+from smp_motor_ident.tune import verification
+from smp_motor_ident.tune.limits import SILENCE
+from smp_motor_ident.tune.verification import STEADY, Change
+
+LEAST = 1.0
+"""Of a change of set-point with its end [s]."""
+
+LEAD = 0.3
+"""Rest before a change that is simulated with it [s]."""
+
+ATTEMPTS = 3
+"""Drives; a drive that was disturbed is repeated, whatever it showed."""
+
+
+@dataclass
+class Trial:
+    """Gains that are set for now; ``kept`` decides what becomes of them."""
+
+    kept: bool = False
+
+
+@contextlib.contextmanager
+def on_trial(client: Any, gains: Mapping[str, Mapping[str, Any]]) -> Iterator[Trial]:
+    """Set gains in the running controllers; set the former ones again unless they are kept."""
+    new = {f"{wheel}/wheel_pid": dict(values) for wheel, values in gains.items()}
+    old = client.get_parameters({node: list(values) for node, values in new.items()})
+    owed, trial = dict(client.owed), Trial()
+    client.owe(**owed, gains=old)
+    client.set_parameters(new)
+    try:
+        yield trial
+    finally:
+        if not trial.kept:
+            client.set_parameters(old)
+        client.owe(**owed)
+
+
+@dataclass(frozen=True)
+class Designed:
+    """What a drive is judged by, by wheel."""
+
+    estimates: Mapping[str, Estimate]  # the motors
+    gains: Mapping[str, Mapping[str, Any]]  # parameters of ``wheel_pid``, as in ``gains.yaml``
+    document: Mapping[str, Mapping[str, Any]]  # as in ``gains.json``
+
+    def plan(self) -> list[tuple[str, float, float]]:
+        """Return the steps of the drive: name, set-point [rad/s] and duration [s]."""
+        specified = [one["specification"] for one in self.document.values()]
+        change = min(float(one["change"]) for one in specified)
+        longest = max(float(one["settling"]["high"] or LEAST) for one in specified)
+        lasts = max(LEAST, 2 * longest + STEADY)
+        return [
+            ("stand", 0.0, 2 * LEAD),
+            ("forward", change, lasts),
+            ("stop", 0.0, lasts),
+            ("reverse", -change, lasts),
+            ("stop", 0.0, lasts),
+        ]
+
+
+def drive(robot: steps.Robot, plan: Sequence[tuple[str, float, float]]) -> Path:
+    """Drive all wheels through a plan with the gains that are set; return the recording."""
+    from smp_motor_control.nodes.step_drive import drive_steps
+
+    bag = robot.folder / "verification"
+    shutil.rmtree(bag, ignore_errors=True)
+    try:
+        robot.switch("activate")
+        steps.record(robot, bag.name)
+        shown = [f"{wheel}/pid_state" for wheel in robot.wheels]
+        robot.client.wait_for_listener("record", shown, timeout=steps.PATIENCE)
+        drive_steps(robot.client, plan, robot.wheels)
+    finally:
+        robot.processes.stop("record")
+        robot.switch("deactivate")
+    return bag
+
+
+def drive_undisturbed(
+    robot: steps.Robot, designed: Designed, say: Callable[[str], None]
+) -> tuple[list[Change], list[Finding]]:
+    """Drive until nothing but the wheels shows; return the changes, and what is to be said."""
+    plan, namespace = designed.plan(), str(robot.client.node.get_namespace()).rstrip("/")
+    for _ in range(ATTEMPTS):
+        say(f"driving on the new gains: {', '.join(name for name, *_ in plan)}")
+        changes, silence = read_changes(drive(robot, plan), plan, designed, namespace)
+        if silence <= SILENCE.value:
+            return changes, verification.judge(changes)
+        say(f"the drive was disturbed: a wheel had no answer for {silence:.2f} s")
+    return changes, [verification.disturbed(silence), *verification.judge(changes)]
+
+
+def read_changes(
+    bag: Path,
+    plan: Sequence[tuple[str, float, float]],
+    designed: Designed,
+    namespace: str,
+) -> tuple[list[Change], float]:
+    """Return every change from rest, measured and predicted, and the longest wait for an answer.
+
+    The wait is that of a wheel for the answer to a sample [s].
+    """
+    wheels = list(designed.document)
+    wanted = {f"{namespace}/{w}/motor_state": ["encoder_count", "position"] for w in wheels}
+    wanted |= {f"{namespace}/{w}/pid_state": ["setpoint", "age", "dt"] for w in wheels}
+    read = read_columns(bag, wanted)
+    changes, silence = [], 0.0
+    for wheel in wheels:
+        state = read[f"{namespace}/{wheel}/motor_state"]
+        answers = read[f"{namespace}/{wheel}/pid_state"]
+        for name, setpoint, lasts in plan:
+            if setpoint:
+                changes.append(_change(wheel, name, setpoint, lasts, designed, state, answers))
+        # The first interval is that since another drive.
+        late = (answers.fields["dt"][1:], answers.fields["age"][1:])
+        silence = max(silence, *(float(np.max(one, initial=0.0)) for one in late))
+    return changes, silence
+
+
+def _change(
+    wheel: str, name: str, setpoint: float, lasts: float, designed: Designed, state: Columns,
+    answers: Columns,
+) -> Change:  # fmt: skip
+    estimate, document = designed.estimates[wheel], designed.document[wheel]
+    asked = np.flatnonzero(np.isclose(answers.fields["setpoint"], setpoint))
+    if not asked.size:
+        raise BagError(f"{wheel}: its set-point never was {setpoint:.3g} rad/s in the drive")
+    begin = float(answers.time[asked[0]])
+    shown = (state.time > begin - LEAD) & (state.time < begin + lasts)
+    instants = state.time[shown] - begin
+    known = dict(zip(answers.time - begin, answers.fields["age"]))
+    ages = np.array([known.get(instant, np.nan) for instant in instants])
+    step = float(document["loop"]["sample_time"])
+    even, speed = verification.smoothed(instants, _angle(state, estimate)[shown], step)
+    kept = (even >= 0.0) & (even < lasts - 0.05)
+    rows = verification.predicted(
+        estimate, _nested(designed.gains[wheel]), document["loop"], setpoint, (instants, ages),
+        even[kept],
+    )  # fmt: skip
+    hardware = estimate.hardware
+    count = 2 * np.pi / (hardware.counts_per_revolution or 1e6) / hardware.gear_ratio
+    return verification.change_of(
+        wheel, name, setpoint, even[kept], speed[kept], rows, document["specification"],
+        verification.resolution(count, step),
+    )  # fmt: skip
+
+
+def _angle(state: Columns, estimate: Estimate) -> Any:
+    """Return the wheel's angle as its counts tell it, where there are counts."""
+    hardware = estimate.hardware
+    if not hardware.counts_per_revolution:
+        return state.fields["position"]
+    turn = 2 * np.pi / hardware.counts_per_revolution
+    return Gearbox(hardware.gear_ratio).to_wheel(turn) * unwrap(
+        state.fields["encoder_count"], hardware.encoder_bits
+    )
+
+
+def _nested(flat: Mapping[str, Any]) -> dict[str, Any]:
+    nested: dict[str, Any] = {}
+    for name, value in flat.items():
+        group, _, key = name.rpartition(".")
+        (nested.setdefault(group, {}) if group else nested)[key] = value
+    return nested

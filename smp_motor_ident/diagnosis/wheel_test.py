@@ -1,0 +1,214 @@
+"""What a small test of a wheel shows: when it starts to turn, which way, how fast, how surely."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from smp_motor_ident.diagnosis.wheel_limits import ANSWER_COUNTS, BREAKAWAY_COUNTS, FRICTION_SHARE
+from smp_motor_ident.record import Hardware
+
+Array = NDArray[np.float64]
+
+TREMBLE = 1.0
+"""An encoder that stands on an edge counts up and down by so much."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """What one wheel's hardware reported while wheels were tested; arrays of shape (n,)."""
+
+    time: Array  # stamps [s]
+    age: Array  # of the stamps on arrival [s]
+    command: Array  # what was commanded when the sample was taken [V]
+    voltage: Array  # as reported [V]
+    velocity: Array  # of the wheel, as reported [rad/s]
+    position: Array  # of the wheel, as reported [rad]
+    count: Array  # total counts; the motor's angle [rad] where nothing counts
+    phase: Array  # number of the phase
+
+    @classmethod
+    def of(cls, rows: ArrayLike) -> Trace:
+        """Return the trace of rows with these columns."""
+        columns = np.asarray(rows, dtype=np.float64).reshape(-1, len(fields(cls))).T
+        return cls(*columns)
+
+    def during(self, *numbers: int) -> Trace:
+        """Return the part in some phases."""
+        kept = np.isin(self.phase, numbers)
+        return Trace(*(getattr(self, f.name)[kept] for f in fields(self)))
+
+
+@dataclass(frozen=True)
+class Phase:
+    """One part of the test of a wheel."""
+
+    wheel: str  # the one that is driven
+    number: int  # as in :class:`Trace`
+    # zero voltage before, growing voltage, constant voltage, zero voltage behind it
+    kind: Literal["rest", "ramp", "hold", "coast"]
+    level: float = 0.0  # voltage at the end, with its sign [V]
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What the test showed of one wheel; NaN for what it did not show."""
+
+    rate: float  # samples per second [Hz]
+    age: float  # of the stamps on arrival, median [s]
+    repeated: int  # stamps that do not grow
+    at_rest: float  # turned under zero voltage [counts]
+    breakaway: float  # command at which it began to turn, the larger of both directions [V]
+    # 1 where positive commands make counts grow, -1 where they make them shrink, 0 where
+    # nothing turned
+    direction: float
+    applied: float  # reported over commanded voltage
+    velocity_ratio: float  # reported over counted speed of the wheel
+    gain: float  # steady motor speed per volt beyond friction [rad/s/V]
+    friction: float  # voltage that keeps it turning slowly [V]
+    # angle of the coast over the speed before it [s]: the time constant, less what friction
+    # takes of it
+    coast: float
+    level: float  # largest commanded voltage [V]
+
+
+def answers_well(level: float, breakaway: float, counts: float) -> bool:
+    """Tell whether a wheel's answer to a voltage tells more of the motor than of its friction."""
+    return level * FRICTION_SHARE.value >= breakaway and counts >= ANSWER_COUNTS.value
+
+
+def figures(trace: Trace, phases: Sequence[Phase], hardware: Hardware) -> Figures:
+    """Read the test of one wheel.
+
+    Parameters
+    ----------
+    trace : Trace
+        Of the wheel.
+    phases : sequence of Phase
+        Those in which this wheel was driven.
+    hardware : Hardware
+        As described.
+
+    Returns
+    -------
+    Figures
+        Of speeds from counts.
+    """
+    steps = np.diff(trace.time)
+    holds = [trace.during(p.number) for p in phases if p.kind == "hold"]
+    levels = [p.level for p in phases if p.kind == "hold"]
+    steady = [_Steady.of(hold, hardware) for hold in holds]
+    starts = [_breakaway(trace.during(p.number)) for p in phases if p.kind == "ramp"]
+    rest = trace.during(*(p.number for p in phases if p.kind == "rest"))
+    gain, friction = _line([s.voltage for s in steady], [s.speed for s in steady])
+    signs = [math.copysign(1.0, s.speed * level) for s, level in zip(steady, levels) if s.speed]
+    return Figures(
+        rate=1.0 / float(np.median(steps)) if steps.size and np.median(steps) > 0 else math.nan,
+        age=float(np.median(trace.age)) if trace.age.size else math.nan,
+        repeated=int((steps <= 0).sum()),
+        at_rest=float(np.ptp(rest.count)) if rest.time.size else 0.0,
+        breakaway=max(starts) if starts and np.all(np.isfinite(starts)) else math.nan,
+        direction=float(np.sign(sum(signs))),
+        applied=_median(s.voltage / level for s, level in zip(steady, levels))
+        if holds
+        else _applied(trace.during(*(p.number for p in phases if p.kind == "ramp"))),
+        velocity_ratio=_median(s.reported / s.wheel for s in steady if s.wheel),
+        gain=gain,
+        friction=friction,
+        coast=_median(
+            _coast(trace.during(a.number), trace.during(b.number), hardware)
+            for a, b in itertools.pairwise(phases)
+            if a.kind == "hold" and b.kind == "coast"
+        ),
+        level=max(map(abs, levels), default=math.nan),
+    )
+
+
+def moved_with(traces: Mapping[str, Trace], phases: Sequence[Phase]) -> dict[str, dict[str, float]]:
+    """Return by driven wheel how far every wheel turned meanwhile [counts]."""
+    found: dict[str, dict[str, float]] = {}
+    for driven in dict.fromkeys(p.wheel for p in phases):
+        numbers = [p.number for p in phases if p.wheel == driven and p.kind in ("ramp", "hold")]
+        parts = {wheel: trace.during(*numbers) for wheel, trace in traces.items()}
+        found[driven] = {
+            wheel: float(np.ptp(part.count)) if part.time.size else 0.0
+            for wheel, part in parts.items()
+        }
+    return found
+
+
+@dataclass(frozen=True)
+class _Steady:
+    """The second half of a constant voltage: voltage, motor speed, and the wheel's two speeds."""
+
+    voltage: float
+    speed: float
+    wheel: float
+    reported: float
+
+    @classmethod
+    def of(cls, hold: Trace, hardware: Hardware) -> _Steady:
+        n = hold.time.size
+        if n < 4 or hold.time[-1] <= hold.time[n // 2]:
+            return cls(math.nan, 0.0, 0.0, math.nan)
+        late = slice(n // 2, None)
+        angle = hold.count[late] * _angle_per_count(hardware)
+        if np.ptp(angle) < BREAKAWAY_COUNTS.value * _angle_per_count(hardware):
+            return cls(float(hold.voltage[late].mean()), 0.0, 0.0, math.nan)
+        speed = float((angle[-1] - angle[0]) / np.ptp(hold.time[late]))
+        return cls(
+            float(hold.voltage[late].mean()),
+            speed,
+            speed / hardware.gear_ratio,
+            float(hold.velocity[late].mean()),
+        )
+
+
+def _angle_per_count(hardware: Hardware) -> float:
+    return 2 * math.pi / (hardware.counts_per_revolution or 2 * math.pi)
+
+
+def _breakaway(ramp: Trace) -> float:
+    """Return the command at which a wheel began to turn and went on [V]; NaN where it did not."""
+    if ramp.time.size < 2:
+        return math.nan
+    turned = np.abs(ramp.count - ramp.count[0])
+    if turned[-1] < BREAKAWAY_COUNTS.value:
+        return math.nan
+    still = np.flatnonzero(turned <= TREMBLE)
+    return float(abs(ramp.command[still[-1]]))
+
+
+def _applied(ramps: Trace) -> float:
+    """Return the reported over the commanded voltage of a wheel that never turned."""
+    late = np.abs(ramps.command) > 0.5 * np.abs(ramps.command).max(initial=0.0)
+    return _median(ramps.voltage[late] / ramps.command[late])
+
+
+def _coast(hold: Trace, coast: Trace, hardware: Hardware) -> float:
+    speed = _Steady.of(hold, hardware).speed
+    if not speed or not coast.time.size:
+        return math.nan
+    angle = coast.count * _angle_per_count(hardware)
+    return float((angle[-1] - angle[0]) / speed)
+
+
+def _line(voltages: Sequence[float], speeds: Sequence[float]) -> tuple[float, float]:
+    """Return gain and friction of ``|speed| = gain (|voltage| - friction)``."""
+    volts, speed = np.abs(voltages), np.abs(speeds)
+    turning = (speed > 0) & np.isfinite(volts)
+    if turning.sum() < 2 or np.ptp(volts[turning]) < 0.1 * volts[turning].max():
+        return math.nan, math.nan
+    gain, offset = np.polyfit(volts[turning], speed[turning], 1)
+    return (float(gain), float(-offset / gain)) if gain > 0 else (math.nan, math.nan)
+
+
+def _median(values: object) -> float:
+    known = [v for v in values if math.isfinite(v)]  # type: ignore[attr-defined]
+    return float(np.median(known)) if known else math.nan

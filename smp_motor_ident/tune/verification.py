@@ -1,0 +1,306 @@
+"""A drive on new gains against what the design said of it: every change of set-point, in bands.
+
+The prediction is the running loop itself on simulated motors: the nominal one and draws of all
+that the estimate leaves open, seen through the same encoder and read in the same way.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from scipy.signal import savgol_filter
+
+from smp_motor_control.encoder import Encoder
+from smp_motor_control.motor.file import MotorEntry
+from smp_motor_control.motor.friction import Gearbox, MotorParameters
+from smp_motor_control.motor.hardware import DrivenMotor, DriveSettings
+from smp_motor_control.motor.model import MotorModel
+from smp_motor_control.pid import PidGains
+from smp_motor_control.reference.profile import Drive, ProfileLimits
+from smp_motor_control.wheel.loop import LoopSettings, WheelLoop
+from smp_motor_ident.finding import Finding
+from smp_motor_ident.result import Estimate
+from smp_motor_ident.tune.arrays import Array
+from smp_motor_ident.tune.limits import OVERSHOOT, SETTLED, SILENCE, STEADY_ERROR
+
+SMOOTHING = 0.05
+"""Length [s] of the parabola whose slope is taken as the speed."""
+
+STEADY = 0.3
+"""End of a change that is taken as steady [s]."""
+
+DRAWS = 12
+"""Motors beside the nominal one: the largest of so many is exceeded once in thirteen changes by
+chance, and the nominal band and the widening cover that."""
+
+SIGMAS = 3.0
+"""Of the speed's resolution that a reading may be off."""
+
+
+@dataclass(frozen=True)
+class Reading:
+    """One change of set-point as its record shows it."""
+
+    settling: float  # until it stays within a tolerance [s]; infinite where it does not
+    overshoot: float  # beyond the set-point [% of the change]
+    error: float  # mean distance from the set-point at the end [% of the change]
+
+
+@dataclass(frozen=True)
+class Bands:
+    """What a change may be at most, with what its record cannot resolve."""
+
+    settling: float  # [s]
+    overshoot: float  # [% of the change]
+    error: float  # [% of the change]
+
+
+@dataclass(frozen=True, eq=False)
+class Change:
+    """One change of set-point of one wheel: what was predicted, and what happened."""
+
+    wheel: str  # whose
+    name: str  # of the change in the drive
+    setpoint: float  # from rest [rad/s, wheel]
+    time: Array  # since the change [s]
+    speed: Array  # as measured [rad/s, wheel]
+    low: Array  # least of the predictions [rad/s]
+    nominal: Array  # as predicted for the motor as identified [rad/s]
+    high: Array  # largest of the predictions [rad/s]
+    reading: Reading  # of the measured speed
+    bands: Bands  # of the design
+
+
+def smoothed(time: Array, angle: Array, step: float) -> tuple[Array, Array]:
+    """Return instants at an even distance and the speed there, from angles at any."""
+    even = np.arange(time[0], time[-1], step)
+    window = max(2 * round(SMOOTHING / step / 2) + 1, 5)
+    held = np.interp(even, time, angle)
+    speed = savgol_filter(held, window, 2, deriv=1, delta=step)
+    return even, np.asarray(speed, dtype=np.float64)
+
+
+def resolution(quantum: float, step: float) -> float:
+    """Return the standard deviation of a smoothed speed by its encoder's steps [rad/s].
+
+    The slope of a parabola over n samples: ``sqrt(12 / n^3) / step`` of the deviation of one,
+    which is ``quantum / sqrt(12)``.
+    """
+    n = max(2 * round(SMOOTHING / step / 2) + 1, 5)
+    return float(quantum / (step * n**1.5))
+
+
+def read(time: Array, speed: Array, setpoint: float, tolerance: float) -> Reading:
+    """Read a change from rest at time zero; ``tolerance`` is a share of the set-point."""
+    relative = speed / setpoint
+    outside = np.flatnonzero(np.abs(relative - 1.0) > tolerance)
+    last = int(outside[-1]) if outside.size else -1
+    late = time > time[-1] - STEADY
+    return Reading(
+        settling=float(time[last + 1]) if last + 1 < time.size else math.inf,
+        overshoot=float(max(100 * (relative.max() - 1.0), 0.0)),
+        error=float(100 * abs(relative[late].mean() - 1.0)),
+    )
+
+
+def predicted(
+    estimate: Estimate,
+    parameters: Mapping[str, Any],
+    loop: Mapping[str, Any],
+    setpoint: float,
+    answers: tuple[Array, Array],
+    time: Array,
+) -> Array:
+    """Return the wheel's speed after a change from rest, a row for each motor, nominal first.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        Of the motor.
+    parameters, loop : mapping
+        Of the wheel in ``gains.yaml``, and in ``gains.json``.
+    setpoint : float
+        [rad/s, wheel].
+    answers : (ndarray, ndarray), each of shape (n,), [s]
+        When the recorded drive took its samples, since the change, and how old each was when it
+        was answered; NaN where it was not.  Rest before the change lets the loop begin.
+    time : ndarray, shape (k,), [s]
+        At which the speed is wanted.
+
+    Returns
+    -------
+    ndarray, shape (1 + DRAWS, k), [rad/s, wheel]
+        As the recorded encoder would have shown it.
+    """
+    instants, ages = answers
+    step = float(loop["sample_time"])
+    delays = np.maximum(ages, float(loop.get("usual_delay") or loop["delay"]))
+    settings = loop_settings(parameters)
+    rows = []
+    for entry in _motors(estimate, float(loop["supply_voltage"])):
+        angle = _run(entry, settings, setpoint, instants, delays)
+        even, speed = smoothed(instants, angle, step)
+        rows.append(np.interp(time, even, speed))
+    return np.array(rows)
+
+
+def _run(
+    entry: MotorEntry, settings: LoopSettings, setpoint: float, instants: Array, delays: Array
+) -> Array:
+    """Return the wheel's angle as its encoder shows it, from rest, with a change at time zero."""
+    begin = float(instants[0])
+    plant = DrivenMotor(entry, DriveSettings(command_timeout=math.inf), start=begin)
+    limit = entry.supply_voltage
+    loop = WheelLoop(settings.within(limit), entry.gearbox, entry.encoder, 1.5 * limit)
+    turn = entry.gearbox.to_wheel(entry.encoder.angle_per_count)
+    angle, before, arrival = np.empty(instants.size), begin, begin
+    for k, (time, delay) in enumerate(zip(instants.tolist(), delays.tolist(), strict=True)):
+        sample = plant.sample(time)
+        angle[k] = turn * sample.encoder_count
+        if time == begin or math.isnan(delay):
+            continue
+        dt, before = time - before, time
+        speed = loop.speed(dt, sample.velocity, sample.encoder_count, sample.voltage)
+        if not math.isnan(speed):
+            arrival = max(arrival, time + delay)
+            plant.command(arrival, loop.step(setpoint if time >= 0.0 else 0.0, speed, dt).output)
+    return angle
+
+
+def bands_of(
+    rows: Array, time: Array, setpoint: float, specification: Mapping[str, Any], unsure: float
+) -> Bands:
+    """Return what the design and the motors that may be allow.
+
+    Parameters
+    ----------
+    rows : ndarray, shape (n, k), [rad/s]
+        As :func:`predicted` returns them.
+    time : ndarray, shape (k,), [s]
+        Since the change.
+    setpoint : float
+        [rad/s, wheel].
+    specification : mapping
+        Of the wheel, from ``gains.json``.
+    unsure : float
+        Resolution of the speed [rad/s].
+
+    Returns
+    -------
+    Bands
+        The widest of design and simulations, and what sampling and resolution add.
+    """
+    blur = SIGMAS * unsure / abs(setpoint)
+    simulated = [read(time, row, setpoint, SETTLED.value + blur) for row in rows]
+    settling = [one.settling for one in simulated] + [_high(specification, "settling")]
+    overshoot = [one.overshoot for one in simulated] + [_high(specification, "overshoot")]
+    step = float(np.median(np.diff(time)))
+    return Bands(
+        settling=max(settling) + 2 * step,
+        overshoot=max(overshoot) + 100 * (OVERSHOOT.value + blur),
+        error=max(one.error for one in simulated) + 100 * (STEADY_ERROR.value + blur),
+    )
+
+
+def change_of(
+    wheel: str, name: str, setpoint: float, time: Array, speed: Array, rows: Array,
+    specification: Mapping[str, Any], unsure: float,
+) -> Change:  # fmt: skip
+    """Return a change with its reading and its bands."""
+    # What a planned change may overshoot is not held against its settling.
+    tolerance = SETTLED.value + OVERSHOOT.value + SIGMAS * unsure / abs(setpoint)
+    return Change(
+        wheel, name, setpoint, time, speed, rows.min(axis=0), rows[0], rows.max(axis=0),
+        read(time, speed, setpoint, tolerance),
+        bands_of(rows, time, setpoint, specification, unsure),
+    )  # fmt: skip
+
+
+def _high(specification: Mapping[str, Any], name: str) -> float:
+    value = specification[name]["high"]
+    return 0.0 if value is None else float(value)
+
+
+def judge(changes: Sequence[Change]) -> list[Finding]:
+    """Hold what happened against the bands."""
+    found = []
+    for one in changes:
+        for name, unit, words in (
+            ("settling", "s", "settles after"),
+            ("overshoot", "%", "overshoots by"),
+            ("error", "%", "stays off its set-point by"),
+        ):
+            value, most = getattr(one.reading, name), getattr(one.bands, name)
+            if not value <= most:
+                text = f"{value:.3g} {unit}" if math.isfinite(value) else "more than was recorded"
+                found.append(Finding(
+                    "verification", "refused",
+                    f"{one.wheel}: {one.name} to {one.setpoint:.3g} rad/s {words} {text}; the "
+                    f"design allows {most:.3g} {unit}",
+                    {"wheel": one.wheel, "value": value if math.isfinite(value) else None,
+                     "limit": most},
+                    "look at the curves in the report: a wheel that touches something, a battery "
+                    "that sags or a motor that changed since; then commission again",
+                ))  # fmt: skip
+    return found
+
+
+def disturbed(silence: float) -> Finding:
+    """Return what is said of a drive in which a wheel was without control for a while [s]."""
+    return Finding(
+        "verification_disturbed",
+        "refused",
+        f"a wheel had no answer to its samples for {silence:.2f} s, in every drive",
+        {"silence": silence, "limit": SILENCE.value},
+        "give the wheels' nodes processor time (scheduling_priority), and the network its quiet",
+    )
+
+
+def loop_settings(parameters: Mapping[str, Any]) -> LoopSettings:
+    """Return the running loop of a wheel's parameters, as ``tune`` writes them."""
+    gains = {f.name: parameters[f.name] for f in fields(PidGains) if f.name in parameters}
+    drive, model = parameters.get("drive"), parameters.get("model")
+    return LoopSettings(
+        gains=PidGains(**gains),
+        limits=ProfileLimits.from_parameters(
+            parameters.get("max_velocity", 0.0), parameters.get("max_acceleration", 0.0), 0.0
+        ),
+        transition_time=parameters.get("transition_time", 0.0),
+        reference_delay=parameters.get("reference_delay", 0.0),
+        reference_doubt=parameters.get("reference_doubt", 0.0),
+        drive=Drive(**drive) if drive and drive["top_speed"] else None,
+        speed_source=parameters.get("speed_source", "measured"),
+        difference_window=parameters.get("difference_window", 1),
+        model=MotorModel(**model) if model else None,
+    )
+
+
+def _motors(estimate: Estimate, supply: float) -> list[MotorEntry]:
+    """Return the nominal motor and draws of what the estimate leaves open."""
+    names = ("dc_gain", "time_constant", "time_constant_product", "static_voltage", "delay")
+    rows = np.vstack([
+        [estimate.value(name) for name in names],
+        estimate.samples_of(names, DRAWS, np.random.default_rng(0)),
+    ])  # fmt: skip
+    hardware = estimate.hardware
+    gearbox = Gearbox(hardware.gear_ratio)
+    encoder = Encoder(hardware.counts_per_revolution or 1e6, 0)
+    return [
+        MotorEntry(
+            MotorParameters.from_combinations(
+                dc_gain=gain,
+                time_constant=slow,
+                time_constant_product=max(product, 0.0),
+                static_voltage=max(friction, 0.0),
+            ),
+            gearbox,
+            encoder,
+            supply,
+            max(delay, 0.0),
+        )
+        for gain, slow, product, friction, delay in rows.tolist()
+    ]

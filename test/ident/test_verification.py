@@ -1,0 +1,137 @@
+"""A drive on new gains against what was predicted of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from wheel_simulation import Timing, simulate_closed_loop
+
+from smp_motor_control.motor.file import MotorEntry, load_motors
+from smp_motor_control.motor.hardware import DriveSettings
+from smp_motor_ident.cli.tuning import read_estimates
+from smp_motor_ident.tune import Design, Loop, design
+from smp_motor_ident.tune import verification as v
+from smp_motor_ident.tune.writing import parameters
+
+MOTORS = Path(__file__).resolve().parents[2] / "config" / "motors_paper.yaml"
+WHEEL, STEP, REST, LASTS = "front_left", 0.005, 0.3, 1.2
+ESTIMATE = read_estimates(MOTORS)[WHEEL]
+ENTRY = load_motors(MOTORS)[WHEEL]
+
+
+@pytest.fixture(scope="module")
+def designed() -> Design:
+    return design(ESTIMATE, Loop(sample_time=STEP, supply_voltage=12.0))
+
+
+def drive(
+    one: Design,
+    entry: MotorEntry = ENTRY,
+    load: float = 0.0,
+    late: float = 0.0,
+    offset: float = 0.0,
+) -> v.Change:
+    """Return a change of set-point that another motor did, as commission reads it."""
+    document = {"sample_time": STEP, "delay": STEP, "supply_voltage": 12.0}
+    setpoint = one.specification.change / one.loop.gear_ratio
+    run = simulate_closed_loop(
+        entry,
+        v.loop_settings(parameters(one)),
+        lambda t: setpoint if t >= REST else 0.0,
+        REST + LASTS,
+        timing=Timing(sample_time=STEP, delay=STEP, jitter=late),
+        drive=DriveSettings(command_timeout=math.inf, pwm_steps=1000),
+        load=lambda t: load,
+    )
+    # Zero is the first sample that saw the new set-point.
+    instants = run.time - run.time[run.time >= REST][0]
+    turn = entry.gearbox.to_wheel(entry.encoder.angle_per_count)
+    even, speed = v.smoothed(instants, turn * run.count, STEP)
+    kept = even >= 0.0
+    rows = v.predicted(
+        ESTIMATE,
+        parameters(one),
+        document,
+        setpoint,
+        (instants, np.zeros(instants.size)),
+        even[kept],
+    )
+    specification = asdict(one.specification)
+    return v.change_of(
+        WHEEL, "forward", setpoint, even[kept], speed[kept] + offset * setpoint, rows,
+        specification, v.resolution(turn, STEP),
+    )  # fmt: skip
+
+
+def test_a_wheel_that_does_as_designed_is_within_its_bands(designed: Design) -> None:
+    change = drive(designed)
+    assert v.judge([change]) == []
+    # The prediction is the drive, but for the steps of the duty cycle.
+    assert np.abs(change.nominal - change.speed).max() < 0.01 * change.setpoint
+
+
+def test_samples_that_come_late_are_in_the_prediction(designed: Design) -> None:
+    # A computer that is busy elsewhere: intervals scatter by a third.
+    change = drive(designed, late=0.3 * STEP)
+    assert v.judge([change]) == []
+    assert np.abs(change.nominal - change.speed).max() < 0.02 * change.setpoint
+
+
+def test_samples_that_nobody_answered_are_in_the_prediction(designed: Design) -> None:
+    loop = {"sample_time": STEP, "delay": STEP, "supply_voltage": 12.0}
+    instants = STEP * np.arange(-60, 240)
+    # 60 ms without an answer while the wheel gets faster: the voltage stays and is too large.
+    silent = np.where((instants > 0.05) & (instants < 0.11), np.nan, 0.0)
+    rows = [
+        v.predicted(ESTIMATE, parameters(designed), loop, 1.0, (instants, ages), instants[60:230])[
+            0
+        ]
+        for ages in (np.zeros(instants.size), silent)
+    ]
+    assert np.abs(rows[1] - rows[0]).max() > 0.02
+    assert rows[1][-1] == pytest.approx(1.0, abs=0.02)
+
+
+@pytest.mark.parametrize("gain", [0.6, 1.6])
+def test_another_motor_is_refused(designed: Design, gain: float) -> None:
+    motor = ENTRY.parameters
+    other = replace(
+        ENTRY,
+        parameters=replace(
+            motor, motor_constant=motor.motor_constant * gain, inertia=motor.inertia / gain
+        ),
+    )
+    found = v.judge([drive(designed, other)])
+    assert found and {f.code for f in found} == {"verification"}
+    assert all(f.severity == "refused" and WHEEL in f.message for f in found)
+
+
+def test_a_speed_that_stays_off_is_refused(designed: Design) -> None:
+    found = v.judge([drive(designed, offset=-0.05)])
+    assert any("stays off" in f.message for f in found)
+
+
+def test_a_wheel_that_never_arrives_is_refused_in_words(designed: Design) -> None:
+    # Twice what 12 V can push: the wheel stands still.
+    stall = 2.0 * ENTRY.gearbox.ratio * 12.0 * ENTRY.parameters.motor_constant
+    found = v.judge([drive(designed, load=stall / ENTRY.parameters.resistance)])
+    assert any("more than was recorded" in f.message for f in found)
+
+
+def test_a_drive_without_control_is_refused_with_its_reason() -> None:
+    found = v.disturbed(0.4)
+    assert found.severity == "refused" and "0.40 s" in found.message and found.advice
+
+
+def test_the_resolution_of_a_speed_is_that_of_its_parabola() -> None:
+    # A staircase of counts from a slow wheel: the smoothed slope scatters as the formula says.
+    quantum, speed = 0.01, 0.37
+    time = np.arange(0.0, 20.0, STEP)
+    angle = quantum * np.floor(speed * time / quantum)
+    _, slope = v.smoothed(time, angle, STEP)
+    # Errors of a staircase repeat and are not independent: to a factor of two.
+    assert 0.5 < np.std(slope[20:-20]) / v.resolution(quantum, STEP) < 2.0

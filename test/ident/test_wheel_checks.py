@@ -1,0 +1,190 @@
+"""The checks before a commissioning: what a small test of the wheels shows, and what is said."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from smp_motor_ident.diagnosis.wheel_checks import Robot, judge
+from smp_motor_ident.diagnosis.wheel_test import (
+    Figures,
+    Phase,
+    Trace,
+    answers_well,
+    figures,
+    moved_with,
+)
+from smp_motor_ident.record import Hardware
+
+STEP, GAIN, FRICTION, SLOW, RATIO, COUNTS = 0.005, 25.0, 0.4, 0.05, 50.0, 500.0
+HARDWARE = Hardware(gear_ratio=RATIO, counts_per_revolution=COUNTS, supply_voltage=12.0)
+LEVELS = (1.2, 2.4, 4.8)
+
+
+def trace(
+    sign: float = 1.0,
+    velocity_scale: float = 1.0,
+    applied: float = 1.0,
+    dead: float = 0.0,
+    driven: bool = True,
+) -> tuple[Trace, list[Phase]]:
+    """Return a test of a motor of first order with friction: ramp, three levels, coast, both ways.
+
+    The motor is integrated here, by Euler steps of a fiftieth of its time constant.
+    """
+    rows, phases, time, speed, angle = [], [], 0.0, 0.0, 0.0
+    number = 0
+    for way in (1.0, -1.0):
+        plan = [("ramp", 0.0, 0.5)] + [("hold", level, 0.5) for level in LEVELS]
+        for kind, level, lasts in [*plan, ("coast", 0.0, 0.4)]:
+            number += 1
+            for k in range(round(lasts / STEP)):
+                command = way * (2.0 * STEP * k if kind == "ramp" else level)
+                volts = applied * command * (abs(command) > dead)
+                for _ in range(5):
+                    push = driven * GAIN * (volts - math.copysign(FRICTION, speed or volts))
+                    if speed == 0.0 and abs(volts) <= FRICTION:
+                        push = 0.0
+                    new = speed + STEP / 5 / SLOW * (push - speed)
+                    speed = 0.0 if speed * new < 0.0 else new
+                    angle += speed * STEP / 5
+                time += STEP
+                shown = sign * angle * COUNTS / (2 * math.pi)
+                told = velocity_scale * sign * speed / RATIO
+                row = (time, 0.001, command, volts, told, sign * angle / RATIO)
+                rows.append((*row, math.floor(shown), number))
+            phases.append(Phase("left", number, kind, command))
+    return Trace.of(rows), phases
+
+
+def shown(**faults: float) -> Figures:
+    seen, phases = trace(**faults)
+    return figures(seen, phases, HARDWARE)
+
+
+GOOD = shown()
+
+
+def codes(*odd: Figures, hardware: Hardware = HARDWARE, **known: object) -> dict[str, str]:
+    """Return code and severity of what is said of three good wheels and odd ones beside them."""
+    names = [f"wheel_{k}" for k in range(3 + len(odd))]
+    found = judge(
+        Robot(dict(zip(names, (*odd, GOOD, GOOD, GOOD))), dict.fromkeys(names, hardware), **known)
+    )
+    return {f.code: f.severity for f in found}
+
+
+def test_the_figures_are_those_of_the_motor() -> None:
+    # The speed of the last half of a hold has settled to exp(-5); counts resolve it to 0.1 %.
+    assert GOOD.gain == pytest.approx(GAIN, rel=0.01)
+    assert GOOD.friction == pytest.approx(FRICTION, abs=0.02)
+    # A ramp of 2 V/s, some 10 counts and a time constant behind the start.
+    assert FRICTION < GOOD.breakaway < FRICTION + 0.2
+    # Friction takes Vc/(V - Vc) ln(V/Vc) of it, a quarter, and the first sample some.
+    assert 0.6 * SLOW < GOOD.coast < SLOW
+    assert GOOD.direction == 1.0 and GOOD.applied == pytest.approx(1.0)
+    assert GOOD.velocity_ratio == pytest.approx(1.0, abs=0.01)
+    assert GOOD.rate == pytest.approx(1 / STEP) and GOOD.level == LEVELS[-1]
+
+
+def test_of_a_sound_robot_only_the_gear_ratio_is_left_open() -> None:
+    assert codes() == {"gear_ratio_unknown": "note"}
+    names = [f"wheel_{k}" for k in range(3)]
+    known = {"gains": dict.fromkeys(names, 25.5), "ratios": dict.fromkeys(names, RATIO)}
+    assert codes(**known) == {}
+
+
+def test_feedback_that_comes_too_seldom_or_late_is_refused() -> None:
+    assert codes(replace(GOOD, rate=20.0))["feedback_rate"] == "refused"
+    assert codes(replace(GOOD, age=0.5))["feedback_age"] == "refused"
+    assert codes(replace(GOOD, age=-3600.0))["feedback_age"] == "refused"
+    assert codes(replace(GOOD, repeated=7))["repeated_stamps"] == "warning"
+
+
+def test_a_trembling_encoder_is_no_motion_and_a_turning_wheel_is() -> None:
+    assert "turns_at_rest" not in codes(replace(GOOD, at_rest=2.0))
+    assert codes(replace(GOOD, at_rest=40.0))["turns_at_rest"] == "refused"
+    seen, phases = trace(driven=False)
+    trembling = replace(seen, count=seen.count + np.arange(seen.count.size) % 2)
+    still = figures(trembling, phases, HARDWARE)
+    assert math.isnan(still.breakaway) and still.direction == 0.0
+
+
+def test_a_wheel_that_does_not_turn_is_refused_by_name() -> None:
+    seen, phases = trace(driven=False)
+    still = figures(seen, [p for p in phases if p.kind == "ramp"], HARDWARE)
+    assert still.applied == pytest.approx(1.0)
+    assert codes(still, moved={"wheel_0": {"wheel_0": 0.0}})["no_motion"] == "refused"
+
+
+def test_plugs_of_two_wheels_that_are_exchanged_are_told_from_a_belt() -> None:
+    (seen, phases), (still, _) = trace(), trace(driven=False)
+    # What is sent to the left turns the right.
+    moved = moved_with({"left": still, "right": seen}, phases)
+    robot = Robot({"left": GOOD, "right": GOOD}, dict.fromkeys(("left", "right"), HARDWARE), moved)
+    assert "crossed_wheels" in {f.code for f in judge(robot)}
+    moved = moved_with({"left": seen, "right": seen}, phases)
+    robot = Robot({"left": GOOD, "right": GOOD}, dict.fromkeys(("left", "right"), HARDWARE), moved)
+    assert {f.code: f.severity for f in judge(robot)}["coupled_wheels"] == "warning"
+
+
+def test_a_swapped_encoder_or_motor_is_refused_with_both_remedies() -> None:
+    wrong = shown(sign=-1.0)
+    assert wrong.direction == -1.0
+    (found,) = [
+        f
+        for f in judge(Robot({"left": wrong}, {"left": HARDWARE}))
+        if f.severity == "refused"
+    ]  # fmt: skip
+    assert found.code == "reversed"
+    assert "channels" in found.advice and "leads" in found.advice
+
+
+def test_a_gear_ratio_that_counts_or_a_motor_file_contradict_is_refused() -> None:
+    assert codes(shown(velocity_scale=0.75))["gear_ratio"] == "refused"
+    assert codes(shown(velocity_scale=-1.0))["velocity_sign"] == "refused"
+    assert codes(ratios={"wheel_0": 65.5})["gear_ratio"] == "refused"
+    # Counts of edges taken for lines make the motor four times as fast.
+    assert codes(gains={"wheel_0": GAIN / 4})["unexpected_gain"] == "refused"
+    assert "unexpected_gain" not in codes(gains={"wheel_0": 1.2 * GAIN})
+
+
+def test_a_dead_zone_is_told_from_friction() -> None:
+    wide = shown(dead=1.0 - 1e-6)
+    # The ramp ends at 1 V; friction itself is 0.4 V.
+    assert codes(replace(wide, breakaway=1.1))["dead_zone"] == "warning"
+    assert "dead_zone" not in codes()
+
+
+def test_a_weak_battery_is_refused_by_what_arrives_or_what_it_says() -> None:
+    weak = shown(applied=0.7)
+    assert weak.applied == pytest.approx(0.7)
+    # Friction and gain are of the voltage that arrives: the motor is the same.
+    assert weak.gain == pytest.approx(GAIN, rel=0.02)
+    assert codes(weak)["supply_low"] == "refused"
+    assert codes(battery=9.0)["supply_low"] == "refused"
+    assert "supply_low" not in codes(shown(applied=0.95), battery=11.9)
+    assert codes(replace(GOOD, applied=-1.0))["reported_voltage_sign"] == "refused"
+    assert codes(replace(GOOD, applied=0.0))["voltage_not_reported"] == "refused"
+
+
+def test_a_wheel_that_drags_is_told_from_motors_that_scatter() -> None:
+    assert codes(replace(GOOD, friction=5 * FRICTION))["unlike_sisters"] == "refused"
+    assert codes(replace(GOOD, coast=5 * GOOD.coast))["unlike_sisters"] == "refused"
+    assert "unlike_sisters" not in codes(replace(GOOD, friction=1.8 * FRICTION))
+    # A load that leaves room for one level only: friction is not told from gain.
+    heavy = replace(GOOD, friction=math.nan, gain=math.nan, breakaway=3.3)
+    assert codes(heavy)["unlike_sisters"] == "refused"
+    # Two wheels cannot tell which of them is the odd one.
+    two = {"a": GOOD, "b": replace(GOOD, friction=9 * FRICTION)}
+    found = judge(Robot(two, dict.fromkeys(two, HARDWARE)))
+    assert "unlike_sisters" not in {f.code for f in found}
+
+
+def test_the_voltage_grows_until_friction_is_a_tenth_and_counts_are_enough() -> None:
+    assert answers_well(5.0, 0.5, 100.0)
+    assert not answers_well(4.9, 0.5, 1000.0)
+    assert not answers_well(5.0, 0.5, 99.0)
