@@ -144,10 +144,7 @@ def _answered(group: list[Record], request: Request, found: Sequence[Finding]) -
 def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) -> Estimate:
     """Choose a structure, fit it, and say how far it can be trusted."""
     base = base_structure(request, group)
-    hold, first = chosen_hold(group, base, request.options, request.say)
-    data = prepare(group, request.use_current, hold=hold)
-    if base.window or "window" in base.fixed:
-        data = data.as_mean_speed()
+    data, hold, first = _prepared(group, base, request)
     candidates = order_selection.explore(
         data, base, request.options, request.model == "auto", request.say, first
     )
@@ -184,6 +181,16 @@ def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) 
         sample_time=data.step,
         **_provenance(group),
     )
+
+
+def _prepared(
+    group: list[Record], base: Structure, request: Request
+) -> tuple[Experiments, str, Fit | None]:
+    """Return the data, how the command was held in them, and the fit that showed that."""
+    hold, first = chosen_hold(group, base, request.options, request.say)
+    data = prepare(group, request.use_current, hold=hold)
+    averaged_speed = base.window or "window" in base.fixed
+    return data.as_mean_speed() if averaged_speed else data, hold, first
 
 
 def _provenance(group: Sequence[Record]) -> dict[str, Any]:
