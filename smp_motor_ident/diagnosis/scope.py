@@ -4,14 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import numpy as np
+
 from smp_motor_ident.diagnosis.effects import EFFECTS
+from smp_motor_ident.diagnosis.limits import REST, SAME_LEVEL
 from smp_motor_ident.estimation.quantities import Answer
 from smp_motor_ident.finding import Finding
+from smp_motor_ident.likelihood.experiments import Experiments
 
 
-def scope(result: Answer, change: Mapping[str, float], alike: Mapping[str, float]) -> list[Finding]:
+def scope(
+    data: Experiments, result: Answer, change: Mapping[str, float], alike: Mapping[str, float]
+) -> list[Finding]:
     """Return what a reader must know of the values' meaning."""
-    out = []
+    out = [] if result.level else _one_size(data)
     if alike:
         out.append(_alike(alike))
     if result.level:
@@ -40,6 +46,30 @@ def _alike(weights: Mapping[str, float]) -> Finding:
         "sample faster, and excite with sharp steps of several sizes: a delay, an averaged "
         "speed and a second lag differ in the first samples after a step",
     )
+
+
+def _one_size(data: Experiments) -> list[Finding]:
+    """Say what a voltage that is only switched between one size both ways cannot show.
+
+    With a size U a driver that takes a share of it (a dead zone, a drop, a clip) is the
+    motor of another gain under U: no residual tells the two apart.
+    """
+    size = np.abs(data.hold_value)
+    top = float(size.max())
+    driven = size[size > REST.value * top]
+    if np.any(np.abs(driven - top) > SAME_LEVEL.value * top):
+        return []
+    return [
+        Finding(
+            "one_size_of_voltage",
+            "warning",
+            f"all of the voltage has one size, {top:.3g} V: a driver that puts out less of it (a "
+            "dead zone, a drop, a clip at the supply) cannot be told from a motor of another gain; "
+            "the numbers hold for the voltage as it was recorded",
+            {"voltage": top},
+            "record the voltage at the motor's terminals, or add levels of other sizes",
+        )
+    ]
 
 
 def _one_level(result: Answer) -> Finding:

@@ -83,3 +83,19 @@ def test_an_angle_that_is_given_as_a_speed_is_recognised():
     noisy = angle + 0.01 * rng.standard_normal(t.size)
     with pytest.raises(SignalError, match="map it as position"):
         estimate(Record("motor", t, voltage, velocity=noisy))
+
+
+@pytest.mark.parametrize(("levels", "said"), [([8.0, -8.0], True), ([8.0, -8.0, 4.0], False)])
+def test_a_voltage_of_one_size_says_that_a_clip_would_not_show(levels, said):
+    rng = np.random.default_rng(12)
+    rate, keep = 200.0, np.exp(-1 / 200.0 / TRUTH["time_constant"])
+    voltage = np.repeat(rng.choice(levels, 40), 30)
+    put_out = np.clip(voltage, -7.0, 7.0)  # the driver's supply
+    w = np.zeros(voltage.size)
+    for k in range(1, w.size):
+        w[k] = keep * w[k - 1] + (1 - keep) * TRUTH["dc_gain"] * put_out[k]
+    t = np.arange(w.size) / rate
+    noisy = w + 0.3 * rng.standard_normal(w.size)
+    found = estimate(Record("motor", t, voltage, velocity=noisy))
+    assert ("one_size_of_voltage" in [f.code for f in found.findings]) is said
+    assert said or found.unreliable  # with another size the clip itself shows
