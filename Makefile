@@ -17,8 +17,8 @@ test: setup
 ifdef ARGS
 	@$(IN) exec python -m pytest $(ARGS)
 else
-	@$(IN) python -m pytest -n 2 --dist loadfile --ignore=test/nodes --ignore=test/system; pure=$$?; \
-	python -m pytest test/nodes test/system && exit $$pure
+	@$(IN) python -m pytest -n 2 --dist loadfile --durations=10 --ignore=test/nodes --ignore=test/system; pure=$$?; \
+	python -m pytest --durations=20 test/nodes test/system && exit $$pure
 endif
 
 check: setup

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -143,13 +144,10 @@ def _answered(group: list[Record], request: Request, found: Sequence[Finding]) -
 def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) -> Estimate:
     """Choose a structure, fit it, and say how far it can be trusted."""
     base = base_structure(request, group)
-    options = request.options
-    hold, first = chosen_hold(group, base, options, request.say)
-    data = prepare(group, request.use_current, hold=hold)
-    if base.window or "window" in base.fixed:
-        data = data.as_mean_speed()
-    auto = request.model == "auto"
-    candidates = order_selection.explore(data, base, options, auto, request.say, first)
+    data, hold, first = _prepared(group, base, request)
+    candidates = order_selection.explore(
+        data, base, request.options, request.model == "auto", request.say, first
+    )
     if not candidates:
         raise no_candidate(group)
     chosen, friction_std, change = _certain(data, candidates[-1].fit, request, group, hold)
@@ -170,7 +168,6 @@ def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) 
         *scope(final, result, change, alike),
     ]
     return Estimate(
-        wheel=group[0].wheel,
         model=_name(chosen.structure),
         parameters=result.parameters,
         combinations=result.combinations,
@@ -181,12 +178,30 @@ def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) 
         residuals=tests,
         findings=tuple(findings),
         samples=data.size,
-        duration=float(sum(r.duration for r in group)),
         sample_time=data.step,
-        largest_voltage=max(float(np.abs(r.voltage).max()) for r in group),
-        sources=tuple(dict.fromkeys(r.source for r in group if r.source)),
-        hardware=group[0].hardware,
+        **_provenance(group),
     )
+
+
+def _prepared(
+    group: list[Record], base: Structure, request: Request
+) -> tuple[Experiments, str, Fit | None]:
+    """Return the data, how the command was held in them, and the fit that showed that."""
+    hold, first = chosen_hold(group, base, request.options, request.say)
+    data = prepare(group, request.use_current, hold=hold)
+    averaged_speed = base.window or "window" in base.fixed
+    return data.as_mean_speed() if averaged_speed else data, hold, first
+
+
+def _provenance(group: Sequence[Record]) -> dict[str, Any]:
+    """Return what an estimate says of its records."""
+    return {
+        "wheel": group[0].wheel,
+        "duration": float(sum(r.duration for r in group)),
+        "largest_voltage": max(float(np.abs(r.voltage).max()) for r in group),
+        "sources": tuple(dict.fromkeys(r.source for r in group if r.source)),
+        "hardware": group[0].hardware,
+    }
 
 
 def _certain(

@@ -30,7 +30,6 @@ from numpy.typing import ArrayLike, NDArray
 from smp_motor_control.errors import ParameterError, check_range
 
 Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 NEGLIGIBLE = 1e-14
 """``tp / tau^2`` up to which a motor is of first order: its response is the same to 1e-14."""
@@ -201,29 +200,6 @@ def _coefficients(tau: Array, tp: Array, t: Array) -> tuple[Array, Array, Array,
         np.where(first_order, 0.0, h_rate),
         np.where(first_order, 0.0, tp),
     )
-
-
-def frequency_response(
-    dc_gain: ArrayLike, time_constant: ArrayLike, product: ArrayLike, omega: ArrayLike
-) -> Complex:
-    """Return ``K / (1 - tp w^2 + j tau w)`` from voltage to speed.
-
-    Parameters
-    ----------
-    dc_gain, time_constant, product : array_like, shape (n,) or ()
-        As in :func:`zero_order_hold`.
-    omega : array_like, shape (f,)
-        [rad/s].
-
-    Returns
-    -------
-    ndarray of complex, shape (n, f)
-        [rad/s/V].
-    """
-    gain, tau, tp = (np.atleast_1d(x)[:, None] for x in (dc_gain, time_constant, product))
-    w = np.atleast_1d(np.asarray(omega, dtype=np.float64))
-    response: Complex = gain / (1.0 - tp * w * w + 1j * tau * w)
-    return response
 
 
 def flexible_shaft(

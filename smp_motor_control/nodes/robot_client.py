@@ -14,7 +14,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import rclpy
-from geometry_msgs.msg import TwistStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.msg import ParameterType
@@ -25,7 +24,7 @@ from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import String
 
-from smp_interfaces.msg import MotorState, PidState
+from smp_interfaces.msg import MotorState
 from smp_motor_control.errors import SmpError
 from smp_motor_control.nodes.conventions import LATCHED, STREAM_SUBSCRIBER, seconds, steady_timer
 from smp_motor_control.nodes.executor import LeanExecutor
@@ -39,10 +38,10 @@ AGAIN = 0.25
 not yet discovered this client, so no request may do harm twice."""
 
 LOOK = 0.02
-"""Interval at which a condition is looked at, and a command repeated [s]."""
+"""Interval at which a condition is looked at [s]."""
 
-STANDSTILL = 1.0
-"""Standstill that is commanded before a drive at least [s]."""
+DISCOVERY = 1.0
+"""Time in which a free machine discovers what is there [s]."""
 
 UNKNOWN = "_NODE_NAME_UNKNOWN_"
 """What the middleware calls the node of an endpoint that it discovered before the node."""
@@ -146,7 +145,7 @@ class RobotClient:
 
     def find_wheels(self) -> list[str]:
         """Return the wheels whose hardware reports in the robot's namespace, after a second."""
-        self.spin(STANDSTILL)
+        self.spin(DISCOVERY)
         pattern = re.compile(re.escape(self._full("")) + r"(\w+)/motor_state")
         topics = [name for name, _ in self.node.get_topic_names_and_types()]
         return [found[1] for name in sorted(topics) if (found := pattern.fullmatch(name))]
@@ -321,7 +320,9 @@ class RobotClient:
             for wheel in wheels
         }
         with self.listen(String, topics, LATCHED):
-            self.spin(1.0)  # what is discovered together with the wheel is not so at one instant
+            self.spin(
+                DISCOVERY
+            )  # what is discovered together with the wheel is not so at one instant
             self.until(lambda: all(self._found(w, w in owners) for w in wheels), PATIENCE)
             for wheel in wheels:
                 if rival := self.strangers(wheel):
@@ -352,54 +353,3 @@ class RobotClient:
     def _controlled(self, wheel: str, owner: str) -> bool:
         """Whether a controller is there, by the graph or the driver."""
         return "wheel_pid" in self._commanders(wheel) or "/wheel_pid#" in owner
-
-    # Driving -------------------------------------------------------------------------------
-
-    def drive(
-        self, segments: Sequence[tuple[str, float, float, float]], wheels: Sequence[str]
-    ) -> list[tuple[str, float, float]]:
-        """Drive through segments of (name, m/s, rad/s, s), and stop whatever happens."""
-        cmd_vel = self.node.create_publisher(TwistStamped, "cmd_vel", 1)
-
-        def send(linear: float, angular: float) -> None:
-            message = TwistStamped()
-            message.header.stamp = self.node.get_clock().now().to_msg()
-            message.header.frame_id = "base_link"
-            message.twist.linear.x, message.twist.angular.z = float(linear), float(angular)
-            cmd_vel.publish(message)
-
-        if not self.until(lambda: cmd_vel.get_subscription_count() > 0, PATIENCE):
-            raise RobotError(f"nobody listens on {cmd_vel.topic_name}: start skid_steer")
-        times = []
-        try:
-            self._stand(send, wheels)
-            for name, linear, angular, duration in segments:
-                begin, end = self._stamp(), time.monotonic() + duration
-                while (left := end - time.monotonic()) > 0:
-                    send(linear, angular)
-                    self.spin(min(LOOK, left))
-                times.append((name, begin, self._stamp()))
-        finally:
-            send(0.0, 0.0)
-            self.spin(LOOK)
-            self.node.destroy_publisher(cmd_vel)
-        return times
-
-    def _stamp(self) -> float:
-        return self.node.get_clock().now().nanoseconds * 1e-9
-
-    def _stand(self, send: Callable[[float, float], None], wheels: Sequence[str]) -> None:
-        """Command standstill until the wheels hear it: who just joined is still being found."""
-        heard = dict.fromkeys(wheels, 0.0)
-        topics = {
-            f"{wheel}/pid_state": lambda _, wheel=wheel: heard.update({wheel: time.monotonic()})
-            for wheel in wheels
-        }
-        followed = time.monotonic() + STANDSTILL
-        with self.listen(PidState, topics):
-            while time.monotonic() < followed or min(heard.values()) < followed:
-                if time.monotonic() > followed + PATIENCE:
-                    silent = [f"{w}/pid_state" for w in wheels if heard[w] < followed]
-                    raise RobotError(f"standstill is commanded, but {', '.join(silent)} is silent")
-                send(0.0, 0.0)
-                self.spin(LOOK)

@@ -274,16 +274,9 @@ class WheelController:
             turns = abs(measurement) > self.settings.faults.stall_velocity
             if not recovery.may_release(setpoint or 0.0, now, turns):
                 return self._zero(State.FAULT)
-        if setpoint is None:
+        if setpoint is None or self.owner or (recovery.cautious and setpoint == 0.0):
             self._resume = True
-            waiting = self._setpoint_at == -math.inf
-            return self._zero(State.WAITING if waiting else State.TIMED_OUT)
-        if self.owner:
-            self._resume = True
-            return self._zero(State.NOT_OURS)
-        if recovery.cautious and setpoint == 0.0:
-            self._resume = True
-            return self._zero(State.DRIVING)
+            return self._zero(self._idle(setpoint))
         loop, detector = self.loop, self._detector
         if self._resume:
             self._resume = False
@@ -311,6 +304,12 @@ class WheelController:
         self.steps += 1
         self.state = State.TIMED_OUT if self._expired else State.DRIVING
         return voltage
+
+    def _idle(self, setpoint: float | None) -> State:
+        """Return why a wheel without a fault is left at zero."""
+        if setpoint is None:
+            return State.WAITING if self._setpoint_at == -math.inf else State.TIMED_OUT
+        return State.NOT_OURS if self.owner else State.DRIVING
 
     def _present_setpoint(self, measurement: float, now: float) -> float | None:
         """Return what the wheel is to do now; None when it is to be left alone."""

@@ -67,11 +67,7 @@ def on_one_axis(
     values = _mean_voltage(voltage, axis, held, alike)
     starts = _count_starts(series, plan, hardware, keep, axis_name, findings)
     starts |= _gaps(axis, plan, alike, held, voltage, values, findings)
-    columns: dict[str, Any] = {
-        name: _on_axis(name, series[name], axis, keep, findings)
-        for name in ("current", "velocity", "position", "count")
-        if name in series
-    }
+    columns = _outputs(series, axis, keep, findings)
     if all(column is None for column in columns.values()):
         raise BagError(f"{source}: {wheel}: no output has a finite value")
     columns["voltage"] = values
@@ -88,6 +84,17 @@ def on_one_axis(
         velocity_window=plan.velocity_window,
         **columns,
     )
+
+
+def _outputs(
+    series: dict[str, Series], axis: Integers, keep: NDArray[np.bool_], findings: list[Finding]
+) -> dict[str, Any]:
+    """Return what was measured besides the voltage, at the instants of the axis."""
+    return {
+        name: _on_axis(name, series[name], axis, keep, findings)
+        for name in ("current", "velocity", "position", "count")
+        if name in series
+    }
 
 
 def _mean_voltage(voltage: Series, axis: Integers, held: str, alike: bool) -> Array:

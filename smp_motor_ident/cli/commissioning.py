@@ -76,7 +76,7 @@ def _commission(arguments: argparse.Namespace, folder: Path, known: Mapping[str,
         if not (folder / EXCITED).exists():
             _confirm(arguments, robot.wheels)
         protocol = Protocol(folder, arguments.accept)
-        with client.paused(robot.wheels):
+        with client.paused(robot.wheels), protocol.ending():
             if not (folder / EXCITED).exists():
                 _move(arguments, robot, protocol, known)
             designed = _design(arguments, robot, protocol)

@@ -126,13 +126,15 @@ def drive(
     robot: steps.Robot, gains: Mapping[str, Mapping[str, Any]], say: Any
 ) -> tuple[Path, list[tuple[str, float, float]], float]:
     """Drive through :data:`DRIVE` with the gains; return bag, segments and longest stall [s]."""
+    from smp_motor_control.nodes.driving import drive_body
+
     steps.set_gains(robot, gains)
     robot.switch("activate")
     say("gains set in the running controllers; driving")
     drives = []
     for attempt in range(1, ATTEMPTS + 1):
         bag = steps.record(robot, "drive" if attempt == 1 else f"drive_{attempt}")
-        segments = robot.client.drive(DRIVE, robot.wheels)
+        segments = drive_body(robot.client, DRIVE, robot.wheels)
         robot.processes.stop("record")
         stall = longest_stall(bag, robot.wheels)
         drives.append((stall, bag, segments))

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import math
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
+from smp_motor_control.errors import SmpError
 from smp_motor_ident.cli.processes import ProcessError
 from smp_motor_ident.diagnosis.wheel_test import Figures
 from smp_motor_ident.finding import Finding
@@ -87,6 +89,16 @@ class Protocol:
             advice = "; ".join(dict.fromkeys(f.advice for f in findings if f.advice))
             self.end(False, f"stopped: {what}")
             raise ProcessError(f"stopped: {what}. What to do: {advice}")
+
+    @contextlib.contextmanager
+    def ending(self) -> Iterator[None]:
+        """Let whatever ends the block otherwise than at a finding stand in the protocol."""
+        try:
+            yield
+        except SmpError as error:
+            if self.document["passed"] is None:
+                self.end(False, f"stopped: {error}")
+            raise
 
     def end(self, passed: bool, verdict: str) -> None:
         """Write the verdict."""

@@ -80,7 +80,7 @@ class Designed:
 
 def drive(robot: steps.Robot, plan: Sequence[tuple[str, float, float]]) -> Path:
     """Drive all wheels through a plan with the gains that are set; return the recording."""
-    from smp_motor_control.nodes.step_drive import drive_steps
+    from smp_motor_control.nodes.driving import drive_wheels
 
     bag = robot.folder / "verification"
     shutil.rmtree(bag, ignore_errors=True)
@@ -89,7 +89,7 @@ def drive(robot: steps.Robot, plan: Sequence[tuple[str, float, float]]) -> Path:
         steps.record(robot, bag.name)
         shown = [f"{wheel}/pid_state" for wheel in robot.wheels]
         robot.client.wait_for_listener("record", shown, timeout=steps.PATIENCE)
-        drive_steps(robot.client, plan, robot.wheels)
+        drive_wheels(robot.client, plan, robot.wheels)
     finally:
         robot.processes.stop("record")
         robot.switch("deactivate")

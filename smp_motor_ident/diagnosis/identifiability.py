@@ -1,8 +1,7 @@
 """What the data can and cannot tell, and what to record next.
 
-Structural: the rank of the sensitivities, scaled so that units do not matter.  Practical:
-certainty against value.  Both come from the Fisher information of the fitted model, which
-also tells, before anything is recorded, what an excitation would teach.
+Certainty against value, from the Fisher information of the fitted model, which also tells, before
+anything is recorded, what an excitation would teach.
 Derivation: docs/derivations.md, section 11.
 """
 
@@ -32,61 +31,6 @@ SHARES = (0.97, 0.7, 0.3, 0.03)  # of a0 that K may be, where the current was no
 LARGEST_RESISTANCE = 15.0  # [ohm] allowed for where it is not known either
 SPREADS = (0.5, 2.0, 6.0)
 TRIAL = 10.0
-
-
-@dataclass(frozen=True, eq=False)
-class Rank:
-    """Structural identifiability of a set of parameters."""
-
-    singular_values: Array  # of the sensitivities by the logarithms of the parameters, largest 1
-    rank: int  # of them above ``tolerance``
-    # Directions in which the response does not change: parameter to exponent
-    blind: tuple[Mapping[str, float], ...]
-
-
-def structural(
-    parameters: Mapping[str, float],
-    current: bool,
-    fixed: Sequence[str] = (),
-    tolerance: float = 1e-7,
-) -> Rank:
-    """Return which parameters of the linear motor its signals can separate at all.
-
-    ``w/v`` shows ``a0, a1, a2``; with current ``i/v = (J s + b)/(K ...)`` shows all five.
-    """
-    names = [n for n in PHYSICAL[:5] if n not in fixed]
-    frequency = np.asarray(2 * np.pi * np.geomspace(0.05, 50, 40), dtype=np.float64)
-    base = np.log([parameters[n] for n in names])
-    rows = []
-    for j in range(len(names)):
-        sides = []
-        for sign in (1, -1):
-            x = base.copy()
-            x[j] += sign * 1e-5
-            sides.append(
-                _response({**parameters, **dict(zip(names, np.exp(x)))}, frequency, current)
-            )
-        rows.append((sides[0] - sides[1]) / 2e-5)
-    _, s, vt = np.linalg.svd(np.array(rows).T, full_matrices=False)
-    s = s / s[0]
-    rank = int((s > tolerance).sum())
-    blind = tuple(
-        {n: float(v) for n, v in zip(names, vt[k]) if abs(v) > 0.02} for k in range(rank, len(s))
-    )
-    return Rank(s, rank, blind)
-
-
-def _response(p: Mapping[str, float], frequency: Array, current: bool) -> Array:
-    """Return logarithms of gain and phase over frequency, stacked."""
-    s = 1j * frequency
-    r, el, k = p["resistance"], p["inductance"], p["motor_constant"]
-    j, b = p["inertia"], p["viscous_friction"]
-    below = (el * s + r) * (j * s + b) + k * k
-    parts = [np.log(k / below)]
-    if current:
-        parts.append(np.log((j * s + b) / below))
-    out = np.concatenate(parts)
-    return np.concatenate([out.real, np.unwrap(out.imag)])
 
 
 @dataclass(frozen=True)

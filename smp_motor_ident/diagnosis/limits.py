@@ -1,8 +1,7 @@
 """Every threshold of a decision about estimates, with its unit and its reason.
 
-Those about recordings stand in `smp_motor_ident.bag.limits`, those about gains in
-`smp_motor_ident.tune.limits`; ``docs/limits.md`` prints all of them:
-``python scripts/limits.py > docs/limits.md``.
+Those about recordings, gains and fleets stand beside their readers (`smp_motor_ident.bag.limits`,
+`tune.limits`, `report.limits`); ``python scripts/limits.py > docs/limits.md`` prints all of them.
 A limit's reason is a significance level, a cost or a physical limit; that some record came out
 right is none.
 """
@@ -269,12 +268,6 @@ SIGN_SURE = Limit(
     "lags exceeds it by chance once in 2000 records of a standing motor",
     "test_screening.py",
 )
-SAME_MOTOR = Limit(
-    0.01,
-    "probability",
-    "that records of one motor differ by so much by chance in any quantity",
-    "test_records.py",
-)
 SIGN_ALIKE = Limit(
     0.5,
     "correlation",
@@ -368,26 +361,6 @@ LEFT_BAND = Limit(
     "s of motion outside of a band",
     "a single load or a bad sample is over by then; a motor that burns takes longer",
     "test_monitor.py: half an hour of ordinary driving",
-)
-
-# Many robots.
-FLEET_DRIFT = Limit(
-    4.0,
-    "standard deviations of the slope",
-    "6 in 100,000 by chance: a thousand robots of four wheels and five quantities raise one",
-    "test_fleet.py: a motor that drifts",
-)
-FLEET_OUTLIER = Limit(
-    5.0,
-    "scatters of the robots",
-    "motors of one batch scatter with longer tails than a normal distribution has",
-    "test_fleet.py: a motor unlike the others",
-)
-FLEET_SIZE = Limit(
-    5,
-    "robots",
-    "with fewer, the median deviation itself is uncertain by half",
-    "test_fleet.py: a motor unlike the others",
 )
 
 # Stamps of arrival, put back on the beat of their sender.

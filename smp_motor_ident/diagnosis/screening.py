@@ -23,7 +23,7 @@ from smp_motor_ident.record import Record
 Array = NDArray[np.float64]
 
 RUNS = 2_000  # runs of samples in which signals are averaged before they are compared
-RUN_COLOUR = 20.0  # by which neighbouring runs' errors hang together, at most
+RUN_CORRELATION = 20.0  # by which neighbouring runs' errors hang together, at most
 
 
 def screen(records: Sequence[Record]) -> list[Finding]:
@@ -333,7 +333,7 @@ def _offset(record: Record) -> None:
         return
     rest = i - columns @ answer
     normal = np.linalg.inv(np.einsum("ni,nj->ij", columns, columns))
-    std = float(np.sqrt(normal[2, 2] * rest.var() * RUN_COLOUR))
+    std = float(np.sqrt(normal[2, 2] * rest.var() * RUN_CORRELATION))
     offset, largest = float(answer[2]), float(np.nanmax(np.abs(record.current)))
     if abs(offset) > max(
         OFFSET_SURE.value * std, LARGEST_OFFSET.value * max(largest - abs(offset), 1e-12)

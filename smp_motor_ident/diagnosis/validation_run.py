@@ -40,11 +40,8 @@ class Simulated:
 def judge(wheel: str, fitted: Sequence[Simulated], unseen: Sequence[Simulated]) -> Finding:
     """Compare the errors on unseen data with those on the data that were fitted.
 
-    Returns
-    -------
-    Finding
-        ``validation_run``: a note that states the fit; refused where the error is larger than
-        the fitted data's, beyond chance, and larger than what costs nothing.
+    The finding is a note that states the fit; it is refused where the error is larger than the
+    fitted data's, beyond chance, and larger than what costs nothing.
     """
     before = np.concatenate([one.powers() for one in fitted])
     after = np.concatenate([one.powers() for one in unseen])

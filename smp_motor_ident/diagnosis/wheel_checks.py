@@ -75,7 +75,7 @@ def feedback(robot: Robot) -> list[Finding]:
 
 
 def motion(robot: Robot) -> list[Finding]:
-    """Every wheel turns when it is told to, it alone, and not before."""
+    """Every wheel turns when it is asked to, it alone, and not before."""
     found = []
     for wheel, one in robot.figures.items():
         if one.at_rest > BREAKAWAY_COUNTS.value:
@@ -165,11 +165,11 @@ def gear_ratio(robot: Robot) -> list[Finding]:
         described, known = robot.hardware[wheel], robot.ratios.get(wheel, math.nan)
         ratio = abs(one.velocity_ratio)
         gain = one.gain / robot.gains.get(wheel, math.nan)
-        told = f"gear_ratio {described.gear_ratio:g}"
+        said = f"gear_ratio {described.gear_ratio:g}"
         if abs(ratio - 1.0) > VELOCITY_RATIO.value:
             found.append(Finding(
                 "gear_ratio", "refused",
-                f"{wheel}: reported velocity is {ratio:.3g} times what counts show with {told} "
+                f"{wheel}: reported velocity is {ratio:.3g} times what counts show with {said} "
                 f"and {described.counts_per_revolution or 0:g} counts per revolution",
                 {"wheel": wheel, "ratio": ratio, "described": described.gear_ratio},
                 f"one of these numbers is wrong in motor_description or in the driver; with the "
@@ -178,7 +178,7 @@ def gear_ratio(robot: Robot) -> list[Finding]:
         if abs(known / described.gear_ratio - 1.0) > VELOCITY_RATIO.value:
             found.append(Finding(
                 "gear_ratio", "refused",
-                f"{wheel}: describes itself with {told}, the motor file has {known:g}",
+                f"{wheel}: describes itself with {said}, the motor file has {known:g}",
                 {"wheel": wheel, "described": described.gear_ratio, "known": known},
                 "correct the one that is wrong",
             ))  # fmt: skip

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from smp_motor_ident.diagnosis.limits import PRIOR_ODDS, SURE_GAIN
+from smp_motor_ident.diagnosis.limits import PRIOR_ODDS, SECOND_LAG, SURE_GAIN
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import Structure
@@ -57,6 +57,16 @@ def size(structure: Structure) -> int:
 def sandwich_factor(fit: Fit) -> float:
     """Return by how much the scores scatter more than white residuals would let them."""
     return max(1.0, float(np.median(fit.sandwich_factors())))
+
+
+def preferred(best: Fit, other: Fit) -> tuple[bool, str]:
+    """Decide whether a candidate of as many parameters or more takes the place of the best."""
+    if size(other.structure) > size(best.structure):
+        return needed(best, other)
+    # Every motor has a second lag, few have a delay: alike, the lag is believed.
+    lag = other.structure.order > best.structure.order
+    better = other.deviance < best.deviance + SECOND_LAG.value * sandwich_factor(other) * lag
+    return better, f"fits {'better' if better else 'worse'} than {label(best.structure)}"
 
 
 def needed(simple: Fit, rich: Fit) -> tuple[bool, str]:

@@ -61,20 +61,17 @@ def initial_fit(
 ) -> Fit | None:
     """Fit a structure without any guess."""
     subset = data.data_window(min(8.0, SCREENING_SAMPLES * data.step))
-    starts = [
-        structure.complete(z) for z in [*extra, *(candidates(data, structure) if own else [])]
-    ]
-    starts = [z for z in starts if np.all(np.isfinite(z))]
+    found = [*extra, *(candidates(data, structure) if own else [])]
+    starts = [z for z in map(structure.complete, found) if np.all(np.isfinite(z))]
     if not starts:
         return None
     noise = first_noise(subset)
-    ranked = sorted(starts, key=lambda z: _score(subset, structure, z, noise))
+    ranked = _ranked(subset, structure, starts, noise)
     best: Fit | None = None
     tried: list[Array] = []
     if models.TE in structure.free() and not structure.current:
-        ranked = [shaped for z in _distinct(ranked, data.step, 2) for shaped in shapes(z)]
-        ranked = sorted(ranked, key=lambda z: _score(subset, structure, z, noise))
-        keep = SHAPES
+        shaped = [other for z in _distinct(ranked, data.step, 2) for other in shapes(z)]
+        ranked, keep = _ranked(subset, structure, shaped, noise), SHAPES
     for z in ranked:
         if any(_alike(z, other, data.step) for other in tried):
             continue
@@ -141,6 +138,13 @@ def _alike(z: Array, other: Array, step: float) -> bool:
     d = np.abs(z - other)
     late = max(d[models.DELAY], d[models.WINDOW]) / step
     return bool(d[:5].max() < 0.05 and late < 0.5)
+
+
+def _ranked(
+    subset: Experiments, structure: Structure, starts: list[Array], noise: Array
+) -> list[Array]:
+    """Return starts, the likeliest first."""
+    return sorted(starts, key=lambda z: _score(subset, structure, z, noise))
 
 
 def _score(subset: Experiments, structure: Structure, z: Array, noise: Array) -> float:

@@ -7,10 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from smp_motor_ident.diagnosis.limits import LITTLE_FRICTION, SECOND_LAG, SUBSET_HOPELESS
+from smp_motor_ident.diagnosis.limits import LITTLE_FRICTION, SUBSET_HOPELESS
 from smp_motor_ident.estimation import data_window, descent, prediction
 from smp_motor_ident.estimation.candidate_starts import from_richer, from_rivals, no_worse, of_kind
-from smp_motor_ident.estimation.choice import FittedCandidate, label, needed, sandwich_factor, size
+from smp_motor_ident.estimation.choice import (
+    FittedCandidate,
+    label,
+    preferred,
+    sandwich_factor,
+    size,
+)
 from smp_motor_ident.estimation.delay_and_averaging import with_averaging, with_delay
 from smp_motor_ident.estimation.fit import Fit, Options, solve
 from smp_motor_ident.estimation.initialisation import initial_fit
@@ -138,50 +144,46 @@ def _orders(
     Candidates that the screening subset rejects by far are not fitted to all of a long record.
     """
     part = descent.screening_subset(thinned(data))
-    tried: list[Fit] = []
-    for structure in _structures(base, data.kind == rc.SPEED, data.quantum > 0):
-        say(f"fitting {label(structure)}")
-        fitted = _one(part, structure, options, tried)
-        if fitted is not None:
-            tried.append(no_worse(of_kind(part, fitted), fitted, tried, options))
-    tried = from_richer(part, tried, options)
-    tried = from_rivals(part, tried, options)
+    tried = _on_subset(
+        part, _structures(base, data.kind == rc.SPEED, data.quantum > 0), options, say
+    )
     least = min((f.deviance for f in tried), default=0.0)
     best: Fit | None = None
     for fitted in tried:
         if part is not data:
             if fitted.deviance > least + SUBSET_HOPELESS.value * sandwich_factor(fitted):
-                candidates.append(
-                    FittedCandidate(
-                        _projected(data, fitted), f"rejected on {part.size} samples", whole=False
-                    )
-                )
+                reason = f"rejected on {part.size} samples"
+                candidates.append(FittedCandidate(_projected(data, fitted), reason, whole=False))
                 continue
-            every = of_kind(data, fitted)
-            fitted = data_window.extend(every, fitted.structure, fitted, options)
-            fitted = random_restart(every, fitted.structure, fitted, options)
-            fitted = no_worse(every, fitted, [r.fit for r in candidates if r.whole], options)
+            fitted = _on_all(data, fitted, [r.fit for r in candidates if r.whole], options)
         if best is None:
-            best = fitted
-            candidates.append(
-                FittedCandidate(
-                    fitted, "the simplest" if len(candidates) == 0 else "the simplest left"
-                )
-            )
-            continue
-        if size(fitted.structure) == size(best.structure):
-            # Every motor has a second lag, few have a delay: alike, the lag is believed.
-            lag = fitted.structure.order > best.structure.order
-            verdict = fitted.deviance < best.deviance + (
-                SECOND_LAG.value * sandwich_factor(fitted) if lag else 0.0
-            )
-            reason = f"fits {'better' if verdict else 'worse'} than {label(best.structure)}"
+            better, reason = True, "the simplest left" if candidates else "the simplest"
         else:
-            verdict, reason = needed(best, fitted)
+            better, reason = preferred(best, fitted)
         candidates.append(FittedCandidate(fitted, reason))
-        if verdict:
-            best = fitted
+        best = fitted if better else best
     return best
+
+
+def _on_subset(
+    part: Experiments, structures: list[Structure], options: Options, say: Say
+) -> list[Fit]:
+    """Fit all candidates to the screening subset, each started from the others' answers too."""
+    tried: list[Fit] = []
+    for structure in structures:
+        say(f"fitting {label(structure)}")
+        fitted = _one(part, structure, options, tried)
+        if fitted is not None:
+            tried.append(no_worse(of_kind(part, fitted), fitted, tried, options))
+    return from_rivals(part, from_richer(part, tried, options), options)
+
+
+def _on_all(data: Experiments, fit: Fit, known: list[Fit], options: Options) -> Fit:
+    """Carry a fit of the screening subset on to all data."""
+    every = of_kind(data, fit)
+    fit = data_window.extend(every, fit.structure, fit, options)
+    fit = random_restart(every, fit.structure, fit, options)
+    return no_worse(every, fit, known, options)
 
 
 def _projected(data: Experiments, fit: Fit) -> Fit:
@@ -265,7 +267,7 @@ def _variations(
         if "delay" in change:
             z[models.DELAY] = 0.3 * data.step
         other = descent.refine(data, richer, best, z, options)
-        verdict, reason = needed(best, other)
+        verdict, reason = preferred(best, other)
         if verdict and "delay" in change and other.z[models.DELAY] < 0.03 * data.step:
             verdict, reason = False, "a delay of hundredths of a sample is how the input was held"
         if verdict and other.noise_ratio > 0:  # what looked like torque noise may have been this
@@ -329,6 +331,6 @@ def _try_average(
     fitted = initial_fit(data.as_mean_speed(), structure, options, starts, keep=3, own=False)
     if fitted is None:
         return best
-    verdict, reason = needed(best, fitted)
+    verdict, reason = preferred(best, fitted)
     candidates.append(FittedCandidate(fitted, reason))
     return fitted if verdict else best

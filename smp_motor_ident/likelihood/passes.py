@@ -102,15 +102,9 @@ def gather(
     if predicted is None and _slides(data, structure, z, noise):
         if p == 0:
             spread[0], spread[3] = squares_sliding(
-                data.time,
-                data.starts,
-                data.hold_value,
-                data.output,
-                angle,
-                par,
-                initial,
+                data.time, data.starts, data.hold_value, data.output, angle, par, initial,
                 data.jittered,
-            )
+            )  # fmt: skip
             used = 0
         else:
             used = run_sliding(

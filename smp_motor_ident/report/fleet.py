@@ -14,8 +14,8 @@ import jinja2
 import numpy as np
 from markupsafe import Markup
 
-from smp_motor_ident.diagnosis.limits import FLEET_DRIFT, FLEET_OUTLIER, FLEET_SIZE
 from smp_motor_ident.report import words
+from smp_motor_ident.report.limits import FLEET_DRIFT, FLEET_OUTLIER, FLEET_SIZE
 
 QUANTITIES = ("dc_gain", "time_constant", "static_voltage", "resistance", "motor_constant")
 """What is compared, where the recordings tell it."""

@@ -10,7 +10,6 @@ from smp_motor_control.errors import ParameterError
 from smp_motor_control.motor.response import (
     FreeResponse,
     flexible_shaft,
-    frequency_response,
     zero_order_hold,
 )
 
@@ -63,17 +62,6 @@ def test_a_decayed_pole_leaves_the_motor_of_first_order() -> None:
     assert second.angle_forced == pytest.approx(first.angle_forced, rel=1e-7)
     for values in second:
         assert np.all(np.isfinite(values))
-
-
-def test_frequency_response_is_the_transform_of_the_held_one() -> None:
-    tp, T, omega = 0.2 * TAU**2, 1e-3, np.array([3.0, 30.0])
-    held = zero_order_hold(GAIN, TAU, tp, T)
-    z = np.exp(1j * omega * T)
-    sampled = [np.linalg.solve(x * np.eye(2) - held.transition[0], held.forced[0])[0] for x in z]
-    # The hold delays by half a sample and dampens by (w T)^2 / 24 = 4e-5; aliases are below that.
-    hold = (1.0 - np.exp(-1j * omega * T)) / (1j * omega * T)
-    response = frequency_response(GAIN, TAU, tp, omega)[0]
-    assert response * hold == pytest.approx(np.array(sampled), rel=1e-4)
 
 
 def test_a_flexible_shaft_resonates_where_its_two_inertias_say() -> None:

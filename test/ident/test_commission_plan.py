@@ -13,6 +13,7 @@ import pytest
 
 from smp_motor_ident.cli import checking, commissioning, steps
 from smp_motor_ident.cli.commission import main
+from smp_motor_ident.cli.processes import ProcessError
 from smp_motor_ident.diagnosis.wheel_test import Figures
 from smp_motor_ident.finding import Finding
 
@@ -140,3 +141,15 @@ def test_a_wrong_wire_stops_before_the_excitation_unless_it_is_accepted(
     assert main([*given, "--resume", "--accept", "reversed"]) == 0
     page = (robot.folder / "report.html").read_text()
     assert "Passed." in page and "accepted" in page
+
+
+def test_what_ends_it_otherwise_stands_in_its_page(
+    robot: Steps, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise ProcessError("left/wheel_pid refused the parameters")
+
+    monkeypatch.setattr(steps, "tune_wheels", refuse)
+    assert main(["--output", str(robot.folder), "--yes"]) == 1
+    document = json.loads((robot.folder / "commissioning.json").read_text())
+    assert document["passed"] is False and "refused the parameters" in document["verdict"]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from smp_motor_ident.diagnosis import validation
-from smp_motor_ident.diagnosis.identifiability import structural, what_next
+from smp_motor_ident.diagnosis.identifiability import what_next
 from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.model.structures import PHYSICAL
@@ -206,14 +206,6 @@ def test_what_next_asks_for_current_where_there_was_none():
     assert proposal.measure_current
     assert 0 < proposal.amplitude <= 12
     assert max(proposal.relative_std.values()) <= 0.0101
-
-
-def test_rank_of_the_sensitivities_is_what_theory_says():
-    p = {n: motors.truth("front_left", 0.0)[n] for n in PHYSICAL[:5]}
-    assert structural(p, current=False).rank == 3
-    assert structural(p, current=False, fixed=("resistance",)).rank == 3
-    assert len(structural(p, current=False, fixed=("resistance",)).blind) == 1
-    assert structural(p, current=True).rank == 5
 
 
 def test_unknown_names_are_refused_by_name():
