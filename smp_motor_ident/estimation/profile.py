@@ -104,8 +104,31 @@ def _followed(
     target *= data.size / fit.samples
     here = solve(data, fit.structure, fit.at(fit.z, initial_of(data, fit)), options, 6)
     ends = [_end(data, here, coordinate, end, first, target, options) for end in (low, high)]
+    if fit.structure.current:
+        shift = _physical(fit.z) - _physical(here.z)
+        both = [_coordinates(_physical(end) + shift) for end in ends]
+        return Profile(coordinate, (both[0], both[1]))
     shift = fit.z - here.z
     return Profile(coordinate, (ends[0] + shift, ends[1] + shift))
+
+
+def _physical(z: Array) -> Array:
+    """Return coordinates with be and ln tm for ln a1 and ln a2, which stay a motor's in between.
+
+    Where L/R is short, a1 = tm + te be and a2 = te tm hang together to a millionth.
+    """
+    _, tm, _, be = to_internal(z, 2)[0][:4]
+    out = z.copy()
+    out[[models.A1, models.A2]] = be, np.log(tm)
+    return out
+
+
+def _coordinates(physical: Array) -> Array:
+    """Return what `_physical` was made of."""
+    te, tm, be = np.exp(physical[models.TE]), np.exp(physical[models.A2]), physical[models.A1]
+    z = physical.copy()
+    z[[models.A1, models.A2]] = np.log(max(tm + te * be, 1e-3 * tm)), np.log(te * tm)
+    return z
 
 
 def _range(data: Experiments, fit: Fit, coordinate: int) -> tuple[float, float]:
@@ -147,6 +170,9 @@ def _end(
             # The deviance is a parabola between the two, its square root a line.
             a, b = np.sqrt(max(inner_rise, 0.0)), np.sqrt(rise)
             share = float(np.clip((np.sqrt(target) - a) / max(b - a, 1e-12), 0.0, 1.0))
+            if fit.structure.current:
+                near_end, far_end = _physical(inner.z), _physical(outer.z)
+                return _coordinates(near_end + share * (far_end - near_end))
             return np.asarray(inner.z + share * (outer.z - inner.z))
         inner, inner_rise, near = outer, rise, outer
         if last:

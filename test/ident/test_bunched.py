@@ -21,13 +21,19 @@ def bunched(size: int) -> Record:
     return replace(made, time=made.time[last] + 1e-9 * (row % size))
 
 
-def test_a_record_with_equal_stamps_is_estimated_as_without_and_says_so() -> None:
+def test_a_record_with_equal_stamps_on_a_beat_is_estimated_as_without_and_says_so() -> None:
     plain = estimate(motors.record("rear_left", current=False, seconds=8.0))
     found = estimate(bunched(4))
-    assert [f.severity for f in found.findings if f.code == "stamps_equal"] == ["warning"]
-    # A voltage that is known as a mean over 20 ms in place of 5 ms: 5 % of the slower motion.
-    assert found.value("dc_gain") == pytest.approx(plain.value("dc_gain"), rel=0.02)
-    assert found.value("time_constant") == pytest.approx(plain.value("time_constant"), rel=0.05)
+    assert "arrival_beat" in [f.code for f in found.findings]
+    # The beat is known to a twentieth of a sample: a hundredth of the lag that it is late by.
+    assert found.value("dc_gain") == pytest.approx(plain.value("dc_gain"), rel=0.002)
+    assert found.value("time_constant") == pytest.approx(plain.value("time_constant"), rel=0.02)
+
+
+def test_samples_that_are_stamped_alike_without_a_beat_are_one_and_that_is_said() -> None:
+    merged = merge_bunches(bunched(4))
+    assert len(merged) == pytest.approx(len(bunched(4)) / 4, abs=1)
+    assert [f.severity for f in merged.findings if f.code == "stamps_equal"] == ["warning"]
 
 
 def test_segments_begin_where_they_began() -> None:
