@@ -66,7 +66,7 @@ def motors(draw: random.Random) -> dict[str, dict[str, float]]:
 
 
 def spoil(case: str, wheel: dict[str, float], draw: random.Random) -> list[str]:
-    """Make one case of a robot's wheel; return what the plant needs to be told besides."""
+    """Make one case of a robot's wheel; return further arguments of the plant."""
     if case == "encoder swapped":
         wheel["encoder"] = -1
     elif case == "leads swapped":
@@ -85,8 +85,14 @@ def spoil(case: str, wheel: dict[str, float], draw: random.Random) -> list[str]:
 class Nodes:
     """The processes of one robot."""
 
-    def __init__(self, folder: Path, told: list[str]) -> None:
-        plant = ["motor_plant", "--ros-args", "-p", f"motors_file:={folder / 'motors.yaml'}", *told]
+    def __init__(self, folder: Path, arguments: list[str]) -> None:
+        plant = [
+            "motor_plant",
+            "--ros-args",
+            "-p",
+            f"motors_file:={folder / 'motors.yaml'}",
+            *arguments,
+        ]
         commands = [plant] + [["wheel_pid", "--ros-args", "-r", f"__ns:=/{w}"] for w in WHEELS]
         with (folder / "nodes.log").open("wb") as log:
             self.processes = [
@@ -113,11 +119,11 @@ def _firmware() -> None:
 def run(case: str, folder: Path, draw: random.Random, duration: float) -> tuple[bool, str, str]:
     """Commission one robot; return whether it ended rightly, how, and its last line."""
     robot, spoilt = motors(draw), draw.choice(WHEELS)
-    told = spoil(case, robot[spoilt], draw)
+    arguments = spoil(case, robot[spoilt], draw)
     may_pass, reason = RIGHT[case]
     tree = {"/**/motor_plant": {"ros__parameters": {"motors": robot}}}
     (folder / "motors.yaml").write_text(yaml.safe_dump(tree))
-    nodes = Nodes(folder, told)
+    nodes = Nodes(folder, arguments)
     try:
         command = ["commission", "--output", str(folder / "out"), "--yes", "--apply"]
         with (folder / "commission.log").open("wb") as log:

@@ -194,15 +194,15 @@ def bands_of(
     Bands
         The widest of design and simulations, and what sampling and resolution add.
     """
-    blur = SIGMAS * unsure / abs(setpoint)
-    simulated = [read(time, row, setpoint, SETTLED.value + blur) for row in rows]
+    margin = SIGMAS * unsure / abs(setpoint)
+    simulated = [read(time, row, setpoint, SETTLED.value + margin) for row in rows]
     settling = [one.settling for one in simulated] + [_high(specification, "settling")]
     overshoot = [one.overshoot for one in simulated] + [_high(specification, "overshoot")]
     step = float(np.median(np.diff(time)))
     return Bands(
         settling=max(settling) + 2 * step,
-        overshoot=max(overshoot) + 100 * (OVERSHOOT.value + blur),
-        error=max(one.error for one in simulated) + 100 * (STEADY_ERROR.value + blur),
+        overshoot=max(overshoot) + 100 * (OVERSHOOT.value + margin),
+        error=max(one.error for one in simulated) + 100 * (STEADY_ERROR.value + margin),
     )
 
 

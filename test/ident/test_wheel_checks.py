@@ -53,8 +53,8 @@ def trace(
                     angle += speed * STEP / 5
                 time += STEP
                 shown = sign * angle * COUNTS / (2 * math.pi)
-                told = velocity_scale * sign * speed / RATIO
-                row = (time, 0.001, command, volts, told, sign * angle / RATIO)
+                reported = velocity_scale * sign * speed / RATIO
+                row = (time, 0.001, command, volts, reported, sign * angle / RATIO)
                 rows.append((*row, math.floor(shown), number))
             phases.append(Phase("left", number, kind, command))
     return Trace.of(rows), phases
@@ -120,7 +120,7 @@ def test_a_wheel_that_does_not_turn_is_refused_by_name() -> None:
     assert codes(still, moved={"wheel_0": {"wheel_0": 0.0}})["no_motion"] == "refused"
 
 
-def test_plugs_of_two_wheels_that_are_exchanged_are_told_from_a_belt() -> None:
+def test_plugs_of_two_wheels_that_are_exchanged_are_separated_from_a_belt() -> None:
     (seen, phases), (still, _) = trace(), trace(driven=False)
     # What is sent to the left turns the right.
     moved = moved_with({"left": still, "right": seen}, phases)
@@ -152,7 +152,7 @@ def test_a_gear_ratio_that_counts_or_a_motor_file_contradict_is_refused() -> Non
     assert "unexpected_gain" not in codes(gains={"wheel_0": 1.2 * GAIN})
 
 
-def test_a_dead_zone_is_told_from_friction() -> None:
+def test_a_dead_zone_is_separated_from_friction() -> None:
     wide = shown(dead=1.0 - 1e-6)
     # The ramp ends at 1 V; friction itself is 0.4 V.
     assert codes(replace(wide, breakaway=1.1))["dead_zone"] == "warning"
@@ -171,11 +171,11 @@ def test_a_weak_battery_is_refused_by_what_arrives_or_what_it_says() -> None:
     assert codes(replace(GOOD, applied=0.0))["voltage_not_reported"] == "refused"
 
 
-def test_a_wheel_that_drags_is_told_from_motors_that_scatter() -> None:
+def test_a_wheel_that_drags_is_separated_from_motors_that_scatter() -> None:
     assert codes(replace(GOOD, friction=5 * FRICTION))["unlike_sisters"] == "refused"
     assert codes(replace(GOOD, coast=5 * GOOD.coast))["unlike_sisters"] == "refused"
     assert "unlike_sisters" not in codes(replace(GOOD, friction=1.8 * FRICTION))
-    # A load that leaves room for one level only: friction is not told from gain.
+    # A load that leaves room for one level only: friction and gain cannot be separated.
     heavy = replace(GOOD, friction=math.nan, gain=math.nan, breakaway=3.3)
     assert codes(heavy)["unlike_sisters"] == "refused"
     # Two wheels cannot tell which of them is the odd one.

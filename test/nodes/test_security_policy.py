@@ -102,11 +102,12 @@ def test_the_wheels_may_do_alike_and_few_may_command_them() -> None:
         return {path for path, rule in rules.items() if topic in rule["publish"]}
 
     for wheel in WHEELS:
-        assert publishers(f"/{wheel}/motor_command") == {f"/{wheel}/wheel_pid", "/excite"}
+        tools = {"/excite", "/commission"}
+        assert publishers(f"/{wheel}/motor_command") == {f"/{wheel}/wheel_pid", *tools}
         assert publishers(f"/{wheel}/motor_state") == {"/serial_driver", "/motor_plant"}
         askers = {
             p for p, rule in rules.items() if f"/{wheel}/wheel_pid/change_state" in rule["request"]
         }
         assert askers == {"/commission", "/tune", "/robot_guard"}
-    assert publishers("/wheel_setpoints") == {"/skid_steer", "/teleop_wheels"}
+    assert publishers("/wheel_setpoints") == {"/skid_steer", "/teleop_wheels", "/commission"}
     assert publishers("/cmd_vel") == {"/teleop_wheels"}
