@@ -78,6 +78,7 @@ setup(
             (f"share/{NAME}/{d}", glob(f"{d}/*.md"))
             for d in ("docs", "docs/howto", "docs/decisions")
         ),
+        (f"share/{NAME}/docs/figures", glob("docs/figures/*.svg")),
     ],
     install_requires=["setuptools"],
     extras_require={"test": ["pytest", "hypothesis"]},  # by which colcon test runs pytest

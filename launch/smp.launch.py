@@ -7,6 +7,8 @@
 
 With ``hardware:=external`` something else must publish ``<wheel>/motor_state`` and
 ``<wheel>/motor_description`` and take ``<wheel>/motor_command`` in the robot's namespace.
+The wheels are those of ``left_wheels`` and ``right_wheels``, or else of ``left_wheel_names`` and
+``right_wheel_names`` in the file of skid_steer (``body``), or else the paper's four.
 """
 
 from pathlib import Path
@@ -21,7 +23,7 @@ from launch_ros.substitutions import FindPackageShare
 from launch import LaunchDescription
 from smp_motor_control import LEFT, RIGHT
 from smp_motor_control.body.description import robot_description
-from smp_motor_control.parameter_file import read_parameters, require_nodes
+from smp_motor_control.parameter_file import parameters_of, require_nodes
 
 PACKAGE = "smp_motor_control"
 STATE_PUBLISHER = "share/robot_state_publisher"
@@ -31,8 +33,8 @@ CONFIG = [FindPackageShare(PACKAGE), "/config/"]
 ARGUMENTS = {
     "namespace": ("", "Of the robot, such as robot1"),
     "hardware": ("simulated", "simulated: motor_plant; external: your driver runs"),
-    "left_wheels": (",".join(LEFT), "Names of the left wheels"),
-    "right_wheels": (",".join(RIGHT), "Names of the right wheels"),
+    "left_wheels": ("", f"Names of the left wheels; else those of body, else {','.join(LEFT)}"),
+    "right_wheels": ("", f"Names of the right wheels; else those of body, else {','.join(RIGHT)}"),
     "params_file": ([*CONFIG, "gains.yaml"], "Parameters of the wheels: what tune writes"),
     "body": ([*CONFIG, "skid_steer.yaml"], "Parameters of skid_steer"),
     "motors": ([*CONFIG, "motors_paper.yaml"], "Motors of the simulation"),
@@ -51,9 +53,11 @@ def start(context, *_) -> list:
     given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
     if given["hardware"] not in ("simulated", "external"):
         raise RuntimeError(f"hardware is {given['hardware']!r}; it must be simulated or external")
+    told = parameters_of(given["body"], "skid_steer")
     sides = [
-        [name.strip() for name in given[side].split(",") if name.strip()]
-        for side in ("left_wheels", "right_wheels")
+        [name.strip() for name in given[f"{side}_wheels"].split(",") if name.strip()]
+        or list(told.get(f"{side}_wheel_names", usual))
+        for side, usual in (("left", LEFT), ("right", RIGHT))
     ]
     robot = "/" + given["namespace"].strip("/") if given["namespace"].strip("/") else ""
     wheels = [wheel for side in sides for wheel in side]
@@ -87,18 +91,23 @@ def start(context, *_) -> list:
         }
         nodes.append(node("skid_steer", [given["body"], body]))
         if is_true(given, "description"):
-            nodes += describe(sides, given["body"], robot, common)
+            nodes += describe(sides, told, robot, common)
+    if given["hardware"] == "external" and Path(given["params_file"]) == paper_gains(context):
+        nodes.append(LogInfo(msg=f"{given['params_file']}: gains for the motors of the paper; "
+                                 "params_file:= gives yours"))  # fmt: skip
     return nodes
 
 
-def describe(sides: list, body: str, robot: str, common: dict) -> list:
+def paper_gains(context) -> Path:
+    """Return the file that is taken where none is given."""
+    return Path(*(FindPackageShare(PACKAGE).perform(context), "config", "gains.yaml"))
+
+
+def describe(sides: list, told: dict, robot: str, common: dict) -> list:
     """Return what turns joint_states into the frames of the wheels."""
     if not any(Path(p, STATE_PUBLISHER).is_dir() for p in get_search_paths()):
         return [LogInfo(msg="robot_state_publisher is not installed: no frames of the wheels")]
-    named = {}
-    for node, parameters in read_parameters(body).items():
-        named.update(parameters if node.endswith("skid_steer") else {})
-    sizes = {to: named[name] for name, to in SIZES.items() if name in named}
+    sizes = {to: told[name] for name, to in SIZES.items() if name in told}
     text = ParameterValue(robot_description(*sides, **sizes), value_type=str)
     prefix = f"{robot.strip('/')}/" if robot else ""
     return [

@@ -41,6 +41,7 @@ EVERY_NODES = (
     "/parameter_events",
     "/rosout",
     "/clock",
+    "/tf",  # only where tf2_msgs is installed; the page says so
     "use_sim_time",
     "start_type_description_service",
 )
@@ -49,11 +50,17 @@ PARAMETER_SERVICES = ("rcl_interfaces/", "type_description_interfaces/")
 HEAD = """# Nodes
 
 Topics, services and parameters of every node, as the node itself says them; printed by
-`python scripts/nodes.py`. Names are relative to the robot's namespace (`-r __ns:=/robot1`);
-`wheel_pid` runs in its wheel's (`-r __ns:=/robot1/front_left`). Units are SI. All nodes have
-`use_sim_time`, answer the usual parameter services, and write to `/rosout`. `skid_steer` hears
-`cmd_vel` as `geometry_msgs/msg/Twist` too once somebody publishes that. `record` and `play` have
-the topics that their arguments name (`--help`).
+`python scripts/nodes.py`. Names are relative to the robot's namespace (`-r __ns:=/robot1`), those
+with a slash before them are one for all robots; `wheel_pid` runs in its wheel's
+(`-r __ns:=/robot1/front_left`). Units are SI. All nodes answer the usual parameter services and
+write to `/rosout`. `skid_steer` hears `cmd_vel` as `geometry_msgs/msg/Twist` too once somebody
+publishes that, and publishes `/tf` where `tf2_msgs` is installed. `record` and `play` have the
+topics that their arguments name (`--help`).
+
+All nodes have `use_sim_time`: stamps, ages and the intervals of odometry and control are those of
+`/clock` then, and a `/clock` that is not heard is named on `/diagnostics`. Silence is measured in
+real time, so that a clock that stands still stops no watchdog, and the motors of `motor_plant` and
+the signals of `excite` pass in real time: simulated time is for a simulator of the motors.
 """
 
 
@@ -75,6 +82,8 @@ def relative(name: str, node: Node) -> str:
     own = f"{node.get_namespace().rstrip('/')}/{node.get_name()}/"
     if name.startswith(own):
         return "~/" + name.removeprefix(own)
+    if name == "/diagnostics":
+        return name
     first, slash, rest = name.lstrip("/").partition("/")
     return f"<wheel>/{rest}" if slash and first in WHEELS else name.lstrip("/")
 

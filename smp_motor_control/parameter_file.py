@@ -81,6 +81,14 @@ def read_parameters(path: str | Path) -> dict[str, dict[str, Any]]:
     return found
 
 
+def parameters_of(path: str | Path, node: str) -> dict[str, Any]:
+    """Return what a parameter file says to the nodes of a name, in whatever namespace."""
+    found: dict[str, Any] = {}
+    for name, parameters in read_parameters(path).items():
+        found.update(parameters if name.rpartition("/")[2] in (node, "*", "**") else {})
+    return found
+
+
 def flat(tree: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:
     """Return nested parameters by their ROS names, such as ``{"model.delay": 0.0}``."""
     found: dict[str, Any] = {}

@@ -28,6 +28,7 @@ from smp_motor_control.motor import Motor
 from smp_motor_control.motor.file import load_motors
 from smp_motor_ident.bag.writer import BagWriter
 from smp_motor_ident.cli import commission, demo, identify, tune, tune_arguments
+from smp_motor_ident.nodes import play, record
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [
@@ -40,6 +41,8 @@ PARSERS = {
     "tune": tune_arguments.parser,
     "commission": commission.parser,
     "demo": demo.parser,
+    "record": record.parser,
+    "play": play.parser,
 }
 NODES = ("wheel_pid", "motor_plant", "skid_steer", "teleop_wheels", "excite", "serial_driver",
          "record", "play", "identifier")  # fmt: skip
@@ -101,8 +104,9 @@ def test_commands_that_do_not_run_here_name_what_exists(page, lines):
         if "--help" in arguments:
             continue
         if name in PARSERS:
-            assert PARSERS[name]().parse_args(arguments), f"{page}: {words}"
-        elif name in NODES and "--ros-args" in arguments and name not in ("record", "play"):
+            own = arguments[: [*arguments, "--ros-args"].index("--ros-args")]
+            assert PARSERS[name]().parse_args(own), f"{page}: {words}"
+        elif name in NODES and "--ros-args" in arguments:
             parameters = known(name)
             for given in re.findall(r"(?<=-p )([\w.]+):=", " ".join(arguments)):
                 assert given in parameters, f"{page}: {name} has no parameter {given}"

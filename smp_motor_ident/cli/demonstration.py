@@ -10,11 +10,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from smp_motor_control import WHEELS
+from smp_motor_control import LEFT, RIGHT, WHEELS
 from smp_motor_control.motor.file import load_motors
 from smp_motor_ident.cli import steps
 from smp_motor_ident.cli.demo import NAME
-from smp_motor_ident.cli.driving import longest_stall, read_answers
+from smp_motor_ident.cli.driving import drive_figure, longest_stall, read_answers
 from smp_motor_ident.cli.processes import (
     Processes,
     connect,
@@ -68,6 +68,8 @@ def work(arguments: argparse.Namespace) -> int:
         bag, segments, stall = drive(robot, gains, say)
     hardware = {wheel: estimates[wheel].hardware for wheel in WHEELS}
     answers = read_answers(bag, segments, hardware)
+    figure = drive_figure(bag, {"left": LEFT, "right": RIGHT}, hardware)
+    (folder / "drive.svg").write_text(figure, encoding="utf-8")
     show(truth, estimates, gains, answers)
     checks = check_estimates(truth, estimates)
     if stall <= STALL:

@@ -14,6 +14,8 @@ from smp_motor_control.encoder import unwrap
 from smp_motor_control.motor.friction import Gearbox
 from smp_motor_ident.bag.columns import Columns, read_columns
 from smp_motor_ident.record import Hardware
+from smp_motor_ident.report.chart import Chart, Curve
+from smp_motor_ident.report.drawing import document
 from smp_motor_ident.tune.simulation import step_figures
 
 Array = NDArray[np.float64]
@@ -53,6 +55,38 @@ def read_answers(
         found = [_answer(time, speed, asked, *segment) for segment in segments]
         answers[wheel] = [a for a in found if a is not None]
     return answers
+
+
+def drive_figure(
+    bag: Path, sides: Mapping[str, Sequence[str]], hardware: Mapping[str, Hardware]
+) -> str:
+    """Return an SVG file: what the wheels of each side were asked for, and what they did."""
+    wheels = list(hardware)
+    wanted = {f"/{wheel}/motor_state": ["encoder_count"] for wheel in wheels}
+    wanted |= {f"/{wheel}/pid_state": ["setpoint"] for wheel in wheels}
+    read = read_columns(bag, wanted)
+    begin = min(float(columns.time[0]) for columns in read.values())
+    charts = []
+    for side, names in sides.items():
+        asked = read[f"/{names[0]}/pid_state"]
+        time = asked.time
+        speeds = {w: wheel_speed(read[f"/{w}/motor_state"], hardware[w]) for w in names}
+        curves = [Curve("set-point", asked.fields["setpoint"], "muted")]
+        curves += [
+            Curve(w, np.interp(time, *speeds[w]), f"wheel-{wheels.index(w) % 4 + 1}") for w in names
+        ]
+        charts.append(
+            Chart(
+                name=side,
+                title=f"Wheels of the {side} side, and their set-point (grey)",
+                x_label="time [s]",
+                y_label="wheel speed [rad/s]",
+                x=time - begin,
+                curves=tuple(curves),
+                height=220,
+            )
+        )
+    return document(charts, wheels)
 
 
 def longest_stall(bag: Path, wheels: Sequence[str]) -> float:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from html import escape
+from importlib import resources
 
 import numpy as np
 
 from smp_motor_ident.report.chart import Array, Chart, Curve, thin
+from smp_motor_ident.report.words import label
 
 WIDTH = 720
 LEFT, RIGHT, TOP, BOTTOM = 64, 12, 8, 40
@@ -36,6 +38,30 @@ def svg(chart: Chart) -> str:
     for curve in chart.curves:
         parts += plane.curve(curve)
     return "".join([*parts, "</svg>"])
+
+
+def document(charts: Sequence[Chart], wheels: Sequence[str]) -> str:
+    """Return charts one below the other as an SVG file, the colours of the wheels above them."""
+    parts, top = [], 40
+    for k, wheel in enumerate(wheels):
+        parts.append(
+            f'<circle cx="{80 + 160 * k}" cy="16" r="5" fill="var(--wheel-{k % 4 + 1})"/>'
+            f'<text x="{90 + 160 * k}" y="20" font-size="12" fill="var(--ink)">'
+            f"{label(wheel)}</text>"
+        )
+    for chart in charts:
+        parts.append(
+            f'<text x="64" y="{top + 14}" font-size="13" fill="var(--ink)">{chart.title}</text>'
+            f'<svg x="0" y="{top + 18}" width="{WIDTH}" height="{chart.height}">{svg(chart)}</svg>'
+        )
+        top += chart.height + 30
+    style = resources.files("smp_motor_ident.report").joinpath("colors.css").read_text("utf-8")
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {top}" '
+        f'font-family="sans-serif">'
+        f'<style>{style}</style><rect width="100%" height="100%" fill="var(--surface)"/>'
+        f"{''.join(parts)}</svg>"
+    )
 
 
 def _path(way: str, color: str, more: str = "") -> str:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from importlib import resources
 
 import numpy as np
 
 from smp_motor_ident.report.chart import Chart, Curve
-from smp_motor_ident.report.drawing import WIDTH, svg
+from smp_motor_ident.report.drawing import document
 from smp_motor_ident.report.words import label
 from smp_motor_ident.tune.arrays import Array
 from smp_motor_ident.tune.curves import Curves
@@ -62,23 +61,4 @@ def _on(x: Array, own: Array, rows: Array) -> Array:
 
 def tuning_svg(wheels: Mapping[str, Curves], limit: float) -> str:
     """Return the charts one below the other, as an SVG document."""
-    parts, top = [], 40
-    for k, wheel in enumerate(wheels):
-        parts.append(
-            f'<circle cx="{80 + 160 * k}" cy="16" r="5" fill="var(--wheel-{k % 4 + 1})"/>'
-            f'<text x="{90 + 160 * k}" y="20" font-size="12" fill="var(--ink)">'
-            f"{label(wheel)}</text>"
-        )
-    for chart in tuning_charts(wheels, limit):
-        parts.append(
-            f'<text x="64" y="{top + 14}" font-size="13" fill="var(--ink)">{chart.title}</text>'
-            f'<svg x="0" y="{top + 18}" width="{WIDTH}" height="{chart.height}">{svg(chart)}</svg>'
-        )
-        top += chart.height + 30
-    style = resources.files("smp_motor_ident.report").joinpath("colors.css").read_text("utf-8")
-    return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {top}" '
-        f'font-family="sans-serif">'
-        f'<style>{style}</style><rect width="100%" height="100%" fill="var(--surface)"/>'
-        f"{''.join(parts)}</svg>"
-    )
+    return document(tuning_charts(wheels, limit), list(wheels))

@@ -11,6 +11,7 @@ import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import pytest
 
@@ -63,6 +64,8 @@ def test_the_demo_shows_everything_and_leaves_nothing_running(
     assert (result / "identification" / "report.html").stat().st_size > 100_000
     assert set(load_motors(result / "identification" / "motors.yaml")) == set(WHEELS)
     assert set(read_records([str(result / "excitation")])) == set(WHEELS)
+    figure = ElementTree.parse(result / "drive.svg").getroot()
+    assert {w.replace("_", " ").capitalize() for w in WHEELS} <= set(figure.itertext())
     gains = from_file(result / "gains.yaml")
     assert set(gains) == set(WHEELS)
     motors = json.loads((result / "identification" / "identification.json").read_text())["motors"]

@@ -9,13 +9,14 @@ import pytest
 
 from smp_motor_control import WHEELS
 from smp_motor_control.errors import ParameterError
-from smp_motor_control.parameter_file import require_nodes
+from smp_motor_control.parameter_file import parameters_of, require_nodes
 
 LAUNCH = Path(__file__).parents[2] / "launch" / "smp.launch.py"
 
 
-def test_launch_file_starts_plant_wheels_and_body_of_any_robot():
+def test_launch_file_starts_plant_wheels_and_body_of_any_robot(tmp_path):
     pytest.importorskip("launch_ros", reason="ros2 launch is not among the wheels")
+    from launch.actions import LogInfo
     from launch_ros.actions import Node
 
     from launch import LaunchContext
@@ -30,6 +31,16 @@ def test_launch_file_starts_plant_wheels_and_body_of_any_robot():
     executables = [one.node_executable for one in started if isinstance(one, Node)]
     assert executables.count("wheel_pid") == 4
     assert {"motor_plant", "skid_steer"} <= set(executables)
+    body = tmp_path / "body.yaml"
+    names = "left_wheel_names: [front_left], right_wheel_names: [front_right]"
+    body.write_text(f"/**/skid_steer: {{ros__parameters: {{{names}}}}}\n")
+    context.launch_configurations.update(body=str(body), hardware="external")
+    started = module.start(context)
+    executables = [one.node_executable for one in started if isinstance(one, Node)]
+    assert executables.count("wheel_pid") == 2  # those of the robot's one file
+    assert "gains for the motors of the paper" in str(
+        [part.text for one in started if isinstance(one, LogInfo) for part in one.msg]
+    )
     context.launch_configurations["left_wheels"] = "unknown"
     with pytest.raises(ParameterError, match="says nothing to /unknown/wheel_pid"):
         module.start(context)
@@ -43,6 +54,17 @@ def test_parameter_file_speaks_to_the_nodes_of_every_robot(tmp_path):
         require_nodes(gains, ["/front_left/motor_plant"])
     with pytest.raises(ParameterError, match="cannot be read"):
         require_nodes(tmp_path / "none.yaml", [])
+
+
+def test_parameters_of_a_node_are_those_of_any_namespace(tmp_path):
+    file = tmp_path / "robot.yaml"
+    file.write_text(
+        "/**: {ros__parameters: {use_sim_time: true}}\n"
+        "/robot1/skid_steer: {ros__parameters: {left_wheel_names: [left]}}\n"
+        "/**/excite: {ros__parameters: {wheel_names: [left, right]}}\n"
+    )
+    found = parameters_of(file, "skid_steer")
+    assert found == {"use_sim_time": True, "left_wheel_names": ["left"]}
 
 
 def test_launch_file_is_python_that_names_real_executables_and_files():

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 
@@ -191,3 +192,16 @@ def test_shell_from_another_folder_finds_the_executables_and_the_messages(ready,
 def test_shell_leaves_discovery_to_its_user(ready, tmp_path):
     script = f". '{ROOT}/setup.bash'; env | grep -c '^ROS_AUTOMATIC_DISCOVERY_RANGE'"
     assert run(tmp_path, "/usr/bin:/bin", command=("bash", "-c", script)).stdout == "0\n"
+
+
+def test_the_root_package_names_what_the_one_below_it_needs():
+    """Where rosdep finds a package.xml, it looks no further down."""
+
+    def keys(path: str) -> set[str]:
+        root = ElementTree.parse(ROOT / path).getroot()
+        return {one.text for one in root if one.tag.endswith("depend")}
+
+    named = keys("package.xml")
+    assert keys("smp_interfaces/package.xml") <= named
+    known = (ROOT / "scripts" / "rosdep_keys.txt").read_text().splitlines()
+    assert named <= set(known)
