@@ -26,6 +26,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from smp_motor_control import WHEELS
 from smp_motor_control.motor import Motor
 from smp_motor_control.motor.file import load_motors
+from smp_motor_control.ros_arguments import split_arguments
 from smp_motor_ident.bag.writer import BagWriter
 from smp_motor_ident.cli import commission, demo, identify, tune, tune_arguments
 from smp_motor_ident.nodes import play, record
@@ -104,7 +105,7 @@ def test_commands_that_do_not_run_here_name_what_exists(page, lines):
         if "--help" in arguments:
             continue
         if name in PARSERS:
-            own = arguments[: [*arguments, "--ros-args"].index("--ros-args")]
+            own, _ = split_arguments(arguments)
             assert PARSERS[name]().parse_args(own), f"{page}: {words}"
         elif name in NODES and "--ros-args" in arguments:
             parameters = known(name)

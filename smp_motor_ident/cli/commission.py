@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 
-from smp_motor_ident.cli.frame import Parser, number, run
+from smp_motor_ident.cli.frame import OF_ROS, Parser, number, run
 
 NAME = "commission"
 
@@ -19,7 +19,7 @@ meanwhile and on again at the end.
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    made = Parser(prog=NAME, description=DESCRIPTION)
+    made = Parser(prog=NAME, description=DESCRIPTION, epilog=OF_ROS)
     add = made.add_argument
     add("--output", "-o", metavar="DIR", required=True, help="new folder for bag and results")
     add("--wheel", action="append", metavar="NAME", help="only this; default: all that report")

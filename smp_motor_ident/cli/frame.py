@@ -26,6 +26,10 @@ PATIENCE = 2.0
 """Where progress goes to no terminal, a step is named when it has taken so long [s]."""
 
 
+OF_ROS = "A robot in a namespace: end the line with --ros-args -r __ns:=/robot1."
+"""In the help of the tools that look for a running robot."""
+
+
 Work = Callable[[argparse.Namespace], int | None]
 """From the parsed arguments to an exit code; None is 0."""
 

@@ -47,7 +47,11 @@ DEFAULT_RATE = 200.0
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the tool's arguments."""
-    p = frame.Parser(prog="tune", description="Design gains that hold on the loop that will run.")
+    p = frame.Parser(
+        prog="tune",
+        description="Design gains that hold on the loop that will run.",
+        epilog=frame.OF_ROS,
+    )
     p.add_argument(
         "source", type=Path, nargs="?", help="identification.json, its folder, or motors.yaml"
     )
