@@ -53,10 +53,10 @@ def start(context, *_) -> list:
     given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
     if given["hardware"] not in ("simulated", "external"):
         raise RuntimeError(f"hardware is {given['hardware']!r}; it must be simulated or external")
-    told = parameters_of(given["body"], "skid_steer")
+    geometry = parameters_of(given["body"], "skid_steer")
     sides = [
         [name.strip() for name in given[f"{side}_wheels"].split(",") if name.strip()]
-        or list(told.get(f"{side}_wheel_names", usual))
+        or list(geometry.get(f"{side}_wheel_names", usual))
         for side, usual in (("left", LEFT), ("right", RIGHT))
     ]
     robot = "/" + given["namespace"].strip("/") if given["namespace"].strip("/") else ""
@@ -91,7 +91,7 @@ def start(context, *_) -> list:
         }
         nodes.append(node("skid_steer", [given["body"], body]))
         if is_true(given, "description"):
-            nodes += describe(sides, told, robot, common)
+            nodes += describe(sides, geometry, robot, common)
     if given["hardware"] == "external" and Path(given["params_file"]) == paper_gains(context):
         nodes.append(LogInfo(msg=f"{given['params_file']}: gains for the motors of the paper; "
                                  "params_file:= gives yours"))  # fmt: skip
@@ -103,11 +103,11 @@ def paper_gains(context) -> Path:
     return Path(*(FindPackageShare(PACKAGE).perform(context), "config", "gains.yaml"))
 
 
-def describe(sides: list, told: dict, robot: str, common: dict) -> list:
+def describe(sides: list, geometry: dict, robot: str, common: dict) -> list:
     """Return what turns joint_states into the frames of the wheels."""
     if not any(Path(p, STATE_PUBLISHER).is_dir() for p in get_search_paths()):
         return [LogInfo(msg="robot_state_publisher is not installed: no frames of the wheels")]
-    sizes = {to: told[name] for name, to in SIZES.items() if name in told}
+    sizes = {to: geometry[name] for name, to in SIZES.items() if name in geometry}
     text = ParameterValue(robot_description(*sides, **sizes), value_type=str)
     prefix = f"{robot.strip('/')}/" if robot else ""
     return [

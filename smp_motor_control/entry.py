@@ -33,13 +33,22 @@ def _program(module: str, interrupted: int) -> Callable[[], int]:
             return importlib.import_module(module).main() or 0
         except KeyboardInterrupt:
             return interrupted
-        except ModuleNotFoundError as error:
-            if os.environ.get("SMP_DEBUG"):
+        except ImportError as error:
+            if was_interrupted(error):
+                return interrupted
+            if os.environ.get("SMP_DEBUG") or not isinstance(error, ModuleNotFoundError):
                 raise
             print(f"{module.rpartition('.')[2]}: {missing(error)}", file=sys.stderr)
             return 2
 
     return run
+
+
+def was_interrupted(error: BaseException | None) -> bool:
+    """Whether an import failed because Ctrl-C came while a compiled module was made ready."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
 
 
 def missing(error: ModuleNotFoundError) -> str:

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from smp_motor_control import entry
+
 
 def has_mapped(pid: int, library: str) -> bool:
     try:
@@ -86,3 +88,25 @@ def test_every_node_has_help(process, executable):
     started = process(executable, "--help")
     assert started.wait(30.0) == 0
     assert f"usage: {executable}" in started.output
+
+
+def test_ctrl_c_that_a_compiled_module_turns_into_an_import_error_is_ctrl_c(monkeypatch):
+    def interrupted(module: str) -> None:
+        try:
+            try:
+                raise KeyboardInterrupt
+            except KeyboardInterrupt as stop:
+                raise ImportError("initialization failed") from stop
+        except ImportError:
+            raise ImportError(f"the C extension of {module} is not present")  # noqa: B904
+
+    monkeypatch.setattr(entry.importlib, "import_module", interrupted)
+    assert entry._program("smp_motor_control.nodes.wheel_pid", 0)() == 0
+    assert entry._program("smp_motor_ident.cli.tune", 130)() == 130
+
+    def broken(module: str) -> None:
+        raise ImportError("undefined symbol")
+
+    monkeypatch.setattr(entry.importlib, "import_module", broken)
+    with pytest.raises(ImportError, match="undefined symbol"):
+        entry._program("smp_motor_control.nodes.wheel_pid", 0)()
