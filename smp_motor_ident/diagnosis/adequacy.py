@@ -148,12 +148,15 @@ def _finding(
     first: Evidence, shown: Sequence[Evidence], numbers: Sequence[Stated], step: float
 ) -> Finding:
     worst, times, share = "", 0.0, 0.0
+    friction = {n: abs(q.value or 0.0) for n, q, _ in numbers}.get("static_voltage", 0.0)
+    # Beside what a number that may be nothing matters: times of the interface beside the sampling
+    # interval, however small they are, and a load beside the friction that it adds to.
+    least = {**dict.fromkeys(INTERFACE, step), "load_voltage": friction}
     for name, quantity, row in numbers:
         if quantity.value is None or not quantity.std:
             continue
         shift = abs(float(row @ first.shift))
-        # Times of the interface matter beside the sampling interval, however small they are.
-        size = max(abs(quantity.value), step if name in INTERFACE else 1e-300)
+        size = max(abs(quantity.value), least.get(name, 0.0), 1e-300)
         if shift > RELEVANT_BIAS.value * size and shift / quantity.std > times:
             worst, times, share = name, shift / quantity.std, shift / size
     also = [e.effect.cause for e in shown if e is not first and e.gain > 0.8 * first.gain]

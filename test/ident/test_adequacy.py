@@ -7,10 +7,12 @@ from dataclasses import replace
 import motors
 import numpy as np
 
-from smp_motor_ident.diagnosis import model_error
+from smp_motor_ident.diagnosis import adequacy, model_error
 from smp_motor_ident.diagnosis.effects import EFFECTS
 from smp_motor_ident.estimate import estimate
+from smp_motor_ident.finding import Finding
 from smp_motor_ident.record import Record
+from smp_motor_ident.result import Quantity
 
 
 def commanded(dead: float = 0.0, top: float = np.inf) -> Record:
@@ -45,3 +47,19 @@ def test_an_effect_whose_shape_the_model_has_to_a_twentieth_is_not_tried() -> No
         tried[part] = model_error._projected(table, 1, block, members, 1).members
     assert not tried[0.05]  # a friction curve is not known to 5 %
     assert tried[0.5]
+
+
+def test_a_load_that_is_nothing_is_no_number_that_an_effect_moves():
+    def stated(name: str, value: float, std: float, row: float) -> adequacy.Stated:
+        interval = (value - 2 * std, value + 2 * std)
+        return name, Quantity(value, std, interval, "V"), np.array([row])
+
+    def finding(shift: float) -> Finding:
+        shown = adequacy.Evidence(EFFECTS[0], 1e-6, 200.0, np.array([shift]), (0,))
+        numbers = [stated("static_voltage", 0.3, 3e-5, 0.0), stated("load_voltage", -1e-5, 3e-6, 1)]
+        return adequacy._finding(shown, [shown], numbers, 0.005)
+
+    # Twice its value, and a ten-thousandth of the friction; then a fifteenth of the friction.
+    assert finding(2e-5).severity == "note"
+    assert finding(0.02).severity == "unreliable"
+    assert finding(0.02).evidence["quantity"] == "load_voltage"
