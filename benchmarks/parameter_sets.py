@@ -63,20 +63,11 @@ def usual(values: dict[str, Any]) -> dict[str, Any]:
 
 def core(count: int, seed: int) -> bool:
     """Judge sets without processes; return whether all that are accepted follow."""
-    from test_acceptance import RATIO, WHEEL, drives, random_settings
+    from test_acceptance import accepted_sets
 
-    from smp_motor_control.errors import ParameterError
-    from smp_motor_control.wheel.acceptance import check
-
-    draw, accepted, wrong = random.Random(seed), 0, 0
-    for _ in range(count):
-        try:
-            given = random_settings(draw)
-            check(given, WHEEL)
-        except ParameterError:
-            continue
+    accepted = wrong = 0
+    for given, share in accepted_sets(random.Random(seed), count):
         accepted += 1
-        share = drives(given, RATIO)
         if not share < 2.5:
             wrong += 1
             print(f"FAILED {share:.2f} set-points: {given}")

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import time
-
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
+from domain_node import DomainNode
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.time import Time
 from sensor_msgs.msg import Imu, JointState
 
@@ -30,15 +28,11 @@ GEOMETRY = [
 ]
 
 
-class Peer:
+class Peer(DomainNode):
     """The rest of the robot: sends commands and feedback, keeps what skid_steer sends."""
 
     def __init__(self, domain: int) -> None:
-        self.context = rclpy.Context()
-        rclpy.init(args=[], context=self.context, domain_id=domain)
-        self.node = rclpy.create_node("peer", context=self.context)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
+        super().__init__(domain, "peer")
         self.setpoints: list[JointState] = []
         self.odometry: list[Odometry] = []
         self.joints: list[JointState] = []
@@ -55,14 +49,6 @@ class Peer:
         self.imu = node.create_publisher(Imu, "imu", 10)
         self.states = {w: node.create_publisher(MotorState, f"{w}/motor_state", 10) for w in WHEELS}
         self.begun: Time | None = None
-
-    def spin(self) -> None:
-        self.executor.spin_once(timeout_sec=0.005)
-
-    def spin_for(self, seconds: float) -> None:
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            self.spin()
 
     def command(self, v: float, w: float = 0.0, age: float = 0.0, zero_stamp: bool = False) -> None:
         message = TwistStamped()

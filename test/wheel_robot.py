@@ -8,12 +8,11 @@ import time
 from collections.abc import Callable, Sequence
 
 import pytest
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
+from domain_node import DomainNode
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.srv import SetParametersAtomically
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
@@ -93,15 +92,11 @@ class Relay:
         self.fault = shifted
 
 
-class WheelRobot:
+class WheelRobot(DomainNode):
     """Publishes set-points while spinning and remembers what the wheels do."""
 
     def __init__(self, domain: int) -> None:
-        self.context = rclpy.Context()
-        rclpy.init(args=[], context=self.context, domain_id=domain)
-        self.node = rclpy.create_node("robot", context=self.context)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
+        super().__init__(domain, "robot")
         self.states: dict[str, list[MotorState]] = {w: [] for w in (*WHEELS, "raw")}
         self.commands: dict[str, list[MotorCommand]] = {w: [] for w in WHEELS}
         self.pid_states: list[PidState] = []
@@ -130,11 +125,6 @@ class WheelRobot:
             self._sent = now
             self.send_setpoint(self.setpoint)
         self.executor.spin_once(timeout_sec=0.005)
-
-    def spin_for(self, seconds: float) -> None:
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            self.spin()
 
     def send_setpoint(self, velocity: float, wheels: Sequence[str] = WHEELS) -> None:
         message = JointState(
@@ -204,8 +194,3 @@ class WheelRobot:
         if not future.done():
             pytest.fail(f"{client.srv_name} does not answer")
         return future.result()
-
-    def close(self) -> None:
-        self.executor.shutdown()
-        self.node.destroy_node()
-        rclpy.shutdown(context=self.context)

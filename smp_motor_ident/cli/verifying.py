@@ -34,7 +34,7 @@ ATTEMPTS = 3
 
 @dataclass
 class Trial:
-    """Gains that are set for now; ``kept`` decides what becomes of them."""
+    """Gains on trial: ``kept`` says whether they stay when it ends."""
 
     kept: bool = False
 

@@ -7,12 +7,12 @@ from collections.abc import Mapping, Sequence
 from importlib import resources
 from typing import TYPE_CHECKING, Any
 
-import jinja2
 from markupsafe import Markup
 
 from smp_motor_ident.report import words
 from smp_motor_ident.report.chart import Chart, Curve
 from smp_motor_ident.report.drawing import svg
+from smp_motor_ident.report.templates import template
 
 if TYPE_CHECKING:
     from smp_motor_ident.tune.verification import Change
@@ -55,17 +55,9 @@ def charts(changes: Sequence[Change]) -> list[Chart]:
 
 def render(document: Mapping[str, Any], changes: Sequence[Change]) -> str:
     """Return the page of what ``commissioning.json`` holds and of the drive's curves."""
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("smp_motor_ident.report", "."),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters |= {"label": words.label}
     drawn = charts(changes)
     data = json.dumps([chart.to_document() for chart in drawn], separators=(",", ":"))
-    return environment.get_template("commissioning.html.jinja").render(
+    return template("commissioning.html.jinja").render(
         document=document,
         findings=document.get("findings", []),
         checks=document.get("checks", {}),

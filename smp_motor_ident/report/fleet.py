@@ -10,12 +10,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 
-import jinja2
 import numpy as np
 from markupsafe import Markup
 
-from smp_motor_ident.report import words
 from smp_motor_ident.report.limits import FLEET_DRIFT, FLEET_OUTLIER, FLEET_SIZE
+from smp_motor_ident.report.templates import template
 
 QUANTITIES = ("dc_gain", "time_constant", "static_voltage", "resistance", "motor_constant")
 """What is compared, where the recordings tell it."""
@@ -147,13 +146,7 @@ def page(rows: Sequence[Row], marks: Sequence[Mark]) -> str:
     """Return the table as a page that stands alone."""
     folder = resources.files("smp_motor_ident.report")
     style = "".join(folder.joinpath(n).read_text("utf-8") for n in ("colors.css", "report.css"))
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("smp_motor_ident.report", "."),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-    )
-    environment.filters |= {"label": words.label, "number": words.number}
-    return environment.get_template("fleet.html.jinja").render(
+    return template("fleet.html.jinja").render(
         rows=rows, marks=marks, quantities=QUANTITIES, style=Markup(style),
         robots=len({r.robot for r in rows}), day=_day,
     )  # fmt: skip

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from importlib import resources
 from typing import TYPE_CHECKING, Any
 
-import jinja2
 import numpy as np
 from markupsafe import Markup
 
@@ -19,6 +18,7 @@ from smp_motor_ident.report.alike import same_response
 from smp_motor_ident.report.chart import Chart
 from smp_motor_ident.report.drawing import svg
 from smp_motor_ident.report.series import Comparison
+from smp_motor_ident.report.templates import template
 from smp_motor_ident.result import Candidate, Estimate, Quantity
 
 if TYPE_CHECKING:
@@ -63,21 +63,13 @@ class Row:
 
 def render(report: Report) -> str:
     """Return the page."""
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("smp_motor_ident.report", "."),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters |= {"label": words.label, "number": words.number}
     motors = {
         wheel: _motor(estimate, report.comparisons.get(wheel, ()), report.history.get(wheel, ()))
         for wheel, estimate in report.estimates.items()
     }
     tuning_charts, tuning_data = _tuning_page(report.tunings)
     charts = [*tuning_charts, *(c for motor in motors.values() for c in motor["charts"])]
-    return environment.get_template("report.html.jinja").render(
+    return template("report.html.jinja").render(
         report=report,
         style=Markup(_text("uplot/uPlot.min.css") + _text("colors.css") + _text("report.css")),
         library=Markup(_text("uplot/uPlot.iife.min.js")),

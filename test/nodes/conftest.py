@@ -5,34 +5,24 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import pytest
-import rclpy
 from body_peer import GEOMETRY, Peer
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
+from domain_node import DomainNode
 from rclpy.node import Node
 
 
 @pytest.fixture
 def node(ros_domain: int) -> Iterator[Node]:
-    context = Context()
-    rclpy.init(context=context, domain_id=ros_domain)
-    made = rclpy.create_node("tester", context=context)
-    executor = SingleThreadedExecutor(context=context)
-    executor.add_node(made)
-    made.spin = lambda: executor.spin_once(timeout_sec=0.01)  # type: ignore[attr-defined]
-    yield made
-    executor.shutdown()
-    made.destroy_node()
-    rclpy.shutdown(context=context)
+    one = DomainNode(ros_domain, "tester")
+    one.node.spin = one.spin  # type: ignore[attr-defined]
+    yield one.node
+    one.close()
 
 
 @pytest.fixture
 def peer(ros_domain: int) -> Iterator[Peer]:
     peer = Peer(ros_domain)
     yield peer
-    peer.executor.shutdown()
-    peer.node.destroy_node()
-    rclpy.shutdown(context=peer.context)
+    peer.close()
 
 
 @pytest.fixture

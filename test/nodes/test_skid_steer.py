@@ -146,6 +146,15 @@ def test_heading_is_held_by_the_imu_and_only_while_driving(skid_steer, peer, eve
         peer.imu.publish(message)
         peer.command(v)
 
+    # Wheels that turn say that cmd_vel is heard, not that the imu is.
+    missing = "heading is not held: no imu"
+    repeatedly(peer, lambda: peer.command(0.0), lambda: peer.diagnosis(missing), eventually)
+    repeatedly(
+        peer,
+        lambda: turned(0.5, 0.0),
+        lambda: missing not in peer.diagnostics[-1].message,
+        eventually,
+    )
     repeatedly(peer, lambda: turned(0.5, 0.5), lambda: peer.drives(5.0, 5.0), eventually)
     # Turned left by 0.1 rad: 2/s times that, 0.2 rad/s to the right, 0.4 rad/s a side.
     repeatedly(peer, lambda: turned(0.6, 0.5), lambda: peer.drives(5.4, 4.6, 1e-6), eventually)

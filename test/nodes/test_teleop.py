@@ -16,9 +16,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-import rclpy
+from domain_node import DomainNode
 from geometry_msgs.msg import TwistStamped
-from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import JointState
 
 LFLAG = 3
@@ -87,27 +86,15 @@ def terminal(ros_domain: int) -> Iterator:
         one.close()
 
 
-class Listener:
+class Listener(DomainNode):
     """What the robot would be asked."""
 
     def __init__(self, domain: int) -> None:
-        self.context = rclpy.Context()
-        rclpy.init(args=[], context=self.context, domain_id=domain)
-        self.node = rclpy.create_node("robot", context=self.context)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
+        super().__init__(domain, "robot")
         self.twists: list[TwistStamped] = []
         self.setpoints: list[JointState] = []
         self.node.create_subscription(TwistStamped, "cmd_vel", self.twists.append, 100)
         self.node.create_subscription(JointState, "wheel_setpoints", self.setpoints.append, 100)
-
-    def spin(self) -> None:
-        self.executor.spin_once(timeout_sec=0.005)
-
-    def spin_for(self, seconds: float) -> None:
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            self.spin()
 
     def linear(self) -> float | None:
         return self.twists[-1].twist.linear.x if self.twists else None
@@ -121,9 +108,7 @@ class Listener:
 def robot(ros_domain: int) -> Iterator[Listener]:
     listener = Listener(ros_domain)
     yield listener
-    listener.executor.shutdown()
-    listener.node.destroy_node()
-    rclpy.shutdown(context=listener.context)
+    listener.close()
 
 
 @pytest.fixture
