@@ -269,7 +269,8 @@ EFFECTS = (
     Effect("cogging", _drive("cog", (0.2, 0.6, 1.5), _torque), ("position",)),
     Effect("drag", lambda c, n: c.drive.update(
         drag=(0.02, 0.08, 0.25)[n] * _stall_torque(c) / c.fastest**2), ("drag",)),
-    Effect("constant load", _drive("load", (0.2, 0.6, 1.2), _torque), ("load",)),
+    Effect("constant load", _drive("load", (0.2, 0.6, 1.2), _torque),
+           ("load", "one_direction")),
     Effect("load step", lambda c, n: c.drive.update(
         load_step=(0.2, 0.6, 1.2)[n] * c.motor.tc, load_time=0.55 * c.samples * c.step),
         ("drift", "load")),

@@ -21,7 +21,7 @@ def scope(
     ohmmeter: float | None,
 ) -> list[Finding]:
     """Return what a reader must know of the values' meaning."""
-    out = [] if result.level else _one_size(data)
+    out = [] if result.level else [*_one_size(data), *_one_direction(data, result)]
     if alike:
         out.append(_alike(alike))
     if result.level:
@@ -73,6 +73,22 @@ def _one_size(data: Experiments) -> list[Finding]:
             "the numbers hold for the voltage as it was recorded",
             {"voltage": top},
             "record the voltage at the motor's terminals, or add levels of other sizes",
+        )
+    ]
+
+
+def _one_direction(data: Experiments, result: Answer) -> list[Finding]:
+    """Say that friction and a constant load are one voltage where the motor turns one way only."""
+    if data.hold_value.min() < 0 < data.hold_value.max() or "load_voltage" in result.combinations:
+        return []
+    return [
+        Finding(
+            "one_direction",
+            "warning",
+            "the motor was driven one way only: static_voltage is friction and a constant load "
+            "together, and the other way may have its own",
+            {"voltage": float(data.hold_value[np.argmax(np.abs(data.hold_value))])},
+            "drive both directions",
         )
     ]
 

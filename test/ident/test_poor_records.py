@@ -53,6 +53,8 @@ def test_two_levels_know_gain_and_friction_apart():
         assert q.value is not None, name
         assert abs(q.value - TRUTH[name]) < 4 * q.std, name
     assert "steady_speed" not in found.combinations
+    # One way only: a load as large as half of the friction would have been friction, too.
+    assert "one_direction" in [f.code for f in found.findings if f.severity == "warning"]
 
 
 def test_rest_before_the_excitation_changes_nothing():
