@@ -78,7 +78,7 @@ def test_play_sends_byte_for_byte_what_was_recorded_in_its_own_time(
     process: Callable[..., Any], listener: Listener, tmp_path: Path
 ) -> None:
     written = write_bag(tmp_path / "bag")
-    player = process("play", tmp_path / "bag")
+    player = process("play", tmp_path / "bag", *UNHURRIED)
     assert player.wait(30.0) == 0
     assert listener.data["/number"] == written["/number"]
     assert listener.data["/text"] == written["/text"]
