@@ -103,14 +103,15 @@ def test_a_voltage_of_one_size_says_that_a_clip_would_not_show(levels, said):
     assert said or found.unreliable  # with another size the clip itself shows
 
 
-def test_the_rounding_of_counts_hides_no_step_in_the_first_row():
+def test_the_rounding_of_counts_hides_no_step():
     # 64 counts a turn at 5 kHz: between two samples there is a count or none.
     t = np.arange(15000) / 5000.0
     gain, tau, net = 17.5, 0.015, 6.6
     angle = gain * net * (t - tau * (1 - np.exp(-t / tau)))
     count = np.floor(angle * 64 / (2 * np.pi) + 0.3).astype(np.int64)
     hardware = Hardware(1.0, 64.0, 0, 9.0, None)
-    found = estimate(Record("motor", t, np.full(t.size, 6.9), count=count, hardware=hardware))
+    voltage = np.r_[0.0, np.full(t.size - 1, 6.9)]
+    found = estimate(Record("motor", t, voltage, count=count, hardware=hardware))
     lag = found.combinations["time_constant"]
     assert abs(lag.value - tau) < 5 * lag.std  # 5 standard deviations: one in 1.7 million
     assert lag.std < 0.1 * tau
