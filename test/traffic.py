@@ -15,7 +15,7 @@ from smp_interfaces.msg import MotorState
 
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 BEGIN = time.time_ns()
-RELIABLE = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
+RELIABLE = QoSProfile(depth=5000, reliability=ReliabilityPolicy.RELIABLE)
 BEST_EFFORT = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
 LATCHED = QoSProfile(
     depth=5,

@@ -49,6 +49,7 @@ def test_plant_turns_on_commands_stops_without_and_describes_itself(process, rob
             send.publish(MotorCommand(voltage=voltage))
             robot.spin()
 
+    eventually(lambda: front[-1].voltage > 5.9, 10.0, lambda: command(6.0, 0.1), "not heard")
     command(6.0, 1.0)
     # Steady state of Table 1 with 0.45 V of friction: 2.17 rad/s; one count of speed is 0.02.
     assert robot.velocity("front_left") == pytest.approx(2.165, abs=0.05)
@@ -58,8 +59,7 @@ def test_plant_turns_on_commands_stops_without_and_describes_itself(process, rob
     )
     assert idle[-1].encoder_count == 0
 
-    command(math.nan, 0.5)
-    assert front[-1].voltage == 0.0
+    eventually(lambda: front[-1].voltage == 0.0, 5.0, lambda: command(math.nan, 0.1))
     eventually(lambda: robot.named("motor_plant", "no numbers"), 3.0, robot.spin)
     command(6.0, 0.5)
     before = time.monotonic()
@@ -101,8 +101,8 @@ def test_wheel_obeys_one_writer_until_that_one_rests(process, robot, eventually)
     send = robot.node.create_publisher(MotorCommand, "/front_left/motor_command", 10)
     eventually(lambda: send.get_subscription_count() and owners, 10.0, robot.spin)
 
-    def command(**voltages: float) -> None:
-        end = time.monotonic() + 0.6
+    def command(seconds: float = 0.6, **voltages: float) -> None:
+        end = time.monotonic() + seconds
         while time.monotonic() < end:
             for name, voltage in voltages.items():
                 message = MotorCommand(voltage=voltage)
@@ -110,7 +110,7 @@ def test_wheel_obeys_one_writer_until_that_one_rests(process, robot, eventually)
                 send.publish(message)
             robot.spin()
 
-    command(first=6.0)
+    eventually(lambda: front[-1].voltage > 5.9, 10.0, lambda: command(0.1, first=6.0), "not heard")
     command(first=6.0, second=-6.0, third=0.0)
     # All six tenths of a second at 6 V, to half a step of the PWM.
     assert min(m.voltage for m in front[-20:]) > 5.98

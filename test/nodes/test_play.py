@@ -78,7 +78,7 @@ def test_play_sends_byte_for_byte_what_was_recorded_in_its_own_time(
     process: Callable[..., Any], listener: Listener, tmp_path: Path
 ) -> None:
     written = write_bag(tmp_path / "bag")
-    player = process("play", tmp_path / "bag")
+    player = process("play", tmp_path / "bag", *UNHURRIED)
     assert player.wait(30.0) == 0
     assert listener.data["/number"] == written["/number"]
     assert listener.data["/text"] == written["/text"]
@@ -163,7 +163,7 @@ def test_topics_of_unknown_types_are_told_and_the_others_played(
     with BagWriter(tmp_path / "bag") as bag:
         bag.write("/odd", "strange_msgs/msg/Thing", bytes(8), 1_000)
         bag.write("/number", "std_msgs/msg/Float64", raw(Float64(data=4.0)), 2_000)
-    player = process("play", tmp_path / "bag")
+    player = process("play", tmp_path / "bag", *UNHURRIED)
     assert player.wait(20.0) == 0
     assert "/odd is not played: its type strange_msgs/msg/Thing is not installed" in player.output
     eventually(lambda: len(listener.data["/number"]) == 1, deadline=2.0)
@@ -185,7 +185,7 @@ def test_topic_with_two_types_is_played_with_one_and_the_other_told(
             channel = writer.register_channel("/number", "cdr", schema)
             writer.add_message(channel, stamp, raw(message), stamp)
         writer.finish()
-    player = process("play", bag)
+    player = process("play", bag, *UNHURRIED)
     assert player.wait(20.0) == 0
     assert "/number: its messages of type std_msgs/msg/String are not played" in player.output
     eventually(lambda: len(listener.data["/number"]) == 1, deadline=2.0)

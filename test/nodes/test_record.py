@@ -6,6 +6,7 @@ import re
 import signal
 import time
 from collections.abc import Callable
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -112,22 +113,31 @@ def test_late_publishers_latched_ones_and_mixed_qos_are_recorded(
     recorder = process("record", "-o", bag)
     eventually(lambda: description.get_subscription_count() > 0, deadline=20.0)
     late = node.create_publisher(Float64, "/late", BEST_EFFORT)
-    eventually(lambda: late.get_subscription_count() > 0)
-    sent = publish_steadily([late], 20, 200.0, lambda k: Float64(data=float(k)))
     # A second, reliable publisher of a topic that is taken best effort changes nothing; a best
     # effort one beside a reliable one makes the recorder ask for less.
     mixed = [node.create_publisher(Float64, "/mixed", RELIABLE)]
     eventually(lambda: mixed[0].get_subscription_count() > 0)
     mixed.append(node.create_publisher(Float64, "/mixed", BEST_EFFORT))
-    eventually(lambda: all(p.get_subscription_count() for p in mixed))
+    marks = {}
+    for publisher in (late, *mixed):
+        mark = Float64(data=-1.0 - len(marks))
+        marks[raw(mark)] = publisher
+        eventually(
+            lambda mark=mark: raw(mark) in chain(*so_far(bag).values()),
+            step=lambda p=publisher, m=mark: publish_steadily([p], 5, 50.0, lambda _: m),
+        )
+    sent = publish_steadily([late], 20, 200.0, lambda k: Float64(data=float(k)))
     both = [publish_steadily([p], 5, 200.0, lambda k: Float64(data=float(k))) for p in mixed]
-    eventually(lambda: len(so_far(bag).get("/mixed", [])) == 10)
+
+    def found(topic: str) -> list[bytes]:
+        return [data for data in so_far(bag).get(topic, []) if data not in marks]
+
+    eventually(lambda: len(found("/mixed")) == 10)
     recorder.interrupt()
     assert recorder.wait(5.0) == 0
-    found = contents(bag)
-    assert len(found["/w/motor_description"]) == 1
-    assert found["/late"] == sent
-    assert sorted(found["/mixed"]) == sorted(both[0] + both[1])
+    assert len(found("/w/motor_description")) == 1
+    assert found("/late") == sent
+    assert sorted(found("/mixed")) == sorted(both[0] + both[1])
 
 
 def test_topics_are_chosen_by_name_and_pattern(

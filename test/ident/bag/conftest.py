@@ -16,6 +16,9 @@ import yaml
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
+from smp_motor_ident.bag import read_records
+from smp_motor_ident.record import Record
+
 ROOT = Path(__file__).resolve().parents[3]
 STATE = "smp_interfaces/msg/MotorState"
 DESCRIPTION = "smp_interfaces/msg/MotorDescription"
@@ -283,11 +286,18 @@ def assert_read(record: Any, truth: Motion, n: int | None = None) -> None:
     np.testing.assert_array_equal(record.count - record.count[0], truth.count[:n] - truth.count[0])
 
 
+def read(path: Path, messages: Iterable[Sent], mapping: Any = None) -> Record:
+    """Return the only record of a bag of these messages."""
+    path.unlink(missing_ok=True)
+    write_mcap(path, messages)
+    return next(iter(read_records(path, mapping).values()))
+
+
 @pytest.fixture(scope="session")
 def corpus() -> SimpleNamespace:
     """What makes recordings; see the functions of this file."""
     names = (
         "STATE DESCRIPTION START RATIO COUNTS TYPES Sent Motion motion merged header stamp_of "
-        "serialized definition write_mcap write_sqlite write_metadata assert_read"
+        "serialized definition write_mcap write_sqlite write_metadata assert_read read"
     )
     return SimpleNamespace(**{name: globals()[name] for name in names.split()})

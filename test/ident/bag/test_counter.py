@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
+from pathlib import Path
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from smp_motor_ident.bag.counter import unwrap, unwrap_angle
 
@@ -232,3 +238,64 @@ def test_an_angle_that_leaves_one_turn_was_never_wrapped() -> None:
         assert unwrap_angle(raw)[1] is undone
     assert unwrap_angle(np.array([2.0, -2.0]))[1] is True
     assert unwrap_angle(np.array([1.5, -1.5]))[1] is False
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    bits=st.sampled_from([8, 12, 16, 24, 31, 32, 48, 63, 64]),
+    seed=st.integers(0, 2**32 - 1),
+    known=st.booleans(),
+)
+def test_a_counter_that_wraps_at_any_width_is_unwrapped(bits: int, seed: int, known: bool) -> None:
+    rng = np.random.default_rng(seed)
+    # A motor's counts change smoothly, by at most a sixteenth of the range from sample to sample.
+    speed = np.sin(np.arange(400) / rng.uniform(20, 60)) * 2.0 ** min(bits - 4, 40)
+    truth = np.cumsum(speed.astype(np.int64)) + rng.integers(0, 2 ** min(bits - 1, 40))
+    half = np.int64(64 - bits)
+    raw = (truth << half) >> half
+    if not known and bits not in (16, 32):
+        return
+    found = unwrap(raw, bits if known else None)
+    np.testing.assert_array_equal(found.count - found.count[0], truth - truth[0])
+    assert found.resets.size == 0
+    wrapped = bool((raw != truth - truth[0] + raw[0]).any())
+    if not known:
+        assert bool(found.findings) == wrapped
+
+
+@pytest.mark.parametrize("bits", [16, 32])
+def test_a_wrapping_counter_in_a_bag_follows_its_description(
+    tmp_path: Path, corpus: SimpleNamespace, bits: int
+) -> None:
+    truth = corpus.motion(n=400, bits=bits)
+    fast = 2 ** (bits - 3)
+    truth = dataclasses.replace(truth, count=np.arange(400, dtype=np.int64) * fast - 3 * fast)
+    # The measured speed agrees, as a motor's does.
+    rate = fast / 0.01 * 2 * np.pi / corpus.COUNTS / corpus.RATIO
+    truth = dataclasses.replace(truth, velocity=np.full(400, rate))
+    record = corpus.read(tmp_path / "bag.mcap", truth.messages())
+    np.testing.assert_array_equal(np.diff(record.count), fast)
+    assert record.starts == (0,)
+
+
+def test_a_narrow_counter_faster_than_half_its_range_follows_the_speed(
+    tmp_path: Path, corpus: SimpleNamespace
+) -> None:
+    truth = corpus.motion(n=200, bits=8)
+    count = np.arange(200, dtype=np.int64) * 700  # 2.7 ranges a sample
+    rate = 700 / 0.01 * 2 * np.pi / corpus.COUNTS / corpus.RATIO
+    truth = dataclasses.replace(truth, count=count, velocity=np.full(200, rate))
+    record = corpus.read(tmp_path / "bag.mcap", truth.messages())
+    np.testing.assert_array_equal(record.count - record.count[0], count)
+
+
+def test_a_reset_counter_begins_a_new_segment(tmp_path: Path, corpus: SimpleNamespace) -> None:
+    truth = corpus.motion(n=300)
+    count = np.arange(300, dtype=np.int64) * 50 + 20_000
+    count[120:] -= count[120]
+    rate = 50 / 0.01 * 2 * np.pi / corpus.COUNTS / corpus.RATIO
+    truth = dataclasses.replace(truth, count=count, velocity=np.full(300, rate))
+    record = corpus.read(tmp_path / "bag.mcap", truth.messages())
+    assert record.starts == (0, 120)
+    assert np.all(np.diff(record.count)[np.arange(299) != 119] == 50)
+    assert "reset 1 times" in " ".join(f.message for f in record.findings)

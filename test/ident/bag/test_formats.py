@@ -15,7 +15,7 @@ import pytest
 import zstandard
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
-from smp_motor_ident.bag import list_topics, read_experiments, read_records
+from smp_motor_ident.bag import list_topics, read_records
 from smp_motor_ident.errors import BagError
 
 Pack = Callable[[bytes], bytes]
@@ -135,85 +135,6 @@ def test_bags_of_rosbags_are_read(
     corpus.assert_read(read_records(tmp_path / "bag")["front_left"], truth)
 
 
-@pytest.mark.parametrize("storage", ["mcap", "db3"])
-@pytest.mark.parametrize("described", [True, False])
-def test_split_bags_are_one_recording(
-    tmp_path: Path, corpus: SimpleNamespace, storage: str, described: bool
-) -> None:
-    truth = corpus.motion(n=300)
-    messages, bag = truth.messages(), tmp_path / "bag"
-    bag.mkdir()
-    write = corpus.write_mcap if storage == "mcap" else corpus.write_sqlite
-    # Ten and more: files must not be taken in the order of their letters.
-    parts = [messages[k * 26 : (k + 1) * 26] for k in range(12)]
-    files = [write(bag / f"bag_{k}.{storage}", part).name for k, part in enumerate(parts)]
-    if described:
-        corpus.write_metadata(bag, files, messages, storage=storage)
-    record = read_records(bag)["front_left"]
-    corpus.assert_read(record, truth)
-    assert record.starts == (0,)
-    assert ("metadata.yaml" in " ".join(f.message for f in record.findings)) is not described
-
-
-def test_a_missing_part_of_a_split_bag_is_told_with_its_messages(
-    tmp_path: Path, corpus: SimpleNamespace
-) -> None:
-    truth = corpus.motion(n=300)
-    messages, bag = truth.messages(), tmp_path / "bag"
-    bag.mkdir()
-    corpus.write_mcap(bag / "bag_0.mcap", messages[:101])
-    corpus.write_metadata(bag, ["bag_0.mcap", "bag_1.mcap"], messages)
-    record = read_records(bag)["front_left"]
-    corpus.assert_read(record, truth, 100)
-    notes = " ".join(f.message for f in record.findings)
-    assert "bag_1.mcap is missing" in notes
-    assert "100 of 300 messages" in notes
-
-
-def test_a_damaged_part_of_a_split_bag_costs_only_itself(
-    tmp_path: Path, corpus: SimpleNamespace
-) -> None:
-    truth = corpus.motion(n=300)
-    messages, bag = truth.messages(), tmp_path / "bag"
-    bag.mkdir()
-    corpus.write_mcap(bag / "bag_0.mcap", messages[:101])
-    (bag / "bag_1.mcap").write_bytes(b"")
-    corpus.write_mcap(bag / "bag_2.mcap", messages[201:])
-    corpus.write_metadata(bag, [f"bag_{k}.mcap" for k in range(3)], messages)
-    record = read_records(bag)["front_left"]
-    assert len(record) == 200
-    assert record.starts == (0, 100)
-    notes = " ".join(f.message for f in record.findings)
-    assert "bag_1.mcap: is empty" in notes
-    assert "200 of 300 messages" in notes
-
-
-def test_a_folder_of_bags_is_a_list_of_experiments(tmp_path: Path, corpus: SimpleNamespace) -> None:
-    truths = [corpus.motion(n=50 + k, seed=k) for k in range(3)]
-    for k, truth in enumerate(truths):
-        bag = tmp_path / f"run{k}"
-        bag.mkdir()
-        corpus.write_sqlite(bag / "x_0.db3", truth.messages())
-        corpus.write_metadata(bag, ["x_0.db3"], truth.messages(), storage="sqlite3")
-    experiments = read_experiments(tmp_path)["front_left"]
-    assert [len(record) for record in experiments] == [50, 51, 52]
-    joined = read_records(tmp_path)["front_left"]
-    assert joined.starts == (0, 50, 101)
-    assert len(joined) == 153
-    assert joined.source == "run0, run1, run2"
-
-
-def test_bare_files_of_different_names_in_a_folder_are_experiments(
-    tmp_path: Path, corpus: SimpleNamespace
-) -> None:
-    for name in ("slow.mcap", "fast.mcap"):
-        corpus.write_mcap(tmp_path / name, corpus.motion(n=20).messages())
-    assert [r.source for r in read_experiments(tmp_path)["front_left"]] == [
-        f"{tmp_path.name}/fast",
-        f"{tmp_path.name}/slow",
-    ]
-
-
 def test_qos_that_disagrees_between_metadata_and_file_hides_nothing(
     tmp_path: Path, corpus: SimpleNamespace
 ) -> None:
@@ -225,24 +146,6 @@ def test_qos_that_disagrees_between_metadata_and_file_hides_nothing(
         bag, ["bag_0.db3"], truth.messages(), version=5, storage="sqlite3", qos="- history: 1\n"
     )
     corpus.assert_read(read_records(bag)["front_left"], truth)
-
-
-def test_fewer_messages_than_the_metadata_promise_are_told(
-    tmp_path: Path, corpus: SimpleNamespace
-) -> None:
-    truth = corpus.motion()
-    bag = tmp_path / "bag"
-    bag.mkdir()
-    corpus.write_sqlite(bag / "bag_0.db3", truth.messages())
-    corpus.write_metadata(
-        bag,
-        ["bag_0.db3"],
-        truth.messages(),
-        storage="sqlite3",
-        counts={"/front_left/motor_state": 1234},
-    )
-    notes = " ".join(f.message for f in read_records(bag)["front_left"].findings)
-    assert "200 of 1234 messages could be read" in notes
 
 
 def test_messages_that_only_the_journal_holds_are_read(
@@ -322,13 +225,6 @@ def test_what_is_no_bag_is_refused_with_its_reason(
     assert "\n" not in str(refused.value)
 
 
-def test_a_path_that_does_not_exist_and_an_empty_folder_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(BagError, match="does not exist"):
-        read_records(tmp_path / "nothing")
-    with pytest.raises(BagError, match="holds no bag"):
-        read_records(tmp_path)
-
-
 @pytest.mark.parametrize("storage", ["mcap", "db3"])
 def test_an_empty_bag_is_refused_with_what_it_lacks(
     tmp_path: Path, corpus: SimpleNamespace, storage: str
@@ -347,21 +243,6 @@ def test_a_topic_without_messages_is_refused_by_its_name(
         database.execute("DELETE FROM messages WHERE topic_id = 2")
     with pytest.raises(BagError, match="/front_left/motor_state has no messages"):
         read_records(path)
-
-
-def test_a_folder_of_bags_tells_which_of_them_could_not_be_read(
-    tmp_path: Path, corpus: SimpleNamespace
-) -> None:
-    for name in ("good", "bad"):
-        (tmp_path / name).mkdir()
-        corpus.write_mcap(tmp_path / name / "x_0.mcap", corpus.motion(n=20).messages())
-    (tmp_path / "bad" / "x_0.mcap").write_bytes(b"")
-    records = read_experiments(tmp_path)["front_left"]
-    assert [len(record) for record in records] == [20]
-    assert "not read:" in " ".join(f.message for f in records[0].findings)
-    assert "is empty" in " ".join(f.message for f in records[0].findings)
-    with pytest.raises(BagError, match="is empty"):
-        read_experiments([tmp_path / "good", tmp_path / "bad"])
 
 
 def test_types_defined_as_idl_are_understood(tmp_path: Path, corpus: SimpleNamespace) -> None:
@@ -399,15 +280,3 @@ def test_a_wheel_that_never_spoke_does_not_hide_the_others(
     assert "not read: bag.db3: rear_left" in " ".join(
         f.message for f in records["front_left"].findings
     )
-
-
-@pytest.mark.parametrize("text", ["", ":\n - {", "a: 1", "rosbag2_bagfile_information: 7"])
-def test_damaged_metadata_do_not_hide_the_files(
-    tmp_path: Path, corpus: SimpleNamespace, text: str
-) -> None:
-    truth = corpus.motion()
-    corpus.write_mcap(tmp_path / "x_0.mcap", truth.messages())
-    (tmp_path / "metadata.yaml").write_text(text)
-    record = read_records(tmp_path)["front_left"]
-    corpus.assert_read(record, truth)
-    assert "metadata.yaml is damaged" in " ".join(f.message for f in record.findings)

@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 
 from smp_motor_ident.bag import BagWriter, join_records, read_records
 from smp_motor_ident.bag.clock import fit_clock, mean_held
-from smp_motor_ident.bag.counter import unwrap
 from smp_motor_ident.errors import BagError
 
 # Without shrinking, which takes minutes where an example is a whole bag.
@@ -24,12 +23,6 @@ MANY = settings(
     suppress_health_check=list(HealthCheck),
     phases=(Phase.explicit, Phase.reuse, Phase.generate),
 )
-
-
-def read(path: Path, corpus: SimpleNamespace, messages: list[Any], mapping: Any = None) -> Any:
-    path.unlink(missing_ok=True)
-    corpus.write_mcap(path, messages)
-    return next(iter(read_records(path, mapping).values()))
 
 
 def replaced(truth: Any, **changes: Any) -> Any:
@@ -80,67 +73,6 @@ def test_shuffled_samples_are_sorted_and_that_is_told(
     assert ("out of order" in " ".join(f.message for f in record.findings)) is shuffled
 
 
-@MANY
-@given(
-    bits=st.sampled_from([8, 12, 16, 24, 31, 32, 48, 63, 64]),
-    seed=st.integers(0, 2**32 - 1),
-    known=st.booleans(),
-)
-def test_a_counter_that_wraps_at_any_width_is_unwrapped(bits: int, seed: int, known: bool) -> None:
-    rng = np.random.default_rng(seed)
-    # A motor's counts change smoothly, by at most a sixteenth of the range from sample to sample.
-    speed = np.sin(np.arange(400) / rng.uniform(20, 60)) * 2.0 ** min(bits - 4, 40)
-    truth = np.cumsum(speed.astype(np.int64)) + rng.integers(0, 2 ** min(bits - 1, 40))
-    half = np.int64(64 - bits)
-    raw = (truth << half) >> half
-    if not known and bits not in (16, 32):
-        return
-    found = unwrap(raw, bits if known else None)
-    np.testing.assert_array_equal(found.count - found.count[0], truth - truth[0])
-    assert found.resets.size == 0
-    wrapped = bool((raw != truth - truth[0] + raw[0]).any())
-    if not known:
-        assert bool(found.findings) == wrapped
-
-
-@pytest.mark.parametrize("bits", [16, 32])
-def test_a_wrapping_counter_in_a_bag_follows_its_description(
-    tmp_path: Path, corpus: SimpleNamespace, bits: int
-) -> None:
-    truth = corpus.motion(n=400, bits=bits)
-    fast = 2 ** (bits - 3)
-    truth = replaced(truth, count=np.arange(400, dtype=np.int64) * fast - 3 * fast)
-    # The measured speed agrees, as a motor's does.
-    rate = fast / 0.01 * 2 * np.pi / corpus.COUNTS / corpus.RATIO
-    truth = replaced(truth, velocity=np.full(400, rate))
-    record = read(tmp_path / "bag.mcap", corpus, truth.messages())
-    np.testing.assert_array_equal(np.diff(record.count), fast)
-    assert record.starts == (0,)
-
-
-def test_a_narrow_counter_faster_than_half_its_range_follows_the_speed(
-    tmp_path: Path, corpus: SimpleNamespace
-) -> None:
-    truth = corpus.motion(n=200, bits=8)
-    count = np.arange(200, dtype=np.int64) * 700  # 2.7 ranges a sample
-    rate = 700 / 0.01 * 2 * np.pi / corpus.COUNTS / corpus.RATIO
-    truth = replaced(truth, count=count, velocity=np.full(200, rate))
-    record = read(tmp_path / "bag.mcap", corpus, truth.messages())
-    np.testing.assert_array_equal(record.count - record.count[0], count)
-
-
-def test_a_reset_counter_begins_a_new_segment(tmp_path: Path, corpus: SimpleNamespace) -> None:
-    truth = corpus.motion(n=300)
-    count = np.arange(300, dtype=np.int64) * 50 + 20_000
-    count[120:] -= count[120]
-    rate = 50 / 0.01 * 2 * np.pi / corpus.COUNTS / corpus.RATIO
-    truth = replaced(truth, count=count, velocity=np.full(300, rate))
-    record = read(tmp_path / "bag.mcap", corpus, truth.messages())
-    assert record.starts == (0, 120)
-    assert np.all(np.diff(record.count)[np.arange(299) != 119] == 50)
-    assert "reset 1 times" in " ".join(f.message for f in record.findings)
-
-
 def test_a_mean_voltage_over_a_long_interval_of_irregular_samples_begins_a_segment(
     tmp_path: Path, corpus: SimpleNamespace
 ) -> None:
@@ -149,7 +81,7 @@ def test_a_mean_voltage_over_a_long_interval_of_irregular_samples_begins_a_segme
     steps = np.where(np.arange(200) % 3, 10_000_000, 19_000_000)
     steps[120] = 400_000_000
     truth = replaced(truth, time=corpus.START + np.cumsum(steps))
-    record = read(tmp_path / "bag.mcap", corpus, truth.messages())
+    record = corpus.read(tmp_path / "bag.mcap", truth.messages())
     assert record.starts == (0, 120)
     assert "1 gaps of up to 0.4 s" in " ".join(f.message for f in record.findings)
 
@@ -164,7 +96,7 @@ def test_a_few_lost_samples_are_bridged_and_more_begin_a_segment(
     kept = np.setdiff1d(np.arange(400), lost)
     messages = truth.messages()
     some = [messages[0], *(messages[1 + k] for k in kept)]
-    record = read(tmp_path / "bag.mcap", corpus, some)
+    record = corpus.read(tmp_path / "bag.mcap", some)
     assert len(record) == kept.size
     assert [int(kept[s]) for s in record.starts] == [0, 205, 350]
     notes = " ".join(f.message for f in record.findings)
@@ -186,7 +118,7 @@ def test_late_samples_are_not_taken_for_lost_ones(tmp_path: Path, corpus: Simple
     for k in (60, 200, 330):
         time[k : k + 4] = time[k + 3] + np.arange(4) * 100_000
     truth = replaced(truth, time=time)
-    record = read(tmp_path / "bag.mcap", corpus, truth.messages())
+    record = corpus.read(tmp_path / "bag.mcap", truth.messages())
     corpus.assert_read(record, truth)
     assert record.starts == (0,)
     assert "missing" not in " ".join(f.message for f in record.findings)
@@ -195,7 +127,7 @@ def test_late_samples_are_not_taken_for_lost_ones(tmp_path: Path, corpus: Simple
 def test_duplicates_are_left_out_and_told(tmp_path: Path, corpus: SimpleNamespace) -> None:
     truth = corpus.motion(n=100)
     messages = truth.messages()
-    record = read(tmp_path / "bag.mcap", corpus, [*messages, *messages[40:60]])
+    record = corpus.read(tmp_path / "bag.mcap", [*messages, *messages[40:60]])
     corpus.assert_read(record, truth)
     assert "20 samples have the time of another and were left out (duplicates)" in " ".join(
         [f.message for f in record.findings]
@@ -211,7 +143,7 @@ def test_samples_without_a_voltage_are_left_out_and_told(
     velocity = truth.velocity.copy()
     velocity[70] = np.nan
     truth = replaced(truth, voltage=voltage, current=current, velocity=velocity)
-    record = read(tmp_path / "bag.mcap", corpus, truth.messages())
+    record = corpus.read(tmp_path / "bag.mcap", truth.messages())
     assert len(record) == 98
     assert record.current is None
     assert np.isnan(record.velocity).sum() == 1
@@ -225,7 +157,7 @@ def test_header_stamps_days_away_from_the_log_are_used_and_that_is_told(
     tmp_path: Path, corpus: SimpleNamespace, days: int
 ) -> None:
     truth = corpus.motion(n=100)
-    record = read(tmp_path / "bag.mcap", corpus, truth.messages(latency=days * 86_400 * 10**9 + 7))
+    record = corpus.read(tmp_path / "bag.mcap", truth.messages(latency=days * 86_400 * 10**9 + 7))
     corpus.assert_read(record, truth)
     notes = " ".join(f.message for f in record.findings)
     assert "time: header stamps" in notes
@@ -239,7 +171,7 @@ def test_stamps_that_are_not_set_are_not_the_time(tmp_path: Path, corpus: Simple
         dataclasses.replace(sent, stamp=int(truth.time[k]))
         for k, sent in enumerate(unset.messages(description=False))
     ]
-    record = read(tmp_path / "bag.mcap", corpus, [*truth.messages()[:1], *messages])
+    record = corpus.read(tmp_path / "bag.mcap", [*truth.messages()[:1], *messages])
     corpus.assert_read(record, truth)
     assert "time: log times (the header stamps are not set)" in " ".join(
         f.message for f in record.findings
@@ -256,7 +188,7 @@ def test_a_clock_that_was_set_back_begins_a_new_segment(
         dataclasses.replace(sent, stamp=int(truth.time[k]))
         for k, sent in enumerate(replaced(truth, time=stamps).messages(description=False))
     ]
-    record = read(tmp_path / "bag.mcap", corpus, [*truth.messages()[:1], *messages])
+    record = corpus.read(tmp_path / "bag.mcap", [*truth.messages()[:1], *messages])
     assert record.starts == (0, 100)
     np.testing.assert_array_equal(record.voltage, truth.voltage)
     assert "set back 1 times" in " ".join(f.message for f in record.findings)
@@ -294,8 +226,8 @@ def test_a_stamped_output_meets_an_unstamped_input_by_offset_and_drift(
     input_times = np.arange(n // 2) * 0.02 + offset
     stamps = corpus.START + np.rint(input_times * 1e9).astype(np.int64)
     messages = sorted(messages + floats(corpus, "/u", stamps, input_times), key=lambda s: s.stamp)
-    record = read(
-        tmp_path / "bag.mcap", corpus, messages, "voltage=/u.data velocity=/js.velocity[w]"
+    record = corpus.read(
+        tmp_path / "bag.mcap", messages, "voltage=/u.data velocity=/js.velocity[w]"
     )
     notes = " ".join(f.message for f in record.findings)
     assert "offset and drift" in notes
@@ -349,7 +281,7 @@ def test_samples_before_the_first_command_are_left_out(
         floats(corpus, "/w", times, np.arange(100)) + floats(corpus, "/u", times[30:], np.ones(70)),
         key=lambda sent: sent.stamp,
     )
-    record = read(tmp_path / "bag.mcap", corpus, messages, "voltage=/u.data velocity=/w.data")
+    record = corpus.read(tmp_path / "bag.mcap", messages, "voltage=/u.data velocity=/w.data")
     assert len(record) == 70
     assert "30 samples before the first voltage were left out" in " ".join(
         f.message for f in record.findings
@@ -363,7 +295,7 @@ def test_an_input_that_stops_ends_the_record_there(tmp_path: Path, corpus: Simpl
         floats(corpus, "/w", times, np.arange(200)) + floats(corpus, "/u", times[on], np.ones(120)),
         key=lambda sent: sent.stamp,
     )
-    record = read(tmp_path / "bag.mcap", corpus, messages, "voltage=/u.data velocity=/w.data")
+    record = corpus.read(tmp_path / "bag.mcap", messages, "voltage=/u.data velocity=/w.data")
     notes = " ".join(f.message for f in record.findings)
     assert "no voltage came for more than 0.2 s" in notes
     assert len(record.starts) == 2
@@ -380,9 +312,8 @@ def test_outputs_of_several_topics_come_onto_one_axis(
         + floats(corpus, "/w", fast, np.arange(400) * 0.5),
         key=lambda sent: sent.stamp,
     )
-    record = read(
+    record = corpus.read(
         tmp_path / "bag.mcap",
-        corpus,
         messages,
         "voltage=/u.data position=/pos.data velocity=/w.data",
     )
@@ -401,8 +332,8 @@ def test_an_angle_that_wraps_at_a_turn_is_unwrapped(
         floats(corpus, "/u", times, np.ones(300)) + floats(corpus, "/angle", times, angle % 360),
         key=lambda sent: sent.stamp,
     )
-    record = read(
-        tmp_path / "bag.mcap", corpus, messages, "voltage=/u.data position=/angle.data:deg"
+    record = corpus.read(
+        tmp_path / "bag.mcap", messages, "voltage=/u.data position=/angle.data:deg"
     )
     np.testing.assert_allclose(np.diff(record.position), np.deg2rad(7.0), rtol=1e-9)
     assert "wraps at one turn" in " ".join(f.message for f in record.findings)
@@ -411,7 +342,7 @@ def test_an_angle_that_wraps_at_a_turn_is_unwrapped(
 def test_recordings_of_different_gearboxes_are_not_joined(
     tmp_path: Path, corpus: SimpleNamespace
 ) -> None:
-    record = read(tmp_path / "bag.mcap", corpus, corpus.motion(n=20).messages())
+    record = corpus.read(tmp_path / "bag.mcap", corpus.motion(n=20).messages())
     other = dataclasses.replace(
         record, hardware=dataclasses.replace(record.hardware, gear_ratio=1.0)
     )
@@ -422,7 +353,7 @@ def test_recordings_of_different_gearboxes_are_not_joined(
 def test_what_only_some_recordings_have_stays_known_where_it_is(
     tmp_path: Path, corpus: SimpleNamespace
 ) -> None:
-    record = read(tmp_path / "bag.mcap", corpus, corpus.motion(n=20).messages())
+    record = corpus.read(tmp_path / "bag.mcap", corpus.motion(n=20).messages())
     other = dataclasses.replace(record, current=None)
     joined = join_records([record, other])
     np.testing.assert_array_equal(joined.current[:20], record.current)
