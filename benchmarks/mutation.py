@@ -51,10 +51,6 @@ TESTS = {
     CONTROL + "body.odometry": "control/test_odometry.py",
     CONTROL + "body.command": "control/test_body_command.py",
     "smp_motor_ident.estimation.choice": "ident/test_structure_choice.py",
-    BAG + "readers.mcap": "ident/bag/test_readers.py ident/bag/test_salvage.py "
-                          "ident/bag/test_truncated.py",
-    BAG + "readers.sqlite": "ident/bag/test_readers.py ident/bag/test_salvage.py "
-                            "ident/bag/test_truncated.py",
     BAG + "counter": "ident/bag/test_counter.py",
     BAG + "salvage": "ident/bag/test_salvage.py",
     BAG + "unpack": "ident/bag/test_unpack.py",

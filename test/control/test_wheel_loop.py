@@ -143,12 +143,14 @@ def test_a_delayed_reference_is_the_one_of_that_long_ago() -> None:
     seen = []
     for samples in (2, 6):
         limits = ProfileLimits(acceleration=1.0)
-        loop = WheelLoop(LoopSettings(limits=limits, reference_delay=samples * DT))
+        gains = PidGains(p=2.0)
+        loop = WheelLoop(LoopSettings(gains=gains, limits=limits, reference_delay=samples * DT))
         loop.start(0.0)
         seen.append([])
         for _ in range(32):
-            loop.step(9.0, 0.0, DT)
+            answer = loop.step(9.0, 0.0, DT)
             seen[-1].append(loop.reference.velocity)
+            assert answer.output == 2.0 * loop.reference.velocity
     assert seen[1][4:] == pytest.approx(seen[0][:-4]) and seen[0][-1] > 0.25
 
 
