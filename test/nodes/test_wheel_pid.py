@@ -181,7 +181,7 @@ def test_watchdogs_and_lifecycle_end_in_a_zero_command(start, robot, eventually)
 
 
 def test_parameters_change_as_one_without_a_jump_or_not_at_all(start, robot, eventually):
-    patient = ("setpoint_timeout:=30.0", "feedback_timeout:=30.0")
+    patient = ("setpoint_timeout:=30.0", "feedback_timeout:=10.0")
     node = start("p:=2.0", "i:=10.0", "u_clamp_max:=12.0", *patient)
     feed = Feed(robot, eventually)
     settle(robot, feed)
