@@ -46,6 +46,8 @@ TESTS = {
     CONTROL + "wheel.lease": "control/test_supervision.py",
     CONTROL + "wheel.controller": "control/test_wheel_limits.py "
                                 "control/test_fault_detector.py control/test_wheel_controller.py",
+    CONTROL + "wheel.loop": "control/test_wheel_loop.py control/test_wheel_limits.py",
+    CONTROL + "wheel.acceptance": "control/test_acceptance.py",
     CONTROL + "body.odometry": "control/test_odometry.py",
     CONTROL + "body.command": "control/test_body_command.py",
     "smp_motor_ident.estimation.choice": "ident/test_structure_choice.py",

@@ -102,7 +102,6 @@ class WheelController:
         self.answer: PidOutput | None = None
         self.owner = ""
         self.steps = 0
-        self.advice = ""
         self._wheel = Circumstances()
         self._intervals: list[float] = []
         self.target = self.measurement = 0.0
@@ -164,7 +163,6 @@ class WheelController:
         """Begin as before the first set-point, without faults: a person has looked at it."""
         self._forget(now)
         self.recovery.reset()
-        self._detector.reset()
 
     def _forget(self, now: float) -> None:
         self.setpoint: float | None = None
@@ -176,7 +174,6 @@ class WheelController:
         self.output = 0.0
         self.answer = None
         self.clock.reset()
-        self.loop.reset_speed()
 
     # Events --------------------------------------------------------------------------------
 
@@ -329,5 +326,4 @@ class WheelController:
     def _trip(self, fault: Fault, now: float) -> float:
         self.recovery.set(fault, now)
         self._resume = True
-        self.answer = None
         return self._zero(State.FAULT)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_control.motor.friction import Gearbox
-from smp_motor_ident.bag.axis import Series, on_one_axis
+from smp_motor_ident.bag.axis import Series, on_one_axis, unwrapped
 from smp_motor_ident.bag.checks import impossible, is_unsigned, signed
 from smp_motor_ident.bag.clock import (
     SAME_CLOCK,
@@ -133,15 +133,21 @@ def _check(motor: _Motor, series: dict[str, Series]) -> None:
         if speed is not None and backward and not np.any(speed.value < 0):
             text = "velocity: never negative although the voltage is; it has no sign"
             motor.tell("unsigned_velocity", text, "unreliable")
-    for name, signal in series.items():
-        if signal.value.dtype.kind != "f":
-            continue
-        bad = impossible(signal.value, steps_allowed=name in ("voltage", "supply", "current"))
+    for name in sorted(series, key=lambda name: name != "count"):
+        value = series[name].value
+        if name == "count":  # which wraps, and that is no jump
+            value = unwrapped(series, motor.plan, motor.hardware).count.astype(np.float64)
+        bad = impossible(value, steps_allowed=name in ("voltage", "supply", "current"))
         if bad.any():
-            worst = float(np.abs(signal.value[bad]).max())
+            worst = float(np.abs(value[bad]).max())
             text = f"{name}: {int(bad.sum())} values that jump impossibly (up to {worst:.4g})"
             motor.tell("impossible_jump", f"{text} were left out", "warning", values=int(bad.sum()))
-            signal.value = np.where(bad, np.nan, signal.value)
+            if name == "count":  # a whole number has no NaN: the samples go
+                time = series[name].time
+                alike = [k for k, signal in series.items() if np.array_equal(signal.time, time)]
+                series.update({k: series[k].take(~bad) for k in alike})
+            else:
+                series[name].value = np.where(bad, np.nan, value)
     if "current" in series and is_unsigned(series["voltage"], series["current"]):
         del series["current"]
         text = (

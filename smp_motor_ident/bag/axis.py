@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident.bag.clock import mean_held, rhythm
-from smp_motor_ident.bag.counter import unwrap
+from smp_motor_ident.bag.counter import Unwrapped, unwrap
 from smp_motor_ident.bag.mapping import MotorMap
 from smp_motor_ident.bag.storage import found
 from smp_motor_ident.errors import BagError
@@ -152,18 +152,23 @@ def _count_starts(
     flags = np.zeros(keep.size, bool)
     flags[0] = True
     if axis_name == "count":
-        counted = series["count"]
-        bits = hardware.encoder_bits if "encoder_bits" in plan.hardware else counted.bits
-        raw = counted.value
-        if raw.dtype.kind == "f":
-            raw = np.rint(raw).astype(np.int64)
-        unwrapped = unwrap(raw, bits, _expected(series, hardware))
-        findings += unwrapped.findings
-        series["count"] = Series(counted.time, unwrapped.count)
-        flags[unwrapped.resets] = True
+        counter = unwrapped(series, plan, hardware)
+        findings += counter.findings
+        series["count"] = Series(series["count"].time, counter.count)
+        flags[counter.resets] = True
     # A reset at a sample that is left out begins a segment at the next that is kept.
     resets = np.cumsum(flags)[keep]
     return np.concatenate([[True], np.diff(resets) > 0])
+
+
+def unwrapped(series: dict[str, Series], plan: MotorMap, hardware: Hardware) -> Unwrapped:
+    """Return the counter without its wraps."""
+    counted = series["count"]
+    bits = hardware.encoder_bits if "encoder_bits" in plan.hardware else counted.bits
+    raw = counted.value
+    if raw.dtype.kind == "f":
+        raw = np.rint(raw).astype(np.int64)
+    return unwrap(raw, bits, _expected(series, hardware))
 
 
 def _expected(series: dict[str, Series], hardware: Hardware) -> Array | None:

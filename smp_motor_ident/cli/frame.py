@@ -17,7 +17,7 @@ from typing import Any, NoReturn
 
 from smp_motor_control.errors import SmpError
 from smp_motor_control.ros_arguments import split_arguments
-from smp_motor_ident.cli.interruption import interruptible
+from smp_motor_ident.cli.interruption import check, interruptible
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
@@ -83,7 +83,7 @@ def run(
         with interruptible(), warnings.catch_warnings():
             # Numerics that fail are dealt with where they occur; standard error is for the user.
             warnings.simplefilter("ignore", RuntimeWarning)
-            code = _loaded(work)(arguments) or 0
+            code = _done(work, arguments)
         sys.stdout.flush()
         return code
     except SystemExit as end:  # of the parser, which has said why
@@ -104,6 +104,17 @@ def run(
         return _fail(parser.prog, f"a defect of this tool: {text} (SMP_DEBUG=1 shows where)", 2)
     finally:
         sys.stdout = before
+
+
+def _done(work: Work | str, arguments: argparse.Namespace) -> int:
+    """Do the work; an error behind a Ctrl-C that some callback has dropped is that Ctrl-C."""
+    try:
+        return _loaded(work)(arguments) or 0
+    except SmpError:
+        raise
+    except Exception:
+        check()
+        raise
 
 
 def _loaded(work: Work | str) -> Work:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +15,6 @@ from wheel_simulation import (
 )
 
 from smp_motor_control import WHEELS
-from smp_motor_control.errors import ParameterError
 from smp_motor_control.excitation import Fourier
 from smp_motor_control.motor.file import load_motors
 from smp_motor_control.motor.model import MotorModel
@@ -139,23 +137,3 @@ def test_reference_delay_changes_while_driving_without_a_jump_of_the_reference(d
     assert loop.reference.velocity == pytest.approx(1.5)
     # Without an error nothing is to change but the way in which the feed-forward is put together.
     assert changed == pytest.approx([out.output] * 50, abs=0.1)
-
-
-def test_counts_without_known_hardware_fall_back_to_the_reported_speed():
-    loop = WheelLoop(settings_of("rear_left", speed_source="observer"))
-    assert loop.speed(0.005, 1.23, 77, 3.0) == 1.23
-    assert loop.source == "measured"
-
-
-@pytest.mark.parametrize(
-    "bad",
-    [
-        {"speed_source": "guess"},
-        {"difference_window": 0},
-        {"transition_time": math.nan},
-        {"speed_source": "observer", "model": None},
-    ],
-)
-def test_loop_settings_that_make_no_sense_are_refused(bad):
-    with pytest.raises(ParameterError):
-        LoopSettings(**bad)

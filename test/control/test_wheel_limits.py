@@ -140,7 +140,7 @@ def test_silence_as_long_as_its_time_out_is_none_and_its_kind_is_named() -> None
 
 def test_after_silence_the_loop_starts_anew_from_the_speed_that_is() -> None:
     loop = LoopSettings(gains=replace(GAINS, i=64.0), transition_time=1.0)
-    for gap in ("silence", "late", "owner"):
+    for gap in ("silence", "late", "owner", "bad", "reset"):
         feed = Feed(replace(SETTINGS, loop=loop))
         feed.ask(1.0)
         for _ in range(16):
@@ -153,6 +153,13 @@ def test_after_silence_the_loop_starts_anew_from_the_speed_that_is() -> None:
             assert feed.give(0.75) == 0.0, "the first sample after a gap has no interval"
         elif gap == "late":
             assert feed.give(0.75, dt=0.5 + DT, age=0.5) == 0.0
+            feed.give(0.75)
+        elif gap == "bad":
+            for _ in range(20):
+                feed.give(math.nan)
+                feed.wheel.tick(feed.now)
+        elif gap == "reset":
+            feed.wheel.reset(feed.now)
             feed.give(0.75)
         else:
             feed.wheel.owner = "/excite#1"
@@ -185,6 +192,34 @@ def test_a_count_that_jumps_is_left_out_and_the_speed_begins_anew() -> None:
     assert feed.wheel.refused == {"feedback count that jumps": 1}
     assert feed.give(encoder_count=5000) is None, "the first of a new window has no speed"
     assert feed.give(encoder_count=5000) == 0.0
+    assert feed.wheel.refused == {"feedback count that jumps": 1}
+    for k in range(20):
+        feed.give(encoder_count=10_000 * (k % 2))
+        feed.wheel.tick(feed.now)
+    assert feed.wheel.state is State.BAD_FEEDBACK
+
+
+def test_a_clock_that_jumps_begins_the_counted_speed_anew() -> None:
+    loop = LoopSettings(gains=GAINS, speed_source="difference", difference_window=1)
+    feed = Feed(replace(SETTINGS, loop=loop))
+    feed.wheel.set_hardware(Gearbox(1.0), Encoder(64.0), 12.0)
+    feed.ask(0.0)
+    feed.give(encoder_count=0)
+    assert feed.give(encoder_count=0) == 0.0
+    feed.give(encoder_count=1, age=60.0)
+    assert feed.give(encoder_count=1, age=60.0) is None, "the first of a new window has no speed"
+    assert feed.give(encoder_count=1, age=60.0) == 0.0
+
+
+def test_a_wheel_at_fault_answers_every_sample_with_zero() -> None:
+    feed = Feed()
+    feed.ask(1.0)
+    assert feed.give() == 2.0
+    feed.wheel.recovery.set(Fault.RUNAWAY, feed.now)
+    for _ in range(32):
+        feed.ask(1.0)
+        assert feed.give() == 0.0 and feed.wheel.output == 0.0
+        assert feed.wheel.state is State.FAULT
 
 
 def test_the_voltage_that_is_no_number_is_taken_to_be_the_one_that_was_asked_for() -> None:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import argparse
+import contextlib
 import os
 import signal
 import weakref
 
 import pytest
 
-from smp_motor_ident.cli import interruption
+from smp_motor_ident.cli import frame, interruption
 
 
 class Thing:
@@ -65,3 +67,13 @@ def test_what_must_not_be_left_half_done_is_done_before_the_interruption():
     with interruption.interruptible(), pytest.raises(KeyboardInterrupt):
         work()
     assert done
+
+
+def test_an_error_behind_an_interruption_that_was_dropped_is_that_interruption(capsys):
+    def compiles(arguments: argparse.Namespace) -> int:
+        with contextlib.suppress(KeyboardInterrupt):  # as a callback of a compiler does
+            signal.raise_signal(signal.SIGTERM)
+        raise RuntimeError("no compiled object yet")
+
+    assert frame.run(argparse.ArgumentParser("tool"), compiles, []) == 130
+    assert capsys.readouterr().err == "tool: interrupted\n"

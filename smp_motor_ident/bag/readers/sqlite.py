@@ -172,6 +172,9 @@ class _SqliteFile:
         """Return the next rows; spoilt pages may give the same bytes to many of them."""
         rows, size = [], 0
         for row in self._database.execute(query, (last,)):
+            if not isinstance(row[0], int) or row[0] <= last:  # or the same would be read for ever
+                raise sqlite3.DatabaseError("its rows are out of order")
+            last = row[0]
             rows.append(row)
             size += len(row[3]) if isinstance(row[3], (bytes, str)) else 0
             if size > _BLOCK:
@@ -190,6 +193,7 @@ class _SqliteFile:
             f"group_concat(char(topic_id + 1, length(data) + 1), '') {source}"
         )
         text, self._database.text_factory = self._database.text_factory, bytes
+        before = last
         try:
             last, data, times, codes = self._database.execute(query, (last,)).fetchone()
             points = np.frombuffer(codes.decode("utf-8").encode("utf-32-le"), np.uint32)
@@ -200,7 +204,7 @@ class _SqliteFile:
         pairs = points.astype(np.int64) - 1
         topic, length = pairs[0::2], pairs[1::2]
         digits, rest = divmod(len(times) + 1, topic.size)
-        if topic.size != length.size or len(data) != length.sum() or rest:
+        if topic.size != length.size or len(data) != length.sum() or rest or last <= before:
             return None
         table = np.frombuffer(times + b",", np.uint8).reshape(topic.size, digits).T
         if (table[-1] != ord(",")).any() or (table[:-1] < ord("0")).any():

@@ -9,6 +9,7 @@ import pytest
 
 from smp_motor_ident.bag import read_records
 from smp_motor_ident.errors import BagError
+from smp_motor_ident.record import Record
 
 N = 400
 T = 0.01 * np.arange(N)
@@ -58,6 +59,37 @@ def test_nothing_is_left_out_of_what_motors_do(tmp_path: Path, shape: str) -> No
     assert "impossible_jump" not in codes(
         read_records(path, ["voltage=u velocity=y time=t"])["motor"]
     )
+
+
+COUNT = np.rint(np.cumsum(motion()) * 0.01 * 500 / (2 * np.pi)).astype(np.int64)
+
+
+def read_count(path: Path, count: np.ndarray, bits: int = 0) -> Record:
+    rows = zip(T.tolist(), U.tolist(), count.tolist())
+    path.write_text("t,u,n\n" + "\n".join(f"{t!r},{u!r},{n}" for t, u, n in rows))
+    mapping = f"voltage=u count=n time=t counts_per_revolution=500 encoder_bits={bits}"
+    return read_records(path, [mapping])["motor"]
+
+
+@pytest.mark.parametrize("spoilt", [-(1 << 62), 3 << 40, 3 << 20])
+def test_a_count_that_jumps_impossibly_is_left_out_with_its_sample(
+    tmp_path: Path, spoilt: int
+) -> None:
+    count = COUNT.copy()
+    count[150] += spoilt
+    record = read_count(tmp_path / "log.csv", count)
+    assert "impossible_jump" in codes(record)
+    assert record.count is not None
+    np.testing.assert_array_equal(record.count, np.delete(COUNT, 150))
+
+
+def test_a_counter_that_turns_to_and_fro_where_it_wraps_loses_no_sample(tmp_path: Path) -> None:
+    to_and_fro = np.rint(30 * np.sin(0.4 * np.arange(N))).astype(np.int64)
+    to_and_fro[: N // 2] = 1000  # most of its steps are none
+    record = read_count(tmp_path / "log.csv", to_and_fro % (1 << 16), 16)
+    assert "impossible_jump" not in codes(record)
+    assert record.count is not None and record.count.size == N
+    np.testing.assert_array_equal(np.diff(record.count), np.diff(to_and_fro))
 
 
 @pytest.mark.parametrize("kind", ["armature", "offset", "without sign", "supply"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import sqlite3
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -73,6 +74,25 @@ def test_a_sqlite_file_cut_at_every_kilobyte(tmp_path: Path, corpus: SimpleNames
     path = corpus.write_sqlite(tmp_path / "bag.db3", truth.messages())
     # The first seven of its twenty pages hold no messages: by the bytes, those of 140.
     assert_every_cut_is_sound(path.read_bytes(), path, 400, 140)
+
+
+def test_rows_that_are_out_of_order_are_not_read_for_ever(
+    tmp_path: Path, corpus: SimpleNamespace
+) -> None:
+    path = corpus.write_sqlite(tmp_path / "bag.db3", corpus.motion(n=400).messages())
+    database = sqlite3.connect(path)
+    last = max(database.execute("SELECT max(id) FROM messages").fetchone())
+    database.execute("UPDATE messages SET data = '' WHERE id = ?", (last,))  # no message
+    database.commit()
+    database.close()
+    # Its key, a varint of two bytes before a header of five numbers, becomes that of the first.
+    high, low = divmod(last, 128)
+    key, header = bytes([0x80 + high, low]), bytes([5, 0])
+    spoilt = path.read_bytes()
+    assert key + header in spoilt
+    path.write_bytes(spoilt.replace(key + header, b"\x80\x01" + header))
+    samples, words = samples_and_words(path)
+    assert samples >= 399 and "out of order" in words
 
 
 @pytest.mark.parametrize("pack", [zstandard.ZstdCompressor().compress, lz4.frame.compress])

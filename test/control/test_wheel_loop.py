@@ -1,0 +1,168 @@
+"""A wheel's loop: where its speed comes from, and what a change of its settings keeps.
+
+Steps of 1/64 s, so that times are exact; the speeds are counted out by the tests.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from smp_motor_control.encoder import Encoder
+from smp_motor_control.errors import ParameterError
+from smp_motor_control.motor.model import MotorModel
+from smp_motor_control.motor.parameters import Gearbox
+from smp_motor_control.observer import ObserverNoise
+from smp_motor_control.pid import PidGains
+from smp_motor_control.reference.profile import ProfileLimits
+from smp_motor_control.wheel import loop as loops
+from smp_motor_control.wheel.loop import LoopSettings, WheelLoop
+
+DT, RATIO = 1.0 / 64.0, 2.0
+ENCODER = Encoder(64.0)
+A_COUNT = 2.0 * math.pi / 64.0 / RATIO  # [rad] at the wheel
+MODEL = MotorModel(dc_gain=25.0, time_constant=0.05)
+LEARNT = 20
+"""Samples from which the observer learns the usual interval."""
+
+
+def make(source: str, **changes: object) -> WheelLoop:
+    settings = LoopSettings(speed_source=source, model=MODEL, difference_window=2)
+    return WheelLoop(replace(settings, **changes), Gearbox(RATIO), ENCODER, 1.0)
+
+
+def rest(loop: WheelLoop, samples: int, voltage: float = 0.0) -> list[str]:
+    """Let the wheel stand; return where the speeds came from."""
+    sources = []
+    for _ in range(samples):
+        loop.speed(DT, 9.0, 0, voltage)
+        sources.append(loop.source)
+    return sources
+
+
+@pytest.mark.parametrize(
+    ("name", "most"), [("reference_delay", 10.0), ("reference_doubt", 1.0), ("transition_time", 60)]
+)
+def test_times_of_the_reference_are_taken_up_to_their_limits(name: str, most: float) -> None:
+    for value in (0.0, most):
+        assert getattr(LoopSettings(**{name: value}), name) == value
+    for value in (math.nextafter(most, math.inf), -5e-324, math.nan):
+        with pytest.raises(ParameterError, match=name):
+            LoopSettings(**{name: value})
+
+
+def test_a_speed_source_needs_what_it_is_made_of() -> None:
+    assert LoopSettings().difference_window == 4
+    for bad in ({"speed_source": "guess"}, {"difference_window": 0}, {"speed_source": "observer"}):
+        with pytest.raises(ParameterError, match=next(iter(bad))):
+            LoopSettings(**bad)
+    LoopSettings(speed_source="observer", model=MODEL, difference_window=1)
+
+
+def test_nothing_is_asked_and_nothing_differenced_before_the_first_sample() -> None:
+    loop = make("observer")
+    assert (loop.source, loop.reference) == ("measured", (0.0, 0.0, 0.0))
+    unknown = WheelLoop(loop.settings)
+    assert unknown.speed(DT, 1.25, 7, 3.0) == 1.25 and unknown.source == "measured"
+
+
+def test_the_speed_that_is_reported_is_passed_on_whatever_the_counts_say() -> None:
+    loop = make("measured")
+    assert [loop.speed(DT, 1.25, count, 3.0) for count in (0, 500, 7)] == [1.25] * 3
+    assert loop.source == "measured"
+
+
+def test_counts_are_differenced_over_the_window_in_the_time_that_passed() -> None:
+    loop = make("difference")
+    assert math.isnan(loop.speed(DT, 9.0, 1000, 0.0)) and loop.source == "difference"
+    assert loop.speed(DT, 9.0, 1001, 0.0) == pytest.approx(A_COUNT / DT)
+    assert loop.speed(3 * DT, 9.0, 1005, 0.0) == pytest.approx(5 * A_COUNT / (4 * DT))
+    assert loop.speed(DT, 9.0, 1005, 0.0) == pytest.approx(4 * A_COUNT / (4 * DT))
+    loop.reset_speed()
+    assert math.isnan(loop.speed(DT, 9.0, 1005, 0.0))
+    assert rest(make("difference"), 2 * LEARNT) == ["difference"] * 2 * LEARNT
+
+
+def test_the_observer_takes_over_once_it_knows_the_usual_interval(monkeypatch) -> None:
+    told: list[tuple[object, ...]] = []
+    real = loops.SpeedObserver
+    monkeypatch.setattr(loops, "SpeedObserver", lambda *given: told.append(given) or real(*given))
+    loop = make("observer")
+    for k in range(LEARNT):  # nine of them shorter: the median is the longer
+        loop.speed(DT if k < 9 else 2 * DT, 9.0, 0, 0.0)
+        assert loop.source == "difference"
+    assert told == [(MODEL, 2 * DT, ENCODER, ObserverNoise(), 2, 1.0)]
+    assert rest(loop, 3) == ["observer"] * 3
+    loop.reset_speed()
+    assert math.isnan(loop.speed(DT, 9.0, 500, 0.0)) and len(told) == 1
+    assert loop.speed(DT, 9.0, 500, 0.0) == 0.0 and loop.source == "observer"
+
+
+def test_an_observer_that_the_counts_contradict_gives_way_to_them() -> None:
+    loop = make("observer")
+    sources = rest(loop, LEARNT + 64, voltage=12.0)  # blocked: more load than 1 V
+    assert sources[-1] == "difference (observer not trusted)"
+    assert loop.speed(DT, 9.0, 0, 12.0) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("change", "anew"),
+    [
+        ({"gains": PidGains(p=2.0)}, "observer"),
+        ({"transition_time": 1.0}, "observer"),
+        ({"noise": ObserverNoise(load=2.0)}, "difference"),
+        ({"model": replace(MODEL, dc_gain=30.0)}, "difference"),
+        ({"difference_window": 3}, "difference"),
+        ({"speed_source": "measured"}, "measured"),
+    ],
+)
+def test_the_speeds_source_begins_anew_where_what_shapes_it_changes(change, anew) -> None:
+    loop = make("observer")
+    rest(loop, LEARNT + 1)
+    loop.configure(replace(loop.settings, **change))
+    assert rest(loop, 1) == [anew]
+    if anew == "difference":  # and is learnt from as many samples as at the start
+        assert rest(loop, LEARNT)[-2:] == ["difference", "observer"]
+
+
+def test_new_limits_of_the_reference_hold_from_the_next_set_point() -> None:
+    slow, quick = (LoopSettings(limits=ProfileLimits(acceleration=a)) for a in (1.0, 4.0))
+    changed, made = WheelLoop(slow), WheelLoop(quick)
+    changed.configure(quick)
+    for loop in (changed, made):
+        loop.start(0.0)
+        for _ in range(16):
+            loop.step(9.0, 0.0, DT)
+    # A quarter of a second at 4 rad/s^2.
+    assert changed.reference == made.reference and made.reference.velocity == pytest.approx(1.0)
+
+
+def test_a_delayed_reference_is_the_one_of_that_long_ago() -> None:
+    seen = []
+    for samples in (2, 6):
+        limits = ProfileLimits(acceleration=1.0)
+        gains = PidGains(p=2.0)
+        loop = WheelLoop(LoopSettings(gains=gains, limits=limits, reference_delay=samples * DT))
+        loop.start(0.0)
+        seen.append([])
+        for _ in range(32):
+            answer = loop.step(9.0, 0.0, DT)
+            seen[-1].append(loop.reference.velocity)
+            assert answer.output == 2.0 * loop.reference.velocity
+    assert seen[1][4:] == pytest.approx(seen[0][:-4]) and seen[0][-1] > 0.25
+
+
+def test_switching_the_delay_on_begins_its_past_at_the_present_reference() -> None:
+    for before, after in ((0.0, 8 * DT), (8 * DT, 0.0), (8 * DT, 4 * DT)):
+        limits = ProfileLimits(acceleration=1.0)
+        loop = WheelLoop(LoopSettings(limits=limits, reference_delay=before))
+        loop.start(0.0)
+        for _ in range(32):
+            loop.step(9.0, 0.0, DT)
+        then = loop.reference.velocity
+        loop.configure(replace(loop.settings, reference_delay=after))
+        loop.step(9.0, 0.0, DT)
+        # No further than the acceleration goes in the samples by which the delay is changed.
+        assert abs(loop.reference.velocity - then) <= 6 * DT
