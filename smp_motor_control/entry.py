@@ -58,7 +58,16 @@ def missing(error: ModuleNotFoundError) -> str:
         return "smp_interfaces is not built or not sourced; build both packages of the repository"
     if name in ("rclpy", "launch", *_ROS) or name.endswith("_msgs"):
         return f"{name} is not there; source ROS 2 Jazzy and the workspace, or setup.bash"
-    return f"the Python package {name} is not installed; type: pip install {_PIP.get(name, name)}"
+    return f"the Python package {name} is not installed; type: {_pip()} {_PIP.get(name, name)}"
+
+
+def _pip() -> str:
+    """Return the command that installs: Ubuntu's Python refuses pip without an option (PEP 668)."""
+    import sysconfig
+
+    marker = os.path.join(sysconfig.get_path("stdlib"), "EXTERNALLY-MANAGED")
+    marked = sys.prefix == sys.base_prefix and os.path.isfile(marker)
+    return f"pip install{' --break-system-packages' if marked else ''}"
 
 
 def node(name: str, package: str = "smp_motor_control") -> Callable[[], int]:

@@ -252,8 +252,9 @@ def test_wheel_without_a_name_and_parameters_that_make_no_sense_are_refused(proc
         assert words in node.output and len(node.output.strip().splitlines()) == 1
 
 
-def test_unknown_parameter_is_warned_of_with_the_nearest_known_name(start, eventually):
+def test_unknown_parameter_and_missing_gains_are_warned_of(start, eventually):
     node = start("max_velocty:=1.0")
+    eventually(lambda: "no gains were given: p is 1 V s/rad" in node.output, 5.0)
     words = "unknown parameter 'max_velocty' is ignored; did you mean 'max_velocity'?"
     eventually(lambda: words in node.output, 5.0)
 

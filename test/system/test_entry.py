@@ -83,6 +83,15 @@ def test_a_package_that_is_not_installed_is_named_with_what_to_type(process, tmp
         assert "Traceback" not in started.output
 
 
+def test_pip_is_told_to_install_beside_the_packages_of_the_system(monkeypatch, tmp_path):
+    monkeypatch.setattr("sysconfig.get_path", lambda name: str(tmp_path))
+    absent = ModuleNotFoundError(name="mcap")
+    monkeypatch.setattr(sys, "prefix", sys.base_prefix)
+    assert entry.missing(absent).endswith("pip install mcap")
+    (tmp_path / "EXTERNALLY-MANAGED").touch()
+    assert entry.missing(absent).endswith("pip install --break-system-packages mcap")
+
+
 @pytest.mark.parametrize("executable", ["wheel_pid", "skid_steer", "excite", "identifier", "play"])
 def test_every_node_has_help(process, executable):
     started = process(executable, "--help")
