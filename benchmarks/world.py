@@ -4,7 +4,8 @@ An independent simulator (`world_motor`) records random motors with one of the e
 `world_effects` in one of three strengths; every estimate is held against the truth.  ``right``:
 no number off by more than 5 of its standard deviations and 2 %, and nothing called unreliable.
 ``cause``: called unreliable, with the effect named; ``other``: with another cause, or none.
-``silent``: off by more than that without a word.
+``silent``: off by more than that without a word.  A warning that names the effect is a word, and
+so is a note that names every number that is off.
 
 Usage: python benchmarks/world.py [--motors 3] [--seed S] [--effects NAME,...] [--processes 2]
        [--rich] [--list]
@@ -73,6 +74,12 @@ def segments(time: np.ndarray) -> tuple[int, ...]:
     return (0, *(int(k) + 1 for k in np.flatnonzero(steps > 10 * np.mean(steps))))
 
 
+def _speaks_of(finding, wrong: dict[str, float]) -> bool:
+    """Tell whether a finding warns, or names every number that is off."""
+    named = str(finding.evidence.get("of_the_scale", "")).split(", ")
+    return finding.severity == "warning" or (bool(wrong) and set(wrong) <= set(named))
+
+
 def judge(job: tuple[int, int, int, bool]) -> tuple[int, str, str]:
     """Simulate and estimate one case; return effect, outcome and words."""
     number, level, seed, rich = job
@@ -107,7 +114,8 @@ def judge(job: tuple[int, int, int, bool]) -> tuple[int, str, str]:
         named = bool(set(codes) & set(effect.causes))
         return number, "cause" if named else "other", words
     if wrong or effect.expect == "refuse":
-        return number, "silent", words
+        said = [f for f in e.findings if f.code in effect.causes and _speaks_of(f, wrong)]
+        return number, "cause" if said else "silent", f"{words} {[f.code for f in said] or ''}"
     return number, "right", words
 
 

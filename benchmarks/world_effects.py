@@ -199,18 +199,20 @@ def _rest(c: Case, level: int) -> None:
     c.stamps["rest"] = (2.0, 5.0, 10.0)[level]
 
 
+ONE_SIZE = "one_size_of_voltage"  # which hides what a driver takes of the voltage
 SPEED = ("speed",)
 COUNTED = ("counts", "angle")
 EFFECTS = (
     Effect("baseline", _nothing),
-    Effect("dead zone", _dead_zone, ("dead_zone", "command_nonlinearity")),
+    Effect("dead zone", _dead_zone, ("dead_zone", "command_nonlinearity", ONE_SIZE)),
     Effect("driver offset", _drive("offset", (0.005, 0.015, 0.04), _volts),
            ("driver_offset", "load")),
-    Effect("supply sag", _drive("source", (0.05, 0.15, 0.4), lambda c: c.motor.R), ("supply_sag",)),
+    Effect("supply sag", _drive("source", (0.05, 0.15, 0.4), lambda c: c.motor.R),
+           ("supply_sag", ONE_SIZE)),
     Effect("battery declines", _drive("decline", (0.01, 0.04, 0.1)), ("drift", "supply_drift")),
     Effect("battery recovers", lambda c, n: c.drive.update(
-        rc=(0.1, 0.3, 0.8)[n] * c.motor.R, rc_time=20 * c.tau), ("supply_sag", "drift")),
-    Effect("clip at the supply", _drive("clip", (0.95, 0.85, 0.7), _volts), ("clip",)),
+        rc=(0.1, 0.3, 0.8)[n] * c.motor.R, rc_time=20 * c.tau), ("supply_sag", "drift", ONE_SIZE)),
+    Effect("clip at the supply", _drive("clip", (0.95, 0.85, 0.7), _volts), ("clip", ONE_SIZE)),
     Effect("coast in every PWM period", _pwm, ("coast",)),
     Effect("coast at zero command", _drive("coast_zero", (1.0, 1.0, 1.0)), ("coast",)),
     Effect("slew limit", lambda c, n: c.drive.update(
@@ -221,7 +223,7 @@ EFFECTS = (
     Effect("duty in few bits", _drive("levels", (127.0, 63.0, 31.0)), ("command_nonlinearity",)),
     Effect("weaker in reverse", _weak, ("asymmetry",)),
     Effect("brush drop", _drive("brush", (0.02, 0.05, 0.12), _volts),
-           ("brush_drop", "command_nonlinearity")),
+           ("brush_drop", "command_nonlinearity", ONE_SIZE)),
     Effect("jitter of stamps", _stamps("jitter", (0.1, 0.3, 0.6), _step), ("timing",)),
     Effect("exponential latency", _stamps("latency", (0.3, 1.0, 3.0), _step), ("timing",)),
     Effect("bursts", _stamps("bursts", (2.0, 4.0, 8.0)), ("timing",)),
@@ -230,9 +232,10 @@ EFFECTS = (
     Effect("rows lost", _stamps("lost", (0.005, 0.02, 0.1)), ("timing",)),
     Effect("first row is the step", _first_row),
     Effect("rest before", _rest),
-    Effect("speed low-passed", _sensor("lowpass", (0.1, 0.3, 1.0), _tau), ("lag", "sensor_lag"),
+    Effect("speed low-passed", _sensor("lowpass", (0.1, 0.3, 1.0), _tau),
+           ("lag", "second_lag"),
            signals=SPEED),
-    Effect("speed averaged", _sensor("window", (2.0, 5.0, 16.0), _step), ("lag", "sensor_lag"),
+    Effect("speed averaged", _sensor("window", (2.0, 5.0, 16.0), _step), ("lag", "averaged_speed"),
            signals=SPEED),
     Effect("speed coarse", _sensor("coarse", (0.01, 0.03, 0.1), lambda c: c.fastest),
            ("resolution",), signals=SPEED),
@@ -266,7 +269,8 @@ EFFECTS = (
     Effect("cogging", _drive("cog", (0.2, 0.6, 1.5), _torque), ("position",)),
     Effect("drag", lambda c, n: c.drive.update(
         drag=(0.02, 0.08, 0.25)[n] * _stall_torque(c) / c.fastest**2), ("drag",)),
-    Effect("constant load", _drive("load", (0.2, 0.6, 1.2), _torque), ("load",)),
+    Effect("constant load", _drive("load", (0.2, 0.6, 1.2), _torque),
+           ("load", "one_direction")),
     Effect("load step", lambda c, n: c.drive.update(
         load_step=(0.2, 0.6, 1.2)[n] * c.motor.tc, load_time=0.55 * c.samples * c.step),
         ("drift", "load")),

@@ -155,7 +155,7 @@ def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) 
     result = answer(chosen, request.known, friction_std, _level(final))
     result, alike = _covering(data, candidates, result, request.known)
     fitted = validate.speed_fit(group, final, chosen)
-    refuse(group, chosen, result, fitted)
+    refuse(group, final, chosen, result, fitted)
     request.say("validating")
     own, common = _validation(group, request, final, chosen, hold)
     percent = FitPercent(fitted, own)
@@ -165,7 +165,7 @@ def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) 
         *assess(final, chosen, FitPercent(fitted, common), tests),
         *adequacy(final, chosen, stated(chosen, result), group[0].hardware.gear_ratio, tests),
         *advise(chosen, result, request.known),
-        *scope(final, result, change, alike),
+        *scope(final, result, change, alike, group[0].hardware.resistance),
     ]
     return Estimate(
         model=_name(chosen.structure),

@@ -17,7 +17,9 @@ from smp_motor_ident.diagnosis.limits import (
     SQUARE_LEVEL,
     STEADY,
     UNEXPLAINED,
+    WINDING_LAG,
 )
+from smp_motor_ident.diagnosis.validation import within_resolution
 from smp_motor_ident.estimation import prediction, shape_constraint
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.quantities import Answer
@@ -39,9 +41,10 @@ def assess(data: Experiments, fit: Fit, percent: FitPercent, tests: ResidualTest
     """
     return [
         *_descent(data, fit),
-        *_fit(percent, tests),
+        *_fit(percent, tests, within_resolution(data, fit)),
         *_resolution(data, fit, tests),
         *_sensors(fit),
+        *_second_lag(data, fit),
         *_torque_noise(data, fit),
     ]
 
@@ -59,10 +62,10 @@ def _descent(data: Experiments, fit: Fit) -> list[Finding]:
     ]
 
 
-def _fit(percent: FitPercent, tests: ResidualTests) -> list[Finding]:
+def _fit(percent: FitPercent, tests: ResidualTests, closely: bool) -> list[Finding]:
     out = []
     estimation, validation = percent.estimation or 0.0, percent.validation
-    if estimation < FIT_EXPLAINS.value:
+    if estimation < FIT_EXPLAINS.value and not closely:
         out.append(
             Finding(
                 "poor_fit",
@@ -99,7 +102,7 @@ def _fit(percent: FitPercent, tests: ResidualTests) -> list[Finding]:
 def _resolution(data: Experiments, fit: Fit, tests: ResidualTests) -> list[Finding]:
     out = []
     own = data.quantum**2 / 12
-    beyond = 0 < UNEXPLAINED.value * own < fit.noise[0, 0] and fit.noise_ratio == 0
+    beyond = own > 0 and fit.noise_ratio == 0 and not within_resolution(data, fit)
     if data.kind == rc.ANGLE and beyond and tests.white is False:
         times = float(np.sqrt(fit.noise[0, 0] / own))
         out.append(
@@ -153,6 +156,30 @@ def _sensors(fit: Fit) -> list[Finding]:
             )
         )
     return out
+
+
+def _second_lag(data: Experiments, fit: Fit) -> list[Finding]:
+    """Say of a speed whose second lag is long for a winding's that it may be the sensor's.
+
+    With time constants T and cT, ``a2 a0 / a1^2 = c / (1 + c)^2``.
+    """
+    if fit.structure.order != 2 or fit.structure.current or data.kind == rc.ANGLE:
+        return []
+    ratio = min(float(np.exp(fit.z[models.A0] + fit.z[models.A2] - 2 * fit.z[models.A1])), 0.25)
+    share = (1 - np.sqrt(1 - 4 * ratio)) / (2 * ratio) - 1
+    if share < WINDING_LAG.value:
+        return []
+    return [
+        Finding(
+            "second_lag",
+            "warning",
+            f"the speed follows by two lags, the second {share:.2g} of the first: long for a "
+            "winding's, it may be a filter of the speed, which is no part of the motor's time "
+            "constant",
+            {"share": float(share), "limit": WINDING_LAG.value},
+            "switch the filter of the firmware off, or record encoder counts or the current",
+        )
+    ]
 
 
 def _torque_noise(data: Experiments, fit: Fit) -> list[Finding]:

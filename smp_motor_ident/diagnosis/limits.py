@@ -218,6 +218,13 @@ STEADY = Limit(
     "98 % of a step are over",
     "test_estimate.py",
 )
+WINDING_LAG = Limit(
+    0.25,
+    "of the first lag",
+    "physical: that is an L/R of a sixth of R J/K^2; catalogues of brushed motors have less than a "
+    "tenth, and a wheel's inertia makes that smaller",
+    "test_findings.py: a speed that is filtered as slowly as the motor turns",
+)
 SQUARE_LEVEL = Limit(
     0.03,
     "share of the level",

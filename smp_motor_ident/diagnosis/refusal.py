@@ -7,9 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from smp_motor_ident.diagnosis.limits import LARGEST_OFFSET, LOOSE_QUANTITY, WORST_FIT
+from smp_motor_ident.diagnosis.validation import within_resolution
 from smp_motor_ident.errors import CurrentError, InsufficientExcitationError, SignalError
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.quantities import Answer
+from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.record import Record
 
@@ -28,9 +30,12 @@ def no_candidate(group: Sequence[Record]) -> InsufficientExcitationError:
     )
 
 
-def refuse(group: Sequence[Record], fit: Fit, result: Answer, fitted: float) -> None:
+def refuse(
+    group: Sequence[Record], data: Experiments, fit: Fit, result: Answer, fitted: float
+) -> None:
     """Refuse what the model does not explain, and what the data hardly tell."""
-    if not np.isfinite(fitted) or fitted < WORST_FIT.value:
+    explained = np.isfinite(fitted) and fitted >= WORST_FIT.value
+    if not explained and not within_resolution(data, fit):
         raise SignalError(
             f"{where(group)}: the voltage does not explain the motion (fit {fitted:.0f} %); check "
             "that voltage and encoder belong to the same motor, and that nothing else drives it"

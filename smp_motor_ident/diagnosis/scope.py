@@ -7,21 +7,26 @@ from collections.abc import Mapping
 import numpy as np
 
 from smp_motor_ident.diagnosis.effects import EFFECTS
-from smp_motor_ident.diagnosis.limits import REST, SAME_LEVEL
+from smp_motor_ident.diagnosis.limits import IMPLIED_BIAS, RESISTANCE_BAND, REST, SAME_LEVEL
 from smp_motor_ident.estimation.quantities import Answer
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import Experiments
 
 
 def scope(
-    data: Experiments, result: Answer, change: Mapping[str, float], alike: Mapping[str, float]
+    data: Experiments,
+    result: Answer,
+    change: Mapping[str, float],
+    alike: Mapping[str, float],
+    ohmmeter: float | None,
 ) -> list[Finding]:
     """Return what a reader must know of the values' meaning."""
-    out = [] if result.level else _one_size(data)
+    out = [] if result.level else [*_one_size(data), *_one_direction(data, result)]
     if alike:
         out.append(_alike(alike))
     if result.level:
         out.append(_one_level(result))
+    out += _current_scale(result, ohmmeter)
     if change:
         out.append(
             Finding(
@@ -68,6 +73,60 @@ def _one_size(data: Experiments) -> list[Finding]:
             "the numbers hold for the voltage as it was recorded",
             {"voltage": top},
             "record the voltage at the motor's terminals, or add levels of other sizes",
+        )
+    ]
+
+
+def _one_direction(data: Experiments, result: Answer) -> list[Finding]:
+    """Say that friction and a constant load are one voltage where the motor turns one way only."""
+    if data.hold_value.min() < 0 < data.hold_value.max() or "load_voltage" in result.combinations:
+        return []
+    return [
+        Finding(
+            "one_direction",
+            "warning",
+            "the motor was driven one way only: static_voltage is friction and a constant load "
+            "together, and the other way may have its own",
+            {"voltage": float(data.hold_value[np.argmax(np.abs(data.hold_value))])},
+            "drive both directions",
+        )
+    ]
+
+
+OF_SCALE = ("resistance", "inductance", "inertia", "viscous_friction", "coulomb_friction")
+"""``v = R i + L di/dt + K w`` and ``J dw/dt = K i - ...``: with a current that is s times too
+large the same motion and voltage are those of R/s, L/s, s J, s b and s Tc, and of the same K."""
+
+
+def _current_scale(result: Answer, ohmmeter: float | None) -> list[Finding]:
+    """Say what only the current's own scale determines, held against an ohmmeter if there is one.
+
+    No record of voltage, current and motion shows that scale.
+    """
+    known = {n: q for n in OF_SCALE if (q := result.parameters[n]).status == "estimated"}
+    if not known:
+        return []
+    words = f"{', '.join(known)} hold to the scale of the current's sensor, which no record shows"
+    found = known.get("resistance")
+    if found is None or found.value is None or not ohmmeter:
+        advice = "state the resistance by ohmmeter (`resistance`), which shows the scale"
+        evidence: dict[str, float | str | None] = {"of_the_scale": ", ".join(known)}
+        return [Finding("current_scale", "note", words, evidence, advice)]
+    scale = ohmmeter / found.value
+    off = (
+        abs(scale - 1)
+        > RESISTANCE_BAND.value + IMPLIED_BIAS.value * (found.std or 0.0) / found.value
+    )
+    return [
+        Finding(
+            "current_scale",
+            "unreliable" if off else "note",
+            f"{words}: by the ohmmeter's {ohmmeter:.4g} ohm it is {scale:.3g}",
+            {"scale": scale, "ohmmeter": ohmmeter, "of_the_scale": ", ".join(known)},
+            "calibrate the current's sensor, or measure the resistance warm, at the current that "
+            "drives"
+            if off
+            else "",
         )
     ]
 

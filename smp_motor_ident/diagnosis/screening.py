@@ -120,11 +120,14 @@ def _starts(record: Record) -> bool:
     """Tell whether a speed rises under a constant voltage: a step before the first row."""
     speed = measured_speed(record)
     speed = np.abs(speed[np.isfinite(speed)])
-    tenth = max(speed.size // 10, 1)
-    steady = float(np.mean(speed[-tenth:]))
-    scatter = float(np.std(speed[-tenth:]))
-    first = float(np.mean(speed[: max(tenth // 10, 3)]))
-    return bool(speed.size >= FEWEST.value and steady - first > max(0.2 * steady, 6 * scatter))
+    if speed.size < FEWEST.value:
+        return False
+    # Means over as many samples: the rounding of counts between two samples is not the motion's.
+    run = max(speed.size // 100, 3)
+    runs = speed[: speed.size // run * run].reshape(-1, run).mean(axis=1)
+    last = runs[-max(runs.size // 5, 3) :]
+    steady = float(last.mean())
+    return steady - float(runs[0]) > max(0.2 * steady, 6 * float(last.std()))
 
 
 def measured_speed(record: Record) -> Array:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from smp_motor_ident.diagnosis.limits import UNEXPLAINED
 from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.likelihood import recursion as rc
@@ -50,6 +51,12 @@ def speed_fit(
         reported = percent(velocity, at_once, scatter), percent(velocity, means, scatter)
         best = max([best, *(x for x in reported if np.isfinite(x))])
     return best
+
+
+def within_resolution(data: Experiments, fit: Fit) -> bool:
+    """Tell whether the free run follows a counter as closely as its rounding lets anything."""
+    own = UNEXPLAINED.value * data.quantum**2 / 12
+    return data.kind == rc.ANGLE and fit.noise_ratio == 0 and bool(fit.noise[0, 0] < own)
 
 
 def _lag(data: Experiments, angle: Array) -> int:

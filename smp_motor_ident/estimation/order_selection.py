@@ -61,6 +61,7 @@ def explore(
             return []
         best = found
     best = _variations(data, best, options, candidates, say)
+    best = _orders_again(data, best, options, candidates, say)
     reason = next((r.reason for r in candidates if r.fit is best), "")
     return [r for r in candidates if r.fit is not best] + [FittedCandidate(best, reason)]
 
@@ -276,6 +277,37 @@ def _variations(
         if verdict:
             best = other
     return _without_friction(data, best, options, candidates)
+
+
+def _orders_again(
+    data: Experiments, best: Fit, options: Options, candidates: list[FittedCandidate], say: Say
+) -> Fit:
+    """Hold the other orders against the choice once more, with the load that was found since.
+
+    A load that is left out hides what tells them apart.
+    """
+    s = best.structure
+    if s.current or not s.load:
+        return best
+    for known in [r.fit for r in candidates if r.whole and not r.fit.structure.load]:
+        structure = known.structure.with_(load=True, friction=s.friction)
+        if any(r.fit.structure == structure for r in candidates):
+            continue
+        say(f"trying {label(structure)}")
+        z = known.z.copy()
+        volts = [models.VC_PLUS, models.VC_MINUS, models.LOAD]
+        z[volts] = best.z[volts]
+        start = replace(known, noise=best.noise, noise_ratio=best.noise_ratio)
+        other = descent.refine(of_kind(data, known), structure, start, z, options)
+        other = no_worse(of_kind(data, known), other, [best], options)
+        if size(structure) < size(s):
+            verdict, reason = preferred(other, best)
+            better = not verdict
+        else:
+            better, reason = preferred(best, other)
+        candidates.append(FittedCandidate(other, reason))
+        best, s = (other, structure) if better else (best, s)
+    return best
 
 
 def _worth_a_fit(data: Experiments, best: Fit, richer: Structure) -> bool:

@@ -26,6 +26,7 @@ from smp_motor_ident.estimation.fitted import NORMAL_95, Profile
 from smp_motor_ident.estimation.prediction import simulate
 from smp_motor_ident.estimation.ridge import slower_winding
 from smp_motor_ident.likelihood.experiments import Experiments
+from smp_motor_ident.likelihood.passes import own_columns
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import to_internal
 
@@ -91,7 +92,9 @@ def one_level(data: Experiments, fit: Fit) -> bool:
     moving = np.abs(speed) > REST.value * np.abs(speed).max()
     driven = (data.hold_value[index] * np.sign(speed))[moving]  # braking is another level
     level = float(np.median(driven)) if driven.size else 0.0
-    return bool(np.all(np.abs(driven - level) <= SAME_LEVEL.value * level))
+    other = int(np.count_nonzero(np.abs(driven - level) > SAME_LEVEL.value * level))
+    # As many samples as a segment's own state has coordinates tell that state, and no more.
+    return other <= len(own_columns(data, fit.structure)) * (data.starts.size - 1)
 
 
 def _followed(

@@ -8,7 +8,7 @@ import pytest
 
 from smp_motor_ident.errors import DesignError, SignalError
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.record import Record
+from smp_motor_ident.record import Hardware, Record
 from smp_motor_ident.tune import Loop, design
 
 TRUTH = {"dc_gain": 15.0, "time_constant": 0.12, "static_voltage": 2.0}
@@ -53,6 +53,8 @@ def test_two_levels_know_gain_and_friction_apart():
         assert q.value is not None, name
         assert abs(q.value - TRUTH[name]) < 4 * q.std, name
     assert "steady_speed" not in found.combinations
+    # One way only: a load as large as half of the friction would have been friction, too.
+    assert "one_direction" in [f.code for f in found.findings if f.severity == "warning"]
 
 
 def test_rest_before_the_excitation_changes_nothing():
@@ -99,3 +101,40 @@ def test_a_voltage_of_one_size_says_that_a_clip_would_not_show(levels, said):
     found = estimate(Record("motor", t, voltage, velocity=noisy))
     assert ("one_size_of_voltage" in [f.code for f in found.findings]) is said
     assert said or found.unreliable  # with another size the clip itself shows
+
+
+def test_the_rounding_of_counts_hides_no_step_in_the_first_row():
+    # 64 counts a turn at 5 kHz: between two samples there is a count or none.
+    t = np.arange(15000) / 5000.0
+    gain, tau, net = 17.5, 0.015, 6.6
+    angle = gain * net * (t - tau * (1 - np.exp(-t / tau)))
+    count = np.floor(angle * 64 / (2 * np.pi) + 0.3).astype(np.int64)
+    hardware = Hardware(1.0, 64.0, 0, 9.0, None)
+    found = estimate(Record("motor", t, np.full(t.size, 6.9), count=count, hardware=hardware))
+    lag = found.combinations["time_constant"]
+    assert abs(lag.value - tau) < 5 * lag.std  # 5 standard deviations: one in 1.7 million
+    assert lag.std < 0.1 * tau
+    assert not found.unreliable
+
+
+def test_a_load_does_not_hide_the_order():
+    # A square of 3.7 V, load of half the friction and a delay of a seventh of a sample: first
+    # order with both, solved exactly between the changes of voltage and of direction.
+    gain, tau, friction, load, rate = 67.0, 0.023, 0.14, 0.08, 200.0
+    fine = 100
+    t = np.arange(760 * fine) / rate / fine
+    v = np.where(np.sin(2 * np.pi * 3.1 * (t[::fine] + 0.01)) > 0, 3.7, -3.7)
+    given = np.r_[np.zeros(fine // 7), np.repeat(v, fine)][: t.size]
+    keep, w, angle, out = np.exp(-1 / rate / fine / tau), 0.0, 0.0, []
+    for volt in given:
+        out.append(angle)
+        w = keep * w + (1 - keep) * gain * (volt - load - friction * np.sign(w or volt))
+        angle += w / rate / fine
+    rng = np.random.default_rng(2)
+    position = np.array(out[::fine]) + 1e-3 * rng.standard_normal(v.size)
+    held = np.r_[0.0, v[:-1]]  # what ran up to each row
+    found = estimate(Record("motor", t[::fine], held, position=position))
+    for name, true in (("dc_gain", gain), ("static_voltage", friction)):
+        q = found.combinations[name]
+        # 4 standard deviations (one in 16,000), and what the grid of the test's solution leaves.
+        assert abs(q.value - true) < 4 * q.std + 2e-3 * true, name
