@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import signal
 import sys
 from collections.abc import Callable
+from types import FrameType
 
 # One thread for linear algebra: our matrices are small, and the library waits for a second
 # thread in a busy loop, which under SCHED_FIFO may never end.
@@ -82,9 +84,24 @@ def node(name: str, package: str = "smp_motor_control") -> Callable[[], int]:
         if name not in ("record", "play") and {"-h", "--help"} & set(sys.argv[1:]):
             sys.argv[1:] = [f"{package}.nodes.{name}"]
             return _program("smp_motor_control.nodes.usage", 0)()
+        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+            signal.signal(signal.SIGINT, _interrupt)
         return program()
 
     return run
+
+
+_interrupts: list[int] = []
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    _interrupts.append(number)
+    raise KeyboardInterrupt
+
+
+def interrupted() -> bool:
+    """Tell whether Ctrl-C came while a node was imported: Python drops it in some callbacks."""
+    return bool(_interrupts)
 
 
 def wrong_domain() -> str:

@@ -119,3 +119,21 @@ def test_ctrl_c_that_a_compiled_module_turns_into_an_import_error_is_ctrl_c(monk
     monkeypatch.setattr(entry.importlib, "import_module", broken)
     with pytest.raises(ImportError, match="undefined symbol"):
         entry._program("smp_motor_control.nodes.wheel_pid", 0)()
+
+
+def test_ctrl_c_that_python_drops_while_importing_ends_a_node(process, tmp_path):
+    (tmp_path / "sitecustomize.py").write_text(
+        "import os, signal, sys\n"
+        "class Dropped:\n"
+        "    def __del__(self):\n"
+        "        os.kill(os.getpid(), signal.SIGINT)\n"
+        "class Finder:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name == 'smp_motor_control.nodes.runtime':\n"
+        "            Dropped()\n"
+        "sys.meta_path.insert(0, Finder())\n"
+    )
+    path = os.pathsep.join([str(tmp_path), os.environ["PYTHONPATH"]])
+    started = process("skid_steer", "--ros-args", env={"PYTHONPATH": path})
+    assert started.wait(30.0) == 0
+    assert "KeyboardInterrupt" in started.output  # Python's word on what it ignored
