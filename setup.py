@@ -70,7 +70,7 @@ setup(
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (
             f"share/{NAME}",
-            ["package.xml", "LICENSE", "README.md", "CHANGELOG.rst", "QUALITY_DECLARATION.md"],
+            ["package.xml", "LICENSE", *glob("*.md"), "CHANGELOG.rst"],
         ),
         (f"share/{NAME}/launch", glob("launch/*.launch.py")),
         (f"share/{NAME}/config", glob("config/*")),

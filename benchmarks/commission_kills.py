@@ -3,11 +3,12 @@
     python benchmarks/commission_kills.py                   # fifty kills, seed of the day
     python benchmarks/commission_kills.py --kills 5 --seed 3
 
-Each time one of the tool's processes (the tool, ``excite``, ``record``) drawn at random is killed
-by SIGKILL.  What must hold: the motors get 0 V within 0.3 s of the last process that drove them,
-as their samples say; the controllers are active again within 5 s of the tool's end; no process of
-it is left but the guard, and that ends too; no wheel ever hears commands other than zero of two
-writers within 0.2 s.  Times are for a machine with a processor to spare: --slack gives more.
+Each time one of the tool's processes (the tool, ``excite``, ``record``) drawn at random is hit by
+SIGKILL, SIGTERM or SIGINT. What must hold: the motors get 0 V within 0.3 s of the last process
+that drove them, as their samples say; the controllers are active again within 5 s of the tool's
+end; no process of it is left but the guard, and that ends too; no wheel ever hears commands other
+than zero of two writers within 0.2 s. Times are for a machine with a processor to spare: --slack
+gives more.
 """
 
 from __future__ import annotations
@@ -32,6 +33,10 @@ WHEELS = ("front_left", "rear_left")
 QUIET = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "stdin": subprocess.DEVNULL}
 DURATION = 2.0
 """Of each signal [s]; the tool starts its processes, excites three times and then computes."""
+LASTS = {"commission": 60.0, "excite": DURATION + 2.0, "record": 6.0 * DURATION}
+"""Up to how long after its start a part is hit [s]."""
+PARTS = ("commission", "commission", "excite", "record")
+SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 
 
 def session(leader: int) -> dict[int, str]:
@@ -112,15 +117,18 @@ class Campaign:
             ["commission", "--output", str(folder), "--duration", str(DURATION), "--yes", *given],
             start_new_session=True, **QUIET,
         )  # type: ignore[call-overload]  # fmt: skip
-        part = draw.choice(["commission", "commission", "excite", "record"])
-        begun = lambda: any(part in args for args in session(tool.pid).values())  # noqa: E731
-        self.until(lambda: begun() or tool.poll() is not None, 120.0)
-        self.until(lambda: tool.poll() is not None, draw.uniform(0.0, 3.0 * DURATION + 6.0))
-        found = [pid for pid, args in session(tool.pid).items() if part in args]
-        for pid in found or [tool.pid]:
-            if tool.poll() is None or pid != tool.pid:
-                os.kill(pid, signal.SIGKILL)
-        moment = f"{part} killed {'at' if found else 'after'} its time"
+        part, number = draw.choice(PARTS), draw.choice(SIGNALS)
+        ended = lambda: tool.poll() is not None  # noqa: E731
+        here = lambda: [p for p, args in session(tool.pid).items() if part in args]  # noqa: E731
+        found: list[int] = []
+        # A part that ends before its moment is met again when it is next started.
+        while not found and not ended():
+            self.until(lambda: here() or ended(), 120.0)
+            self.until(ended, draw.uniform(0.0, LASTS[part]))
+            found = here()
+        for pid in found:
+            os.kill(pid, number)
+        moment = f"{part} {'hit by' if found else 'ended before'} {number.name}"
         return moment, self.judge(tool, bool(found) and part == "excite")
 
     def judge(self, tool: Any, drives_no_more: bool) -> str:

@@ -12,10 +12,10 @@ mkdir -p "$workspace/src"
 git -C "$root" archive HEAD --prefix=smp/ | tar -x -C "$workspace/src"
 cd "$workspace"
 # Nothing of this repository's own build is seen; its Python environment, where there is one, stands in for apt and pip.
-clean=$(tr ':' '\n' <<<"${AMENT_PREFIX_PATH:-}" | grep -v "^$root/install" | paste -sd: || true)
-export AMENT_PREFIX_PATH=$clean CMAKE_PREFIX_PATH=$clean
-unset COLCON_PREFIX_PATH PYTHONPATH
-[ -z "${ROS_DISTRO:-}" ] || . "${clean%%:*}/setup.bash"
+clean() { tr ':' '\n' <<<"$1" | grep -vE "^($root/(install|build)|\$)" | paste -sd: || true; }
+for variable in AMENT_PREFIX_PATH PYTHONPATH; do export "$variable=$(clean "${!variable:-}")"; done
+export CMAKE_PREFIX_PATH=$AMENT_PREFIX_PATH
+unset COLCON_PREFIX_PATH
 options=(--cmake-args "-DPython3_EXECUTABLE=$(command -v python3)")
 
 if command -v rosdep >/dev/null; then

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import signal
 import sys
 from collections.abc import Callable
+from types import FrameType
 
 # One thread for linear algebra: our matrices are small, and the library waits for a second
 # thread in a busy loop, which under SCHED_FIFO may never end.
@@ -58,7 +60,16 @@ def missing(error: ModuleNotFoundError) -> str:
         return "smp_interfaces is not built or not sourced; build both packages of the repository"
     if name in ("rclpy", "launch", *_ROS) or name.endswith("_msgs"):
         return f"{name} is not there; source ROS 2 Jazzy and the workspace, or setup.bash"
-    return f"the Python package {name} is not installed; type: pip install {_PIP.get(name, name)}"
+    return f"the Python package {name} is not installed; type: {_pip()} {_PIP.get(name, name)}"
+
+
+def _pip() -> str:
+    """Return the command that installs: Ubuntu's Python refuses pip without an option (PEP 668)."""
+    import sysconfig
+
+    marker = os.path.join(sysconfig.get_path("stdlib"), "EXTERNALLY-MANAGED")
+    marked = sys.prefix == sys.base_prefix and os.path.isfile(marker)
+    return f"pip install{' --break-system-packages' if marked else ''}"
 
 
 def node(name: str, package: str = "smp_motor_control") -> Callable[[], int]:
@@ -73,9 +84,24 @@ def node(name: str, package: str = "smp_motor_control") -> Callable[[], int]:
         if name not in ("record", "play") and {"-h", "--help"} & set(sys.argv[1:]):
             sys.argv[1:] = [f"{package}.nodes.{name}"]
             return _program("smp_motor_control.nodes.usage", 0)()
+        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+            signal.signal(signal.SIGINT, _interrupt)
         return program()
 
     return run
+
+
+_interrupts: list[int] = []
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    _interrupts.append(number)
+    raise KeyboardInterrupt
+
+
+def interrupted() -> bool:
+    """Tell whether Ctrl-C came while a node was imported: Python drops it in some callbacks."""
+    return bool(_interrupts)
 
 
 def wrong_domain() -> str:

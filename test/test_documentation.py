@@ -363,10 +363,12 @@ def test_the_page_of_nodes_is_what_the_nodes_say():
 
 def test_our_names_in_the_table_of_ros2_controllers_are_parameters():
     text = (ROOT / "docs/howto/ros2-controllers.md").read_text()
-    for node, part in zip(("skid_steer", "wheel_pid"), text.split("\n## ")[1:], strict=True):
+    topics = set(re.findall(r"`([\w/<>~]+)`", (ROOT / "docs/nodes.md").read_text())) | {"/tf"}
+    names = known("skid_steer"), known("wheel_pid"), topics
+    for there, part in zip(names, text.split("\n## ")[1:], strict=True):
         rows = [line.split("|") for line in part.splitlines() if line.startswith("| ")][1:]
-        ours = {name for row in rows for name in re.findall(r"`([\w.]+)`", row[2])}
-        assert ours - {"pid_state", "---"} <= known(node)
+        ours = {name for row in rows for name in re.findall(r"`([\w./<>~]+)`", row[2])}
+        assert ours <= there
         assert all(row[2].strip() or row[3].strip() for row in rows)  # nothing without a reason
 
 

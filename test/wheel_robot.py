@@ -6,6 +6,7 @@ import copy
 import math
 import time
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
@@ -103,6 +104,7 @@ class WheelRobot(DomainNode):
         self.diagnoses: list[tuple[float, str, bytes, str]] = []
         self.setpoint: float | None = None
         self._sent = 0.0
+        self._clients: dict[str, Any] = {}
         node = self.node
         for wheel in WHEELS:
             kept = self.states[wheel].append
@@ -161,36 +163,34 @@ class WheelRobot(DomainNode):
 
     def set(self, node: str, **values: object) -> tuple[bool, str]:
         """Set parameters as one; names have __ for a dot."""
-        client = self.node.create_client(
-            SetParametersAtomically, f"/{node}/set_parameters_atomically"
-        )
-        assert client.wait_for_service(10.0)
         parameters = [
             Parameter(name.replace("__", "."), value=value).to_parameter_msg()
             for name, value in values.items()
         ]
-        result = self._call(client, SetParametersAtomically.Request(parameters=parameters)).result
+        request = SetParametersAtomically.Request(parameters=parameters)
+        name = f"/{node}/set_parameters_atomically"
+        result = self._call(SetParametersAtomically, name, request).result
         return result.successful, result.reason
 
     def transition(self, node: str, name: str) -> bool:
-        client = self.node.create_client(ChangeState, f"/{node}/change_state")
-        assert client.wait_for_service(10.0)
         number = getattr(Transition, f"TRANSITION_{name.upper()}")
         request = ChangeState.Request(transition=Transition(id=number))
-        return bool(self._call(client, request).success)
+        return bool(self._call(ChangeState, f"/{node}/change_state", request).success)
 
     def trigger(self, node: str, service: str) -> str:
         """Call a ``std_srvs/Trigger`` of a node; return what it answers."""
-        client = self.node.create_client(Trigger, f"/{node}/{service}")
-        assert client.wait_for_service(10.0)
-        return str(self._call(client, Trigger.Request()).message)
+        return str(self._call(Trigger, f"/{node}/{service}", Trigger.Request()).message)
 
-    def _call(self, client: object, request: object) -> object:
+    def _call(self, kind: object, name: str, request: object) -> object:
+        # Kept: a client must be discovered anew each time that it is made.
+        if name not in self._clients:
+            self._clients[name] = self.node.create_client(kind, name)
+        client = self._clients[name]
+        assert client.wait_for_service(10.0)
         future = client.call_async(request)
         end = time.monotonic() + 10.0
         while not future.done() and time.monotonic() < end:
             self.spin()
-        self.node.destroy_client(client)
         if not future.done():
-            pytest.fail(f"{client.srv_name} does not answer")
+            pytest.fail(f"{name} does not answer")
         return future.result()

@@ -23,6 +23,7 @@ from rclpy.lifecycle import LifecycleNode
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
+from smp_motor_control.entry import interrupted
 from smp_motor_control.errors import SmpError
 from smp_motor_control.nodes.conventions import (
     LATCHED,
@@ -121,6 +122,8 @@ def run(name: str, make: Callable[[], Node], argv: list[str] | None = None) -> i
     _stop = stop = _Stop()
     # rclpy's own handlers would shut the context down, and with it the way to send a zero.
     stop.watch_signals()
+    if interrupted():
+        return 0
     arguments = [name, *(sys.argv[1:] if argv is None else argv)]
     node: Node | None = None
     try:

@@ -20,7 +20,7 @@ from smp_motor_control.errors import ParameterError
 from smp_motor_control.motor.parameters import Gearbox
 from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.motor_writer import MotorWriter
-from smp_motor_control.nodes.settings import Parameters
+from smp_motor_control.nodes.settings import Parameters, given_parameters
 from smp_motor_control.nodes.wheel_report import WheelReport, pid_state
 from smp_motor_control.nodes.wheel_settings import Settings
 from smp_motor_control.wheel.controller import WheelController, WheelSettings
@@ -44,6 +44,11 @@ class WheelPid(LifecycleNode):
         if self._joint == "_wheel_joint":
             raise ParameterError(
                 "wheel_pid needs joint_name, or a wheel's namespace: -r __ns:=/front_left"
+            )
+        if not {"p", "i", "feedforward_velocity"} & given_parameters(self).keys():
+            self.get_logger().warning(
+                f"no gains were given: p is {settings.wheel.loop.gains.p:g} V s/rad, the rest 0; "
+                "start it with --params-file gains.yaml, which tune writes"
             )
         self._change(settings)
         self._entities: list[Any] = []

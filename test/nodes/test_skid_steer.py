@@ -23,6 +23,7 @@ BEHAVIOUR = json.loads(
 
 def test_only_a_sound_and_fresh_command_starts_the_wheels(skid_steer, peer, eventually) -> None:
     started = skid_steer()
+    eventually(lambda: peer.diagnosis(""), deadline=5.0, step=peer.spin)
     for _ in range(8):
         peer.command(math.nan, 0.0)
         peer.command(0.0, math.inf)
@@ -56,8 +57,10 @@ def test_command_turns_all_four_wheels_and_its_timeout_stops_them(
     seen = {value for message in peer.setpoints[before:] for value in message.velocity}
     assert seen == {-2.0, 2.0}
     # Then cmd_vel_timeout, 0.5 s, from the last sound message on, whatever else comes.
+    peer.setpoints.clear()
     sent = time.monotonic()
     peer.command(0.0, 1.0)
+    eventually(lambda: peer.drives(-2.0, 2.0), deadline=2.0, step=peer.spin)
     repeatedly(
         peer,
         lambda: peer.command(math.nan, math.inf),

@@ -140,10 +140,8 @@ def test_watchdogs_and_lifecycle_end_in_a_zero_command(start, robot, eventually)
     node = start("p:=2.0", "setpoint_timeout:=0.3", "feedback_timeout:=0.3")
     feed = Feed(robot, eventually)
     settle(robot, feed)
-    eventually(lambda: robot.setpoints.get_subscription_count(), 5.0, robot.spin)
-    robot.send_setpoint(1.0)
-    robot.spin_for(0.05)
-    eventually(lambda: feed.sample(0.0) == pytest.approx(2.0), 3.0)
+    drives = lambda: feed.sample(0.0) == pytest.approx(2.0)  # noqa: E731
+    eventually(drives, 5.0, lambda: robot.send_setpoint(1.0))
     begin = time.monotonic()
     eventually(lambda: feed.sample(0.0) == 0.0, 2.0)
     assert time.monotonic() - begin > 0.1  # how soon after: test_controller, on exact times
@@ -159,7 +157,13 @@ def test_watchdogs_and_lifecycle_end_in_a_zero_command(start, robot, eventually)
 
     eventually(lambda: feed.sample(0.0) == pytest.approx(2.0), 3.0)
     assert robot.transition(NODE, "deactivate")
-    robot.spin_for(0.1)
+
+    def silent() -> bool:
+        before = len(feed.commands)
+        robot.spin_for(0.3)
+        return len(feed.commands) == before
+
+    eventually(silent, 5.0)  # the last zeros have come
     assert feed.commands[-1].voltage == 0.0
     answers = len(feed.commands)
     for _ in range(5):
@@ -177,12 +181,12 @@ def test_watchdogs_and_lifecycle_end_in_a_zero_command(start, robot, eventually)
 
 
 def test_parameters_change_as_one_without_a_jump_or_not_at_all(start, robot, eventually):
-    node = start("p:=2.0", "i:=10.0", "u_clamp_max:=12.0", "setpoint_timeout:=30.0")
+    patient = ("setpoint_timeout:=30.0", "feedback_timeout:=10.0")
+    node = start("p:=2.0", "i:=10.0", "u_clamp_max:=12.0", *patient)
     feed = Feed(robot, eventually)
     settle(robot, feed)
-    eventually(lambda: robot.setpoints.get_subscription_count(), 5.0, robot.spin)
-    robot.send_setpoint(1.0)
-    robot.spin_for(0.05)
+    assert robot.set(NODE, p=2.0)[0]  # from here on the service is known
+    eventually(lambda: feed.sample(0.0) > 0.0, 5.0, lambda: robot.send_setpoint(1.0))
     for _ in range(20):
         feed.sample(0.5)
     for values, words in (
@@ -248,8 +252,9 @@ def test_wheel_without_a_name_and_parameters_that_make_no_sense_are_refused(proc
         assert words in node.output and len(node.output.strip().splitlines()) == 1
 
 
-def test_unknown_parameter_is_warned_of_with_the_nearest_known_name(start, eventually):
+def test_unknown_parameter_and_missing_gains_are_warned_of(start, eventually):
     node = start("max_velocty:=1.0")
+    eventually(lambda: "no gains were given: p is 1 V s/rad" in node.output, 5.0)
     words = "unknown parameter 'max_velocty' is ignored; did you mean 'max_velocity'?"
     eventually(lambda: words in node.output, 5.0)
 

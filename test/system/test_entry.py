@@ -83,6 +83,15 @@ def test_a_package_that_is_not_installed_is_named_with_what_to_type(process, tmp
         assert "Traceback" not in started.output
 
 
+def test_pip_is_told_to_install_beside_the_packages_of_the_system(monkeypatch, tmp_path):
+    monkeypatch.setattr("sysconfig.get_path", lambda name: str(tmp_path))
+    absent = ModuleNotFoundError(name="mcap")
+    monkeypatch.setattr(sys, "prefix", sys.base_prefix)
+    assert entry.missing(absent).endswith("pip install mcap")
+    (tmp_path / "EXTERNALLY-MANAGED").touch()
+    assert entry.missing(absent).endswith("pip install --break-system-packages mcap")
+
+
 @pytest.mark.parametrize("executable", ["wheel_pid", "skid_steer", "excite", "identifier", "play"])
 def test_every_node_has_help(process, executable):
     started = process(executable, "--help")
@@ -110,3 +119,21 @@ def test_ctrl_c_that_a_compiled_module_turns_into_an_import_error_is_ctrl_c(monk
     monkeypatch.setattr(entry.importlib, "import_module", broken)
     with pytest.raises(ImportError, match="undefined symbol"):
         entry._program("smp_motor_control.nodes.wheel_pid", 0)()
+
+
+def test_ctrl_c_that_python_drops_while_importing_ends_a_node(process, tmp_path):
+    (tmp_path / "sitecustomize.py").write_text(
+        "import os, signal, sys\n"
+        "class Dropped:\n"
+        "    def __del__(self):\n"
+        "        os.kill(os.getpid(), signal.SIGINT)\n"
+        "class Finder:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name == 'smp_motor_control.nodes.runtime':\n"
+        "            Dropped()\n"
+        "sys.meta_path.insert(0, Finder())\n"
+    )
+    path = os.pathsep.join([str(tmp_path), os.environ["PYTHONPATH"]])
+    started = process("skid_steer", "--ros-args", env={"PYTHONPATH": path})
+    assert started.wait(30.0) == 0
+    assert "KeyboardInterrupt" in started.output  # Python's word on what it ignored

@@ -194,6 +194,20 @@ def test_shell_leaves_discovery_to_its_user(ready, tmp_path):
     assert run(tmp_path, "/usr/bin:/bin", command=("bash", "-c", script)).stdout == "0\n"
 
 
+def test_pytest_works_beside_the_plugin_of_a_sourced_launch_testing(tmp_path):
+    # Its hook takes an argument that pytest 9 no longer gives.
+    (tmp_path / "older.py").write_text("def pytest_pycollect_makemodule(path, parent): ...\n")
+    package = tmp_path / "launch_testing-3.4.3.dist-info"
+    package.mkdir()
+    (package / "METADATA").write_text("Name: launch_testing\nVersion: 3.4.3\n")
+    (package / "entry_points.txt").write_text("[pytest11]\nlaunch_testing = older\n")
+    path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
+    command = [sys.executable, "-m", "pytest", "-q", "--co", "test/system/test_robots.py"]
+    ran = subprocess.run(command, cwd=ROOT, env=os.environ | {"PYTHONPATH": path},
+                         capture_output=True, text=True, timeout=120, check=False)  # fmt: skip
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+
+
 def test_the_root_package_names_what_the_one_below_it_needs():
     """Where rosdep finds a package.xml, it looks no further down."""
 
