@@ -4,8 +4,8 @@ An independent simulator (`world_motor`) records random motors with one of the e
 `world_effects` in one of three strengths; every estimate is held against the truth.  ``right``:
 no number off by more than 5 of its standard deviations and 2 %, and nothing called unreliable.
 ``cause``: called unreliable, with the effect named; ``other``: with another cause, or none.
-``silent``: off by more than that without a word.  A warning that names the effect is a word, and
-so is a note that names every number that is off.
+``silent``: off by more than that and not called unreliable; ``warned`` where at least a warning
+names the effect, or a note names every number that is off.
 
 Usage: python benchmarks/world.py [--motors 3] [--seed S] [--effects NAME,...] [--processes 2]
        [--rich] [--list]
@@ -31,7 +31,7 @@ from world_record import case, measure  # noqa: E402
 
 FAR = 5.0  # standard deviations
 SHARE = 0.02  # of the truth
-OUTCOMES = ("right", "cause", "other", "refused", "silent", "crash")
+OUTCOMES = ("right", "cause", "other", "refused", "warned", "silent", "crash")
 
 
 def truth(c: Case) -> dict[str, tuple[float, float]]:
@@ -115,7 +115,7 @@ def judge(job: tuple[int, int, int, bool]) -> tuple[int, str, str]:
         return number, "cause" if named else "other", words
     if wrong or effect.expect == "refuse":
         said = [f for f in e.findings if f.code in effect.causes and _speaks_of(f, wrong)]
-        return number, "cause" if said else "silent", f"{words} {[f.code for f in said] or ''}"
+        return number, "warned" if said else "silent", f"{words} {[f.code for f in said] or ''}"
     return number, "right", words
 
 
