@@ -69,7 +69,7 @@ def _one_size(data: Experiments) -> list[Finding]:
             "one_size_of_voltage",
             "warning",
             f"all of the voltage has one size, {top:.3g} V: a driver that puts out less of it (a "
-            "dead zone, a drop, a clip at the supply) cannot be told from a motor of another gain; "
+            "dead zone, a drop, a clip at the supply) looks like a motor of another gain; "
             "the numbers hold for the voltage as it was recorded",
             {"voltage": top},
             "record the voltage at the motor's terminals, or add levels of other sizes",

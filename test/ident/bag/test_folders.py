@@ -11,14 +11,21 @@ from smp_motor_ident.bag import read_experiments, read_records
 from smp_motor_ident.errors import BagError
 
 
+@pytest.fixture
+def bag(tmp_path: Path) -> Path:
+    """Return an empty folder."""
+    folder = tmp_path / "bag"
+    folder.mkdir()
+    return folder
+
+
 @pytest.mark.parametrize("storage", ["mcap", "db3"])
 @pytest.mark.parametrize("described", [True, False])
 def test_split_bags_are_one_recording(
-    tmp_path: Path, corpus: SimpleNamespace, storage: str, described: bool
+    bag: Path, corpus: SimpleNamespace, storage: str, described: bool
 ) -> None:
     truth = corpus.motion(n=300)
-    messages, bag = truth.messages(), tmp_path / "bag"
-    bag.mkdir()
+    messages = truth.messages()
     write = corpus.write_mcap if storage == "mcap" else corpus.write_sqlite
     # Ten and more: files must not be taken in the order of their letters.
     parts = [messages[k * 26 : (k + 1) * 26] for k in range(12)]
@@ -32,11 +39,10 @@ def test_split_bags_are_one_recording(
 
 
 def test_a_missing_part_of_a_split_bag_is_told_with_its_messages(
-    tmp_path: Path, corpus: SimpleNamespace
+    bag: Path, corpus: SimpleNamespace
 ) -> None:
     truth = corpus.motion(n=300)
-    messages, bag = truth.messages(), tmp_path / "bag"
-    bag.mkdir()
+    messages = truth.messages()
     corpus.write_mcap(bag / "bag_0.mcap", messages[:101])
     corpus.write_metadata(bag, ["bag_0.mcap", "bag_1.mcap"], messages)
     record = read_records(bag)["front_left"]
@@ -47,11 +53,10 @@ def test_a_missing_part_of_a_split_bag_is_told_with_its_messages(
 
 
 def test_a_damaged_part_of_a_split_bag_costs_only_itself(
-    tmp_path: Path, corpus: SimpleNamespace
+    bag: Path, corpus: SimpleNamespace
 ) -> None:
     truth = corpus.motion(n=300)
-    messages, bag = truth.messages(), tmp_path / "bag"
-    bag.mkdir()
+    messages = truth.messages()
     corpus.write_mcap(bag / "bag_0.mcap", messages[:101])
     (bag / "bag_1.mcap").write_bytes(b"")
     corpus.write_mcap(bag / "bag_2.mcap", messages[201:])
