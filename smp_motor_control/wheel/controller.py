@@ -27,6 +27,7 @@ _EVIDENCE = 0.1
 """Of a longer gap between samples no more counts against the wheel [s]: the driver may have
 switched off by its own time-out meanwhile."""
 _AT_REST = 0.05
+_STANDS = PidOutput(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, False)
 _FRESH, _FIRST, _LATE = Verdict.FRESH, Verdict.FIRST, Verdict.LATE
 
 
@@ -273,6 +274,9 @@ class WheelController:
                 return self._zero(State.FAULT)
         if setpoint is None or self.owner or (recovery.cautious and setpoint == 0.0):
             self._resume = True
+            if setpoint == 0.0 and not self.owner:  # obeyed, without the loop
+                self.loop.reference = self.loop.reference._replace(velocity=0.0)
+                self.answer, self.target, self.measurement = _STANDS, 0.0, measurement
             return self._zero(self._idle(setpoint))
         loop, detector = self.loop, self._detector
         if self._resume:

@@ -213,6 +213,20 @@ def test_nothing_is_driven_at_a_zero_set_point_after_a_runaway():
     assert all(voltage == 0.0 for _, voltage, _ in world.log[found:])
 
 
+def test_wheel_that_stands_after_a_fault_shows_that_it_hears_its_set_point():
+    world = World().run(2.0)
+    world.blocked = True
+    world.until(lambda: world.wheel.recovery.fault is not None, 1.5)
+    world.blocked, world.setpoint = False, 0.0
+    world.until(lambda: world.wheel.recovery.fault is None, 2.0)
+    world.run(0.1)
+    assert world.wheel.recovery.cautious
+    assert world.wheel.answer is not None and world.wheel.answer.output == 0.0
+    assert world.wheel.target == world.wheel.loop.reference.velocity == world.held == 0.0
+    world.setpoint = 1.5
+    world.until(lambda: abs(world.speed - 1.5) < 0.15, 4.0)
+
+
 def test_intact_wheel_may_be_tried_as_often_as_it_was_proven_sound():
     world = World().run(2.0)
     for _ in range(6):
