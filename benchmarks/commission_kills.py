@@ -14,6 +14,7 @@ gives more.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import random
 import signal
@@ -21,6 +22,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import uuid
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -29,6 +31,8 @@ from lifecycle_msgs.srv import GetState
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "test")]
+MARK = "SMP_CAMPAIGN"
+"""Environment variable that the tool hands down to all that it starts."""
 WHEELS = ("front_left", "rear_left")
 QUIET = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "stdin": subprocess.DEVNULL}
 DURATION = 2.0
@@ -39,13 +43,23 @@ PARTS = ("commission", "commission", "excite", "record")
 SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 
 
-def session(leader: int) -> dict[int, str]:
-    """Return the processes of a session by their command lines."""
-    asked = subprocess.run(
-        ["ps", "-s", str(leader), "-o", "pid=,stat=,args="], capture_output=True, text=True
-    )
-    rows = [line.split(None, 2) for line in asked.stdout.splitlines()]
-    return {int(row[0]): row[2] for row in rows if not row[1].startswith("Z")}
+def family(mark: str) -> dict[int, list[str]]:
+    """Return the processes whose environment bears a mark, whichever session they are in."""
+    found = {}
+    for entry in Path("/proc").glob("[0-9]*"):
+        try:
+            bears = f"{MARK}={mark}\0".encode() in (entry / "environ").read_bytes()
+            arguments = (entry / "cmdline").read_bytes().split(b"\0")[:-1]
+        except OSError:  # ended meanwhile, or another user's
+            continue
+        if bears and arguments:  # one that has ended and waits for its parent has none
+            found[int(entry.name)] = [a.decode(errors="replace") for a in arguments]
+    return found
+
+
+def plays(part: str, arguments: list[str]) -> bool:
+    """Return whether a command line is that of an executable."""
+    return any(Path(a).name == part for a in arguments[:2])
 
 
 class Campaign:
@@ -55,7 +69,7 @@ class Campaign:
         from wheel_robot import WheelRobot
 
         self.robot, self.slack = WheelRobot(domain), slack
-        self.tool: subprocess.Popen[bytes] | None = None
+        self.mark = ""
         self.robot.spin_for(2.0)
         if self.robot.node.count_publishers("/front_left/motor_description"):
             sys.exit(f"another robot runs in domain {domain}; choose another ROS_DOMAIN_ID")
@@ -70,12 +84,16 @@ class Campaign:
             sys.exit("the controllers do not become active")
 
     def close(self) -> None:
-        if self.tool is not None and session(self.tool.pid):
-            os.killpg(self.tool.pid, signal.SIGKILL)
+        self.end_family()
         for process in self.processes:
             process.kill()
             process.wait(60.0)
         self.robot.close()
+
+    def end_family(self) -> None:
+        for pid in family(self.mark) if self.mark else ():
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
 
     def until(self, condition: Callable[[], object], within: float) -> bool:
         end = time.monotonic() + within
@@ -113,13 +131,14 @@ class Campaign:
         """Start the tool and kill a part of it; return which, and what did not hold."""
         folder = Path(tempfile.mkdtemp(), "out")
         given = [part for wheel in WHEELS for part in ("--wheel", wheel)]
-        self.tool = tool = subprocess.Popen(
+        self.mark = uuid.uuid4().hex
+        tool = subprocess.Popen(
             ["commission", "--output", str(folder), "--duration", str(DURATION), "--yes", *given],
-            start_new_session=True, **QUIET,
+            env={**os.environ, MARK: self.mark}, start_new_session=True, **QUIET,
         )  # type: ignore[call-overload]  # fmt: skip
         part, number = draw.choice(PARTS), draw.choice(SIGNALS)
         ended = lambda: tool.poll() is not None  # noqa: E731
-        here = lambda: [p for p, args in session(tool.pid).items() if part in args]  # noqa: E731
+        here = lambda: [p for p, args in family(self.mark).items() if plays(part, args)]  # noqa: E731
         found: list[int] = []
         # A part that ends before its moment is met again when it is next started.
         while not found and not ended():
@@ -127,7 +146,8 @@ class Campaign:
             self.until(ended, draw.uniform(0.0, LASTS[part]))
             found = here()
         for pid in found:
-            os.kill(pid, number)
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, number)
         moment = f"{part} {'hit by' if found else 'ended before'} {number.name}"
         return moment, self.judge(tool, bool(found) and part == "excite")
 
@@ -141,9 +161,9 @@ class Campaign:
             return f"{12.0 * self.volts():.1f} V 0.3 s after the tool's end"
         if not self.until(self.active, 5.0 + self.slack):
             return "controllers are not active 5 s after the tool's end"
-        if not self.until(lambda: not session(tool.pid), 5.0 + self.slack):
-            left = "; ".join(session(tool.pid).values())
-            os.killpg(tool.pid, signal.SIGKILL)
+        if not self.until(lambda: not family(self.mark), 5.0 + self.slack):
+            left = "; ".join(" ".join(args) for args in family(self.mark).values())
+            self.end_family()
             return f"left: {left}"
         return self.two_writers()
 
