@@ -16,6 +16,7 @@ from smp_motor_ident.diagnosis.wheel_test import (
     answers_well,
     figures,
     moved_with,
+    settled,
 )
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.record import Hardware
@@ -23,11 +24,8 @@ from smp_motor_ident.record import Hardware
 REST, COAST = 0.3, 0.4
 """Zero voltage before and behind [s]; a coast of a few time constants."""
 
-HOLD = 0.4
-"""A voltage is held for so long [s], ..."""
-
 LONGEST_HOLD = 2.0
-"""... or for so long where the wheel is slow [s]."""
+"""A voltage is held for so long where the wheel is slow [s]."""
 
 RAMP = 0.15
 """Growth of the voltage until the wheel turns [of the supply per second]."""
@@ -93,18 +91,10 @@ class _Way:
         self.phase("coast", lambda t: 0.0, COAST, None)
 
     def _steady(self, since: int) -> Callable[[], bool]:
-        """Return whether the wheel turned as far in the last third as in the one before."""
+        """Return whether the wheel has settled since a row."""
         tape = self.test.tapes[self.wheel]
 
-        def steady() -> bool:
-            n = len(tape.rows) - since
-            span = tape.rows[-1][0] - tape.rows[since][0] if n > 8 else 0.0
-            if span < HOLD:
-                return False
-            last, before = tape.turned(-(n // 3)), tape.turned(-2 * (n // 3))
-            return bool(abs(before - 2 * last) <= max(0.02 * before, 2.0))
-
-        return steady
+        return lambda: settled(Trace.of(tape.rows[since:]))
 
 
 def check_wheels(

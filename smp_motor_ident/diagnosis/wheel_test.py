@@ -16,6 +16,9 @@ from smp_motor_ident.record import Hardware
 
 Array = NDArray[np.float64]
 
+HOLD = 0.4
+"""A voltage is held for so long [s] at least."""
+
 TREMBLE = 1.0
 """An encoder that stands on an edge counts up and down by so much."""
 
@@ -41,7 +44,13 @@ class Trace:
 
     def during(self, *numbers: int) -> Trace:
         """Return the part in some phases."""
-        kept = np.isin(self.phase, numbers)
+        return self._take(np.isin(self.phase, numbers))
+
+    def since(self, begin: int) -> Trace:
+        """Return the samples from an index on."""
+        return self._take(slice(begin, None))
+
+    def _take(self, kept: slice | NDArray[np.bool_]) -> Trace:
         return Trace(*(getattr(self, f.name)[kept] for f in fields(self)))
 
 
@@ -81,6 +90,31 @@ class Figures:
 def answers_well(level: float, breakaway: float, counts: float) -> bool:
     """Tell whether a wheel's answer to a voltage tells more of the motor than of its friction."""
     return level * FRICTION_SHARE.value >= breakaway and counts >= ANSWER_COUNTS.value
+
+
+def settled(hold: Trace) -> bool:
+    """Tell whether a wheel turned as far in the last third of a held voltage as in the one before.
+
+    Thirds of the time in which the voltage was there: a busy computer takes samples in bunches,
+    and for a while those of the voltage before.
+    """
+    there = _held(hold)
+    time, count = there.time, there.count
+    span = float(np.ptp(time)) if time.size > 8 else 0.0
+    if span < HOLD:
+        return False
+    thirds = np.interp(time[0] + span * np.arange(1, 4) / 3, time, count)
+    before, last = np.abs(np.diff(thirds))
+    return bool(abs(before - last) <= max(0.02 * (before + last), 2.0))
+
+
+def _held(hold: Trace) -> Trace:
+    """Return the part behind the last change of the reported voltage by more than a tenth."""
+    end = float(np.median(hold.voltage[-8:])) if hold.time.size else 0.0
+    other = np.flatnonzero(np.abs(hold.voltage - end) > 0.1 * abs(end))
+    begin = int(other[-1]) + 1 if other.size else 0
+    # A voltage that scatters so much tells no change.
+    return hold if hold.time.size - begin < 8 else hold.since(begin)
 
 
 def figures(trace: Trace, phases: Sequence[Phase], hardware: Hardware) -> Figures:
@@ -154,20 +188,16 @@ class _Steady:
 
     @classmethod
     def of(cls, hold: Trace, hardware: Hardware) -> _Steady:
-        n = hold.time.size
-        if n < 4 or hold.time[-1] <= hold.time[n // 2]:
+        hold = _held(hold)
+        middle = 0.5 * (hold.time[0] + hold.time[-1]) if hold.time.size else 0.0
+        late = hold.since(int(np.searchsorted(hold.time, middle)))
+        if late.time.size < 2 or late.time[-1] <= late.time[0]:
             return cls(math.nan, 0.0, 0.0, math.nan)
-        late = slice(n // 2, None)
-        angle = hold.count[late] * _angle_per_count(hardware)
+        voltage, angle = float(late.voltage.mean()), late.count * _angle_per_count(hardware)
         if np.ptp(angle) < BREAKAWAY_COUNTS.value * _angle_per_count(hardware):
-            return cls(float(hold.voltage[late].mean()), 0.0, 0.0, math.nan)
-        speed = float((angle[-1] - angle[0]) / np.ptp(hold.time[late]))
-        return cls(
-            float(hold.voltage[late].mean()),
-            speed,
-            speed / hardware.gear_ratio,
-            float(hold.velocity[late].mean()),
-        )
+            return cls(voltage, 0.0, 0.0, math.nan)
+        speed = float((angle[-1] - angle[0]) / np.ptp(late.time))
+        return cls(voltage, speed, speed / hardware.gear_ratio, float(late.velocity.mean()))
 
 
 def _angle_per_count(hardware: Hardware) -> float:

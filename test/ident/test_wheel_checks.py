@@ -16,6 +16,7 @@ from smp_motor_ident.diagnosis.wheel_test import (
     answers_well,
     figures,
     moved_with,
+    settled,
 )
 from smp_motor_ident.record import Hardware
 
@@ -188,3 +189,38 @@ def test_the_voltage_grows_until_friction_is_a_tenth_and_counts_are_enough() -> 
     assert answers_well(5.0, 0.5, 100.0)
     assert not answers_well(4.9, 0.5, 1000.0)
     assert not answers_well(5.0, 0.5, 99.0)
+
+
+def test_samples_that_wait_in_a_queue_show_the_same_motor() -> None:
+    # A busy computer takes samples 0.2 s late: a phase begins with what the one before did.
+    seen, phases = trace()
+    late = np.concatenate([np.full(40, seen.phase[0]), seen.phase[:-40]])
+    found = figures(replace(seen, phase=late), phases, HARDWARE)
+    # The last 0.15 s of the 0.3 s that are left begin after three time constants: of each step of
+    # the speed 1.6 % are missing, of the line through speeds half a step apart twice that.
+    assert found.gain == pytest.approx(GAIN, rel=0.032)
+    assert found.friction == pytest.approx(FRICTION, abs=0.032 * LEVELS[0])
+
+
+def test_a_wheel_has_not_settled_while_samples_are_of_the_voltage_before() -> None:
+    seen, phases = trace()
+    first, second = (seen.during(p.number) for p in phases if p.kind == "hold" and p.level > 2.0)
+    assert settled(first)
+    begun = Trace.of(np.concatenate([_rows(first), _rows(second)[:20]]))
+    assert not settled(begun)
+    assert settled(Trace.of(np.concatenate([_rows(first), _rows(second)])))
+
+
+def test_samples_that_come_in_bunches_settle_nothing() -> None:
+    # Half-way up an exponential of 0.4 s: of the last tenth of the time come most samples.
+    time = np.concatenate([np.linspace(0.0, 0.5, 6), np.linspace(0.5, 0.55, 40)[1:]])
+    count = 1000.0 * (time - 0.4 * (1.0 - np.exp(-time / 0.4)))
+    columns = [np.ones(time.size)] * 8
+    rows = np.stack(columns, axis=1)
+    rows[:, 0], rows[:, 6] = time, count
+    assert not settled(Trace.of(rows))
+
+
+def _rows(part: Trace) -> np.ndarray:
+    names = ("time", "age", "command", "voltage", "velocity", "position", "count", "phase")
+    return np.stack([getattr(part, name) for name in names], axis=1)
