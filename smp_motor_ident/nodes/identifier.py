@@ -25,6 +25,7 @@ from typing import Any
 
 from builtin_interfaces.msg import Time
 from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from smp_interfaces.msg import MotorDescription, MotorParameters, MotorState
 from smp_motor_control import WHEELS, joint_of
@@ -39,6 +40,9 @@ from smp_motor_ident.record import Hardware, Record
 from smp_motor_ident.report import history
 from smp_motor_ident.report.document import read_identification
 from smp_motor_ident.result import Estimate
+
+UNHURRIED = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""On a busy machine samples wait for the node: one that is lost leaves the fit a guessed voltage."""
 
 MINUTE = 60.0
 """Between two lines of a history [s]."""
@@ -104,7 +108,7 @@ class Wheel:
             MotorParameters, f"{name}/motor_parameters", runtime.LATCHED
         )
         topic = f"{name}/motor_state"
-        node.create_subscription(MotorState, topic, self._on_state, runtime.STREAM_SUBSCRIBER)
+        node.create_subscription(MotorState, topic, self._on_state, UNHURRIED)
         topic = f"{name}/motor_description"
         node.create_subscription(MotorDescription, topic, self._on_description, runtime.LATCHED)
 
