@@ -42,7 +42,7 @@ from smp_motor_ident.report.document import read_identification
 from smp_motor_ident.result import Estimate
 
 UNHURRIED = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""On a busy machine samples wait for the node: one that is lost leaves the fit a guessed voltage."""
+"""On a busy machine samples wait for the node: a lost one leaves the fit a guessed voltage."""
 
 MINUTE = 60.0
 """Between two lines of a history [s]."""
