@@ -21,12 +21,13 @@ def scope(
     ohmmeter: float | None,
 ) -> list[Finding]:
     """Return what a reader must know of the values' meaning."""
-    out = [] if result.level else [*_one_size(data), *_one_direction(data, result)]
+    size = _one_size(data)
+    out = [] if result.level else [*_one_size_of_voltage(size), *_one_direction(data, result)]
     if alike:
         out.append(_alike(alike))
     if result.level:
         out.append(_one_level(result))
-    out += _current_scale(result, ohmmeter)
+    out += _current_scale(result, ohmmeter, size > 0)
     if change:
         out.append(
             Finding(
@@ -53,16 +54,21 @@ def _alike(weights: Mapping[str, float]) -> Finding:
     )
 
 
-def _one_size(data: Experiments) -> list[Finding]:
-    """Say what a voltage that is only switched between one size both ways cannot show.
+def _one_size(data: Experiments) -> float:
+    """Return the size of a voltage that is only switched between one size both ways, else 0."""
+    size = np.abs(data.hold_value)
+    top = float(size.max())
+    driven = size[size > REST.value * top]
+    return 0.0 if np.any(np.abs(driven - top) > SAME_LEVEL.value * top) else top
+
+
+def _one_size_of_voltage(top: float) -> list[Finding]:
+    """Say what a voltage of one size both ways cannot show.
 
     With a size U a driver that takes a share of it (a dead zone, a drop, a clip) is the
     motor of another gain under U: no residual tells the two apart.
     """
-    size = np.abs(data.hold_value)
-    top = float(size.max())
-    driven = size[size > REST.value * top]
-    if np.any(np.abs(driven - top) > SAME_LEVEL.value * top):
+    if not top:
         return []
     return [
         Finding(
@@ -98,10 +104,11 @@ OF_SCALE = ("resistance", "inductance", "inertia", "viscous_friction", "coulomb_
 large the same motion and voltage are those of R/s, L/s, s J, s b and s Tc, and of the same K."""
 
 
-def _current_scale(result: Answer, ohmmeter: float | None) -> list[Finding]:
+def _current_scale(result: Answer, ohmmeter: float | None, one_size: bool) -> list[Finding]:
     """Say what only the current's own scale determines, held against an ohmmeter if there is one.
 
-    No record of voltage, current and motion shows that scale.
+    No record of voltage, current and motion shows that scale; under a voltage of one size the
+    supply's current, ``i |v| / supply``, is another scale and no more.
     """
     known = {n: q for n in OF_SCALE if (q := result.parameters[n]).status == "estimated"}
     if not known:
@@ -111,7 +118,10 @@ def _current_scale(result: Answer, ohmmeter: float | None) -> list[Finding]:
     if found is None or found.value is None or not ohmmeter:
         advice = "state the resistance by ohmmeter (`resistance`), which shows the scale"
         evidence: dict[str, float | str | None] = {"of_the_scale": ", ".join(known)}
-        return [Finding("current_scale", "note", words, evidence, advice)]
+        if not one_size:
+            return [Finding("current_scale", "note", words, evidence, advice)]
+        words += "; under a voltage of one size the current of the supply looks like such a scale"
+        return [Finding("current_scale", "warning", words, evidence, advice)]
     scale = ohmmeter / found.value
     off = (
         abs(scale - 1)
