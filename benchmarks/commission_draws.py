@@ -138,6 +138,8 @@ def run(case: str, folder: Path, draw: random.Random, duration: float) -> tuple[
     if not document.is_file():
         return False, f"exit {tool.returncode}", words
     found = json.loads(document.read_text())
+    if missing := set(WHEELS) - set(found["checks"]):
+        return False, f"without {', '.join(sorted(missing))}", words
     if tool.returncode == 0 and found["passed"]:
         return may_pass, "passed", words
     at = {f["code"] for f in found.get("findings", []) if f["severity"] == "refused"}

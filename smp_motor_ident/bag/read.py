@@ -25,7 +25,7 @@ from smp_motor_ident.finding import Finding
 from smp_motor_ident.record import Hardware, Record
 
 STATE, DESCRIPTION = "smp_interfaces/msg/MotorState", "smp_interfaces/msg/MotorDescription"
-_OWN_FIELDS = {
+OWN_FIELDS = {
     "voltage": "voltage",
     "current": "current",
     "velocity": "velocity",
@@ -228,7 +228,7 @@ def _plans(recording: Recording, asked: SignalMap, channels: list[Channel]) -> d
         names = {topic: topic.rpartition("/")[0][1:] or topic[1:] for topic in states}
     plans = {}
     for topic, wheel in names.items():
-        signals = {name: Signal(topic, path) for name, path in _OWN_FIELDS.items()}
+        signals = {name: Signal(topic, path) for name, path in OWN_FIELDS.items()}
         given = asked.motors.get(wheel, asked.defaults)
         plans[wheel] = replace(
             given,

@@ -41,8 +41,8 @@ SIGNALS = (
 )
 """What moves the wheels: signal, shares of amplitude and duration, and whose recording."""
 
-LOOKS = 10
-"""Wheels are looked for so often, until all have been discovered."""
+LOOKS, ALIKE = 15, 4
+"""Wheels are looked for at most so often, until so many looks [1 s each] find the same."""
 
 UNRELIABLE = "unreliable_identification"
 """Code of the finding that an identification is not to be designed on."""
@@ -168,13 +168,13 @@ def _verify(
 
 
 def _found(client: Any) -> tuple[str, ...]:
-    """Return the wheels that report, when none was found beside them for a second."""
-    found: tuple[str, ...] = ()
-    for _ in range(LOOKS):
-        before, found = found, tuple(client.find_wheels())
-        if found and found == before:
+    """Return the wheels that report: a busy machine's are discovered seconds apart."""
+    looks: list[tuple[str, ...]] = []
+    while len(looks) < LOOKS:
+        looks.append(tuple(client.find_wheels()))
+        if looks[-1] and looks[-ALIKE:] == [looks[-1]] * ALIKE:
             break
-    return found
+    return looks[-1]
 
 
 def _controlled(robot: steps.Robot, wheel: str) -> bool:

@@ -23,7 +23,7 @@ from smp_motor_ident.model import structures as models
 
 Array = NDArray[np.float64]
 
-GRIDS = 8  # segments that are looked at
+GRIDS = 8  # segments that are looked at, those that moved most
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,8 +104,8 @@ def speed_candidates(
 
 
 def _grids(data: Experiments) -> list[Uniform]:
-    segments = range(min(len(data.starts) - 1, GRIDS))
-    return [u for g in segments if (u := resample(data, g)) is not None]
+    grids = [u for g in range(len(data.starts) - 1) if (u := resample(data, g)) is not None]
+    return sorted(grids, key=lambda u: -float(np.ptp(u.output)))[:GRIDS]
 
 
 def _late(u: Uniform, lag: int) -> Uniform:

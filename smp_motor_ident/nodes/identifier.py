@@ -15,10 +15,13 @@ from __future__ import annotations
 
 import math
 import sys
+import time
+from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from builtin_interfaces.msg import Time
 from rclpy.node import Node
@@ -28,8 +31,9 @@ from smp_motor_control import WHEELS, joint_of
 from smp_motor_control.errors import ParameterError, SmpError
 from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.settings import Parameters, described, nested
+from smp_motor_ident.bag.window import Window
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.estimation.live import Demands, Window, missing
+from smp_motor_ident.estimation.live import Demands, missing
 from smp_motor_ident.estimation.monitor import Monitor, commissioned_of
 from smp_motor_ident.record import Hardware, Record
 from smp_motor_ident.report import history
@@ -46,11 +50,15 @@ class Settings:
 
     wheels: tuple[str, ...] = described(WHEELS, "Wheels to identify.", read_only=True)
     window: float = described(
-        30.0, "How much of the past is used [s].", minimum=2.0, maximum=600.0, read_only=True
+        60.0, "How much of the past is used [s].", minimum=2.0, maximum=600.0, read_only=True
     )
     period: float = described(
-        5.0, "Interval between two estimates of a wheel [s].", minimum=0.5, read_only=True
+        5.0, "Least interval between two estimates of a wheel [s].", minimum=0.5, read_only=True
     )
+    share: float = described(
+        0.03, "Most of a processor that estimates take of it in the long run [1].",
+        minimum=1e-3, maximum=1.0,
+    )  # fmt: skip
     model: str = described("auto", "Model to fit; auto chooses the simplest that holds.")
     commissioned: str = described(
         "", "identification.json, or its folder, of the motors to watch.", read_only=True
@@ -89,7 +97,9 @@ class Wheel:
         self.joint_name = joint_of(name)
         self.stamp = Time()
         self.status = "collecting: no motor_state yet"
-        self.running: Future[Estimate] | None = None
+        self.running: Future[tuple[Estimate | Exception, float]] | None = None
+        # Stamp of the last sample when last looked at, and of the last estimate's [ns]
+        self.seen = self.estimated = 0
         self.publisher = node.create_publisher(
             MotorParameters, f"{name}/motor_parameters", runtime.LATCHED
         )
@@ -98,34 +108,27 @@ class Wheel:
         topic = f"{name}/motor_description"
         node.create_subscription(MotorDescription, topic, self._on_description, runtime.LATCHED)
 
-    def _on_state(self, message: MotorState) -> None:
-        self.stamp = message.header.stamp
+    def _on_state(self, message: MotorState, info: Mapping[str, Any]) -> None:
+        self.stamp = stamp = message.header.stamp
+        nanoseconds = 1_000_000_000 * stamp.sec + stamp.nanosec
+        voltage, current, position = message.voltage, message.current, message.position
+        count = message.encoder_count
         if self.monitor is not None:
-            self.monitor.add(
-                runtime.seconds(message.header.stamp),
-                message.voltage,
-                message.current,
-                self._turned(message),
-            )
-        self.window.add(
-            runtime.seconds(message.header.stamp),
-            message.voltage,
-            message.current,
-            message.velocity,
-            message.position,
-            message.encoder_count,
-        )
+            turned = self._turned(count, position)
+            self.monitor.add(1e-9 * nanoseconds, voltage, current, turned)
+        number = info["publication_sequence_number"] or 0
+        self.window.add(nanoseconds, voltage, current, message.velocity, position, count, number)
 
-    def _turned(self, message: MotorState) -> float:
+    def _turned(self, count: int, position: float) -> float:
         """Return the motor's angle since the sample before [rad]; NaN where it is not known."""
         hardware = self.window.hardware
-        before, self._count = self._count, message.encoder_count
-        angle, self._position = self._position, message.position
+        before, self._count = self._count, count
+        angle, self._position = self._position, position
         if hardware.counts_per_revolution is None:
-            return (message.position - angle) * hardware.gear_ratio
+            return (position - angle) * hardware.gear_ratio
         if before is None:
             return math.nan
-        counts = message.encoder_count - before
+        counts = count - before
         if hardware.encoder_bits:
             half = 1 << (hardware.encoder_bits - 1)
             counts = (counts + half) % (2 * half) - half
@@ -173,40 +176,53 @@ class Identifier(Node):
             name: Wheel(self, name, settings.window, monitors.get(name)) for name in settings.wheels
         }
         self._worker = ThreadPoolExecutor(max_workers=1)
+        self._not_before = 0.0
+        self._compiled = False  # the first estimate loads or compiles code, too: it counts for none
         self._diagnostics = runtime.Diagnostics(self, self._assess)
-        runtime.steady_timer(self, settings.period, self._begin_all)
+        runtime.steady_timer(self, settings.period, self._begin)
         runtime.steady_timer(self, 0.1, self._publish_finished)
         if settings.history:
             runtime.steady_timer(self, MINUTE, self._add_history)
 
-    def _begin_all(self) -> None:
-        """Hand every window that shows enough to the worker."""
-        settings = self._given.settings
+    def _begin(self) -> None:
+        """Hand every window that shows enough to the worker; say what the others lack.
+
+        Estimates are followed by a pause in proportion to what they cost.  What came last before
+        samples ceased to come does not wait for its end.
+        """
+        settings, now = self._given.settings, time.monotonic()
         for wheel in self._wheels.values():
-            if wheel.running is not None:
+            ceased, wheel.seen = wheel.window.last == wheel.seen, wheel.window.last
+            if wheel.running or (wheel.seen and wheel.seen == wheel.estimated):
                 continue
-            record = wheel.window.record()
-            lacks = missing(record, settings.demands)
+            try:
+                record = wheel.window.record()
+                lacks = missing(record, settings.demands)
+            except SmpError as error:
+                record, lacks = None, [str(error)]
             if lacks or record is None:
                 wheel.tell("collecting: " + "; ".join(lacks))
-            else:
+            elif ceased or now >= self._not_before:
+                wheel.estimated = wheel.seen
                 wheel.running = self._worker.submit(partial(_identify, record, settings.model))
 
     def _publish_finished(self) -> None:
         for wheel in self._wheels.values():
             if wheel.running is None or not wheel.running.done():
                 continue
-            future, wheel.running = wheel.running, None
-            error = future.exception()
-            if error is None:
-                found = future.result()
+            (found, cost), wheel.running = wheel.running.result(), None
+            if self._compiled:
+                since = max(self._not_before, time.monotonic())
+                self._not_before = since + cost / self._given.settings.share
+            self._compiled = True
+            if isinstance(found, Estimate):
                 why = "; ".join(f.message for f in found.findings if f.severity == "unreliable")
                 wheel.tell(f"unreliable: {why}" if why else "valid", found)
-            elif isinstance(error, SmpError):
-                wheel.tell(f"refused: {error}")
+            elif isinstance(found, SmpError):
+                wheel.tell(f"refused: {found}")
             else:
-                self.get_logger().error(f"{wheel.window.wheel}: {error!r}")
-                wheel.tell(f"refused: the estimator failed with {error!r}")
+                self.get_logger().error(f"{wheel.window.wheel}: {found!r}")
+                wheel.tell(f"refused: the estimator failed with {found!r}")
 
     def _assess(self) -> tuple[bytes, str, dict[str, object]]:
         states: dict[str, object] = {name: wheel.status for name, wheel in self._wheels.items()}
@@ -259,8 +275,15 @@ def _positive(value: float) -> float | None:
     return value if value > 0 else None
 
 
-def _identify(record: Record, model: str) -> Estimate:
-    return estimate([record], model=model)
+def _identify(record: Record, model: str) -> tuple[Estimate | Exception, float]:
+    """Return what a window tells, or why nothing, and the processor time that it took [s]."""
+    begun = time.thread_time()
+    found: Estimate | Exception
+    try:
+        found = estimate([record], model=model)
+    except Exception as error:
+        found = error
+    return found, time.thread_time() - begun
 
 
 def main(argv: list[str] | None = None) -> int:

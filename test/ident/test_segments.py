@@ -1,5 +1,8 @@
 """A motor that changes within a record gets the intervals of the next recording, others do not."""
 
+from dataclasses import replace
+
+import independent
 import motors
 import numpy as np
 
@@ -49,3 +52,17 @@ def test_parts_without_excitation_do_not_count():
         q = found.combinations[name]
         assert abs(q.value - truth[name]) < 4 * q.std, name
         assert q.std < 0.02 * truth[name], name  # the bound is 0.1 %
+
+
+def test_many_short_segments_at_rest_before_the_motion_hide_no_motor():
+    # A computer that stood still while a robot waited: each gap begins a segment.
+    n, rate = 1000, 200.0
+    t = np.arange(n) / rate
+    moving = [independent.excitation(t, kind, 10.0) for kind in ("square", "fourier")]
+    volts = np.concatenate([np.zeros(240), *moving])
+    whole = motors.record("rear_left", voltage=volts, kinds=("square",) * 3)
+    found = estimate(replace(whole, starts=tuple(range(0, 240, 20))))
+    truth = motors.truth("rear_left", 0.3)
+    for name in ("dc_gain", "time_constant"):
+        q = found.combinations[name]
+        assert abs(q.value - truth[name]) < 4 * q.std, name

@@ -104,10 +104,22 @@ def check(design: Design, gains: Gains) -> Check:
 
 
 def duration(design: Design, gains: Gains) -> float:
-    """Return how long a change of set-point is looked at, tail of the integral included [s]."""
-    fb, a0 = gains.feedback, 1 / design.motor["dc_gain"]
-    tail = 8 * (fb.p + a0) / fb.i if fb.i > 0 else 0.0
-    return float(0.5 + 12 * design.motor["time_constant"] + tail)
+    """Return how long a change of set-point is looked at [s].
+
+    The slow mode of the integral decays with ``(p + a0) / i`` from what feed-forward and
+    proportional action leave, and from what is summed up while the speed rises; it is followed
+    down to a tenth of the band of settling.
+    """
+    fb, a0, rise = gains.feedback, 1 / design.motor["dc_gain"], design.motor["time_constant"]
+    tail = 0.0
+    if fb.i > 0:
+        slow = (fb.p + a0) / fb.i
+        target = CHANGE * design.reference.max_velocity
+        needed = a0 + (design.motor["static_voltage"] - gains.static) / target
+        given = gains.velocity + fb.p * (gains.weight - 1)
+        left = abs(given - needed) / (fb.p + a0) + rise / slow
+        tail = slow * max(math.log(10 * left / BAND), 0.0)
+    return float(0.5 + 12 * rise + tail)
 
 
 def present_error(feedback: Feedback, sample_time: float) -> Feedback:

@@ -1,0 +1,101 @@
+"""A running motor's recent past, read as a bag of it would be."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import numpy as np
+
+from smp_motor_ident.bag.assemble import assemble
+from smp_motor_ident.bag.mapping import MotorMap, Signal
+from smp_motor_ident.bag.read import OWN_FIELDS
+from smp_motor_ident.bag.storage import Table
+from smp_motor_ident.record import Hardware, Record
+
+CAPACITY = 200_000
+"""Samples that are kept at most."""
+
+LEAST = 10
+"""Samples below which there is no record."""
+
+
+class Window:
+    """The last seconds of one wheel's ``motor_state``, as a record at the motor shaft.
+
+    Parameters
+    ----------
+    wheel : str
+        Name of the wheel.
+    length : float
+        How much is kept [s].
+    """
+
+    def __init__(self, wheel: str, length: float) -> None:
+        self.wheel = wheel
+        self.hardware = Hardware()
+        self._length = round(1e9 * length)
+        self._rows: deque[tuple[int, float, float, float, float, int, int]] = deque(maxlen=CAPACITY)
+
+    def __len__(self) -> int:
+        """Return the number of samples held."""
+        return len(self._rows)
+
+    @property
+    def last(self) -> int:
+        """Stamp of the last sample [ns], 0 without one."""
+        return self._rows[-1][0] if self._rows else 0
+
+    def add(
+        self,
+        stamp: int,
+        voltage: float,
+        current: float,
+        velocity: float,
+        position: float,
+        count: int,
+        number: int = 0,
+    ) -> None:
+        """Take one sample; a stamp [ns] that was set back begins the window anew.
+
+        ``number`` is the publisher's own, 0 where that is not known.
+        """
+        if not math.isfinite(voltage):
+            return
+        rows = self._rows
+        if rows and stamp <= rows[-1][0]:
+            if stamp > rows[-1][0] - self._length:
+                return  # late or twice
+            rows.clear()  # the clock was set back
+        rows.append((stamp, voltage, current, velocity, position, count, number))
+        while rows[0][0] < stamp - self._length:
+            rows.popleft()
+
+    def record(self) -> Record | None:
+        """Return what is held; None below 10 samples.
+
+        Raises
+        ------
+        BagError
+            Where nothing that is held could be read from a bag either.
+        """
+        if len(self) < LEAST:
+            return None
+        rows = zip(*self._rows, strict=True)
+        stamp, voltage, current, velocity, position, count, number = rows
+        time, numbers = np.array(stamp, dtype=np.int64), np.array(number, dtype=np.int64)
+        columns = {
+            "voltage": np.array(voltage),
+            "current": np.array(current),
+            "velocity": np.array(velocity),
+            "position": np.array(position),
+            "encoder_count": np.array(count, dtype=np.int64),
+        }
+        signals = {name: Signal("", path) for name, path in OWN_FIELDS.items()}
+        if self.hardware.counts_per_revolution is None or not np.ptp(columns["encoder_count"]):
+            del signals["count"]
+        bits = {"encoder_bits": self.hardware.encoder_bits}
+        plan = MotorMap(signals, bits, held="before", clock="header", own=True)
+        known = bool(numbers.all() and np.all(np.diff(numbers) > 0))
+        table = Table(time, time, columns, number=numbers if known else None)
+        return assemble(self.wheel, plan, self.hardware, {"": table}, "live")

@@ -1,0 +1,106 @@
+"""The pages' ``sh`` blocks for a running robot, as they are printed, on the simulated one.
+
+They take minutes, so they run on request: ``make test ARGS="-m long"``. Lines of ``ros2`` run
+where ROS is sourced.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+from test_documentation import ROOT, commands, motion, of_language, write_bag
+from wheel_robot import WheelRobot
+
+from smp_motor_control import WHEELS
+from smp_motor_ident.cli import identify
+
+NEEDS = ("# needs a running robot", "# needs a robot that drives",
+         "# needs a terminal and a running robot", "# needs ROS 2")  # fmt: skip
+ENDLESS = ("record", "identifier", "teleop_wheels", "ros2")
+"""What runs until Ctrl-C."""
+LOOKED_AT = 12.0
+"""For how long such a command is let run [s]."""
+LIMIT = 900.0
+"""Of a command that ends by itself [s]; ``commission`` takes two minutes on two free cores."""
+ELSEWHERE = ("plotjuggler", "foxglove_bridge", "nav2_bringup", "teleop_twist_joy")
+"""Packages of others, which need a screen or a robot's map."""
+
+
+def printed() -> list[tuple[str, list[str]]]:
+    blocks = [(page, lines) for page, lines in of_language("sh") if lines[0].strip() in NEEDS]
+    here = shutil.which("ros2")
+    return [b for b in blocks if here or not any(line.startswith("ros2 ") for line in b[1])]
+
+
+def run(line: str, folder: Path) -> str:
+    """Run a printed line in a terminal; return what went wrong."""
+    here, there = os.openpty()
+    log = folder / "output.txt"
+    with log.open("wb") as out:
+        process = subprocess.Popen(
+            ["bash", "-c", line], stdin=there, stdout=out, stderr=out, cwd=folder,
+            start_new_session=True,
+        )  # fmt: skip
+        os.write(here, b"y\n")
+        endless = line.split()[0] in ENDLESS and "--show-args" not in line
+        try:
+            process.wait(LOOKED_AT if endless else LIMIT)
+        except subprocess.TimeoutExpired:
+            if not endless:
+                os.killpg(process.pid, signal.SIGKILL)
+            else:
+                os.killpg(process.pid, signal.SIGINT)
+        code = process.wait(60.0)
+        os.close(here), os.close(there)
+    text = log.read_text(errors="replace")
+    fine = code in ((0, 130, -signal.SIGINT) if endless else (0,)) and "Traceback" not in text
+    return "" if fine else f"{line}: exit code {code}\n{text}"
+
+
+@pytest.fixture
+def robots(ros_domain, process, eventually):
+    """Start robots by their namespaces."""
+    watchers = []
+
+    def start(namespace: str) -> None:
+        ns = f"__ns:={namespace or '/'}"
+        process("motor_plant", "--ros-args", "-r", ns)
+        process("skid_steer", "--ros-args", "-r", ns)
+        gains = ROOT / "config" / "gains.yaml"
+        for wheel in WHEELS:
+            process("wheel_pid", "--ros-args", "-r", f"__ns:={namespace}/{wheel}",
+                    "--params-file", gains)  # fmt: skip
+        if not namespace:
+            watchers.append(WheelRobot(ros_domain))
+            states = watchers[0].states
+            eventually(lambda: all(states[w] for w in WHEELS), 60.0, watchers[0].spin)
+        else:
+            time.sleep(10.0)
+
+    yield start
+    for one in watchers:
+        one.close()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("page", "lines"), printed())
+def test_commands_for_a_running_robot_do_what_their_page_says(page, lines, tmp_path, robots):
+    write_bag(tmp_path / "my_bag", motion(1), own=True)
+    answered = identify.main([str(tmp_path / "my_bag"), "--output", str(tmp_path / "result"), "-q"])
+    assert answered == 0
+    shutil.copy(ROOT / "config" / "gains.yaml", tmp_path)
+    (tmp_path / "history.jsonl").touch()
+    text = "\n".join(lines)
+    if "ros2 launch smp_motor_control smp.launch.py" not in text:
+        for namespace in ("", *sorted(set(re.findall(r"__ns:=(/\w+)", text)))):
+            robots(namespace)
+    for line in text.replace("\\\n", " ").splitlines():
+        if commands([line]) and not any(name in line for name in ELSEWHERE):
+            assert not (wrong := run(line, tmp_path)), f"{page}: {wrong}"
