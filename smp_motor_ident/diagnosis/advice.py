@@ -13,6 +13,7 @@ from smp_motor_ident.diagnosis.limits import (
     FIT_INDEPENDENT,
     FRICTION_SHOWN,
     IMPLIED_BIAS,
+    RELEVANT_BIAS,
     RINGING,
     SQUARE_LEVEL,
     STEADY,
@@ -171,15 +172,16 @@ def _second_lag(data: Experiments, fit: Fit) -> list[Finding]:
     free = row @ fit.structure.matrix()
     ratio, spread = float(row @ fit.z), float(np.sqrt(free @ fit.covariance() @ free))
     share, least = (_lag_share(ratio - k * spread) for k in (0.0, IMPLIED_BIAS.value))
-    if share < WINDING_LAG.value:
+    long = share >= WINDING_LAG.value
+    if not long and least < RELEVANT_BIAS.value:
         return []
+    may_be = "long for a winding's, it may be" if long else "a winding's, or"
     return [
         Finding(
             "second_lag",
-            "unreliable" if least > WINDING_LAG.value else "warning",
-            f"the speed follows by two lags, the second {share:.2g} of the first: long for a "
-            "winding's, it may be a filter of the speed, which is no part of the motor's time "
-            "constant",
+            "unreliable" if least > WINDING_LAG.value else "warning" if long else "note",
+            f"the speed follows by two lags, the second {share:.2g} of the first: {may_be} a "
+            "filter of the speed, which is no part of the motor's time constant",
             {
                 "share": share,
                 "limit": WINDING_LAG.value,
