@@ -12,6 +12,8 @@ from smp_motor_ident.estimation.quantities import Answer
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import Experiments
 
+FEWEST_SWINGS = 6  # of which it can be said that they are alike
+
 
 def scope(
     data: Experiments,
@@ -22,7 +24,8 @@ def scope(
 ) -> list[Finding]:
     """Return what a reader must know of the values' meaning."""
     size = _one_size(data)
-    out = [] if result.level else [*_one_size_of_voltage(size), *_one_direction(data, result)]
+    top = size or _one_swing(data)
+    out = [] if result.level else [*_one_size_of_voltage(top), *_one_direction(data, result)]
     if alike:
         out.append(_alike(alike))
     if result.level:
@@ -62,11 +65,30 @@ def _one_size(data: Experiments) -> float:
     return 0.0 if np.any(np.abs(driven - top) > SAME_LEVEL.value * top) else top
 
 
+def _one_swing(data: Experiments) -> float:
+    """Return the peak of a voltage that swings there and back always as far and as long, else 0.
+
+    A sine of one amplitude and frequency, above all; what begins and ends it does not count.
+    """
+    value = data.hold_value
+    turns = np.flatnonzero(np.diff(value >= 0)) + 1
+    if turns.size < FEWEST_SWINGS:
+        return 0.0
+    peaks = np.maximum.reduceat(np.abs(value), turns)[:-1]
+    lengths = np.diff(data.hold_end[turns - 1])
+    peak, length = float(np.median(peaks)), float(np.median(lengths))
+    alike = (np.abs(peaks - peak) < SAME_LEVEL.value * peak) & (
+        np.abs(lengths - length) < SAME_LEVEL.value * length + 1.5 * data.step
+    )
+    return peak if float(alike.mean()) > 1 - SAME_LEVEL.value else 0.0
+
+
 def _one_size_of_voltage(top: float) -> list[Finding]:
-    """Say what a voltage of one size both ways cannot show.
+    """Say what a voltage of one size both ways, or of one swing, cannot show.
 
     With a size U a driver that takes a share of it (a dead zone, a drop, a clip) is the
-    motor of another gain under U: no residual tells the two apart.
+    motor of another gain under U: no residual tells the two apart.  Under a sine it is another
+    gain of the fundamental (its describing function), and the motor hides the harmonics.
     """
     if not top:
         return []
@@ -74,7 +96,7 @@ def _one_size_of_voltage(top: float) -> list[Finding]:
         Finding(
             "one_size_of_voltage",
             "warning",
-            f"all of the voltage has one size, {top:.3g} V: a driver that puts out less of it (a "
+            f"the voltage has one size, {top:.3g} V: a driver that puts out less of it (a "
             "dead zone, a drop, a clip at the supply) looks like a motor of another gain; "
             "the numbers hold for the voltage as it was recorded",
             {"voltage": top},
