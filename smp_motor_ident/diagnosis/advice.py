@@ -13,6 +13,7 @@ from smp_motor_ident.diagnosis.limits import (
     FIT_INDEPENDENT,
     FRICTION_SHOWN,
     IMPLIED_BIAS,
+    RELEVANT_BIAS,
     RINGING,
     SQUARE_LEVEL,
     STEADY,
@@ -161,25 +162,41 @@ def _sensors(fit: Fit) -> list[Finding]:
 def _second_lag(data: Experiments, fit: Fit) -> list[Finding]:
     """Say of a speed whose second lag is long for a winding's that it may be the sensor's.
 
-    With time constants T and cT, ``a2 a0 / a1^2 = c / (1 + c)^2``.
+    With time constants T and cT, ``a2 a0 / a1^2 = c / (1 + c)^2``, and the sensor's lag is
+    ``c / (1 + c)`` of what is stated as the motor's.
     """
     if fit.structure.order != 2 or fit.structure.current or data.kind == rc.ANGLE:
         return []
-    ratio = min(float(np.exp(fit.z[models.A0] + fit.z[models.A2] - 2 * fit.z[models.A1])), 0.25)
-    share = (1 - np.sqrt(1 - 4 * ratio)) / (2 * ratio) - 1
-    if share < WINDING_LAG.value:
+    row = np.zeros(fit.z.size)
+    row[[models.A0, models.A1, models.A2]] = 1.0, -2.0, 1.0
+    free = row @ fit.structure.matrix()
+    ratio, spread = float(row @ fit.z), float(np.sqrt(free @ fit.covariance() @ free))
+    share, least = (_lag_share(ratio - k * spread) for k in (0.0, IMPLIED_BIAS.value))
+    long = share >= WINDING_LAG.value
+    if not long and least < RELEVANT_BIAS.value:
         return []
+    may_be = "long for a winding's, it may be" if long else "a winding's, or"
     return [
         Finding(
             "second_lag",
-            "warning",
-            f"the speed follows by two lags, the second {share:.2g} of the first: long for a "
-            "winding's, it may be a filter of the speed, which is no part of the motor's time "
-            "constant",
-            {"share": float(share), "limit": WINDING_LAG.value},
+            "unreliable" if least > WINDING_LAG.value else "warning" if long else "note",
+            f"the speed follows by two lags, the second {share:.2g} of the first: {may_be} a "
+            "filter of the speed, which is no part of the motor's time constant",
+            {
+                "share": share,
+                "limit": WINDING_LAG.value,
+                "quantity": "time_constant",
+                "shift_share": share / (1 + share),
+            },
             "switch the filter of the firmware off, or record encoder counts or the current",
         )
     ]
+
+
+def _lag_share(log_ratio: float) -> float:
+    """Return c of ``c / (1 + c)^2 = exp(log_ratio)``, at most 1."""
+    root = np.sqrt(1 - 4 * min(float(np.exp(log_ratio)), 0.25))
+    return float((1 - root) / (1 + root))
 
 
 def _torque_noise(data: Experiments, fit: Fit) -> list[Finding]:

@@ -12,6 +12,8 @@ from smp_motor_ident.estimation.quantities import Answer
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import Experiments
 
+FEWEST_SWINGS = 6  # of which it can be said that they are alike
+
 
 def scope(
     data: Experiments,
@@ -21,12 +23,14 @@ def scope(
     ohmmeter: float | None,
 ) -> list[Finding]:
     """Return what a reader must know of the values' meaning."""
-    out = [] if result.level else [*_one_size(data), *_one_direction(data, result)]
+    size = _one_size(data)
+    top = size or _one_swing(data)
+    out = [] if result.level else [*_one_size_of_voltage(top), *_one_direction(data, result)]
     if alike:
         out.append(_alike(alike))
     if result.level:
         out.append(_one_level(result))
-    out += _current_scale(result, ohmmeter)
+    out += _current_scale(result, ohmmeter, size > 0)
     if change:
         out.append(
             Finding(
@@ -53,22 +57,46 @@ def _alike(weights: Mapping[str, float]) -> Finding:
     )
 
 
-def _one_size(data: Experiments) -> list[Finding]:
-    """Say what a voltage that is only switched between one size both ways cannot show.
-
-    With a size U a driver that takes a share of it (a dead zone, a drop, a clip) is the
-    motor of another gain under U: no residual tells the two apart.
-    """
+def _one_size(data: Experiments) -> float:
+    """Return the size of a voltage that is only switched between one size both ways, else 0."""
     size = np.abs(data.hold_value)
     top = float(size.max())
     driven = size[size > REST.value * top]
-    if np.any(np.abs(driven - top) > SAME_LEVEL.value * top):
+    return 0.0 if np.any(np.abs(driven - top) > SAME_LEVEL.value * top) else top
+
+
+def _one_swing(data: Experiments) -> float:
+    """Return the peak of a voltage that swings there and back always as far and as long, else 0.
+
+    A sine of one amplitude and frequency, above all; what begins and ends it does not count.
+    """
+    value = data.hold_value
+    turns = np.flatnonzero(np.diff(value >= 0)) + 1
+    if turns.size < FEWEST_SWINGS:
+        return 0.0
+    peaks = np.maximum.reduceat(np.abs(value), turns)[:-1]
+    lengths = np.diff(data.hold_end[turns - 1])
+    peak, length = float(np.median(peaks)), float(np.median(lengths))
+    alike = (np.abs(peaks - peak) < SAME_LEVEL.value * peak) & (
+        np.abs(lengths - length) < SAME_LEVEL.value * length + 1.5 * data.step
+    )
+    return peak if float(alike.mean()) > 1 - SAME_LEVEL.value else 0.0
+
+
+def _one_size_of_voltage(top: float) -> list[Finding]:
+    """Say what a voltage of one size both ways, or of one swing, cannot show.
+
+    With a size U a driver that takes a share of it (a dead zone, a drop, a clip) is the
+    motor of another gain under U: no residual tells the two apart.  Under a sine it is another
+    gain of the fundamental (its describing function), and the motor hides the harmonics.
+    """
+    if not top:
         return []
     return [
         Finding(
             "one_size_of_voltage",
             "warning",
-            f"all of the voltage has one size, {top:.3g} V: a driver that puts out less of it (a "
+            f"the voltage has one size, {top:.3g} V: a driver that puts out less of it (a "
             "dead zone, a drop, a clip at the supply) looks like a motor of another gain; "
             "the numbers hold for the voltage as it was recorded",
             {"voltage": top},
@@ -98,10 +126,11 @@ OF_SCALE = ("resistance", "inductance", "inertia", "viscous_friction", "coulomb_
 large the same motion and voltage are those of R/s, L/s, s J, s b and s Tc, and of the same K."""
 
 
-def _current_scale(result: Answer, ohmmeter: float | None) -> list[Finding]:
+def _current_scale(result: Answer, ohmmeter: float | None, one_size: bool) -> list[Finding]:
     """Say what only the current's own scale determines, held against an ohmmeter if there is one.
 
-    No record of voltage, current and motion shows that scale.
+    No record of voltage, current and motion shows that scale; under a voltage of one size the
+    supply's current, ``i |v| / supply``, is another scale and no more.
     """
     known = {n: q for n in OF_SCALE if (q := result.parameters[n]).status == "estimated"}
     if not known:
@@ -111,7 +140,10 @@ def _current_scale(result: Answer, ohmmeter: float | None) -> list[Finding]:
     if found is None or found.value is None or not ohmmeter:
         advice = "state the resistance by ohmmeter (`resistance`), which shows the scale"
         evidence: dict[str, float | str | None] = {"of_the_scale": ", ".join(known)}
-        return [Finding("current_scale", "note", words, evidence, advice)]
+        if not one_size:
+            return [Finding("current_scale", "note", words, evidence, advice)]
+        words += "; under a voltage of one size the current of the supply looks like such a scale"
+        return [Finding("current_scale", "warning", words, evidence, advice)]
     scale = ohmmeter / found.value
     off = (
         abs(scale - 1)

@@ -66,7 +66,8 @@ def choose_source(estimate: Estimate, loop: Loop, **targets: Any) -> tuple[Loop,
     if best is None:
         return loop, "the reported speed: no source allows what is asked"
     compared = "; ".join(
-        f"{t.name} allows i = {t.integral:.3g} V/rad at {1e3 * t.control_noise:.3g} mV of ripple"
+        f"{t.name} allows i = {t.integral:.3g} V/rad "
+        f"at {1e3 * t.control_noise:.3g} mV of control noise"
         for t in (usual, longer, watched)
         if t is not None
     )

@@ -5,6 +5,7 @@ from dataclasses import replace
 import motors
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from smp_motor_ident.errors import DesignError, SignalError
 from smp_motor_ident.estimate import estimate
@@ -139,3 +140,15 @@ def test_a_load_does_not_hide_the_order():
         q = found.combinations[name]
         # 4 standard deviations (one in 16,000), and what the grid of the test's solution leaves.
         assert abs(q.value - true) < 4 * q.std + 2e-3 * true, name
+
+
+@pytest.mark.parametrize(("second_tone", "said"), [(0.0, True), (2.0, False)])
+def test_a_sine_says_that_a_drop_would_not_show(second_tone, said):
+    rate = 200.0
+    t = np.arange(2000) / rate
+    voltage = 6.0 * np.sin(2 * np.pi * 1.1 * t) + second_tone * np.sin(2 * np.pi * 3.7 * t)
+    keep = np.exp(-1 / rate / TRUTH["time_constant"])
+    w = lfilter([0.0, (1 - keep) * TRUTH["dc_gain"]], [1.0, -keep], voltage)
+    noisy = w + 0.3 * np.random.default_rng(13).standard_normal(w.size)
+    found = estimate(Record("motor", t, np.r_[0.0, voltage[:-1]], velocity=noisy))
+    assert ("one_size_of_voltage" in [f.code for f in found.findings]) is said

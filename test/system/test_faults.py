@@ -6,6 +6,7 @@ within its time-out, and driving resumes without a restart.
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 import random
@@ -31,6 +32,8 @@ GAINS = (
     # A machine that runs tests is busy; these would be a tenth on a robot.
     "feedback_timeout:=0.4", "setpoint_timeout:=0.5", "stall_time:=0.4", "fault_retry:=1.0",
 )  # fmt: skip
+SAMPLE = 0.01
+"""Of the plant [s]."""
 TIMEOUT = 2.0
 """Longest time-out of all [s], with a second for /diagnostics and a busy machine."""
 
@@ -42,13 +45,16 @@ def robot(ros_domain: int) -> Iterator[WheelRobot]:
     robot.close()
 
 
+def stamp(message: MotorState | MotorCommand) -> float:
+    return message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
+
+
 def true_speed(robot: WheelRobot) -> float:
     """Speed of the plant itself, upstream of the relay."""
     last = robot.states["raw"][-10:]
     if len(last) < 10:
         return math.nan
-    stamps = [m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec for m in last]
-    return (last[-1].position - last[0].position) / (stamps[-1] - stamps[0])
+    return (last[-1].position - last[0].position) / (stamp(last[-1]) - stamp(last[0]))
 
 
 class Campaign:
@@ -120,9 +126,16 @@ def test_feedback_faults_stop_the_wheel_are_named_and_driving_resumes(process, r
         relay.passes()
         campaign.is_sound()
 
-    since = time.monotonic()
+    since, n = time.monotonic(), len(robot.states["raw"])
     relay.changes(velocity=lambda v: -v, encoder_count=lambda n: -n, position=lambda p: -p)
     campaign.names("runaway", since)
+    # A command bears the stamp of its sample: samples that a busy machine lost are no evidence.
+    begin = stamp(robot.states["raw"][n])
+    answers = [(stamp(c), c.voltage) for c in robot.commands[WHEEL] if stamp(c) >= begin]
+    end = next(at for at, voltage in answers if voltage == 0.0)
+    stamps = [begin, *(at for at, _ in answers if at <= end)]
+    lost = sum(max(b - a - 2 * SAMPLE, 0.0) for a, b in itertools.pairwise(stamps))
+    assert end - begin <= 0.5 + SAMPLE + lost
     campaign.eventually(lambda: abs(true_speed(robot)) < 0.5, 3.0, robot.spin, "runs away")
     relay.passes()
     campaign.drives()

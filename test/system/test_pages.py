@@ -11,6 +11,7 @@ import re
 import shutil
 import signal
 import subprocess
+import threading
 import time
 from pathlib import Path
 
@@ -21,8 +22,11 @@ from wheel_robot import WheelRobot
 from smp_motor_control import WHEELS
 from smp_motor_ident.cli import identify
 
-NEEDS = ("# needs a running robot", "# needs a robot that drives",
-         "# needs a terminal and a running robot", "# needs ROS 2")  # fmt: skip
+DRIVES = "# needs a robot that drives"
+NEEDS = (DRIVES, "# needs a running robot", "# needs a terminal and a running robot",
+         "# needs ROS 2")  # fmt: skip
+SPEED = 1.2
+"""Of a robot that drives [rad/s]."""
 ENDLESS = ("record", "identifier", "teleop_wheels", "ros2")
 """What runs until Ctrl-C."""
 LOOKED_AT = 12.0
@@ -66,10 +70,10 @@ def run(line: str, folder: Path) -> str:
 
 @pytest.fixture
 def robots(ros_domain, process, eventually):
-    """Start robots by their namespaces."""
-    watchers = []
+    """Start robots by their namespaces, driving or not."""
+    watchers, threads, ended = [], [], threading.Event()
 
-    def start(namespace: str) -> None:
+    def start(namespace: str, driving: bool) -> None:
         ns = f"__ns:={namespace or '/'}"
         process("motor_plant", "--ros-args", "-r", ns)
         process("skid_steer", "--ros-args", "-r", ns)
@@ -83,8 +87,20 @@ def robots(ros_domain, process, eventually):
             eventually(lambda: all(states[w] for w in WHEELS), 60.0, watchers[0].spin)
         else:
             time.sleep(10.0)
+        if driving:
+            watchers[0].setpoint = SPEED
+            threads.append(threading.Thread(target=drive))
+            threads[0].start()
+            eventually(lambda: abs(watchers[0].velocity("front_left") - SPEED) < 0.1, 30.0)
+
+    def drive() -> None:
+        while not ended.is_set():
+            watchers[0].spin()
 
     yield start
+    ended.set()
+    for one in threads:
+        one.join()
     for one in watchers:
         one.close()
 
@@ -100,7 +116,7 @@ def test_commands_for_a_running_robot_do_what_their_page_says(page, lines, tmp_p
     text = "\n".join(lines)
     if "ros2 launch smp_motor_control smp.launch.py" not in text:
         for namespace in ("", *sorted(set(re.findall(r"__ns:=(/\w+)", text)))):
-            robots(namespace)
+            robots(namespace, driving=lines[0].strip() == DRIVES)
     for line in text.replace("\\\n", " ").splitlines():
         if commands([line]) and not any(name in line for name in ELSEWHERE):
             assert not (wrong := run(line, tmp_path)), f"{page}: {wrong}"

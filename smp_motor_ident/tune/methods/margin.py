@@ -251,7 +251,7 @@ def _at_bandwidth(problem: Problem, wished: float, margin: float, peak: float) -
 
 MARGIN = Method(
     "margin",
-    "largest integral gain under phase margin, Ms and ripple",
+    "largest integral gain under phase margin, Ms and control noise",
     "Astrom, Panagopoulos and Hagglund 1998",
     RequiredMargins(phase=60.0, gain=2.0, sensitivity=1.4),
     _solve,
