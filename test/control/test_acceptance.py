@@ -63,35 +63,123 @@ def test_gains_that_drive_the_motor_are_accepted(gains):
     check(settings(**gains))
 
 
-def test_limit_of_stability_is_that_of_the_sampled_loop():
-    # P alone on a motor of first order, one sample late, mean speed over a sample: the largest p
-    # by the roots of the characteristic polynomial, found on the test's own recursion.
-    dt = 0.005
+QUIET = dict(i=0.0, feedforward_velocity=0.0, feedforward_acceleration=0.0)
+"""A proportional action alone."""
+
+
+def limit(dt: float, late: int = 1) -> float:
+    """Return the largest p, alone on a motor of first order whose voltage acts so much later.
+
+    By the test's own recursion: mean speed over a sample, as the hardware shows it.
+    """
     decay = math.exp(-dt / TAU)
 
     def grows(p: float) -> bool:
-        speed, mean, held = 0.0, 0.0, 0.0
-        errors = []
+        speed, mean, held = 0.0, 0.0, [0.0] * late
         for _ in range(4000):
-            command, drive = p * (1.0 - mean), held
-            held = command
-            final = GAIN / RATIO * drive
+            held.append(p * (1.0 - mean))
+            final = GAIN / RATIO * held.pop(0)
             before, speed = speed, final + (speed - final) * decay
             mean = final + (before - final) * TAU / dt * (1.0 - decay)
-            errors.append(abs(mean))
-            if errors[-1] > 1e6:
+            if abs(mean) > 1e6:
                 return True
         return False
 
-    low, high = 1.0, 500.0
+    low, high = 0.1, 5000.0
     while high / low > 1.001:
         middle = math.sqrt(low * high)
         low, high = (low, middle) if grows(middle) else (middle, high)
-    quiet = dict(i=0.0, feedforward_velocity=0.0, feedforward_acceleration=0.0)
+    return low
+
+
+@pytest.mark.parametrize(("delay", "late"), [(0.0, 1), (0.005, 2), (0.006, 3), (0.01, 3)])
+def test_limit_of_stability_is_that_of_the_sampled_loop(delay, late):
     # Within 3 %: so near to the limit nothing grows visibly in the samples of the trial.
-    check(settings(p=0.97 * low, **quiet), WHEEL)
+    largest, model = limit(0.005, late), replace(MODEL, delay=delay)
+    check(replace(settings(p=0.97 * largest, **QUIET), model=model), WHEEL)
     with pytest.raises(ParameterError, match="unstable"):
-        check(settings(p=1.03 * low, **quiet), WHEEL)
+        check(replace(settings(p=1.03 * largest, **QUIET), model=model), WHEEL)
+
+
+def test_refusal_says_by_how_much_at_which_interval():
+    largest = limit(0.005)
+    with pytest.raises(ParameterError, match=r"stable with [\d.]+ times these") as refused:
+        check(settings(p=4 * largest, **QUIET), WHEEL)
+    share = float(str(refused.value).split("stable with ")[1].split()[0])
+    assert 0.25 - 1 / 32 - 0.01 < share < 0.26  # five halvings, printed with two digits
+    with pytest.raises(ParameterError, match="lower them by far"):
+        check(settings(p=100 * largest, **QUIET), WHEEL)
+    named = {1e-9: "0.1 ms", 0.02: "20 ms", 7.0: r"1e\+03 ms", math.nan: "1 ms"}
+    for given, words in named.items():
+        with pytest.raises(ParameterError, match=f"intervals of {words}"):
+            check(settings(i=5e6), replace(WHEEL, sample_time=given))
+
+
+def test_before_the_rate_is_known_one_of_the_usual_must_do():
+    # A motor of first order gets a winding of 0.05 ms, of a sample of 1 ms a twentieth.
+    check(settings(p=0.92 * limit(0.001), **QUIET), replace(WHEEL, sample_time=math.nan))
+    with pytest.raises(ParameterError, match="unstable"):
+        check(settings(p=1.03 * limit(0.001), **QUIET), replace(WHEEL, sample_time=math.nan))
+
+
+@pytest.mark.parametrize(
+    ("factor", "static", "reached"),
+    [(2.1, 0.0, 2.1), (6.0, 0.0, 5.0), (3.0, 1.0, (3.0 * 2.2 - 1.0) / 2.2)],
+)
+def test_feed_forward_of_another_motor_is_refused_by_how_fast_it_would_drive(
+    factor, static, reached
+):
+    # Feed-forward alone for a fifth of what 12 V, less friction, reach; at most those 12 V.
+    given = settings(p=0.0, i=0.0, feedforward_velocity=factor * RATIO / GAIN,
+                     feedforward_acceleration=0.0)  # fmt: skip
+    model = replace(MODEL, static_voltage=static)
+    with pytest.raises(ParameterError, match="times its set-point") as refused:
+        check(replace(given, model=model), WHEEL)
+    said = float(str(refused.value).split("reach ")[1].split()[0])
+    assert said == pytest.approx(reached, rel=0.01)
+    if not static:  # a slow wheel's, too
+        with pytest.raises(ParameterError, match=f"reach {reached if factor < 5 else factor:g} "):
+            check(replace(given, limits=ProfileLimits(velocity=0.01)), WHEEL)
+
+
+def test_feed_forward_of_almost_twice_what_the_motor_takes_is_accepted():
+    check(settings(p=0.0, i=0.0, feedforward_velocity=1.95 * RATIO / GAIN,
+                   feedforward_acceleration=0.0), WHEEL)  # fmt: skip
+
+
+def test_motor_is_known_by_its_model_and_gearing_or_by_the_feed_forward():
+    swinging, nobody = settings(i=1e5), replace(WHEEL, gearbox=None)
+    known = [
+        (swinging, WHEEL),
+        (swinging, nobody),  # the gearing by feed-forward and model
+        (replace(swinging, model=None), nobody),
+        (replace(settings(i=1e5, feedforward_velocity=0.0)), WHEEL),
+    ]
+    for given, wheel in known:
+        with pytest.raises(ParameterError, match="unstable"):
+            check(given, wheel)
+    check(settings(i=1e5, feedforward_velocity=0.0), nobody)
+    for absent in ("feedforward_velocity", "feedforward_acceleration"):
+        check(replace(settings(i=1e5, **{absent: 0.0}), model=None), WHEEL)
+
+
+@pytest.mark.parametrize(
+    ("name", "least", "most"),
+    [
+        ("p", 0.0, 1e5), ("i", 0.0, 1e8), ("d", -1e5, 1e5), ("feedforward_static", 0.0, 1e5),
+        ("feedforward_velocity", 0.0, 1e5), ("feedforward_acceleration", 0.0, 1e5),
+        ("setpoint_weight_p", 0.0, 1.0), ("setpoint_weight_d", 0.0, 1.0),
+    ],
+)  # fmt: skip
+def test_gains_beyond_any_supply_are_refused_and_those_at_the_border_are_not(name, least, most):
+    bounded = PidGains(u_clamp_min=-SUPPLY, u_clamp_max=SUPPLY)
+    for value in (least, most):
+        check(LoopSettings(gains=replace(bounded, **{name: value})))
+    outside = [(most * 1.25, most * 0.25), (least - 0.5, 0.5)]
+    for value, beyond in outside[: 1 if name == "feedforward_static" else 2]:
+        with pytest.raises(ParameterError, match=rf"{name} is .* beyond by ") as refused:
+            check(LoopSettings(gains=replace(bounded, **{name: value})))
+        assert float(str(refused.value).rsplit(" ", 1)[1]) == pytest.approx(beyond, rel=1e-5)
 
 
 def test_gains_that_suit_a_faster_loop_alone_wait_for_its_rate():
