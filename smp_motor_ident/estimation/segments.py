@@ -43,7 +43,8 @@ def heterogeneous(data: Experiments, fit: Fit) -> tuple[Fit, dict[str, float]]:
         return fit, {}
     middle, step, cov, free = found
     parts, size = step.shape
-    expected = np.einsum("bii->i", cov) / parts
+    # Nothing of what stands at its bound in every part.
+    expected = np.maximum(np.einsum("bii->i", cov) / parts, 1e-300)
     square = float(np.square(middle).sum())
     scatter = np.square(step - step.mean(axis=0)).sum(axis=0)
     drift = np.square(middle @ step) / square
