@@ -94,7 +94,7 @@ def _check_signs(gains: PidGains) -> None:
         value = getattr(gains, name)
         least = -largest if name == "d" else 0.0
         if not least <= value <= largest:
-            beyond = value - largest if value > largest else least - value
+            beyond = max(value - largest, least - value)
             raise ParameterError(
                 f"{name} is {value:g}; it must be in [{least:g}, {largest:g}], "
                 f"and is beyond by {beyond:g}"
@@ -129,12 +129,9 @@ class _Plant:
         drift = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0],
                           [0.0, -1.0 / tp, -tau / tp, self.final / tp], [0.0] * 4])  # fmt: skip
         advance = expm(drift * dt)[:3]
-        if not np.all(np.isfinite(advance)):
-            raise ParameterError("the motor's model cannot be computed; look at model.*")
         self._advance = tuple(tuple(float(x) for x in row) for row in advance)
         self.samples = round(min(max(4.0 * (tau + model.delay) / dt, SAMPLES), MOST_SAMPLES))
-        self._late = max(1, 1 + math.ceil(min(model.delay / dt, MOST_SAMPLES) - 1e-9))
-        self.rest()
+        self._late = 1 + math.ceil(min(model.delay / dt, MOST_SAMPLES) - 1e-9)
 
     def rest(self) -> None:
         self.angle = self.speed = self.rate = 0.0
@@ -164,7 +161,6 @@ def _is_stable(settings: LoopSettings, plant: _Plant) -> bool:
     loop = WheelLoop(
         LoopSettings(gains=open_clamps, limits=UNLIMITED, reference_delay=settings.reference_delay)
     )
-    loop.start(0.0)
     plant.rest()
     speed, errors = 0.0, []
     for _ in range(plant.samples):
@@ -198,9 +194,7 @@ def _swing(settings: LoopSettings, plant: _Plant, wheel: Circumstances) -> float
     """Return the largest speed, in set-points, of the loop as it would drive the wheel."""
     gearbox = Gearbox(plant.ratio) if plant.ratio > 0.0 else None
     encoder = wheel.encoder or Encoder()
-    supply = wheel.supply if math.isfinite(wheel.supply) else 1e3
-    loop = WheelLoop(settings, gearbox, encoder, 1.5 * supply)
-    loop.start(0.0)
+    loop = WheelLoop(settings, gearbox, encoder, 1.5 * min(wheel.supply, 1e3))
     plant.rest()
     dt = plant.dt
     most = min(settings.gains.u_clamp_max, -settings.gains.u_clamp_min, 12.0)
@@ -219,5 +213,5 @@ def _swing(settings: LoopSettings, plant: _Plant, wheel: Circumstances) -> float
         voltage = out
         fastest = max(fastest, abs(plant.speed))
         if not fastest < _FAR * target + _FAR:
-            return fastest / target
+            break
     return fastest / target

@@ -9,6 +9,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
+from smp_motor_control.encoder import Encoder
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.motor.model import MotorModel
 from smp_motor_control.motor.parameters import Gearbox
@@ -106,7 +107,8 @@ def test_refusal_says_by_how_much_at_which_interval():
     with pytest.raises(ParameterError, match=r"stable with [\d.]+ times these") as refused:
         check(settings(p=4 * largest, **QUIET), WHEEL)
     share = float(str(refused.value).split("stable with ")[1].split()[0])
-    assert 0.25 - 1 / 32 - 0.01 < share < 0.26  # five halvings, printed with two digits
+    assert 0.25 - 1 / 32 - 0.01 < share < 0.26
+    assert abs(32 * share - round(32 * share)) < 0.17  # five halvings, printed with two digits
     with pytest.raises(ParameterError, match="lower them by far"):
         check(settings(p=100 * largest, **QUIET), WHEEL)
     named = {1e-9: "0.1 ms", 0.02: "20 ms", 7.0: r"1e\+03 ms", math.nan: "1 ms"}
@@ -140,6 +142,70 @@ def test_feed_forward_of_another_motor_is_refused_by_how_fast_it_would_drive(
     if not static:  # a slow wheel's, too
         with pytest.raises(ParameterError, match=f"reach {reached if factor < 5 else factor:g} "):
             check(replace(given, limits=ProfileLimits(velocity=0.01)), WHEEL)
+
+
+def test_set_point_of_the_trial_is_a_fifth_of_what_the_clamps_and_12_v_allow():
+    double = dict(p=0.0, i=0.0, feedforward_acceleration=0.0)
+    weak = settings(feedforward_velocity=2.1 * RATIO / GAIN, u_clamp_min=-3.0, u_clamp_max=5.0,
+                    **double)  # fmt: skip
+    with pytest.raises(ParameterError, match=r"reach 2\.1 times"):  # of 0.6 V; 1.26 V of 5 V
+        check(weak, WHEEL)
+    strong = settings(feedforward_velocity=12.0 * RATIO / GAIN, u_clamp_min=-24.0,
+                      u_clamp_max=24.0, **double)  # fmt: skip
+    with pytest.raises(ParameterError, match="reach 10 times"):  # 24 V, and 2.4 V are due
+        check(strong, replace(WHEEL, supply=24.0))
+
+
+def test_speed_that_is_differenced_over_many_samples_is_tried_with_its_delay():
+    # Half of 20 samples late, beside 1.5 of the loop: the limit of p is a fraction of what it was.
+    largest = limit(0.005)
+    counted = replace(WHEEL, encoder=Encoder(counts_per_revolution=4000.0))
+    late = replace(settings(p=0.6 * largest, **QUIET), speed_source="difference")
+    check(replace(late, difference_window=1), counted)
+    with pytest.raises(ParameterError, match="times its set-point"):
+        check(replace(late, difference_window=20), counted)
+
+
+def test_slow_motor_is_looked_at_for_as_long_as_it_takes():
+    # An integral alone on tau = 1 s, 0.1 s late, swings with a period of seconds: the largest i
+    # is where the phase of 1/(s (1 + tau s)) e^(-D s) is -180 deg; delay, hold and mean included.
+    tau, dt, delay = 1.0, 0.005, 0.1
+    total = delay + 2 * dt
+    low, high = 0.1, 10.0
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        beyond = math.atan(middle * tau) + middle * total > math.pi / 2
+        low, high = (low, middle) if beyond else (middle, high)
+    gain = low * math.hypot(1.0, low * tau) * RATIO / GAIN
+    model = replace(MODEL, time_constant=tau, delay=delay)
+    alone = dict(QUIET, p=0.0)
+    check(replace(settings(**{**alone, "i": 0.3 * gain}), model=model), WHEEL)
+    with pytest.raises(ParameterError, match="unstable"):
+        check(replace(settings(**{**alone, "i": 1.1 * gain}), model=model), WHEEL)
+
+
+def test_feed_forward_that_tells_the_motor_is_its_model():
+    largest = limit(0.005)
+    given = settings(p=0.7 * largest, i=0.0, setpoint_weight_p=0.0)
+    check(replace(given, model=None), WHEEL)
+    with pytest.raises(ParameterError, match="unstable"):
+        check(replace(settings(p=1.1 * largest, i=0.0), model=None), WHEEL)
+    small = settings(i=1e5, feedforward_velocity=0.5, feedforward_acceleration=0.025)
+    with pytest.raises(ParameterError, match="unstable"):
+        check(replace(small, model=None), WHEEL)
+
+
+def test_arithmetic_that_fails_is_refused_in_words(monkeypatch):
+    def fails(*_: object) -> None:
+        raise np.linalg.LinAlgError("singular")
+
+    monkeypatch.setattr("smp_motor_control.wheel.acceptance.WheelLoop", fails)
+    with pytest.raises(ParameterError, match="cannot be computed with these parameters: singular"):
+        check(LoopSettings(gains=GAINS))
+
+
+def test_gains_that_grow_on_nobodys_motor_are_not_judged():
+    check(LoopSettings(gains=PidGains(p=1e5)))
 
 
 def test_feed_forward_of_almost_twice_what_the_motor_takes_is_accepted():
