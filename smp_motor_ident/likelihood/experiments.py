@@ -245,8 +245,9 @@ def _initial(time: Array, output: Array, starts: Integers, kind: int) -> Array:
         y, t = y[ok], t[ok]
         if kind == rc.ANGLE:
             initial[g, 2] = y[0]
-            if y.size > 1 and y.max() != y.min():
-                initial[g, 1] = (y[1] - y[0]) / (t[1] - t[0])
+            moved = int(np.argmax(y != y[0]))  # one that is taken to stand may be held by friction
+            if moved:
+                initial[g, 1] = (y[moved] - y[0]) / (t[moved] - t[0])
         else:
             initial[g, 1] = y[0]
     return initial

@@ -66,3 +66,21 @@ def test_many_short_segments_at_rest_before_the_motion_hide_no_motor():
     for name in ("dc_gain", "time_constant"):
         q = found.combinations[name]
         assert abs(q.value - truth[name]) < 4 * q.std, name
+
+
+def test_a_segment_that_begins_in_a_reversal_does_not_begin_with_a_wheel_held_by_friction():
+    # Through zero speed a coarse encoder shows the same count twice, and the wheel is not at rest.
+    fine = motors.record("rear_left", seconds=6.0, kinds=("square", "fourier"))
+    coarse = fine.count // 10
+    hardware = replace(fine.hardware, counts_per_revolution=50.0)
+    record = replace(fine, count=coarse, velocity=None, hardware=hardware)
+    k = next(
+        k for k in range(200, 1000)
+        if coarse[k] == coarse[k + 1] and abs(coarse[k + 4] - coarse[k]) > 1
+        and abs(coarse[k] - coarse[k - 4]) > 1
+    )  # fmt: skip
+    found = estimate(record.slice(k, len(coarse)))
+    gain, true = found.combinations["dc_gain"], motors.truth("rear_left", 0.3)["dc_gain"]
+    assert not [f for f in found.findings if f.code in ("torque_noise", "not_converged")]
+    assert abs(gain.value - true) < 4 * gain.std
+    assert gain.std < 1e-3 * true  # 11 s of motion; a torque that fluctuates made it 8e-3
