@@ -192,14 +192,13 @@ def _unstable(settings: LoopSettings, plant: _Plant) -> str:
 
 def _swing(settings: LoopSettings, plant: _Plant, wheel: Circumstances) -> float:
     """Return the largest speed, in set-points, of the loop as it would drive the wheel."""
-    gearbox = Gearbox(plant.ratio) if plant.ratio > 0.0 else None
     encoder = wheel.encoder or Encoder()
-    loop = WheelLoop(settings, gearbox, encoder, 1.5 * min(wheel.supply, 1e3))
+    loop = WheelLoop(settings, Gearbox(plant.ratio), encoder, 1.5 * wheel.supply)
     plant.rest()
     dt = plant.dt
     most = min(settings.gains.u_clamp_max, -settings.gains.u_clamp_min, 12.0)
     target = max(0.2 * plant.final * max(most - plant.static, 0.0), 1e-9)
-    target = min(target, settings.limits.velocity or math.inf, 1e4)
+    target = min(target, settings.limits.velocity or math.inf)
     speed = voltage = fastest = 0.0
     for _ in range(plant.samples):
         count = math.floor(plant.angle * plant.ratio / encoder.angle_per_count)
@@ -212,6 +211,6 @@ def _swing(settings: LoopSettings, plant: _Plant, wheel: Circumstances) -> float
         speed = plant.step(out, plant.static)
         voltage = out
         fastest = max(fastest, abs(plant.speed))
-        if not fastest < _FAR * target + _FAR:
+        if not fastest < _FAR * target:
             break
     return fastest / target

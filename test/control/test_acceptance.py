@@ -14,7 +14,7 @@ from smp_motor_control.errors import ParameterError
 from smp_motor_control.motor.model import MotorModel
 from smp_motor_control.motor.parameters import Gearbox
 from smp_motor_control.observer import ObserverNoise
-from smp_motor_control.pid import STRATEGIES, PidGains
+from smp_motor_control.pid import STRATEGIES, PidGains, PidOutput
 from smp_motor_control.reference.profile import Drive, ProfileLimits
 from smp_motor_control.wheel.acceptance import Circumstances, check
 from smp_motor_control.wheel.loop import SPEED_SOURCES, LoopSettings, WheelLoop
@@ -167,9 +167,9 @@ def test_speed_that_is_differenced_over_many_samples_is_tried_with_its_delay():
 
 
 def test_slow_motor_is_looked_at_for_as_long_as_it_takes():
-    # An integral alone on tau = 1 s, 0.1 s late, swings with a period of seconds: the largest i
+    # An integral alone on tau = 3 s, 0.1 s late, swings with a period of seconds: the largest i
     # is where the phase of 1/(s (1 + tau s)) e^(-D s) is -180 deg; delay, hold and mean included.
-    tau, dt, delay = 1.0, 0.005, 0.1
+    tau, dt, delay = 3.0, 0.005, 0.1
     total = delay + 2 * dt
     low, high = 0.1, 10.0
     for _ in range(60):
@@ -179,7 +179,7 @@ def test_slow_motor_is_looked_at_for_as_long_as_it_takes():
     gain = low * math.hypot(1.0, low * tau) * RATIO / GAIN
     model = replace(MODEL, time_constant=tau, delay=delay)
     alone = dict(QUIET, p=0.0)
-    check(replace(settings(**{**alone, "i": 0.3 * gain}), model=model), WHEEL)
+    check(replace(settings(**{**alone, "i": 0.85 * gain}), model=model), WHEEL)
     with pytest.raises(ParameterError, match="unstable"):
         check(replace(settings(**{**alone, "i": 1.1 * gain}), model=model), WHEEL)
 
@@ -204,6 +204,13 @@ def test_arithmetic_that_fails_is_refused_in_words(monkeypatch):
         check(LoopSettings(gains=GAINS))
 
 
+def test_output_that_is_no_number_is_refused_on_anybodys_motor(monkeypatch):
+    nothing = PidOutput(*[math.nan] * 6, False)
+    monkeypatch.setattr(WheelLoop, "step", lambda *_: nothing)
+    with pytest.raises(ParameterError, match="reach nan times"):
+        check(LoopSettings(gains=PidGains()))
+
+
 def test_gains_that_grow_on_nobodys_motor_are_not_judged():
     check(LoopSettings(gains=PidGains(p=1e5)))
 
@@ -224,6 +231,8 @@ def test_motor_is_known_by_its_model_and_gearing_or_by_the_feed_forward():
     for given, wheel in known:
         with pytest.raises(ParameterError, match="unstable"):
             check(given, wheel)
+    with pytest.raises(ParameterError, match="unstable"):
+        check(settings(i=1e5, feedforward_velocity=0.5), nobody)
     check(settings(i=1e5, feedforward_velocity=0.0), nobody)
     for absent in ("feedforward_velocity", "feedforward_acceleration"):
         check(replace(settings(i=1e5, **{absent: 0.0}), model=None), WHEEL)
