@@ -118,10 +118,31 @@ def test_refusal_says_by_how_much_at_which_interval():
 
 
 def test_before_the_rate_is_known_one_of_the_usual_must_do():
-    # A motor of first order gets a winding of 0.05 ms, of a sample of 1 ms a twentieth.
-    check(settings(p=0.92 * limit(0.001), **QUIET), replace(WHEEL, sample_time=math.nan))
+    largest = limit_with_winding(0.001)
+    check(settings(p=0.985 * largest, **QUIET), replace(WHEEL, sample_time=math.nan))
     with pytest.raises(ParameterError, match="unstable"):
-        check(settings(p=1.03 * limit(0.001), **QUIET), replace(WHEEL, sample_time=math.nan))
+        check(settings(p=1.03 * largest, **QUIET), replace(WHEEL, sample_time=math.nan))
+
+
+def limit_with_winding(dt: float) -> float:
+    """Return the largest p, where a motor of first order has a winding of a thousandth of its lag.
+
+    The angle of a sample is that of ``tp w'' + tau w' + w = K u``, integrated once.
+    """
+    step, tp = exact_step(MODEL, RATIO, dt), 1e-3 * TAU * TAU
+    low, high = 0.1, 5000.0
+    while high / low > 1.0005:
+        middle = math.sqrt(low * high)
+        speed = rate = mean = held = 0.0
+        for _ in range(8000):
+            drive, held = held, middle * (1.0 - mean)
+            before = TAU * speed + tp * rate
+            speed, rate = (float(x) for x in step @ (speed, rate, drive))
+            mean = GAIN / RATIO * drive - (TAU * speed + tp * rate - before) / dt
+            if abs(mean) > 1e6:
+                break
+        low, high = (low, middle) if abs(mean) > 1e6 else (middle, high)
+    return low
 
 
 @pytest.mark.parametrize(
