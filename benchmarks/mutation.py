@@ -54,10 +54,6 @@ TESTS = {
     BAG + "counter": "ident/bag/test_counter.py",
     BAG + "salvage": "ident/bag/test_salvage.py",
     BAG + "unpack": "ident/bag/test_unpack.py",
-    BAG + "readers.mcap": "ident/bag/test_truncated.py ident/bag/test_folders.py "
-                          "ident/bag/test_writer.py ident/bag/test_salvage.py",
-    BAG + "readers.sqlite": "ident/bag/test_truncated.py ident/bag/test_folders.py "
-                            "ident/bag/test_writer.py ident/bag/test_salvage.py",
 }  # fmt: skip
 """Test files, the quickest first, by the module that they test."""
 

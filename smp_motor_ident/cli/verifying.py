@@ -15,7 +15,7 @@ from smp_motor_control.encoder import unwrap
 from smp_motor_control.motor.friction import Gearbox
 from smp_motor_ident.bag.columns import Columns, read_columns
 from smp_motor_ident.cli import steps
-from smp_motor_ident.errors import BagError
+from smp_motor_ident.cli.processes import ProcessError
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune import verification
@@ -144,7 +144,10 @@ def _change(
     estimate, document = designed.estimates[wheel], designed.document[wheel]
     asked = np.flatnonzero(np.isclose(answers.fields["setpoint"], setpoint))
     if not asked.size:
-        raise BagError(f"{wheel}: its set-point never was {setpoint:.3g} rad/s in the drive")
+        raise ProcessError(
+            f"{wheel}: wheel_pid was never heard at {setpoint:.3g} rad/s in the drive: it was at "
+            "fault, or its messages were lost; look at /diagnostics, then go on with --resume"
+        )
     begin = float(answers.time[asked[0]])
     shown = (state.time > begin - LEAD) & (state.time < begin + lasts)
     instants = state.time[shown] - begin

@@ -12,7 +12,6 @@ import shutil
 import signal
 import subprocess
 import threading
-import time
 from pathlib import Path
 
 import pytest
@@ -81,12 +80,11 @@ def robots(ros_domain, process, eventually):
         for wheel in WHEELS:
             process("wheel_pid", "--ros-args", "-r", f"__ns:={namespace}/{wheel}",
                     "--params-file", gains)  # fmt: skip
-        if not namespace:
+        if not watchers:
             watchers.append(WheelRobot(ros_domain))
-            states = watchers[0].states
-            eventually(lambda: all(states[w] for w in WHEELS), 60.0, watchers[0].spin)
-        else:
-            time.sleep(10.0)
+        there = watchers[0].node.count_publishers
+        topics = [f"{namespace}/{w}/{t}" for w in WHEELS for t in ("motor_state", "motor_command")]
+        eventually(lambda: all(there(topic) for topic in topics), 60.0, watchers[0].spin)
         if driving:
             watchers[0].setpoint = SPEED
             threads.append(threading.Thread(target=drive))
