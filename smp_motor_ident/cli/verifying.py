@@ -19,7 +19,6 @@ from smp_motor_ident.cli.processes import ProcessError
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune import verification
-from smp_motor_ident.tune.limits import SILENCE
 from smp_motor_ident.tune.verification import STEADY, Change
 
 LEAST = 1.0
@@ -114,10 +113,11 @@ def drive_undisturbed(
                 raise
             say(f"the drive was disturbed: {error}")
             continue
-        if silence <= SILENCE.value:
-            return changes, [*verification.slow_answers(changes), *verification.judge(changes)]
-        say(f"the drive was disturbed: a wheel had no answer for {silence:.2f} s")
-    return changes, [verification.disturbed(silence), *verification.judge(changes)]
+        late = verification.disturbed(silence) or verification.slow_answers(changes)
+        if not late:
+            break
+        say(f"the drive was disturbed: {late[0].message}")
+    return changes, [*late, *verification.judge(changes)]
 
 
 def read_changes(

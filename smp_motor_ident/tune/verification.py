@@ -308,21 +308,19 @@ def slow_answers(changes: Sequence[Change]) -> list[Finding]:
     if worst.excess <= 0.0:
         return []
     text = (
-        f"{worst.wheel}: {worst.name}: samples and answers were so late in this drive that the "
-        f"design overshoots by {worst.excess:.3g} % more than it specifies, which is allowed for"
+        f"{worst.wheel}: {worst.name}: samples and answers were so late that by this alone the "
+        f"design overshoots by {worst.excess:.3g} % more than it specifies"
     )
     return [Finding("slow_answers", "warning", text, {"excess": worst.excess}, _TIME)]
 
 
-def disturbed(silence: float) -> Finding:
+def disturbed(silence: float) -> list[Finding]:
     """Return what is said of a drive in which a wheel was without control for a while [s]."""
-    return Finding(
-        "verification_disturbed",
-        "refused",
-        f"a wheel had no answer to its samples for {silence:.2f} s, in every drive",
-        {"silence": silence, "limit": SILENCE.value},
-        _TIME,
-    )
+    if silence <= SILENCE.value:
+        return []
+    evidence = {"silence": silence, "limit": SILENCE.value}
+    text = f"a wheel had no answer to its samples for {silence:.2f} s"
+    return [Finding("verification_disturbed", "refused", text, evidence, _TIME)]
 
 
 def loop_settings(parameters: Mapping[str, Any]) -> LoopSettings:

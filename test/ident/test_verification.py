@@ -149,7 +149,8 @@ def test_a_wheel_that_never_arrives_is_refused_in_words(designed: Design) -> Non
 
 
 def test_a_drive_without_control_is_refused_with_its_reason() -> None:
-    found = v.disturbed(0.4)
+    assert v.disturbed(0.09) == []
+    (found,) = v.disturbed(0.4)
     assert found.severity == "refused" and "0.40 s" in found.message and found.advice
 
 
