@@ -48,6 +48,11 @@ UNKNOWN = 0.1
 
 _TIME = "give the wheels' nodes processor time (scheduling_priority), and the network its quiet"
 
+_WHEEL = (
+    "look at the curves in the report: a wheel that touches something, a battery that sags or a "
+    "motor that changed since; then commission again"
+)
+
 SIGMAS = 3.0
 """Of the speed's resolution that a reading may be off."""
 
@@ -296,8 +301,7 @@ def judge(changes: Sequence[Change]) -> list[Finding]:
                     f"design allows {most:.3g} {unit}",
                     {"wheel": one.wheel, "value": value if math.isfinite(value) else None,
                      "limit": most},
-                    "look at the curves in the report: a wheel that touches something, a battery "
-                    "that sags or a motor that changed since; then commission again",
+                    _TIME if one.excess > 0.0 else _WHEEL,
                 ))  # fmt: skip
     return found
 

@@ -120,6 +120,9 @@ def test_a_drive_that_its_computer_slowed_is_within_its_bands_and_says_so(design
     (found,) = v.slow_answers([slow, drive(designed)])
     assert found.severity == "warning" and found.evidence["excess"] == slow.excess
     assert v.slow_answers([drive(designed)]) == []
+    # Where it is beyond even that, the computer is named, not the wheel.
+    (refused,) = v.judge([replace(slow, bands=replace(slow.bands, overshoot=1.0))])
+    assert refused.advice == found.advice != v.judge([drive(designed, offset=-0.05)])[0].advice
 
 
 @pytest.mark.parametrize("gain", [0.6, 1.6])
