@@ -36,7 +36,7 @@ MARK = "SMP_CAMPAIGN"
 WHEELS = ("front_left", "rear_left")
 QUIET = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "stdin": subprocess.DEVNULL}
 DURATION = 2.0
-"""Of each signal [s]; the tool records four signals, each in processes of its own, and then computes."""
+"""Of each signal [s]; each of four is recorded by processes of its own, then the tool computes."""
 LASTS = {"commission": 60.0, "excite": DURATION + 2.0, "record": DURATION + 4.0}
 """Up to how long after its start a part is hit [s]."""
 PARTS = ("commission", "commission", "excite", "record")
