@@ -6,9 +6,11 @@ import copy
 import math
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from diagnostic_msgs.msg import DiagnosticArray
 from domain_node import DomainNode
 from lifecycle_msgs.msg import Transition
@@ -25,6 +27,21 @@ from smp_motor_control import WHEELS
 
 STREAM = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 PERIOD = 0.02
+CONFIG = Path(__file__).resolve().parents[1] / "config"
+
+
+def two_wheeled(folder: Path) -> tuple[Path, Path]:
+    """Write motors and gains of a robot of two wheels: those of the paper's first two."""
+    names = {"front_left": "left", "front_right": "right"}
+    (document,) = yaml.safe_load((CONFIG / "motors_paper.yaml").read_text()).values()
+    motors = document["ros__parameters"]["motors"]
+    document["ros__parameters"]["motors"] = {to: motors[name] for name, to in names.items()}
+    gains = yaml.safe_load((CONFIG / "gains.yaml").read_text())
+    tree = {f"/**/{to}/wheel_pid": gains[f"/**/{name}/wheel_pid"] for name, to in names.items()}
+    files = folder / "motors_of_two.yaml", folder / "gains_of_two.yaml"
+    files[0].write_text(yaml.safe_dump({"/**/motor_plant": document}))
+    files[1].write_text(yaml.safe_dump(tree))
+    return files
 
 
 class Relay:

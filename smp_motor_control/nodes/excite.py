@@ -2,26 +2,42 @@
 
 Ends by itself with exit code 0; sends zero to every wheel whatever the reason of leaving.
 A wheel that another node drives is refused: deactivate its controller, or let it rest.
+A wheel that turns too fast, draws too much, becomes too hot or is not heard any more ends the
+signal for all, with exit code 1.
 """
 
 from __future__ import annotations
 
+import json
 import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from pathlib import Path
 
 from rclpy.node import Node
 
+from smp_interfaces.msg import MotorState
 from smp_motor_control import WHEELS
-from smp_motor_control.errors import ParameterError
+from smp_motor_control.errors import ParameterError, SmpError
 from smp_motor_control.excitation import SIGNALS, Bounded, Excitation
 from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.motor_writer import MotorWriter
 from smp_motor_control.nodes.settings import Parameters, described
+from smp_motor_control.wheel.protection import Bounds, Protection, Resistance
 
 _OTHERS = 0.5
 """Time [s] that other listeners than the driver are given to connect."""
+
+_SILENCE = 1.0
+"""A wheel that was heard is missed after commands of so long [s]; time in which this process did
+not run does not count."""
+
+
+class LimitError(SmpError):
+    """A wheel left what it may reach."""
+
+    exit_code = 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,6 +54,21 @@ class Settings:
     )
     max_voltage: float = described(
         12.0, "Amplitudes beyond this are refused [V].", minimum=0.0, read_only=True
+    )
+    max_speed: float = described(
+        0.0, "Largest speed of a wheel [rad/s]; 0 for any.", minimum=0.0, read_only=True
+    )
+    max_current: float = described(
+        0.0, "Largest current of a motor [A]; 0 for any.", minimum=0.0, read_only=True
+    )
+    max_winding_rise: float = described(
+        60.0,
+        "Largest rise of a winding's temperature [K], by its resistance; 0 for any.",
+        minimum=0.0,
+        read_only=True,
+    )
+    cold_file: str = described(
+        "", "Where cold windings' resistances are kept between signals.", read_only=True
     )
     duration: float = described(
         20.0, "Length of the signal [s].", minimum=0.1, maximum=3600.0, read_only=True
@@ -79,6 +110,14 @@ class Settings:
             )
         self.signal_of(0)
 
+    def bounds(self) -> Bounds:
+        """Return what a wheel may reach."""
+        return Bounds(
+            speed=self.max_speed or math.inf,
+            current=self.max_current or math.inf,
+            rise=self.max_winding_rise or math.inf,
+        )
+
     def chosen(self) -> tuple[str, ...]:
         """Return the wheels to excite."""
         return self.wheel_names if "all" in self.wheels else tuple(dict.fromkeys(self.wheels))
@@ -103,10 +142,20 @@ class Excite(Node):
         settings = Parameters(self, Settings).settings
         self._settings = settings
         self._outputs: list[tuple[MotorWriter, Excitation]] = []
+        self._watched: dict[str, Protection] = {}
+        self._unheard: dict[str, float] = {}
+        cold = _read_cold(settings.cold_file)
         for k, wheel in enumerate(settings.chosen()):
             signal = settings.signal_of(k)
             signal(0.0)  # Prepared now, not in the first period.
             self._outputs.append((MotorWriter(self, f"{wheel}/"), signal))
+            self._watched[wheel] = Protection(settings.bounds(), cold.get(wheel))
+            self.create_subscription(
+                MotorState,
+                f"{wheel}/motor_state",
+                lambda message, wheel=wheel: self._watch(wheel, message),
+                runtime.STREAM_SUBSCRIBER,
+            )
         self._begin: float | None = None
         self._all_heard = math.inf
         self._created = time.monotonic()
@@ -133,15 +182,34 @@ class Excite(Node):
                     "deactivate it first"
                 )
             writer.send(signal(elapsed), stamp)
+        for wheel in self._unheard:
+            self._unheard[wheel] += 1.0 / self._settings.rate
+            if self._unheard[wheel] > _SILENCE:
+                raise LimitError(
+                    f"{wheel}: no motor_state for {_SILENCE:g} s; does its driver run?"
+                )
+
+    def _watch(self, wheel: str, message: MotorState) -> None:
+        self._unheard[wheel] = 0.0
+        why = self._watched[wheel].add(
+            runtime.seconds(message.header.stamp), message.voltage, message.current,
+            message.velocity, message.position,
+        )  # fmt: skip
+        if why and self._begin is not None:
+            raise LimitError(f"{wheel}: {why}")
 
     def _heard(self, now: float) -> bool:
         publishers = [writer.publisher for writer, _ in self._outputs]
         silent = [p.topic_name for p in publishers if not p.get_subscription_count()]
-        if silent and now - self._created > self._settings.wait:
-            raise ParameterError(
-                f"nobody listens on {', '.join(silent)}; is the driver or motor_plant running?"
+        mute = [wheel for wheel in self._watched if wheel not in self._unheard]
+        if (silent or mute) and now - self._created > self._settings.wait:
+            what = (
+                f"nobody listens on {', '.join(silent)}"
+                if silent
+                else f"no motor_state of {', '.join(mute)}"
             )
-        if silent:
+            raise ParameterError(f"{what}; is the driver or motor_plant running?")
+        if silent or mute:
             self._all_heard = math.inf
             return False
         # Recorders that are known but not connected yet are waited for, a little.
@@ -169,6 +237,27 @@ class Excite(Node):
         """Send zero to every wheel before the process ends."""
         for writer, _ in self._outputs:
             writer.stop()
+        if self._settings.cold_file:
+            _write_cold(Path(self._settings.cold_file), self._watched)
+
+
+def _read_cold(path: str) -> dict[str, Resistance]:
+    if not path or not Path(path).is_file():
+        return {}
+    try:
+        found = json.loads(Path(path).read_text("utf-8"))
+        return {wheel: Resistance(*map(float, one)) for wheel, one in found.items()}
+    except (ValueError, TypeError, AttributeError):
+        raise ParameterError(f"{path}: holds no cold resistances; remove it") from None
+
+
+def _write_cold(path: Path, watched: Mapping[str, Protection]) -> None:
+    """Keep what was found cold; what an earlier signal kept stays."""
+    found = {wheel: one.winding.cold for wheel, one in watched.items()}
+    known = {wheel: one for wheel, one in found.items() if one is not None}
+    draft = path.with_name(f"{path.name}.part")
+    draft.write_text(json.dumps(_read_cold(str(path)) | known))
+    draft.replace(path)
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -19,6 +19,7 @@ from smp_motor_control.encoder import Unwrapper
 from smp_motor_control.nodes.conventions import LATCHED, seconds
 from smp_motor_control.nodes.motor_writer import MotorWriter
 from smp_motor_control.nodes.robot_client import RobotClient, RobotError
+from smp_motor_control.wheel.protection import Bounds, Protection
 
 COLUMNS = ("time", "age", "command", "voltage", "velocity", "position", "count", "phase")
 
@@ -52,10 +53,15 @@ class WheelTest:
         Whose wheels are paused.
     counters : mapping of str to callable
         By wheel that is heard, from a ``MotorState`` to the total count.
+    bounds : Bounds
+        What ends the test.
     """
 
-    def __init__(self, client: RobotClient, counters: Mapping[str, Counter]) -> None:
+    def __init__(
+        self, client: RobotClient, counters: Mapping[str, Counter], bounds: Bounds
+    ) -> None:
         self._client, self._counters = client, counters
+        self._watched = {wheel: Protection(bounds) for wheel in counters}
         self.tapes = {wheel: Tape() for wheel in counters}
         self._commands = dict.fromkeys(counters, 0.0)
         self._laws: Mapping[str, Law] = {}
@@ -99,6 +105,11 @@ class WheelTest:
             stamp, age, self._commands[wheel], message.voltage, message.velocity,
             message.position, self._counters[wheel](message), float(self._phase),
         ))  # fmt: skip
+        why = self._watched[wheel].add(
+            stamp, message.voltage, message.current, message.velocity, message.position
+        )
+        if why:
+            raise RobotError(f"{wheel}: {why}")
         law = self._laws.get(wheel)
         if law is not None:
             self._commands[wheel] = law(time.monotonic() - self._begun)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from smp_motor_control.motor.file import MotorEntry
+from smp_motor_control.wheel.protection import Bounds
 from smp_motor_ident.diagnosis.wheel_checks import Robot, judge
 from smp_motor_ident.diagnosis.wheel_test import (
     Figures,
@@ -50,6 +51,7 @@ class Checked:
     findings: tuple[Finding, ...]  # in the order of the checks
     figures: Mapping[str, Figures]  # by wheel
     amplitude: float  # voltage at which every wheel answers well, as far as the limit allows [V]
+    speed: float  # of the fastest wheel at that voltage, as far as they show [rad/s]; NaN for none
 
 
 @dataclass
@@ -101,6 +103,7 @@ def check_wheels(
     client: Any,
     wheels: Sequence[str],
     limit: float,
+    bounds: Bounds,
     known: Mapping[str, MotorEntry],
     say: Callable[[str], None],
 ) -> Checked:
@@ -115,7 +118,7 @@ def check_wheels(
         )
         for wheel, one in hardware.items()
     }
-    with wheel_test.WheelTest(client, counters).open() as test:
+    with wheel_test.WheelTest(client, counters, bounds).open() as test:
         for wheel in wheels:
             say(f"checking {wheel}: slowly until it turns, both ways")
             way = _Way(test, wheel, hardware[wheel].supply_voltage or 12.0, limit)
@@ -137,7 +140,10 @@ def check_wheels(
         wheel_test.battery(client),
     )
     levels = [one.level for one in found.values() if math.isfinite(one.level)]
-    return Checked(tuple(judge(robot)), found, max(levels, default=limit))
+    amplitude = max(levels, default=limit)
+    speeds = [abs(found[w].gain) * amplitude / hardware[w].gear_ratio for w in wheels]
+    fastest = max(filter(math.isfinite, speeds), default=math.nan)
+    return Checked(tuple(judge(robot)), found, amplitude, fastest)
 
 
 def _described(found: Mapping[str, Any], wheels: Sequence[str]) -> dict[str, Hardware]:

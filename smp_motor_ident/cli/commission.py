@@ -26,6 +26,11 @@ def parser() -> argparse.ArgumentParser:
     add("--amplitude", type=number(0), default=6.0, help="largest voltage [V]; default 6")
     add("--duration", type=number(0), default=15.0, help="of each of three signals [s]; default 15")
     add("--motors", metavar="FILE", help="what is known of the motors, to check gearing by")
+    add("--max-speed", type=number(0), metavar="RAD/S",
+        help="of a wheel; default: half more than its checks show for the voltage")  # fmt: skip
+    add("--max-current", type=number(0), default=0.0, metavar="A", help="of a motor; default any")
+    add("--max-winding-rise", type=number(0), default=60.0, metavar="K",
+        help="of its winding's temperature, by its resistance; default 60")  # fmt: skip
     add("--accept", action="append", default=[], metavar="CODE", help="do not stop at this finding")
     add("--apply", action="store_true", help="leave gains that pass in the running controllers")
     add("--resume", action="store_true", help="go on in DIR where an earlier run was cut off")

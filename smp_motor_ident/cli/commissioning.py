@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import shutil
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +17,14 @@ import numpy as np
 from smp_motor_control import WHEELS
 from smp_motor_control.excitation import SIGNALS as SHAPES
 from smp_motor_control.motor.file import load_motors
+from smp_motor_control.wheel.protection import Bounds
 from smp_motor_ident import bag
 from smp_motor_ident.cli import checking, steps, verifying
 from smp_motor_ident.cli.commission import NAME
 from smp_motor_ident.cli.processes import ProcessError, Processes, connect
 from smp_motor_ident.cli.protocol import Protocol
 from smp_motor_ident.diagnosis import validation_run
+from smp_motor_ident.diagnosis.wheel_limits import OVER_SPEED
 from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.estimation.simulation import simulate
 from smp_motor_ident.finding import Finding
@@ -40,6 +44,9 @@ SIGNALS = (
     ("steps", 1.0, 0.5, "validation"),
 )
 """What moves the wheels: signal, shares of amplitude and duration, and whose recording."""
+
+COLD = "cold.json"
+"""Resistances of the windings before the first signal, for ``excite``."""
 
 LOOKS, ALIKE = 15, 4
 """Wheels are looked for at most so often, until so many looks [1 s each] find the same."""
@@ -67,10 +74,16 @@ def work(arguments: argparse.Namespace) -> int:
 
 def _commission(arguments: argparse.Namespace, folder: Path, known: Mapping[str, Any]) -> int:
     ros = tuple(arguments.ros_arguments)
+    bounds: dict[str, object] = {
+        "max_speed": arguments.max_speed or 0.0,
+        "max_current": arguments.max_current,
+        "max_winding_rise": arguments.max_winding_rise,
+        "cold_file": folder.resolve() / COLD,
+    }
     # The client leaves last: who excites has ended when the controllers are given back.
     with connect(NAME, ros) as client, Processes(folder / "logs") as processes:
         wheels = tuple(dict.fromkeys(arguments.wheel or ())) or _found(client)
-        robot = steps.Robot(processes, client, wheels or WHEELS, folder, ros)
+        robot = steps.Robot(processes, client, wheels or WHEELS, folder, ros, bounds)
         rates = client.wait_for_wheels(robot.wheels, timeout=15.0)
         print("; ".join(f"{wheel} reports at {rate:.0f} Hz" for wheel, rate in rates.items()))
         if not (folder / EXCITED).exists():
@@ -98,7 +111,17 @@ def _move(
         shutil.rmtree(folder / name, ignore_errors=True)
     (folder / BEGUN).touch()
     protocol.begin(robot.wheels)
-    checked = checking.check_wheels(robot.client, robot.wheels, arguments.amplitude, known, _say)
+    bounds = Bounds(
+        speed=arguments.max_speed or math.inf,
+        current=arguments.max_current or math.inf,
+        rise=arguments.max_winding_rise,
+    )
+    checked = checking.check_wheels(
+        robot.client, robot.wheels, arguments.amplitude, bounds, known, _say
+    )
+    if not arguments.max_speed and math.isfinite(checked.speed):
+        fastest = OVER_SPEED.value * checked.speed
+        robot = replace(robot, bounds={**robot.bounds, "max_speed": fastest})
     protocol.checks(checked.figures, checked.amplitude)
     protocol.stop(protocol.add("checks", checked.findings))
     protocol.write()

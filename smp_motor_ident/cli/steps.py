@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -26,13 +26,14 @@ class Excitation:
 
 @dataclass(frozen=True)
 class Robot:
-    """A robot whose nodes run, and where its results go."""
+    """A robot whose nodes run, where its results go, and what it may reach meanwhile."""
 
     processes: Processes
     client: Any
     wheels: tuple[str, ...]
     folder: Path
     ros_arguments: tuple[str, ...] = ()
+    bounds: Mapping[str, object] = field(default_factory=dict)  # parameters of ``excite``
 
     def wheel_nodes(self) -> list[str]:
         """Return the names of the wheels' controllers."""
@@ -68,6 +69,7 @@ def excite(robot: Robot, plan: Sequence[Excitation]) -> None:
             "wheels": f"[{', '.join(robot.wheels)}]",
             "amplitude": float(part.amplitude),
             "duration": float(part.duration),
+            **robot.bounds,
         }
         arguments = [a for n, v in parameters.items() for a in ("-p", f"{n}:={v}")]
         robot.processes.start("excite", "excite", *robot.ros_arguments, "--ros-args", *arguments)

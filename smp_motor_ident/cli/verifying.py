@@ -19,7 +19,6 @@ from smp_motor_ident.cli.processes import ProcessError
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune import verification
-from smp_motor_ident.tune.limits import SILENCE
 from smp_motor_ident.tune.verification import STEADY, Change
 
 LEAST = 1.0
@@ -30,6 +29,10 @@ LEAD = 0.3
 
 ATTEMPTS = 3
 """Drives; a drive that was disturbed is repeated, whatever it showed."""
+
+
+class NeverHeard(ProcessError):
+    """A wheel's controller that was not heard at a set-point of the drive."""
 
 
 @dataclass
@@ -101,13 +104,20 @@ def drive_undisturbed(
 ) -> tuple[list[Change], list[Finding]]:
     """Drive until nothing but the wheels shows; return the changes, and what is to be said."""
     plan, namespace = designed.plan(), str(robot.client.node.get_namespace()).rstrip("/")
-    for _ in range(ATTEMPTS):
+    for left in reversed(range(ATTEMPTS)):
         say(f"driving on the new gains: {', '.join(name for name, *_ in plan)}")
-        changes, silence = read_changes(drive(robot, plan), plan, designed, namespace)
-        if silence <= SILENCE.value:
-            return changes, verification.judge(changes)
-        say(f"the drive was disturbed: a wheel had no answer for {silence:.2f} s")
-    return changes, [verification.disturbed(silence), *verification.judge(changes)]
+        try:
+            changes, silence = read_changes(drive(robot, plan), plan, designed, namespace)
+        except NeverHeard as error:
+            if not left:
+                raise
+            say(f"the drive was disturbed: {error}")
+            continue
+        late = verification.disturbed(silence) or verification.slow_answers(changes)
+        if not late:
+            break
+        say(f"the drive was disturbed: {late[0].message}")
+    return changes, [*late, *verification.judge(changes)]
 
 
 def read_changes(
@@ -121,43 +131,51 @@ def read_changes(
     The wait is that of a wheel for the answer to a sample [s].
     """
     wheels = list(designed.document)
-    wanted = {f"{namespace}/{w}/motor_state": ["encoder_count", "position"] for w in wheels}
-    wanted |= {f"{namespace}/{w}/pid_state": ["setpoint", "age", "dt"] for w in wheels}
+    fields = ["encoder_count", "position", "voltage"]
+    wanted = {f"{namespace}/{w}/motor_state": fields for w in wheels}
+    wanted |= {f"{namespace}/{w}/pid_state": ["setpoint", "age", "dt", "output"] for w in wheels}
     read = read_columns(bag, wanted)
     changes, silence = [], 0.0
     for wheel in wheels:
         state = read[f"{namespace}/{wheel}/motor_state"]
         answers = read[f"{namespace}/{wheel}/pid_state"]
+        delays = verification.arrival_delays(
+            (answers.time, answers.fields["age"], answers.fields["output"]),
+            (state.time, state.fields["voltage"]),
+            float(designed.document[wheel]["loop"]["supply_voltage"]),
+        )
         for name, setpoint, lasts in plan:
             if setpoint:
-                changes.append(_change(wheel, name, setpoint, lasts, designed, state, answers))
+                changes.append(
+                    _change(wheel, name, setpoint, lasts, designed, state, answers, delays)
+                )
         # The first interval is that since another drive.
-        late = (answers.fields["dt"][1:], answers.fields["age"][1:])
+        late = answers.fields["dt"][1:], delays[1:]
         silence = max(silence, *(float(np.max(one, initial=0.0)) for one in late))
     return changes, silence
 
 
 def _change(
     wheel: str, name: str, setpoint: float, lasts: float, designed: Designed, state: Columns,
-    answers: Columns,
+    answers: Columns, delays: np.ndarray[Any, Any],
 ) -> Change:  # fmt: skip
     estimate, document = designed.estimates[wheel], designed.document[wheel]
     asked = np.flatnonzero(np.isclose(answers.fields["setpoint"], setpoint))
     if not asked.size:
-        raise ProcessError(
+        raise NeverHeard(
             f"{wheel}: wheel_pid was never heard at {setpoint:.3g} rad/s in the drive: it was at "
             "fault, or its messages were lost; look at /diagnostics, then go on with --resume"
         )
     begin = float(answers.time[asked[0]])
     shown = (state.time > begin - LEAD) & (state.time < begin + lasts)
     instants = state.time[shown] - begin
-    known = dict(zip(answers.time - begin, answers.fields["age"]))
-    ages = np.array([known.get(instant, np.nan) for instant in instants])
+    known = dict(zip(answers.time - begin, delays))
+    waited = np.array([known.get(instant, np.nan) for instant in instants])
     step = float(document["loop"]["sample_time"])
     even, speed = verification.smoothed(instants, _angle(state, estimate)[shown], step)
     kept = (even >= 0.0) & (even < lasts - 0.05)
     rows = verification.predicted(
-        estimate, _nested(designed.gains[wheel]), document["loop"], setpoint, (instants, ages),
+        estimate, _nested(designed.gains[wheel]), document["loop"], setpoint, (instants, waited),
         even[kept],
     )  # fmt: skip
     hardware = estimate.hardware

@@ -65,6 +65,13 @@ SISTERS = Limit(
     "frictions of one type of motor scatter by a half; three times is a brake",
     "test_wheel_checks.py: a wheel that drags",
 )
+OVER_SPEED = Limit(
+    1.5,
+    "times what the checks show for the largest voltage",
+    "a supply that is too high adds a tenth, lost friction another; only a broken encoder, another "
+    "driver or another motor makes half",
+    "test_commission_plan.py: a wheel that turns faster than its checks",
+)
 VALIDATION_LEVEL = Limit(
     0.01,
     "significance level",

@@ -95,7 +95,7 @@ def reconstruct(record: Record, loop: KnownLoop, numbers: Mapping[str, float]) -
     ticks = math.nan if per_turn is None else per_turn * record.hardware.gear_ratio / (2 * math.pi)
     setting = Setting(numbers, T, supply, ticks)
     speed = record.velocity / record.hardware.gear_ratio
-    speed, step = _as_the_loop_had_it(speed, setting)
+    speed, step, counted = _as_the_loop_had_it(speed, setting)
     volts = _run(loop.start(setting), record.voltage, speed)
     error = _error(loop, setting, record.voltage, speed, step)
     if error > COMMAND_RESOLUTION.value * supply:
@@ -111,7 +111,7 @@ def reconstruct(record: Record, loop: KnownLoop, numbers: Mapping[str, float]) -
         f"gains and the supply of {supply:g} V",
         {"error": error},
     )
-    return replace(record, voltage=volts, findings=(*record.findings, note))
+    return replace(record, voltage=volts, findings=(*record.findings, note), **counted)
 
 
 def _interval(record: Record, loop: KnownLoop, numbers: Mapping[str, float]) -> float:
@@ -141,17 +141,23 @@ def _unbroken(record: Record, T: float) -> Record:
     return record
 
 
-def _as_the_loop_had_it(speed: Array, setting: Setting) -> tuple[Array, float]:
-    """Return the speed in whole ticks where it is that, and the step in which it was logged."""
+def _as_the_loop_had_it(speed: Array, setting: Setting) -> tuple[Array, float, dict[str, Any]]:
+    """Return the speed as the loop had it, the step in which it was logged, and its counts.
+
+    Whole ticks of every interval are counts: known far better than the speed at each instant.
+    """
     if math.isfinite(setting.ticks):
         exact = speed * setting.ticks * setting.sample_time
-        if np.mean(np.abs(exact - np.rint(exact)) < TICK_FIT.value) > 1 - TICK_FIT.value:
-            return np.rint(exact) / setting.ticks / setting.sample_time, 0.0
+        ticks = np.rint(exact)
+        whole = np.abs(exact - ticks) < TICK_FIT.value
+        if np.mean(whole) > 1 - TICK_FIT.value:
+            counted = {"count": np.cumsum(ticks), "velocity": None} if whole.all() else {}
+            return ticks / setting.ticks / setting.sample_time, 0.0, counted
     gaps = np.diff(np.unique(np.abs(speed)))
     gaps = gaps[gaps > 1e-9 * np.abs(speed).max(initial=1e-9)]
     step = float(gaps.min()) if gaps.size else 0.0
     on_grid = step > 0 and np.abs(speed / step - np.rint(speed / step)).max() < 0.1
-    return speed, step if on_grid else 0.0
+    return speed, step if on_grid else 0.0, {}
 
 
 def _run(step: Step, setpoints: Array, speed: Array) -> Array:

@@ -25,7 +25,13 @@ from smp_motor_control.wheel.loop import LoopSettings, WheelLoop
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune.arrays import Array
-from smp_motor_ident.tune.limits import OVERSHOOT, SETTLED, SILENCE, STEADY_ERROR
+from smp_motor_ident.tune.limits import (
+    COMMAND_RESOLUTION,
+    OVERSHOOT,
+    SETTLED,
+    SILENCE,
+    STEADY_ERROR,
+)
 
 SMOOTHING = 0.05
 """Length [s] of the parabola whose slope is taken as the speed."""
@@ -36,6 +42,16 @@ STEADY = 0.3
 DRAWS = 12
 """Motors beside the nominal one: the largest of so many is exceeded once in thirteen changes by
 chance, and the nominal band and the widening cover that."""
+
+UNKNOWN = 0.1
+"""Of the samples whose voltage may be no command's: one that changed within an interval."""
+
+_TIME = "give the wheels' nodes processor time (scheduling_priority), and the network its quiet"
+
+_WHEEL = (
+    "look at the curves in the report: a wheel that touches something, a battery that sags or a "
+    "motor that changed since; then commission again"
+)
 
 SIGMAS = 3.0
 """Of the speed's resolution that a reading may be off."""
@@ -73,6 +89,7 @@ class Change:
     high: Array  # largest of the predictions [rad/s]
     reading: Reading  # of the measured speed
     bands: Bands  # of the design
+    excess: float  # overshoot of the nominal motor beyond the design's [% of the change]
 
 
 def smoothed(time: Array, angle: Array, step: float) -> tuple[Array, Array]:
@@ -107,6 +124,45 @@ def read(time: Array, speed: Array, setpoint: float, tolerance: float) -> Readin
     )
 
 
+def arrival_delays(
+    answers: tuple[Array, Array, Array], applied: tuple[Array, Array], supply: float
+) -> Array:
+    """Return how long each answer took from its sample until the motor had it.
+
+    A computer that is busy keeps commands in queues, which their ages do not show; the voltages
+    that the driver reports do.
+
+    Parameters
+    ----------
+    answers : (ndarray, ndarray, ndarray), each of shape (m,)
+        Times of the answered samples [s], how old these were when answered [s], commands [V].
+    applied : (ndarray, ndarray), each of shape (n,)
+        Times of the samples [s], mean voltages over the intervals that end there [V].
+    supply : float
+        Voltage of a full command [V].
+
+    Returns
+    -------
+    ndarray, shape (m,), [s]
+        The ages, where the voltages are not the commands' (measured ones, say).
+    """
+    (asked, ages, commands), (time, voltage) = answers, applied
+    sent = asked + ages
+    step = COMMAND_RESOLUTION.value * supply
+    effective = np.zeros(time.size, dtype=np.intp)
+    unknown = 0
+    for k in range(1, time.size):
+        last = int(np.searchsorted(sent, time[k - 1], side="right"))
+        alike = np.flatnonzero(np.abs(commands[effective[k - 1] : last] - voltage[k]) <= step)
+        unknown += last > 0 and not alike.size
+        effective[k] = effective[k - 1] + (alike[-1] if alike.size else 0)
+    if unknown > UNKNOWN * time.size:
+        return ages
+    first = np.searchsorted(effective, np.arange(asked.size), side="left")
+    begun = time[np.clip(first - 1, 0, time.size - 1)]
+    return np.where(first < time.size, np.maximum(ages, begun - asked), ages)
+
+
 def predicted(
     estimate: Estimate,
     parameters: Mapping[str, Any],
@@ -126,8 +182,8 @@ def predicted(
     setpoint : float
         [rad/s, wheel].
     answers : (ndarray, ndarray), each of shape (n,), [s]
-        When the recorded drive took its samples, since the change, and how old each was when it
-        was answered; NaN where it was not.  Rest before the change lets the loop begin.
+        When the recorded drive took its samples, since the change, and how long after each the
+        motor had its answer; NaN where there was none.  Rest before the change lets the loop begin.
     time : ndarray, shape (k,), [s]
         At which the speed is wanted.
 
@@ -213,10 +269,12 @@ def change_of(
     """Return a change with its reading and its bands."""
     # What a planned change may overshoot is not held against its settling.
     tolerance = SETTLED.value + OVERSHOOT.value + SIGMAS * unsure / abs(setpoint)
+    expected = read(time, rows[0], setpoint, tolerance).overshoot
     return Change(
         wheel, name, setpoint, time, speed, rows.min(axis=0), rows[0], rows.max(axis=0),
         read(time, speed, setpoint, tolerance),
         bands_of(rows, time, setpoint, specification, unsure),
+        expected - _high(specification, "overshoot") - 100 * (tolerance - SETTLED.value),
     )  # fmt: skip
 
 
@@ -243,21 +301,30 @@ def judge(changes: Sequence[Change]) -> list[Finding]:
                     f"design allows {most:.3g} {unit}",
                     {"wheel": one.wheel, "value": value if math.isfinite(value) else None,
                      "limit": most},
-                    "look at the curves in the report: a wheel that touches something, a battery "
-                    "that sags or a motor that changed since; then commission again",
+                    _TIME if one.excess > 0.0 else _WHEEL,
                 ))  # fmt: skip
     return found
 
 
-def disturbed(silence: float) -> Finding:
-    """Return what is said of a drive in which a wheel was without control for a while [s]."""
-    return Finding(
-        "verification_disturbed",
-        "refused",
-        f"a wheel had no answer to its samples for {silence:.2f} s, in every drive",
-        {"silence": silence, "limit": SILENCE.value},
-        "give the wheels' nodes processor time (scheduling_priority), and the network its quiet",
+def slow_answers(changes: Sequence[Change]) -> list[Finding]:
+    """Say it where the drive's own timing makes the design overshoot: the bands allow for that."""
+    worst = max(changes, key=lambda one: one.excess)
+    if worst.excess <= 0.0:
+        return []
+    text = (
+        f"{worst.wheel}: {worst.name}: samples and answers were so late that by this alone the "
+        f"design overshoots by {worst.excess:.3g} % more than it specifies"
     )
+    return [Finding("slow_answers", "warning", text, {"excess": worst.excess}, _TIME)]
+
+
+def disturbed(silence: float) -> list[Finding]:
+    """Return what is said of a drive in which a wheel was without control for a while [s]."""
+    if silence <= SILENCE.value:
+        return []
+    evidence = {"silence": silence, "limit": SILENCE.value}
+    text = f"a wheel had no answer to its samples for {silence:.2f} s"
+    return [Finding("verification_disturbed", "refused", text, evidence, _TIME)]
 
 
 def loop_settings(parameters: Mapping[str, Any]) -> LoopSettings:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import shutil
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -65,6 +66,7 @@ class Steps:
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self.folder, self.done = folder, list[str]()
         self.cut, self.found = "", tuple[Finding, ...]()
+        self.bounds = dict[str, object]()
         monkeypatch.setattr(commissioning, "connect", lambda *_: Client())
         monkeypatch.setattr(steps, "record", self.record)
         for owner, name, called in (
@@ -77,15 +79,17 @@ class Steps:
         monkeypatch.setattr(steps, "tune_wheels", self.tune)
         monkeypatch.setattr(checking, "check_wheels", self.check)
 
-    def step(self, name: str, *_: object) -> Any:
+    def step(self, name: str, *given: Any) -> Any:
         self.done.append(name)
+        if name == "excite":
+            self.bounds = dict(given[0].bounds)
         if name == self.cut:
             raise KeyboardInterrupt
         return {"identify": {}, "validate": [], "verify": "as designed"}.get(name)
 
     def check(self, *_: object) -> checking.Checked:
         self.step("check")
-        return checking.Checked(self.found, {"left": FIGURES}, 4.0)
+        return checking.Checked(self.found, {"left": FIGURES}, 4.0, 1.6)
 
     def record(self, robot: object, name: str) -> Path:
         (self.folder / name).mkdir()  # as record does, which refuses a folder that is there
@@ -153,3 +157,18 @@ def test_what_ends_it_otherwise_stands_in_its_page(
     assert main(["--output", str(robot.folder), "--yes"]) == 1
     document = json.loads((robot.folder / "commissioning.json").read_text())
     assert document["passed"] is False and "refused the parameters" in document["verdict"]
+
+
+def test_a_wheel_that_turns_faster_than_its_checks_or_its_limit_ends_the_excitation(
+    robot: Steps,
+) -> None:
+    given = ["--output", str(robot.folder), "--yes"]
+    assert main(given) == 0
+    # The checks show 1.6 rad/s; half as much again is no supply's and no friction's doing.
+    assert robot.bounds["max_speed"] == pytest.approx(1.5 * 1.6)
+    assert robot.bounds["max_winding_rise"] == 60.0 and robot.bounds["max_current"] == 0.0
+    shutil.rmtree(robot.folder)
+    limits = ["--max-speed", "3", "--max-current", "2", "--max-winding-rise", "40"]
+    assert main([*given, *limits]) == 0
+    asked = [robot.bounds[f"max_{name}"] for name in ("speed", "current", "winding_rise")]
+    assert asked == [3.0, 2.0, 40.0]

@@ -121,6 +121,8 @@ def test_the_motor_is_identified_through_the_loop(laws, name, tmp_path):
         # Four standard deviations: 1 in 16,000 by chance, and the seed is fixed.
         assert abs(found["value"] - truth) < 4 * found["std"]
         assert found["std"] < 0.02 * truth
+    # Its speeds are whole ticks: a gain from 20 s of counts, not from speeds rounded one by one.
+    assert motor["combinations"]["dc_gain"]["std"] < 1e-4 * GAIN
     assert "reconstructed_voltage" in [f["code"] for f in motor["findings"]]
 
 

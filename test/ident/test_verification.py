@@ -33,6 +33,7 @@ def drive(
     entry: MotorEntry = ENTRY,
     load: float = 0.0,
     late: float = 0.0,
+    wait: float = 0.0,
     offset: float = 0.0,
 ) -> v.Change:
     """Return a change of set-point that another motor did, as commission reads it."""
@@ -43,7 +44,7 @@ def drive(
         v.loop_settings(parameters(one)),
         lambda t: setpoint if t >= REST else 0.0,
         REST + LASTS,
-        timing=Timing(sample_time=STEP, delay=STEP, jitter=late),
+        timing=Timing(sample_time=STEP, delay=STEP + wait, jitter=late),
         drive=DriveSettings(command_timeout=math.inf, pwm_steps=1000),
         load=lambda t: load,
     )
@@ -57,7 +58,7 @@ def drive(
         parameters(one),
         document,
         setpoint,
-        (instants, np.zeros(instants.size)),
+        (instants, np.full(instants.size, STEP + wait)),
         even[kept],
     )
     specification = asdict(one.specification)
@@ -96,6 +97,34 @@ def test_samples_that_nobody_answered_are_in_the_prediction(designed: Design) ->
     assert rows[1][-1] == pytest.approx(1.0, abs=0.02)
 
 
+def test_how_long_a_command_waited_is_seen_in_the_voltages_that_were_applied() -> None:
+    rng = np.random.default_rng(4)
+    time = STEP * np.arange(200)
+    commands, ages = rng.uniform(-10.0, 10.0, time.size), np.full(time.size, 0.001)
+    # In effect from the next sample on; between 0.50 and 0.54 s the driver takes none.
+    arrived = time + STEP
+    arrived[(arrived > 0.501) & (arrived < 0.539)] = 0.54
+    latest = np.array([np.flatnonzero(arrived <= t + 1e-9)[-1:] for t in time[:-1]], dtype=object)
+    voltage = np.array([0.0] + [float(commands[k[0]]) if k.size else 0.0 for k in latest])
+    delays = v.arrival_delays((time, ages, commands), (time, voltage), 12.0)
+    # Before the first nothing was; the last two were not in effect when the record ended.
+    np.testing.assert_allclose(delays[1:-2], (arrived - time)[1:-2], atol=1e-9)
+    measured = voltage + rng.normal(0.0, 1.0, voltage.size)
+    assert np.array_equal(v.arrival_delays((time, ages, commands), (time, measured), 12.0), ages)
+
+
+def test_a_drive_that_its_computer_slowed_is_within_its_bands_and_says_so(designed: Design) -> None:
+    slow = drive(designed, wait=0.03)
+    assert slow.reading.overshoot > 10.0
+    assert v.judge([slow]) == []
+    (found,) = v.slow_answers([slow, drive(designed)])
+    assert found.severity == "warning" and found.evidence["excess"] == slow.excess
+    assert v.slow_answers([drive(designed)]) == []
+    # Where it is beyond even that, the computer is named, not the wheel.
+    (refused,) = v.judge([replace(slow, bands=replace(slow.bands, overshoot=1.0))])
+    assert refused.advice == found.advice != v.judge([drive(designed, offset=-0.05)])[0].advice
+
+
 @pytest.mark.parametrize("gain", [0.6, 1.6])
 def test_another_motor_is_refused(designed: Design, gain: float) -> None:
     motor = ENTRY.parameters
@@ -123,7 +152,8 @@ def test_a_wheel_that_never_arrives_is_refused_in_words(designed: Design) -> Non
 
 
 def test_a_drive_without_control_is_refused_with_its_reason() -> None:
-    found = v.disturbed(0.4)
+    assert v.disturbed(0.09) == []
+    (found,) = v.disturbed(0.4)
     assert found.severity == "refused" and "0.40 s" in found.message and found.advice
 
 

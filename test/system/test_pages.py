@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 from test_documentation import ROOT, commands, motion, of_language, write_bag
-from wheel_robot import WheelRobot
+from wheel_robot import CONFIG, WheelRobot, two_wheeled
 
 from smp_motor_control import WHEELS
 from smp_motor_ident.cli import identify
@@ -67,24 +67,32 @@ def run(line: str, folder: Path) -> str:
     return "" if fine else f"{line}: exit code {code}\n{text}"
 
 
-@pytest.fixture
-def robots(ros_domain, process, eventually):
-    """Start robots by their namespaces, driving or not."""
-    watchers, threads, ended = [], [], threading.Event()
+TWO = ("left", "right")
 
-    def start(namespace: str, driving: bool) -> None:
-        ns = f"__ns:={namespace or '/'}"
-        process("motor_plant", "--ros-args", "-r", ns)
-        process("skid_steer", "--ros-args", "-r", ns)
-        gains = ROOT / "config" / "gains.yaml"
-        for wheel in WHEELS:
-            process("wheel_pid", "--ros-args", "-r", f"__ns:={namespace}/{wheel}",
-                    "--params-file", gains)  # fmt: skip
+
+@pytest.fixture
+def robots(ros_domain, process, eventually, tmp_path):
+    """Start a robot of two or four wheels in a namespace, driving or not; the last one ends."""
+    watchers, threads, running, ended = [], [], [], threading.Event()
+    four = CONFIG / "motors_paper.yaml", CONFIG / "gains.yaml"
+
+    def start(namespace: str, wheels: tuple[str, ...], driving: bool) -> None:
+        while running:
+            running.pop().end()
+        place = ("--ros-args", "-r", f"__ns:={namespace or '/'}")
+        motors, gains = two_wheeled(tmp_path) if wheels == TWO else four
+        sides = (("left", wheels[::2]), ("right", wheels[1::2]))
+        named = [f"{side}_wheel_names:=[{', '.join(names)}]" for side, names in sides]
+        running.append(process("motor_plant", *place, "-p", f"motors_file:={motors}"))
+        running.append(process("skid_steer", *place, "-p", named[0], "-p", named[1]))
+        for wheel in wheels:
+            there = ("--ros-args", "-r", f"__ns:={namespace}/{wheel}")
+            running.append(process("wheel_pid", *there, "--params-file", gains))
         if not watchers:
             watchers.append(WheelRobot(ros_domain))
-        there = watchers[0].node.count_publishers
-        topics = [f"{namespace}/{w}/{t}" for w in WHEELS for t in ("motor_state", "motor_command")]
-        eventually(lambda: all(there(topic) for topic in topics), 60.0, watchers[0].spin)
+        heard = watchers[0].node.count_publishers
+        topics = [f"{namespace}/{w}/{t}" for w in wheels for t in ("motor_state", "motor_command")]
+        eventually(lambda: all(heard(topic) for topic in topics), 60.0, watchers[0].spin)
         if driving:
             watchers[0].setpoint = SPEED
             threads.append(threading.Thread(target=drive))
@@ -111,10 +119,14 @@ def test_commands_for_a_running_robot_do_what_their_page_says(page, lines, tmp_p
     assert answered == 0
     shutil.copy(ROOT / "config" / "gains.yaml", tmp_path)
     (tmp_path / "history.jsonl").touch()
-    text = "\n".join(lines)
-    if "ros2 launch smp_motor_control smp.launch.py" not in text:
-        for namespace in ("", *sorted(set(re.findall(r"__ns:=(/\w+)", text)))):
-            robots(namespace, driving=lines[0].strip() == DRIVES)
-    for line in text.replace("\\\n", " ").splitlines():
-        if commands([line]) and not any(name in line for name in ELSEWHERE):
-            assert not (wrong := run(line, tmp_path)), f"{page}: {wrong}"
+    text = "\n".join(lines).replace("\\\n", " ")
+    launched = "ros2 launch smp_motor_control smp.launch.py" in text
+    place = re.compile(r"__ns:=(/\w+)")
+    for namespace in ("", *sorted(set(place.findall(text)))):
+        its = [one for one in text.splitlines() if "".join(place.findall(one)) == namespace]
+        two = any("[left, right]" in one or "--wheel left" in one for one in its)
+        if not launched:
+            robots(namespace, TWO if two else WHEELS, driving=lines[0].strip() == DRIVES)
+        for line in its:
+            if commands([line]) and not any(name in line for name in ELSEWHERE):
+                assert not (wrong := run(line, tmp_path)), f"{page}: {wrong}"

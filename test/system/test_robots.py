@@ -7,12 +7,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import pytest
 import rclpy
-import yaml
 from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
 from rclpy.executors import SingleThreadedExecutor
+from wheel_robot import two_wheeled
 
 from smp_motor_control import WHEELS
 
@@ -21,21 +20,6 @@ Process = Callable[..., Any]
 
 SPEEDS = {"robot1": 0.1, "robot2": -0.15}
 """Of the two bodies [m/s]."""
-
-
-@pytest.fixture
-def files(tmp_path: Path) -> tuple[Path, Path]:
-    """Motors and gains of a robot of two wheels, from those of the paper's first two."""
-    names = {"front_left": "left", "front_right": "right"}
-    paper = yaml.safe_load((ROOT / "config" / "motors_paper.yaml").read_text())
-    (document,) = paper.values()
-    motors = document["ros__parameters"]["motors"]
-    document["ros__parameters"]["motors"] = {to: motors[name] for name, to in names.items()}
-    gains = yaml.safe_load((ROOT / "config" / "gains.yaml").read_text())
-    tree = {f"/**/{to}/wheel_pid": gains[f"/**/{name}/wheel_pid"] for name, to in names.items()}
-    (tmp_path / "motors.yaml").write_text(yaml.safe_dump({"/**/motor_plant": document}))
-    (tmp_path / "gains.yaml").write_text(yaml.safe_dump(tree))
-    return tmp_path / "motors.yaml", tmp_path / "gains.yaml"
 
 
 def begin(process: Process, robot: str, sides: tuple[str, str], motors: Path, gains: Path) -> None:
@@ -50,9 +34,9 @@ def begin(process: Process, robot: str, sides: tuple[str, str], motors: Path, ga
 
 
 def test_two_robots_with_two_and_four_wheels_drive_independently(
-    process: Process, files: tuple[Path, Path], ros_domain: int
+    process: Process, tmp_path: Path, ros_domain: int
 ) -> None:
-    begin(process, "robot1", ("left", "right"), *files)
+    begin(process, "robot1", ("left", "right"), *two_wheeled(tmp_path))
     lefts, rights = " ".join(WHEELS[::2]), " ".join(WHEELS[1::2])
     config = ROOT / "config"
     begin(process, "robot2", (lefts, rights), config / "motors_paper.yaml", config / "gains.yaml")
