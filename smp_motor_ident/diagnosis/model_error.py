@@ -69,8 +69,8 @@ def regression(data: Experiments, fit: Fit, gear: float) -> Regression | None:
     table = np.array(columns).T  # columns stay together in memory
     if np.count_nonzero(columns[0]) < 4 * BLOCKS or not np.isfinite(table).all():
         return None
-    made = _projected(table, n_own, _blocks(data), members, len(fit.structure.free()))
-    return replace(made, conditions=_conditions(data, samples))
+    whole = _projected(table, n_own, _blocks(data), members, len(fit.structure.free()))
+    return replace(whole, conditions=_conditions(data, samples))
 
 
 def _conditions(data: Experiments, m: Motion) -> dict[str, Array]:
