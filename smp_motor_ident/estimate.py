@@ -14,8 +14,10 @@ from smp_motor_ident.diagnosis.adequacy import adequacy, stated
 from smp_motor_ident.diagnosis.advice import advise, assess
 from smp_motor_ident.diagnosis.beat import on_beat
 from smp_motor_ident.diagnosis.bunched import merge_bunches
+from smp_motor_ident.diagnosis.conditions import dependent
 from smp_motor_ident.diagnosis.current_kind import ARMATURE, current_kind
 from smp_motor_ident.diagnosis.limits import CANDIDATE_WEIGHT, LEAST_FIT, PROFILED
+from smp_motor_ident.diagnosis.model_error import regression
 from smp_motor_ident.diagnosis.refusal import no_candidate, refuse
 from smp_motor_ident.diagnosis.residuals import residual_tests
 from smp_motor_ident.diagnosis.scope import blames_current, current_left_out, scope
@@ -25,7 +27,11 @@ from smp_motor_ident.estimation import flexible_shaft, order_selection, predicti
 from smp_motor_ident.estimation.averaging import averaged, weights
 from smp_motor_ident.estimation.candidate_starts import of_kind
 from smp_motor_ident.estimation.choice import FittedCandidate
-from smp_motor_ident.estimation.consider_covariance import consider_friction, consider_timing
+from smp_motor_ident.estimation.consider_covariance import (
+    consider_friction,
+    consider_left_out,
+    consider_timing,
+)
 from smp_motor_ident.estimation.descent import refine
 from smp_motor_ident.estimation.fit import Fit, Prior
 from smp_motor_ident.estimation.hold_choice import chosen_hold, instant_deviation
@@ -150,8 +156,56 @@ def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) 
     )
     if not candidates:
         raise no_candidate(group)
+    refused: SmpError | None = None
+    for fits in _in_turn(candidates):
+        try:
+            words = [*found, *_fallen_back(refused, fits)]
+            return _stated(group, request, words, data, hold, fits)
+        except (SignalError, InsufficientExcitationError) as refusal:
+            refused = refused or refusal
+    assert refused is not None
+    raise refused
+
+
+def _in_turn(candidates: list[FittedCandidate]) -> list[list[FittedCandidate]]:
+    """Return the candidates with the choice last, and with each that it contains in its place."""
+    chosen = candidates[-1].fit
+    inner = [
+        r for r in candidates[:-1]
+        if r.whole and r.fit.converged and r.fit.kind == chosen.kind
+        and set(r.fit.structure.free()) < set(chosen.structure.free())
+    ]  # fmt: skip
+    inner.sort(key=lambda r: r.bic)
+    return [candidates, *([*(o for o in candidates if o is not r), r] for r in inner)]
+
+
+def _fallen_back(refusal: SmpError | None, candidates: list[FittedCandidate]) -> list[Finding]:
+    if refusal is None:
+        return []
+    return [
+        Finding(
+            "richer_refused",
+            "unreliable",
+            f"a richer structure that fits the samples better was refused ({refusal}); this is "
+            f"the answer of {candidates[-1].label}",
+            advice="record longer, with sharper and larger steps",
+        )
+    ]
+
+
+def _stated(
+    group: list[Record],
+    request: Request,
+    found: Sequence[Finding],
+    data: Experiments,
+    hold: str,
+    candidates: list[FittedCandidate],
+) -> Estimate:
+    """Return what the last candidate says, and how far it can be trusted."""
     chosen, friction_std, change = _certain(data, candidates[-1].fit, request, group, hold)
     final = of_kind(data, chosen)
+    errors = regression(final, chosen, group[0].hardware.gear_ratio)
+    chosen, parts = dependent(chosen, errors)
     result = answer(chosen, request.known, friction_std, _level(final))
     result, alike = _covering(data, candidates, result, request.known)
     fitted = validate.speed_fit(group, final, chosen)
@@ -163,7 +217,8 @@ def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) 
     findings = [
         *found,
         *assess(final, chosen, FitPercent(fitted, common), tests),
-        *adequacy(final, chosen, stated(chosen, result), group[0].hardware.gear_ratio, tests),
+        *adequacy(errors, data.step, stated(chosen, result), tests),
+        *parts,
         *advise(chosen, result, request.known),
         *scope(final, result, change, alike, group[0].hardware.resistance),
     ]
@@ -213,7 +268,7 @@ def _certain(
     few = thinned(final) if final.size > PROFILED.value else final
     chosen = profiled(few, widened(final, chosen), request.options)
     timed = consider_timing(final, chosen, instant_deviation(group, hold))
-    chosen, friction_std = consider_friction(final, timed)
+    chosen, friction_std = consider_friction(final, consider_left_out(final, timed))
     chosen, change = heterogeneous(final, chosen)
     return chosen, friction_std, change
 

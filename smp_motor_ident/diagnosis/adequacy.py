@@ -32,11 +32,10 @@ from smp_motor_ident.diagnosis.limits import (
     IMPLIED_BIAS,
     RELEVANT_BIAS,
 )
-from smp_motor_ident.diagnosis.model_error import BLOCKS, Regression, regression
+from smp_motor_ident.diagnosis.model_error import Regression
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.quantities import Answer
 from smp_motor_ident.finding import Finding
-from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.result import Quantity, ResidualTests
 
@@ -60,16 +59,9 @@ class Evidence:
 
 
 def adequacy(
-    data: Experiments,
-    fit: Fit,
-    numbers: Sequence[Stated],
-    gear: float,
-    tests: ResidualTests,
+    errors: Regression | None, step: float, numbers: Sequence[Stated], tests: ResidualTests
 ) -> list[Finding]:
     """Name what the model lacks, and whether that moves a stated number beyond its interval."""
-    if not fit.structure.free() or data.size < 4 * BLOCKS:
-        return []
-    errors = regression(data, fit, gear)
     if errors is None:
         return []
     out: list[Finding] = []
@@ -81,7 +73,7 @@ def adequacy(
         if not shown:
             break
         first = max(shown, key=lambda e: e.gain - 2 * len(e.columns))
-        out.append(_finding(first, shown, numbers, data.step))
+        out.append(_finding(first, shown, numbers, step))
         named += first.columns
     return out
 

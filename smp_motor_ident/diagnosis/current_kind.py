@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident.diagnosis.limits import CURRENT_KIND, FEWEST
+from smp_motor_ident.diagnosis.limits import CURRENT_KIND, FEWEST, METER, REST
 from smp_motor_ident.diagnosis.screening import averaged_runs, measured_speed
 from smp_motor_ident.record import Record
 
@@ -36,7 +36,19 @@ def current_kind(group: Sequence[Record]) -> str:
         SUPPLY: _rest(np.column_stack([v * v, v * w, ones]), i)[1],
     }
     best = min(rests, key=lambda kind: rests[kind])
-    return best if rests[best] < CURRENT_KIND.value * rests[ARMATURE] else ARMATURE
+    if rests[best] < CURRENT_KIND.value * rests[ARMATURE]:
+        return best
+    # A coarse encoder's speed hides the equations, and one direction leaves them alike.
+    return UNSIGNED if _one_sign(v, i) else ARMATURE
+
+
+def _one_sign(v: Array, i: Array) -> bool:
+    """Tell whether the current flows forward, and never back, while the motor is driven back."""
+    back = i[v < -REST.value * np.abs(v).max()]
+    low, high = np.percentile(i, [1, 99])
+    if back.size < FEWEST.value or low < -METER.value * high:
+        return False
+    return float(np.median(back)) > REST.value * float(high)
 
 
 def _signals(record: Record) -> tuple[Array, Array, Array]:

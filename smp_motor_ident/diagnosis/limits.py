@@ -296,6 +296,18 @@ EFFECT_LEVEL = Limit(
     "that a clean record shows any of the effects, shared among all that are tried (Bonferroni)",
     "test_adequacy.py",
 )
+CONDITION_LEVEL = Limit(
+    0.01,
+    "probability",
+    "that a clean record's numbers seem to hang on any condition (Bonferroni)",
+    "test_adequacy.py",
+)
+CONDITION_WEIGHT = Limit(
+    0.8,
+    "share of the weight",
+    "nine to one: nearly half of the data alone, and yet no number is lost that one half lacks",
+    "test_adequacy.py",
+)
 EFFECT_BLOCKS = Limit(
     6,
     "degrees of freedom",

@@ -7,7 +7,7 @@ corrected by the measurements as the model is.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,10 +41,16 @@ class Regression:
     shifts: Array  # shape (f, r): change of the free coordinates for a unit of each
     block: NDArray[np.int64]  # shape (n,): which stretch of time a row belongs to
     members: Sequence[tuple[Effect, tuple[int, ...]]]  # which columns are whose
+    own: Array  # shape (n, p): sensitivities to the free coordinates and initial states
+    n_free: int
+    # shape (n,) each: -1 in one half of the motion, 1 in the other
+    conditions: dict[str, Array] = field(default_factory=dict)
 
 
 def regression(data: Experiments, fit: Fit, gear: float) -> Regression | None:
     """Return residuals and responses, whitened, the model's coordinates projected out."""
+    if not fit.structure.free() or data.size < 4 * BLOCKS:
+        return None
     base = _predicted(data, fit)
     columns = [_stacked(data, fit, _measured(data) - base)]
     columns += [_stacked(data, fit, c) for c in _own(data, fit, base)]
@@ -63,7 +69,32 @@ def regression(data: Experiments, fit: Fit, gear: float) -> Regression | None:
     table = np.array(columns).T  # columns stay together in memory
     if np.count_nonzero(columns[0]) < 4 * BLOCKS or not np.isfinite(table).all():
         return None
-    return _projected(table, n_own, _blocks(data), members, len(fit.structure.free()))
+    whole = _projected(table, n_own, _blocks(data), members, len(fit.structure.free()))
+    return replace(whole, conditions=_conditions(data, samples))
+
+
+def _conditions(data: Experiments, m: Motion) -> dict[str, Array]:
+    """Return the halves of the motion by each condition that there is, for every row."""
+    power = m.voltage * m.drop
+    kinds = {
+        "size of the voltage": _halves(np.abs(m.voltage)),
+        "speed": _halves(np.abs(m.speed)),
+        "acceleration": _halves(np.abs(np.gradient(m.speed))),
+        "direction": np.sign(m.speed),
+        "braking": np.sign(power),
+    }
+    begins = np.arange(0, data.size, _together(data))
+    out = {name: half[begins] for name, half in kinds.items()}
+    if data.current.size:
+        out = {name: np.tile(half, 2) for name, half in out.items()}
+        out["current"] = np.repeat([-1.0, 1.0], begins.size)
+    return {name: half for name, half in out.items() if np.ptp(half) > 0}
+
+
+def _halves(size: Array) -> Array:
+    """Return 1 where a size is above its median, else -1; all alike where it is one size."""
+    middle = 0.5 * float(np.median(size)) + 0.5 * float(np.mean(size))
+    return np.where(size > middle + 0.02 * float(size.max()), 1.0, -1.0)
 
 
 def _projected(
@@ -73,7 +104,7 @@ def _projected(
     members: Sequence[tuple[Effect, tuple[int, ...]]],
     n_free: int,
 ) -> Regression:
-    own = table[:, 1 : 1 + n_own]
+    whole = own = table[:, 1 : 1 + n_own]
     rest = np.asfortranarray(table[:, [0, *range(1 + n_own, table.shape[1])]])
     scale = np.sqrt(np.square(own).sum(axis=0))
     own = own / np.where(scale > 0, scale, 1.0)
@@ -87,7 +118,8 @@ def _projected(
         seen = tuple(c for c in columns if kept[c + 1])
         if seen:
             usable.append((effect, seen))
-    return Regression(left[:, 0], left[:, 1:], rest[:, 1:], answer[:n_free, 1:], block, usable)
+    return Regression(left[:, 0], left[:, 1:], rest[:, 1:], answer[:n_free, 1:], block, usable,
+                      whole, n_free)  # fmt: skip
 
 
 def _predicted(data: Experiments, fit: Fit) -> Array:

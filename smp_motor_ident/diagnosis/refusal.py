@@ -7,9 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from smp_motor_ident.diagnosis.limits import LARGEST_OFFSET, LOOSE_QUANTITY, WORST_FIT
-from smp_motor_ident.diagnosis.validation import within_resolution
+from smp_motor_ident.diagnosis.validation import speed_fit, within_resolution
 from smp_motor_ident.errors import CurrentError, InsufficientExcitationError, SignalError
 from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.estimation.prediction import simulate
 from smp_motor_ident.estimation.quantities import Answer
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model import structures as models
@@ -35,7 +36,7 @@ def refuse(
 ) -> None:
     """Refuse what the model does not explain, and what the data hardly tell."""
     explained = np.isfinite(fitted) and fitted >= WORST_FIT.value
-    if not explained and not within_resolution(data, fit):
+    if not explained and not within_resolution(data, fit) and not _follows(group, data, fit):
         raise SignalError(
             f"{where(group)}: the voltage does not explain the motion (fit {fitted:.0f} %); check "
             "that voltage and encoder belong to the same motor, and that nothing else drives it"
@@ -53,6 +54,16 @@ def refuse(
             "excitation with several frequencies, in both directions and well above the friction"
         )
     _refuse_offset(group, fit)
+
+
+def _follows(group: Sequence[Record], data: Experiments, fit: Fit) -> bool:
+    """Tell whether the free run is near a speed that hardly changes, beside its size.
+
+    Of a motor at one speed the scatter is the counter's: no share of it says anything.
+    """
+    speed = simulate(data, fit)[:, 0]
+    size = float(np.sqrt(np.mean(np.square(speed))))
+    return size > 0 and speed_fit(group, data, fit, size) >= WORST_FIT.value
 
 
 def _refuse_integral(group: Sequence[Record], fit: Fit) -> None:

@@ -40,12 +40,17 @@ def weights(data: Callable[[Fit], Experiments], fits: Sequence[Fit], seed: int =
     rows = []
     for fit in fits:
         own = data(fit)
-        residual = own.output - prediction.outputs(own, fit, gain=True)
-        seen = np.isfinite(residual)
-        square = np.where(seen, np.square(residual), 0.0)
-        variance = float(square.sum() / seen.sum())
-        edges = np.linspace(0, residual.size, BLOCKS + 1).astype(np.int64)[:-1]
-        rows.append(np.add.reduceat(square / variance + seen * np.log(variance), edges))
+        predicted = prediction.simulate(own, fit, gain=True)
+        edges = np.linspace(0, own.size, BLOCKS + 1).astype(np.int64)[:-1]
+        run = np.zeros(BLOCKS)
+        measured = [own.output, own.current] if own.current.size else [own.output]
+        for column, values in enumerate(measured, 1):
+            residual = values - predicted[:, column]
+            seen = np.isfinite(residual)
+            square = np.where(seen, np.square(residual), 0.0)
+            variance = float(square.sum() / max(seen.sum(), 1))
+            run += np.add.reduceat(square / variance + seen * np.log(variance), edges)
+        rows.append(run)
     runs = np.array(rows)
     rng = np.random.default_rng(seed)
     shares = rng.dirichlet(np.ones(BLOCKS), DRAWS) * BLOCKS

@@ -1,13 +1,16 @@
 """Consider covariance: the uncertainty of what is fixed though not known exactly, handed on.
 
-A delay or a friction that the model leaves out is not known to be nothing.  The estimate's
-answer to it, ``G = N^-1 N_beside``, carries its variance to all that is reported.
-Derivation: docs/derivations.md, section 9.
+A delay, a load or a friction that the model leaves out is not known to be nothing.  The
+estimate's answer to it, ``G = N^-1 N_beside``, carries its variance to all that is reported.
+Order selection leaves out what is there, too, where it is not worth its price: of an addition
+that the score puts at c with variance V, ``c^2 - V`` estimates the square of what is left out.
+Derivation: docs/derivations.md, section 9; Leeb and Poetscher, Econometric Theory 21 (2005), 21
+(intervals after a selection).
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,14 +23,17 @@ from smp_motor_ident.model.structures import Structure
 
 Array = NDArray[np.float64]
 
+SEEN = 1e-6
+"""Share of a coordinate's information below which rounding and kinks decide what is left."""
+
 
 def consider_timing(data: Experiments, fit: Fit, instant: float) -> Fit:
     """Return the fit with its covariance widened by what the input's instants leave open."""
     structure = fit.structure
     if instant <= 0 or structure.delay or "delay" in structure.fixed or not structure.free():
         return fit
-    answer, _ = _answer(data, fit, structure.with_(delay=True), models.DELAY)
-    return _wider(fit, answer, instant**2)
+    beside = _beside(data, fit, structure.with_(delay=True), models.DELAY)
+    return _wider(fit, beside.answer, instant**2)
 
 
 def consider_friction(data: Experiments, fit: Fit) -> tuple[Fit, float]:
@@ -35,18 +41,49 @@ def consider_friction(data: Experiments, fit: Fit) -> tuple[Fit, float]:
     structure = fit.structure
     if structure.friction != "none" or not structure.free():
         return fit, 0.0
-    answer, left = _answer(data, fit, structure.with_(friction="symmetric"), models.VC_PLUS)
-    variance = float(np.max(fit.sandwich_factors())) / max(left, 1e-12)
-    return _wider(fit, answer, variance), float(np.sqrt(variance))
+    beside = _beside(data, fit, structure.with_(friction="symmetric"), models.VC_PLUS)
+    variance = float(np.max(fit.sandwich_factors())) * beside.variance
+    return _wider(fit, beside.answer, variance), float(np.sqrt(variance))
 
 
-def _answer(data: Experiments, fit: Fit, richer: Structure, coordinate: int) -> tuple[Array, float]:
-    """Return how the fit answers to one more coordinate, and the information left on that."""
-    both = prediction.information(data, replace(fit, structure=richer))
+def consider_left_out(data: Experiments, fit: Fit) -> Fit:
+    """Return the fit with its covariance widened by a delay or load not worth its price."""
+    s = fit.structure
+    additions = []
+    if not s.delay and "delay" not in s.fixed:
+        additions.append((s.with_(delay=True), models.DELAY))
+    if not s.load and not s.own_load and "load" not in s.fixed:
+        additions.append((s.with_(load=True), models.LOAD))
+    factor = float(np.median(fit.sandwich_factors())) if s.free() else 1.0
+    wider = fit
+    for richer, coordinate in additions if s.free() else []:
+        beside = _beside(data, fit, richer, coordinate)
+        own = factor * beside.variance
+        # Akaike: with it the motor is predicted better.
+        if beside.seen and beside.size**2 > 2 * own:
+            wider = _wider(wider, beside.answer, beside.size**2 - own)
+    return wider
+
+
+@dataclass(frozen=True, eq=False)
+class _Beside:
+    """A coordinate beside a fit: what the score says of it, and how the fit answers to it."""
+
+    answer: Array  # shape (f,): change of the free coordinates for a unit
+    size: float
+    variance: float
+    seen: bool  # whether the data tell it from the free coordinates at all
+
+
+def _beside(data: Experiments, fit: Fit, richer: Structure, coordinate: int) -> _Beside:
+    """Return how the fit answers to one more coordinate."""
+    here = prediction.again(data, richer, fit)
     keep = [i for i, c in enumerate(richer.free()) if c != coordinate]
     late = richer.free().index(coordinate)
-    answer = prediction.inverse(both[np.ix_(keep, keep)], 1e-12) @ both[keep, late]
-    return answer, float(both[late, late] - both[late, keep] @ answer)
+    answer = prediction.inverse(here.normal[np.ix_(keep, keep)], 1e-12) @ here.normal[keep, late]
+    left = max(float(here.normal[late, late] - here.normal[late, keep] @ answer), 1e-12)
+    score = float(here.gradient[late] - here.gradient[keep] @ answer)
+    return _Beside(answer, score / left, 1 / left, left > SEEN * here.normal[late, late])
 
 
 def _wider(fit: Fit, answer: Array, variance: float) -> Fit:

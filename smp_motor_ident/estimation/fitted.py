@@ -118,18 +118,16 @@ class Fit(Start):
         return cov
 
     def conditional(self) -> Array:
-        """Return the covariance with the profiled coordinates fixed, shape (f, f)."""
+        """Return the covariance with the profiled coordinates fixed, and what is added, (f, f)."""
         cov = self.white()
         widen = np.sqrt(self.sandwich_factors())
         cov = cov * np.outer(widen, widen)
         if self.widen is not None:
             cov = cov * np.outer(self.widen, self.widen)
-        if self.added is not None:
-            cov = cov + self.added
         for profile in self.profiles:
             i = self.structure.free().index(profile.coordinate)
             cov = cov - np.outer(cov[:, i], cov[i]) / max(float(cov[i, i]), 1e-300)
-        return cov
+        return cov if self.added is None else cov + self.added
 
     def sandwich_factors(self) -> Array:
         """Return by how much each variance is larger than of white residuals, shape (f,)."""

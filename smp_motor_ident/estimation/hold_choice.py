@@ -59,10 +59,16 @@ def chosen_hold(
 def instant_deviation(group: Sequence[Record], hold: str) -> float:
     """Return how well the input's instants are known [s].
 
-    A command on a clock of its own, or jittered stamps, leave a part of an interval open.
+    A command on a clock of its own, or jittered stamps, leave a part of an interval open; how
+    the stamps scatter, of the mean over all changes of the command.
     """
-    steps = np.concatenate([np.diff(r.time[: int(HOLD_COST.value)]) for r in group])
+    most = int(HOLD_COST.value)
+    steps = np.concatenate([np.diff(r.time[:most]) for r in group])
+    squares = np.concatenate([np.square(np.diff(r.voltage[:most])) for r in group])
     step = float(np.median(steps))
     jitter = float(np.median(np.abs(steps - step)))
     loose = hold != "held" or jitter > 1e-3 * step or any(between_samples(r) for r in group)
-    return INSTANT.value * step if loose else 0.0
+    near = steps[steps < 2.5 * step]  # no gaps
+    changes = max(float(squares.sum()) / max(float(squares.max(initial=0.0)), 1e-300), 1.0)
+    scatter = float(near.std()) / np.sqrt(2 * changes)  # each stamp is in two intervals
+    return max(INSTANT.value * step, scatter) if loose else 0.0

@@ -37,7 +37,8 @@ def _predict(data: Experiments, fit: Fit, gain: bool, columns: int) -> Array:
     return predicted
 
 
-def _again(data: Experiments, structure: Structure, fit: Fit) -> Pass:
+def again(data: Experiments, structure: Structure, fit: Fit) -> Pass:
+    """Return normal equations of experiments at a fit, with the coordinates of a structure."""
     z = structure.complete(fit.z)
     return evaluate(data, structure, z, fit.initial, fit.initial, fit.noise_model())
 
@@ -51,12 +52,12 @@ def inverse(normal: Array, rcond: float = 1e-13) -> Array:
 
 def information(data: Experiments, fit: Fit) -> Array:
     """Return the Fisher information that experiments would give about a fit's coordinates."""
-    return _again(data, fit.structure, fit).normal
+    return again(data, fit.structure, fit).normal
 
 
 def one_step(data: Experiments, fit: Fit) -> Array:
     """Return the Gauss-Newton step that other outputs on the same motion would ask for."""
-    here = _again(data, fit.structure, fit)
+    here = again(data, fit.structure, fit)
     return np.asarray(inverse(here.normal) @ here.gradient)
 
 
@@ -64,7 +65,7 @@ def predicted_decrease(
     data: Experiments, fit: Fit, richer: Structure
 ) -> tuple[float, Array, Array]:
     """Return what freeing more would gain, by the score: one pass in place of a fit."""
-    here = _again(data, richer, fit)
+    here = again(data, richer, fit)
     covariance = inverse(here.normal)
     step = covariance @ here.gradient
     return float(here.gradient @ step), step, covariance

@@ -54,7 +54,12 @@ def profiled(data: Experiments, fit: Fit, options: Options) -> Fit:
             continue
         i = free.index(coordinate)
         if coordinate == models.VC_PLUS and one_level(data, fit):
-            both = [rubbing(data, fit, f)[0] for f in _range(data, fit, coordinate)]
+            ends = _range(data, fit, coordinate)
+            if fit.structure.order == 2 and not fit.structure.current:
+                # A winding first builds up the torque that breaks loose: from rest that is late.
+                both = [_fixed_at(data, fit, coordinate, f, options).z for f in ends]
+            else:
+                both = [rubbing(data, fit, f)[0] for f in ends]
             found.append(Profile(coordinate, (both[0], both[1])))
             # The others are followed at this friction: along it the motors are all alike.
             alike = replace(fit, profiles=tuple(found))
@@ -198,8 +203,14 @@ def _fixed_at(data: Experiments, near: Fit, coordinate: int, value: float, optio
         if coordinate == models.A2 and structure.current:
             z = slower_winding(z, z[models.TE] + value - z[models.A2])
     z[coordinate] = value
-    z = structure.complete(z)
-    tried = [solve(data, structure, near.at(z, i), options, 10, 0.05) for i in initials]
+    starts = [structure.complete(z)]
+    if coordinate == models.VC_PLUS and models.TE in structure.free() and not structure.current:
+        # Without friction L/R is any; with it, what is late in the response is the winding.
+        z[models.TE] = z[models.A2] - z[models.A1]
+        starts.append(structure.complete(z))
+    tried = [
+        solve(data, structure, near.at(z, i), options, 10, 0.05) for z in starts for i in initials
+    ]
     return min(tried, key=lambda f: f.deviance)
 
 

@@ -8,9 +8,12 @@ import motors
 import numpy as np
 
 from smp_motor_ident.diagnosis import adequacy, model_error
+from smp_motor_ident.diagnosis.conditions import dependent
 from smp_motor_ident.diagnosis.effects import EFFECTS
 from smp_motor_ident.estimate import estimate
+from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.finding import Finding
+from smp_motor_ident.model.structures import Structure
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import Quantity
 
@@ -63,3 +66,33 @@ def test_a_load_that_is_nothing_is_no_number_that_an_effect_moves():
     assert finding(2e-5).severity == "note"
     assert finding(0.02).severity == "unreliable"
     assert finding(0.02).evidence["quantity"] == "load_voltage"
+
+
+def test_numbers_that_hang_on_the_size_of_the_voltage_cover_both_sizes():
+    """A motor whose gain falls from 10 to 9 at the larger voltages, by regression alone."""
+    rng = np.random.default_rng(4)
+    volts = rng.choice([-1.0, 1.0], 4000) * rng.choice([2.0, 8.0], 4000)
+    small = np.abs(volts) < 5.0
+    fit = estimation_fit()
+    for lost in (0.0, 1.0):
+        speed = (10.0 - lost * ~small) * volts + 0.5 * rng.standard_normal(4000)
+        gain = float(speed @ volts / (volts @ volts))
+        errors = model_error.Regression(
+            (speed - gain * volts) / 0.5, np.zeros((4000, 0)), np.zeros((4000, 0)),
+            np.zeros((1, 0)), np.arange(4000) * 40 // 4000, [], volts[:, None] / 0.5, 1,
+            {"size of the voltage": np.where(small, -1.0, 1.0)},
+        )  # fmt: skip
+        wider, said = dependent(fit, errors)
+        assert bool(said) is bool(lost)
+        if lost:  # the small voltages, nine times as heavy, ask for what they know of the gain
+            assert 0.1 < float(np.sqrt(wider.added[0, 0])) < 1.0
+
+
+def estimation_fit() -> Fit:
+    """A fit of one free coordinate, of which only that matters here."""
+    structure = Structure("static_gain", order=1, friction="none")
+    return Fit(
+        np.zeros(11), np.zeros((1, 4)), np.eye(2), structure=structure, gain=np.zeros((3, 2)),
+        objective=1.0, deviance=0.0, information=np.eye(1), scores=np.zeros((0, 1)), passes=1,
+        converged=True, samples=4000, kind=0,
+    )  # fmt: skip

@@ -1,9 +1,16 @@
 """Candidates that explain the data alike are all covered by what is stated."""
 
+from dataclasses import replace
+
+import motors
 import numpy as np
 
-from smp_motor_ident.estimation.averaging import averaged
+from smp_motor_ident.estimation.averaging import averaged, weights
+from smp_motor_ident.estimation.fitted import Options
+from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.estimation.quantities import Answer
+from smp_motor_ident.likelihood.experiments import prepare
+from smp_motor_ident.model.structures import LN_R, Structure
 from smp_motor_ident.result import Quantity
 
 
@@ -30,3 +37,12 @@ def test_a_lag_that_may_be_a_delay_is_stated_with_both():
 def test_a_candidate_that_is_rejected_changes_nothing():
     alone = _answer(0.05, 0.01)
     assert averaged(alone, np.array([0.999, 0.001]), [_answer(0.06, None)]) is alone
+
+
+def test_a_candidate_that_only_the_current_rejects_has_no_weight():
+    data = prepare([motors.record("rear_left", seconds=2.0)], True)
+    fit = initial_fit(data, Structure("electromechanical", current=True), Options())
+    # Of another resistance, and all torques with it, the motor turns just alike.
+    other = replace(fit, z=fit.z + 0.02 * np.eye(fit.z.size)[LN_R])
+    assert weights(lambda _: data, [fit, other])[1] < 1e-6
+    assert np.ptp(weights(lambda _: data, [fit, fit])) < 1e-9

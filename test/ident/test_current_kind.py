@@ -41,3 +41,16 @@ def test_without_its_current_a_record_still_says_what_the_speed_tells(kind):
     for name in ("dc_gain", "time_constant"):
         q = result.combinations[name]
         assert abs(q.value - true[name]) < 4 * q.std + 0.005 * true[name]  # four deviations
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_the_size_of_a_current_is_left_out_where_the_motor_is_driven_back_only(sign):
+    step = np.r_[np.zeros(100), np.full(700, -8.0)]
+    back = motors.record("rear_left", voltage=step, seconds=4.0)
+    kind = current_kind([replace(back, current=sign * back.current)])
+    assert kind == (ARMATURE if sign > 0 else UNSIGNED)
+
+
+def test_a_coarse_encoder_does_not_hide_that_a_current_has_no_sign():
+    coarse = replace(GOOD, velocity=None, count=GOOD.count // 20 * 20, current=np.abs(GOOD.current))
+    assert current_kind([coarse]) == UNSIGNED

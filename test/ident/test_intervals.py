@@ -9,10 +9,16 @@ from scipy.stats import chi2
 from smp_motor_control.excitation import Fourier
 from smp_motor_ident.diagnosis.identifiability import what_next
 from smp_motor_ident.estimate import estimate
+from smp_motor_ident.estimation.consider_covariance import consider_left_out
+from smp_motor_ident.estimation.fitted import Options
+from smp_motor_ident.estimation.hold_choice import instant_deviation
+from smp_motor_ident.estimation.initialisation import initial_fit
+from smp_motor_ident.estimation.prediction import predicted_decrease
 from smp_motor_ident.estimation.thinning import thinned
 from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import prepare
-from smp_motor_ident.model.structures import PHYSICAL
+from smp_motor_ident.model.structures import DELAY, PHYSICAL, Structure
+from smp_motor_ident.record import Record
 
 
 def test_a_friction_that_does_not_show_is_nothing_within_an_interval():
@@ -97,3 +103,30 @@ def test_stated_deviations_are_those_of_repeated_recordings():
     # sqrt(chi2(20) / 20) lies outside of 0.54 to 1.51 in one of 500 cases.
     low, high = np.sqrt(chi2.ppf([1e-3, 1 - 1e-3], 20) / 20)
     assert np.all((low < scatter) & (scatter < high)), dict(zip(names, scatter, strict=True))
+
+
+def test_a_delay_not_worth_its_price_is_in_the_interval():
+    """Of what is late by three of its deviations selection keeps nothing; the lags bear it."""
+    data = prepare([motors.record("rear_left", current=False, seconds=2.0)], False)
+    structure = Structure("second_order", order=2, friction="symmetric")
+    late = structure.with_(delay=True)
+    fit = initial_fit(data, structure, Options())
+    step, cov = predicted_decrease(data, fit, late)[1:]
+    std = float(np.sqrt(cov[late.free().index(DELAY), late.free().index(DELAY)]))
+    for times in (0.0, 3.0):
+        shift = times * std - step[late.free().index(DELAY)]  # after which the score says so
+        moved = replace(data, hold_end=data.hold_end - shift)
+        wider = consider_left_out(moved, replace(fit, added=None))
+        lags = wider.conditional()[2, 2] / fit.conditional()[2, 2]
+        assert lags == 1.0 if times == 0.0 else lags > 2.0
+
+
+def test_stamps_that_scatter_leave_the_instant_of_one_step_open():
+    rng = np.random.default_rng(5)
+    t = np.arange(1000) / 500.0 + 2e-4 * rng.standard_normal(1000)
+    t = np.sort(t) - t.min()
+    step = Record("motor", t, np.r_[np.zeros(300), np.full(700, 5.0)], velocity=0 * t)
+    many = replace(step, voltage=5.0 * np.sign(np.sin(40 * t)))
+    # A stamp's own deviation for one step; divided by the root of their number for many.
+    assert 1e-4 < instant_deviation([step], "held") < 4e-4
+    assert instant_deviation([many], "held") < 1e-4

@@ -7,8 +7,12 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from smp_motor_ident.diagnosis import refusal
 from smp_motor_ident.errors import DesignError, SignalError
 from smp_motor_ident.estimate import estimate
+from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.likelihood.experiments import prepare
+from smp_motor_ident.model.structures import Structure
 from smp_motor_ident.record import Hardware, Record
 from smp_motor_ident.tune import Loop, design
 
@@ -28,6 +32,23 @@ def _record(voltage: np.ndarray, rate: float = 500.0, noise: float = 0.5) -> Rec
     return Record("motor", t, voltage, velocity=w + noise * rng.standard_normal(t.size))
 
 
+@pytest.fixture
+def fit_of():
+    """Return a fit of a gain and a lag of 16 ms that begins at a speed."""
+
+    def made(gain: float, speed: float) -> Fit:
+        z = np.zeros(11)
+        z[0], z[1] = -np.log(gain), np.log(0.016 / gain)
+        return Fit(
+            z, np.array([[0.0, speed, 0.0, 0.0]]), np.eye(2),
+            structure=Structure("first_order", order=1, friction="none"), gain=np.zeros((3, 2)),
+            objective=1.0, deviance=0.0, information=np.eye(2), scores=np.zeros((0, 2)),
+            passes=1, converged=True, samples=2000, kind=0,
+        )  # fmt: skip
+
+    return made
+
+
 @pytest.mark.parametrize("rest", [0, 200])
 def test_a_single_level_of_voltage_gives_one_combination(rest):
     record = _record(np.r_[np.zeros(rest), np.full(600, 8.0)])
@@ -45,6 +66,46 @@ def test_a_single_level_of_voltage_gives_one_combination(rest):
     assert [f.evidence["voltage"] for f in found.findings if f.code == "one_level"] == [8.0]
     with pytest.raises(DesignError, match="combination"):
         design(found, Loop())
+
+
+def test_friction_that_delays_the_first_motion_is_in_the_lags_of_one_step():
+    # From rest the winding first builds up the torque that friction holds: 0.6 V of 8 V are a
+    # delay of 1.5 ms, which another winding and no friction explain as well.
+    step = np.r_[np.zeros(100), np.full(900, 8.0)]
+    record = motors.record(
+        "rear_left", current=False, voltage=step, kinds=("x",), rate=1000.0, static_voltage=0.6
+    )
+    found, true = estimate(record).combinations, motors.truth("rear_left", 0.6)
+    for name in ("time_constant", "time_constant_product"):
+        q = found[name]
+        assert abs(q.value - true[name]) < 4 * q.std, name
+        assert q.std < 0.5 * true[name], name
+
+
+def test_the_scatter_of_coarse_counts_at_one_speed_refuses_no_motor(fit_of):
+    # 64 rad/s are 1.4 counts a sample: beside the scatter of these no share is explained.
+    t, gain, volts = np.arange(2000) / 500.0, 29.0, 2.2
+    count = np.floor(gain * volts * t * 70 / (2 * np.pi)).astype(np.int64)
+    hardware = Hardware(1.0, 70.0, 0, 6.0, None)
+    group = [Record("motor", t, np.full(t.size, volts), count=count, hardware=hardware)]
+    data = prepare(group, False)
+    for factor, follows in ((1.0, True), (0.25, False)):
+        right = fit_of(gain * factor, gain * factor * volts)
+        assert refusal._follows(group, data, right) is follows
+
+
+def test_a_refusal_is_tried_again_with_the_simpler_structure(monkeypatch):
+    refuse = refusal.refuse
+
+    def strict(group, data, fit, result, fitted):
+        if fit.structure.order == 2:
+            raise SignalError("no second order today")
+        refuse(group, data, fit, result, fitted)
+
+    monkeypatch.setattr("smp_motor_ident.estimate.refuse", strict)
+    found = estimate(motors.record("rear_left", current=False, seconds=3.0))
+    assert found.model == "first_order"
+    assert "richer_refused" in [f.code for f in found.findings if f.severity == "unreliable"]
 
 
 def test_two_levels_know_gain_and_friction_apart():

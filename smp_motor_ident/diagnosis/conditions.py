@@ -1,0 +1,87 @@
+"""Whether the numbers hang on which part of the motion one looks at.
+
+Where a model is right, estimates of the same data that weigh them otherwise differ by chance
+alone.  The data are weighed towards the higher and the lower half of a condition u (the size of
+the voltage or of the speed, the direction, the acceleration, driving or braking, the output or
+the current); with sensitivities S, residuals e and W = 1 + r u the other estimate is off by
+
+    d = (S' W S)^-1 S' W e,
+
+whose covariance under a right model follows from sums of scores over blocks of samples.  A
+coordinate that moves by more than that is known no better than it moves.
+
+References
+----------
+J. Hausman, Specification tests in econometrics, Econometrica 46 (1978), 1251; H. White, Maximum
+likelihood estimation of misspecified models, Econometrica 50 (1982), 1, section 4.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import fdtrc
+
+from smp_motor_ident.diagnosis.limits import CONDITION_LEVEL, CONDITION_WEIGHT
+from smp_motor_ident.diagnosis.model_error import Regression
+from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.estimation.prediction import inverse
+from smp_motor_ident.finding import Finding
+from smp_motor_ident.model import structures as models
+
+Array = NDArray[np.float64]
+
+
+def dependent(fit: Fit, errors: Regression | None) -> tuple[Fit, list[Finding]]:
+    """Return the fit with its covariance widened by what the conditions move, and say which."""
+    if errors is None:
+        return fit, []
+    size = errors.n_free
+    level = CONDITION_LEVEL.value / max(2 * size * len(errors.conditions), 1)
+    names = [models.Z_NAMES[i] for i in fit.structure.free()]
+    added, said = np.zeros((size, size)), {}
+    for name, condition in errors.conditions.items():
+        moves = []
+        for sign in (1.0, -1.0):
+            move, p_value = _moved(errors, 1 + sign * CONDITION_WEIGHT.value * condition)
+            moves.append(np.where(p_value[:size] < level, move[:size], 0.0))
+        far = max(moves, key=lambda d: float(np.abs(d).max()))
+        if far.any():
+            added += np.outer(far, far)
+            said[name] = ", ".join(n for n, d in zip(names, far, strict=True) if d)
+    if not said:
+        return fit, []
+    wider = replace(fit, added=added + (0.0 if fit.added is None else fit.added))
+    message = "the numbers hang on the part of the motion that one looks at (" + "; ".join(said)
+    return wider, [
+        Finding(
+            "conditions",
+            "note",
+            message + "): the model is not all of the motor, and the intervals cover the parts",
+            dict(said),
+            "record as the motor will run: those speeds, voltages and directions",
+        )
+    ]
+
+
+def _moved(errors: Regression, weight: Array) -> tuple[Array, Array]:
+    """Return by how much other weights move the coordinates, and how likely chance does that."""
+    own, e = errors.own, errors.residual
+    weighted = own * weight[:, None]
+    unweighted, other = inverse(own.T @ own, 1e-12), inverse(own.T @ weighted, 1e-12)
+    move = other @ (weighted.T @ e)
+    rows = weighted @ other - own @ unweighted  # of the residuals in the move of each coordinate
+    seen = e != 0.0  # rows without a measurement are zero
+    white = float(e @ e) / max(int(seen.sum()) - own.shape[1], 1)
+    blocks = int(errors.block[-1]) + 1
+    share, sums = (
+        np.stack([np.bincount(errors.block, x, blocks) for x in part.T])
+        for part in (np.square(rows) * seen[:, None], rows * e[:, None])
+    )
+    whole = np.maximum(share.sum(axis=1), 1e-300)
+    stretches = 1 / np.maximum(np.square(share / whole[:, None]).sum(axis=1), 1e-300)
+    variance = np.maximum(np.square(sums).sum(axis=1) * blocks / (blocks - 1), white * whole)
+    ratio = np.square(move) / np.maximum(variance, 1e-300)
+    return move, np.asarray(fdtrc(1, np.maximum(stretches - 1, 1.0), ratio))
