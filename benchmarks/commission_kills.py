@@ -36,8 +36,8 @@ MARK = "SMP_CAMPAIGN"
 WHEELS = ("front_left", "rear_left")
 QUIET = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "stdin": subprocess.DEVNULL}
 DURATION = 2.0
-"""Of each signal [s]; the tool starts its processes, excites three times and then computes."""
-LASTS = {"commission": 60.0, "excite": DURATION + 2.0, "record": 6.0 * DURATION}
+"""Of each signal [s]; each of four is recorded by processes of its own, then the tool computes."""
+LASTS = {"commission": 60.0, "excite": DURATION + 2.0, "record": DURATION + 4.0}
 """Up to how long after its start a part is hit [s]."""
 PARTS = ("commission", "commission", "excite", "record")
 SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT)

@@ -201,23 +201,20 @@ class Excite(Node):
     def _heard(self, now: float) -> bool:
         publishers = [writer.publisher for writer, _ in self._outputs]
         silent = [p.topic_name for p in publishers if not p.get_subscription_count()]
-        mute = [wheel for wheel in self._watched if wheel not in self._unheard]
-        if (silent or mute) and now - self._created > self._settings.wait:
-            what = (
-                f"nobody listens on {', '.join(silent)}"
-                if silent
-                else f"no motor_state of {', '.join(mute)}"
+        if silent and now - self._created > self._settings.wait:
+            raise ParameterError(
+                f"nobody listens on {', '.join(silent)}; is the driver or motor_plant running?"
             )
-            raise ParameterError(f"{what}; is the driver or motor_plant running?")
-        if silent or mute:
+        if silent:
             self._all_heard = math.inf
             return False
-        # Recorders that are known but not connected yet are waited for, a little.
+        # Recorders and wheels that are known but not connected yet are waited for, a little.
         self._all_heard = min(self._all_heard, now)
         waited = now - self._all_heard
+        unheard = (wheel for wheel in self._watched if wheel not in self._unheard)
         known = all(
             p.get_subscription_count() >= self.count_subscribers(p.topic_name) for p in publishers
-        )
+        ) and not any(self.count_publishers(f"{wheel}/motor_state") for wheel in unheard)
         return waited > _OTHERS and (known or waited > 4 * _OTHERS)
 
     def _announce(self) -> None:

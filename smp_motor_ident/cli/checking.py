@@ -120,7 +120,7 @@ def check_wheels(
     }
     with wheel_test.WheelTest(client, counters, bounds).open() as test:
         for wheel in wheels:
-            say(f"checking {wheel}: slowly until it turns, both ways")
+            say(wheel)
             way = _Way(test, wheel, hardware[wheel].supply_voltage or 12.0, limit)
             way.phase("rest", lambda t: 0.0, REST, None)
             way.test_direction(1.0)

@@ -23,8 +23,8 @@ def parser() -> argparse.ArgumentParser:
     add = made.add_argument
     add("--output", "-o", metavar="DIR", required=True, help="new folder for bag and results")
     add("--wheel", action="append", metavar="NAME", help="only this; default: all that report")
-    add("--amplitude", type=number(0), default=6.0, help="largest voltage [V]; default 6")
-    add("--duration", type=number(0), default=15.0, help="of each of three signals [s]; default 15")
+    add("--amplitude", type=number(0), help="largest voltage [V]; default 6")
+    add("--duration", type=number(0), help="of each of three signals [s]; default 15")
     add("--motors", metavar="FILE", help="what is known of the motors, to check gearing by")
     add("--max-speed", type=number(0), metavar="RAD/S",
         help="of a wheel; default: half more than its checks show for the voltage")  # fmt: skip

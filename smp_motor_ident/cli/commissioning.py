@@ -1,4 +1,8 @@
-"""What ``commission`` does: the whole way on the user's own running robot."""
+"""What ``commission`` does: the whole way on the user's own running robot.
+
+What is done is kept as soon as it is whole: what the checks came to, and every recording.  A run
+that is gone on with does the rest at the same voltages, and so ends as one that was not cut off.
+"""
 
 from __future__ import annotations
 
@@ -8,18 +12,15 @@ import math
 import shutil
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from smp_motor_control import WHEELS
-from smp_motor_control.excitation import SIGNALS as SHAPES
 from smp_motor_control.motor.file import load_motors
 from smp_motor_control.wheel.protection import Bounds
 from smp_motor_ident import bag
-from smp_motor_ident.cli import checking, steps, verifying
+from smp_motor_ident.cli import checking, plan, protocol, steps, verifying
 from smp_motor_ident.cli.commission import NAME
 from smp_motor_ident.cli.processes import ProcessError, Processes, connect
 from smp_motor_ident.cli.protocol import Protocol
@@ -31,19 +32,11 @@ from smp_motor_ident.finding import Finding
 from smp_motor_ident.report.document import read_identification
 from smp_motor_ident.result import Estimate
 
-BEGUN, EXCITED = "excitation.begun", "excitation.complete"
-"""Mark in the folder that wheels were moved, and that all signals were recorded."""
+AMPLITUDE, DURATION = 6.0, 15.0
+"""Largest voltage [V] and length of a signal [s], unless the user or an earlier run says so."""
 
-BAGS = ("excitation", "validation")
-"""Recordings that motors are identified from, and that they are judged by."""
-
-SIGNALS = (
-    ("sine", 0.75, 1.0, "excitation"),
-    ("square", 0.75, 1.0, "excitation"),
-    ("fourier", 1.0, 1.0, "excitation"),
-    ("steps", 1.0, 0.5, "validation"),
-)
-"""What moves the wheels: signal, shares of amplitude and duration, and whose recording."""
+DRAFT = "recording"
+"""Folder of a recording until it is whole."""
 
 COLD = "cold.json"
 """Resistances of the windings before the first signal, for ``excite``."""
@@ -54,22 +47,44 @@ LOOKS, ALIKE = 15, 4
 UNRELIABLE = "unreliable_identification"
 """Code of the finding that an identification is not to be designed on."""
 
-DRAWN, COLUMNS, BLOCKS = 4.0, 72, "▁▂▃▄▅▆▇█"
-"""So many seconds of a signal are drawn, on so many columns, with these levels."""
+
+@dataclass
+class Session:
+    """A commissioning under way: what is asked, of which robot, and how far it is."""
+
+    arguments: argparse.Namespace
+    robot: steps.Robot
+    protocol: Protocol
+    schedule: plan.Schedule
+
+    def begin(self, part: str, how: str = "") -> None:
+        """Say what is done next, and how long all takes."""
+        _say(self.schedule.begin(part, how))
 
 
 def work(arguments: argparse.Namespace) -> int:
     """Do what the arguments say."""
     folder = _checked(arguments)
     known = load_motors(arguments.motors) if arguments.motors else {}
+    begun = Protocol(folder, arguments.accept)
+    _as_begun(arguments, begun.document)
     if arguments.dry_run:
-        print("\n".join(drawn(arguments.amplitude, arguments.duration)))
+        wheels = arguments.wheel or WHEELS
+        print("\n".join(plan.drawn(arguments.amplitude, arguments.duration, wheels)))
         return 0
     try:
         return _commission(arguments, folder, known)
     finally:
-        if folder.is_dir() and not any((folder / n).exists() for n in (BEGUN, EXCITED)):
+        if folder.is_dir() and not (folder / protocol.NAME).exists():
             shutil.rmtree(folder)  # nothing but logs of what did not begin
+
+
+def _as_begun(arguments: argparse.Namespace, document: dict[str, Any]) -> None:
+    """Fill in what is not asked for: as in the run that is gone on with, else the defaults."""
+    earlier = document.get("asked", {})
+    arguments.wheel = arguments.wheel or earlier.get("wheels")
+    arguments.amplitude = arguments.amplitude or earlier.get("amplitude", AMPLITUDE)
+    arguments.duration = arguments.duration or earlier.get("duration", DURATION)
 
 
 def _commission(arguments: argparse.Namespace, folder: Path, known: Mapping[str, Any]) -> int:
@@ -86,15 +101,12 @@ def _commission(arguments: argparse.Namespace, folder: Path, known: Mapping[str,
         robot = steps.Robot(processes, client, wheels or WHEELS, folder, ros, bounds)
         rates = client.wait_for_wheels(robot.wheels, timeout=15.0)
         print("; ".join(f"{wheel} reports at {rate:.0f} Hz" for wheel, rate in rates.items()))
-        if not (folder / EXCITED).exists():
-            _confirm(arguments, robot.wheels)
-        protocol = Protocol(folder, arguments.accept)
-        with client.paused(robot.wheels), protocol.ending():
-            if not (folder / EXCITED).exists():
-                _move(arguments, robot, protocol, known)
-            designed = _design(arguments, robot, protocol)
-            verdict = _verify(arguments, robot, protocol, designed)
-    protocol.end(True, verdict)
+        session = _begin(arguments, robot)
+        with client.paused(robot.wheels), session.protocol.ending():
+            _move(session, known)
+            designed = _design(session)
+            verdict = _verify(session, designed)
+    session.protocol.end(True, verdict)
     print(f"{verdict}\nreport: {folder / 'report.html'}")
     if not arguments.apply:
         results = folder / "identification"
@@ -102,87 +114,143 @@ def _commission(arguments: argparse.Namespace, folder: Path, known: Mapping[str,
     return 0
 
 
-def _move(
-    arguments: argparse.Namespace, robot: steps.Robot, protocol: Protocol, known: Mapping[str, Any]
-) -> None:
-    """Check the wheels, then record them excited; whatever happens, nobody moves them behind it."""
-    folder = robot.folder
-    for name in BAGS:
-        shutil.rmtree(folder / name, ignore_errors=True)
-    (folder / BEGUN).touch()
-    protocol.begin(robot.wheels)
+def _begin(arguments: argparse.Namespace, robot: steps.Robot) -> Session:
+    """Ask before anything moves; what was done at other voltages or of other wheels is not kept."""
+    made = Protocol(robot.folder, arguments.accept)
+    asked = {
+        "wheels": list(robot.wheels),
+        "amplitude": arguments.amplitude,
+        "duration": arguments.duration,
+    }
+    same = made.document.get("asked") == asked
+    left = [one for one in _recordings(arguments, made) if not (same and _is_kept(robot, one))]
+    checked = same and made.checked
+    session = Session(arguments, robot, made, plan.schedule(robot.wheels, left, checked))
+    if left:
+        _confirm(arguments, robot.wheels, left, session.schedule)
+    if not same:
+        if "asked" in made.document:
+            _say("wheels, amplitude or duration are others than before: all of it is done anew")
+        for name in (plan.FITTED, plan.UNSEEN):
+            shutil.rmtree(robot.folder / name, ignore_errors=True)
+        made.begin(robot.wheels, asked)
+        made.write()
+    return session
+
+
+def _recordings(arguments: argparse.Namespace, made: Protocol) -> list[plan.Recording]:
+    """Return what is recorded at the voltage that the checks found, or before them at the most."""
+    amplitude = made.document["amplitude"] if made.checked else arguments.amplitude
+    return plan.recordings(amplitude, arguments.duration)
+
+
+def _is_kept(robot: steps.Robot, one: plan.Recording) -> bool:
+    return (robot.folder / one.folder / one.name).is_dir()
+
+
+def _move(session: Session, known: Mapping[str, Any]) -> None:
+    """Check the wheels, then record them excited, as far as that is not done."""
+    arguments, made = session.arguments, session.protocol
+    if not made.checked:
+        _check(session, known)
+    for one in _recordings(arguments, made):
+        if not _is_kept(session.robot, one):
+            _record(session, one)
+
+
+def _check(session: Session, known: Mapping[str, Any]) -> None:
+    """Check the wheels one by one; stop where another hand must mend something."""
+    arguments, robot, made = session.arguments, session.robot, session.protocol
     bounds = Bounds(
         speed=arguments.max_speed or math.inf,
         current=arguments.max_current or math.inf,
         rise=arguments.max_winding_rise,
     )
     checked = checking.check_wheels(
-        robot.client, robot.wheels, arguments.amplitude, bounds, known, _say
-    )
-    if not arguments.max_speed and math.isfinite(checked.speed):
-        fastest = OVER_SPEED.value * checked.speed
+        robot.client, robot.wheels, arguments.amplitude, bounds, known,
+        lambda wheel: session.begin(f"checking {wheel}"),
+    )  # fmt: skip
+    made.checks(checked.figures, checked.amplitude, checked.speed)
+    made.stop(made.add("checks", checked.findings))
+    made.document["checked"] = True
+    made.write()
+
+
+def _record(session: Session, one: plan.Recording) -> None:
+    """Record the wheels while one signal moves them; whatever ends it, nobody moves them then."""
+    arguments, robot = session.arguments, session.robot
+    speed = session.protocol.document.get("speed")
+    if speed and not arguments.max_speed:
+        fastest = OVER_SPEED.value * float(speed)
         robot = replace(robot, bounds={**robot.bounds, "max_speed": fastest})
-    protocol.checks(checked.figures, checked.amplitude)
-    protocol.stop(protocol.add("checks", checked.findings))
-    protocol.write()
-    for name in BAGS:
-        try:
-            steps.record(robot, name)
-            for part in plan(checked.amplitude, arguments.duration, name):
-                _say(f"exciting: {part.signal}, {part.amplitude:.3g} V, {part.duration:g} s")
-                steps.excite(robot, [part])
-        finally:
-            robot.processes.stop("excite", "record")
-    (folder / BEGUN).rename(folder / EXCITED)
+    session.begin(one.part, one.describe())
+    draft = robot.folder / DRAFT
+    shutil.rmtree(draft, ignore_errors=True)
+    try:
+        steps.record(robot, DRAFT)
+        steps.excite(robot, [one.excitation])
+    finally:
+        robot.processes.stop("excite", "record")
+    (robot.folder / one.folder).mkdir(exist_ok=True)
+    draft.rename(robot.folder / one.folder / one.name)
 
 
-def _design(
-    arguments: argparse.Namespace, robot: steps.Robot, protocol: Protocol
-) -> verifying.Designed:
+def _design(session: Session) -> verifying.Designed:
     """Identify and tune; what they write appears as a whole, and is written anew."""
+    arguments, robot, made = session.arguments, session.robot, session.protocol
     folder, results = robot.folder, robot.folder / "identification"
-    fitted, unseen = (folder / name for name in BAGS)
-    again = ["--force"] if arguments.resume else []
+    fitted, unseen = folder / plan.FITTED, folder / plan.UNSEEN
+    again = ["--force"]
     again += ["--accept-unreliable"] if UNRELIABLE in arguments.accept else []
     options = [*again, *(["--tuning"] if arguments.tuning else []), "--validate", str(unseen)]
     options += [part for wheel in robot.wheels for part in ("--wheel", wheel)]
-    try:
-        estimates = steps.identify_wheels(fitted, results, *options)
-    except ProcessError:
-        protocol.stop(protocol.add("identification", unreliable(results)))
-        raise
-    protocol.stop(protocol.add("validation", validated(estimates, fitted, unseen)))
-    gains = steps.tune_wheels(results, folder / "gains.yaml", *again)
+
+    def identify(part: str) -> dict[str, Estimate]:
+        session.begin(part)
+        try:
+            return steps.identify_wheels(fitted, results, *options)
+        except ProcessError:
+            made.stop(made.add("identification", unreliable(results)))
+            raise
+
+    estimates = identify(plan.IDENTIFYING)
+    known = (fitted / plan.FURTHER).is_dir()
+    more = None if known else plan.further(estimates, arguments.amplitude)
+    if more:
+        session.schedule.add_further(more, len(robot.wheels))
+        _record(session, more)
+        estimates = identify(plan.AGAIN)
+    made.stop(made.add("validation", validated(estimates, fitted, unseen)))
+    session.begin(plan.TUNING)
+    gains = steps.tune_wheels(results, folder / "gains.yaml", *again[:1])
     document = json.loads((folder / "gains.json").read_text("utf-8"))["wheels"]
     return verifying.Designed(estimates, gains, document)
 
 
-def _verify(
-    arguments: argparse.Namespace,
-    robot: steps.Robot,
-    protocol: Protocol,
-    designed: verifying.Designed,
-) -> str:
+def _verify(session: Session, designed: verifying.Designed) -> str:
     """Drive with the gains on trial, judge the drive, and return what became of them."""
+    arguments, robot, made = session.arguments, session.robot, session.protocol
     missing = [w for w in robot.wheels if not _controlled(robot, w)]
     if missing and arguments.apply:
         raise ProcessError(f"{', '.join(missing)}: no wheel_pid runs that could take the gains")
     if missing:
-        protocol.add("verification", [Finding(
+        made.add("verification", [Finding(
             "not_verified", "warning",
             f"no wheel_pid runs for {', '.join(missing)}: the gains have not driven yet", {},
             "start the controllers and commission again with --resume",
         )])  # fmt: skip
         return "Gains are designed, and have not driven yet."
+    session.schedule.add(plan.DRIVING, "drive", plan.START + sum(one[2] for one in designed.plan()))
+    session.begin(plan.DRIVING)
     with verifying.on_trial(robot.client, designed.gains) as trial:
         changes, findings = verifying.drive_undisturbed(robot, designed, _say)
-        protocol.changes(changes)
-        refused = protocol.add("verification", findings)
+        made.changes(changes)
+        refused = made.add("verification", findings)
         trial.kept = arguments.apply and not refused
     if refused:
         print("the gains were taken back")
-        refused += protocol.warned_of({f.evidence.get("wheel") for f in refused})
-    protocol.stop(refused)
+        refused += made.warned_of({f.evidence.get("wheel") for f in refused})
+    made.stop(refused)
     return "The wheels did as designed" + (
         "; the gains are set in the running controllers."
         if trial.kept
@@ -240,55 +308,27 @@ def _checked(arguments: argparse.Namespace) -> Path:
         raise ParameterError(
             f"{folder}: exists already; choose another --output, or go on there with --resume"
         )
-    if arguments.resume and not any((folder / name).exists() for name in (BEGUN, EXCITED)):
+    if arguments.resume and not (folder / protocol.NAME).is_file():
         raise ParameterError(f"{folder}: no commissioning was cut off there; leave out --resume")
     return folder
 
 
-def plan(amplitude: float, duration: float, of: str = "") -> list[steps.Excitation]:
-    """Return the signals of one recording, or of all."""
-    return [
-        steps.Excitation(signal, lasts * duration, share * amplitude)
-        for signal, share, lasts, recording in SIGNALS
-        if of in ("", recording)
-    ]
-
-
-def drawn(amplitude: float, duration: float) -> list[str]:
-    """Return the plan in words, each signal with its first seconds as a line of blocks."""
-    lines = [
-        f"first: each wheel alone, slowly until it turns, then at growing voltages up to "
-        f"{amplitude:g} V, both ways; signs, gearing, dead zone, supply and load are checked"
-    ]
-    begin = 0.0
-    for part in plan(amplitude, duration):
-        signal = SHAPES[part.signal](amplitude=part.amplitude)
-        shown = min(part.duration, DRAWN)
-        level = signal(np.arange(COLUMNS, dtype=np.float64) * (shown / COLUMNS)) / part.amplitude
-        bars = "".join(BLOCKS[round((1 + float(v)) / 2 * (len(BLOCKS) - 1))] for v in level)
-        lines.append(
-            f"from {begin:5.1f} s: {part.signal}, up to {part.amplitude:g} V either way, "
-            f"{part.duration:g} s; its first {shown:g} s:"
-        )
-        lines.append(f"  {bars}")
-        begin += part.duration
-    lines.append(
-        f"then: identify, tune, and a drive of all wheels with the gains on trial; {begin:g} s of "
-        "excitation in all. Nothing was moved."
-    )
-    return lines
-
-
-def _confirm(arguments: argparse.Namespace, wheels: Sequence[str]) -> None:
+def _confirm(
+    arguments: argparse.Namespace,
+    wheels: Sequence[str],
+    left: Sequence[plan.Recording],
+    schedule: plan.Schedule,
+) -> None:
     """Ask before anything moves."""
     if arguments.yes:
         return
     if not sys.stdin.isatty():
         raise ParameterError("the wheels would move: say --yes, or run this in a terminal")
-    seconds = sum(part.duration for part in plan(arguments.amplitude, arguments.duration))
+    seconds = sum(one.excitation.duration for one in left)
     print(
         f"{', '.join(wheels)} will turn both ways for {seconds:.0f} s at up to "
-        f"{arguments.amplitude:g} V. Is the robot on blocks and clear of people? [y/N] ",
+        f"{arguments.amplitude:g} V; all takes about {plan.words(schedule.left())}. "
+        "Is the robot on blocks and clear of people? [y/N] ",
         end="",
         flush=True,
     )

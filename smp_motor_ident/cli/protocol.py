@@ -42,14 +42,21 @@ class Protocol:
             self.document = json.loads((folder / NAME).read_text("utf-8"))
         self.document |= {"passed": None, "verdict": "It was cut off.", "accepted": [*accepted]}
 
-    def begin(self, wheels: Sequence[str]) -> None:
+    def begin(self, wheels: Sequence[str], asked: Mapping[str, Any]) -> None:
         """Forget what was found before: the wheels move anew."""
-        self.document |= {"wheels": list(wheels), "findings": [], "changes": []}
+        self.document |= {
+            "wheels": list(wheels), "asked": asked, "checked": False, "findings": [], "changes": [],
+        }  # fmt: skip
 
-    def checks(self, figures: Mapping[str, Figures], amplitude: float) -> None:
-        """Note what the test of the wheels showed."""
+    @property
+    def checked(self) -> bool:
+        """Whether the wheels were checked, and nothing stopped at that."""
+        return bool(self.document.get("checked"))
+
+    def checks(self, figures: Mapping[str, Figures], amplitude: float, speed: float) -> None:
+        """Note what the test of the wheels showed, as :class:`~.checking.Checked` has it."""
         shown = {wheel: _plain(dataclasses.asdict(one)) for wheel, one in figures.items()}
-        self.document |= {"checks": shown, "amplitude": amplitude}
+        self.document |= {"checks": shown, "amplitude": amplitude, **_plain({"speed": speed})}
 
     def changes(self, changes: Sequence[Change]) -> None:
         """Note what a drive showed."""

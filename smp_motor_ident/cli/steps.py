@@ -22,6 +22,7 @@ class Excitation:
     signal: str  # as the node ``excite`` names it
     duration: float  # [s]
     amplitude: float  # [V]
+    band: tuple[float, float] | None = None  # of Fourier [Hz]
 
 
 @dataclass(frozen=True)
@@ -64,13 +65,15 @@ def record(robot: Robot, name: str) -> Path:
 def excite(robot: Robot, plan: Sequence[Excitation]) -> None:
     """Move all wheels by one signal after the other."""
     for part in plan:
-        parameters = {
+        parameters: dict[str, object] = {
             "signal": part.signal,
             "wheels": f"[{', '.join(robot.wheels)}]",
             "amplitude": float(part.amplitude),
             "duration": float(part.duration),
             **robot.bounds,
         }
+        if part.band:
+            parameters["lowest"], parameters["highest"] = part.band
         arguments = [a for n, v in parameters.items() for a in ("-p", f"{n}:={v}")]
         robot.processes.start("excite", "excite", *robot.ros_arguments, "--ros-args", *arguments)
         robot.processes.wait("excite", part.duration + PATIENCE)

@@ -72,6 +72,13 @@ OVER_SPEED = Limit(
     "driver or another motor makes half",
     "test_commission_plan.py: a wheel that turns faster than its checks",
 )
+WANTED_ACCURACY = Limit(
+    0.01,
+    "relative standard deviation",
+    "cost: a loop that is off by a hundredth in gain or time constant; margins bear twenty times "
+    "that, and a further recording takes a minute",
+    "test_commission_plan.py: a motor that is not known well enough",
+)
 VALIDATION_LEVEL = Limit(
     0.01,
     "significance level",

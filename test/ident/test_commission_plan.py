@@ -6,13 +6,15 @@ import contextlib
 import json
 import shutil
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
+from results import estimate as make_estimate
 
-from smp_motor_ident.cli import checking, commissioning, steps
+from smp_motor_ident.cli import checking, commissioning, plan, steps
 from smp_motor_ident.cli.commission import main
 from smp_motor_ident.cli.processes import ProcessError
 from smp_motor_ident.diagnosis.wheel_test import Figures
@@ -33,7 +35,8 @@ def test_a_dry_run_prints_and_draws_the_plan_and_touches_nothing(
     assert "slowly until it turns" in lines[0] and "8 V" in lines[0]
     # A square is at one of its ends: three quarters of 8 V either way.
     assert set(lines[4].strip()) == {"▁", "█"}
-    assert "6 V" in lines[3] and "35 s" in lines[-1]
+    # Four wheels: 32 s of checks, 35 s of signals and 4 s around each, 32 s to compute, the drive.
+    assert "6 V" in lines[3] and "35 s of excitation, about 2 min 5 s in all" in lines[-1]
     assert not folder.exists()
 
 
@@ -65,9 +68,13 @@ class Steps:
 
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self.folder, self.done = folder, list[str]()
-        self.cut, self.found = "", tuple[Finding, ...]()
-        self.bounds = dict[str, object]()
-        monkeypatch.setattr(commissioning, "connect", lambda *_: Client())
+        self.cut, self.fuel = "", 100  # moves that a run completes before it is cut off
+        self.left = 0
+        self.found = tuple[Finding, ...]()
+        self.bounds, self.sent = dict[str, object](), list[Any]()
+        self.more: plan.Recording | None = None
+        monkeypatch.setattr(plan, "further", lambda *_: self.more)
+        monkeypatch.setattr(commissioning, "connect", self.connect)
         monkeypatch.setattr(steps, "record", self.record)
         for owner, name, called in (
             (steps, "excite", "excite"),
@@ -79,12 +86,20 @@ class Steps:
         monkeypatch.setattr(steps, "tune_wheels", self.tune)
         monkeypatch.setattr(checking, "check_wheels", self.check)
 
+    def connect(self, *_: object) -> Client:
+        self.left = self.fuel
+        return Client()
+
     def step(self, name: str, *given: Any) -> Any:
         self.done.append(name)
         if name == "excite":
             self.bounds = dict(given[0].bounds)
-        if name == self.cut:
+        if name in ("check", "excite"):
+            self.left -= 1
+        if name == self.cut or self.left < 0:
             raise KeyboardInterrupt
+        if name == "excite":
+            self.sent += given[1]
         return {"identify": {}, "validate": [], "verify": "as designed"}.get(name)
 
     def check(self, *_: object) -> checking.Checked:
@@ -106,6 +121,25 @@ def robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Steps:
     return Steps(tmp_path / "robot", monkeypatch)
 
 
+def test_cut_off_in_every_part_it_sends_what_it_sends_when_it_is_not(robot: Steps) -> None:
+    given = ["--output", str(robot.folder), "--yes"]
+    robot.more = plan.Recording("excitation", "further", steps.Excitation("fourier", 9.0, 5.0))
+    assert main([*given, "--amplitude", "5", "--duration", "2"]) == 0
+    moved = ["check", *["excite"] * 4, "identify", "excite", "identify"]
+    assert robot.done == [*moved, "validate", "tune", "verify"]
+    sent, robot.sent, robot.fuel = robot.sent, [], 1
+    shutil.rmtree(robot.folder)
+    assert main([*given, "--amplitude", "5", "--duration", "2"]) == 130
+    runs = 1
+    while main([*given, "--resume"]) == 130:  # each does one part more
+        runs += 1
+    assert runs == 5 and robot.sent == sent
+    # What was recorded at one voltage is not mixed with another.
+    robot.fuel = 100
+    assert main([*given, "--resume", "--amplitude", "8"]) == 0
+    assert len(robot.sent) == 2 * len(sent)
+
+
 def test_what_was_cut_off_while_it_moved_moves_again_and_afterwards_does_not(
     tmp_path: Path, robot: Steps
 ) -> None:
@@ -123,9 +157,8 @@ def test_what_was_cut_off_while_it_moved_moves_again_and_afterwards_does_not(
     robot.cut = ""
     assert main([*given, "--resume"]) == 0
     # Cut off in the first signal; then in identify after all four; then no wheel moves again.
-    moved = ["check", *["excite"] * 4]
     ended = ["identify", "validate", "tune", "verify"]
-    assert robot.done == ["check", "excite", *moved, "identify", *ended]
+    assert robot.done == ["check", "excite", *["excite"] * 4, "identify", *ended]
     document = json.loads((robot.folder / "commissioning.json").read_text())
     assert document["passed"] and document["checks"]["left"]["gain"] == 25.0
 
@@ -172,3 +205,37 @@ def test_a_wheel_that_turns_faster_than_its_checks_or_its_limit_ends_the_excitat
     assert main([*given, *limits]) == 0
     asked = [robot.bounds[f"max_{name}"] for name in ("speed", "current", "winding_rise")]
     assert asked == [3.0, 2.0, 40.0]
+
+
+def test_the_time_left_follows_what_parts_of_a_kind_took() -> None:
+    now = [0.0]
+    robots = [plan.Recording("excitation", name, steps.Excitation(name, 10.0, 6.0))
+              for name in ("sine", "square")]  # fmt: skip
+    schedule = plan.schedule(["left"], robots, checked=True)
+    compute = 2 * plan.COMPUTE + plan.DRIVE
+    assert schedule.left() == pytest.approx(2 * (10.0 + plan.START) + compute)
+    assert schedule.begin("exciting: sine", "6 V").startswith("[1/5] exciting: sine, 6 V; about ")
+    timed = plan.Schedule(lambda: now[0])
+    for name, kind in (("a", "x"), ("b", "x"), ("c", "y")):
+        timed.add(name, kind, 10.0)
+    timed.begin("a")
+    now[0] = 25.0
+    assert timed.left() == 20.0  # what is overdue is over at any moment
+    timed.begin("b")
+    assert timed.left() == 25.0 + 10.0  # b is late as a was, c is of another kind
+    now[0] = 30.0
+    assert timed.left() == 20.0 + 10.0
+    assert plan.words(30.4) == "30 s" and plan.words(123.0) == "2 min 5 s"
+
+
+def test_a_motor_that_is_not_known_well_enough_is_recorded_once_more() -> None:
+    known = make_estimate()  # to a percent, and the gain better
+    assert plan.further({"left": known}, 6.0) is None
+    vague = replace(known.combinations["time_constant"], std=0.002)  # 5 %
+    open_ = replace(known, combinations={**known.combinations, "time_constant": vague})
+    more = plan.further({"left": known, "right": open_}, 6.0)
+    assert more is not None and more.folder == "excitation" and more.name == "further"
+    sent = more.excitation
+    assert sent.signal == "fourier" and sent.amplitude <= 6.0 and sent.band is not None
+    # The tones lie around the motor's corner, 4 Hz.
+    assert sent.band[0] < 4.0 < sent.band[1] and 5.0 <= sent.duration <= plan.LONGEST

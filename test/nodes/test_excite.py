@@ -73,7 +73,8 @@ def test_a_wheel_that_is_too_fast_or_is_not_heard_ends_the_signal(
     assert (tmp_path / "cold.json").is_file()
     last.clear()
     excite = process(*square, "-p", "wheels:=[rear_left]")
-    eventually(lambda: len(last) > 20, 20.0, robot.spin, excite.output)
+    # Two seconds, in which it has heard the wheel, too.
+    eventually(lambda: len(last) > 200, 20.0, robot.spin, excite.output)
     plant.send_signal(signal.SIGKILL)
     eventually(lambda: excite.returncode is not None, 20.0, robot.spin, excite.output)
     assert excite.returncode == 1 and "rear_left: no motor_state for 1 s" in excite.output

@@ -1,0 +1,218 @@
+"""What a commissioning does, and how long it takes: the plan, drawn, and the time that is left."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from statistics import mean
+
+import numpy as np
+
+from smp_motor_control.excitation import SIGNALS as SHAPES
+from smp_motor_ident.cli.steps import Excitation
+from smp_motor_ident.diagnosis.identifiability import what_next
+from smp_motor_ident.diagnosis.wheel_limits import WANTED_ACCURACY
+from smp_motor_ident.result import Estimate
+
+FITTED, UNSEEN = "excitation", "validation"
+"""Folders of the recordings that motors are identified from, and that they are judged by."""
+
+SIGNALS = (
+    ("sine", 0.75, 1.0, FITTED),
+    ("square", 0.75, 1.0, FITTED),
+    ("fourier", 1.0, 1.0, FITTED),
+    ("steps", 1.0, 0.5, UNSEEN),
+)
+"""What moves the wheels: signal, shares of amplitude and duration, and whose recording."""
+
+FURTHER = "further"
+"""Name of the recording that an identification asks for."""
+
+IDENTIFYING, AGAIN, TUNING, DRIVING = (
+    "identifying",
+    "identifying again",
+    "tuning",
+    "driving on the new gains",
+)
+"""Parts behind the recordings."""
+
+LONGEST = 120.0
+"""Of such a recording [s]."""
+
+CHECK, START, COMPUTE, DRIVE = 8.0, 4.0, 4.0, 12.0
+"""First guesses [s]: the test of one wheel, the start and end of processes around a signal, the
+identification or tuning of one wheel, the drive."""
+
+DRAWN, COLUMNS, BLOCKS = 4.0, 72, "▁▂▃▄▅▆▇█"
+"""So many seconds of a signal are drawn, on so many columns, with these levels."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One signal and where it is kept."""
+
+    folder: str  # :data:`FITTED` or :data:`UNSEEN`
+    name: str
+    excitation: Excitation
+
+    @property
+    def part(self) -> str:
+        """Name of the part that this is of the whole way."""
+        return f"exciting: {self.name}"
+
+    def describe(self) -> str:
+        """Return what is sent, in words."""
+        one = self.excitation
+        band = f", {one.band[0]:.2g} to {one.band[1]:.2g} Hz" if one.band else ""
+        return f"{one.amplitude:.3g} V{band}, {one.duration:.3g} s"
+
+
+def recordings(amplitude: float, duration: float) -> list[Recording]:
+    """Return what is recorded of every robot."""
+    return [
+        Recording(folder, signal, Excitation(signal, lasts * duration, share * amplitude))
+        for signal, share, lasts, folder in SIGNALS
+    ]
+
+
+def further(estimates: Mapping[str, Estimate], amplitude: float) -> Recording | None:
+    """Return the recording that would tell what these estimates leave open; None where none would.
+
+    Open is what gains are designed from: parameters and combinations that the data give, known to
+    less than the accuracy wanted.  Of several wheels the one that needs the longest decides.
+    """
+    wanting = [one for one in estimates.values() if _open(one)]
+    if not wanting:
+        return None
+    proposals = [
+        what_next(one, WANTED_ACCURACY.value, supply=amplitude, longest=LONGEST) for one in wanting
+    ]
+    longest = max(proposals, key=lambda one: one.duration)
+    signal = Excitation("fourier", longest.duration, longest.amplitude, longest.band)
+    return Recording(FITTED, FURTHER, signal)
+
+
+def _open(estimate: Estimate) -> list[str]:
+    known = {**estimate.parameters, **estimate.combinations}
+    return [
+        name
+        for name in ("dc_gain", "time_constant", "resistance", "motor_constant", "inertia")
+        if (one := known.get(name)) is not None
+        and one.value
+        and (one.std or 0.0) > WANTED_ACCURACY.value * abs(one.value)
+    ]
+
+
+class Schedule:
+    """Parts that are done one after the other, and the time that is left.
+
+    Parts of a kind are late alike: what is left is what was planned and, for each part, by how
+    much the parts of its kind that are done took longer on average.
+
+    Parameters
+    ----------
+    clock : callable
+        Returns the time [s].
+
+    Examples
+    --------
+    >>> now = 0.0
+    >>> schedule = Schedule(lambda: now)
+    >>> for name in ("one", "two", "three"):
+    ...     schedule.add(name, "test", 10.0)
+    >>> schedule.begin("one")
+    '[1/3] one; about 30 s left'
+    >>> now = 15.0
+    >>> schedule.begin("two")
+    '[2/3] two; about 30 s left'
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._parts: dict[str, tuple[str, float]] = {}
+        self._took: dict[str, float] = {}
+        self._running: tuple[str, float] | None = None
+
+    def add(self, name: str, kind: str, seconds: float) -> None:
+        """Plan a part, or plan it anew."""
+        self._parts[name] = kind, seconds
+
+    def add_further(self, one: Recording, wheels: int) -> None:
+        """Plan one more recording, and an identification behind it."""
+        self.add(one.part, "signal", one.excitation.duration + START)
+        self.add(AGAIN, "identify", COMPUTE * wheels)
+
+    def begin(self, name: str, how: str = "") -> str:
+        """End the part under way and begin a planned one; return it and the time left in words."""
+        if self._running is not None:
+            before, since = self._running
+            self._took[before] = self._clock() - since
+        self._running = name, self._clock()
+        text = f"{name}, {how}" if how else name
+        number = len(self._took) + 1
+        return f"[{number}/{len(self._parts)}] {text}; about {words(self.left())} left"
+
+    def left(self) -> float:
+        """Return the time that is left [s]."""
+        running, since = self._running or ("", 0.0)
+        total = 0.0
+        for name, (kind, planned) in self._parts.items():
+            if name not in self._took:
+                gone = self._clock() - since if name == running else 0.0
+                total += max(planned + self._late(kind) - gone, 0.0)
+        return total
+
+    def _late(self, kind: str) -> float:
+        done = [n for n in self._took if self._parts[n][0] == kind]
+        return mean(self._took[n] - self._parts[n][1] for n in done) if done else 0.0
+
+
+def schedule(wheels: Sequence[str], parts: Iterable[Recording], checked: bool) -> Schedule:
+    """Return the whole way of a commissioning, without what is done already."""
+    made = Schedule()
+    for wheel in () if checked else wheels:
+        made.add(f"checking {wheel}", "check", CHECK)
+    for part in parts:
+        made.add(part.part, "signal", part.excitation.duration + START)
+    made.add(IDENTIFYING, "identify", COMPUTE * len(wheels))
+    made.add(TUNING, "tune", COMPUTE * len(wheels))
+    made.add(DRIVING, "drive", DRIVE)
+    return made
+
+
+def words(seconds: float) -> str:
+    """Return a time to wait as a person says it."""
+    whole = round(seconds / 5) * 5 if seconds > 20 else round(seconds)
+    return f"{whole // 60} min {whole % 60} s" if whole >= 60 else f"{whole} s"
+
+
+def drawn(amplitude: float, duration: float, wheels: Sequence[str]) -> list[str]:
+    """Return the plan in words, each signal with its first seconds as a line of blocks."""
+    lines = [
+        f"first: each wheel alone, some {CHECK:g} s: slowly until it turns, then at growing "
+        f"voltages up to {amplitude:g} V, both ways; signs, gearing, dead zone, supply and load "
+        "are checked"
+    ]
+    begin, parts = 0.0, recordings(amplitude, duration)
+    for one in parts:
+        part = one.excitation
+        signal = SHAPES[part.signal](amplitude=part.amplitude)
+        shown = min(part.duration, DRAWN)
+        level = signal(np.arange(COLUMNS, dtype=np.float64) * (shown / COLUMNS)) / part.amplitude
+        bars = "".join(BLOCKS[round((1 + float(v)) / 2 * (len(BLOCKS) - 1))] for v in level)
+        lines.append(
+            f"from {begin:5.1f} s: {part.signal}, up to {part.amplitude:g} V either way, "
+            f"{part.duration:g} s; its first {shown:g} s:"
+        )
+        lines.append(f"  {bars}")
+        begin += part.duration
+    total = words(schedule(wheels, parts, False).left())
+    accuracy = 100 * WANTED_ACCURACY.value
+    lines += [
+        f"then: identify; where a number is not known to {accuracy:g} %, one more Fourier signal "
+        f"of at most {LONGEST:g} s; tune; a drive of some {DRIVE:g} s with the gains on trial",
+        f"{begin:g} s of excitation, about {total} in all for {len(wheels)} wheels. "
+        "Nothing was moved.",
+    ]
+    return lines

@@ -1,0 +1,131 @@
+"""A commissioning that is cut off and gone on with ends with the numbers of one that is not."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from motors import record
+from rclpy.serialization import serialize_message
+
+from smp_interfaces.msg import MotorDescription, MotorState
+from smp_motor_control.excitation import SIGNALS
+from smp_motor_ident.bag import BagWriter
+from smp_motor_ident.cli import checking, commissioning, steps
+from smp_motor_ident.cli.commission import main
+from smp_motor_ident.diagnosis.wheel_test import Figures
+from smp_motor_ident.record import Record
+
+WHEEL, RATE = "rear_left", 100.0
+FIGURES = Figures(100.0, 0.001, 0, 0.0, 0.5, 1.0, 1.0, 1.0, 25.0, 0.4, 0.05, 5.0)
+
+
+class Robot:
+    """Its motor is simulated when ``excite`` moves it; a run completes ``fuel`` parts."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.fuel, self.left, self.draft = 100, 0, Path()
+        monkeypatch.setattr(commissioning, "connect", self.connect)
+        monkeypatch.setattr(checking, "check_wheels", self.check)
+        monkeypatch.setattr(steps, "record", self.record)
+        monkeypatch.setattr(steps, "excite", self.excite)
+        monkeypatch.setattr(commissioning, "_verify", lambda *_: "as designed")
+
+    def connect(self, *_: object) -> Any:
+        self.left = self.fuel
+        return contextlib.nullcontext(self)
+
+    def find_wheels(self) -> list[str]:
+        return [WHEEL]
+
+    def wait_for_wheels(self, wheels: Sequence[str], timeout: float) -> dict[str, float]:
+        return dict.fromkeys(wheels, RATE)
+
+    def paused(self, wheels: Sequence[str]) -> Any:
+        return contextlib.nullcontext()
+
+    def use(self) -> None:
+        self.left -= 1
+        if self.left < 0:
+            raise KeyboardInterrupt
+
+    def check(self, *_: object) -> checking.Checked:
+        self.use()
+        return checking.Checked((), {WHEEL: FIGURES}, 6.0, math.nan)
+
+    def record(self, robot: steps.Robot, name: str) -> None:
+        self.draft = robot.folder / name
+        self.draft.mkdir()  # what is cut off leaves it
+
+    def excite(self, robot: steps.Robot, plan: Sequence[steps.Excitation]) -> None:
+        self.use()
+        (part,) = plan
+        n = round(part.duration * RATE)
+        sent = SIGNALS[part.signal](amplitude=part.amplitude)(np.arange(n) / RATE)
+        held = np.concatenate([np.zeros(1), sent])
+        did = record(WHEEL, rate=RATE, voltage=held, kinds=("of ours",), seconds=1e2, seed=n)
+        self.draft.rmdir()
+        write(self.draft, did)
+
+
+def write(folder: Path, did: Record) -> None:
+    """Write a record as ``record`` records it."""
+    begin = 1_700_000_000_000_000_000
+    with BagWriter(folder) as bag:
+        hardware = did.hardware
+        described = MotorDescription(
+            joint_name=f"{WHEEL}_wheel_joint", gear_ratio=hardware.gear_ratio,
+            counts_per_revolution=hardware.counts_per_revolution, encoder_bits=0,
+            supply_voltage=12.0, resistance=math.nan,
+        )  # fmt: skip
+        put(bag, "motor_description", described, begin)
+        turn = 2 * math.pi / 500.0 / hardware.gear_ratio
+        for k, seconds in enumerate(did.time):
+            state = MotorState(voltage=float(did.voltage[k]), current=float(did.current[k]))
+            state.velocity = float(did.velocity[k]) / hardware.gear_ratio
+            state.encoder_count = int(did.count[k])
+            state.position = float(did.count[k]) * turn
+            stamp = begin + round(1e9 * float(seconds))
+            state.header.stamp.sec, state.header.stamp.nanosec = divmod(stamp, 10**9)
+            put(bag, "motor_state", state, stamp)
+
+
+def put(bag: BagWriter, topic: str, message: Any, stamp: int) -> None:
+    kind = f"smp_interfaces/msg/{type(message).__name__}"
+    data = bytes(serialize_message(message))
+    bag.write(f"/{WHEEL}/{topic}", kind, data + bytes(-len(data) % 4), stamp)
+
+
+def numbers(folder: Path) -> dict[str, Any]:
+    """What came out, without dates and paths."""
+    gains = json.loads((folder / "gains.json").read_text())
+    return {
+        "identification": (folder / "identification" / "identification.json").read_text(),
+        "motors": yaml.safe_load((folder / "identification" / "motors.yaml").read_text()),
+        "wheels": gains["wheels"],
+        "gains": yaml.safe_load((folder / "gains.yaml").read_text()),
+    }
+
+
+def test_it_ends_with_the_same_numbers_to_the_bit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot, codes = Robot(monkeypatch), list[int]()
+    asked = ["--yes", "--amplitude", "6", "--duration", "2"]
+    assert main(["--output", str(tmp_path / "whole"), *asked]) == 0
+    robot.fuel = 1
+    cut = ["--output", str(tmp_path / "cut")]
+    codes.append(main([*cut, *asked]))
+    while codes[-1] == 130 and len(codes) < 9:  # in the check, and in each of four signals
+        codes.append(main([*cut, "--yes", "--resume"]))
+    assert codes == [130] * 4 + [0]
+    whole, parts = numbers(tmp_path / "whole"), numbers(tmp_path / "cut")
+    assert WHEEL in whole["identification"]
+    assert parts == whole
