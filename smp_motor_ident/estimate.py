@@ -26,7 +26,7 @@ from smp_motor_ident.errors import InsufficientExcitationError, SignalError, Smp
 from smp_motor_ident.estimation import flexible_shaft, order_selection, prediction
 from smp_motor_ident.estimation.averaging import averaged, weights
 from smp_motor_ident.estimation.candidate_starts import of_kind
-from smp_motor_ident.estimation.choice import FittedCandidate
+from smp_motor_ident.estimation.choice import FittedCandidate, size
 from smp_motor_ident.estimation.consider_covariance import (
     consider_friction,
     consider_left_out,
@@ -168,15 +168,15 @@ def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) 
 
 
 def _in_turn(candidates: list[FittedCandidate]) -> list[list[FittedCandidate]]:
-    """Return the candidates with the choice last, and with each that it contains in its place."""
+    """Return the candidates with the choice last, then with each that is no richer in its place."""
     chosen = candidates[-1].fit
-    inner = [
-        r for r in candidates[:-1]
-        if r.whole and r.fit.converged and r.fit.kind == chosen.kind
-        and set(r.fit.structure.free()) < set(chosen.structure.free())
-    ]  # fmt: skip
-    inner.sort(key=lambda r: r.bic)
-    return [candidates, *([*(o for o in candidates if o is not r), r] for r in inner)]
+    others = [
+        r
+        for r in candidates[:-1]
+        if r.whole and r.fit.converged and size(r.fit.structure) <= size(chosen.structure)
+    ]
+    others.sort(key=lambda r: r.bic)
+    return [candidates, *([*(o for o in candidates if o is not r), r] for r in others)]
 
 
 def _fallen_back(refusal: SmpError | None, candidates: list[FittedCandidate]) -> list[Finding]:
@@ -184,9 +184,9 @@ def _fallen_back(refusal: SmpError | None, candidates: list[FittedCandidate]) ->
         return []
     return [
         Finding(
-            "richer_refused",
+            "choice_refused",
             "unreliable",
-            f"a richer structure that fits the samples better was refused ({refusal}); this is "
+            f"the structure that fits the samples best was refused ({refusal}); this is "
             f"the answer of {candidates[-1].label}",
             advice="record longer, with sharper and larger steps",
         )

@@ -250,24 +250,20 @@ def _variations(
     s = best.structure
     if best.kind == rc.MEAN_SPEED:
         data = data.as_mean_speed()
-    trials: list[dict[str, object]] = []
-    if best.structure.current:
-        trials.append({"offset": True})
-        if "delay" not in s.fixed and not best.structure.delay:
-            trials.append({"delay": True})
-    if best.structure.friction != "asymmetric":
-        trials.append({"load": True})
-    if best.structure.friction == "symmetric":
-        trials.append({"friction": "asymmetric", "load": True})
-    for change in trials:
+    for change in _additions(s):
         richer = best.structure.with_(**change)
-        if richer == best.structure or not _worth_a_fit(data, best, richer):
+        # Torque noise flattens the score of what it has taken the place of: there only a fit
+        # that begins without it tells.
+        hidden = "delay" in change and best.noise_ratio > 0
+        if richer == best.structure or not (hidden or _worth_a_fit(data, best, richer)):
             continue
         say(f"trying {label(richer)}")
         z = best.z.copy()
         if "delay" in change:
             z[models.DELAY] = 0.3 * data.step
         other = descent.refine(data, richer, best, z, options)
+        fresh = with_delay(data, richer, options, None) if hidden else None
+        other = min(other, fresh or other, key=lambda f: f.deviance)
         verdict, reason = preferred(best, other)
         if verdict and "delay" in change and other.z[models.DELAY] < 0.03 * data.step:
             verdict, reason = False, "a delay of hundredths of a sample is how the input was held"
@@ -277,6 +273,20 @@ def _variations(
         if verdict:
             best = other
     return _without_friction(data, best, options, candidates)
+
+
+def _additions(s: Structure) -> list[dict[str, object]]:
+    """Return what may be added to a structure, in the order in which it is tried."""
+    trials: list[dict[str, object]] = []
+    if s.current:
+        trials.append({"offset": True})
+        if "delay" not in s.fixed and not s.delay:
+            trials.append({"delay": True})
+    if s.friction != "asymmetric":
+        trials.append({"load": True})
+    if s.friction == "symmetric":
+        trials.append({"friction": "asymmetric", "load": True})
+    return trials
 
 
 def _orders_again(

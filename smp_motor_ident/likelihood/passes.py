@@ -129,7 +129,8 @@ def _ring(data: Experiments, par: Array, p: int) -> Array:
         return np.zeros((0, 0))
     steps = np.diff(data.time)
     # A descent may try any width; one that is no width at all is thrown out by its objective.
-    width = min(max(float(par[recursion.WINDOW]), 0.0), float(np.ptp(data.time)))
+    width = float(par[recursion.WINDOW])
+    width = min(width, float(np.ptp(data.time))) if width > 0 else 0.0  # NaN is none, too
     depth = 4 + math.ceil(width / float(steps[steps > 0].min()))
     return np.zeros((min(depth, data.size + 1), 3 + 2 * p))
 

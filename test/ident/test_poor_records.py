@@ -105,7 +105,7 @@ def test_a_refusal_is_tried_again_with_the_simpler_structure(monkeypatch):
     monkeypatch.setattr("smp_motor_ident.estimate.refuse", strict)
     found = estimate(motors.record("rear_left", current=False, seconds=3.0))
     assert found.model == "first_order"
-    assert "richer_refused" in [f.code for f in found.findings if f.severity == "unreliable"]
+    assert "choice_refused" in [f.code for f in found.findings if f.severity == "unreliable"]
 
 
 def test_two_levels_know_gain_and_friction_apart():

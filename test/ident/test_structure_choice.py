@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from types import SimpleNamespace
 from typing import Any
 
+import motors
 import numpy as np
 import pytest
 
+from smp_motor_ident.estimation import order_selection
 from smp_motor_ident.estimation.choice import (
     FittedCandidate,
     label,
@@ -16,7 +19,10 @@ from smp_motor_ident.estimation.choice import (
     sandwich_factor,
     size,
 )
-from smp_motor_ident.model.structures import Z_NAMES, Structure
+from smp_motor_ident.estimation.fitted import Options
+from smp_motor_ident.estimation.initialisation import initial_fit
+from smp_motor_ident.likelihood.experiments import prepare
+from smp_motor_ident.model.structures import DELAY, Z_NAMES, Structure
 
 FIRST = Structure("first_order", order=1)
 SECOND = Structure("second_order")
@@ -92,3 +98,18 @@ def test_a_structure_is_named_with_all_that_was_added() -> None:
     rest = Structure("x", friction="asymmetric", delay=True, window=True, offset=True)
     words = "asymmetric friction, delay, averaged speed, current offset"
     assert label(rest) == f"x with {words}"
+
+
+def test_torque_noise_does_not_hide_a_delay(monkeypatch):
+    """With torque noise the score says nothing of a delay: a fit that begins without it does."""
+    data = prepare([motors.record("rear_left", seconds=2.0)], True)
+    plain = initial_fit(data, Structure("electromechanical", current=True), Options())
+    noisy = dataclasses.replace(plain, noise_ratio=1.0, deviance=plain.deviance + 1e4)
+    late = dataclasses.replace(plain, structure=plain.structure.with_(delay=True))
+    late = dataclasses.replace(late, z=plain.z + 0.4 * data.step * np.eye(11)[DELAY])
+    late = dataclasses.replace(late, information=np.eye(len(late.structure.free())) * 1e12,
+                               scores=np.zeros((0, len(late.structure.free()))))  # fmt: skip
+    monkeypatch.setattr(order_selection, "with_delay", lambda *_: late)
+    monkeypatch.setattr(order_selection, "_worth_a_fit", lambda *_: False)
+    best = order_selection._variations(data, noisy, Options(), [], lambda _: None)
+    assert best.structure.delay
