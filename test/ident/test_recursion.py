@@ -111,3 +111,11 @@ def test_irregular_stamps_are_taken_as_they_are():
     z = models.from_physical(*p, 0.2 * p[2] / p[0])
     out = predict(data, Structure("electromechanical", current=True), z)
     np.testing.assert_allclose(out[:, 0], small[:, 1], atol=0.05)  # as above
+
+
+def test_coordinates_that_are_no_numbers_are_no_motor_and_no_crash():
+    data = prepare([motors.record("rear_left", current=False, seconds=1.0)], False, "speed")
+    structure = Structure("first_order", order=1, window=True)
+    z = np.full(len(models.Z_NAMES), np.nan)  # as a descent's overflow leaves it
+    cost = gather(data.as_mean_speed(), structure, z, data.initial).cost
+    assert not np.all(np.isfinite(cost))
