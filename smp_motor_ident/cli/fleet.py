@@ -112,7 +112,7 @@ def _results(
 ) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield results as they come; a worker that dies takes nothing with it but its own try."""
     if scheduler:
-        yield from _on_cluster(paths, settings, scheduler)
+        yield from on_cluster(paths, settings, scheduler)
         return
     fork = multiprocessing.get_context("fork")
     tries = dict.fromkeys(paths, 0)
@@ -143,9 +143,10 @@ def _gathered(
         yield futures[future], future.result()
 
 
-def _on_cluster(
+def on_cluster(
     paths: Sequence[str], settings: tuple[Any, ...], address: str
 ) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield results as workers of a Dask cluster give them; it repeats what a dead one had."""
     try:
         from dask import distributed
     except ImportError:

@@ -1,0 +1,144 @@
+"""The pages for people who see little or use no mouse: judged by axe-core in a browser."""
+
+from __future__ import annotations
+
+import json
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from browser import CHROMIUM, Browser
+from results import estimate
+
+from smp_motor_ident.finding import Finding
+from smp_motor_ident.report import commissioning, fleet, tuning_page
+from smp_motor_ident.report.html import Report, render
+from smp_motor_ident.report.series import Comparison
+from smp_motor_ident.tune import Loop
+from smp_motor_ident.tune.verification import Bands, Change, Reading
+
+AXE = find_spec("axe_core_python")
+FRAME = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
+
+pytestmark = pytest.mark.skipif(not CHROMIUM, reason="no Chromium on this machine")
+
+
+def report(monkeypatch: pytest.MonkeyPatch) -> str:
+    """Of two motors, one with a tuning page, and one that failed."""
+    monkeypatch.setattr(tuning_page, "SHARES", (0.5, 1.0))
+    monkeypatch.setattr(tuning_page, "MARGINS", (60.0,))
+    monkeypatch.setattr(tuning_page, "SAMPLES", 20)
+    loop = Loop(sample_time=0.005, gear_ratio=65.5, counts_per_revolution=500, supply_voltage=12.0)
+    time = np.arange(4000) * 0.005
+    voltage = 8 * np.sign(np.sin(2 * np.pi * 0.37 * time))
+    noisy = 25 * voltage + np.random.default_rng(7).normal(0, 2, time.size)
+    compared = Comparison("estimation", "bag", time, voltage, noisy, 25 * voltage)
+    one, other = estimate(), estimate("rear_right", current=False)
+    return render(
+        Report(
+            {one.wheel: one, other.wheel: other}, {one.wheel: [compared]},
+            {"rear_left": "voltage is constant; excite the motor"}, {"Command": "identify a b"},
+            {one.wheel: tuning_page.tuning_of(one, loop)},
+        )
+    )  # fmt: skip
+
+
+def fleet_page(_: pytest.MonkeyPatch) -> str:
+    rows = [
+        fleet.Row(f"robot{k}", "front_left", f"bag{n}", n * fleet.DAY,
+                  {"dc_gain": (25.0 + (0.3 * n if k == 3 else 0.02 * (n % 2)), 0.01)}, 97.0, n == 9)
+        for k in range(4) for n in range(10)
+    ]  # fmt: skip
+    rows.append(fleet.Row("robot9", "", "torn", 0.0, {}, failure="torn: is no bag"))
+    return fleet.page(rows, fleet.drifts(rows))
+
+
+def commissioning_page(_: pytest.MonkeyPatch) -> str:
+    time = np.linspace(0.0, 1.0, 200)
+    speed = 2.0 * (1 - np.exp(-time / 0.1))
+    change = Change(
+        "front_left", "forward", 2.0, time, speed + 0.01, speed - 0.1, speed, speed + 0.1,
+        Reading(0.4, 1.0, 0.5), Bands(0.5, 2.0, 1.0), 0.0,
+    )  # fmt: skip
+    steps = [("checks", "warning"), ("validation", "note"), ("verification", "refused")]
+    findings = [
+        {"step": step, **Finding("code", severity, "what was seen", {}, "do this").to_document()}
+        for step, severity in steps
+    ]
+    names = [name for name, _ in commissioning.COLUMNS]
+    document = {
+        "wheels": ["front_left"], "date": "today", "passed": False, "verdict": "stopped: it did",
+        "accepted": [], "findings": findings, "checks": {"front_left": dict.fromkeys(names, 1.0)},
+        "amplitude": 6.0, "changes": [{
+            "wheel": "front_left", "name": "forward", "setpoint": 2.0,
+            "reading": {"settling": 0.4, "overshoot": 1.0, "error": None},
+            "allowed": {"settling": 0.5, "overshoot": 2.0, "error": 1.0},
+        }],
+    }  # fmt: skip
+    return commissioning.render(document, [change])
+
+
+def violations(browser: Browser) -> list[str]:
+    """What axe-core calls serious or critical, with the elements."""
+    assert AXE is not None and AXE.origin is not None
+    browser.value(Path(AXE.origin).with_name("axe.min.js").read_text("utf-8") + ";0")
+    said = browser.ask(
+        "Runtime.evaluate", awaitPromise=True, returnByValue=True,
+        expression="axe.run(document, {resultTypes: ['violations']})"
+        ".then(r => JSON.stringify(r.violations))",
+    )  # fmt: skip
+    found: list[dict[str, Any]] = json.loads(said["result"]["value"])
+    return [
+        f"{one['id']}: {node['html'][:120]}: {node.get('failureSummary', '')}"
+        for one in found
+        if one["impact"] in ("serious", "critical")
+        for node in one["nodes"]
+    ]
+
+
+@pytest.mark.skipif(AXE is None, reason="axe-core-python is not installed")
+@pytest.mark.parametrize("made", [report, fleet_page, commissioning_page])
+def test_no_page_has_a_serious_violation_wide_or_narrow_light_or_dark(
+    made: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "page.html"
+    file.write_text(made(monkeypatch))
+    with Browser(tmp_path / "profile") as browser:
+        for width, dark in ((1200, False), (390, True), (1200, True), (390, False)):
+            browser.open(file, width, dark=dark)
+            assert browser.value("document.documentElement.scrollWidth") <= width
+            assert violations(browser) == []
+        assert browser.complaints == []
+
+
+def test_what_a_mouse_does_with_a_chart_a_keyboard_does_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "page.html"
+    file.write_text(commissioning_page(monkeypatch))
+
+    def press(browser: Browser, key: str, text: str = "") -> None:
+        for kind in ("keyDown", "keyUp"):
+            browser.ask("Input.dispatchKeyEvent", type=kind, key=key, code=key, text=text,
+                        windowsVirtualKeyCode={"Tab": 9}.get(key, 0))  # fmt: skip
+
+    with Browser(tmp_path / "profile") as browser:
+        browser.open(file, 1200)
+        reached = []
+        for _ in range(40):  # links, tables that scroll, buttons, charts
+            press(browser, "Tab")
+            reached.append(browser.value("document.activeElement.className"))
+            if reached[-1] == "live":
+                break
+        assert "live" in reached
+        # Who does not see where the focus is, cannot use it.
+        assert browser.value("getComputedStyle(document.activeElement).outlineStyle") != "none"
+        whole = browser.value("document.activeElement.dataset.shown")
+        press(browser, "+", "+")
+        browser.ask("Runtime.evaluate", awaitPromise=True, expression=FRAME)
+        assert browser.value("document.activeElement.dataset.shown") != whole
+        press(browser, "Escape")
+        browser.ask("Runtime.evaluate", awaitPromise=True, expression=FRAME)
+        assert browser.value("document.activeElement.dataset.shown") == whole
