@@ -129,8 +129,7 @@ def _ring(data: Experiments, par: Array, p: int) -> Array:
         return np.zeros((0, 0))
     steps = np.diff(data.time)
     # A descent may try any width; one that is no width at all is thrown out by its objective.
-    width = float(par[recursion.WINDOW])
-    width = min(width, float(np.ptp(data.time))) if width > 0 else 0.0  # NaN is none, too
+    width = min(max(float(par[recursion.WINDOW]), 0.0), float(np.ptp(data.time)))
     depth = 4 + math.ceil(width / float(steps[steps > 0].min()))
     return np.zeros((min(depth, data.size + 1), 3 + 2 * p))
 
@@ -159,11 +158,16 @@ def evaluate(
     priors: Sequence[tuple[Array, float]] = (),
 ) -> Pass:
     """Run, add what is known beforehand, and eliminate the initial states."""
-    sums = gather(data, structure, z, initial, noise)
     own = own_columns(data, structure)
-    segments, f, o = len(sums.cost), structure.matrix().shape[1], len(own)
+    segments, f, o = len(data.starts) - 1, structure.matrix().shape[1], len(own)
     common, score = np.zeros((f, f)), np.zeros(f)
     step, local_gain = np.zeros((segments, o)), np.zeros((segments, o, f))
+    nowhere = Pass(math.inf, np.zeros((f, f)), np.zeros(f), np.zeros_like(step),
+                   np.zeros_like(local_gain), 0.0, np.full(6, np.nan),
+                   np.zeros((0, f)))  # fmt: skip
+    if not np.isfinite(z).all():  # what predicts no number misses no measurement
+        return nowhere
+    sums = gather(data, structure, z, initial, noise)
     total = float(sums.cost.sum())
     for row, miss in priors:
         common += np.outer(row, row)
@@ -174,7 +178,5 @@ def evaluate(
                                local_gain, sums.scores, sums.owner)  # fmt: skip
     total += prior
     if not math.isfinite(total + float(common.sum()) + float(score.sum()) + float(step.sum())):
-        return Pass(math.inf, np.zeros((f, f)), np.zeros(f), np.zeros_like(step),
-                    np.zeros_like(local_gain), 0.0, np.full(6, np.nan),
-                    np.zeros((0, f)))  # fmt: skip
+        return nowhere
     return Pass(total, common, score, step, local_gain, decrease, sums.spread, sums.scores[:, :f])

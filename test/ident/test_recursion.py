@@ -10,7 +10,7 @@ import pytest
 from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.likelihood.noise import NO_GAIN, NoiseModel, kalman_gain
-from smp_motor_ident.likelihood.passes import gather
+from smp_motor_ident.likelihood.passes import evaluate, gather
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import Structure
 
@@ -111,3 +111,12 @@ def test_irregular_stamps_are_taken_as_they_are():
     z = models.from_physical(*p, 0.2 * p[2] / p[0])
     out = predict(data, Structure("electromechanical", current=True), z)
     np.testing.assert_allclose(out[:, 0], small[:, 1], atol=0.05)  # as above
+
+
+def test_coordinates_that_are_no_numbers_are_no_motor_and_no_crash():
+    data = prepare([motors.record("rear_left", current=False, seconds=1.0)], False, "speed")
+    data = data.as_mean_speed()
+    structure = Structure("first_order", order=1, window=True)
+    z = np.full(len(models.Z_NAMES), np.nan)  # as a descent's overflow leaves it
+    found = evaluate(data, structure, z, data.initial, data.initial, NoiseModel())
+    assert found.objective == np.inf
