@@ -17,7 +17,6 @@ from rclpy.publisher import Publisher
 from rclpy.qos import (
     DurabilityPolicy,
     HistoryPolicy,
-    LivelinessPolicy,
     QoSProfile,
     ReliabilityPolicy,
 )
@@ -27,17 +26,10 @@ from smp_motor_control.errors import SmpError
 
 # REP-2003: streams are published reliably and taken best effort, so that both a stock
 # reliable subscriber and a stock best-effort publisher find a partner in our nodes.
-# Only offered, never asked for: who asks for more than is offered gets no link, and no word of it.
-STREAM_PUBLISHER = QoSProfile(
-    depth=5,
-    reliability=ReliabilityPolicy.RELIABLE,
-    liveliness=LivelinessPolicy.AUTOMATIC,
-    liveliness_lease_duration=Duration(seconds=1.0),
-)
-"""Commands, states, set-points: what is outdated by the next message.
-
-Who asks for a lease of a second or more learns within it that the process has died.
-"""
+# No lease of liveliness is offered: what keeps it can lock up with the end of another process
+# (docs/decisions/when-a-wheel-stops.md).
+STREAM_PUBLISHER = QoSProfile(depth=5, reliability=ReliabilityPolicy.RELIABLE)
+"""Commands, states, set-points: what is outdated by the next message."""
 
 STREAM_SUBSCRIBER = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 """The other end of :data:`STREAM_PUBLISHER`, and of any stock publisher."""

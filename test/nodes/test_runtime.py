@@ -268,3 +268,10 @@ def test_node_that_raises_still_stops_its_motors_and_says_why(process):
     assert node.wait(20.0) == 1
     assert "stopped" in node.output
     assert "busy: stopped by ValueError: too bad" in node.output
+
+
+def test_no_lease_of_liveliness_is_offered():
+    # What renews one can lock up with the end of another process, for ever.
+    assert (
+        STREAM_PUBLISHER.liveliness_lease_duration == QoSProfile(depth=1).liveliness_lease_duration
+    )

@@ -11,12 +11,7 @@ import time
 from collections.abc import Iterator
 
 import pytest
-from rclpy.duration import Duration
-from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.qos import LivelinessPolicy, QoSProfile
 from wheel_robot import WheelRobot
-
-from smp_interfaces.msg import MotorCommand
 
 WHEEL = "front_left"
 NODE = "front_left/wheel_pid"
@@ -308,26 +303,3 @@ def test_processor_that_is_not_there_is_told_and_done_without(start, robot, even
     start("cpu_affinity:=[4000]")
     settle(robot, Feed(robot, eventually))
     eventually(lambda: robot.named(NODE, "cpu_affinity [4000] not granted"), 3.0, robot.spin)
-
-
-def test_driver_that_asks_for_liveliness_is_told_when_the_controller_is_killed(
-    start, robot, eventually
-):
-    node = start()
-    alive: list[int] = []
-    robot.node.create_subscription(
-        MotorCommand,
-        f"/{WHEEL}/motor_command",
-        lambda message: None,
-        QoSProfile(
-            depth=5,
-            liveliness=LivelinessPolicy.AUTOMATIC,
-            liveliness_lease_duration=Duration(seconds=1.0),
-        ),
-        event_callbacks=SubscriptionEventCallbacks(
-            liveliness=lambda event: alive.append(event.alive_count)
-        ),
-    )
-    eventually(lambda: alive and alive[-1] == 1, 5.0, robot.spin)
-    node.send_signal(signal.SIGKILL)
-    eventually(lambda: alive[-1] == 0, 3.0, robot.spin)
