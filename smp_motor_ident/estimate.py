@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from smp_motor_ident.diagnosis import validation as validate
 from smp_motor_ident.diagnosis.adequacy import adequacy, stated
-from smp_motor_ident.diagnosis.advice import advise, assess
+from smp_motor_ident.diagnosis.advice import advise, assess, unsettled_rival
 from smp_motor_ident.diagnosis.beat import on_beat
 from smp_motor_ident.diagnosis.bunched import merge_bunches
 from smp_motor_ident.diagnosis.conditions import dependent
@@ -219,6 +219,7 @@ def _stated(
         *assess(final, chosen, FitPercent(fitted, common), tests),
         *adequacy(errors, data.step, stated(chosen, result), tests),
         *parts,
+        *unsettled_rival(candidates, result, request.known),
         *advise(chosen, result, request.known),
         *scope(final, result, change, alike, group[0].hardware.resistance),
     ]

@@ -29,7 +29,7 @@ from smp_motor_ident.diagnosis.limits import (
     EFFECT_BLOCKS,
     EFFECT_LEVEL,
     EFFECT_OWN,
-    IMPLIED_BIAS,
+    HALF_WIDTH,
     RELEVANT_BIAS,
 )
 from smp_motor_ident.diagnosis.model_error import Regression
@@ -161,7 +161,7 @@ def _finding(
         "shift_share": share,
         "alternatives": ", ".join(e.effect.code for e in shown if e is not first) or None,
     }
-    if times < IMPLIED_BIAS.value:
+    if times < HALF_WIDTH.value:
         message = f"the model's error shows {words}; it moves no stated number by what matters"
         return Finding(first.effect.code, "note", message, evidence)
     return Finding(

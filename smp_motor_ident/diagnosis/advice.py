@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ from smp_motor_ident.diagnosis.limits import (
     FIT_HOLDS,
     FIT_INDEPENDENT,
     FRICTION_SHOWN,
-    IMPLIED_BIAS,
+    HALF_WIDTH,
     RELEVANT_BIAS,
     RINGING,
     SQUARE_LEVEL,
@@ -22,8 +22,9 @@ from smp_motor_ident.diagnosis.limits import (
 )
 from smp_motor_ident.diagnosis.validation import within_resolution
 from smp_motor_ident.estimation import prediction, shape_constraint
+from smp_motor_ident.estimation.choice import FittedCandidate, preferred_but_for_descent
 from smp_motor_ident.estimation.fit import Fit
-from smp_motor_ident.estimation.quantities import Answer
+from smp_motor_ident.estimation.quantities import Answer, answer
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments
@@ -48,6 +49,38 @@ def assess(data: Experiments, fit: Fit, percent: FitPercent, tests: ResidualTest
         *_second_lag(data, fit),
         *_torque_noise(data, fit),
     ]
+
+
+def unsettled_rival(
+    candidates: Sequence[FittedCandidate], result: Answer, known: Mapping[str, float]
+) -> list[Finding]:
+    """Say it where a structure that explains more did not settle, and has other values.
+
+    It is no answer; but neither is the one that it would have replaced.
+    """
+    chosen = candidates[-1]
+    for other in candidates[:-1]:
+        if other.fit.converged or not other.whole or not preferred_but_for_descent(chosen, other):
+            continue
+        values = answer(other.fit, known).combinations
+        moved = [
+            name
+            for name, q in result.combinations.items()
+            if q.value is not None and q.std and name in values
+            and abs((values[name].value or 0.0) - q.value) > HALF_WIDTH.value * q.std
+        ]  # fmt: skip
+        if moved:
+            return [
+                Finding(
+                    "unsettled_rival",
+                    "unreliable",
+                    f"{other.label} explains the data better and did not settle; its "
+                    f"{', '.join(moved)} lie outside of the intervals",
+                    {"gain": chosen.fit.deviance - other.fit.deviance},
+                    "record longer, with sharper and larger steps",
+                )
+            ]
+    return []
 
 
 def _descent(data: Experiments, fit: Fit) -> list[Finding]:
@@ -171,9 +204,9 @@ def _second_lag(data: Experiments, fit: Fit) -> list[Finding]:
     row[[models.A0, models.A1, models.A2]] = 1.0, -2.0, 1.0
     free = row @ fit.structure.matrix()
     ratio, spread = float(row @ fit.z), float(np.sqrt(free @ fit.covariance() @ free))
-    if ratio - IMPLIED_BIAS.value * spread > np.log(0.25):  # it rings, which no lag does
+    if ratio - HALF_WIDTH.value * spread > np.log(0.25):  # it rings, which no lag does
         return []
-    share, least = (_lag_share(ratio - k * spread) for k in (0.0, IMPLIED_BIAS.value))
+    share, least = (_lag_share(ratio - k * spread) for k in (0.0, HALF_WIDTH.value))
     long = share >= WINDING_LAG.value
     if not long and least < RELEVANT_BIAS.value:
         return []
@@ -267,12 +300,12 @@ def _unsettled(data: Experiments, fit: Fit) -> bool:
     free = np.array(fit.structure.free())
     reported = (free != models.TE) | fit.structure.current
     deviation = np.sqrt(np.diag(fit.covariance()))
-    if not np.any(np.abs(step) > IMPLIED_BIAS.value * deviation, where=reported):
+    if not np.any(np.abs(step) > HALF_WIDTH.value * deviation, where=reported):
         return False
     here = _least_squares(data, fit, fit.z)
     return any(
         _least_squares(data, fit, fit.z + share * fit.structure.matrix() @ step)
-        < here - IMPLIED_BIAS.value**2
+        < here - HALF_WIDTH.value**2
         for share in (1.0, 0.3, 0.1)
     )
 

@@ -2,8 +2,7 @@
 
 Those about recordings, gains and fleets stand beside their readers (`smp_motor_ident.bag.limits`,
 `tune.limits`, `report.limits`); ``python scripts/limits.py > docs/limits.md`` prints all of them.
-A limit's reason is a significance level, a cost or a physical limit; that some record came out
-right is none.
+A reason is a significance level, a cost or a physical limit; that a record came out right is none.
 """
 
 from __future__ import annotations
@@ -329,20 +328,18 @@ BUNCHED = Limit(
     "points as there are samples at this share, and without end where stamps are equal",
     "test_bunched.py",
 )
-IMPLIED_BIAS = Limit(
+HALF_WIDTH = Limit(
     1.96,
     "standard deviations",
     "the half-width of the 95 % interval that is stated",
     "test_adequacy.py",
 )
-
 RELEVANT_BIAS = Limit(
     0.02,
     "of a number, or of a sampling interval for a delay",
     "costs a loop a fiftieth of its bandwidth or of its sampling interval: less than any margin",
     "test_adequacy.py",
 )
-
 CANDIDATE_WEIGHT = Limit(
     0.05,
     "probability",
@@ -367,12 +364,6 @@ FRICTION_BAND = Limit(
     1.0,
     "of the commissioned value",
     "a floor instead of blocks adds its rolling resistance, about as much again",
-    "test_monitor.py: half an hour of ordinary driving",
-)
-OUTSIDE = Limit(
-    2.0,
-    "standard deviations",
-    "2.3 % of chance for one look at one value, which must stay outside besides",
     "test_monitor.py: half an hour of ordinary driving",
 )
 LEFT_BAND = Limit(

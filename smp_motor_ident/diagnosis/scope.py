@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from smp_motor_ident.diagnosis.effects import EFFECTS
-from smp_motor_ident.diagnosis.limits import IMPLIED_BIAS, RESISTANCE_BAND, REST, SAME_LEVEL
+from smp_motor_ident.diagnosis.limits import HALF_WIDTH, RESISTANCE_BAND, REST, SAME_LEVEL
 from smp_motor_ident.estimation.quantities import Answer
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import Experiments
@@ -146,8 +146,7 @@ def _current_scale(result: Answer, ohmmeter: float | None, one_size: bool) -> li
         return [Finding("current_scale", "warning", words, evidence, advice)]
     scale = ohmmeter / found.value
     off = (
-        abs(scale - 1)
-        > RESISTANCE_BAND.value + IMPLIED_BIAS.value * (found.std or 0.0) / found.value
+        abs(scale - 1) > RESISTANCE_BAND.value + HALF_WIDTH.value * (found.std or 0.0) / found.value
     )
     return [
         Finding(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -67,6 +67,14 @@ def preferred(best: Fit, other: Fit) -> tuple[bool, str]:
     lag = other.structure.order > best.structure.order
     better = other.deviance < best.deviance + SECOND_LAG.value * sandwich_factor(other) * lag
     return better, f"fits {'better' if better else 'worse'} than {label(best.structure)}"
+
+
+def preferred_but_for_descent(best: FittedCandidate, other: FittedCandidate) -> bool:
+    """Decide whether a candidate would take the place of the best, had its fit settled."""
+    settled = replace(other.fit, converged=True)
+    if size(settled.structure) < size(best.fit.structure):
+        return settled.deviance < best.fit.deviance
+    return preferred(best.fit, settled)[0]
 
 
 def needed(simple: Fit, rich: Fit) -> tuple[bool, str]:

@@ -28,9 +28,9 @@ from numpy.typing import NDArray
 from smp_motor_control.wheel.protection import COPPER
 from smp_motor_ident.diagnosis.limits import (
     FRICTION_BAND,
+    HALF_WIDTH,
     LEFT_BAND,
     MOTOR_CONSTANT_BAND,
-    OUTSIDE,
     RESISTANCE_BAND,
 )
 from smp_motor_ident.errors import ParameterError
@@ -270,7 +270,7 @@ class Monitor:
     def _judge(self) -> None:
         """Note since when, in time of motion, each value has been out of its band for sure."""
         for name, (share, std, band) in self._shares().items():
-            if abs(share) - band > OUTSIDE.value * std:
+            if abs(share) - band > HALF_WIDTH.value * std:
                 self._outside.setdefault(name, self._clock)
             elif abs(share) < band:
                 self._outside.pop(name, None)
