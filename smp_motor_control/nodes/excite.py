@@ -62,7 +62,7 @@ class Settings:
         0.0, "Largest current of a motor [A]; 0 for any.", minimum=0.0, read_only=True
     )
     max_winding_rise: float = described(
-        60.0,
+        0.0,
         "Largest rise of a winding's temperature [K], by its resistance; 0 for any.",
         minimum=0.0,
         read_only=True,

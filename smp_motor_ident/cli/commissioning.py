@@ -164,7 +164,7 @@ def _check(session: Session, known: Mapping[str, Any]) -> None:
     bounds = Bounds(
         speed=arguments.max_speed or math.inf,
         current=arguments.max_current or math.inf,
-        rise=arguments.max_winding_rise,
+        rise=arguments.max_winding_rise or math.inf,
     )
     checked = checking.check_wheels(
         robot.client, robot.wheels, arguments.amplitude, bounds, known,

@@ -114,10 +114,11 @@ def drive_undisturbed(
             say(f"the drive was disturbed: {error}")
             continue
         late = verification.disturbed(silence) or verification.slow_answers(changes)
-        if not late:
+        judged = verification.judge(changes)
+        if not (late and (judged or late[0].severity == "refused")):
             break
         say(f"the drive was disturbed: {late[0].message}")
-    return changes, [*late, *verification.judge(changes)]
+    return changes, [*late, *judged]
 
 
 def read_changes(
