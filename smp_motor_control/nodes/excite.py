@@ -2,18 +2,16 @@
 
 Ends by itself with exit code 0; sends zero to every wheel whatever the reason of leaving.
 A wheel that another node drives is refused: deactivate its controller, or let it rest.
-A wheel that turns too fast, draws too much, becomes too hot or is not heard any more ends the
-signal for all, with exit code 1.
+A wheel that turns too fast, draws too much or is not heard any more ends the signal for
+all, with exit code 1.
 """
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from pathlib import Path
 
 from rclpy.node import Node
 
@@ -24,7 +22,7 @@ from smp_motor_control.excitation import SIGNALS, Bounded, Excitation
 from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.motor_writer import MotorWriter
 from smp_motor_control.nodes.settings import Parameters, described
-from smp_motor_control.wheel.protection import Bounds, Protection, Resistance
+from smp_motor_control.wheel.protection import Bounds, Protection
 
 _OTHERS = 0.5
 """Time [s] that other listeners than the driver are given to connect."""
@@ -60,15 +58,6 @@ class Settings:
     )
     max_current: float = described(
         0.0, "Largest current of a motor [A]; 0 for any.", minimum=0.0, read_only=True
-    )
-    max_winding_rise: float = described(
-        0.0,
-        "Largest rise of a winding's temperature [K], by its resistance; 0 for any.",
-        minimum=0.0,
-        read_only=True,
-    )
-    cold_file: str = described(
-        "", "Where cold windings' resistances are kept between signals.", read_only=True
     )
     duration: float = described(
         20.0, "Length of the signal [s].", minimum=0.1, maximum=3600.0, read_only=True
@@ -115,7 +104,6 @@ class Settings:
         return Bounds(
             speed=self.max_speed or math.inf,
             current=self.max_current or math.inf,
-            rise=self.max_winding_rise or math.inf,
         )
 
     def chosen(self) -> tuple[str, ...]:
@@ -144,12 +132,11 @@ class Excite(Node):
         self._outputs: list[tuple[MotorWriter, Excitation]] = []
         self._watched: dict[str, Protection] = {}
         self._unheard: dict[str, float] = {}
-        cold = _read_cold(settings.cold_file)
         for k, wheel in enumerate(settings.chosen()):
             signal = settings.signal_of(k)
             signal(0.0)  # Prepared now, not in the first period.
             self._outputs.append((MotorWriter(self, f"{wheel}/"), signal))
-            self._watched[wheel] = Protection(settings.bounds(), cold.get(wheel))
+            self._watched[wheel] = Protection(settings.bounds())
             self.create_subscription(
                 MotorState,
                 f"{wheel}/motor_state",
@@ -191,10 +178,8 @@ class Excite(Node):
 
     def _watch(self, wheel: str, message: MotorState) -> None:
         self._unheard[wheel] = 0.0
-        why = self._watched[wheel].add(
-            runtime.seconds(message.header.stamp), message.voltage, message.current,
-            message.velocity, message.position,
-        )  # fmt: skip
+        stamp = runtime.seconds(message.header.stamp)
+        why = self._watched[wheel].add(stamp, message.current, message.velocity)
         if why and self._begin is not None:
             raise LimitError(f"{wheel}: {why}")
 
@@ -234,27 +219,6 @@ class Excite(Node):
         """Send zero to every wheel before the process ends."""
         for writer, _ in self._outputs:
             writer.stop()
-        if self._settings.cold_file:
-            _write_cold(Path(self._settings.cold_file), self._watched)
-
-
-def _read_cold(path: str) -> dict[str, Resistance]:
-    if not path or not Path(path).is_file():
-        return {}
-    try:
-        found = json.loads(Path(path).read_text("utf-8"))
-        return {wheel: Resistance(*map(float, one)) for wheel, one in found.items()}
-    except (ValueError, TypeError, AttributeError):
-        raise ParameterError(f"{path}: holds no cold resistances; remove it") from None
-
-
-def _write_cold(path: Path, watched: Mapping[str, Protection]) -> None:
-    """Keep what was found cold; what an earlier signal kept stays."""
-    found = {wheel: one.winding.cold for wheel, one in watched.items()}
-    known = {wheel: one for wheel, one in found.items() if one is not None}
-    draft = path.with_name(f"{path.name}.part")
-    draft.write_text(json.dumps(_read_cold(str(path)) | known))
-    draft.replace(path)
 
 
 def main(argv: list[str] | None = None) -> int:

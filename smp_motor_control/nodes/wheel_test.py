@@ -105,9 +105,7 @@ class WheelTest:
             stamp, age, self._commands[wheel], message.voltage, message.velocity,
             message.position, self._counters[wheel](message), float(self._phase),
         ))  # fmt: skip
-        why = self._watched[wheel].add(
-            stamp, message.voltage, message.current, message.velocity, message.position
-        )
+        why = self._watched[wheel].add(stamp, message.current, message.velocity)
         if why:
             raise RobotError(f"{wheel}: {why}")
         law = self._laws.get(wheel)

@@ -29,8 +29,6 @@ def parser() -> argparse.ArgumentParser:
     add("--max-speed", type=number(0), metavar="RAD/S",
         help="of a wheel; default: half more than its checks show for the voltage")  # fmt: skip
     add("--max-current", type=number(0), default=0.0, metavar="A", help="of a motor; default any")
-    add("--max-winding-rise", type=number(0), default=0.0, metavar="K",
-        help="of its winding's temperature, by its resistance; default any")  # fmt: skip
     add("--accept", action="append", default=[], metavar="CODE", help="do not stop at this finding")
     add("--apply", action="store_true", help="leave gains that pass in the running controllers")
     add("--resume", action="store_true", help="go on in DIR where an earlier run was cut off")

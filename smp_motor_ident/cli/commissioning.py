@@ -38,9 +38,6 @@ AMPLITUDE, DURATION = 6.0, 15.0
 DRAFT = "recording"
 """Folder of a recording until it is whole."""
 
-COLD = "cold.json"
-"""Resistances of the windings before the first signal, for ``excite``."""
-
 LOOKS, ALIKE = 15, 4
 """Wheels are looked for at most so often, until so many looks [1 s each] find the same."""
 
@@ -92,8 +89,6 @@ def _commission(arguments: argparse.Namespace, folder: Path, known: Mapping[str,
     bounds: dict[str, object] = {
         "max_speed": arguments.max_speed or 0.0,
         "max_current": arguments.max_current,
-        "max_winding_rise": arguments.max_winding_rise,
-        "cold_file": folder.resolve() / COLD,
     }
     # The client leaves last: who excites has ended when the controllers are given back.
     with connect(NAME, ros) as client, Processes(folder / "logs") as processes:
@@ -164,7 +159,6 @@ def _check(session: Session, known: Mapping[str, Any]) -> None:
     bounds = Bounds(
         speed=arguments.max_speed or math.inf,
         current=arguments.max_current or math.inf,
-        rise=arguments.max_winding_rise or math.inf,
     )
     checked = checking.check_wheels(
         robot.client, robot.wheels, arguments.amplitude, bounds, known,

@@ -92,7 +92,7 @@ def _conditions(data: Experiments, m: Motion) -> dict[str, Array]:
 
 
 def _halves(size: Array) -> Array:
-    """Return 1 where a size is above its median, else -1; all alike where it is one size."""
+    """Return 1 where a size is above median and mean, half each, else -1; alike where it is one."""
     middle = 0.5 * float(np.median(size)) + 0.5 * float(np.mean(size))
     return np.where(size > middle + 0.02 * float(size.max()), 1.0, -1.0)
 

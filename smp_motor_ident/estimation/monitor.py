@@ -25,7 +25,6 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_control.wheel.protection import COPPER
 from smp_motor_ident.diagnosis.limits import (
     FRICTION_BAND,
     HALF_WIDTH,
@@ -55,6 +54,9 @@ PRIOR = {"resistance": 0.3, "motor_constant": 0.1, "inductance": 0.01, "friction
 
 FARTHEST = 4.0
 """Standard deviations beyond which a block is left out: a bad sample, a blow."""
+
+COPPER = 0.00393
+"""Temperature coefficient of copper's resistance [1/K]."""
 
 
 @dataclass(frozen=True)

@@ -199,12 +199,12 @@ def test_a_wheel_that_turns_faster_than_its_checks_or_its_limit_ends_the_excitat
     assert main(given) == 0
     # The checks show 1.6 rad/s; half as much again is no supply's and no friction's doing.
     assert robot.bounds["max_speed"] == pytest.approx(1.5 * 1.6)
-    assert robot.bounds["max_winding_rise"] == 0.0 and robot.bounds["max_current"] == 0.0
+    assert robot.bounds["max_current"] == 0.0
     shutil.rmtree(robot.folder)
-    limits = ["--max-speed", "3", "--max-current", "2", "--max-winding-rise", "40"]
+    limits = ["--max-speed", "3", "--max-current", "2"]
     assert main([*given, *limits]) == 0
-    asked = [robot.bounds[f"max_{name}"] for name in ("speed", "current", "winding_rise")]
-    assert asked == [3.0, 2.0, 40.0]
+    asked = [robot.bounds[f"max_{name}"] for name in ("speed", "current")]
+    assert asked == [3.0, 2.0]
 
 
 def test_the_time_left_follows_what_parts_of_a_kind_took() -> None:
