@@ -46,7 +46,7 @@ def dependent(fit: Fit, errors: Regression | None) -> tuple[Fit, list[Finding]]:
         moves = []
         for sign in (1.0, -1.0):
             move, p_value = _moved(errors, 1 + sign * CONDITION_WEIGHT.value * condition)
-            moves.append(np.where(p_value[:size] < level, move[:size], 0.0))
+            moves.append(np.where(p_value < level, move, 0.0))
         far = max(moves, key=lambda d: float(np.abs(d).max()))
         if far.any():
             added += np.outer(far, far)
@@ -69,19 +69,26 @@ def dependent(fit: Fit, errors: Regression | None) -> tuple[Fit, list[Finding]]:
 def _moved(errors: Regression, weight: Array) -> tuple[Array, Array]:
     """Return by how much other weights move the coordinates, and how likely chance does that."""
     own, e = errors.own, errors.residual
+    free = slice(errors.n_free)
     weighted = own * weight[:, None]
-    unweighted, other = inverse(own.T @ own, 1e-12), inverse(own.T @ weighted, 1e-12)
-    move = other @ (weighted.T @ e)
+    unweighted, other = (inverse(own.T @ x, 1e-12)[:, free] for x in (own, weighted))
+    move = other.T @ (weighted.T @ e)
     rows = weighted @ other - own @ unweighted  # of the residuals in the move of each coordinate
     seen = e != 0.0  # rows without a measurement are zero
     white = float(e @ e) / max(int(seen.sum()) - own.shape[1], 1)
-    blocks = int(errors.block[-1]) + 1
-    share, sums = (
-        np.stack([np.bincount(errors.block, x, blocks) for x in part.T])
-        for part in (np.square(rows) * seen[:, None], rows * e[:, None])
-    )
-    whole = np.maximum(share.sum(axis=1), 1e-300)
-    stretches = 1 / np.maximum(np.square(share / whole[:, None]).sum(axis=1), 1e-300)
-    variance = np.maximum(np.square(sums).sum(axis=1) * blocks / (blocks - 1), white * whole)
+    share = _by_block(np.square(rows) * seen[:, None], errors.block)
+    sums = _by_block(rows * e[:, None], errors.block)
+    whole = np.maximum(share.sum(axis=0), 1e-300)
+    stretches = 1 / np.maximum(np.square(share / whole).sum(axis=0), 1e-300)
+    blocks = len(sums)
+    variance = np.maximum(np.square(sums).sum(axis=0) * blocks / (blocks - 1), white * whole)
     ratio = np.square(move) / np.maximum(variance, 1e-300)
     return move, np.asarray(fdtrc(1, np.maximum(stretches - 1, 1.0), ratio))
+
+
+def _by_block(x: Array, block: NDArray[np.int64]) -> Array:
+    """Return the sums of columns over the rows of each block."""
+    begins = np.flatnonzero(np.diff(block, prepend=-1))
+    sums = np.zeros((int(block.max()) + 1, x.shape[1]))
+    np.add.at(sums, block[begins], np.add.reduceat(x, begins))
+    return sums

@@ -30,6 +30,8 @@ from smp_motor_ident.model.structures import Structure
 
 Say = Callable[[str], None]
 
+DELAYS = (0.3, 1.5, 3.5)  # samples at which a delay is begun that torque noise may have hidden
+
 
 def explore(
     data: Experiments,
@@ -252,18 +254,17 @@ def _variations(
         data = data.as_mean_speed()
     for change in _additions(s):
         richer = best.structure.with_(**change)
-        # Torque noise flattens the score of what it has taken the place of: there only a fit
-        # that begins without it tells.
-        hidden = "delay" in change and best.noise_ratio > 0
-        if richer == best.structure or not (hidden or _worth_a_fit(data, best, richer)):
+        if richer == best.structure:
+            continue
+        hidden = _delay_without_noise(data, best, options) if "delay" in change else None
+        if hidden is None and not _worth_a_fit(data, best, richer):
             continue
         say(f"trying {label(richer)}")
         z = best.z.copy()
         if "delay" in change:
             z[models.DELAY] = 0.3 * data.step
         other = descent.refine(data, richer, best, z, options)
-        fresh = with_delay(data, richer, options, None) if hidden else None
-        other = min(other, fresh or other, key=lambda f: f.deviance)
+        other = min(other, hidden or other, key=lambda f: f.deviance)
         verdict, reason = preferred(best, other)
         if verdict and "delay" in change and other.z[models.DELAY] < 0.03 * data.step:
             verdict, reason = False, "a delay of hundredths of a sample is how the input was held"
@@ -273,6 +274,26 @@ def _variations(
         if verdict:
             best = other
     return _without_friction(data, best, options, candidates)
+
+
+def _delay_without_noise(data: Experiments, best: Fit, options: Options) -> Fit | None:
+    """Return a fit with the delay in whose place the torque noise of another stands, if any.
+
+    Torque noise flattens the score of what it has taken the place of: there only fits that begin
+    without it tell.
+    """
+    if not best.noise_ratio > 0:
+        return None
+    noiseless = replace(best, noise_ratio=0.0)
+    plain = descent.refine(data, best.structure, noiseless, best.z, options)
+    richer = best.structure.with_(delay=True)
+    late = []
+    for samples in DELAYS:
+        z = plain.z.copy()
+        z[models.DELAY] = samples * data.step
+        late.append(descent.refine(data, richer, plain, z, options))
+    other = min(late, key=lambda f: f.deviance)
+    return data_window.grow(data, richer, other, options) if preferred(plain, other)[0] else None
 
 
 def _additions(s: Structure) -> list[dict[str, object]]:

@@ -20,7 +20,8 @@ from smp_motor_ident.estimation.choice import (
     sandwich_factor,
     size,
 )
-from smp_motor_ident.estimation.fitted import Options
+from smp_motor_ident.estimation.descent import bandwidth, noise_ratio_of
+from smp_motor_ident.estimation.fit import Options, solve
 from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.estimation.quantities import answer
 from smp_motor_ident.likelihood.experiments import prepare
@@ -104,30 +105,13 @@ def test_a_structure_is_named_with_all_that_was_added() -> None:
 
 def test_torque_noise_does_not_hide_a_delay(monkeypatch):
     """With torque noise the score says nothing of a delay: a fit that begins without it does."""
-    data = prepare([motors.record("rear_left", seconds=2.0)], True)
+    prompt = motors.record("rear_left", seconds=2.0)
+    late = dataclasses.replace(prompt, voltage=np.append(prompt.voltage[1:], 0.0))
+    data = prepare([late], True)
     plain = initial_fit(data, Structure("electromechanical", current=True), Options())
-    noisy = dataclasses.replace(plain, noise_ratio=1.0, deviance=plain.deviance + 1e4)
-    late = dataclasses.replace(plain, structure=plain.structure.with_(delay=True))
-    late = dataclasses.replace(late, z=plain.z + 0.4 * data.step * np.eye(11)[DELAY])
-    late = dataclasses.replace(late, information=np.eye(len(late.structure.free())) * 1e12,
-                               scores=np.zeros((0, len(late.structure.free()))))  # fmt: skip
-    monkeypatch.setattr(order_selection, "with_delay", lambda *_: late)
+    ratio = noise_ratio_of(bandwidth(plain.z, data), data.step, data.kind)
+    noisy = solve(data, plain.structure, plain.at(plain.z, noise_ratio=ratio), Options(), 20)
     monkeypatch.setattr(order_selection, "_worth_a_fit", lambda *_: False)
     best = order_selection._variations(data, noisy, Options(), [], lambda _: None)
     assert best.structure.delay
-
-
-def test_a_better_structure_that_did_not_settle_makes_the_answer_unreliable() -> None:
-    data = prepare([motors.record("rear_left", seconds=2.0, current=False)], False)
-    poor, rich = (initial_fit(data, s, Options()) for s in (FIRST, SECOND))
-    result = answer(poor, {})
-    unsettled = dataclasses.replace(rich, converged=False)
-    (found,) = unsettled_rival([FittedCandidate(unsettled), FittedCandidate(poor)], result, {})
-    assert found.severity == "unreliable" and "time_constant" in found.message
-    # Not where it settled, where it is no better, or where its values are those that are stated.
-    assert not unsettled_rival([FittedCandidate(rich), FittedCandidate(poor)], result, {})
-    worse = dataclasses.replace(unsettled, deviance=poor.deviance)
-    assert not unsettled_rival([FittedCandidate(worse), FittedCandidate(poor)], result, {})
-    own = answer(rich, {})
-    better = FittedCandidate(dataclasses.replace(unsettled, deviance=rich.deviance - 1e4))
-    assert not unsettled_rival([better, FittedCandidate(rich)], own, {})
+    assert best.z[DELAY] == pytest.approx(data.step, rel=0.05)
