@@ -11,7 +11,6 @@ import motors
 import numpy as np
 import pytest
 
-from smp_motor_ident.diagnosis.advice import unsettled_rival
 from smp_motor_ident.estimation import order_selection
 from smp_motor_ident.estimation.choice import (
     FittedCandidate,
@@ -23,7 +22,6 @@ from smp_motor_ident.estimation.choice import (
 from smp_motor_ident.estimation.descent import bandwidth, noise_ratio_of
 from smp_motor_ident.estimation.fit import Options, solve
 from smp_motor_ident.estimation.initialisation import initial_fit
-from smp_motor_ident.estimation.quantities import answer
 from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.model.structures import DELAY, Z_NAMES, Structure
 
