@@ -11,6 +11,7 @@ import motors
 import numpy as np
 import pytest
 
+from smp_motor_ident.diagnosis.advice import unsettled_rival
 from smp_motor_ident.estimation import order_selection
 from smp_motor_ident.estimation.choice import (
     FittedCandidate,
@@ -22,6 +23,7 @@ from smp_motor_ident.estimation.choice import (
 from smp_motor_ident.estimation.descent import bandwidth, noise_ratio_of
 from smp_motor_ident.estimation.fit import Options, solve
 from smp_motor_ident.estimation.initialisation import initial_fit
+from smp_motor_ident.estimation.quantities import answer
 from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.model.structures import DELAY, Z_NAMES, Structure
 
@@ -113,3 +115,19 @@ def test_torque_noise_does_not_hide_a_delay(monkeypatch):
     best = order_selection._variations(data, noisy, Options(), [], lambda _: None)
     assert best.structure.delay
     assert best.z[DELAY] == pytest.approx(data.step, rel=0.05)
+
+
+def test_a_better_structure_that_did_not_settle_makes_the_answer_unreliable() -> None:
+    data = prepare([motors.record("rear_left", seconds=2.0, current=False)], False)
+    poor, rich = (initial_fit(data, s, Options()) for s in (FIRST, SECOND))
+    result = answer(poor, {})
+    unsettled = dataclasses.replace(rich, converged=False)
+    (found,) = unsettled_rival([FittedCandidate(unsettled), FittedCandidate(poor)], result, {})
+    assert found.severity == "unreliable" and "time_constant" in found.message
+    # Not where it settled, where it is no better, or where its values are those that are stated.
+    assert not unsettled_rival([FittedCandidate(rich), FittedCandidate(poor)], result, {})
+    worse = dataclasses.replace(unsettled, deviance=poor.deviance)
+    assert not unsettled_rival([FittedCandidate(worse), FittedCandidate(poor)], result, {})
+    own = answer(rich, {})
+    better = FittedCandidate(dataclasses.replace(unsettled, deviance=rich.deviance - 1e4))
+    assert not unsettled_rival([better, FittedCandidate(rich)], own, {})
