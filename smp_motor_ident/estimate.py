@@ -206,18 +206,25 @@ def _stated(
     final = of_kind(data, chosen)
     errors = regression(final, chosen, group[0].hardware.gear_ratio)
     chosen, parts = dependent(chosen, errors)
-    result = answer(chosen, request.known, friction_std, _level(final))
-    result, alike = _covering(data, candidates, result, request.known)
+
+    def said(fit: Fit) -> tuple[Answer, dict[str, float]]:
+        own = answer(fit, request.known, friction_std, _level(final))
+        return _covering(data, candidates, own, request.known)
+
+    result, alike = said(chosen)
     fitted = validate.speed_fit(group, final, chosen)
     refuse(group, final, chosen, result, fitted)
     request.say("validating")
     own, common = _validation(group, request, final, chosen, hold)
     percent = FitPercent(fitted, own)
     tests = residual_tests(final, chosen)
+    lacks, possible = adequacy(errors, data.step, stated(chosen, result), tests)
+    if possible is not None:
+        result, alike = said(chosen.wider(np.outer(possible, possible)))
     findings = [
         *found,
         *assess(final, chosen, FitPercent(fitted, common), tests),
-        *adequacy(errors, data.step, stated(chosen, result), tests),
+        *lacks,
         *parts,
         *unsettled_rival(candidates, result, request.known),
         *advise(chosen, result, request.known),

@@ -7,7 +7,8 @@ its own coordinates, and on the responses Z of the model to an effect that it la
 
 tested by a Wald statistic whose covariance allows for correlated errors (sums over blocks of
 samples).  What the effect did to the estimate is ``(S' S)^-1 S' Z c``: where that exceeds the
-interval of a stated number, the number is unreliable.
+interval of a stated number, the number is unreliable.  An effect that is not shown so surely, but
+that a test of the intervals' own level rejects to be nothing, is in the intervals.
 
 References
 ----------
@@ -27,6 +28,7 @@ from scipy.special import fdtrc
 from smp_motor_ident.diagnosis.effects import Effect
 from smp_motor_ident.diagnosis.limits import (
     EFFECT_BLOCKS,
+    EFFECT_COVERED,
     EFFECT_LEVEL,
     EFFECT_OWN,
     HALF_WIDTH,
@@ -60,22 +62,44 @@ class Evidence:
 
 def adequacy(
     errors: Regression | None, step: float, numbers: Sequence[Stated], tests: ResidualTests
-) -> list[Finding]:
-    """Name what the model lacks, and whether that moves a stated number beyond its interval."""
-    if errors is None:
-        return []
+) -> tuple[list[Finding], Array | None]:
+    """Name what the model lacks, and whether that moves a stated number beyond its interval.
+
+    Beside the findings: how far the coordinates may be off by what is neither shown nor excluded.
+    """
     out: list[Finding] = []
     named: list[int] = []
-    for _ in range(ROUNDS):
+    for _ in range(ROUNDS if errors is not None else 0):
+        assert errors is not None
         evidence = _tried(_without(errors, named), tests.white is True)
         level = EFFECT_LEVEL.value / max(len(evidence), 1)
         shown = [e for e in evidence if e.p_value < level]
         if not shown:
-            break
+            level = EFFECT_COVERED.value / max(len(evidence), 1)
+            return _covered([e for e in evidence if e.p_value < level], out, numbers, step)
         first = max(shown, key=lambda e: e.gain - 2 * len(e.columns))
         out.append(_finding(first, shown, numbers, step))
         named += first.columns
-    return out
+    return out, None
+
+
+def _covered(
+    possible: Sequence[Evidence], out: list[Finding], numbers: Sequence[Stated], step: float
+) -> tuple[list[Finding], Array | None]:
+    """Return with the findings the move by the effect that moves a number farthest, if any."""
+    moves = [(_farthest(e, numbers, step), e) for e in possible]
+    (name, times, share), far = max(moves, key=lambda m: m[0][1], default=(("", 0.0, 0.0), None))
+    if far is None or times < HALF_WIDTH.value:
+        return out, None
+    found = Finding(
+        far.effect.code,
+        "note",
+        f"the data hardly tell whether there is {far.effect.cause}, which would move {name} by "
+        f"{share:.2g} of its value: the intervals cover it",
+        {"p_value": far.p_value, "quantity": name, "shift_share": share},
+        far.effect.advice,
+    )
+    return [*out, found], far.shift
 
 
 def _tried(errors: Regression, white: bool) -> list[Evidence]:
@@ -139,18 +163,7 @@ def _without(errors: Regression, named: Sequence[int]) -> Regression:
 def _finding(
     first: Evidence, shown: Sequence[Evidence], numbers: Sequence[Stated], step: float
 ) -> Finding:
-    worst, times, share = "", 0.0, 0.0
-    friction = {n: abs(q.value or 0.0) for n, q, _ in numbers}.get("static_voltage", 0.0)
-    # Beside what a number that may be nothing matters: times of the interface beside the sampling
-    # interval, however small they are, and a load beside the friction that it adds to.
-    least = {**dict.fromkeys(INTERFACE, step), "load_voltage": friction}
-    for name, quantity, row in numbers:
-        if quantity.value is None or not quantity.std:
-            continue
-        shift = abs(float(row @ first.shift))
-        size = max(abs(quantity.value), least.get(name, 0.0), 1e-300)
-        if shift > RELEVANT_BIAS.value * size and shift / quantity.std > times:
-            worst, times, share = name, shift / quantity.std, shift / size
+    worst, times, share = _farthest(first, numbers, step)
     also = [e.effect.cause for e in shown if e is not first and e.gain > 0.8 * first.gain]
     words = " or ".join([first.effect.cause, *also[:2]])
     evidence: dict[str, float | str | None] = {
@@ -172,6 +185,23 @@ def _finding(
         evidence,
         first.effect.advice,
     )
+
+
+def _farthest(shown: Evidence, numbers: Sequence[Stated], step: float) -> tuple[str, float, float]:
+    """Return which number an effect moves most by what matters: its deviations, and the share."""
+    worst, times, share = "", 0.0, 0.0
+    friction = {n: abs(q.value or 0.0) for n, q, _ in numbers}.get("static_voltage", 0.0)
+    # Beside what a number that may be nothing matters: times of the interface beside the sampling
+    # interval, however small they are, and a load beside the friction that it adds to.
+    least = {**dict.fromkeys(INTERFACE, step), "load_voltage": friction}
+    for name, quantity, row in numbers:
+        if quantity.value is None or not quantity.std:
+            continue
+        shift = abs(float(row @ shown.shift))
+        size = max(abs(quantity.value), least.get(name, 0.0), 1e-300)
+        if shift > RELEVANT_BIAS.value * size and shift / quantity.std > times:
+            worst, times, share = name, shift / quantity.std, shift / size
+    return worst, times, share
 
 
 def stated(fit: Fit, result: Answer) -> list[Stated]:

@@ -18,8 +18,6 @@ likelihood estimation of misspecified models, Econometrica 50 (1982), 1, section
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import fdtrc
@@ -53,9 +51,8 @@ def dependent(fit: Fit, errors: Regression | None) -> tuple[Fit, list[Finding]]:
             said[name] = ", ".join(n for n, d in zip(names, far, strict=True) if d)
     if not said:
         return fit, []
-    wider = replace(fit, added=added + (0.0 if fit.added is None else fit.added))
     message = "the numbers hang on the part of the motion that one looks at (" + "; ".join(said)
-    return wider, [
+    return fit.wider(added), [
         Finding(
             "conditions",
             "note",

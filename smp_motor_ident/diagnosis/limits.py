@@ -211,12 +211,7 @@ RINGING = Limit(
     "sampling between two swings still shows both",
     "test_findings.py",
 )
-STEADY = Limit(
-    4.0,
-    "time constants",
-    "98 % of a step are over",
-    "test_estimate.py",
-)
+STEADY = Limit(4.0, "time constants", "98 % of a step are over", "test_estimate.py")
 WINDING_LAG = Limit(
     0.25,
     "of the first lag",
@@ -295,6 +290,12 @@ EFFECT_LEVEL = Limit(
     "that a clean record shows any of the effects, shared among all that are tried (Bonferroni)",
     "test_adequacy.py",
 )
+EFFECT_COVERED = Limit(
+    0.05,
+    "probability",
+    "that a clean record's 95 % intervals are wider by an effect that is not there (Bonferroni)",
+    "test_adequacy.py",
+)
 CONDITION_LEVEL = Limit(
     0.01,
     "probability",
@@ -310,8 +311,7 @@ CONDITION_WEIGHT = Limit(
 EFFECT_BLOCKS = Limit(
     6,
     "degrees of freedom",
-    "with fewer stretches of data that show an effect its covariance, and "
-    "so the test's level, is not known",
+    "with fewer stretches of data that show an effect the level of its test is not known",
     "test_adequacy.py",
 )
 EFFECT_OWN = Limit(

@@ -10,7 +10,7 @@ Derivation: docs/derivations.md, section 9; Leeb and Poetscher, Econometric Theo
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +33,7 @@ def consider_timing(data: Experiments, fit: Fit, instant: float) -> Fit:
     if instant <= 0 or structure.delay or "delay" in structure.fixed or not structure.free():
         return fit
     beside = _beside(data, fit, structure.with_(delay=True), models.DELAY)
-    return _wider(fit, beside.answer, instant**2)
+    return fit.wider(beside.covariance(instant**2))
 
 
 def consider_friction(data: Experiments, fit: Fit) -> tuple[Fit, float]:
@@ -43,7 +43,7 @@ def consider_friction(data: Experiments, fit: Fit) -> tuple[Fit, float]:
         return fit, 0.0
     beside = _beside(data, fit, structure.with_(friction="symmetric"), models.VC_PLUS)
     variance = float(np.max(fit.sandwich_factors())) * beside.variance
-    return _wider(fit, beside.answer, variance), float(np.sqrt(variance))
+    return fit.wider(beside.covariance(variance)), float(np.sqrt(variance))
 
 
 def consider_left_out(data: Experiments, fit: Fit) -> Fit:
@@ -61,7 +61,7 @@ def consider_left_out(data: Experiments, fit: Fit) -> Fit:
         own = factor * beside.variance
         # Akaike: with it the motor is predicted better.
         if beside.seen and beside.size**2 > 2 * own:
-            wider = _wider(wider, beside.answer, beside.size**2 - own)
+            wider = wider.wider(beside.covariance(beside.size**2 - own))
     return wider
 
 
@@ -74,6 +74,10 @@ class _Beside:
     variance: float
     seen: bool  # whether the data tell it from the free coordinates at all
 
+    def covariance(self, variance: float) -> Array:
+        """Return what a variance of the coordinate is for the free ones."""
+        return np.asarray(variance * np.outer(self.answer, self.answer))
+
 
 def _beside(data: Experiments, fit: Fit, richer: Structure, coordinate: int) -> _Beside:
     """Return how the fit answers to one more coordinate."""
@@ -84,8 +88,3 @@ def _beside(data: Experiments, fit: Fit, richer: Structure, coordinate: int) -> 
     left = max(float(here.normal[late, late] - here.normal[late, keep] @ answer), 1e-12)
     score = float(here.gradient[late] - here.gradient[keep] @ answer)
     return _Beside(answer, score / left, 1 / left, left > SEEN * here.normal[late, late])
-
-
-def _wider(fit: Fit, answer: Array, variance: float) -> Fit:
-    more = np.asarray(variance * np.outer(answer, answer), dtype=np.float64)
-    return replace(fit, added=more + (0.0 if fit.added is None else fit.added))

@@ -5,7 +5,7 @@ Derivation: docs/derivations.md, section 9.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,6 +97,10 @@ class Fit(Start):
     added: Array | None = None
     # Coordinates whose interval was followed, not extrapolated, see `profile`
     profiles: tuple[Profile, ...] = ()
+
+    def wider(self, added: Array) -> Fit:
+        """Return the fit with a covariance added that the likelihood does not see."""
+        return replace(self, added=added if self.added is None else self.added + added)
 
     def noise_model(self) -> NoiseModel:
         """Return how the residuals weigh."""

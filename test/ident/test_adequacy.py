@@ -15,7 +15,7 @@ from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.model.structures import Structure
 from smp_motor_ident.record import Record
-from smp_motor_ident.result import Quantity
+from smp_motor_ident.result import Quantity, ResidualTests
 
 
 def commanded(dead: float = 0.0, top: float = np.inf) -> Record:
@@ -86,6 +86,44 @@ def test_numbers_that_hang_on_the_size_of_the_voltage_cover_both_sizes():
         assert bool(said) is bool(lost)
         if lost:  # the small voltages, nine times as heavy, ask for what they know of the gain
             assert 0.1 < float(np.sqrt(wider.added[0, 0])) < 1.0
+
+
+def error_with(deviations: float, seed: int) -> model_error.Regression:
+    """White errors that show an effect by so many deviations; a unit of it moves a number by 1."""
+    rng = np.random.default_rng(seed)
+    shape, error = rng.standard_normal((2, 4000))
+    shape /= np.linalg.norm(shape)
+    if deviations:
+        error += (deviations - shape @ error) * shape
+    return model_error.Regression(
+        error, shape[:, None], shape[:, None], np.ones((1, 1)), np.arange(4000) * 40 // 4000,
+        [(EFFECTS[0], (0,))], np.zeros((4000, 0)), 1,
+    )  # fmt: skip
+
+
+def held_against(deviations: float, value: float = 30.0, seed: int = 5):
+    numbers = [("dc_gain", Quantity(value, 0.3, (0.0, 2 * value), "rad/(V s)"), np.ones(1))]
+    return adequacy.adequacy(
+        error_with(deviations, seed), 0.005, numbers, ResidualTests(True, True)
+    )
+
+
+def test_an_effect_that_is_neither_shown_nor_excluded_is_in_the_intervals():
+    # The probability of 2.3 deviations by chance is 2 %: between a finding's 1 % and an
+    # interval's 5 %; of 1 it is 32 %, of 4 it is 6e-5.
+    (found,), moved = held_against(2.3)
+    assert found.severity == "note" and found.evidence["quantity"] == "dc_gain"
+    np.testing.assert_allclose(moved, 2.3, rtol=1e-9)
+    assert held_against(1.0) == ([], None)
+    (sure,), nothing = held_against(4.0)
+    assert sure.severity == "unreliable" and nothing is None
+    assert held_against(2.3, value=300.0) == ([], None)  # less than a hundredth of the number
+
+
+def test_intervals_of_clean_errors_are_widened_as_seldom_as_stated():
+    widened = sum(held_against(0.0, seed=seed)[1] is not None for seed in range(400))
+    # 4 % of them lie between the two levels: 16, four binomial deviations above them.
+    assert widened <= 16 + 4 * 3.9
 
 
 def estimation_fit() -> Fit:
