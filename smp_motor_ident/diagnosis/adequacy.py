@@ -94,8 +94,8 @@ def _covered(
     found = Finding(
         far.effect.code,
         "note",
-        f"the data hardly tell whether there is {far.effect.cause}, which would move {name} by "
-        f"{share:.2g} of its value: the intervals cover it",
+        f"neither shown nor excluded: {far.effect.cause}; it would move {name} by {share:.2g} of "
+        "its value: the intervals cover that",
         {"p_value": far.p_value, "quantity": name, "shift_share": share},
         far.effect.advice,
     )

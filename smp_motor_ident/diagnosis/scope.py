@@ -87,7 +87,8 @@ def _one_size_of_voltage(top: float) -> list[Finding]:
     """Say what a voltage of one size both ways, or of one swing, cannot show.
 
     With a size U a driver that takes a share of it (a dead zone, a drop, a clip) is the
-    motor of another gain under U: no residual tells the two apart.  Under a sine it is another
+    motor of another gain under U: no residual tells the two apart, and next to none a drag by
+    the square of a speed that is of one size, too.  Under a sine it is another
     gain of the fundamental (its describing function), and the motor hides the harmonics.
     """
     if not top:
@@ -97,8 +98,8 @@ def _one_size_of_voltage(top: float) -> list[Finding]:
             "one_size_of_voltage",
             "warning",
             f"the voltage has one size, {top:.3g} V: a driver that puts out less of it (a "
-            "dead zone, a drop, a clip at the supply) looks like a motor of another gain; "
-            "the numbers hold for the voltage as it was recorded",
+            "dead zone, a drop, a clip at the supply), or a drag by the square of the speed, looks "
+            "like a motor of another gain; the numbers hold for the voltage as it was recorded",
             {"voltage": top},
             "record the voltage at the motor's terminals, or add levels of other sizes",
         )
