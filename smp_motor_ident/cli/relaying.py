@@ -21,8 +21,8 @@ from smp_motor_ident.tune.methods.ziegler_nichols import by_rule
 BIAS = 0.4
 """Share of the supply around which the relay switches, so that friction is not crossed."""
 
-GAP = 3.5
-"""Steps without a sample over which a record is not read."""
+GAP = 0.25
+"""Share of a cycle without a sample over which a record is not read."""
 
 SIGNALS = ("time", "voltage", "applied", "speed", "angle")
 
@@ -77,7 +77,9 @@ def evenly(answer: Mapping[str, Any]) -> tuple[list[tuple[Array, Array]], float]
     if time.size < 20:
         raise DesignError(f"only {time.size} samples came while the relay switched")
     step = float(np.median(np.diff(time)))
-    cuts = np.flatnonzero(np.diff(time) > GAP * step) + 1  # what acted in between is not known
+    rising = np.flatnonzero(np.diff(np.sign(answer["voltage"])) > 0)
+    cycle = float(np.median(np.diff(time[rising]))) if rising.size > 1 else np.inf
+    cuts = np.flatnonzero(np.diff(time) > max(GAP * cycle, 3 * step)) + 1
     parts = [np.split(np.array(answer[name]), cuts) for name in SIGNALS]
     return [_even(step, *part) for part in zip(*parts, strict=True) if part[0].size > 2], step
 
