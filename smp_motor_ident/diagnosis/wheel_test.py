@@ -233,11 +233,13 @@ def _applied(ramps: Trace) -> float:
 
 
 def _coast(hold: Trace, coast: Trace, hardware: Hardware) -> float:
-    speed = _Steady.of(hold, hardware).speed
-    if not speed or not coast.time.size:
+    steady, free = _Steady.of(hold, hardware), _held(coast)
+    if not steady.speed or free.time.size < 2:
         return math.nan
-    angle = coast.count * _angle_per_count(hardware)
-    return float((angle[-1] - angle[0]) / speed)
+    if abs(float(np.median(free.voltage[-8:]))) > SUPPLY_SHORTFALL.value * abs(steady.voltage):
+        return math.nan  # a busy computer did not let go of it yet
+    angle = free.count * _angle_per_count(hardware)
+    return float((angle[-1] - angle[0]) / steady.speed)
 
 
 def _line(voltages: Sequence[float], speeds: Sequence[float]) -> tuple[float, float]:
