@@ -142,6 +142,7 @@ def try_gains(
     watches = {wheel: Watch(supply) for wheel in values}
     with client.listen(PidState, {f"{w}/pid_state": one.take for w, one in watches.items()}):
         old = client.get_parameters({controller(w): list(new) for w, new in values.items()})
+        client.set_parameters(old)  # what could not be taken back is not tried
         client.until(lambda: all(w.seen for w in watches.values()), PATIENCE)
         silent = [wheel for wheel, one in watches.items() if not one.seen]
         if silent:

@@ -17,6 +17,9 @@ from smp_motor_control.nodes.robot_client import PATIENCE, RobotClient, RobotErr
 SETTLE = 1.5
 """How long the constant voltage acts; its last half second tells the speed [s]."""
 
+FOLLOWED = 0.1
+"""Share of the relay's amplitude by which what acts may differ from what is asked for."""
+
 MOST_BETWEEN = 0.5
 """Share of samples at whose voltage the relay never is, above which someone else commands."""
 
@@ -73,6 +76,8 @@ class _Test:
     def run(self, duration: float) -> Oscillation:
         seen = self.seen
         with self.client.listen(MotorState, {f"{self.wheel}/motor_state": self.answer}):
+            if not self.client.until(self._acts, PATIENCE):
+                raise self._not_followed()
             self.client.spin(SETTLE)
             if len(seen.speed) < 20:
                 raise RobotError(f"{self.wheel}: {len(seen.speed)} samples came in {SETTLE} s")
@@ -83,17 +88,32 @@ class _Test:
             self.client.spin(duration)
         return self._around_rest(first)
 
+    def _acts(self) -> bool:
+        """Return whether the wheel has the constant voltage, as far as its hardware tells."""
+        if not self.seen.applied or not self.writer.publisher.get_subscription_count():
+            return False
+        off = abs(self.seen.applied[-1] - self.output)
+        return not off > FOLLOWED * self.relay.amplitude  # NaN: not told
+
+    def _not_followed(self) -> RobotError:
+        topic = self.writer.publisher.topic_name
+        if not self.seen.applied:
+            return RobotError(f"{self.wheel}/motor_state: no sample came in {PATIENCE:g} s")
+        if not self.writer.publisher.get_subscription_count():
+            return RobotError(f"{topic}: nobody listens; start motor_plant or the robot's driver")
+        return RobotError(
+            f"{topic}: what acts on the wheel is not what the relay asks for; "
+            f"{self.writer.owner or 'someone else'} commands it"
+        )
+
     def _around_rest(self, first: int) -> Oscillation:
         seen, centre, bias = self.seen, self.centre or 0.0, self.relay.bias
         applied = [v - bias for v in seen.applied[first:]]
         # A relay is at one of its levels but for the samples in which it switches.
         amplitude = self.relay.amplitude
-        between = sum(abs(abs(v) - amplitude) > 0.1 * amplitude for v in applied)
+        between = sum(abs(abs(v) - amplitude) > FOLLOWED * amplitude for v in applied)
         if between > MOST_BETWEEN * len(applied):
-            raise RobotError(
-                f"{self.writer.publisher.topic_name}: what acts on the wheel is not what the relay "
-                f"asks for; {self.writer.owner or 'someone else'} commands it"
-            )
+            raise self._not_followed()
         time = [t - seen.time[first] for t in seen.time[first:]]
         turned = [a - seen.angle[first] for a in seen.angle[first:]]
         return Oscillation(

@@ -21,8 +21,10 @@ from smp_motor_ident.tune.methods.ziegler_nichols import by_rule
 BIAS = 0.4
 """Share of the supply around which the relay switches, so that friction is not crossed."""
 
-GAP = 3.5
-"""Steps without a sample over which a record is not read."""
+GAP = 0.25
+"""Share of a cycle without a sample over which a record is not read."""
+
+SIGNALS = ("time", "voltage", "applied", "speed", "angle")
 
 
 def tune_by_relay(arguments: argparse.Namespace, files: Sequence[Path]) -> int:
@@ -69,30 +71,30 @@ def tune_by_relay(arguments: argparse.Namespace, files: Sequence[Path]) -> int:
     return 0
 
 
-def evenly(answer: Mapping[str, Any]) -> tuple[Array, Array, float]:
-    """Return a recorded oscillation on an even grid, whatever samples were lost."""
+def evenly(answer: Mapping[str, Any]) -> tuple[list[tuple[Array, Array]], float]:
+    """Return a recorded oscillation on even grids, cut where too many samples were lost."""
     time = np.array(answer["time"])
     if time.size < 20:
         raise DesignError(f"only {time.size} samples came while the relay switched")
     step = float(np.median(np.diff(time)))
-    kept = _longest_stretch(time, GAP * step)
-    time = time[kept]
+    rising = np.flatnonzero(np.diff(np.sign(answer["voltage"])) > 0)
+    cycle = float(np.median(np.diff(time[rising]))) if rising.size > 1 else np.inf
+    cuts = np.flatnonzero(np.diff(time) > max(GAP * cycle, 3 * step)) + 1
+    parts = [np.split(np.array(answer[name]), cuts) for name in SIGNALS]
+    return [_even(step, *part) for part in zip(*parts, strict=True) if part[0].size > 2], step
+
+
+def _even(
+    step: float, time: Array, voltage: Array, applied: Array, speed: Array, angle: Array
+) -> tuple[Array, Array]:
+    """Return voltage and speed of one stretch as means over the intervals of an even grid."""
     lasted = np.diff(time)
     grid = np.arange(time[0], time[-1], step)
-    applied, angle = (np.array(answer[name])[kept] for name in ("applied", "angle"))
     if not np.isfinite(applied).all():  # the hardware does not tell it
-        applied = np.concatenate([[0.0], np.array(answer["voltage"])[kept][:-1]])
-    turned = applied[1:] * lasted
+        applied = np.concatenate([[0.0], voltage[:-1]])
     # Means over intervals, long and short, are exact as integrals at their ends.
-    volt_seconds = np.concatenate([[0.0], np.cumsum(turned)])
+    volt_seconds = np.concatenate([[0.0], np.cumsum(applied[1:] * lasted)])
     if not np.isfinite(angle).all():
-        angle = np.concatenate([[0.0], np.cumsum(np.array(answer["speed"])[kept][1:] * lasted)])
-    voltage, speed = (np.diff(np.interp(grid, time, x)) / step for x in (volt_seconds, angle))
-    return voltage, speed, step
-
-
-def _longest_stretch(time: Array, gap: float) -> slice:
-    """Return the part of a record in which no gap is longer: what acted in one is not known."""
-    ends = np.concatenate([[0], np.flatnonzero(np.diff(time) > gap) + 1, [time.size]])
-    k = int(np.argmax(np.diff(ends)))
-    return slice(int(ends[k]), int(ends[k + 1]))
+        angle = np.concatenate([[0.0], np.cumsum(speed[1:] * lasted)])
+    even, turned = (np.diff(np.interp(grid, time, x)) / step for x in (volt_seconds, angle))
+    return even, turned

@@ -145,46 +145,62 @@ def read_changes(
             (state.time, state.fields["voltage"]),
             float(designed.document[wheel]["loop"]["supply_voltage"]),
         )
-        for name, setpoint, lasts in plan:
-            if setpoint:
-                changes.append(
-                    _change(wheel, name, setpoint, lasts, designed, state, answers, delays)
-                )
+        changes += _changes(wheel, plan, designed, state, answers, delays)
         # The first interval is that since another drive.
         late = answers.fields["dt"][1:], delays[1:]
         silence = max(silence, *(float(np.max(one, initial=0.0)) for one in late))
     return changes, silence
 
 
-def _change(
-    wheel: str, name: str, setpoint: float, lasts: float, designed: Designed, state: Columns,
+def _changes(
+    wheel: str, plan: Sequence[tuple[str, float, float]], designed: Designed, state: Columns,
     answers: Columns, delays: np.ndarray[Any, Any],
-) -> Change:  # fmt: skip
+) -> list[Change]:  # fmt: skip
+    """Return the changes of one wheel; the prediction is of its whole drive."""
     estimate, document = designed.estimates[wheel], designed.document[wheel]
+    setpoints = answers.fields["setpoint"]
+    begun = {
+        name: (_begin(wheel, setpoint, answers), setpoint, lasts)
+        for name, setpoint, lasts in plan
+        if setpoint
+    }
+    end = max(begin + lasts for begin, _, lasts in begun.values())
+    shown = (state.time > answers.time[0] - LEAD) & (state.time < end)
+    instants = state.time[shown]
+    known = dict(zip(answers.time, delays))
+    waited = np.array([known.get(instant, np.nan) for instant in instants])
+    latest = np.searchsorted(answers.time, instants, side="right") - 1
+    asked = np.where(latest < 0, 0.0, setpoints[latest])
+    step = float(document["loop"]["sample_time"])
+    even, speed = verification.smoothed(instants, _angle(state, estimate)[shown], step)
+    parameters = _nested(designed.gains[wheel])
+    rows = verification.predicted(
+        estimate, parameters, document["loop"], asked, (instants, waited), even
+    )
+    hardware = estimate.hardware
+    count = 2 * np.pi / (hardware.counts_per_revolution or 1e6) / hardware.gear_ratio
+    unsure = verification.resolution(count, step)
+    changes = []
+    for name, (begin, setpoint, lasts) in begun.items():
+        since = even - begin
+        kept = (since >= 0.0) & (since < lasts - 0.05)
+        measured = since[kept], speed[kept], rows[:, kept]
+        specification = document["specification"]
+        changes.append(
+            verification.change_of(wheel, name, setpoint, *measured, specification, unsure)
+        )
+    return changes
+
+
+def _begin(wheel: str, setpoint: float, answers: Columns) -> float:
+    """Return when a wheel was first heard at a set-point."""
     asked = np.flatnonzero(np.isclose(answers.fields["setpoint"], setpoint))
     if not asked.size:
         raise NeverHeard(
             f"{wheel}: wheel_pid was never heard at {setpoint:.3g} rad/s in the drive: it was at "
             "fault, or its messages were lost; look at /diagnostics, then go on with --resume"
         )
-    begin = float(answers.time[asked[0]])
-    shown = (state.time > begin - LEAD) & (state.time < begin + lasts)
-    instants = state.time[shown] - begin
-    known = dict(zip(answers.time - begin, delays))
-    waited = np.array([known.get(instant, np.nan) for instant in instants])
-    step = float(document["loop"]["sample_time"])
-    even, speed = verification.smoothed(instants, _angle(state, estimate)[shown], step)
-    kept = (even >= 0.0) & (even < lasts - 0.05)
-    rows = verification.predicted(
-        estimate, _nested(designed.gains[wheel]), document["loop"], setpoint, (instants, waited),
-        even[kept],
-    )  # fmt: skip
-    hardware = estimate.hardware
-    count = 2 * np.pi / (hardware.counts_per_revolution or 1e6) / hardware.gear_ratio
-    return verification.change_of(
-        wheel, name, setpoint, even[kept], speed[kept], rows, document["specification"],
-        verification.resolution(count, step),
-    )  # fmt: skip
+    return float(answers.time[asked[0]])
 
 
 def _angle(state: Columns, estimate: Estimate) -> Any:

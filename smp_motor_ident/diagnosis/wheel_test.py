@@ -11,7 +11,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from smp_motor_ident.diagnosis.wheel_limits import ANSWER_COUNTS, BREAKAWAY_COUNTS, FRICTION_SHARE
+from smp_motor_ident.diagnosis.wheel_limits import (
+    ANSWER_COUNTS,
+    BREAKAWAY_COUNTS,
+    FRICTION_SHARE,
+    SUPPLY_SHORTFALL,
+)
 from smp_motor_ident.record import Hardware
 
 Array = NDArray[np.float64]
@@ -96,12 +101,12 @@ def settled(hold: Trace) -> bool:
     """Tell whether a wheel turned as far in the last third of a held voltage as in the one before.
 
     Thirds of the time in which the voltage was there: a busy computer takes samples in bunches,
-    and for a while those of the voltage before.
+    and for a while those of the voltage before, or of that alone.
     """
     there = _held(hold)
     time, count = there.time, there.count
     span = float(np.ptp(time)) if time.size > 8 else 0.0
-    if span < HOLD:
+    if span < HOLD or not _arrived(there):
         return False
     thirds = np.interp(time[0] + span * np.arange(1, 4) / 3, time, count)
     before, last = np.abs(np.diff(thirds))
@@ -115,6 +120,12 @@ def _held(hold: Trace) -> Trace:
     begin = int(other[-1]) + 1 if other.size else 0
     # A voltage that scatters so much tells no change.
     return hold if hold.time.size - begin < 8 else hold.since(begin)
+
+
+def _arrived(held: Trace) -> bool:
+    """Tell whether the reported voltage is the commanded one, but for what a supply may lack."""
+    command, voltage = (float(np.median(x[-8:])) for x in (held.command, held.voltage))
+    return abs(voltage - command) <= SUPPLY_SHORTFALL.value * abs(command)
 
 
 def figures(trace: Trace, phases: Sequence[Phase], hardware: Hardware) -> Figures:
@@ -222,11 +233,13 @@ def _applied(ramps: Trace) -> float:
 
 
 def _coast(hold: Trace, coast: Trace, hardware: Hardware) -> float:
-    speed = _Steady.of(hold, hardware).speed
-    if not speed or not coast.time.size:
+    steady, free = _Steady.of(hold, hardware), _held(coast)
+    if not steady.speed or free.time.size < 2:
         return math.nan
-    angle = coast.count * _angle_per_count(hardware)
-    return float((angle[-1] - angle[0]) / speed)
+    if abs(float(np.median(free.voltage[-8:]))) > SUPPLY_SHORTFALL.value * abs(steady.voltage):
+        return math.nan  # a busy computer did not let go of it yet
+    angle = free.count * _angle_per_count(hardware)
+    return float((angle[-1] - angle[0]) / steady.speed)
 
 
 def _line(voltages: Sequence[float], speeds: Sequence[float]) -> tuple[float, float]:

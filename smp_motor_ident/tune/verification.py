@@ -167,11 +167,11 @@ def predicted(
     estimate: Estimate,
     parameters: Mapping[str, Any],
     loop: Mapping[str, Any],
-    setpoint: float,
+    setpoints: Array,
     answers: tuple[Array, Array],
     time: Array,
 ) -> Array:
-    """Return the wheel's speed after a change from rest, a row for each motor, nominal first.
+    """Return the wheel's speed in a drive from rest, a row for each motor, nominal first.
 
     Parameters
     ----------
@@ -179,11 +179,11 @@ def predicted(
         Of the motor.
     parameters, loop : mapping
         Of the wheel in ``gains.yaml``, and in ``gains.json``.
-    setpoint : float
-        [rad/s, wheel].
+    setpoints : ndarray, shape (n,), [rad/s, wheel]
+        At every sample.
     answers : (ndarray, ndarray), each of shape (n,), [s]
-        When the recorded drive took its samples, since the change, and how long after each the
-        motor had its answer; NaN where there was none.  Rest before the change lets the loop begin.
+        When the recorded drive took its samples, and how long after each the motor had its answer;
+        NaN where there was none.  Rest before the first change lets the loop begin.
     time : ndarray, shape (k,), [s]
         At which the speed is wanted.
 
@@ -198,23 +198,24 @@ def predicted(
     settings = loop_settings(parameters)
     rows = []
     for entry in _motors(estimate, float(loop["supply_voltage"])):
-        angle = _run(entry, settings, setpoint, instants, delays)
+        angle = _run(entry, settings, setpoints, instants, delays)
         even, speed = smoothed(instants, angle, step)
         rows.append(np.interp(time, even, speed))
     return np.array(rows)
 
 
 def _run(
-    entry: MotorEntry, settings: LoopSettings, setpoint: float, instants: Array, delays: Array
+    entry: MotorEntry, settings: LoopSettings, setpoints: Array, instants: Array, delays: Array
 ) -> Array:
-    """Return the wheel's angle as its encoder shows it, from rest, with a change at time zero."""
+    """Return the wheel's angle as its encoder shows it, from rest."""
     begin = float(instants[0])
     plant = DrivenMotor(entry, DriveSettings(command_timeout=math.inf), start=begin)
     limit = entry.supply_voltage
     loop = WheelLoop(settings.within(limit), entry.gearbox, entry.encoder, 1.5 * limit)
     turn = entry.gearbox.to_wheel(entry.encoder.angle_per_count)
     angle, before, arrival = np.empty(instants.size), begin, begin
-    for k, (time, delay) in enumerate(zip(instants.tolist(), delays.tolist(), strict=True)):
+    samples = zip(instants.tolist(), delays.tolist(), setpoints.tolist(), strict=True)
+    for k, (time, delay, setpoint) in enumerate(samples):
         sample = plant.sample(time)
         angle[k] = turn * sample.encoder_count
         if time == begin or math.isnan(delay):
@@ -223,7 +224,7 @@ def _run(
         speed = loop.speed(dt, sample.velocity, sample.encoder_count, sample.voltage)
         if not math.isnan(speed):
             arrival = max(arrival, time + delay)
-            plant.command(arrival, loop.step(setpoint if time >= 0.0 else 0.0, speed, dt).output)
+            plant.command(arrival, loop.step(setpoint, speed, dt).output)
     return angle
 
 

@@ -110,7 +110,7 @@ def test_relay_feedback_finds_the_ultimate_point_without_a_model(coefficients):
     one = problem(coefficients)
     quantum = one.loop.count_angle / one.loop.sample_time
     voltage, speed = oscillate(one, 3.0, quantum, 4.0)
-    gain, period = read_oscillation(voltage, speed, one.loop.sample_time)
+    gain, period = read_oscillation([(voltage, speed)], one.loop.sample_time)
     # What was read is a point of the loop's own response; counts of a tenth of the amplitude
     # leave less than 1 %.
     w = 2 * np.pi / period
@@ -137,12 +137,28 @@ def test_relay_feedback_bears_lost_samples():
         "angle": (0.005 * np.cumsum(speed))[kept].tolist(),
     }
     gain, period = read_oscillation(*evenly(answer))
-    whole = read_oscillation(voltage, speed, 0.005)
+    whole = read_oscillation([(voltage, speed)], 0.005)
     # One sample of twenty is a straight line between its neighbours, a twelfth of a period apart.
     assert (gain, period) == pytest.approx(whole, rel=0.05)
     # Without the voltage that acted, the one that was asked for tells nearly the same.
     asked = read_oscillation(*evenly({**answer, "applied": [np.nan] * kept.sum()}))
     assert asked == pytest.approx(whole, rel=0.05)
+
+
+def test_relay_is_read_between_the_moments_at_which_its_computer_stands_still():
+    one = problem(PAPER[3])
+    voltage, speed = oscillate(one, 3.0, one.loop.count_angle / 0.005, 4.0)
+    period = read_oscillation([(voltage, speed)], 0.005)[1]
+    time = 0.005 * np.arange(voltage.size)
+    # Five cycles, then none of the samples of two fifths of one: no stretch alone is enough.
+    kept = time % (5.4 * period) < 5 * period
+    answer = {"time": time, "voltage": voltage, "applied": np.roll(voltage, 2), "speed": speed}
+    answer = {name: x[kept] for name, x in {**answer, "angle": 0.005 * np.cumsum(speed)}.items()}
+    stretches, step = evenly(answer)
+    with pytest.raises(DesignError, match="steady cycles"):
+        read_oscillation(stretches[:1], step)
+    whole = read_oscillation([(voltage, speed)], 0.005)
+    assert read_oscillation(stretches, step) == pytest.approx(whole, rel=0.02)
 
 
 def test_relay_without_samples_is_told():
@@ -152,7 +168,7 @@ def test_relay_without_samples_is_told():
 
 def test_relay_that_does_not_oscillate_is_told():
     with pytest.raises(DesignError, match="steady cycles"):
-        read_oscillation(np.ones(100), np.ones(100), 0.005)
+        read_oscillation([(np.ones(100), np.ones(100))], 0.005)
 
 
 @pytest.mark.parametrize("coefficients", PAPER)

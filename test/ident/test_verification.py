@@ -11,8 +11,10 @@ import pytest
 from wheel_simulation import Timing, simulate_closed_loop
 
 from smp_motor_control.motor.file import MotorEntry, load_motors
+from smp_motor_control.motor.friction import MotorParameters
 from smp_motor_control.motor.hardware import DriveSettings
 from smp_motor_ident.cli.tuning import read_estimates
+from smp_motor_ident.result import Quantity
 from smp_motor_ident.tune import Design, Loop, design
 from smp_motor_ident.tune import verification as v
 from smp_motor_ident.tune.writing import parameters
@@ -57,7 +59,7 @@ def drive(
         ESTIMATE,
         parameters(one),
         document,
-        setpoint,
+        np.where(instants < 0.0, 0.0, setpoint),
         (instants, np.full(instants.size, STEP + wait)),
         even[kept],
     )
@@ -87,14 +89,45 @@ def test_samples_that_nobody_answered_are_in_the_prediction(designed: Design) ->
     instants = STEP * np.arange(-60, 240)
     # 60 ms without an answer while the wheel gets faster: the voltage stays and is too large.
     silent = np.where((instants > 0.05) & (instants < 0.11), np.nan, 0.0)
+    setpoints = np.where(instants < 0.0, 0.0, 1.0)
     rows = [
-        v.predicted(ESTIMATE, parameters(designed), loop, 1.0, (instants, ages), instants[60:230])[
-            0
-        ]
+        v.predicted(
+            ESTIMATE, parameters(designed), loop, setpoints, (instants, ages), instants[60:230]
+        )[0]
         for ages in (np.zeros(instants.size), silent)
     ]
     assert np.abs(rows[1] - rows[0]).max() > 0.02
     assert rows[1][-1] == pytest.approx(1.0, abs=0.02)
+
+
+def test_what_the_integral_keeps_from_one_change_to_the_next_is_in_the_prediction(
+    designed: Design,
+) -> None:
+    # Friction of 2 V holds the wheel after each stop: the integral keeps what it had.
+    m = ENTRY.parameters
+    rubbing = MotorParameters.from_combinations(
+        dc_gain=m.dc_gain, time_constant=m.time_constant,
+        time_constant_product=m.time_constant_product, static_voltage=2.0,
+    )  # fmt: skip
+    known = {**ESTIMATE.combinations, "static_voltage": Quantity(2.0, status="fixed")}
+    setpoint, lasts = 1.0, 1.0
+
+    def asked(t: float) -> float:
+        return 0.0 if t < REST or REST + lasts <= t < REST + 2 * lasts else setpoint
+
+    run = simulate_closed_loop(
+        replace(ENTRY, parameters=rubbing), v.loop_settings(parameters(designed)), asked,
+        REST + 3 * lasts, timing=Timing(sample_time=STEP, delay=STEP),
+        drive=DriveSettings(command_timeout=math.inf, pwm_steps=1000),
+    )  # fmt: skip
+    turn = ENTRY.gearbox.to_wheel(ENTRY.encoder.angle_per_count)
+    even, speed = v.smoothed(run.time, turn * run.count, STEP)
+    estimate = replace(ESTIMATE, combinations=known)
+    loop = {"sample_time": STEP, "delay": STEP, "supply_voltage": 12.0}
+    setpoints = np.array([asked(t) for t in run.time])
+    answers = (run.time, np.full(run.time.size, STEP))
+    row = v.predicted(estimate, parameters(designed), loop, setpoints, answers, even)[0]
+    assert np.abs(row - speed).max() < 0.02 * setpoint
 
 
 def test_how_long_a_command_waited_is_seen_in_the_voltages_that_were_applied() -> None:

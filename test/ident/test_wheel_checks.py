@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 
@@ -209,6 +210,18 @@ def test_a_wheel_has_not_settled_while_samples_are_of_the_voltage_before() -> No
     begun = Trace.of(np.concatenate([_rows(first), _rows(second)[:20]]))
     assert not settled(begun)
     assert settled(Trace.of(np.concatenate([_rows(first), _rows(second)])))
+    # As long as a computer is busy these are all that there are.
+    assert not settled(replace(first, command=second.command[: first.command.size]))
+
+
+def test_a_coast_begins_when_the_voltage_is_gone() -> None:
+    seen, phases = trace()
+    late = seen.voltage.copy()
+    for hold, coast in itertools.pairwise(phases):
+        if (hold.kind, coast.kind) == ("hold", "coast"):
+            rows = np.flatnonzero(seen.phase == coast.number)
+            late[rows] = hold.level
+    assert math.isnan(figures(replace(seen, voltage=late), phases, HARDWARE).coast)
 
 
 def test_samples_that_come_in_bunches_settle_nothing() -> None:

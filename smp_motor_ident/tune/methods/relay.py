@@ -1,9 +1,10 @@
 """Relay feedback: the ultimate point from a bounded oscillation, no model needed.
 
 A relay in place of the controller makes the loop oscillate at a bounded voltage.  The
-fundamental of what it did, ``|U1| / |Y1|``, is the describing function's answer for the
-ultimate gain; the period is that of the oscillation.  The same reading serves an oscillation
-of the simulated loop and one recorded on a running wheel.
+fundamental of what it did, ``|U1|^2 / |Y1 U1*|`` over every two cycles (P. Welch, The use of
+fast Fourier transform for the estimation of power spectra, 1967), is the describing function's
+answer for the ultimate gain; the period is that of the oscillation.  The same reading serves an
+oscillation of the simulated loop and one recorded on a running wheel.
 
 References
 ----------
@@ -13,9 +14,10 @@ References
 
 from __future__ import annotations
 
-import math
+from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.tune.arrays import Array
@@ -27,8 +29,8 @@ LEAST_CYCLES = 4
 ALIKE = 0.25
 """Share by which the length of a cycle may differ from the usual one and still count."""
 
-BAND = 0.1
-"""Share of the frequency on either side of it that counts as the oscillation's."""
+TRANSIENT = 5
+"""Cycles after which an oscillation is steady, where as many are there."""
 
 
 def oscillate(
@@ -62,44 +64,52 @@ def oscillate(
     return voltage, speed
 
 
-def read_oscillation(voltage: Array, speed: Array, sample_time: float) -> tuple[float, float]:
-    """Return ultimate gain and period of a recorded relay oscillation."""
-    switches = np.flatnonzero((voltage[:-1] <= 0) & (voltage[1:] > 0)) + 1
-    # The first half of the cycles is the transient.
-    switches = switches[switches.size // 2 :]
-    if switches.size <= LEAST_CYCLES:
+def read_oscillation(
+    stretches: Sequence[tuple[Array, Array]], sample_time: float
+) -> tuple[float, float]:
+    """Return ultimate gain and period of the voltages and speeds of a relay oscillation.
+
+    A record may be in several stretches, where its computer stood still between them.
+    """
+    switches = [_settled(voltage) for voltage, _ in stretches]
+    lengths = np.concatenate([[], *map(np.diff, switches)])
+    if lengths.size < LEAST_CYCLES:
         raise DesignError(
-            f"the relay switched over only {max(switches.size - 1, 0)} steady cycles, it needs "
+            f"the relay switched over only {lengths.size} steady cycles, it needs "
             f"{LEAST_CYCLES}; run it longer or with a larger amplitude"
         )
-    lengths = np.diff(switches)
     # A cycle during which the machine stood still, or counts made it switch twice, is none.
-    alike = np.flatnonzero(np.abs(lengths - np.median(lengths)) <= ALIKE * np.median(lengths))
-    if alike.size < LEAST_CYCLES:
+    usual = float(np.median(lengths))
+    alike = lengths[np.abs(lengths - usual) <= ALIKE * usual]
+    power, cross = 0.0, 0j
+    for begins, signals in zip(switches, stretches, strict=True):
+        steady = np.abs(np.diff(begins) - usual) <= ALIKE * usual
+        for k in np.flatnonzero(steady[:-1] & steady[1:]):
+            sent, answered = (_fundamental(x[begins[k] : begins[k + 2]]) for x in signals)
+            power += abs(sent) ** 2
+            cross += answered * sent.conjugate()
+    if alike.size < LEAST_CYCLES or power == 0:
         raise DesignError(
             f"only {alike.size} of {lengths.size} cycles are alike, it needs {LEAST_CYCLES}: the "
             "delay wanders; run it on a machine that is less busy"
         )
-    period = float(lengths[alike].mean())
-    sent, answered = _fundamentals(voltage[switches[0] :], speed[switches[0] :], 1 / period)
-    if not answered > 0:
+    if not abs(cross) > 0:
         raise DesignError("the wheel did not move under the relay; use a larger amplitude")
-    return sent / answered, period * sample_time
+    return power / abs(cross), float(alike.mean()) * sample_time
 
 
-def _fundamentals(voltage: Array, speed: Array, frequency: float) -> tuple[float, float]:
-    """Return the sizes of two signals around a frequency [per sample].
+def _settled(voltage: Array) -> NDArray[np.int64]:
+    """Return the samples at which a relay switches up, without those of the transient."""
+    switches = np.flatnonzero((voltage[:-1] <= 0) & (voltage[1:] > 0)) + 1
+    return switches[min(switches.size // 3, TRANSIENT) :]
 
-    What the motor makes of a voltage does not depend on whether that repeats exactly: a record
-    whose cycles wander is as good, so long as it fades in and out.
-    """
-    time = np.arange(voltage.size)
-    fade = np.sin(np.pi * (time + 0.5) / voltage.size) ** 2
-    reach = max(BAND * frequency, 2 / voltage.size)
-    around = np.linspace(frequency - reach, frequency + reach, 41)
-    turns = np.exp(-2j * math.pi * np.outer(around, time)) * fade
-    sent, answered = (turns @ (x - np.mean(x)) for x in (voltage, speed))
-    return float(np.linalg.norm(sent)), float(np.linalg.norm(answered))
+
+def _fundamental(two_cycles: Array) -> complex:
+    """Return the component of a period of half the length; the window has no mean or harmonics."""
+    n = two_cycles.size
+    time = np.arange(n)
+    window = np.sin(np.pi * (time + 0.5) / n) ** 2
+    return complex(np.sum(window * np.exp(-4j * np.pi * time / n) * two_cycles))
 
 
 def _solve(problem: Problem) -> Feedback:
@@ -117,7 +127,7 @@ def _solve(problem: Problem) -> Feedback:
     rule = str(problem.targets.get("rule") or "tyreus_luyben")
     if rule not in ("tyreus_luyben", "ziegler_nichols"):
         raise DesignError(f"rule is {rule!r}; it must be tyreus_luyben or ziegler_nichols")
-    return from_ultimate(problem, rule, *read_oscillation(voltage, speed, loop.sample_time))
+    return from_ultimate(problem, rule, *read_oscillation([(voltage, speed)], loop.sample_time))
 
 
 RELAY = Method(
