@@ -220,7 +220,7 @@ def _stated(
     tests = residual_tests(final, chosen)
     lacks, possible = adequacy(errors, data.step, stated(chosen, result), tests)
     if possible is not None:
-        result, alike = said(chosen.wider(np.outer(possible, possible)))
+        result, alike = said(chosen.wider(np.outer(possible, possible).astype(np.float64)))
     findings = [
         *found,
         *assess(final, chosen, FitPercent(fitted, common), tests),
