@@ -143,7 +143,7 @@ def read_changes(
         delays = verification.arrival_delays(
             (answers.time, answers.fields["age"], answers.fields["output"]),
             (state.time, state.fields["voltage"]),
-            float(designed.document[wheel]["loop"]["supply_voltage"]),
+            designed.document[wheel]["loop"],
         )
         changes += _changes(wheel, plan, designed, state, answers, delays)
         # The first interval is that since another drive.

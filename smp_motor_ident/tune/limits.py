@@ -81,3 +81,9 @@ STEADY_ERROR = Limit(
     "the same band: integral action leaves no error, only what has not settled",
     "test_verification.py: a speed that stays off",
 )
+DRIVE_LEVEL = Limit(
+    0.0005,
+    "significance level of one reading",
+    "four wheels have 24 readings in a drive: one sound drive in a hundred may be refused",
+    "test_verification.py: a wheel that does as designed",
+)

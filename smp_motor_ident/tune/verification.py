@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from scipy.signal import savgol_filter
+from scipy.special import stdtrit
 
 from smp_motor_control.encoder import Encoder
 from smp_motor_control.motor.file import MotorEntry
@@ -27,6 +28,7 @@ from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune.arrays import Array
 from smp_motor_ident.tune.limits import (
     COMMAND_RESOLUTION,
+    DRIVE_LEVEL,
     OVERSHOOT,
     SETTLED,
     SILENCE,
@@ -40,8 +42,7 @@ STEADY = 0.3
 """End of a change that is taken as steady [s]."""
 
 DRAWS = 12
-"""Motors beside the nominal one: the largest of so many is exceeded once in thirteen changes by
-chance, and the nominal band and the widening cover that."""
+"""Motors beside the nominal one."""
 
 UNKNOWN = 0.1
 """Of the samples whose voltage may be no command's: one that changed within an interval."""
@@ -125,7 +126,7 @@ def read(time: Array, speed: Array, setpoint: float, tolerance: float) -> Readin
 
 
 def arrival_delays(
-    answers: tuple[Array, Array, Array], applied: tuple[Array, Array], supply: float
+    answers: tuple[Array, Array, Array], applied: tuple[Array, Array], loop: Mapping[str, Any]
 ) -> Array:
     """Return how long each answer took from its sample until the motor had it.
 
@@ -138,17 +139,19 @@ def arrival_delays(
         Times of the answered samples [s], how old these were when answered [s], commands [V].
     applied : (ndarray, ndarray), each of shape (n,)
         Times of the samples [s], mean voltages over the intervals that end there [V].
-    supply : float
-        Voltage of a full command [V].
+    loop : mapping
+        Of the wheel in ``gains.json``.
 
     Returns
     -------
     ndarray, shape (m,), [s]
-        The ages, where the voltages are not the commands' (measured ones, say).
+        The ages, and the loop's usual delay at least, where the voltages are not the commands'
+        (measured ones, say).
     """
     (asked, ages, commands), (time, voltage) = answers, applied
     sent = asked + ages
-    step = COMMAND_RESOLUTION.value * supply
+    usual = np.maximum(ages, float(loop.get("usual_delay") or loop["delay"]))
+    step = COMMAND_RESOLUTION.value * float(loop["supply_voltage"])
     effective = np.zeros(time.size, dtype=np.intp)
     unknown = 0
     for k in range(1, time.size):
@@ -157,10 +160,10 @@ def arrival_delays(
         unknown += last > 0 and not alike.size
         effective[k] = effective[k - 1] + (alike[-1] if alike.size else 0)
     if unknown > UNKNOWN * time.size:
-        return ages
+        return usual
     first = np.searchsorted(effective, np.arange(asked.size), side="left")
     begun = time[np.clip(first - 1, 0, time.size - 1)]
-    return np.where(first < time.size, np.maximum(ages, begun - asked), ages)
+    return np.where(first < time.size, np.maximum(ages, begun - asked), usual)
 
 
 def predicted(
@@ -192,24 +195,26 @@ def predicted(
     ndarray, shape (1 + DRAWS, k), [rad/s, wheel]
         As the recorded encoder would have shown it.
     """
-    instants, ages = answers
+    instants, delays = answers
     step = float(loop["sample_time"])
-    delays = np.maximum(ages, float(loop.get("usual_delay") or loop["delay"]))
     settings = loop_settings(parameters)
     rows = []
-    for entry in _motors(estimate, float(loop["supply_voltage"])):
-        angle = _run(entry, settings, setpoints, instants, delays)
+    for k, entry in enumerate(_motors(estimate, float(loop["supply_voltage"]))):
+        phase = k / (1 + DRAWS)  # of a count; which it was nobody knows
+        angle = _run(entry, settings, setpoints, instants, delays, phase)
         even, speed = smoothed(instants, angle, step)
         rows.append(np.interp(time, even, speed))
     return np.array(rows)
 
 
 def _run(
-    entry: MotorEntry, settings: LoopSettings, setpoints: Array, instants: Array, delays: Array
-) -> Array:
-    """Return the wheel's angle as its encoder shows it, from rest."""
+    entry: MotorEntry, settings: LoopSettings, setpoints: Array, instants: Array, delays: Array,
+    phase: float,
+) -> Array:  # fmt: skip
+    """Return the wheel's angle as its encoder shows it, from rest within a count."""
     begin = float(instants[0])
     plant = DrivenMotor(entry, DriveSettings(command_timeout=math.inf), start=begin)
+    plant.motor.angle = phase * entry.encoder.angle_per_count
     limit = entry.supply_voltage
     loop = WheelLoop(settings.within(limit), entry.gearbox, entry.encoder, 1.5 * limit)
     turn = entry.gearbox.to_wheel(entry.encoder.angle_per_count)
@@ -249,7 +254,8 @@ def bands_of(
     Returns
     -------
     Bands
-        The widest of design and simulations, and what sampling and resolution add.
+        The widest of design and simulations, these as prediction limits, and what sampling and
+        resolution add.
     """
     margin = SIGMAS * unsure / abs(setpoint)
     simulated = [read(time, row, setpoint, SETTLED.value + margin) for row in rows]
@@ -257,10 +263,22 @@ def bands_of(
     overshoot = [one.overshoot for one in simulated] + [_high(specification, "overshoot")]
     step = float(np.median(np.diff(time)))
     return Bands(
-        settling=max(settling) + 2 * step,
-        overshoot=max(overshoot) + 100 * (OVERSHOOT.value + margin),
-        error=max(one.error for one in simulated) + 100 * (STEADY_ERROR.value + margin),
+        settling=max(*settling, _limit(settling[:-1])) + 2 * step,
+        overshoot=max(*overshoot, _limit(overshoot[:-1])) + 100 * (OVERSHOOT.value + margin),
+        error=_limit([one.error for one in simulated]) + 100 * (STEADY_ERROR.value + margin),
     )
+
+
+def _limit(readings: Sequence[float]) -> float:
+    """Return the upper prediction limit for one more of such readings.
+
+    G. Hahn, W. Meeker, Statistical Intervals, Wiley 1991, section 4.8.
+    """
+    n = len(readings)
+    if not math.isfinite(sum(readings)):
+        return math.inf
+    quantile = float(stdtrit(n - 1, 1 - DRIVE_LEVEL.value))
+    return float(np.mean(readings) + quantile * np.std(readings, ddof=1) * math.sqrt(1 + 1 / n))
 
 
 def change_of(

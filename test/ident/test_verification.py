@@ -139,11 +139,15 @@ def test_how_long_a_command_waited_is_seen_in_the_voltages_that_were_applied() -
     arrived[(arrived > 0.501) & (arrived < 0.539)] = 0.54
     latest = np.array([np.flatnonzero(arrived <= t + 1e-9)[-1:] for t in time[:-1]], dtype=object)
     voltage = np.array([0.0] + [float(commands[k[0]]) if k.size else 0.0 for k in latest])
-    delays = v.arrival_delays((time, ages, commands), (time, voltage), 12.0)
+    loop = {"delay": 0.0, "supply_voltage": 12.0}
+    delays = v.arrival_delays((time, ages, commands), (time, voltage), loop)
     # Before the first nothing was; the last two were not in effect when the record ended.
     np.testing.assert_allclose(delays[1:-2], (arrived - time)[1:-2], atol=1e-9)
     measured = voltage + rng.normal(0.0, 1.0, voltage.size)
-    assert np.array_equal(v.arrival_delays((time, ages, commands), (time, measured), 12.0), ages)
+    said = v.arrival_delays((time, ages, commands), (time, measured), loop)
+    assert np.array_equal(said, ages)
+    slower = v.arrival_delays((time, ages, commands), (time, measured), {**loop, "delay": STEP})
+    assert np.array_equal(slower, np.full(time.size, STEP))
 
 
 def test_a_drive_that_its_computer_slowed_is_within_its_bands_and_says_so(designed: Design) -> None:
