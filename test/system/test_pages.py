@@ -83,7 +83,9 @@ def robots(ros_domain, process, eventually, tmp_path):
         motors, gains = two_wheeled(tmp_path) if wheels == TWO else four
         sides = (("left", wheels[::2]), ("right", wheels[1::2]))
         named = [f"{side}_wheel_names:=[{', '.join(names)}]" for side, names in sides]
-        running.append(process("motor_plant", *place, "-p", f"motors_file:={motors}"))
+        # What a page says holds at any rate; half of the usual one leaves a small machine its time.
+        rate = ("-p", "rate:=100.0")
+        running.append(process("motor_plant", *place, "-p", f"motors_file:={motors}", *rate))
         if body:
             running.append(process("skid_steer", *place, "-p", named[0], "-p", named[1]))
         for wheel in wheels:
