@@ -137,6 +137,8 @@ def known(node: str) -> set[str]:
 STEP, RATIO, COUNTS = 0.01, 65.5, 500.0
 PARTS, WINDOW = 5, 16
 """Steps of 2 ms; one log's speed is averaged over 32 ms."""
+SENSOR = 0.005
+"""Standard deviation of a measured current [A]."""
 
 
 def motion(seed: int, seconds: float = 12.0) -> SimpleNamespace:
@@ -145,16 +147,17 @@ def motion(seed: int, seconds: float = 12.0) -> SimpleNamespace:
     n = round(seconds / STEP)
     rng = np.random.default_rng(seed)
     voltage = np.repeat(rng.uniform(-9.0, 9.0, n // 12 + 1), 12)[:n]
-    fine = np.zeros(WINDOW + PARTS * n)
+    fine, amps = np.zeros(WINDOW + PARTS * n), np.zeros(PARTS * n)
     for k in range(PARTS * n):
-        fine[WINDOW + k] = motor.angle
+        fine[WINDOW + k], amps[k] = motor.angle, motor.current
         motor.step(voltage[k // PARTS], STEP / PARTS)
     angle = fine[WINDOW::PARTS]
     averaged = (angle - fine[: PARTS * n : PARTS]) / (WINDOW * STEP / PARTS)
     count = np.floor(angle * COUNTS / (2 * math.pi)).astype(int)
     speed = np.diff(count, prepend=0) * 2 * math.pi / COUNTS / STEP  # [rad/s], motor
+    current = amps[::PARTS] + rng.normal(0.0, SENSOR, n)
     return SimpleNamespace(
-        t=STEP * np.arange(n), u=voltage, count=count, w=speed, averaged=averaged
+        t=STEP * np.arange(n), u=voltage, i=current, count=count, w=speed, averaged=averaged
     )
 
 
@@ -166,8 +169,9 @@ def store():
     return types
 
 
-def write_bag(path: Path, one: SimpleNamespace, own: bool) -> None:
+def write_bag(path: Path, one: SimpleNamespace, own: bool, current: bool = False) -> None:
     """Write our messages, or PWM and joint states as other robots have them."""
+    amps = one.i if current else np.full(one.t.size, math.nan)
     types = store()
 
     def put(bag: BagWriter, topic: str, kind: str, seconds: float, **fields: object) -> None:
@@ -192,10 +196,10 @@ def write_bag(path: Path, one: SimpleNamespace, own: bool) -> None:
                 joint_name="front_left_wheel_joint", gear_ratio=RATIO, counts_per_revolution=COUNTS,
                 encoder_bits=0, supply_voltage=12.0, resistance=math.nan)  # fmt: skip
         before = 0.0
-        for t, u, count, w in zip(one.t, one.u, one.count, one.w, strict=True):
+        for t, u, i, count, w in zip(one.t, one.u, amps, one.count, one.w, strict=True):
             if own:
                 put(bag, "/front_left/motor_state", state, t, header="front_left_wheel_joint",
-                    voltage=before, current=math.nan, velocity=w / RATIO,
+                    voltage=before, current=float(i), velocity=w / RATIO,
                     position=count * 2 * math.pi / COUNTS / RATIO, encoder_count=int(count),
                     duty_cycle=0.0)  # fmt: skip
                 before = float(u)
