@@ -29,6 +29,7 @@ Array = NDArray[np.float64]
 FLOOR = 1.3  # residual variance over that of quantisation, below which there is no more
 WALK = 0.6  # step of the logarithm of the bandwidth while its best is not bracketed
 CLOSE = 0.15  # spacing of the same at which the best is known well enough
+SLOW = 0.03  # of the motor's own bandwidth: what follows no faster runs as good as free
 MOST = 5.0  # farthest from the motor's own bandwidth
 
 
@@ -46,10 +47,15 @@ def grow(
     if found.noise_ratio > 0 and found.deviance < best.deviance - TORQUE_NOISE.value:
         again = _find_noise_ratio(part, structure, found, options, found)
         found = min(found, again, key=lambda f: f.deviance)
-    if found.noise_ratio > 0 and found.noise[0, 0] < FLOOR * part.quantum**2 / 12:
+    slowest = noise_ratio_of(SLOW * bandwidth(found.z, part), part.step, part.kind)
+    fine = found.noise[0, 0] < FLOOR * part.quantum**2 / 12
+    if found.noise_ratio > 0 and (fine or found.noise_ratio < slowest):
         # It came from afar on innovations; in free run nothing is left for torque noise.
         free_run = solve(part, structure, found.at(found.z, noise_ratio=0.0), options, 40)
-        if free_run.noise[0, 0] < FLOOR * part.quantum**2 / 12:
+        if (
+            free_run.noise[0, 0] < FLOOR * part.quantum**2 / 12
+            or free_run.deviance < found.deviance + TORQUE_NOISE.value
+        ):
             found = along_friction(part, structure, free_run, options)
     best = found
     return extend(data, structure, best, options)

@@ -26,6 +26,7 @@ __all__ = ["Fit", "Options", "Prior", "Start", "solve"]
 Array = NDArray[np.float64]
 
 STALL = 4, 0.02  # passes that together gain less deviance than this end a descent
+FIRST = 1e-3  # damping at which a descent begins
 FREE = 0.1  # damping (relative to the diagonal) below which a step counts as undamped
 LARGEST = 80.0  # logarithm of a coordinate: 1e35
 CLOSE = 0.3  # of the tolerance, within which a step is not even tried where there are kinks
@@ -54,7 +55,7 @@ class _Descent:
         self.start, self.initial = start.initial.copy(), start.initial.copy()
         self.smooth = structure.friction == "none" and not structure.delay
         self.only_scale = not self.current and options.huber == math.inf and start.noise_ratio == 0
-        self.damping, self.passes, self.converged = 1e-3, 0, False
+        self.damping, self.passes, self.converged = FIRST, 0, False
         self.look(proper(start.noise))
 
     def _allowed(self, z: Array) -> Array:
@@ -90,13 +91,15 @@ class _Descent:
         step, size = self._solved(self.damping)
         z = self._allowed(self.z + self.matrix @ step)
         moved = self.initial.copy()
-        moved[:, list(self.own)] += here.local_step - here.local_gain @ step
+        # Initial states alone are a small problem, and shorten their own step where it led up.
+        share = 1.0 if self.matrix.shape[1] else min(1.0, math.sqrt(FIRST / self.damping))
+        moved[:, list(self.own)] += share * here.local_step - here.local_gain @ step
         return z, moved, size
 
     def within(self, tolerance: float, size: float) -> bool:
         """Tell whether a step is so small that another pass would not tell more."""
         own = self.here.local_decrease
-        return self.matrix.shape[1] > 0 and size < tolerance and 0 <= own < tolerance**2
+        return size < tolerance and 0 <= own < tolerance**2
 
     def settled(self) -> bool:
         """Tell whether an undamped step would stay within half a standard deviation."""
@@ -142,7 +145,7 @@ class _Descent:
                 return
             new = self._pass(z, initial)
             # A step may be small because it is damped: only a nearly free one tells the end.
-            small = z.size > 0 and size < tolerance and self.damping < FREE
+            small = self.matrix.shape[1] > 0 and size < tolerance and self.damping < FREE
             gained = max(before - new.objective, 0.0)
             if new.objective <= before:
                 recent.append(gained * self.data.size / max(before, 1e-300))

@@ -19,6 +19,10 @@ REST = 10
 """Samples after which an unchanged count is a standstill."""
 JITTER = 2_000
 """Samples that tell whether the stamps jitter."""
+FINEST_ENCODER = 2 * np.pi / 2**17
+"""Resolution [rad] of the encoders of servos, finer than those of any wheel."""
+FINEST_SENSOR = 1e-4
+"""Of its range: what shunt amplifiers and tachometers are linear to at best."""
 FEW = 2_000
 """Samples that tell whether a speed repeats its values."""
 
@@ -196,6 +200,7 @@ def prepare(
         outputs = [output_of(r, "speed") for r in records]
     starts, ends, values, hold_start = [], [], [], []
     offset = sections = 0
+    rng = np.random.default_rng(0)
     for record in records:
         end, value, index = held_intervals(record, hold)
         starts += [offset + s for s in record.starts]
@@ -207,12 +212,9 @@ def prepare(
     starts.append(offset)
     hold_start.append(sections)
     time = _join([r.time for r in records])
-    output = _join([o for o, _, _ in outputs])
-    current = (
-        _join([r.current if r.current is not None else np.full(len(r), np.nan) for r in records])
-        if use_current
-        else np.zeros(0)
-    )
+    output = _join([o if quantum else dithered(o, k, rng) for o, k, quantum in outputs])
+    currents = [r.current if r.current is not None else np.full(len(r), np.nan) for r in records]
+    current = _join([dithered(i, None, rng) for i in currents]) if use_current else np.zeros(0)
     bounds = np.array(starts, dtype=np.int64)
     steps = np.concatenate([np.diff(r.time[:200_000]) for r in records])
     return Experiments(
@@ -228,6 +230,18 @@ def prepare(
         outputs[0][2],
         _initial(time, output, bounds, outputs[0][1]),
     )
+
+
+def dithered(values: Array, kind: int | None, rng: np.random.Generator) -> Array:
+    """Return an angle, a speed or a current as the finest sensor of it reads.
+
+    A signal without any noise, as simulators write it, would weigh without bound beside another,
+    and its least deviation from the model, of rounding alone, would count as torque noise.
+    """
+    known = values[np.isfinite(values)]
+    range_ = float(np.ptp(known)) if known.size else 0.0
+    step = FINEST_ENCODER if kind == rc.ANGLE else FINEST_SENSOR * range_
+    return np.asarray(values + step * rng.uniform(-0.5, 0.5, values.size))
 
 
 def _join(arrays: Sequence[Array]) -> Array:
