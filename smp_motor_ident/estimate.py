@@ -34,7 +34,7 @@ from smp_motor_ident.estimation.consider_covariance import (
 )
 from smp_motor_ident.estimation.descent import refine
 from smp_motor_ident.estimation.fit import Fit, Prior
-from smp_motor_ident.estimation.hold_choice import chosen_hold, instant_deviation
+from smp_motor_ident.estimation.hold_choice import chosen_hold, held_otherwise, instant_deviation
 from smp_motor_ident.estimation.profile import profiled
 from smp_motor_ident.estimation.quantisation import widened
 from smp_motor_ident.estimation.quantities import Answer, answer
@@ -43,6 +43,7 @@ from smp_motor_ident.estimation.segments import heterogeneous
 from smp_motor_ident.estimation.subset import excited
 from smp_motor_ident.estimation.thinning import thinned
 from smp_motor_ident.finding import Finding
+from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments, prepare
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import PHYSICAL, Structure
@@ -156,6 +157,8 @@ def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) 
     )
     if not candidates:
         raise no_candidate(group)
+    for other, how in held_otherwise(group, data, hold, candidates[-1].fit, request.options):
+        data, hold, candidates = _held(group, base, request, (data, hold, candidates), other, how)
     refused: SmpError | None = None
     for fits in _in_turn(candidates):
         try:
@@ -254,6 +257,34 @@ def _prepared(
     data = prepare(group, request.use_current, hold=hold)
     averaged_speed = base.window or "window" in base.fixed
     return data.as_mean_speed() if averaged_speed else data, hold, first
+
+
+def _held(
+    group: list[Record],
+    base: Structure,
+    request: Request,
+    known: tuple[Experiments, str, list[FittedCandidate]],
+    other: str,
+    how: str,
+) -> tuple[Experiments, str, list[FittedCandidate]]:
+    """Return data, hold and candidates, with those under another hold."""
+    data, hold, candidates = known
+    request.say("how the command ran between samples")
+    again = data if other == hold else prepare(group, request.use_current, hold=other)
+    again = again.as_mean_speed() if data.kind == rc.MEAN_SPEED else again
+    rivals = order_selection.explore(
+        again.held(how),
+        base.with_(held=how),
+        request.options,
+        request.model == "auto",
+        request.say,
+    )
+    if not rivals:
+        return known
+    better = rivals[-1].bic < candidates[-1].bic
+    if other != hold:
+        return (again, other, rivals) if better else known
+    return data, hold, [*candidates, *rivals] if better else [*rivals, *candidates]
 
 
 def _provenance(group: Sequence[Record]) -> dict[str, Any]:

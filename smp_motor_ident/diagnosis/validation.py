@@ -99,6 +99,7 @@ def held_out(records: Sequence[Record], fit: Fit, hold: str, scatter: float) -> 
     data = prepare(records, False, kind, hold)
     if fit.kind == rc.MEAN_SPEED and data.kind == rc.SPEED:
         data = data.as_mean_speed()
+    data = data.held(fit.structure.held)
     settled = prediction.settle(data, fit)
     return speed_fit(records, data, settled), speed_fit(records, data, settled, scatter)
 

@@ -17,7 +17,8 @@ from smp_motor_ident.model.structures import Structure
 
 
 def of_kind(data: Experiments, fit: Fit) -> Experiments:
-    """Return the experiments with the output taken as a fit's structure takes it."""
+    """Return the experiments with output and command taken as a fit's structure takes them."""
+    data = data.held(fit.structure.held)
     return data.as_mean_speed() if fit.kind == rc.MEAN_SPEED else data
 
 

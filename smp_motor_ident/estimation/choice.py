@@ -42,6 +42,8 @@ def label(structure: Structure) -> str:
             (structure.delay, "delay"),
             (structure.window, "averaged speed"),
             (structure.offset, "current offset"),
+            (structure.held == "after", "command held after its row"),
+            (structure.held == "interpolated", "command interpolated"),
         )
         if flag
     ]
@@ -49,9 +51,14 @@ def label(structure: Structure) -> str:
 
 
 def size(structure: Structure) -> int:
-    """Return the number of parameters that a structure is charged for."""
+    """Return the number of parameters that a structure is charged for.
+
+    A recorded voltage is one that ran: a command that runs otherwise is an addition, as a
+    parameter is.
+    """
     free = structure.free()
-    return len(free) - (models.TE in free and not structure.current)
+    shape = models.TE in free and not structure.current
+    return len(free) - shape + (structure.held != "before")
 
 
 def sandwich_factor(fit: Fit) -> float:

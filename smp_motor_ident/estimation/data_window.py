@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from smp_motor_ident.diagnosis.limits import TORQUE_NOISE
 from smp_motor_ident.estimation.descent import (
     SCREENING_SAMPLES,
+    at_rest,
     bandwidth,
     initial_of,
     noise_ratio_of,
@@ -21,7 +22,6 @@ from smp_motor_ident.estimation.fit import Fit, Options, solve
 from smp_motor_ident.estimation.ridge import along_friction
 from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments
-from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import Structure
 
 Array = NDArray[np.float64]
@@ -83,7 +83,7 @@ def _find_noise_ratio(
     def fitted(near: Fit, noise_ratio: float, passes: int) -> Fit:
         start = near.at(near.z, initial_of(part, near), noise_ratio)
         one = solve(part, structure, start, options, passes)
-        return _at_rest(part, structure, one, options)
+        return at_rest(part, structure, one, options)
 
     # A speed output survives torque noise in free run, and free run has no bias where the
     # model is not the motor; the innovations form is for angles, which drift.
@@ -145,17 +145,3 @@ def _likeliest(path: dict[float, Fit], fitted: Callable[[Fit, float], Fit]) -> F
                 break
         path[x] = fitted(best, x)
     return min(path.values(), key=lambda f: f.deviance)
-
-
-def _at_rest(data: Experiments, structure: Structure, fit: Fit, options: Options) -> Fit:
-    """Try whether segments that begin slowly began at rest: friction makes that a kink."""
-    if structure.friction == "none":
-        return fit
-    first = np.abs(fit.initial[:, 1])
-    slow = (first > 0) & (first < 0.05 * np.exp(-fit.z[models.A0]) * np.abs(data.hold_value).max())
-    if not slow.any():
-        return fit
-    initial = fit.initial.copy()
-    initial[slow, 1] = 0.0
-    other = solve(data, structure, fit.at(fit.z, initial), options, 12)
-    return other if other.deviance < fit.deviance else fit

@@ -64,7 +64,22 @@ def initial_of(data: Experiments, fit: Fit) -> Array:
 
 def refine(data: Experiments, structure: Structure, near: Fit, z: Array, options: Options) -> Fit:
     """Fit a structure from another's answer on the same data."""
-    return solve(data, structure, near.at(z, initial_of(data, near)), options, 30)
+    fit = solve(data, structure, near.at(z, initial_of(data, near)), options, 30)
+    return at_rest(data, structure, fit, options)
+
+
+def at_rest(data: Experiments, structure: Structure, fit: Fit, options: Options) -> Fit:
+    """Try whether segments that begin slowly began at rest: friction makes that a kink."""
+    if structure.friction == "none":
+        return fit
+    first = np.abs(fit.initial[:, 1])
+    slow = (first > 0) & (first < 0.05 * np.exp(-fit.z[models.A0]) * np.abs(data.hold_value).max())
+    if not slow.any():
+        return fit
+    initial = fit.initial.copy()
+    initial[slow, :2] = 0.0
+    other = solve(data, structure, fit.at(fit.z, initial), options, 12)
+    return other if other.deviance < fit.deviance else fit
 
 
 def restate(data: Experiments, structure: Structure, fit: Fit, options: Options) -> Fit:

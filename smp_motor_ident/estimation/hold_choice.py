@@ -1,22 +1,35 @@
-"""How the command ran between the samples: held, switched inside the interval, or in its middle."""
+"""How the command ran between the samples: held, switched inside the interval, in its middle, or
+straight from row to row."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from smp_motor_ident.diagnosis.limits import HOLD_COST, HOLD_EVIDENCE, HOLD_HOPELESS, INSTANT
+from smp_motor_ident.diagnosis.limits import (
+    HOLD_COST,
+    HOLD_EVIDENCE,
+    HOLD_HOPELESS,
+    INSTANT,
+    PRIOR_ODDS,
+)
+from smp_motor_ident.estimation.candidate_starts import of_kind
 from smp_motor_ident.estimation.data_window import extend, grow
 from smp_motor_ident.estimation.descent import refine, screening_subset
 from smp_motor_ident.estimation.fit import Fit, Options
 from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.estimation.thinning import thinned
 from smp_motor_ident.likelihood import recursion as rc
-from smp_motor_ident.likelihood.experiments import prepare
+from smp_motor_ident.likelihood.experiments import Experiments, prepare
 from smp_motor_ident.likelihood.hold import between_samples
+from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import Structure
 from smp_motor_ident.record import Record
+
+EARLIER = {"after": 1.0, "interpolated": 0.5}
+"""Samples of delay that a hold takes the place of."""
 
 
 def chosen_hold(
@@ -54,6 +67,42 @@ def chosen_hold(
         if fitted.deviance < best.deviance - HOLD_EVIDENCE.value:
             hold, best = other, fitted
     return hold, best
+
+
+def held_otherwise(
+    group: Sequence[Record], data: Experiments, hold: str, best: Fit, options: Options
+) -> list[tuple[str, str]]:
+    """Return how else the command may have run: ``hold`` and `Structure.held` worth a search.
+
+    A delay and a second lag take the place of a hold that is not the command's, and hide it
+    from a comparison without them.
+    """
+    s = best.structure
+    if best.samples > HOLD_COST.value or s.order != 2 or thinned(data) is not data:
+        return []
+    known = screening_subset(of_kind(data, best))
+    least = best if known.size == best.samples else refine(known, s, best, best.z, options)
+    late = float(best.z[models.DELAY]) / data.step
+    price = float(np.log(known.size)) + PRIOR_ODDS.value
+    out = []
+    for other, how in [("held", "before")] * (hold != "held") + [(hold, how) for how in EARLIER]:
+        there = data if other == hold else prepare(group, s.current, hold=other)
+        part = screening_subset(of_kind(there.held(how), best))
+        lag = max(late - EARLIER.get(how, 0.0), 0.0)
+        fits = [_delayed(part, best, n, options) for n in {lag, float(round(lag))}]
+        # What has not settled tells nothing against a search.
+        if any(f.deviance < least.deviance + price or not f.converged for f in fits):
+            out.append((other, how))
+    return out
+
+
+def _delayed(part: Experiments, best: Fit, lag: float, options: Options) -> Fit:
+    """Return a fit with a delay of that many samples, from the choice's coordinates."""
+    fixed = {**best.structure.fixed, "delay": lag * part.step}
+    structure = best.structure.with_(delay=False, fixed=fixed)
+    z = structure.complete(best.z)
+    near = [best] if best.noise_ratio == 0 else [best, replace(best, noise_ratio=0.0)]
+    return min((refine(part, structure, n, z, options) for n in near), key=lambda f: f.deviance)
 
 
 def instant_deviation(group: Sequence[Record], hold: str) -> float:

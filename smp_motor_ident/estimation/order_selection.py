@@ -13,6 +13,7 @@ from smp_motor_ident.estimation.candidate_starts import from_richer, from_rivals
 from smp_motor_ident.estimation.choice import (
     FittedCandidate,
     label,
+    needed,
     preferred,
     sandwich_factor,
     size,
@@ -165,7 +166,26 @@ def _orders(
             better, reason = preferred(best, fitted)
         candidates.append(FittedCandidate(fitted, reason))
         best = fitted if better else best
-    return best
+    return best and _simplest_left(best, candidates)
+
+
+def _simplest_left(best: Fit, candidates: list[FittedCandidate]) -> Fit:
+    """Return the likeliest of what the choice contains and the data do not reject beside it.
+
+    The choice has been held against the one before it, which need not be the better of those.
+    """
+    free = set(best.structure.free())
+    inner = [
+        r
+        for r in candidates
+        if r.whole
+        and r.fit.kind == best.kind
+        and set(r.fit.structure.free()) < free
+        and r.fit.converged
+        and not needed(r.fit, best)[0]
+    ]
+    least = min(inner, key=lambda r: r.bic, default=None)
+    return least.fit if least is not None else best
 
 
 def _on_subset(

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident.likelihood import recursion as rc
-from smp_motor_ident.likelihood.hold import held_intervals
+from smp_motor_ident.likelihood.hold import held_intervals, rerun
 from smp_motor_ident.record import Record
 
 Array = NDArray[np.float64]
@@ -44,6 +44,7 @@ class Experiments:
     step: float  # median sampling interval [s]
     quantum: float  # resolution of the output [rad or rad/s]; 0 where it has none
     initial: Array  # shape (g, 4): first guess of q (0), speed, angle and load of each segment
+    voltage: Array  # as it was recorded, by the row
 
     @property
     def plain(self) -> bool:
@@ -72,6 +73,15 @@ class Experiments:
     def as_mean_speed(self) -> Experiments:
         """Return the same experiments, the speed taken for a mean over a trailing window."""
         return replace(self, kind=rc.MEAN_SPEED)
+
+    def held(self, how: str) -> Experiments:
+        """Return the same experiments, a row's command taken to run before it (as they are), after
+        it, or straight from row to row.
+        """
+        if how == "before":
+            return self
+        sections, end, value = rerun(self.time, self.voltage, self.starts[:-1], how)
+        return replace(self, hold_end=end, hold_value=value, hold_start=sections * self.starts)
 
     def data_window(self, duration: float) -> Experiments:
         """Return all up to ``duration`` seconds after the first voltage, of all segments together.
@@ -117,6 +127,7 @@ class Experiments:
             self.step,
             self.quantum,
             self.initial[:segments],
+            self.voltage[:end],
         )
 
 
@@ -229,6 +240,7 @@ def prepare(
         float(np.median(steps)),
         outputs[0][2],
         _initial(time, output, bounds, outputs[0][1]),
+        _join([r.voltage for r in records]),
     )
 
 

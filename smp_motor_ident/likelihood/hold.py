@@ -15,6 +15,10 @@ Integers = NDArray[np.int64]
 EDGE = 0.02
 """Part of an interval next to its ends in which a switch counts as one at the sample."""
 
+QUARTERS = np.array([7, 39, 51, 83]) / 90
+"""Shares of a rise, held for a quarter of an interval each, whose moments up to the fourth are
+those of the straight line."""
+
 
 def held_intervals(record: Record, hold: str) -> tuple[Array, Array, Integers]:
     """Return the input as it was held, as far as the mean voltages tell.
@@ -51,6 +55,21 @@ def held_intervals(record: Record, hold: str) -> tuple[Array, Array, Integers]:
     shift = np.zeros(len(v), dtype=np.int64)
     shift[split] = 1
     return end, value, index + np.cumsum(shift)
+
+
+def rerun(time: Array, voltage: Array, starts: Integers, how: str) -> tuple[int, Array, Array]:
+    """Return sections a row, their ends and values, of a command that does not run up to its row.
+
+    ``after`` it: zero-order hold from the row on.  ``interpolated``: straight from row to row.
+    """
+    before, start = np.roll(voltage, 1), np.roll(time, 1)
+    before[starts], start[starts] = voltage[starts], time[starts]
+    if how == "after":
+        return 1, time.copy(), before
+    value = before[:, None] + (voltage - before)[:, None] * QUARTERS
+    end = start[:, None] + (time - start)[:, None] * np.array([0.25, 0.5, 0.75, 1.0])
+    end[:, -1] = time
+    return len(QUARTERS), end.ravel(), value.ravel()
 
 
 def between_samples(record: Record) -> bool:

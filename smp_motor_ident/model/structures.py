@@ -73,6 +73,8 @@ class Structure:
     delay: bool = False
     window: bool = False
     offset: bool = False
+    # How the command ran: a row's value before it, after it, or interpolated from row to row
+    held: str = "before"
     own_load: bool = False  # whether every segment has a constant load of its own
     # Coordinates fixed at a value (by name of `Z_NAMES`)
     fixed: Mapping[str, float] = field(default_factory=dict)
