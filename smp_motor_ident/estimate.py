@@ -32,6 +32,7 @@ from smp_motor_ident.estimation.consider_covariance import (
     consider_left_out,
     consider_timing,
 )
+from smp_motor_ident.estimation.data_window import extend
 from smp_motor_ident.estimation.descent import refine
 from smp_motor_ident.estimation.fit import Fit, Prior
 from smp_motor_ident.estimation.hold_choice import chosen_hold, held_otherwise, instant_deviation
@@ -157,8 +158,8 @@ def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) 
     )
     if not candidates:
         raise no_candidate(group)
-    for other, how in held_otherwise(group, data, hold, candidates[-1].fit, request.options):
-        data, hold, candidates = _held(group, base, request, (data, hold, candidates), other, how)
+    for other, fit in held_otherwise(group, data, hold, candidates[-1].fit, request.options):
+        data, hold, candidates = _held(group, base, request, (data, hold, candidates), other, fit)
     refused: SmpError | None = None
     for fits in _in_turn(candidates):
         try:
@@ -265,22 +266,24 @@ def _held(
     request: Request,
     known: tuple[Experiments, str, list[FittedCandidate]],
     other: str,
-    how: str,
+    fit: Fit,
 ) -> tuple[Experiments, str, list[FittedCandidate]]:
     """Return data, hold and candidates, with those under another hold."""
     data, hold, candidates = known
     request.say("how the command ran between samples")
     again = data if other == hold else prepare(group, request.use_current, hold=other)
     again = again.as_mean_speed() if data.kind == rc.MEAN_SPEED else again
-    rivals = order_selection.explore(
-        again.held(how),
-        base.with_(held=how),
-        request.options,
+    again, options = again.held(fit.structure.held), request.options
+    found = order_selection.explore(
+        again,
+        base.with_(held=fit.structure.held),
+        options,
         request.model == "auto",
         request.say,
     )
-    if not rivals:
-        return known
+    whole = extend(of_kind(again, fit), fit.structure, fit, options)
+    near = FittedCandidate(whole, f"as {candidates[-1].label}")
+    rivals = [*found, near] if not found or near.bic < found[-1].bic else [near, *found]
     better = rivals[-1].bic < candidates[-1].bic
     if other != hold:
         return (again, other, rivals) if better else known

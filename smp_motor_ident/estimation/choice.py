@@ -53,12 +53,12 @@ def label(structure: Structure) -> str:
 def size(structure: Structure) -> int:
     """Return the number of parameters that a structure is charged for.
 
-    A recorded voltage is one that ran: a command that runs otherwise is an addition, as a
-    parameter is.
+    Loops hold a command, which a log has before its row or after it: one that runs straight from
+    row to row is an addition, as a parameter is.
     """
     free = structure.free()
     shape = models.TE in free and not structure.current
-    return len(free) - shape + (structure.held != "before")
+    return len(free) - shape + (structure.held == "interpolated")
 
 
 def sandwich_factor(fit: Fit) -> float:

@@ -17,7 +17,7 @@ from smp_motor_ident.diagnosis.limits import (
 )
 from smp_motor_ident.estimation.candidate_starts import of_kind
 from smp_motor_ident.estimation.data_window import extend, grow
-from smp_motor_ident.estimation.descent import refine, screening_subset
+from smp_motor_ident.estimation.descent import refine, restate, screening_subset
 from smp_motor_ident.estimation.fit import Fit, Options
 from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.estimation.thinning import thinned
@@ -71,14 +71,14 @@ def chosen_hold(
 
 def held_otherwise(
     group: Sequence[Record], data: Experiments, hold: str, best: Fit, options: Options
-) -> list[tuple[str, str]]:
-    """Return how else the command may have run: ``hold`` and `Structure.held` worth a search.
+) -> list[tuple[str, Fit]]:
+    """Return how else the command may have run: the hold, and a fit of a `Structure.held` under it.
 
     A delay and a second lag take the place of a hold that is not the command's, and hide it
     from a comparison without them.
     """
     s = best.structure
-    if best.samples > HOLD_COST.value or s.order != 2 or thinned(data) is not data:
+    if best.samples > HOLD_COST.value or s.order != 2:
         return []
     known = screening_subset(of_kind(data, best))
     least = best if known.size == best.samples else refine(known, s, best, best.z, options)
@@ -89,20 +89,23 @@ def held_otherwise(
         there = data if other == hold else prepare(group, s.current, hold=other)
         part = screening_subset(of_kind(there.held(how), best))
         lag = max(late - EARLIER.get(how, 0.0), 0.0)
-        fits = [_delayed(part, best, n, options) for n in {lag, float(round(lag))}]
+        fits = [_delayed(part, best, how, n, options) for n in {lag, float(round(lag))}]
+        least_there = min(fits, key=lambda f: f.deviance)
         # What has not settled tells nothing against a search.
-        if any(f.deviance < least.deviance + price or not f.converged for f in fits):
-            out.append((other, how))
+        if least_there.deviance < least.deviance + price or not all(f.converged for f in fits):
+            out.append((other, least_there))
     return out
 
 
-def _delayed(part: Experiments, best: Fit, lag: float, options: Options) -> Fit:
-    """Return a fit with a delay of that many samples, from the choice's coordinates."""
-    fixed = {**best.structure.fixed, "delay": lag * part.step}
-    structure = best.structure.with_(delay=False, fixed=fixed)
-    z = structure.complete(best.z)
+def _delayed(part: Experiments, best: Fit, how: str, lag: float, options: Options) -> Fit:
+    """Return a fit from the choice's coordinates, with a delay of that many samples."""
+    structure = best.structure.with_(held=how, delay=lag > 0)
+    z = best.z.copy()
+    z[models.DELAY] = lag * part.step
+    fixed = structure.with_(delay=False, fixed={**structure.fixed, "delay": lag * part.step})
     near = [best] if best.noise_ratio == 0 else [best, replace(best, noise_ratio=0.0)]
-    return min((refine(part, structure, n, z, options) for n in near), key=lambda f: f.deviance)
+    whole = [refine(part, fixed, n, fixed.complete(z), options) for n in near]
+    return restate(part, structure, min(whole, key=lambda f: f.deviance), options)
 
 
 def instant_deviation(group: Sequence[Record], hold: str) -> float:

@@ -204,7 +204,11 @@ def _on_subset(
 def _on_all(data: Experiments, fit: Fit, known: list[Fit], options: Options) -> Fit:
     """Carry a fit of the screening subset on to all data."""
     every = of_kind(data, fit)
-    fit = data_window.extend(every, fit.structure, fit, options)
+    starts = [fit]
+    if fit.noise_ratio > 0 and thinned(every) is not every:
+        starts.append(replace(fit, noise_ratio=0.0))  # thinning leaves an error of its own
+    fits = [data_window.extend(every, fit.structure, start, options) for start in starts]
+    fit = min(fits, key=lambda f: f.deviance)
     fit = random_restart(every, fit.structure, fit, options)
     return no_worse(every, fit, known, options)
 
