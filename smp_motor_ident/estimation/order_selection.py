@@ -22,7 +22,7 @@ from smp_motor_ident.estimation.delay_and_averaging import with_averaging, with_
 from smp_motor_ident.estimation.fit import Fit, Options, solve
 from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.estimation.profile import RISE, one_level, rubbing
-from smp_motor_ident.estimation.ridge import random_restart
+from smp_motor_ident.estimation.ridge import random_restart, slower_winding
 from smp_motor_ident.estimation.thinning import thinned
 from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments
@@ -205,8 +205,12 @@ def _on_all(data: Experiments, fit: Fit, known: list[Fit], options: Options) -> 
     """Carry a fit of the screening subset on to all data."""
     every = of_kind(data, fit)
     starts = [fit]
-    if fit.noise_ratio > 0 and thinned(every) is not every:
-        starts.append(replace(fit, noise_ratio=0.0))  # thinning leaves an error of its own
+    if thinned(every) is not every:
+        # Thinning hides a short winding, and leaves an error of its own that looks like noise.
+        starts += [replace(fit, noise_ratio=0.0)] * (fit.noise_ratio > 0)
+        if fit.structure.order == 2:
+            z = slower_winding(fit.z, float(np.log(0.5 * data.step)))
+            starts.append(replace(fit, noise_ratio=0.0, z=fit.structure.complete(z)))
     fits = [data_window.extend(every, fit.structure, start, options) for start in starts]
     fit = min(fits, key=lambda f: f.deviance)
     fit = random_restart(every, fit.structure, fit, options)
