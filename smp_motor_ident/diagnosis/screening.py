@@ -212,7 +212,7 @@ def _saturation(record: Record) -> None:
             if share < 0.01 or at.sum() < 5 * next_times or runs.sum() < 0.5 * at.sum():
                 continue
             low, high = np.percentile(v[at], [5, 95])
-            if high - low < 0.02 * np.ptp(v) and not _abrupt(x, at):
+            if high - low < 10 * METER.value * np.ptp(v) and not _abrupt(x, at):
                 continue
             raise SignalError(
                 f"{where}: saturated sensor, {name} rests at {limit:.4g} {unit} in "

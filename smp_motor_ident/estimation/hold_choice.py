@@ -91,8 +91,9 @@ def held_otherwise(
         lag = max(late - EARLIER.get(how, 0.0), 0.0)
         fits = [_delayed(part, best, how, n, options) for n in {lag, float(round(lag))}]
         least_there = min(fits, key=lambda f: f.deviance)
-        # What has not settled tells nothing against a search.
-        if least_there.deviance < least.deviance + price or not all(f.converged for f in fits):
+        # One that has not settled, but comes near, tells nothing against a search.
+        near = price if least_there.converged else known.size * (1 + (known.current.size > 0))
+        if least_there.deviance < least.deviance + near:
             out.append((other, least_there))
     return out
 

@@ -13,7 +13,6 @@ from smp_motor_ident.estimation.candidate_starts import from_richer, from_rivals
 from smp_motor_ident.estimation.choice import (
     FittedCandidate,
     label,
-    needed,
     preferred,
     sandwich_factor,
     size,
@@ -166,26 +165,22 @@ def _orders(
             better, reason = preferred(best, fitted)
         candidates.append(FittedCandidate(fitted, reason))
         best = fitted if better else best
-    return best and _simplest_left(best, candidates)
+    return best and _simplest_left(next(r for r in candidates if r.fit is best), candidates)
 
 
-def _simplest_left(best: Fit, candidates: list[FittedCandidate]) -> Fit:
-    """Return the likeliest of what the choice contains and the data do not reject beside it.
+def _simplest_left(best: FittedCandidate, candidates: list[FittedCandidate]) -> Fit:
+    """Return the choice, or what it contains where the data ask for no more.
 
     The choice has been held against the one before it, which need not be the better of those.
     """
-    free = set(best.structure.free())
+    free = set(best.fit.structure.free())
     inner = [
         r
         for r in candidates
-        if r.whole
-        and r.fit.kind == best.kind
+        if r.whole and r.fit.converged and r.fit.kind == best.fit.kind
         and set(r.fit.structure.free()) < free
-        and r.fit.converged
-        and not needed(r.fit, best)[0]
-    ]
-    least = min(inner, key=lambda r: r.bic, default=None)
-    return least.fit if least is not None else best
+    ]  # fmt: skip
+    return min([best, *inner], key=lambda r: r.bic).fit
 
 
 def _on_subset(

@@ -53,10 +53,11 @@ def random_record(seed, n=3000, noise=0.5):
 @pytest.mark.parametrize("seed", range(6))
 def test_initial_fit_is_the_least_squares_optimum_that_scipy_finds_from_the_truth(seed):
     record, truth = random_record(seed)
-    fit = initial_fit(prepare([record], False), Structure("linear", friction="none"), Options())
+    data = prepare([record], False)
+    fit = initial_fit(data, Structure("linear", friction="none"), Options())
 
     def residual(x):
-        return reference(record.voltage, *np.exp(x[:3]), *x[3:]) - record.velocity
+        return reference(record.voltage, *np.exp(x[:3]), *x[3:]) - data.output
 
     start = np.concatenate([truth, [0.0, record.velocity[0]]])
     found = least_squares(residual, start, x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15)
@@ -71,7 +72,8 @@ def test_initial_fit_is_the_least_squares_optimum_that_scipy_finds_from_the_trut
 @pytest.mark.parametrize("seed", range(3))
 def test_without_noise_the_initial_fit_returns_the_motor_itself(seed):
     record, truth = random_record(seed, noise=0.0)
-    fit = initial_fit(prepare([record], False), Structure("linear", friction="none"), Options())
+    data = replace(prepare([record], False), output=record.velocity)  # not as a sensor reads it
+    fit = initial_fit(data, Structure("linear", friction="none"), Options())
     # Rounding of speeds of 1e2 rad/s, summed over the record.
     np.testing.assert_allclose(fit.z[:3], truth, atol=1e-8)
 
