@@ -28,6 +28,7 @@ from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import Structure
 from smp_motor_ident.record import Record
 
+FEW = 4_000  # samples on which it is asked whether another hold is worth a search
 EARLIER = {"after": 1.0, "interpolated": 0.5}
 """Samples of delay that a hold takes the place of."""
 
@@ -78,19 +79,17 @@ def held_otherwise(
     from a comparison without them.
     """
     s = best.structure
-    if best.samples > HOLD_COST.value or s.order != 2:
+    if best.samples > HOLD_COST.value:
         return []
-    known = screening_subset(of_kind(data, best))
+    known = of_kind(data, best).data_window(FEW * data.step)
     least = best if known.size == best.samples else refine(known, s, best, best.z, options)
     late = float(best.z[models.DELAY]) / data.step
     price = float(np.log(known.size)) + PRIOR_ODDS.value
     out = []
     for other, how in [("held", "before")] * (hold != "held") + [(hold, how) for how in EARLIER]:
         there = data if other == hold else prepare(group, s.current, hold=other)
-        part = screening_subset(of_kind(there.held(how), best))
-        lag = max(late - EARLIER.get(how, 0.0), 0.0)
-        fits = [_delayed(part, best, how, n, options) for n in {lag, float(round(lag))}]
-        least_there = min(fits, key=lambda f: f.deviance)
+        part = of_kind(there.held(how), best).data_window(FEW * data.step)
+        least_there = _delayed(part, least, how, late - EARLIER.get(how, 0.0), options)
         # One that has not settled, but comes near, tells nothing against a search.
         near = price if least_there.converged else known.size * (1 + (known.current.size > 0))
         if least_there.deviance < least.deviance + near:
@@ -99,14 +98,28 @@ def held_otherwise(
 
 
 def _delayed(part: Experiments, best: Fit, how: str, lag: float, options: Options) -> Fit:
-    """Return a fit from the choice's coordinates, with a delay of that many samples."""
-    structure = best.structure.with_(held=how, delay=lag > 0)
-    z = best.z.copy()
-    z[models.DELAY] = lag * part.step
-    fixed = structure.with_(delay=False, fixed={**structure.fixed, "delay": lag * part.step})
+    """Return a fit from the choice's coordinates, as late as that many samples.
+
+    Earlier than no delay only a shorter second lag is.
+    """
+    starts = {max(lag, 0.0): best.z, float(max(round(lag), 0)): best.z}
+    if lag < 0 and best.structure.order == 2:
+        te = float(np.exp(best.z[models.A2] - best.z[models.A1]))
+        z = best.z.copy()
+        z[[models.A2, models.TE]] += np.log(max(te + lag * part.step, 0.1 * te) / te)
+        starts[-1.0] = z
     near = [best] if best.noise_ratio == 0 else [best, replace(best, noise_ratio=0.0)]
-    whole = [refine(part, fixed, n, fixed.complete(z), options) for n in near]
-    return restate(part, structure, min(whole, key=lambda f: f.deviance), options)
+    fits = []
+    for samples, start in starts.items():
+        delay = max(samples, 0.0) * part.step
+        structure = best.structure.with_(held=how, delay=delay > 0)
+        z = start.copy()
+        z[models.DELAY] = delay
+        fixed = structure.with_(delay=False, fixed={**structure.fixed, "delay": delay})
+        whole = [refine(part, fixed, n, fixed.complete(z), options) for n in near]
+        fits.append((min(whole, key=lambda f: f.deviance), structure))
+    fit, structure = min(fits, key=lambda f: f[0].deviance)
+    return restate(part, structure, fit, options)
 
 
 def instant_deviation(group: Sequence[Record], hold: str) -> float:
