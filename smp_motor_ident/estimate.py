@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from smp_motor_ident.diagnosis import validation as validate
 from smp_motor_ident.diagnosis.adequacy import adequacy, stated
 from smp_motor_ident.diagnosis.advice import advise, assess, unsettled_rival
-from smp_motor_ident.diagnosis.beat import on_beat
+from smp_motor_ident.diagnosis.beat import clock_share, on_beat
 from smp_motor_ident.diagnosis.bunched import merge_bunches
 from smp_motor_ident.diagnosis.conditions import dependent
 from smp_motor_ident.diagnosis.current_kind import ARMATURE, current_kind
@@ -28,14 +28,15 @@ from smp_motor_ident.estimation.averaging import averaged, weights
 from smp_motor_ident.estimation.candidate_starts import of_kind
 from smp_motor_ident.estimation.choice import FittedCandidate, size
 from smp_motor_ident.estimation.consider_covariance import (
+    consider_clock,
+    consider_drop,
     consider_friction,
     consider_left_out,
     consider_timing,
 )
-from smp_motor_ident.estimation.data_window import extend
 from smp_motor_ident.estimation.descent import refine
 from smp_motor_ident.estimation.fit import Fit, Prior
-from smp_motor_ident.estimation.hold_choice import chosen_hold, held_otherwise, instant_deviation
+from smp_motor_ident.estimation.hold_choice import chosen_hold, instant_deviation, otherwise
 from smp_motor_ident.estimation.profile import profiled
 from smp_motor_ident.estimation.quantisation import widened
 from smp_motor_ident.estimation.quantities import Answer, answer
@@ -44,7 +45,6 @@ from smp_motor_ident.estimation.segments import heterogeneous
 from smp_motor_ident.estimation.subset import excited
 from smp_motor_ident.estimation.thinning import thinned
 from smp_motor_ident.finding import Finding
-from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments, prepare
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import PHYSICAL, Structure
@@ -158,8 +158,7 @@ def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) 
     )
     if not candidates:
         raise no_candidate(group)
-    for other, fit in held_otherwise(group, data, hold, candidates[-1].fit, request.options):
-        data, hold, candidates = _held(group, base, request, (data, hold, candidates), other, fit)
+    data, hold, candidates = otherwise(group, base, request, data, hold, candidates)
     refused: SmpError | None = None
     for fits in _in_turn(candidates):
         try:
@@ -260,36 +259,6 @@ def _prepared(
     return data.as_mean_speed() if averaged_speed else data, hold, first
 
 
-def _held(
-    group: list[Record],
-    base: Structure,
-    request: Request,
-    known: tuple[Experiments, str, list[FittedCandidate]],
-    other: str,
-    fit: Fit,
-) -> tuple[Experiments, str, list[FittedCandidate]]:
-    """Return data, hold and candidates, with those under another hold."""
-    data, hold, candidates = known
-    request.say("how the command ran between samples")
-    again = data if other == hold else prepare(group, request.use_current, hold=other)
-    again = again.as_mean_speed() if data.kind == rc.MEAN_SPEED else again
-    again, options = again.held(fit.structure.held), request.options
-    found = order_selection.explore(
-        again,
-        base.with_(held=fit.structure.held),
-        options,
-        request.model == "auto",
-        request.say,
-    )
-    whole = extend(of_kind(again, fit), fit.structure, fit, options)
-    near = FittedCandidate(whole, f"as {candidates[-1].label}")
-    rivals = [*found, near] if not found or near.bic < found[-1].bic else [near, *found]
-    better = rivals[-1].bic < candidates[-1].bic
-    if other != hold:
-        return (again, other, rivals) if better else known
-    return data, hold, [*candidates, *rivals] if better else [*rivals, *candidates]
-
-
 def _provenance(group: Sequence[Record]) -> dict[str, Any]:
     """Return what an estimate says of its records."""
     return {
@@ -310,6 +279,7 @@ def _certain(
     few = thinned(final) if final.size > PROFILED.value else final
     chosen = profiled(few, widened(final, chosen), request.options)
     timed = consider_timing(final, chosen, instant_deviation(group, hold))
+    timed = consider_drop(final, consider_clock(final, timed, clock_share(group)))
     chosen, friction_std = consider_friction(final, consider_left_out(final, timed))
     chosen, change = heterogeneous(final, chosen)
     return chosen, friction_std, change

@@ -119,7 +119,8 @@ def _on_beat(motor: _Motor, topic: str, time: Integers) -> Integers:
         f"{topic or 'time'}: arrival times put back on their beat of {beat.period * 1e-6:.5g} ms "
         f"(median latency {beat.latency * 1e-6:.3g} ms)"
     )
-    motor.tell("arrival_beat", text, period=beat.period * 1e-9, latency=beat.latency * 1e-9)
+    period, deviation, latency = (1e-9 * x for x in (beat.period, beat.deviation, beat.latency))
+    motor.tell("arrival_beat", text, period=period, deviation=deviation, latency=latency)
     return beat.time
 
 

@@ -9,6 +9,7 @@ repeated stamps, which round a regular time down, lie above such a line, too.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -31,6 +32,7 @@ Integers = NDArray[np.int64]
 
 _PAUSE = 20_000_000
 """Shortest silence [ns] that divides arrivals."""
+BLOCKS = 8
 _LEAST = 50
 """Samples below which a beat is not looked for."""
 
@@ -39,12 +41,14 @@ _LEAST = 50
 class Beat:
     """A regular clock behind arrivals.
 
-    ``time`` are the instants [ns], ``period`` the interval [ns], ``latency`` the median delay
-    [ns] behind the fastest, ``repeated`` whether arrivals came several at once.
+    ``time`` are the instants [ns], ``period`` the interval [ns] and ``deviation`` its standard
+    deviation, ``latency`` the median delay [ns] behind the fastest, ``repeated`` whether arrivals
+    came several at once.
     """
 
     time: Integers
     period: float
+    deviation: float
     latency: float
     repeated: bool
 
@@ -57,7 +61,7 @@ def find_beat(arrival: Integers) -> Beat | None:
     usual = (arrival[-1] - arrival[0]) / (arrival.size - 1)
     pause = max(20 * usual, _PAUSE)
     edges = [0, *(np.flatnonzero(np.diff(arrival) > pause) + 1).tolist(), arrival.size]
-    time, periods, late = arrival.copy(), [], []
+    time, periods, deviations, late = arrival.copy(), [], [], []
     for begin, end in pairwise(edges):
         if end - begin < _LEAST:
             return None
@@ -66,16 +70,17 @@ def find_beat(arrival: Integers) -> Beat | None:
             return None
         time[begin:end] = arrival[begin] + np.rint(fitted[0]).astype(np.int64)
         periods.append(fitted[1])
+        deviations.append(fitted[2])
         late.append((arrival[begin:end] - time[begin:end]).astype(np.float64))
     latency, period = np.concatenate(late), float(np.median(periods))
     if np.std(latency) < BEAT_JITTER.value * period or np.any(np.diff(time) <= 0):
         return None
     repeated = float(np.mean(np.diff(arrival) < BUNCHED.value * period)) > BEAT_LOST.value
-    return Beat(time, period, float(np.median(latency)), repeated)
+    return Beat(time, period, max(deviations), float(np.median(latency)), repeated)
 
 
-def _fit(arrival: Integers) -> tuple[Array, float] | None:
-    """Return the beat's instants from the first arrival [ns], and its period."""
+def _fit(arrival: Integers) -> tuple[Array, float, float] | None:
+    """Return the beat's instants from the first arrival [ns], its period and how sure that is."""
     since = (arrival - arrival[0]).astype(np.float64)
     usual = since[-1] / (since.size - 1)
     if usual <= 0:
@@ -96,8 +101,15 @@ def _fit(arrival: Integers) -> tuple[Array, float] | None:
         floors = [part.min() for part in np.array_split(latency, since.size // window)]
         # What arrives late catches up: where the sender is regular the floor stays.
         if period > 0 and max(floors) <= BEAT_FLOOR.value * period * longest:
-            return begin + period * number, period
+            return begin + period * number, period, _deviation(number, since)
     return None
+
+
+def _deviation(number: Array, since: Array) -> float:
+    """Return the standard deviation of the period, by a jackknife that deletes blocks."""
+    parts = np.array_split(np.arange(number.size), BLOCKS)
+    periods = [_line(np.delete(number, part), np.delete(since, part))[1] for part in parts]
+    return float(np.sqrt((BLOCKS - 1) * np.var(periods)))
 
 
 def _lost(since: Array, number: Array, window: int) -> Array:
@@ -181,7 +193,7 @@ def on_beat(record: Record) -> Record:
         "note",
         f"stamps put back on their beat of {1e3 * period:.5g} ms (median latency "
         f"{1e3 * latency:.3g} ms)",
-        {"period": period, "latency": latency},
+        {"period": period, "deviation": beat.deviation * 1e-9, "latency": latency},
         "stamp each sample where it is measured",
     )
     return replace(
@@ -189,3 +201,10 @@ def on_beat(record: Record) -> Record:
         time=(beat.time - beat.time[0]) * 1e-9,
         findings=(*record.findings, finding),
     )
+
+
+def clock_share(records: Sequence[Record]) -> float:
+    """Return how well the sender's clock is known behind arrivals: a share of its interval."""
+    beats = [f.evidence for r in records for f in r.findings if f.code == "arrival_beat"]
+    shares = [float(b["deviation"] or 0.0) / float(b["period"] or 1.0) for b in beats]
+    return max(shares, default=0.0)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import Structure
@@ -34,6 +35,37 @@ def consider_timing(data: Experiments, fit: Fit, instant: float) -> Fit:
         return fit
     beside = _beside(data, fit, structure.with_(delay=True), models.DELAY)
     return fit.wider(beside.covariance(instant**2))
+
+
+def consider_clock(data: Experiments, fit: Fit, share: float) -> Fit:
+    """Return the fit with its covariance widened by a clock that is known to a share only.
+
+    Under another interval an angle's speed, and every time, is another; voltages are not.
+    """
+    if share <= 0 or not fit.structure.free():
+        return fit
+    angle = float(data.kind == rc.ANGLE)
+    powers: Array = np.zeros(fit.z.size)
+    powers[[models.A0, models.A1, models.A2, models.TE]] = angle, 1 + angle, 2 + angle, 1.0
+    powers[[models.DELAY, models.WINDOW]] = fit.z[[models.DELAY, models.WINDOW]]
+    row = share * powers[list(fit.structure.free())]
+    return fit.wider(np.asarray(np.outer(row, row), dtype=np.float64))
+
+
+def consider_drop(data: Experiments, fit: Fit) -> Fit:
+    """Return the fit with its covariance widened by what a current's offset may be instead.
+
+    Where the motor turns one way only, a driver's drop of ``R offset`` looks the same, and
+    friction is then that much more or less.
+    """
+    free = fit.structure.free()
+    one_way = not data.hold_value.min() < 0 < data.hold_value.max()
+    if not (one_way and fit.structure.offset and models.VC_PLUS in free):
+        return fit
+    row: Array = np.zeros(len(free))
+    drop = float(np.exp(fit.z[models.LN_R]) * fit.z[models.OFFSET])
+    row[[free.index(i) for i in (models.VC_PLUS, models.VC_MINUS) if i in free]] = drop
+    return fit.wider(np.asarray(np.outer(row, row), dtype=np.float64))
 
 
 def consider_friction(data: Experiments, fit: Fit) -> tuple[Fit, float]:

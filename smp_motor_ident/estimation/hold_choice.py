@@ -15,11 +15,14 @@ from smp_motor_ident.diagnosis.limits import (
     INSTANT,
     PRIOR_ODDS,
 )
+from smp_motor_ident.estimation import order_selection
 from smp_motor_ident.estimation.candidate_starts import of_kind
+from smp_motor_ident.estimation.choice import FittedCandidate
 from smp_motor_ident.estimation.data_window import extend, grow
 from smp_motor_ident.estimation.descent import refine, restate, screening_subset
 from smp_motor_ident.estimation.fit import Fit, Options
 from smp_motor_ident.estimation.initialisation import initial_fit
+from smp_motor_ident.estimation.request import Request
 from smp_motor_ident.estimation.thinning import thinned
 from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments, prepare
@@ -70,7 +73,36 @@ def chosen_hold(
     return hold, best
 
 
-def held_otherwise(
+def otherwise(
+    group: list[Record],
+    base: Structure,
+    request: Request,
+    data: Experiments,
+    hold: str,
+    candidates: list[FittedCandidate],
+) -> tuple[Experiments, str, list[FittedCandidate]]:
+    """Return data, hold and candidates, the choice last, with those under other holds."""
+    for other, fit in _worth_a_search(group, data, hold, candidates[-1].fit, request.options):
+        request.say("how the command ran between samples")
+        again = data if other == hold else prepare(group, request.use_current, hold=other)
+        again = again.as_mean_speed() if data.kind == rc.MEAN_SPEED else again
+        again = again.held(fit.structure.held)
+        there = base.with_(held=fit.structure.held)
+        auto = request.model == "auto"
+        rivals = order_selection.explore(again, there, request.options, auto, request.say)
+        whole = extend(of_kind(again, fit), fit.structure, fit, request.options)
+        near = FittedCandidate(whole, f"as {candidates[-1].label}")
+        first = not rivals or near.bic < rivals[-1].bic
+        rivals = [*rivals, near] if first else [near, *rivals]
+        better = rivals[-1].bic < candidates[-1].bic
+        if other == hold:
+            candidates = [*candidates, *rivals] if better else [*rivals, *candidates]
+        elif better:
+            data, hold, candidates = again, other, rivals
+    return data, hold, candidates
+
+
+def _worth_a_search(
     group: Sequence[Record], data: Experiments, hold: str, best: Fit, options: Options
 ) -> list[tuple[str, Fit]]:
     """Return how else the command may have run: the hold, and a fit of a `Structure.held` under it.
@@ -79,7 +111,7 @@ def held_otherwise(
     from a comparison without them.
     """
     s = best.structure
-    if best.samples > HOLD_COST.value:
+    if best.samples > HOLD_COST.value or "delay" in s.fixed:
         return []
     known = of_kind(data, best).data_window(FEW * data.step)
     least = best if known.size == best.samples else refine(known, s, best, best.z, options)

@@ -5,6 +5,7 @@ from dataclasses import replace
 import motors
 import numpy as np
 import pytest
+from independent import simulate
 from scipy.signal import lfilter
 
 from smp_motor_ident.diagnosis import refusal
@@ -213,3 +214,19 @@ def test_a_sine_says_that_a_drop_would_not_show(second_tone, said):
     noisy = w + 0.3 * np.random.default_rng(13).standard_normal(w.size)
     found = estimate(Record("motor", t, np.r_[0.0, voltage[:-1]], velocity=noisy))
     assert ("one_size_of_voltage" in [f.code for f in found.findings]) is said
+
+
+def test_an_offset_of_the_current_may_be_a_drop_of_the_driver_where_the_motor_turns_one_way():
+    r, el, k, j, b, tc, drop = 3.4, 1.5e-3, 0.026, 2.3e-5, 4e-5, 7e-4, 0.06
+    rng = np.random.default_rng(3)
+    t = np.arange(4000) / 500
+    v = np.repeat(rng.uniform(2.0, 6.0, 80), 50)
+    out = simulate(t, v, r, el, k, j, b, tc, np.zeros(t.size), 40)
+    current = out[:, 0] + 0.004 * rng.standard_normal(t.size)
+    angle = out[:, 2] + 1e-3 * rng.standard_normal(t.size)
+    found = estimate(Record("motor", t, v + drop, current, position=angle))
+    assert "current_offset" in [f.code for f in found.findings]
+    q = found.parameters["coulomb_friction"]
+    # 5 standard deviations: what is wrong silently.
+    assert abs(q.value - tc) < 5 * q.std
+    assert q.std < tc
