@@ -141,8 +141,12 @@ def output_of(record: Record, kind: str = "auto") -> tuple[Array, int, float]:
             angle[_repeats(record.count, record.starts)] = np.nan
             return angle, rc.ANGLE, quantum
         if record.position is not None and np.isfinite(record.position).sum() > 2:
-            first = record.position[np.isfinite(record.position)][0]
-            return record.position - first, rc.ANGLE, 0.0
+            angle = record.position - record.position[np.isfinite(record.position)][0]
+            quantum = angle_quantum(angle)
+            if quantum > 0 and np.all(np.isfinite(angle)):
+                count = np.rint(angle / quantum).astype(np.int64)
+                angle[_repeats(count, record.starts)] = np.nan
+            return angle, rc.ANGLE, quantum
     if record.velocity is None:
         raise ValueError("record has no velocity")
     mean = rc.MEAN_SPEED if record.velocity_window > 0 else rc.SPEED
@@ -169,6 +173,27 @@ def _repeats(count: Integers, starts: Sequence[int]) -> NDArray[np.bool_]:
     stays = begin[rests]
     repeats[stays + np.where(first[stays], 0, length[rests] // 2)] = False
     return repeats
+
+
+def angle_quantum(angle: Array) -> float:
+    """Return the step [rad] in which an angle comes, as counts or rounding make it; 0 for none."""
+    moves = np.abs(np.diff(angle[:20_000]))
+    moves = np.sort(moves[moves > FINEST_ENCODER])  # lost samples compare as smaller
+    if moves.size < 50:
+        return 0.0
+    moves = moves[:: -(-moves.size // FEW)]
+    for parts in (1, 2, 3):  # a motor that is fast in every sample may show no single step
+        quantum = float(moves[0]) / parts
+        for reach in (10.0, np.inf):  # the longer moves tell it better
+            near = moves[moves < reach * quantum]
+            whole = np.round(near / quantum)
+            quantum = float(near @ whole / (whole @ whole))
+        whole = np.round(moves / quantum)
+        levels = np.unique(whole).size
+        off = np.abs(moves / quantum - whole)
+        if (levels > 2 and np.mean(off < 0.05) > 0.95) or (levels == 2 and off.max() < 0.005):
+            return quantum
+    return 0.0
 
 
 def speed_quantum(velocity: Array) -> float:

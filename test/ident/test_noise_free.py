@@ -5,6 +5,7 @@ import pytest
 from independent import excitation, simulate
 
 from smp_motor_ident.estimate import estimate
+from smp_motor_ident.likelihood.experiments import angle_quantum
 from smp_motor_ident.record import Hardware, Record
 
 R, L, K, J, B, TC = 1.9, 4.0e-4, 0.0357, 2.2e-5, 0.0, 1.2e-2
@@ -47,3 +48,27 @@ def test_a_record_without_noise_is_answered_as_one_with_little(kind, signal, cur
             continue
         # 5 standard deviations: what is wrong silently; the simulator's steps cost 1e-4.
         assert abs(q.value - true) < max(5 * q.std, 1e-3 * true), name
+
+
+@pytest.mark.parametrize("per_turn", [28.0, 500.0])
+def test_an_angle_that_comes_in_steps_is_a_count(per_turn):
+    t = np.arange(4000) / 500.0
+    v = excitation(t, "fourier", 9.0)
+    out = simulate(t, v, R, L, K, J, B, TC, np.zeros(t.size), 100)
+    step = 2 * np.pi / per_turn
+    count = np.floor(out[:, 2] / step).astype(np.int64)
+    counted = estimate(Record("motor", t, v, count=count, hardware=Hardware(1.0, per_turn)))
+    angle = np.round(count * step + 0.3, 6)  # as a text file has it
+    found = estimate(Record("motor", t, v, position=angle))
+    assert found.model == counted.model
+    for name, q in counted.combinations.items():
+        assert found.combinations[name].value == pytest.approx(q.value, abs=0.02 * (q.std or 0.0))
+
+
+def test_a_smooth_angle_comes_in_no_steps():
+    rng = np.random.default_rng(0)
+    t = np.arange(5000) / 200
+    for _ in range(50):
+        angle = rng.uniform(0.05, 5) * np.cumsum(np.sin(rng.uniform(0.1, 3) * t)) * 0.1
+        for noise in (0.0, 1e-4, 1e-3):
+            assert angle_quantum(angle + noise * rng.standard_normal(t.size)) == 0.0
