@@ -47,7 +47,8 @@ def edge(z: Array, share: float) -> tuple[float, Array] | None:
     root = a1 * a1 - 4 * share * a0 * a2
     if root <= 0.0:
         return None
-    both = (a1 + np.array([-1.0, 1.0]) * math.sqrt(root)) / (2 * share * a0)
+    larger = a1 + math.sqrt(root)  # a difference would lose a short winding to rounding
+    both = 2 * a2 / larger, larger / (2 * share * a0)
     te = float(min(both, key=lambda x: abs(math.log(x) - z[TE])))
     slope = a1 * te - 2 * share * a0 * te * te
     if slope == 0.0:

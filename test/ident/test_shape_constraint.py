@@ -85,3 +85,12 @@ def test_the_gradient_of_an_edge_is_its_slope():
             slope = (shape_constraint.edge(moved, share)[0] - z[TE]) / 1e-6
             # a forward difference over 1e-6 of a smooth function
             assert shape_constraint.edge(z, share)[1][j] == pytest.approx(slope, abs=1e-4)
+
+
+def test_the_edge_of_a_winding_too_short_for_rounding_is_found():
+    # a1^2 - 4 share a0 a2 rounds to a1^2 here; the shorter lag at the edge is a2 / a1.
+    z = np.zeros(11)
+    z[[A0, A1, A2, TE]] = np.log([0.05, 2e-3, 1e-23, 5e-21])
+    there = shape_constraint.edge(z, 0.98)
+    assert there is not None
+    assert there[0] == pytest.approx(float(z[A2] - z[A1]), abs=1e-9)
