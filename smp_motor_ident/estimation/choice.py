@@ -84,6 +84,21 @@ def preferred_but_for_descent(best: FittedCandidate, other: FittedCandidate) -> 
     return preferred(best.fit, settled)[0]
 
 
+def simplest_left(best: FittedCandidate, candidates: list[FittedCandidate]) -> Fit:
+    """Return the choice, or what it contains where the data ask for no more.
+
+    The choice has been held against the one before it, which need not be the better of those.
+    """
+    free = set(best.fit.structure.free())
+    inner = [
+        r
+        for r in candidates
+        if r.whole and r.fit.converged and r.fit.kind == best.fit.kind
+        and set(r.fit.structure.free()) < free
+    ]  # fmt: skip
+    return min([best, *inner], key=lambda r: r.bic).fit
+
+
 def needed(simple: Fit, rich: Fit) -> tuple[bool, str]:
     """Decide whether the data reject the simpler of two models.
 

@@ -5,14 +5,19 @@ Derivation: docs/derivations.md, section 10.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from smp_motor_ident.estimation import descent, start
+from smp_motor_ident.estimation import data_window, descent, start
+from smp_motor_ident.estimation.choice import preferred
 from smp_motor_ident.estimation.fit import Fit, Options
 from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import Structure
+
+DELAYS = (0.3, 1.5, 3.5)  # samples at which a delay is begun that torque noise may have hidden
 
 
 def with_delay(
@@ -78,3 +83,23 @@ def with_averaging(
     own = structure.order == 2 and not structure.delay
     fitted = initial_fit(mean, structure, options, starts, keep=3, own=own)
     return _snap(mean, fitted, options) if structure.delay else fitted
+
+
+def delay_without_noise(data: Experiments, best: Fit, options: Options) -> Fit | None:
+    """Return a fit with the delay in whose place the torque noise of another stands, if any.
+
+    Torque noise flattens the score of what it has taken the place of: there only fits that begin
+    without it tell.
+    """
+    if not best.noise_ratio > 0:
+        return None
+    noiseless = replace(best, noise_ratio=0.0)
+    plain = descent.refine(data, best.structure, noiseless, best.z, options)
+    richer = best.structure.with_(delay=True)
+    late = []
+    for samples in DELAYS:
+        z = plain.z.copy()
+        z[models.DELAY] = samples * data.step
+        late.append(descent.refine(data, richer, plain, z, options))
+    other = min(late, key=lambda f: f.deviance)
+    return data_window.grow(data, richer, other, options) if preferred(plain, other)[0] else None

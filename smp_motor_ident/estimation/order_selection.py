@@ -15,9 +15,14 @@ from smp_motor_ident.estimation.choice import (
     label,
     preferred,
     sandwich_factor,
+    simplest_left,
     size,
 )
-from smp_motor_ident.estimation.delay_and_averaging import with_averaging, with_delay
+from smp_motor_ident.estimation.delay_and_averaging import (
+    delay_without_noise,
+    with_averaging,
+    with_delay,
+)
 from smp_motor_ident.estimation.fit import Fit, Options, solve
 from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.estimation.profile import RISE, one_level, rubbing
@@ -29,8 +34,6 @@ from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import Structure
 
 Say = Callable[[str], None]
-
-DELAYS = (0.3, 1.5, 3.5)  # samples at which a delay is begun that torque noise may have hidden
 
 
 def explore(
@@ -165,22 +168,7 @@ def _orders(
             better, reason = preferred(best, fitted)
         candidates.append(FittedCandidate(fitted, reason))
         best = fitted if better else best
-    return best and _simplest_left(next(r for r in candidates if r.fit is best), candidates)
-
-
-def _simplest_left(best: FittedCandidate, candidates: list[FittedCandidate]) -> Fit:
-    """Return the choice, or what it contains where the data ask for no more.
-
-    The choice has been held against the one before it, which need not be the better of those.
-    """
-    free = set(best.fit.structure.free())
-    inner = [
-        r
-        for r in candidates
-        if r.whole and r.fit.converged and r.fit.kind == best.fit.kind
-        and set(r.fit.structure.free()) < free
-    ]  # fmt: skip
-    return min([best, *inner], key=lambda r: r.bic).fit
+    return best and simplest_left(next(r for r in candidates if r.fit is best), candidates)
 
 
 def _on_subset(
@@ -279,7 +267,7 @@ def _variations(
         richer = best.structure.with_(**change)
         if richer == best.structure:
             continue
-        hidden = _delay_without_noise(data, best, options) if "delay" in change else None
+        hidden = delay_without_noise(data, best, options) if "delay" in change else None
         if hidden is None and not _worth_a_fit(data, best, richer):
             continue
         say(f"trying {label(richer)}")
@@ -297,26 +285,6 @@ def _variations(
         if verdict:
             best = other
     return _without_friction(data, best, options, candidates)
-
-
-def _delay_without_noise(data: Experiments, best: Fit, options: Options) -> Fit | None:
-    """Return a fit with the delay in whose place the torque noise of another stands, if any.
-
-    Torque noise flattens the score of what it has taken the place of: there only fits that begin
-    without it tell.
-    """
-    if not best.noise_ratio > 0:
-        return None
-    noiseless = replace(best, noise_ratio=0.0)
-    plain = descent.refine(data, best.structure, noiseless, best.z, options)
-    richer = best.structure.with_(delay=True)
-    late = []
-    for samples in DELAYS:
-        z = plain.z.copy()
-        z[models.DELAY] = samples * data.step
-        late.append(descent.refine(data, richer, plain, z, options))
-    other = min(late, key=lambda f: f.deviance)
-    return data_window.grow(data, richer, other, options) if preferred(plain, other)[0] else None
 
 
 def _additions(s: Structure) -> list[dict[str, object]]:
