@@ -93,7 +93,7 @@ class _Test:
         if not self.seen.applied or not self.writer.publisher.get_subscription_count():
             return False
         off = abs(self.seen.applied[-1] - self.output)
-        return not off > FOLLOWED * self.relay.amplitude  # NaN: not told
+        return not off > FOLLOWED * self.relay.amplitude  # NaN: not known
 
     def _not_followed(self) -> RobotError:
         topic = self.writer.publisher.topic_name

@@ -45,6 +45,7 @@ class Experiments:
     quantum: float  # resolution of the output [rad or rad/s]; 0 where it has none
     initial: Array  # shape (g, 4): first guess of q (0), speed, angle and load of each segment
     voltage: Array  # as it was recorded, by the row
+    how: str = "before"  # how a row's command ran, as in `Structure.held`
 
     @property
     def plain(self) -> bool:
@@ -78,10 +79,11 @@ class Experiments:
         """Return the same experiments, a row's command taken to run before it (as they are), after
         it, or straight from row to row.
         """
-        if how == "before":
+        if how in ("before", self.how):
             return self
         sections, end, value = rerun(self.time, self.voltage, self.starts[:-1], how)
-        return replace(self, hold_end=end, hold_value=value, hold_start=sections * self.starts)
+        first = sections * self.starts
+        return replace(self, hold_end=end, hold_value=value, hold_start=first, how=how)
 
     def data_window(self, duration: float) -> Experiments:
         """Return all up to ``duration`` seconds after the first voltage, of all segments together.
@@ -128,6 +130,7 @@ class Experiments:
             self.quantum,
             self.initial[:segments],
             self.voltage[:end],
+            self.how,
         )
 
 
