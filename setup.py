@@ -1,12 +1,15 @@
 """Install rules of the ROS package (colcon builds it as ament_python)."""
 
 import os
+import subprocess
+import sys
 from glob import glob
 from pathlib import Path
 
 from setuptools import find_packages, setup
 from setuptools.command.build_py import build_py
 from setuptools.command.develop import develop
+from setuptools.command.install import install
 
 NAME = "smp_motor_control"
 EXECUTABLES = (
@@ -38,6 +41,20 @@ def require_messages() -> None:
         )
 
 
+def compile_ahead(folder: str) -> None:
+    """Compile for this machine what computes, or leave that to the first estimate."""
+    if "COLCON" not in os.environ:
+        return
+    path = os.pathsep.join(p for p in (folder, os.environ.get("PYTHONPATH", "")) if p)
+    done = subprocess.run(
+        [sys.executable, "-m", "smp_motor_ident.compilation"],
+        cwd=folder, env={**os.environ, "PYTHONPATH": path}, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    if done.returncode:
+        reason = (done.stderr.strip().splitlines() or ["no reason given"])[-1]
+        print(f"{NAME}: the first estimate will compile for half a minute ({reason})")
+
+
 class BuildPy(build_py):
     """As colcon build asks for."""
 
@@ -51,9 +68,20 @@ class Develop(develop):
     """As colcon build --symlink-install asks for."""
 
     def run(self) -> None:
-        """Link what is whole."""
+        """Link what is whole, and compile it."""
         require_messages()
         super().run()
+        if not self.uninstall:
+            compile_ahead(os.getcwd())
+
+
+class Install(install):
+    """As colcon build asks for, after it."""
+
+    def run(self) -> None:
+        """Copy, and compile what was copied."""
+        super().run()
+        compile_ahead(str(Path(self.install_lib or ".").resolve()))
 
 
 setup(
@@ -82,7 +110,7 @@ setup(
     ],
     install_requires=["setuptools"],
     extras_require={"test": ["pytest", "hypothesis"]},  # by which colcon test runs pytest
-    cmdclass={"build_py": BuildPy, "develop": Develop},
+    cmdclass={"build_py": BuildPy, "develop": Develop, "install": Install},
     zip_safe=False,
     entry_points={
         "console_scripts": [f"{name} = {NAME}.entry:{name}" for name in EXECUTABLES],

@@ -313,7 +313,10 @@ def prepare(lock: IO[str]) -> bool:
             "the messages of smp_interfaces",
             lambda: build_interfaces(ros, lock),
         ),
-        "package": ("smp_motor_control", lambda: build("smp_motor_control", ros, lock)),
+        "package": (
+            "smp_motor_control, compiled for this machine (half a minute)",
+            lambda: build("smp_motor_control", ros, lock),
+        ),
     }
     say(f"with ROS 2 of {ros}" if ros else "without ROS: real rclpy and DDS from wheels")
     for number, (stage, (title, work)) in enumerate(stages.items(), start=1):

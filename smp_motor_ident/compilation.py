@@ -1,0 +1,69 @@
+"""Compile for this machine before anybody waits for it: ``python -m smp_motor_ident.compilation``.
+
+What numba compiles stays on the disk beside the modules.  The rehearsal is a real one: a motor is
+simulated, estimated from each kind of signal, and given gains, so that every compiled function is
+called with the types that it has in use.  Where all is compiled already it takes a second.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+
+from smp_motor_control.motor.friction import Motor
+from smp_motor_control.motor.parameters import MotorParameters
+from smp_motor_ident.errors import InsufficientExcitationError
+from smp_motor_ident.estimate import estimate
+from smp_motor_ident.record import Hardware, Record
+from smp_motor_ident.tune import Loop, design
+
+STEP, SAMPLES, COUNTS = 0.01, 400, 500.0
+MOTOR = MotorParameters(
+    resistance=3.0, inductance=0.05, motor_constant=0.03, inertia=1.4e-5, viscous_friction=5e-5
+)
+"""Near the third motor of the paper's Table 1."""
+
+
+def recording(friction: float) -> Record:
+    """Return every signal of a simulated motor at random levels of voltage."""
+    motor = Motor(replace(MOTOR, coulomb_friction=friction))
+    rng = np.random.default_rng(1)
+    voltage = np.repeat(rng.uniform(-8.0, 8.0, SAMPLES // 20), 20)
+    shown = [(motor.step(float(u), STEP), motor.current, motor.angle) for u in voltage]
+    speed, current, angle = np.array(shown).T
+    return Record(
+        "rehearsal",
+        STEP * np.arange(SAMPLES),
+        voltage,
+        current + 0.01 * rng.standard_normal(SAMPLES),
+        speed + 0.1 * rng.standard_normal(SAMPLES),
+        None,
+        np.floor(angle * COUNTS / (2 * np.pi)).astype(np.int64),
+        hardware=Hardware(counts_per_revolution=COUNTS, supply_voltage=12.0),
+    )
+
+
+def rehearse(signals: str) -> None:
+    """Estimate from some signals, and design gains."""
+    whole, smooth = recording(1e-3), recording(0.0)
+    speed = replace(smooth, current=None, count=None)
+    if signals == "whole":
+        design(estimate(whole), Loop())
+        return
+    estimate(speed)
+    with contextlib.suppress(InsufficientExcitationError):  # it has no flexible shaft
+        estimate(speed, "flexible_shaft")
+
+
+def main() -> int:
+    """Compile all, on two cores; return the exit code."""
+    with ProcessPoolExecutor(2) as pool:
+        list(pool.map(rehearse, ("whole", "speed")))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
