@@ -18,36 +18,44 @@ from smp_motor_control.motor.parameters import MotorParameters
 from smp_motor_ident.errors import InsufficientExcitationError
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.record import Hardware, Record
-from smp_motor_ident.tune import Loop, design
 
 STEP, SAMPLES, COUNTS = 0.01, 400, 500.0
+FEW = 100
+"""Samples from which an estimate takes no longer than loading what it calls."""
 MOTOR = MotorParameters(
     resistance=3.0, inductance=0.05, motor_constant=0.03, inertia=1.4e-5, viscous_friction=5e-5
 )
 """Near the third motor of the paper's Table 1."""
 
 
-def recording(friction: float) -> Record:
+def recording(friction: float, samples: int = SAMPLES) -> Record:
     """Return every signal of a simulated motor at random levels of voltage."""
     motor = Motor(replace(MOTOR, coulomb_friction=friction))
     rng = np.random.default_rng(1)
-    voltage = np.repeat(rng.uniform(-8.0, 8.0, SAMPLES // 20), 20)
+    voltage = np.repeat(rng.uniform(-8.0, 8.0, samples // 20), 20)
     shown = [(motor.step(float(u), STEP), motor.current, motor.angle) for u in voltage]
     speed, current, angle = np.array(shown).T
     return Record(
         "rehearsal",
-        STEP * np.arange(SAMPLES),
+        STEP * np.arange(samples, dtype=np.float64),
         voltage,
-        current + 0.01 * rng.standard_normal(SAMPLES),
-        speed + 0.1 * rng.standard_normal(SAMPLES),
+        current + 0.01 * rng.standard_normal(samples),
+        speed + 0.1 * rng.standard_normal(samples),
         None,
         np.floor(angle * COUNTS / (2 * np.pi)).astype(np.int64),
         hardware=Hardware(counts_per_revolution=COUNTS, supply_voltage=12.0),
     )
 
 
+def load() -> None:
+    """Load what estimates of whole records call, for all processes that are forked after it."""
+    estimate(recording(1e-3, FEW), "electromechanical")
+
+
 def rehearse(signals: str) -> None:
     """Estimate from some signals, and design gains."""
+    from smp_motor_ident.tune import Loop, design  # `load` does without
+
     whole, smooth = recording(1e-3), recording(0.0)
     speed = replace(smooth, current=None, count=None)
     if signals == "whole":

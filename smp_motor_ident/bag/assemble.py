@@ -25,8 +25,7 @@ from smp_motor_ident.bag.counter import unwrap_angle
 from smp_motor_ident.bag.mapping import MotorMap, Signal
 from smp_motor_ident.bag.storage import Table, found
 from smp_motor_ident.bag.units import FACTORS, check_unit, factor
-from smp_motor_ident.diagnosis.beat import find_beat, roughness
-from smp_motor_ident.diagnosis.limits import SMOOTHER
+from smp_motor_ident.diagnosis.beat import find_beat, moves_on
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.finding import Finding, Severity
 from smp_motor_ident.record import Hardware, Record
@@ -108,12 +107,12 @@ def _on_beat(motor: _Motor, topic: str, time: Integers) -> Integers:
     if beat is None:
         return time
     if table.clocked and not beat.repeated:
-        # Stamps of one's own may be the samples' instants: the smoother motion is the true one.
+        # Stamps of one's own may be the samples' instants: the motion tells.
         signal = next((s for n, s in motor.plan.signals.items() if n in _MOTION), None)
         if rhythm(time).regular or signal is None or signal.topic != topic:
             return time
         motion = table.columns[signal.field].astype(np.float64)
-        if roughness(beat.time, motion) > SMOOTHER.value * roughness(time, motion):
+        if not moves_on(beat, time, motion):
             return time
     text = (
         f"{topic or 'time'}: arrival times put back on their beat of {beat.period * 1e-6:.5g} ms "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -61,9 +62,10 @@ class _Collector:
                 )
             candidates = self.types.candidates(channel)
             paths = list(self.paths)
-            if _has_stamp(candidates[0], channel.type):
+            first = next(candidates)
+            if _has_stamp(first, channel.type):
                 paths += [name for name in STAMP if name not in paths]
-            self._decoders[key] = Decoder(channel, candidates, paths)
+            self._decoders[key] = Decoder(channel, chain((first,), candidates), paths)
         return self._decoders[key]
 
     def table(self) -> Table:

@@ -7,7 +7,7 @@ one indexing per field reads them all.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -53,7 +53,7 @@ class Decoder:
     ----------
     channel : Channel
         Type and encoding.
-    candidates : sequence of Definitions
+    candidates : iterable of Definitions
         What that type may be; the first that fits a message is used from then on.
     paths : sequence of str
         Fields that are wanted.
@@ -62,13 +62,14 @@ class Decoder:
     KEPT = 64
 
     def __init__(
-        self, channel: Channel, candidates: Sequence[Definitions], paths: Sequence[str]
+        self, channel: Channel, candidates: Iterable[Definitions], paths: Sequence[str]
     ) -> None:
         self.name = channel.type
         self._encoding = channel.encoding
         self.paths = tuple(paths)
         self._steps = [parse_path(path) for path in paths]
-        self._candidates = list(candidates)
+        self._tried: list[Definitions] = []
+        self._others = iter(candidates)
         self._layouts: list[Layout] = []
         self.undecodable = 0
         self.reason = ""
@@ -93,16 +94,23 @@ class Decoder:
                 left = left[1:]
         return Decoded.joined(rows, columns, len(self.paths))
 
+    def _candidates(self) -> Iterator[Definitions]:
+        """Yield what the type may be; none is looked for before the others have failed."""
+        yield from tuple(self._tried)
+        for definitions in self._others:
+            self._tried.append(definitions)
+            yield definitions
+
     def _learn(self, data: bytes) -> bool:
         """Take a message as template; False where it cannot be taken apart."""
         template = None
-        for definitions in self._candidates:
+        for definitions in self._candidates():
             try:
                 template = take_apart(data, self.name, definitions, self._encoding)
             except DecodeError as error:
                 self.reason = self.reason or str(error)
                 continue
-            self._candidates = [definitions]
+            self._tried, self._others = [definitions], iter(())
             break
         if template is None:
             return False

@@ -88,20 +88,19 @@ def _fields(types: Types, batch: Any) -> tuple[list[str], str]:
     """Return the numeric fields of a batch's first message, or why they are unknown."""
     if batch.channel.encoding not in ("cdr", "ros1"):
         return [], f"encoded as {batch.channel.encoding}"
+    reason = ""
     try:
-        candidates = types.candidates(batch.channel)
+        for definitions in types.candidates(batch.channel):
+            try:
+                template = take_apart(
+                    batch.message(0), batch.channel.type, definitions, batch.channel.encoding
+                )
+            except DecodeError as error:
+                reason = str(error)
+                continue
+            return list(fields_of(template)), ""
     except BagError:
         return [], "unknown type: give its .msg files"
-    reason = ""
-    for definitions in candidates:
-        try:
-            template = take_apart(
-                batch.message(0), batch.channel.type, definitions, batch.channel.encoding
-            )
-        except DecodeError as error:
-            reason = str(error)
-            continue
-        return list(fields_of(template)), ""
     return [], f"not as its type says: {reason}"
 
 

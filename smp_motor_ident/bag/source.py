@@ -34,6 +34,9 @@ _BAG_NAME = re.compile(rf"({'|'.join(map(re.escape, BAGS))})(\.\w+)?$")
 _NAMED_ONLY = (".json", ".txt", ".log", ".dat")
 """Tables that a folder may hold for other reasons: read only when named."""
 _DAMAGE = (ValueError, AttributeError, OSError, RecursionError, MemoryError)
+_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_DEEPEST = 50
+"""Levels of a metadata.yaml; a real one has six, and libyaml's loader dies of some ten thousand."""
 
 
 @dataclass
@@ -223,13 +226,24 @@ def _order(path: Path) -> tuple[str, int]:
     return match[1], int(match[2] or 0)
 
 
+def _loaded(text: str) -> Any:
+    """Return what a YAML text holds; what is nested too deep is refused before it is built."""
+    depth = 0
+    for event in yaml.parse(text, _LOADER):
+        depth += isinstance(event, yaml.CollectionStartEvent)
+        depth -= isinstance(event, yaml.CollectionEndEvent)
+        if depth > _DEEPEST:
+            raise yaml.YAMLError(f"nested more than {_DEEPEST} deep")
+    return yaml.load(text, _LOADER)
+
+
 def _bag(path: Path) -> Recording:
     """Return a bag by its metadata.yaml, of any version, as far as it can be trusted."""
     name = path.resolve().name
     bag = Recording(name, [])
     try:
         text = (path / "metadata.yaml").read_text("utf-8", "replace")
-        information = yaml.safe_load(text)["rosbag2_bagfile_information"]
+        information = _loaded(text)["rosbag2_bagfile_information"]
         listed = [Path(str(file)).name for file in information["relative_file_paths"]]
         bag.promised = _promise(information)
         bag.distribution = str(information.get("ros_distro") or "")

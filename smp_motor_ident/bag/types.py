@@ -57,6 +57,18 @@ def _references(fields: Fields) -> Iterator[str]:
             yield detail
 
 
+class _Store(dict[str, Fields]):
+    """Types of a distribution, loaded when one is asked for."""
+
+    def __init__(self, which: Stores) -> None:
+        super().__init__()
+        self._which = which
+
+    def get(self, name: str, default: Any = None) -> Any:
+        """Return a type's fields."""
+        return _store(self._which).get(name, default)
+
+
 @cache
 def _store(which: Stores) -> dict[str, Fields]:
     return {name: fields for name, (_, fields) in get_typestore(which).fielddefs.items()}
@@ -99,32 +111,32 @@ class Types:
         except (TypesysError, OSError, ValueError, RecursionError) as error:
             raise BagError(f"{file}: not a message definition ({_line(error)})") from None
 
-    def candidates(self, channel: Channel) -> list[Definitions]:
-        """Return what the channel's type may be, the most trusted first.
+    def candidates(self, channel: Channel) -> Iterator[Definitions]:
+        """Yield what the channel's type may be, the most trusted first; at least one.
 
         Several distributions changed messages without changing their name; where a bag
         does not define its types, the one that fits the bytes is right.
         """
-        name, reasons, found = channel.type, [], []
+        name, reasons = channel.type, []
+        stores = [_Store(which) for which in _STORES]
         if channel.definition:
             try:
                 own = _parse(channel.definition, name, channel.definition_format)
-                found.append(self._closed(name, [own, self._given, *map(_store, _STORES)]))
+                yield self._closed(name, [own, self._given, *stores])
             except _SPOILT as error:
                 reasons.append(f"the bag's own definition cannot be used: {_line(error)}")
         given: list[Mapping[str, Fields]] = [self._named(name), self._given]
-        known = [[_Ament(), _store(_STORES[0])], *([_store(s), _Ament()] for s in _STORES[1:])]
+        known = [[_Ament(), stores[0]], *([store, _Ament()] for store in stores[1:])]
         for sources in known:
             try:
-                found.append(self._closed(name, [*given, *sources]))
+                yield self._closed(name, [*given, *sources])
             except (TypesysError, BagError) as error:
                 reasons.append(_line(error))
-        if not found:
+        if len(reasons) == len(known) + bool(channel.definition):
             raise BagError(
                 f"{channel.topic}: the message type {name or '(none)'!r} is unknown "
                 f"({reasons[0]}); give its definition as .msg files"
             )
-        return found
 
     def _named(self, name: str) -> dict[str, Fields]:
         """Return a definition by the type's last name where the user's folder says no package."""
@@ -169,7 +181,7 @@ def definition(name: str) -> tuple[str, str]:
     """Return definition and REP-2011 hash of a message type, as rosbag2 writes them."""
     name = message_type(name)
     types = Types()
-    closed = types.candidates(Channel(0, name, name))[0]
+    closed = next(types.candidates(Channel(0, name, name)))
     texts = {key: _msg_text(key) for key in closed}
     if all(text is not None for text in texts.values()):
         whole = [texts.pop(name) or ""]

@@ -155,7 +155,7 @@ def on_cluster(
         ) from None
     call = cast(Callable[..., Any], distributed.as_completed)
     try:
-        client = distributed.Client(address, timeout="10s")
+        client = cast(Callable[..., Any], distributed.Client)(address, timeout="10s")
     except OSError as error:
         raise ParameterError(f"--scheduler {address}: nobody answers there ({error})") from None
     with client:

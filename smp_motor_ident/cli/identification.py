@@ -22,6 +22,7 @@ from smp_motor_ident.cli.identify import NAME
 from smp_motor_ident.cli.tables import console, estimate_table
 from smp_motor_ident.cli.topics import list_topics
 from smp_motor_ident.cli.workers import in_parallel
+from smp_motor_ident.compilation import load
 from smp_motor_ident.diagnosis.identifiability import what_next
 from smp_motor_ident.diagnosis.validation import split
 from smp_motor_ident.errors import (
@@ -86,8 +87,7 @@ def work(arguments: argparse.Namespace) -> int:
     paths = [Path(arguments.output) / name for name in OUTPUTS]
     check_free(paths, arguments.force)
     with progress(NAME, arguments.quiet) as say:
-        cold = not any(COMPILED.glob("*.nbi"))
-        if cold and not arguments.quiet:
+        if not arguments.quiet and not any(COMPILED.glob("*.nbi")):
             print(f"{NAME}: compiling for this machine, only this once ...", file=sys.stderr)
         say("reading")
         records = _read(arguments.bags, mapping, arguments.wheel)
@@ -99,7 +99,9 @@ def work(arguments: argparse.Namespace) -> int:
             wheel: partial(identify_wheel, group, kept.get(wheel, ()), arguments.model, fixed)
             for wheel, group in records.items()
         }
-        outcomes = in_parallel(jobs, say, cold)
+        if len(jobs) > 1:
+            load()
+        outcomes = in_parallel(jobs, say)
         if any(outcome.estimate for outcome in outcomes.values()):
             tunings = _tunings(outcomes, say) if arguments.tuning else {}
             say("writing the report")

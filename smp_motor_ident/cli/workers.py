@@ -20,15 +20,9 @@ _PR_SET_PDEATHSIG = 1
 _JOBS: dict[str, Callable[[Say], Any]] = {}
 
 
-def in_parallel(
-    jobs: Mapping[str, Callable[[Say], Result]], say: Say, cold: bool = False
-) -> dict[str, Result]:
+def in_parallel(jobs: Mapping[str, Callable[[Say], Result]], say: Say) -> dict[str, Result]:
     """Do every job, each in a process that is forked and so has what is loaded already."""
     cores = min(len(os.sched_getaffinity(0)), len(jobs))
-    if cold and cores > 1:
-        first, *others = jobs
-        done = {first: jobs[first](_named(say, first))}
-        return done | in_parallel({name: jobs[name] for name in others}, say)
     if cores < 2:
         return {name: job(_named(say, name)) for name, job in jobs.items()}
     say(f"estimating {', '.join(jobs)}")

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter1d
 
+from smp_motor_ident._compile import compiled
 from smp_motor_ident.diagnosis.limits import (
     BEAT_FLOOR,
     BEAT_JITTER,
@@ -131,46 +132,63 @@ def _lost(since: Array, number: Array, window: int) -> Array:
     return lost
 
 
+@compiled
 def _line(number: Array, value: Array) -> tuple[float, float]:
-    """Return offset and slope of the line of least sum under the points."""
-    blocks = np.array_split(np.arange(number.size), min(number.size, 500))
-    slope = (value[-1] - value[0]) / max(number[-1] - number[0], 1.0)
-    rest = value - slope * number
-    lowest = [int(block[np.argmin(rest[block])]) for block in blocks]
-    hull: list[int] = []
-    for k in lowest:
-        while len(hull) > 1:
-            i, j = hull[-2:]
+    """Return offset and slope of the line of least sum under the points.
+
+    It is the edge of their lower hull that lies above the mean number (Andrew's monotone chain).
+    """
+    n = number.size
+    hull = np.empty(n, dtype=np.int64)
+    size = 0
+    for k in range(n):
+        while size > 1:
+            i, j = hull[size - 2], hull[size - 1]
             run, rise = number[j] - number[i], value[j] - value[i]
             if rise * (number[k] - number[i]) < (value[k] - value[i]) * run:
                 break
-            hull.pop()
-        hull.append(k)
-    middle = float(np.mean(number))
-    edge = next((m for m in range(len(hull) - 1) if number[hull[m + 1]] >= middle), 0)
-    if len(hull) < 2:
-        return float(value[0]), float(slope)
-    i, j = hull[edge], hull[edge + 1]
-    slope = (value[j] - value[i]) / (number[j] - number[i])
-    return float(value[i] - slope * number[i]), float(slope)
+            size -= 1
+        hull[size] = k
+        size += 1
+    middle = number.sum() / n
+    edge = 0
+    while edge < size - 2 and number[hull[edge + 1]] < middle:
+        edge += 1
+    i, j = hull[edge], hull[min(edge + 1, size - 1)]
+    slope = (value[j] - value[i]) / max(number[j] - number[i], 1.0)
+    return value[i] - slope * number[i], slope
 
 
-def roughness(time: Integers, value: Array) -> float:
-    """Return how far samples lie from the line between their neighbours, without the worst."""
+def moves_on(beat: Beat, arrival: Integers, motion: Array) -> bool:
+    """Return whether a motion was sampled on the beat, rather than when its samples arrived.
+
+    A sample whose two instants lie clearly apart on the motion is nearer to the line between its
+    neighbours at the true one: a sign test over these samples decides.  Most samples arrive
+    punctually and tell nothing, and steps of an encoder are smooth on any regular time.
+    """
+    kept, put_back = _off_line(arrival, motion), _off_line(beat.time, motion)
+    good = np.isfinite(kept + put_back)
+    kept, put_back = kept[good], put_back[good]
+    if kept.size < _LEAST // 2:
+        return False
+    nearer = np.minimum(kept, put_back)
+    apart = np.abs(kept - put_back) > 2.0 * np.quantile(nearer, 0.95)
+    votes = np.sign(kept - put_back)[apart]
+    return bool(votes.sum() > SMOOTHER.value * np.sqrt(votes.size))
+
+
+def _off_line(time: Integers, value: Array) -> Array:
+    """Return how far samples lie from the line between their neighbours; NaN where none does."""
     since = (time - time[0]).astype(np.float64)
     span = since[2:] - since[:-2]
-    good = (span > 0) & np.isfinite(value[2:] + value[1:-1] + value[:-2])
-    if good.sum() < _LEAST // 2:
-        return np.inf
-    weight = (since[1:-1] - since[:-2])[good] / span[good]
-    middle = value[:-2][good] * (1 - weight) + value[2:][good] * weight
-    return float(np.mean(np.sort(np.abs(value[1:-1][good] - middle))[: int(0.95 * good.sum())]))
+    weight = (since[1:-1] - since[:-2]) / np.where(span > 0, span, np.nan)
+    return np.abs(value[1:-1] - value[:-2] * (1 - weight) - value[2:] * weight)
 
 
 def on_beat(record: Record) -> Record:
     """Return a record whose stamps came late on the beat of its sender; any other as it is.
 
-    Stamps of one's own may be the samples' instants: the smoother motion is the true one.
+    Stamps of one's own may be the samples' instants: the motion tells.
     """
     steps = np.diff(record.time)
     if np.ptp(steps) < BEAT_JITTER.value * float(np.median(steps)):
@@ -184,8 +202,7 @@ def on_beat(record: Record) -> Record:
     beat = find_beat(arrival)
     if beat is None:
         return record
-    kept, put_back = roughness(arrival, motion), roughness(beat.time, motion)
-    if not beat.repeated and not put_back <= SMOOTHER.value * kept:
+    if not beat.repeated and not moves_on(beat, arrival, motion):
         return record
     period, latency = beat.period * 1e-9, beat.latency * 1e-9
     finding = Finding(

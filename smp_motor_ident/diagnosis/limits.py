@@ -393,8 +393,8 @@ BEAT_LOST = Limit(
     "test_beat.py",
 )
 SMOOTHER = Limit(
-    0.9,
-    "1",
-    "cost: stamps are kept unless the motion is evidently smoother on the beat that they keep",
+    3.1,
+    "standard deviations",
+    "sign test of size 1e-3: stamps are kept unless the motion is evidently that of their beat",
     "test_beat.py",
 )

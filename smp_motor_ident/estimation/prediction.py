@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from smp_motor_ident.estimation.fit import Fit, solve
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.noise import NO_GAIN, NoiseModel
-from smp_motor_ident.likelihood.passes import Pass, evaluate, gather
+from smp_motor_ident.likelihood.passes import BLOCKS, Pass, evaluate, gather
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import Structure
 
@@ -37,10 +37,10 @@ def _predict(data: Experiments, fit: Fit, gain: bool, columns: int) -> Array:
     return predicted
 
 
-def again(data: Experiments, structure: Structure, fit: Fit) -> Pass:
+def again(data: Experiments, structure: Structure, fit: Fit, blocks: int = BLOCKS) -> Pass:
     """Return normal equations of experiments at a fit, with the coordinates of a structure."""
-    z = structure.complete(fit.z)
-    return evaluate(data, structure, z, fit.initial, fit.initial, fit.noise_model())
+    z, noise = structure.complete(fit.z), fit.noise_model()
+    return evaluate(data, structure, z, fit.initial, fit.initial, noise, blocks=blocks)
 
 
 def inverse(normal: Array, rcond: float = 1e-13) -> Array:
@@ -55,10 +55,21 @@ def information(data: Experiments, fit: Fit) -> Array:
     return again(data, fit.structure, fit).normal
 
 
-def one_step(data: Experiments, fit: Fit) -> Array:
-    """Return the Gauss-Newton step that other outputs on the same motion would ask for."""
-    here = again(data, fit.structure, fit)
-    return np.asarray(inverse(here.normal) @ here.gradient)
+def influence(data: Experiments, fit: Fit) -> Array:
+    """Return how an error of one in each output moves the coordinates, shape (n, f).
+
+    The motion stays the one that the fit predicts, so the Gauss-Newton step is a sum over the
+    samples; an error of a tenth of the noise asks for it, which no robust loss weighs otherwise.
+    """
+    predicted = simulate(data, fit)
+    error = 0.1 * float(np.sqrt(fit.noise[0, 0]))
+    output = np.where(np.isnan(data.output), np.nan, predicted[:, 1] + error)
+    current = data.current
+    if current.size:
+        current = np.where(np.isnan(current), np.nan, predicted[:, 2])
+    there = replace(data, output=output, current=current)
+    here = again(there, fit.structure, fit, blocks=data.size)
+    return np.asarray(here.scores @ inverse(here.normal) / error)
 
 
 def predicted_decrease(

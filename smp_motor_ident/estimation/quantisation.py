@@ -2,7 +2,7 @@
 
 Quantisation is not noise: where the motion repeats, so does its error, and more samples do
 not average it away.  The fitted motor is replayed with the counter's zero at random places;
-one Gauss-Newton step from each replay tells the estimate's error on this very motion.
+the Gauss-Newton step from each replay is the estimate's error on this very motion.
 Derivation: docs/derivations.md, section 9.
 """
 
@@ -36,12 +36,12 @@ def widened(data: Experiments, fit: Fit, seed: int = 0) -> Fit:
     counted, metered = (np.diag(share) for share in _shares(data, fit))
     expected = np.maximum(metered + counted, 1e-300)
     rng = np.random.default_rng(seed)
-    excess = np.ones(len(cov))
+    excess, influence = np.ones(len(cov)), prediction.influence(data, fit)
     # How the counter errs hangs on the motion itself, known as well as the estimate tells:
     # a first round shows how well that is, the second takes it from there.
     for _ in range(2):
         spread = REACH**2 * cov * np.sqrt(np.outer(excess, excess))
-        errors = _errors(data, fit, own, spread, rng)
+        errors = _counting_errors(data, fit, own, spread, rng) @ influence
         # Only what the counter does is replayed; what the current's noise does is known.
         second = metered + np.mean(np.square(errors), axis=0)
         excess = np.maximum(second / np.maximum(expected, np.diag(cov)), excess)
@@ -59,16 +59,12 @@ def _shares(data: Experiments, fit: Fit) -> tuple[Array, Array]:
     return inverse @ counter @ inverse, inverse @ (whole - counter) @ inverse
 
 
-def _errors(
+def _counting_errors(
     data: Experiments, fit: Fit, own: float, spread: Array, rng: np.random.Generator
 ) -> Array:
-    """Return the estimate's errors where nothing but the counter errs, shape (replays, f)."""
+    """Return what a counter adds to the angle of motions near the fit's, shape (replays, n)."""
     matrix = fit.structure.matrix()
-    predicted = prediction.simulate(data, fit)
     noise = np.sqrt(max(fit.noise[0, 0] - own, 0.0))
-    current = data.current
-    if current.size:
-        current = np.where(np.isnan(current), np.nan, predicted[:, 2])
     errors = []
     values, vectors = np.linalg.eigh(spread)
     half = vectors * np.sqrt(np.maximum(values, 0.0))
@@ -77,7 +73,5 @@ def _errors(
         angle = prediction.outputs(data, replace(fit, z=near))
         shown = angle + rng.uniform(0, data.quantum) + noise * rng.standard_normal(data.size)
         wrong = np.floor(shown / data.quantum) * data.quantum - angle
-        counts = predicted[:, 1] + wrong - wrong.mean()
-        counts[np.isnan(data.output)] = np.nan
-        errors.append(prediction.one_step(replace(data, output=counts, current=current), fit))
+        errors.append(wrong - wrong.mean())
     return np.array(errors)

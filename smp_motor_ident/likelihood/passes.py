@@ -84,8 +84,9 @@ def gather(
     noise: NoiseModel | None = None,
     predicted: Array | None = None,
     differentiate: bool = True,
+    blocks: int = BLOCKS,
 ) -> Sums:
-    """Run over the data once."""
+    """Run over the data once; scores are summed over about so many runs of samples."""
     noise = NoiseModel() if noise is None else noise
     par, internal = to_internal(z, structure.order)
     slope = (
@@ -93,7 +94,7 @@ def gather(
     )
     own = np.array(own_columns(data, structure) if differentiate else (), dtype=np.int64)
     p, segments = slope.shape[1] + own.size, len(data.starts) - 1
-    length = max(1, -(-data.size // BLOCKS))
+    length = max(1, -(-data.size // blocks))
     rows = data.size // length + 2 * segments + 2
     scores, owner = np.empty((rows, p)), np.empty(rows, dtype=np.int64)
     normal, gradient, cost = np.empty((segments, p, p)), np.empty((segments, p)), np.zeros(segments)
@@ -156,6 +157,7 @@ def evaluate(
     start: Array,
     noise: NoiseModel,
     priors: Sequence[tuple[Array, float]] = (),
+    blocks: int = BLOCKS,
 ) -> Pass:
     """Run, add what is known beforehand, and eliminate the initial states."""
     own = own_columns(data, structure)
@@ -167,7 +169,7 @@ def evaluate(
                    np.zeros((0, f)))  # fmt: skip
     if not np.isfinite(z).all():  # what predicts no number misses no measurement
         return nowhere
-    sums = gather(data, structure, z, initial, noise)
+    sums = gather(data, structure, z, initial, noise, blocks=blocks)
     total = float(sums.cost.sum())
     for row, miss in priors:
         common += np.outer(row, row)

@@ -122,6 +122,26 @@ def test_a_record_with_stamps_of_its_own_keeps_them() -> None:
     assert on_beat(record) is record
 
 
+def _stalled(seed: int, sampled_late: bool) -> Record:
+    """Return a record of a machine that stood still now and then: in its stamps, or its samples."""
+    rng = np.random.default_rng(seed)
+    beat = 5e-3 * np.arange(1600)
+    stamp = beat + 1e-4 * rng.random(beat.size)
+    stalls = np.sort(rng.choice(np.arange(10, 1590, 8), 24, replace=False))
+    stamp[stalls] += rng.uniform(2e-3, 4.8e-3, stalls.size)
+    at = stamp if sampled_late else beat
+    angle = 300 * np.sin(0.8 * at) + 20 * np.sin(7 * at)  # [rad], up to 330 rad/s
+    count = np.floor(angle * 48 / (2 * np.pi)).astype(np.int64)
+    return Record("m", stamp - stamp[0], np.sin(beat), count=count)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_samples_that_a_stall_made_late_keep_their_stamps_and_late_stamps_do_not(seed: int) -> None:
+    honest, arrived = _stalled(seed, True), _stalled(seed, False)
+    assert on_beat(honest) is honest
+    assert "arrival_beat" in [finding.code for finding in on_beat(arrived).findings]
+
+
 def test_how_sure_the_beat_is_of_its_period_is_how_it_scatters() -> None:
     found = []
     for seed in range(40):
