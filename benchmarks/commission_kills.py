@@ -2,6 +2,7 @@
 
     python benchmarks/commission_kills.py                   # fifty kills, seed of the day
     python benchmarks/commission_kills.py --kills 5 --seed 3
+    python benchmarks/commission_kills.py --kills 30 --resume   # and gone on with to the end
 
 Each time one of the tool's processes (the tool, ``excite``, ``record``) drawn at random is hit by
 SIGKILL, SIGTERM or SIGINT. What must hold: the motors get 0 V within 0.3 s of the last process
@@ -15,6 +16,8 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import json
+import math
 import os
 import random
 import signal
@@ -31,15 +34,21 @@ from lifecycle_msgs.srv import GetState
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "test")]
+
+from smp_motor_ident.report.document import read_identification  # noqa: E402
+
+Values = dict[str, tuple[float, float]]
 MARK = "SMP_CAMPAIGN"
 """Environment variable that the tool hands down to all that it starts."""
 WHEELS = ("front_left", "rear_left")
 QUIET = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "stdin": subprocess.DEVNULL}
-DURATION = 2.0
+DURATION = 4.0
 """Of each signal [s]; each of four is recorded by processes of its own, then the tool computes."""
-LASTS = {"commission": 60.0, "excite": DURATION + 2.0, "record": DURATION + 4.0}
+LASTS = {"commission": 80.0, "excite": DURATION + 2.0, "record": DURATION + 4.0}
 """Up to how long after its start a part is hit [s]."""
 PARTS = ("commission", "commission", "excite", "record")
+FAR = 4.0
+"""Joint standard deviations between the values of two runs that are not the same result."""
 SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 
 
@@ -69,7 +78,7 @@ class Campaign:
         from wheel_robot import WheelRobot
 
         self.robot, self.slack = WheelRobot(domain), slack
-        self.mark = ""
+        self.mark, self.folder = "", Path()
         self.robot.spin_for(2.0)
         if self.robot.node.count_publishers("/front_left/motor_description"):
             sys.exit(f"another robot runs in domain {domain}; choose another ROS_DOMAIN_ID")
@@ -127,15 +136,49 @@ class Campaign:
             self.robot.commands[wheel].clear()
         return ""
 
-    def kill(self, draw: random.Random) -> tuple[str, str]:
-        """Start the tool and kill a part of it; return which, and what did not hold."""
-        folder = Path(tempfile.mkdtemp(), "out")
+    def commission(self, *more: str) -> Any:
+        """Start the tool."""
         given = [part for wheel in WHEELS for part in ("--wheel", wheel)]
+        command = ["commission", "--output", str(self.folder), "--duration", str(DURATION), "--yes"]
         self.mark = uuid.uuid4().hex
-        tool = subprocess.Popen(
-            ["commission", "--output", str(folder), "--duration", str(DURATION), "--yes", *given],
+        return subprocess.Popen(
+            [*command, *given, *more],
             env={**os.environ, MARK: self.mark}, start_new_session=True, **QUIET,
         )  # type: ignore[call-overload]  # fmt: skip
+
+    def result(self, *more: str) -> tuple[str, Values]:
+        """Run the tool to its end; return what did not hold, and the values."""
+        tool = self.commission(*more)
+        if wrong := self.judge(tool, drives_no_more=False, within=400.0):
+            return wrong, {}
+        document = json.loads((self.folder / "commissioning.json").read_text())
+        if tool.returncode or not document["passed"]:
+            return f"exit {tool.returncode}: {document['verdict']}", {}
+        found = read_identification(self.folder / "identification")
+        return "", {
+            f"{wheel} {name}": (float(q.value), float(q.std))
+            for wheel, one in found.items()
+            for name, q in {**one.parameters, **one.combinations}.items()
+            if q.value is not None and q.std
+        }
+
+    def resumed(self, whole: Values) -> str:
+        """Go on with what was cut off; return how it differs from a run that was not."""
+        begun = (self.folder / "commissioning.json").is_file()
+        wrong, values = self.result(*["--resume"] * begun)
+        if wrong:
+            return f"resumed: {wrong}"
+        apart = {
+            name: abs(value - whole[name][0]) / math.hypot(std, whole[name][1])
+            for name, (value, std) in values.items()
+            if name in whole
+        }
+        return ", ".join(f"{name} {x:.1f} deviations off" for name, x in apart.items() if x > FAR)
+
+    def kill(self, draw: random.Random) -> tuple[str, str]:
+        """Start the tool and kill a part of it; return which, and what did not hold."""
+        self.folder = Path(tempfile.mkdtemp(), "out")
+        tool = self.commission()
         part, number = draw.choice(PARTS), draw.choice(SIGNALS)
         ended = lambda: tool.poll() is not None  # noqa: E731
         here = lambda: [p for p, args in family(self.mark).items() if plays(part, args)]  # noqa: E731
@@ -151,11 +194,11 @@ class Campaign:
         moment = f"{part} {'hit by' if found else 'ended before'} {number.name}"
         return moment, self.judge(tool, bool(found) and part == "excite")
 
-    def judge(self, tool: Any, drives_no_more: bool) -> str:
+    def judge(self, tool: Any, drives_no_more: bool, within: float = 180.0) -> str:
         at_rest = lambda: self.volts() == 0.0  # noqa: E731
         if drives_no_more and not self.until(at_rest, 0.3 + self.slack):
             return f"{12.0 * self.volts():.1f} V after 0.3 s"
-        if not self.until(lambda: tool.poll() is not None, 180.0):
+        if not self.until(lambda: tool.poll() is not None, within):
             return "the tool hangs"
         if not self.until(at_rest, 0.3 + self.slack):
             return f"{12.0 * self.volts():.1f} V 0.3 s after the tool's end"
@@ -175,6 +218,7 @@ def main() -> int:
     )
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--seed", type=int, default=int(time.time()) // 86400)
+    parser.add_argument("--resume", action="store_true", help="go on with each, to its end")
     parser.add_argument("--slack", type=float, default=0.5, help="more time [s]; default 0.5")
     given = parser.parse_args()
     domain = int(os.environ.setdefault("ROS_DOMAIN_ID", "105"))
@@ -183,8 +227,17 @@ def main() -> int:
     draw, failures = random.Random(given.seed), 0
     campaign = Campaign(domain, given.slack)
     try:
+        whole: Values = {}
+        if given.resume:
+            campaign.folder = Path(tempfile.mkdtemp(), "out")
+            wrong, whole = campaign.result()
+            if wrong:
+                sys.exit(f"a run that nobody cut off: {wrong}")
+            print(f"a run that nobody cut off: passed, {len(whole)} values", flush=True)
         for k in range(given.kills):
             moment, wrong = campaign.kill(draw)
+            if given.resume and not wrong:
+                wrong = campaign.resumed(whole)
             failures += bool(wrong)
             load = os.getloadavg()[0]
             print(f"{k + 1}: {moment}: {wrong or 'held'} (load {load:.1f})", flush=True)

@@ -298,11 +298,14 @@ def validated(estimates: Mapping[str, Estimate], fitted: Path, unseen: Path) -> 
 def _checked(arguments: argparse.Namespace) -> Path:
     """Return the folder, or refuse before anything starts."""
     folder = Path(arguments.output)
+    there = {path.name for path in folder.iterdir()} if folder.is_dir() else {folder.name}
+    if folder.exists() and there <= {"logs"}:  # of one that was killed before it began
+        return folder
     if folder.exists() and not arguments.resume:
         raise ParameterError(
             f"{folder}: exists already; choose another --output, or go on there with --resume"
         )
-    if arguments.resume and not (folder / protocol.NAME).is_file():
+    if arguments.resume and protocol.NAME not in there:
         raise ParameterError(f"{folder}: no commissioning was cut off there; leave out --resume")
     return folder
 
