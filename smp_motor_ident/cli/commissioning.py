@@ -26,6 +26,7 @@ from smp_motor_ident.cli.processes import ProcessError, Processes, connect
 from smp_motor_ident.cli.protocol import Protocol
 from smp_motor_ident.diagnosis import validation_run
 from smp_motor_ident.diagnosis.wheel_limits import OVER_SPEED
+from smp_motor_ident.diagnosis.winding import heated
 from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.estimation.simulation import simulate
 from smp_motor_ident.finding import Finding
@@ -187,6 +188,20 @@ def _record(session: Session, one: plan.Recording) -> None:
         robot.processes.stop("excite", "record")
     (robot.folder / one.folder).mkdir(exist_ok=True)
     draft.rename(robot.folder / one.folder / one.name)
+    made = session.protocol
+    earlier = [r for r in _recordings(arguments, made) if r != one and _is_kept(robot, r)]
+    made.stop(made.add(one.part, too_hot(robot.folder, earlier, one)))
+
+
+def too_hot(
+    folder: Path, earlier: Sequence[plan.Recording], last: plan.Recording
+) -> list[Finding]:
+    """Return which windings must cool before the next signal."""
+    before, now = (
+        bag.read_experiments([str(folder / r.folder / r.name) for r in some]) if some else {}
+        for some in (earlier, [last])
+    )
+    return [f for w in now if w in before for f in heated(w, before[w], now[w][0])]
 
 
 def _design(session: Session) -> verifying.Designed:

@@ -72,6 +72,12 @@ OVER_SPEED = Limit(
     "driver or another motor makes half",
     "test_commission_plan.py: a wheel that turns faster than its checks",
 )
+WINDING_RISE = Limit(
+    0.2,
+    "of the resistance in an earlier signal",
+    "51 K of copper above a room's 25 leave a margin to the 105 of insulation class A",
+    "test_winding.py: a winding that heats",
+)
 WANTED_ACCURACY = Limit(
     0.01,
     "relative standard deviation",

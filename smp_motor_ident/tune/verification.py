@@ -146,24 +146,29 @@ def arrival_delays(
     -------
     ndarray, shape (m,), [s]
         The ages, and the loop's usual delay at least, where the voltages are not the commands'
-        (measured ones, say).
+        (measured ones, say, or none inside a driver's dead zone).
     """
     (asked, ages, commands), (time, voltage) = answers, applied
     sent = asked + ages
     usual = np.maximum(ages, float(loop.get("usual_delay") or loop["delay"]))
     step = COMMAND_RESOLUTION.value * float(loop["supply_voltage"])
     effective = np.zeros(time.size, dtype=np.intp)
-    unknown = 0
+    strange, unknown = 0, np.zeros(time.size, dtype=np.bool_)
     for k in range(1, time.size):
         last = int(np.searchsorted(sent, time[k - 1], side="right"))
         alike = np.flatnonzero(np.abs(commands[effective[k - 1] : last] - voltage[k]) <= step)
-        unknown += last > 0 and not alike.size
+        newest = abs(commands[max(last - 1, 0)] - voltage[k]) <= step
+        strange += last > 0 and not alike.size
+        # No voltage may be an old command's, or a new one's in a dead zone.
+        unknown[k] = last > 0 and not newest and (not alike.size or abs(voltage[k]) <= step)
         effective[k] = effective[k - 1] + (alike[-1] if alike.size else 0)
-    if unknown > UNKNOWN * time.size:
+    if strange > UNKNOWN * time.size:
         return usual
     first = np.searchsorted(effective, np.arange(asked.size), side="left")
     begun = time[np.clip(first - 1, 0, time.size - 1)]
-    return np.where(first < time.size, np.maximum(ages, begun - asked), usual)
+    so_far = np.concatenate(([0], np.cumsum(unknown)))
+    seen = so_far[first] == so_far[np.minimum(np.searchsorted(time, sent, side="right"), first)]
+    return np.where((first < time.size) & seen, np.maximum(ages, begun - asked), usual)
 
 
 def predicted(

@@ -70,7 +70,7 @@ class Steps:
         self.folder, self.done = folder, list[str]()
         self.cut, self.fuel = "", 100  # moves that a run completes before it is cut off
         self.left = 0
-        self.found = tuple[Finding, ...]()
+        self.found, self.heat = tuple[Finding, ...](), list[Finding]()
         self.bounds, self.sent = dict[str, object](), list[Any]()
         self.more: plan.Recording | None = None
         monkeypatch.setattr(plan, "further", lambda *_: self.more)
@@ -85,6 +85,7 @@ class Steps:
             monkeypatch.setattr(owner, called, partial(self.step, name))
         monkeypatch.setattr(steps, "tune_wheels", self.tune)
         monkeypatch.setattr(checking, "check_wheels", self.check)
+        monkeypatch.setattr(commissioning, "too_hot", lambda *_: self.heat)
 
     def connect(self, *_: object) -> Client:
         self.left = self.fuel
@@ -178,6 +179,19 @@ def test_a_wrong_wire_stops_before_the_excitation_unless_it_is_accepted(
     assert main([*given, "--resume", "--accept", "reversed"]) == 0
     page = (robot.folder / "report.html").read_text()
     assert "Passed." in page and "accepted" in page
+
+
+def test_a_hot_winding_ends_it_before_the_next_signal_and_goes_on_when_it_is_cool(
+    robot: Steps,
+) -> None:
+    given = ["--output", str(robot.folder), "--yes"]
+    robot.heat = [Finding("winding_hot", "refused", "left: 60 K hotter", {"wheel": "left"}, "wait")]
+    assert main(given) != 0
+    assert robot.done == ["check", "excite"]
+    assert "60 K hotter" in (robot.folder / "report.html").read_text()
+    robot.heat = []
+    assert main([*given, "--resume"]) == 0
+    assert robot.done.count("excite") == 4
 
 
 def test_what_ends_it_otherwise_stands_in_its_page(

@@ -1,0 +1,94 @@
+"""The temperature of a winding by its resistance, from one recording to the next.
+
+Over a block of time nothing is differentiated:
+
+    int v dt = R int i dt + K dtheta + L di + c T,
+
+so that a regression over the blocks of a recording gives R, whatever the friction is.  How the
+current runs between its samples, while the held voltage steps, is a share of the change of both
+over the block.  That change is as noisy as the current, so the sums are weighed with what its
+noise is not in: voltage, angle and the change of speed (instrumental variables).  Copper's
+resistance grows by 0.39 % a kelvin; the driver's part of it and the brushes' stay.
+
+References
+----------
+L. Ljung, *System Identification*, 2nd ed. (1999), section 7.6 for the instruments.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from smp_motor_ident.diagnosis.wheel_limits import WINDING_RISE
+from smp_motor_ident.estimation.monitor import BLOCK, COPPER
+from smp_motor_ident.finding import Finding
+from smp_motor_ident.record import Record
+
+SURE = 3.0
+"""Standard deviations by which the limit must be exceeded."""
+
+
+class Resistance(NamedTuple):
+    """Of a winding and its driver [ohm]."""
+
+    value: float
+    std: float
+
+
+def resistance(record: Record) -> Resistance | None:
+    """Return what a recording shows; None where it has no current or too little moves."""
+    motion = record.count if record.position is None else record.position
+    if record.current is None or motion is None:
+        return None
+    dt = np.diff(record.time)
+    current, voltage = record.current, record.voltage
+    turned = np.diff(np.asarray(motion, dtype=np.float64))
+    block = (record.time[1:] / BLOCK).astype(np.int64) * len(record.starts)
+    block += np.searchsorted(record.starts, np.arange(1, len(record)), side="right")
+    speeding = np.diff(turned / dt, prepend=0.0)
+    changes = np.diff(current), np.diff(voltage)
+    rows = np.stack([voltage[1:] * dt, current[1:] * dt, turned, *changes, dt, speeding])
+    good = np.isfinite(rows).all(axis=0)
+    good[np.asarray(record.starts[1:], dtype=np.int64) - 1] = False
+    sums = np.stack([np.bincount(block[good], weights=row[good]) for row in rows])
+    volts, amps, angle, surge, step, spent, run_up = sums[:, sums[5] > 0.5 * BLOCK]
+    table = np.stack([amps, angle, surge, step, spent])
+    known = np.stack([volts, angle, run_up, step, spent])  # nothing of the current's noise is in it
+    spare = volts.size - len(table)
+    if spare < len(table):
+        return None
+    known /= np.maximum(np.linalg.norm(known, axis=1), 1e-300)[:, None]
+    inverse = np.linalg.pinv(known @ table.T)
+    solved = inverse @ (known @ volts)
+    noise = float(np.square(volts - solved @ table).sum()) / spare
+    spread = inverse @ (known @ known.T) @ inverse.T
+    return Resistance(float(solved[0]), math.sqrt(noise * spread[0, 0]))
+
+
+def heated(wheel: str, earlier: Sequence[Record], last: Record) -> list[Finding]:
+    """Return whether a winding is too much hotter than in an earlier recording.
+
+    That is the one of them which knows the resistance best.
+    """
+    known = [r for one in earlier if (r := resistance(one)) is not None and r.value > 0]
+    now = resistance(last)
+    if not known or now is None:
+        return []
+    cold = min(known, key=lambda r: r.std / r.value)
+    rise = now.value / cold.value - 1.0
+    std = math.hypot((1.0 + rise) * cold.std, now.std) / cold.value
+    if rise - SURE * std <= WINDING_RISE.value:
+        return []
+    warmer = rise / COPPER
+    return [Finding(
+        "winding_hot", "refused",
+        f"{wheel}: its resistance rose by {100 * rise:.0f} % from signal to signal: the winding "
+        f"is {warmer:.0f} K hotter",
+        {"wheel": wheel, "rise": rise, "warmer": warmer},
+        "let it cool and go on with --resume; see that the wheel turns freely, or begin anew "
+        "with a smaller --amplitude",
+    )]  # fmt: skip
