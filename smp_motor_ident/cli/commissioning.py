@@ -193,9 +193,7 @@ def _record(session: Session, one: plan.Recording) -> None:
     made.stop(made.add(one.part, too_hot(robot.folder, earlier, one)))
 
 
-def too_hot(
-    folder: Path, earlier: Sequence[plan.Recording], last: plan.Recording
-) -> list[Finding]:
+def too_hot(folder: Path, earlier: Sequence[plan.Recording], last: plan.Recording) -> list[Finding]:
     """Return which windings must cool before the next signal."""
     before, now = (
         bag.read_experiments([str(folder / r.folder / r.name) for r in some]) if some else {}

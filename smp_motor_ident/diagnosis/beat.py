@@ -182,7 +182,8 @@ def _off_line(time: Integers, value: Array) -> Array:
     since = (time - time[0]).astype(np.float64)
     span = since[2:] - since[:-2]
     weight = (since[1:-1] - since[:-2]) / np.where(span > 0, span, np.nan)
-    return np.abs(value[1:-1] - value[:-2] * (1 - weight) - value[2:] * weight)
+    off = np.abs(value[1:-1] - value[:-2] * (1 - weight) - value[2:] * weight)
+    return np.asarray(off)
 
 
 def on_beat(record: Record) -> Record:

@@ -256,26 +256,49 @@ def supply(robot: Robot) -> list[Finding]:
 
 
 def sisters(robot: Robot) -> list[Finding]:
-    """No wheel is held back, or carries, far more than its sisters."""
-    found = []
-    for name, words in (("friction", "friction"), ("coast", "time to come to rest")):
-        values = {w: getattr(one, name) for w, one in robot.figures.items()}
-        if name == "friction":  # which is below what starts the wheel, where nothing else is known
-            values = {w: v if v > 0 else robot.figures[w].breakaway for w, v in values.items()}
-        values = {w: v for w, v in values.items() if v > 0}
-        for wheel, value in values.items():
-            others = [v for w, v in values.items() if w != wheel]
-            usual = float(np.median(others)) if len(others) > 1 else math.nan
-            if value > SISTERS.value * usual:
-                found.append(Finding(
-                    "unlike_sisters", "refused",
-                    f"{wheel}: its {words} is {value / usual:.3g} times its sisters': it drags, "
-                    "brakes, carries something or is another motor",
-                    {"wheel": wheel, "value": value, "sisters": usual},
-                    "turn it by hand beside the others: free what rubs, lift what touches the "
-                    "ground; --accept unlike_sisters where it is meant to differ",
-                ))  # fmt: skip
-    return found
+    """No wheel is held back far more than its sisters; one that coasts far longer is told of.
+
+    What drags heats its motor and tears at the robot.  A motor of another time constant is
+    identified and tuned like any other.
+    """
+    figures = robot.figures
+    # Friction is below what starts the wheel, where nothing else is known.
+    held = {w: one.friction if one.friction > 0 else one.breakaway for w, one in figures.items()}
+    drags = (
+        Finding(
+            "unlike_sisters", "refused",
+            f"{wheel}: its friction is {ratio:.3g} times its sisters': it drags, brakes, or is "
+            "another motor",
+            {"wheel": wheel, "value": held[wheel], "sisters": held[wheel] / ratio},
+            "turn it by hand beside the others: free what rubs, lift what touches the ground; "
+            "--accept unlike_sisters where it is meant to differ",
+        )
+        for wheel, ratio in _beside_sisters(held)
+    )  # fmt: skip
+    coast = {w: one.coast for w, one in figures.items()}
+    carries = (
+        Finding(
+            "coasts_longer", "warning",
+            f"{wheel}: its time to come to rest is {ratio:.3g} times its sisters': it carries "
+            "something, touches the ground, or is another motor",
+            {"wheel": wheel, "value": coast[wheel], "sisters": coast[wheel] / ratio},
+            "look whether it is off the ground and bare",
+        )
+        for wheel, ratio in _beside_sisters(coast)
+    )  # fmt: skip
+    return [*drags, *carries]
+
+
+def _beside_sisters(values: Mapping[str, float]) -> list[tuple[str, float]]:
+    """Return the wheels that exceed the median of the others too far, and how many times."""
+    known = {w: v for w, v in values.items() if v > 0}
+    out = []
+    for wheel, value in known.items():
+        others = [v for w, v in known.items() if w != wheel]
+        usual = float(np.median(others)) if len(others) > 1 else math.nan
+        if value > SISTERS.value * usual:
+            out.append((wheel, value / usual))
+    return out
 
 
 CHECKS: tuple[Check, ...] = (feedback, motion, signs, gear_ratio, dead_zone, supply, sisters)

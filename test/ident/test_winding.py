@@ -15,13 +15,13 @@ R, L, K, J, B, TC = 3.2, 2e-3, 0.03, 1.4e-5, 5.5e-5, 2e-3
 
 
 def signal(rise: float, seed: int, friction: float = TC) -> Record:
-    """Return six seconds of a sine that a motor follows whose resistance has risen."""
+    """Return six seconds of three tones that a motor follows whose resistance has risen."""
     rng = np.random.default_rng(seed)
     time = 5e-3 * np.arange(1200)
-    volts = 6.0 * np.sin(2 * np.pi * 0.7 * time)
+    volts = sum(2.0 * np.sin(2 * np.pi * f * time + f) for f in (0.3, 0.7, 2.9))
     out = simulate(time, volts, R * (1 + rise), L, K, J, B, friction, np.zeros(time.size), 50)
     count = np.floor(out[:, 2] * 500 / (2 * np.pi)).astype(np.int64)
-    current = out[:, 0] + 0.02 * rng.standard_normal(time.size)
+    current = out[:, 0] + 0.005 * rng.standard_normal(time.size)
     return Record("m", time, volts, current, count=count)
 
 
@@ -33,12 +33,12 @@ def test_the_resistance_of_a_recording_is_the_windings_whatever_the_friction(
     found = resistance(signal(0.1, seed, friction))
     assert found is not None
     assert found.value == pytest.approx(1.1 * R, abs=4 * found.std)
-    assert found.std < 0.02 * R
+    assert found.std < 0.03 * R
 
 
 @pytest.mark.parametrize("rise", [0.3, 0.5])
 def test_a_winding_that_heats_ends_the_commissioning(rise: float) -> None:
-    (finding,) = heated("left", signal(0.0, 1), signal(rise, 2))
+    (finding,) = heated("left", [signal(0.0, 1)], signal(rise, 2))
     assert finding.code == "winding_hot" and finding.severity == "refused"
     assert finding.evidence["warmer"] == pytest.approx(rise / 0.00393, rel=0.1)
     assert "--resume" in finding.advice
@@ -46,13 +46,13 @@ def test_a_winding_that_heats_ends_the_commissioning(rise: float) -> None:
 
 @pytest.mark.parametrize("seed", range(20))
 def test_a_winding_that_warms_as_motors_do_does_not(seed: int) -> None:
-    assert not heated("left", signal(0.0, seed), signal(0.1, 100 + seed))
+    assert not heated("left", [signal(0.0, seed)], signal(0.1, 100 + seed))
 
 
 def test_without_a_current_nothing_is_known() -> None:
     bare = replace(signal(0.5, 1), current=None)
     assert resistance(bare) is None
-    assert not heated("left", signal(0.0, 1), bare)
+    assert not heated("left", [signal(0.0, 1)], bare)
 
 
 def test_segments_and_lost_samples_are_left_out() -> None:
