@@ -27,6 +27,7 @@ import tempfile
 import time
 import uuid
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,12 @@ PARTS = ("commission", "commission", "excite", "record")
 FAR = 4.0
 """Joint standard deviations between the values of two runs that are not the same result."""
 SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
+
+
+def as_firmware() -> None:
+    """Run before this machine's other work, as firmware and real-time nodes do."""
+    with contextlib.suppress(PermissionError):
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
 
 
 def family(mark: str) -> dict[int, list[str]]:
@@ -82,10 +89,11 @@ class Campaign:
         self.robot.spin_for(2.0)
         if self.robot.node.count_publishers("/front_left/motor_description"):
             sys.exit(f"another robot runs in domain {domain}; choose another ROS_DOMAIN_ID")
-        self.processes = [subprocess.Popen(["motor_plant"], **QUIET)]  # type: ignore[call-overload]
+        start = partial(subprocess.Popen, preexec_fn=as_firmware, **QUIET)
+        self.processes = [start(["motor_plant"])]
         for wheel in WHEELS:
             command = ["wheel_pid", "--ros-args", "-r", f"__ns:=/{wheel}", "-p", "p:=2.0"]
-            self.processes.append(subprocess.Popen(command, **QUIET))  # type: ignore[call-overload]
+            self.processes.append(start(command))
         self.clients = {
             w: self.robot.node.create_client(GetState, f"/{w}/wheel_pid/get_state") for w in WHEELS
         }

@@ -150,6 +150,17 @@ def test_how_long_a_command_waited_is_seen_in_the_voltages_that_were_applied() -
     assert np.array_equal(slower, np.full(time.size, STEP))
 
 
+def test_a_command_inside_the_dead_zone_of_a_driver_has_not_waited() -> None:
+    time = STEP * np.arange(400)
+    commands, ages = 6.0 * np.sin(2 * np.pi * time), np.full(time.size, 0.001)
+    commands[:60] = 0.0  # stands, then moves; the zone of 1.5 V is crossed four times
+    applied = np.where(np.abs(commands) < 1.5, 0.0, commands)
+    voltage = np.concatenate(([0.0], applied[:-1]))
+    loop = {"delay": 0.0, "supply_voltage": 12.0}
+    delays = v.arrival_delays((time, ages, commands), (time, voltage), loop)
+    assert delays[1:].max() <= STEP + 1e-9
+
+
 def test_a_drive_that_its_computer_slowed_is_within_its_bands_and_says_so(designed: Design) -> None:
     slow = drive(designed, wait=0.03)
     assert slow.reading.overshoot > 10.0
