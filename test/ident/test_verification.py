@@ -151,9 +151,11 @@ def test_how_long_a_command_waited_is_seen_in_the_voltages_that_were_applied() -
 
 
 def test_a_command_inside_the_dead_zone_of_a_driver_has_not_waited() -> None:
-    time = STEP * np.arange(400)
-    commands, ages = 6.0 * np.sin(2 * np.pi * time), np.full(time.size, 0.001)
-    commands[:60] = 0.0  # stands, then moves; the zone of 1.5 V is crossed four times
+    # It drives, brakes, creeps up inside a zone of 1.5 V, and drives on.
+    parts = (0.0, 60), (5.0, 100), (0.0, 1), (0.5, 100), (5.0, 100)
+    commands = np.concatenate([np.full(lasts, volts) for volts, lasts in parts])
+    commands += 1e-2 * np.arange(commands.size) * (commands != 0.0)
+    time, ages = STEP * np.arange(commands.size), np.full(commands.size, 0.001)
     applied = np.where(np.abs(commands) < 1.5, 0.0, commands)
     voltage = np.concatenate(([0.0], applied[:-1]))
     loop = {"delay": 0.0, "supply_voltage": 12.0}
