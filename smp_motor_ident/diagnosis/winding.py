@@ -32,6 +32,10 @@ SURE = 3.0
 """Standard deviations by which the limit must be exceeded."""
 
 
+SEPARABLE = 1e6
+"""Condition number beyond which the columns of a recording are one and the same."""
+
+
 class Resistance(NamedTuple):
     """Of a winding and its driver [ohm]."""
 
@@ -55,18 +59,24 @@ def resistance(record: Record) -> Resistance | None:
     good = np.isfinite(rows).all(axis=0)
     good[np.asarray(record.starts[1:], dtype=np.int64) - 1] = False
     sums = np.stack([np.bincount(block[good], weights=row[good]) for row in rows])
-    volts, amps, angle, surge, step, spent, run_up = sums[:, sums[5] > 0.5 * BLOCK]
+    moves = (sums[5] > 0.5 * BLOCK) & (sums[2] != 0.0)
+    volts, amps, angle, surge, step, spent, run_up = sums[:, moves]
     table = np.stack([amps, angle, surge, step, spent])
     known = np.stack([volts, angle, run_up, step, spent])  # nothing of the current's noise is in it
     spare = volts.size - len(table)
-    if spare < len(table):
+    sizes, tools = np.linalg.norm(table, axis=1), np.linalg.norm(known, axis=1)
+    if spare < len(table) or not (sizes > 0).all() or not (tools > 0).all():
         return None
-    known /= np.maximum(np.linalg.norm(known, axis=1), 1e-300)[:, None]
-    inverse = np.linalg.pinv(known @ table.T)
-    solved = inverse @ (known @ volts)
+    normal = (known / tools[:, None]) @ (table / sizes[:, None]).T
+    if np.linalg.cond(normal) > SEPARABLE:
+        return None
+    inverse = np.linalg.inv(normal) / sizes[:, None]
+    solved = inverse @ (known / tools[:, None] @ volts)
     noise = float(np.square(volts - solved @ table).sum()) / spare
-    spread = inverse @ (known @ known.T) @ inverse.T
-    return Resistance(float(solved[0]), math.sqrt(noise * spread[0, 0]))
+    alike = known @ known.T / np.outer(tools, tools)
+    return Resistance(
+        float(solved[0]), math.sqrt(noise * float((inverse @ alike @ inverse.T)[0, 0]))
+    )
 
 
 def heated(wheel: str, earlier: Sequence[Record], last: Record) -> list[Finding]:

@@ -33,6 +33,11 @@ OPEN = 0.02  # standard deviation of ln L/R or ln R above which other starts are
 WINDING = 0.2  # of a sample: a shorter L/R has settled to a hundredth when the current is read
 
 
+MOVES = 0.5
+"""Largest share of the voltage that a start lets friction take: a motor that never moves shows a
+descent no way out."""
+
+
 def candidates(data: Experiments, structure: Structure) -> list[Array]:
     """Return starting coordinates for a structure, from linear regressions."""
     found = start.current_candidates(data) if structure.current else []
@@ -44,9 +49,12 @@ def candidates(data: Experiments, structure: Structure) -> list[Array]:
             z[models.A2] = 2 * z[models.A1] - z[models.A0] - np.log(20)
             z[models.TE] = z[models.A2] - z[models.A1]
             found.append(z)
+    most = MOVES * float(np.abs(data.hold_value).max(initial=0.0))
     for z in found:
         if structure.window:
             z[models.WINDOW] = 1.02 * data.step
+        for friction in (models.VC_PLUS, models.VC_MINUS):  # what moves is held by less
+            z[friction] = np.clip(z[friction], -most, most)
     return found
 
 

@@ -139,18 +139,23 @@ def current_candidates(data: Experiments) -> list[Array]:
         electric, mechanic = np.zeros((4, 7)), np.zeros((4, 7))
         for u in grids:
             _both_equations(u, cutoff, data.kind == rc.ANGLE, electric, mechanic)
-        el, me = solved(electric), solved(mechanic)
-        inductance, r, k = el[:3]
+        inductance, r, k = solved(electric)[:3]
         if not (r > 0 and k > 0):
             continue
         inductance = inductance if inductance > 0 else 1e-3 * r * data.step
-        j, b, tc = k * me[0], max(k * me[1], 0.0), max(k * me[2], 0.0)
-        if not j > 0:
-            continue
-        z = models.from_physical(r, inductance, k, j, b, tc)
-        z[models.OFFSET] = 0.0
-        out.append(z)
+        # One way, friction and the current's offset are one column: the second is without it.
+        bare = np.delete(np.delete(mechanic, SIGN, 0), SIGN, 1)
+        for slope, damping, drag in (solved(mechanic)[:3], (*solved(bare)[:2], 0.0)):
+            if slope > 0:
+                b, tc = k * max(damping, 0.0), k * max(drag, 0.0)
+                z = models.from_physical(r, inductance, k, k * slope, b, tc)
+                z[models.OFFSET] = 0.0
+                out.append(z)
     return out
+
+
+SIGN = 2
+"""Place of the direction's sign among the columns of the mechanical equation."""
 
 
 def _both_equations(
