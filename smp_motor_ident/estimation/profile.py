@@ -53,14 +53,20 @@ def profiled(data: Experiments, fit: Fit, options: Options) -> Fit:
         if coordinate not in free:
             continue
         i = free.index(coordinate)
+        # Coloured residuals and repeating counts scale the deviance as they do variances.
+        target = RISE * float((std[i] / white[i]) ** 2)
         if coordinate == models.VC_PLUS and one_level(data, fit):
             ends = _range(data, fit, coordinate)
-            if fit.structure.order == 2 and not fit.structure.current:
-                # A winding first builds up the torque that breaks loose: from rest that is late.
+            # A winding first builds up the torque that breaks loose: from rest that is late,
+            # and where its current is measured it tells friction.
+            if fit.structure.current:
+                found.append(_followed(data, fit, coordinate, float(std[i]), target, options))
+            elif fit.structure.order == 2:
                 both = [_fixed_at(data, fit, coordinate, f, options).z for f in ends]
+                found.append(Profile(coordinate, (both[0], both[1])))
             else:
                 both = [rubbing(data, fit, f)[0] for f in ends]
-            found.append(Profile(coordinate, (both[0], both[1])))
+                found.append(Profile(coordinate, (both[0], both[1])))
             # The others are followed at this friction: along it the motors are all alike.
             alike = replace(fit, profiles=tuple(found))
             std = np.sqrt(np.maximum(np.diag(alike.conditional()), 0.0))
@@ -72,8 +78,6 @@ def profiled(data: Experiments, fit: Fit, options: Options) -> Fit:
         loose = std[i] > PROFILE_FROM.value * (1.0 if coordinate == models.A2 else abs(value))
         if not loose and (coordinate == models.A2 or value > NEAR * std[i]):
             continue
-        # Coloured residuals and repeating counts scale the deviance as they do variances.
-        target = RISE * float((std[i] / white[i]) ** 2)
         found.append(_followed(data, held, coordinate, float(std[i]), target, options))
     return replace(fit, profiles=tuple(found))
 

@@ -1,6 +1,7 @@
 """One step from rest with the current measured: what L/R of next to nothing would hide."""
 
 import numpy as np
+import pytest
 from independent import simulate
 
 from smp_motor_ident.estimate import estimate
@@ -42,3 +43,39 @@ def test_a_step_with_current_is_known_where_its_first_samples_tell_it():
         for name in ("resistance", "inductance", "motor_constant", "time_constant"):
             assert every[name].value is not None, (seed, name)
             assert abs(every[name].value / TRUTH[name] - 1) < 0.1, (seed, name)
+
+
+def _random_step(seed: int) -> tuple[Record, dict[str, float]]:
+    """Return a step either way, 0.4 s after the beginning, of a random motor at 50 to 500 Hz."""
+    rng = np.random.default_rng(seed)
+    rate, tau = float(rng.choice([50, 100, 200, 500])), rng.uniform(0.05, 0.25)
+    r, k, friction = rng.uniform(1, 6), rng.uniform(0.01, 0.06), rng.uniform(0.2, 0.8)
+    j, el, b = tau * k * k / r, r * tau * rng.uniform(0.01, 0.05), 0.1 * k * k / r
+    supply, sign = float(rng.choice([4, 6, 9])), float(rng.choice([-1, 1]))
+    turn, t = int(rng.choice([28, 64, 500])), np.arange(int(4 * rate)) / rate
+    v = np.where(t > 0.4, sign * supply, 0.0)
+    substeps = int(max(20, 20_000 / rate))
+    out = simulate(t, v, r, el, k, j, b, friction * k / r, np.zeros(t.size), substeps)
+    count = np.floor(out[:, 2] * turn / (2 * np.pi) + rng.uniform()).astype(np.int64)
+    current = out[:, 0] + 0.01 * supply / r * rng.standard_normal(t.size)
+    stiff = r * b + k * k
+    true = {
+        "dc_gain": k / stiff, "time_constant": (r * j + el * b) / stiff, "static_voltage": friction,
+        "time_constant_product": el * j / stiff, "resistance": r, "inductance": el,
+        "motor_constant": k, "inertia": j,
+    }  # fmt: skip
+    hardware = Hardware(1.0, float(turn), 0, 12.0)
+    return Record("motor", t, v, current, count=count, hardware=hardware), true
+
+
+@pytest.mark.parametrize("seed", [3, 6, 12, 14, 16, 19, 22, 31])
+def test_what_friction_and_winding_share_of_a_step_is_in_their_intervals(seed: int) -> None:
+    # From rest the current must first hold what friction does: both are late.
+    record, true = _random_step(seed)
+    found = estimate(record)
+    for name, q in {**found.combinations, **found.parameters}.items():
+        if name in true and q.value is not None and q.std:
+            # 5 standard deviations and 2 %: what is wrong silently.
+            assert abs(q.value - true[name]) < max(5 * q.std, 0.02 * true[name]), name
+    tau = found.combinations["time_constant"]
+    assert tau.value is not None and abs(tau.value / true["time_constant"] - 1) < 0.1
