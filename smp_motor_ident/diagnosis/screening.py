@@ -116,15 +116,30 @@ def _excitation(records: Sequence[Record], where: str) -> None:
         )
 
 
+LEAST_MEANS = 12
+"""Of a record, from which their scatter is known."""
+
+
 def _starts(record: Record) -> bool:
-    """Tell whether a speed rises under a constant voltage: a step before the first row."""
+    """Tell whether a speed rises under a constant voltage: a step before the first row.
+
+    It rises over few samples or many, so means over several lengths are looked at; their noise is
+    what those of the last third scatter.
+    """
     speed = measured_speed(record)
-    speed = np.abs(speed[np.isfinite(speed)])
-    tenth = max(speed.size // 10, 1)
-    steady = float(np.mean(speed[-tenth:]))
-    scatter = float(np.std(speed[-tenth:]))
-    first = float(np.mean(speed[: max(tenth // 10, 3)]))
-    return bool(speed.size >= FEWEST.value and steady - first > max(0.2 * steady, 6 * scatter))
+    speed = speed[np.isfinite(speed)]
+    if speed.size < FEWEST.value:
+        return False
+    length = 1
+    while speed.size // length >= LEAST_MEANS:
+        means = speed[: speed.size // length * length].reshape(-1, length).mean(axis=1)
+        last = means[-(len(means) // 3) :]
+        steady = float(np.mean(last))
+        rise = (steady - float(means[0])) * np.sign(steady)
+        if rise > max(0.2 * abs(steady), 6 * float(np.std(last, ddof=1))):
+            return True
+        length *= 2
+    return False
 
 
 def measured_speed(record: Record) -> Array:

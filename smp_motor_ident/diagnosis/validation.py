@@ -18,6 +18,7 @@ from smp_motor_ident.result import Estimate
 
 Array = NDArray[np.float64]
 
+SMOOTH = 0.1  # of an angle's own roughness: what the motion may have of it
 COARSE = 0.02  # of the speed's scatter: what a counter's resolution may add to it
 
 
@@ -54,16 +55,27 @@ def speed_fit(
 
 
 def within_resolution(data: Experiments, fit: Fit) -> bool:
-    """Tell whether the free run follows a counter as closely as its rounding lets anything."""
-    own = UNEXPLAINED.value * data.quantum**2 / 12
-    return data.kind == rc.ANGLE and fit.noise_ratio == 0 and bool(fit.noise[0, 0] < own)
+    """Tell whether the free run follows an angle as closely as its sensor lets anything.
+
+    That is a counter's rounding, or the scatter of an angle whose motion is smooth beside it.
+    """
+    if data.kind != rc.ANGLE or fit.noise_ratio > 0:
+        return False
+    moved = _roughness(prediction.outputs(data, fit))
+    scatter = _roughness(data.output)
+    own = max(data.quantum**2 / 12, scatter if moved < SMOOTH * scatter else 0.0)
+    return bool(fit.noise[0, 0] < UNEXPLAINED.value * own)
+
+
+def _roughness(angle: Array) -> float:
+    """Return the variance of what is white in an angle, by its fourth differences: 1 4 6 4 1."""
+    y = angle[np.isfinite(angle)]
+    return float(np.diff(y, n=4).var() / 70) if y.size > 8 else 0.0
 
 
 def _lag(data: Experiments, angle: Array) -> int:
     """Return over how many samples angles tell a speed, and not mostly their resolution."""
-    y = data.output[np.isfinite(data.output)]
-    rough = np.diff(y, n=4).var() / 70 if y.size > 8 else 0.0  # fourth differences: 1 4 6 4 1
-    noise = np.sqrt(2 * max(rough, data.quantum**2 / 12))
+    noise = np.sqrt(2 * max(_roughness(data.output), data.quantum**2 / 12))
     first = float(np.nanstd(_means(data, angle, 1)))
     lag = 1
     while noise / (lag * data.step) > COARSE * first and 8 * lag < data.size:

@@ -6,10 +6,12 @@ Derivation: docs/derivations.md, section 10.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
+from smp_motor_ident.diagnosis.limits import METER
 from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.regression import (
@@ -87,25 +89,42 @@ def speed_candidates(
     Least squares on ``v = a2 w'' + a1 w' + a0 w + Vc sign(w)`` after filtering, for several
     cut-offs, with and without friction, each refined by one instrumental-variable step.
     """
-    grids = [_late(u, lag) for u in _grids(data)]
-    if not grids:
-        return []
     out: list[Array] = []
-    voltage = np.concatenate([u.voltage for u in grids])
-    output = np.concatenate([u.output for u in grids])
-    bounds = np.cumsum([0, *(len(u.output) for u in grids)])
-    steps = np.array([u.step for u in grids])
-    bands = cutoffs(data, 7 if lag == 0 else 4)
-    angle = data.kind == rc.ANGLE
-    for friction in frictions:
-        for theta in search(voltage, output, bounds, steps, bands, order, angle, friction):
-            out.append(_to_z(theta, order))
+    for view in _views(data):
+        grids = [_late(u, lag) for u in view]
+        voltage = np.concatenate([u.voltage for u in grids])
+        output = np.concatenate([u.output for u in grids])
+        bounds = np.cumsum([0, *(len(u.output) for u in grids)])
+        steps = np.array([u.step for u in grids])
+        bands = cutoffs(data, 7 if lag == 0 else 4)
+        angle = data.kind == rc.ANGLE
+        for friction in frictions:
+            for theta in search(voltage, output, bounds, steps, bands, order, angle, friction):
+                out.append(_to_z(theta, order))
     return out
 
 
-def _grids(data: Experiments) -> list[Uniform]:
+def _views(data: Experiments) -> list[list[Uniform]]:
+    """Return the segments that move most; where no voltage changes, also as steps from rest.
+
+    Filters swallow what happens in the first samples: rest before them keeps it.
+    """
     grids = [u for g in range(len(data.starts) - 1) if (u := resample(data, g)) is not None]
-    return sorted(grids, key=lambda u: -float(np.ptp(u.output)))[:GRIDS]
+    if not grids:
+        return []
+    grids = sorted(grids, key=lambda u: -float(np.ptp(u.output)))[:GRIDS]
+    if any(np.ptp(u.voltage) > METER.value * np.abs(u.voltage).max() for u in grids):
+        return [grids]
+    return [grids, [_from_rest(u, data.kind == rc.ANGLE) for u in grids]]
+
+
+def _from_rest(u: Uniform, angle: bool) -> Uniform:
+    """Put rest before a voltage that is switched on in the first row."""
+    still = np.zeros(len(u.voltage) // 2)
+    where = still + (u.output[0] if angle else 0.0)
+    current = None if u.current is None else np.concatenate((still, u.current))
+    voltage = np.concatenate((still, [0.0], u.voltage[1:]))
+    return Uniform(u.step, voltage, np.concatenate((where, u.output)), current)
 
 
 def _late(u: Uniform, lag: int) -> Uniform:
@@ -131,14 +150,12 @@ def current_candidates(data: Experiments) -> list[Array]:
     The electric equation ``v = L i' + R i + K w`` and the mechanical
     ``K i = J w' + b w + Tc sign(w)`` are two linear regressions, filtered.
     """
-    grids = [u for u in _grids(data) if u.current is not None]
     out: list[Array] = []
-    if not grids:
-        return out
-    for cutoff in cutoffs(data):
+    for view, cutoff in product(_views(data), cutoffs(data)):
         electric, mechanic = np.zeros((4, 7)), np.zeros((4, 7))
-        for u in grids:
-            _both_equations(u, cutoff, data.kind == rc.ANGLE, electric, mechanic)
+        for u in view:
+            if u.current is not None:
+                _both_equations(u, cutoff, data.kind == rc.ANGLE, electric, mechanic)
         inductance, r, k = solved(electric)[:3]
         if not (r > 0 and k > 0):
             continue
