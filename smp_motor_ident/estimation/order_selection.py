@@ -327,6 +327,8 @@ def _orders_again(
             better = not verdict
         else:
             better, reason = preferred(best, other)
+        if better and other.noise_ratio > 0:  # what looked like torque noise may have been this
+            other = data_window.grow(of_kind(data, known), structure, other, options)
         candidates.append(FittedCandidate(other, reason))
         best, s = (other, structure) if better else (best, s)
     return best

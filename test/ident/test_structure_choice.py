@@ -10,8 +10,10 @@ from typing import Any
 import motors
 import numpy as np
 import pytest
+from independent import simulate
 
 from smp_motor_ident.diagnosis.advice import unsettled_rival
+from smp_motor_ident.estimate import estimate
 from smp_motor_ident.estimation import order_selection
 from smp_motor_ident.estimation.choice import (
     FittedCandidate,
@@ -26,6 +28,7 @@ from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.estimation.quantities import answer
 from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.model.structures import DELAY, Z_NAMES, Structure
+from smp_motor_ident.record import Hardware, Record
 
 FIRST = Structure("first_order", order=1)
 SECOND = Structure("second_order")
@@ -131,3 +134,36 @@ def test_a_better_structure_that_did_not_settle_makes_the_answer_unreliable() ->
     own = answer(rich, {})
     better = FittedCandidate(dataclasses.replace(unsettled, deviance=rich.deviance - 1e4))
     assert not unsettled_rival([better, FittedCandidate(rich)], own, {})
+
+
+def _loaded(seed: int) -> tuple[Record, dict[str, float]]:
+    """Return counts of a random motor with a constant load, on a staircase either way."""
+    rng = np.random.default_rng(seed)
+    tau, r, k = rng.uniform(0.2, 0.4), rng.uniform(1, 6), rng.uniform(0.01, 0.06)
+    j, el, b = tau * k * k / r, r * tau * rng.uniform(0.02, 0.05), 0.1 * k * k / r
+    friction = rng.uniform(0.3, 0.6)
+    load = rng.uniform(0.1, 0.3) * friction
+    t = np.arange(2000) / 100.0
+    v = np.repeat(np.concatenate([np.linspace(1, 6, 10), np.linspace(-1, -6, 10)]), 100)
+    torque = np.full(t.size, load * k / r)
+    out = simulate(t, v, r, el, k, j, b, friction * k / r, torque, 200)
+    count = np.floor(out[:, 2] * 500 / (2 * np.pi) + rng.uniform()).astype(np.int64)
+    stiff = r * b + k * k
+    true = {
+        "dc_gain": k / stiff, "time_constant": (r * j + el * b) / stiff,
+        "time_constant_product": el * j / stiff, "static_voltage": friction, "load_voltage": load,
+    }  # fmt: skip
+    return Record("m", t, v, count=count, hardware=Hardware(1.0, 500.0, 0, 12.0)), true
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_constant_load_is_no_torque_noise(seed: int) -> None:
+    # A second lag and a load each look like torque noise while the other is missing.
+    record, true = _loaded(seed)
+    found = estimate(record)
+    assert found.model == "second_order"
+    assert "torque_noise" not in [f.code for f in found.findings]
+    for name, value in true.items():
+        q = found.combinations[name]
+        assert abs(q.value - value) < 4 * q.std, name
+    assert found.combinations["time_constant"].std < 0.01 * true["time_constant"]
