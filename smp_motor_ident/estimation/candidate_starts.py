@@ -6,6 +6,7 @@ Derivation: docs/derivations.md, section 10.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from smp_motor_ident.estimation import descent
 from smp_motor_ident.estimation.choice import size
@@ -14,6 +15,8 @@ from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import Structure
+
+Array = NDArray[np.float64]
 
 
 def of_kind(data: Experiments, fit: Fit) -> Experiments:
@@ -90,3 +93,21 @@ def _translated(rival: Fit, structure: Structure, step: float) -> models.Array:
         late = 0.1 * step
     z[models.DELAY] = max(late, 0.1 * step)
     return z
+
+
+def under_load(known: Fit, best: Fit) -> list[Array]:
+    """Return coordinates of a structure whose fit lacked a load: its own, and the choice's."""
+    volts = [models.VC_PLUS, models.VC_MINUS, models.LOAD]
+    own, other = known.z.copy(), best.z.copy()
+    own[volts] = best.z[volts]
+    s, t = best.structure, known.structure
+    if t.order > s.order:  # what answers late may be a second lag
+        slow = np.exp(other[models.A1] - other[models.A0])
+        late = float(other[models.DELAY] + 0.5 * other[models.WINDOW] * s.window)
+        other[models.A2] = other[models.A1] + np.log(max(late, 0.02 * slow))
+        other[models.TE] = other[models.A2] - other[models.A1]
+    elif t.order < s.order:
+        other[models.DELAY] += np.exp(other[models.A2] - other[models.A1])
+    other[models.DELAY] *= t.delay
+    other[models.WINDOW] = best.z[models.WINDOW] if s.window else known.z[models.WINDOW]
+    return [own, other]

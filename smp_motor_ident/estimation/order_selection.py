@@ -9,7 +9,13 @@ import numpy as np
 
 from smp_motor_ident.diagnosis.limits import LITTLE_FRICTION, SUBSET_HOPELESS
 from smp_motor_ident.estimation import data_window, descent, prediction
-from smp_motor_ident.estimation.candidate_starts import from_richer, from_rivals, no_worse, of_kind
+from smp_motor_ident.estimation.candidate_starts import (
+    from_richer,
+    from_rivals,
+    no_worse,
+    of_kind,
+    under_load,
+)
 from smp_motor_ident.estimation.choice import (
     FittedCandidate,
     label,
@@ -281,6 +287,8 @@ def _variations(
             verdict, reason = False, "a delay of hundredths of a sample is how the input was held"
         if verdict and other.noise_ratio > 0:  # what looked like torque noise may have been this
             other = data_window.grow(data, richer, other, options)
+        if verdict and s.current and "load" in change:  # R and K were found where it was missing
+            other = initial_fit(data, richer, options, [other.z], near=other) or other
         candidates.append(FittedCandidate(other, reason))
         if verdict:
             best = other
@@ -316,19 +324,19 @@ def _orders_again(
         if any(r.fit.structure == structure for r in candidates):
             continue
         say(f"trying {label(structure)}")
-        z = known.z.copy()
-        volts = [models.VC_PLUS, models.VC_MINUS, models.LOAD]
-        z[volts] = best.z[volts]
+        there = of_kind(data, known)
         start = replace(known, noise=best.noise, noise_ratio=best.noise_ratio)
-        other = descent.refine(of_kind(data, known), structure, start, z, options)
-        other = no_worse(of_kind(data, known), other, [best], options)
+        fits = [
+            descent.refine(there, structure, start, z, options) for z in under_load(known, best)
+        ]
+        other = no_worse(there, min(fits, key=lambda f: f.deviance), [best], options)
         if size(structure) < size(s):
             verdict, reason = preferred(other, best)
             better = not verdict
         else:
             better, reason = preferred(best, other)
         if better and other.noise_ratio > 0:  # what looked like torque noise may have been this
-            other = data_window.grow(of_kind(data, known), structure, other, options)
+            other = data_window.grow(there, structure, other, options)
         candidates.append(FittedCandidate(other, reason))
         best, s = (other, structure) if better else (best, s)
     return best

@@ -167,3 +167,43 @@ def test_a_constant_load_is_no_torque_noise(seed: int) -> None:
         q = found.combinations[name]
         assert abs(q.value - value) < 4 * q.std, name
     assert found.combinations["time_constant"].std < 0.01 * true["time_constant"]
+
+
+def test_a_second_lag_is_found_under_a_load_that_hid_it() -> None:
+    # Without the load no order fits; with it, a delay had taken the second lag's place.
+    rng = np.random.default_rng(6)
+    r, k, tau, te, friction, load = 3.0, 0.02, 0.055, 0.01, 0.9, -0.35
+    j, el, b = tau * k * k / r, r * te, 0.1 * k * k / r
+    t = np.arange(2000) / 200.0
+    v = 9.6 * np.sin(2 * np.pi * 2.5 * t)
+    torque = np.full(t.size, load * k / r)
+    out = simulate(t, v, r, el, k, j, b, friction * k / r, torque, 100)
+    speed = out[:, 1] + 0.01 * np.abs(out[:, 1]).max() * rng.standard_normal(t.size)
+    found = estimate(Record("m", t, v, velocity=speed))
+    assert found.model == "second_order" and not found.unreliable
+    stiff = r * b + k * k
+    true = {"dc_gain": k / stiff, "time_constant": (r * j + el * b) / stiff, "load_voltage": load}
+    for name, value in true.items():
+        q = found.combinations[name]
+        assert abs(q.value - value) < 4 * q.std, name
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_constant_load_hides_no_resistance(seed: int) -> None:
+    # R and K that were fitted without the load are no start for a fit with it.
+    rng = np.random.default_rng(seed)
+    r, k, tau, friction, load = 14.7, 0.047, 0.026, 1.9, rng.choice([-1, 1]) * rng.uniform(0.3, 0.6)
+    j, el, b = tau * k * k / r, r * 7e-4, 0.1 * k * k / r
+    t = np.arange(900) / 100.0
+    v = 18.0 * np.repeat(rng.choice([-1.0, 1.0], 450), 2)
+    out = simulate(t, v, r, el, k, j, b, friction * k / r, np.full(t.size, load * k / r), 200)
+    count = np.floor(out[:, 2] * 64 / (2 * np.pi) + rng.uniform()).astype(np.int64)
+    current = out[:, 0] + 0.012 * rng.standard_normal(t.size)
+    hardware = Hardware(1.0, 64.0, 0, 24.0)
+    found = estimate(Record("m", t, v, current, count=count, hardware=hardware))
+    assert not found.unreliable
+    true = {"resistance": r, "motor_constant": k, "inertia": j, "load_voltage": load}
+    for name, value in true.items():
+        q = {**found.parameters, **found.combinations}[name]
+        assert q.value is not None and abs(q.value - value) < 4 * q.std, name
+        assert q.std < 0.02 * abs(value), name
