@@ -195,7 +195,7 @@ def test_a_constant_load_hides_no_resistance(seed: int) -> None:
     r, k, tau, friction, load = 14.7, 0.047, 0.026, 1.9, rng.choice([-1, 1]) * rng.uniform(0.3, 0.6)
     j, el, b = tau * k * k / r, r * 7e-4, 0.1 * k * k / r
     t = np.arange(900) / 100.0
-    v = 18.0 * np.repeat(rng.choice([-1.0, 1.0], 450), 2)
+    v = 18.0 * rng.choice([-1.0, 1.0], t.size)
     out = simulate(t, v, r, el, k, j, b, friction * k / r, np.full(t.size, load * k / r), 200)
     count = np.floor(out[:, 2] * 64 / (2 * np.pi) + rng.uniform()).astype(np.int64)
     current = out[:, 0] + 0.012 * rng.standard_normal(t.size)
