@@ -149,7 +149,8 @@ def _scan_friction(
         if level not in profile:
             near = min(profile.values(), key=lambda f: abs(_level(f) - level), default=best)
             z = near.z.copy()
-            z[models.A0] += np.log((full - level) / max(full - _level(near), 1e-9))
+            left, before = (max(full - x, 1e-9) for x in (level, _level(near)))
+            z[models.A0] += np.log(left / before)
             fixed = structure.with_(fixed={**structure.fixed, "vc_plus": level})
             start = near.at(fixed.complete(z), noise_ratio=best.noise_ratio)
             profile[level] = solve(part, fixed, start, options, 12, 0.1)
