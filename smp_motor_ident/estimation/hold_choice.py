@@ -111,7 +111,7 @@ def _worth_a_search(
     from a comparison without them.
     """
     s = best.structure
-    if best.samples > HOLD_COST.value or "delay" in s.fixed:
+    if best.samples > HOLD_COST.value or "delay" in s.fixed or not np.ptp(data.hold_value):
         return []
     known = of_kind(data, best).data_window(FEW * data.step)
     least = best if known.size == best.samples else refine(known, s, best, best.z, options)
