@@ -23,7 +23,7 @@ from smp_motor_ident.diagnosis.wheel_limits import (
     VELOCITY_RATIO,
 )
 from smp_motor_ident.diagnosis.wheel_test import Figures
-from smp_motor_ident.finding import Finding
+from smp_motor_ident.finding import Finding, Severity
 from smp_motor_ident.record import Hardware
 
 
@@ -256,48 +256,44 @@ def supply(robot: Robot) -> list[Finding]:
 
 
 def sisters(robot: Robot) -> list[Finding]:
-    """No wheel is held back far more than its sisters; one that coasts far longer is told of.
+    """No wheel is held back far more than its sisters; coasting far longer is a warning.
 
     What drags heats its motor and tears at the robot.  A motor of another time constant is
     identified and tuned like any other.
     """
     figures = robot.figures
     # Friction is below what starts the wheel, where nothing else is known.
-    held = {w: one.friction if one.friction > 0 else one.breakaway for w, one in figures.items()}
-    drags = (
-        Finding(
-            "unlike_sisters", "refused",
-            f"{wheel}: its friction is {ratio:.3g} times its sisters': it drags, brakes, or is "
-            "another motor",
-            {"wheel": wheel, "value": held[wheel], "sisters": held[wheel] / ratio},
+    drag = {w: one.friction if one.friction > 0 else one.breakaway for w, one in figures.items()}
+    return [
+        *_beside_sisters(
+            drag, ("unlike_sisters", "refused"),
+            "friction", "it drags, brakes, or is another motor",
             "turn it by hand beside the others: free what rubs, lift what touches the ground; "
             "--accept unlike_sisters where it is meant to differ",
-        )
-        for wheel, ratio in _beside_sisters(held)
-    )  # fmt: skip
-    coast = {w: one.coast for w, one in figures.items()}
-    carries = (
-        Finding(
-            "coasts_longer", "warning",
-            f"{wheel}: its time to come to rest is {ratio:.3g} times its sisters': it carries "
-            "something, touches the ground, or is another motor",
-            {"wheel": wheel, "value": coast[wheel], "sisters": coast[wheel] / ratio},
+        ),
+        *_beside_sisters(
+            {w: one.coast for w, one in figures.items()}, ("coasts_longer", "warning"),
+            "time to come to rest", "it carries something, touches the ground, or is another motor",
             "look whether it is off the ground and bare",
-        )
-        for wheel, ratio in _beside_sisters(coast)
-    )  # fmt: skip
-    return [*drags, *carries]
+        ),
+    ]  # fmt: skip
 
 
-def _beside_sisters(values: Mapping[str, float]) -> list[tuple[str, float]]:
-    """Return the wheels that exceed the median of the others too far, and how many times."""
+def _beside_sisters(
+    values: Mapping[str, float], code: tuple[str, Severity], what: str, why: str, advice: str
+) -> list[Finding]:
+    """Return a finding for each wheel that exceeds the median of the others too far."""
     known = {w: v for w, v in values.items() if v > 0}
     out = []
     for wheel, value in known.items():
         others = [v for w, v in known.items() if w != wheel]
         usual = float(np.median(others)) if len(others) > 1 else math.nan
         if value > SISTERS.value * usual:
-            out.append((wheel, value / usual))
+            text = f"{wheel}: its {what} is {value / usual:.3g} times its sisters': {why}"
+            evidence: dict[str, float | str | None] = {
+                "wheel": wheel, "value": value, "sisters": usual
+            }  # fmt: skip
+            out.append(Finding(*code, text, evidence, advice))
     return out
 
 

@@ -167,8 +167,8 @@ def arrival_delays(
     first = np.searchsorted(effective, np.arange(asked.size), side="left")
     begun = time[np.clip(first - 1, 0, time.size - 1)]
     so_far = np.concatenate(([0], np.cumsum(unknown)))
-    seen = so_far[first] == so_far[np.minimum(np.searchsorted(time, sent, side="right"), first)]
-    return np.where((first < time.size) & seen, np.maximum(ages, begun - asked), usual)
+    matched = so_far[first] == so_far[np.minimum(np.searchsorted(time, sent, side="right"), first)]
+    return np.where((first < time.size) & matched, np.maximum(ages, begun - asked), usual)
 
 
 def predicted(
