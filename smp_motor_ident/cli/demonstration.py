@@ -135,7 +135,8 @@ def drive(
     say("gains set in the running controllers; driving")
     drives = []
     for attempt in range(1, ATTEMPTS + 1):
-        bag = steps.record(robot, "drive" if attempt == 1 else f"drive_{attempt}")
+        name = "drive" if attempt == 1 else f"drive_{attempt}"
+        bag = steps.record(robot, name, "motor_command", "pid_state")
         segments = drive_body(robot.client, DRIVE, robot.wheels)
         robot.processes.stop("record")
         stall = longest_stall(bag, robot.wheels)

@@ -52,12 +52,12 @@ TOPICS = "/(.*/)?(motor_.*|pid_state|wheel_setpoints|cmd_vel|odom|joint_states|d
 """What is worth keeping of a robot, for ``record``."""
 
 
-def record(robot: Robot, name: str) -> Path:
-    """Begin to record."""
+def record(robot: Robot, name: str, *shown: str) -> Path:
+    """Begin to record; return when the motors, and what else a wheel shows, are listened to."""
     bag = robot.folder / name
     arguments = ("--output", str(bag), "--regex", TOPICS, *robot.ros_arguments)
     robot.processes.start("record", "record", *arguments)
-    topics = [f"{wheel}/motor_state" for wheel in robot.wheels]
+    topics = [f"{wheel}/{topic}" for wheel in robot.wheels for topic in ("motor_state", *shown)]
     robot.client.wait_for_listener("record", topics, timeout=PATIENCE)
     return bag
 

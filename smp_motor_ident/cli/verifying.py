@@ -89,9 +89,7 @@ def drive(robot: steps.Robot, plan: Sequence[tuple[str, float, float]]) -> Path:
     shutil.rmtree(bag, ignore_errors=True)
     try:
         robot.switch("activate")
-        steps.record(robot, bag.name)
-        shown = [f"{wheel}/pid_state" for wheel in robot.wheels]
-        robot.client.wait_for_listener("record", shown, timeout=steps.PATIENCE)
+        steps.record(robot, bag.name, "motor_command", "pid_state")
         drive_wheels(robot.client, plan, robot.wheels)
     finally:
         robot.processes.stop("record")
