@@ -1,15 +1,17 @@
 """Compile for this machine before anybody waits for it: ``python -m smp_motor_ident.compilation``.
 
-What numba compiles stays on the disk beside the modules.  The rehearsal is a real one: a motor is
+What Python and numba compile stays on the disk beside the modules.  The rehearsal is a real one: a motor is
 simulated, estimated from each kind of signal, and given gains, so that every compiled function is
 called with the types that it has in use.  Where all is compiled already it takes a second.
 """
 
 from __future__ import annotations
 
+import compileall
 import contextlib
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -68,6 +70,8 @@ def rehearse(signals: str) -> None:
 
 def main() -> int:
     """Compile all, on two cores; return the exit code."""
+    for package in ("smp_motor_control", "smp_motor_ident"):
+        compileall.compile_dir(Path(__file__).parents[1] / package, quiet=2)
     with ProcessPoolExecutor(2) as pool:
         list(pool.map(rehearse, ("whole", "speed")))
     return 0
