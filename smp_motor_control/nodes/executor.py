@@ -16,6 +16,7 @@ import time
 from contextlib import ExitStack
 from typing import Any
 
+from rclpy.callback_groups import CallbackGroup
 from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
@@ -96,6 +97,21 @@ class _WaitSet:
         return [w for w in self.waitables if w.is_ready(self._waits)]
 
 
+class Untouched(CallbackGroup):
+    """Subscriptions that the executor leaves alone: their owner takes from them, in batches."""
+
+    def can_execute(self, entity: Any) -> bool:
+        """Never."""
+        return False
+
+    def beginning_execution(self, entity: Any) -> bool:
+        """Never."""
+        return False
+
+    def ending_execution(self, entity: Any) -> None:
+        """Nothing to end."""
+
+
 class LeanExecutor(SingleThreadedExecutor):
     """Spins one or more nodes; only waiting without a time-out is lean."""
 
@@ -110,12 +126,12 @@ class LeanExecutor(SingleThreadedExecutor):
         nodes = self.get_nodes()
         kinds = ("subscriptions", "timers", "clients", "services", "guards", "waitables")
         return tuple(
-            # A subscription whose group cannot execute is taken from by its owner (see record).
+            # What is taken by its owner wakes nobody, nor do events of it: data wake those, too.
             tuple(
                 e
                 for node in nodes
                 for e in getattr(node, kind)
-                if kind != "subscriptions" or e.callback_group.can_execute(e)
+                if not isinstance(getattr(e, "callback_group", None), Untouched)
             )
             for kind in kinds
         )

@@ -31,6 +31,7 @@ from smp_interfaces.msg import MotorDescription, MotorParameters, MotorState
 from smp_motor_control import WHEELS, joint_of
 from smp_motor_control.errors import ParameterError, SmpError
 from smp_motor_control.nodes import runtime
+from smp_motor_control.nodes.executor import Untouched
 from smp_motor_control.nodes.settings import Parameters, described, nested
 from smp_motor_ident.bag.window import Window
 from smp_motor_ident.estimate import estimate
@@ -43,6 +44,9 @@ from smp_motor_ident.result import Estimate
 
 UNHURRIED = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
 """On a busy machine samples wait for the node: a lost one leaves the fit a guessed voltage."""
+
+TAKE_PERIOD = 0.05
+"""Between two batches of samples [s]: waking up for each would cost half as much again."""
 
 MINUTE = 60.0
 """Between two lines of a history [s]."""
@@ -108,9 +112,18 @@ class Wheel:
             MotorParameters, f"{name}/motor_parameters", runtime.LATCHED
         )
         topic = f"{name}/motor_state"
-        node.create_subscription(MotorState, topic, self._on_state, UNHURRIED)
+        self._states = node.create_subscription(
+            MotorState, topic, self._on_state, UNHURRIED, callback_group=Untouched()
+        )
         topic = f"{name}/motor_description"
         node.create_subscription(MotorDescription, topic, self._on_description, runtime.LATCHED)
+
+    def take(self) -> None:
+        """Take all samples that wait."""
+        handle = self._states.handle
+        with handle:
+            while (taken := handle.take_message(MotorState, False)) is not None:
+                self._on_state(*taken)
 
     def _on_state(self, message: MotorState, info: Mapping[str, Any]) -> None:
         self.stamp = stamp = message.header.stamp
@@ -183,10 +196,15 @@ class Identifier(Node):
         self._not_before = 0.0
         self._compiled = False  # the first estimate loads or compiles code, too: it counts for none
         self._diagnostics = runtime.Diagnostics(self, self._assess)
+        runtime.steady_timer(self, TAKE_PERIOD, self._take_all)
         runtime.steady_timer(self, settings.period, self._begin)
         runtime.steady_timer(self, 0.1, self._publish_finished)
         if settings.history:
             runtime.steady_timer(self, MINUTE, self._add_history)
+
+    def _take_all(self) -> None:
+        for wheel in self._wheels.values():
+            wheel.take()
 
     def _begin(self) -> None:
         """Hand every window that shows enough to the worker; say what the others lack.

@@ -17,7 +17,6 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 from rclpy.qos import (
     DurabilityPolicy,
@@ -30,6 +29,7 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from smp_motor_control.errors import SmpError
 from smp_motor_control.nodes import runtime
+from smp_motor_control.nodes.executor import Untouched
 from smp_motor_control.ros_arguments import split_arguments
 from smp_motor_ident.bag import BagWriter
 from smp_motor_ident.nodes.bag_arguments import message_class, pattern
@@ -38,21 +38,6 @@ TAKE_PERIOD = 0.004
 LOOK_PERIOD = 0.05
 DEPTH = 2000
 """Messages that DDS keeps for us per topic: two seconds of 1 kHz while the disk is busy."""
-
-
-class Untouched(CallbackGroup):
-    """Subscriptions that the executor leaves alone: the recorder takes from them itself."""
-
-    def can_execute(self, entity: Any) -> bool:
-        """Never."""
-        return False
-
-    def beginning_execution(self, entity: Any) -> bool:
-        """Never."""
-        return False
-
-    def ending_execution(self, entity: Any) -> None:
-        """Nothing to end."""
 
 
 @dataclass

@@ -20,7 +20,7 @@ from std_msgs.msg import Float64, String
 from std_srvs.srv import Trigger
 
 from smp_motor_control.errors import ParameterError
-from smp_motor_control.nodes.executor import LeanExecutor, _WaitSet
+from smp_motor_control.nodes.executor import LeanExecutor, Untouched, _WaitSet
 from smp_motor_control.nodes.runtime import STREAM_PUBLISHER, STREAM_SUBSCRIBER, steady_timer
 from smp_motor_control.nodes.settings import Parameters, described
 
@@ -167,6 +167,26 @@ def test_a_stream_is_waited_for_alone_and_keeps_nobody_waiting_for_long(context,
     spin_until(executor, node, lambda: refused)
     node.destroy_timer(timer)
     call()
+
+
+def test_messages_that_their_owner_takes_wake_nobody(context, executor):
+    node = rclpy.create_node("batches", context=context)
+    executor.add_node(node)
+    kept = node.create_subscription(
+        Float64, "batch", lambda _: None, STREAM_SUBSCRIBER, callback_group=Untouched()
+    )
+    publisher = node.create_publisher(Float64, "batch", STREAM_PUBLISHER)
+    spin_until(executor, node, lambda: publisher.get_subscription_count() == 1)
+    publisher.publish(Float64(data=7.0))
+    steady_timer(node, 0.1, lambda: None)
+    begun, rounds = time.monotonic(), 0
+    while time.monotonic() < begun + 1.0:
+        executor.spin_once()
+        rounds += 1
+    assert rounds < 30  # of the timer, and what the node's birth left to do
+    with kept.handle:
+        message, _ = kept.handle.take_message(Float64, False)
+    assert message.data == 7.0
 
 
 def test_an_event_of_what_was_just_destroyed_does_not_end_the_spin(context, executor):
