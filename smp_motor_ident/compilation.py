@@ -1,8 +1,9 @@
 """Compile for this machine before anybody waits for it: ``python -m smp_motor_ident.compilation``.
 
-What Python and numba compile stays on the disk beside the modules.  The rehearsal is a real one: a motor is
-simulated, estimated from each kind of signal, and given gains, so that every compiled function is
-called with the types that it has in use.  Where all is compiled already it takes a second.
+What Python and numba compile stays on the disk beside the modules.  The rehearsal is a real one:
+a motor is simulated, estimated from each kind of signal, and given gains, so that every compiled
+function is called with the types that it has in use.  Where all is compiled already it takes a
+second.
 """
 
 from __future__ import annotations
