@@ -41,6 +41,8 @@ def label(structure: Structure) -> str:
             (structure.load, "load"),
             (structure.delay, "delay"),
             (structure.window, "averaged speed"),
+            (structure.current_sensor == "averaged", "averaged current"),
+            (structure.current_sensor == "low_passed", "low-passed current"),
             (structure.offset, "current offset"),
             (structure.held == "after", "command held after its row"),
             (structure.held == "interpolated", "command interpolated"),
@@ -129,7 +131,7 @@ def _loose(simple: Fit, rich: Fit) -> str:
     for i in set(free) - set(simple.structure.free()):
         name = models.Z_NAMES[i]
         std = float(np.sqrt(cov[free.index(i), free.index(i)]))
-        if name in ("delay", "window") and std > 0.4 * rich.z[i]:
+        if name in ("delay", "window", "current_lag") and std > 0.4 * rich.z[i]:
             return name
         if name == "ln_a2" and std > 0.4:
             return "second time constant"

@@ -47,7 +47,8 @@ def consider_clock(data: Experiments, fit: Fit, share: float) -> Fit:
     angle = float(data.kind == rc.ANGLE)
     powers: Array = np.zeros(fit.z.size)
     powers[[models.A0, models.A1, models.A2, models.TE]] = angle, 1 + angle, 2 + angle, 1.0
-    powers[[models.DELAY, models.WINDOW]] = fit.z[[models.DELAY, models.WINDOW]]
+    times = [models.DELAY, models.WINDOW, models.CURRENT_LAG]
+    powers[times] = fit.z[times]
     row = share * powers[list(fit.structure.free())]
     return fit.wider(np.asarray(np.outer(row, row), dtype=np.float64))
 

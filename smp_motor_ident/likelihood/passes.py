@@ -17,6 +17,7 @@ from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.linear_pass import run_sliding, squares_sliding
 from smp_motor_ident.likelihood.noise import NoiseModel, whitening
 from smp_motor_ident.likelihood.normal_equations import eliminate
+from smp_motor_ident.likelihood.sensitivities import LANES
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import Structure, to_internal
 
@@ -119,7 +120,8 @@ def gather(
             data.output, data.current, data.kind, structure.friction != "none", par, slope,
             initial, own, noise.gain, whitening(noise.covariance), noise.huber, normal, gradient,
             cost, spread, length, scores, owner, _ring(data, par, p),
-            np.zeros((0, 3)) if predicted is None else predicted, data.jittered,
+            models.SENSORS.index(structure.current_sensor) if structure.current else 0,
+            _trail(data, structure, par), np.zeros((0, 3)) if predicted is None else predicted, data.jittered,
         )  # fmt: skip
     return Sums(normal, gradient, cost, spread, scores[:used], owner[:used])
 
@@ -128,11 +130,22 @@ def _ring(data: Experiments, par: Array, p: int) -> Array:
     """Return the memory for the window of a mean speed."""
     if data.kind != recursion.MEAN_SPEED:
         return np.zeros((0, 0))
+    return np.zeros((_depth(data, par[recursion.WINDOW]), 3 + 2 * p))
+
+
+def _trail(data: Experiments, structure: Structure, par: Array) -> Array:
+    """Return the memory for the window of a mean current."""
+    if not structure.lags or structure.current_sensor != "averaged":
+        return np.zeros((0, 0))
+    return np.zeros((_depth(data, 2 * par[models.CURRENT_LAG]), 2 + LANES))
+
+
+def _depth(data: Experiments, width: float) -> int:
+    """Return how many samples a window may hold."""
     steps = np.diff(data.time)
     # A descent may try any width; one that is no width at all is thrown out by its objective.
-    width = min(max(float(par[recursion.WINDOW]), 0.0), float(np.ptp(data.time)))
-    depth = 4 + math.ceil(width / float(steps[steps > 0].min()))
-    return np.zeros((min(depth, data.size + 1), 3 + 2 * p))
+    width = min(max(float(width), 0.0), float(np.ptp(data.time)))
+    return min(4 + math.ceil(width / float(steps[steps > 0].min())), data.size + 1)
 
 
 def _slides(data: Experiments, structure: Structure, z: Array, noise: NoiseModel) -> bool:
