@@ -178,6 +178,8 @@ def _sensors(fit: Fit) -> list[Finding]:
                 "zero the current sensor at rest",
             )
         )
+    if s.lags:
+        out.append(_current_lag(s.current_sensor, float(fit.z[models.CURRENT_LAG])))
     if s.window or "window" in s.fixed:
         window = float(fit.z[models.WINDOW])
         out.append(
@@ -190,6 +192,21 @@ def _sensors(fit: Fit) -> list[Finding]:
             )
         )
     return out
+
+
+def _current_lag(sensor: str, lag: float) -> Finding:
+    """Say how the current's sensor is late."""
+    how = (
+        f"the mean over {2e3 * lag:.3g} ms"
+        if sensor == "averaged"
+        else f"low-passed with a time constant of {1e3 * lag:.3g} ms"
+    )
+    return Finding(
+        "current_lag",
+        "note",
+        f"the current is {how}: L/R is stated without that lag of its sensor",
+        {"lag": lag, "sensor": sensor},
+    )
 
 
 def _second_lag(data: Experiments, fit: Fit) -> list[Finding]:

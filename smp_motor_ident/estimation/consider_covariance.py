@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident.estimation import prediction
+from smp_motor_ident.estimation.current_lag import LITTLE, with_lag
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments
@@ -80,20 +81,26 @@ def consider_friction(data: Experiments, fit: Fit) -> tuple[Fit, float]:
 
 
 def consider_left_out(data: Experiments, fit: Fit) -> Fit:
-    """Return the fit with its covariance widened by a delay or load not worth its price."""
+    """Return the fit with its covariance widened by what was not worth its price.
+
+    That is a delay, a load, or a lag of the current's sensor.
+    """
     s = fit.structure
     additions = []
     if not s.delay and "delay" not in s.fixed:
         additions.append((s.with_(delay=True), models.DELAY))
     if not s.load and not s.own_load and "load" not in s.fixed:
         additions.append((s.with_(load=True), models.LOAD))
+    if s.current and not s.lags:
+        additions.append((s.with_(current_sensor="averaged"), models.CURRENT_LAG))
     factor = float(np.median(fit.sandwich_factors())) if s.free() else 1.0
     wider = fit
     for richer, coordinate in additions if s.free() else []:
-        beside = _beside(data, fit, richer, coordinate)
+        lag = coordinate == models.CURRENT_LAG
+        beside = _beside(data, with_lag(fit, LITTLE * data.step) if lag else fit, richer, coordinate)
         own = factor * beside.variance
-        # Akaike: with it the motor is predicted better.
-        if beside.seen and beside.size**2 > 2 * own:
+        # Akaike: with it the motor is predicted better.  No sensor is early.
+        if beside.seen and beside.size**2 > 2 * own and not (lag and beside.size < 0):
             wider = wider.wider(beside.covariance(beside.size**2 - own))
     return wider
 

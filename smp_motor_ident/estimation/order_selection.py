@@ -24,6 +24,7 @@ from smp_motor_ident.estimation.choice import (
     simplest_left,
     size,
 )
+from smp_motor_ident.estimation.current_lag import with_current_lag
 from smp_motor_ident.estimation.delay_and_averaging import (
     delay_without_noise,
     with_averaging,
@@ -60,10 +61,10 @@ def explore(
             first = _initial_fit(data, base, options, say)
         if first is None:
             return []
-        best = first
         candidates.append(
             FittedCandidate(first, "asked for" if not auto else "current is measured")
         )
+        best = with_current_lag(data, first, options, candidates, say)
         if auto and data.kind == rc.SPEED:
             best = _try_average(data, best, options, candidates, say)
     else:
@@ -292,6 +293,7 @@ def _variations(
         candidates.append(FittedCandidate(other, reason))
         if verdict:
             best = other
+    best = with_current_lag(data, best, options, candidates, say)
     return _without_friction(data, best, options, candidates)
 
 
