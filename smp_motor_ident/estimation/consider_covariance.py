@@ -96,12 +96,13 @@ def consider_left_out(data: Experiments, fit: Fit) -> Fit:
     factor = float(np.median(fit.sandwich_factors())) if s.free() else 1.0
     wider = fit
     for richer, coordinate in additions if s.free() else []:
-        lag = coordinate == models.CURRENT_LAG
-        beside = _beside(data, with_lag(fit, LITTLE * data.step) if lag else fit, richer, coordinate)
-        own = factor * beside.variance
-        # Akaike: with it the motor is predicted better.  No sensor is early.
-        if beside.seen and beside.size**2 > 2 * own and not (lag and beside.size < 0):
-            wider = wider.wider(beside.covariance(beside.size**2 - own))
+        little = LITTLE * data.step * (coordinate == models.CURRENT_LAG)
+        beside = _beside(data, with_lag(fit, little) if little else fit, richer, coordinate)
+        own, found = factor * beside.variance, beside.size + little
+        early = little > 0 and found < 0  # which no sensor is
+        # Akaike: with it the motor is predicted better.
+        if beside.seen and found**2 > 2 * own and not early:
+            wider = wider.wider(beside.covariance(found**2 - own))
     return wider
 
 

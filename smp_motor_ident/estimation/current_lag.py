@@ -17,7 +17,6 @@ from smp_motor_ident.estimation.choice import (
     label,
     preferred,
     sandwich_factor,
-    size,
 )
 from smp_motor_ident.estimation.fit import Fit, Options
 from smp_motor_ident.estimation.ridge import slower_winding
@@ -27,7 +26,9 @@ from smp_motor_ident.model.structures import SENSORS, Structure
 
 Array = models.Array
 
-LITTLE = 0.05  # of a sample: a lag whose shape shows in nothing, for the score
+LITTLE = 0.01  # of a sample: a lag that is as good as none, for the score
+WINDOW = 0.6  # of a sample: the mean lag of a window that reaches beyond the last change of voltage
+SETTLED = 0.5  # of a sample: of a shorter L/R a smaller window shows next to nothing
 SHARES = (0.3, 0.8)  # of the winding's lag that may be the sensor's
 SAMPLES = (0.25, 0.5, 1.5)  # of lag at which a descent begins
 
@@ -40,21 +41,18 @@ def with_current_lag(
     say: Callable[[str], None],
 ) -> Fit:
     """Return the fit, or one with the lag of the current's sensor where the data ask for it."""
-    if not best.structure.current or best.structure.lags or not _asked_for(data, best):
+    direct = best
+    if not direct.structure.current or direct.structure.lags or not _asked_for(data, direct):
         return best
     for sensor in SENSORS[1:]:
-        richer = best.structure.with_(current_sensor=sensor)
+        richer = direct.structure.with_(current_sensor=sensor)
         if any(r.fit.structure == richer for r in candidates):
             continue
         say(f"trying {label(richer)}")
-        plain = best if not best.structure.lags else with_lag(best, LITTLE * data.step)
+        starts = _starts(data, direct, richer) + [best.z] * best.structure.lags
         # What looks like torque noise may be this.
         near = [best] if best.noise_ratio == 0 else [best, replace(best, noise_ratio=0.0)]
-        tried = [
-            descent.refine(data, richer, n, z, options)
-            for z in _starts(data, plain, richer)
-            for n in near
-        ]
+        tried = [descent.refine(data, richer, n, z, options) for z in starts for n in near]
         other = min(tried, key=lambda f: f.deviance)
         verdict, reason = preferred(best, other)
         if verdict and other.noise_ratio > 0:
@@ -71,22 +69,40 @@ def with_lag(fit: Fit, lag: float) -> Fit:
     return replace(fit, z=z)
 
 
-def _asked_for(data: Experiments, best: Fit) -> bool:
-    """Tell from the score at next to no lag whether a fit with it is worth its passes."""
-    if not best.converged:
+def _asked_for(data: Experiments, direct: Fit) -> bool:
+    """Tell from the score of a window whether a fit with a lag is worth its passes.
+
+    The score is taken at next to no window; of a winding that has settled when its current is
+    read that shows nothing, so there at a window of more than a sample, too.
+    """
+    if not direct.converged:
         return True
-    richer = best.structure.with_(current_sensor="averaged")
-    near = with_lag(best, LITTLE * data.step)
-    gain, _, _ = prediction.predicted_decrease(data, near, richer)
-    return not gain < 0.5 * float(np.log(best.samples)) * sandwich_factor(best)
+    averaged = direct.structure.with_(current_sensor="averaged")
+    short = float(np.exp(direct.z[models.TE])) < SETTLED * data.step
+    least = _predicted(data, direct, direct.structure)
+    price = 0.5 * float(np.log(direct.samples)) * sandwich_factor(direct)
+    return any(
+        not least - _predicted(data, with_lag(direct, lag * data.step), averaged) < price
+        for lag in [LITTLE] + [WINDOW] * short
+    )
 
 
-def _starts(data: Experiments, best: Fit, richer: Structure) -> list[Array]:
+def _predicted(data: Experiments, fit: Fit, structure: Structure) -> float:
+    """Return the sum of squares that a step from here would leave; infinite for no lag."""
+    here = prediction.again(data, structure, fit)
+    step = prediction.inverse(here.normal) @ here.gradient
+    if structure.lags and fit.z[models.CURRENT_LAG] + step[-1] <= 0:
+        return np.inf
+    return here.objective - here.local_decrease - float(here.gradient @ step)
+
+
+def _starts(data: Experiments, direct: Fit, richer: Structure) -> list[Array]:
     """Return starts: lags of so many samples, and those that L/R has taken up."""
-    te = float(np.exp(best.z[models.TE]))
+    te = float(np.exp(direct.z[models.TE]))
+    lags = [(samples * data.step, te) for samples in SAMPLES]
     out = []
-    for lag, left in [(s * data.step, te) for s in SAMPLES] + [(s * te, (1 - s) * te) for s in SHARES]:
-        z = slower_winding(best.z, float(np.log(left)))
+    for lag, left in lags + [(share * te, (1 - share) * te) for share in SHARES]:
+        z = slower_winding(direct.z, float(np.log(left)))
         z[models.CURRENT_LAG] = lag
         out.append(richer.complete(z))
     return out

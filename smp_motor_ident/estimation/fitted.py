@@ -61,7 +61,7 @@ class Start:
     """Where a descent begins: a motor, how it moved at first, and the noise that is believed."""
 
     z: Array  # shape (12,): coordinates
-    initial: Array  # shape (g, 4): q, w, angle, load of each segment
+    initial: Array  # shape (g, 5): q, w, angle, load, earlier current of each segment
     noise: Array  # shape (2, 2): covariance of the innovations of (output, current)
     noise_ratio: float = 0.0  # intensity of the torque noise over the output's noise variance
 

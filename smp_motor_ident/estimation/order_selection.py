@@ -23,6 +23,7 @@ from smp_motor_ident.estimation.choice import (
     sandwich_factor,
     simplest_left,
     size,
+    worth_a_fit,
 )
 from smp_motor_ident.estimation.current_lag import with_current_lag
 from smp_motor_ident.estimation.delay_and_averaging import (
@@ -275,7 +276,7 @@ def _variations(
         if richer == best.structure:
             continue
         hidden = delay_without_noise(data, best, options) if "delay" in change else None
-        if hidden is None and not _worth_a_fit(data, best, richer):
+        if hidden is None and not worth_a_fit(data, best, richer):
             continue
         say(f"trying {label(richer)}")
         z = best.z.copy()
@@ -342,15 +343,6 @@ def _orders_again(
         candidates.append(FittedCandidate(other, reason))
         best, s = (other, structure) if better else (best, s)
     return best
-
-
-def _worth_a_fit(data: Experiments, best: Fit, richer: Structure) -> bool:
-    """Tell from the score whether a fit of more is worth its passes."""
-    if not best.converged:
-        return True
-    gain, _, _ = prediction.predicted_decrease(data, best, richer)
-    price = (size(richer) - size(best.structure)) * float(np.log(best.samples))
-    return not gain < 0.5 * price * sandwich_factor(best)
 
 
 def _without_friction(

@@ -142,7 +142,7 @@ def _parted(data: Experiments, fit: Fit, parts: int) -> Experiments:
     starts = np.array(sorted({*map(int, data.starts), *near}), dtype=np.int64)
     owner = np.searchsorted(data.starts, starts[:-1], side="right") - 1
     first = np.empty(starts.size - 1, dtype=np.int64)
-    initial = np.zeros((starts.size - 1, 4))
+    initial = np.zeros((starts.size - 1, 5))
     predicted = np.empty((data.size, 2))
     gather(
         data, fit.structure, fit.z, fit.initial, fit.noise_model(), predicted, differentiate=False
@@ -160,6 +160,7 @@ def _parted(data: Experiments, fit: Fit, parts: int) -> Experiments:
             predicted[begin, 0],
             data.output[begin],
             fit.initial[g, 3],
+            0.0,
         )
         if data.kind != rc.ANGLE or not np.isfinite(data.output[begin]):
             initial[n, 2] = predicted[begin, 1] if data.kind == rc.ANGLE else 0.0

@@ -30,6 +30,7 @@ from smp_motor_ident.likelihood.sensitivities import (
 from smp_motor_ident.model.structures import CURRENT_LAG, LN_R, OFFSET
 
 Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
 
 DIRECT, AVERAGED, LOW_PASSED = range(3)
 # The state and what the sensor keeps (the charge R int i, or R times the low-passed current); the
@@ -58,12 +59,17 @@ def sensor_rate(sensor: int, par: Array) -> float:
 
 
 @compiled
-def begin_current(x: Array, m: Array, marks: Array) -> None:
-    """Begin a segment: no charge yet, or a low-pass at rest at the first current."""
+def begin_current(more: float, own: Integers, x: Array, m: Array, marks: Array) -> None:
+    """Begin a segment: no charge yet, or a low-pass that has settled on the current before it.
+
+    That was more than the first by so many volts, of which the columns ``own`` are the derivative.
+    """
     low = marks[SENSOR] == LOW_PASSED
-    x[KEEPS] = x[0] if low else 0.0
+    x[KEEPS] = x[0] + more if low else 0.0
     for j in range(LANES):
         m[KEPT + j] = m[SQ + j] if low else 0.0
+    for j in own:
+        m[KEPT + j] = 1.0 if low else 0.0
 
 
 @compiled
@@ -144,6 +150,22 @@ def _low_pass(
             diq = (d1 * on_w - k * d2) / below
         m[KEPT + j] = e * m[KEPT + j] + de * y + diq
     x[KEEPS] = e * y + iq
+
+
+@compiled
+def mark_first(
+    trail: Array, time: Array, first: int, last: int, width: float, more: float, own: Integers,
+    x: Array, m: Array,
+) -> int:  # fmt: skip
+    """Mark the samples whose windows begin before the segment; return the next one."""
+    k = mark(trail, time, first, last, time[first], width, x, m)
+    for n in range(first, k):
+        row, since = trail[n % trail.shape[0]], time[first] - (time[n] - width)
+        row[CHARGE] -= since * more
+        row[FLOW] += more
+        for j in own:
+            row[MARK + j] -= since
+    return k
 
 
 @compiled

@@ -71,10 +71,11 @@ class Pass:
 
 
 def own_columns(data: Experiments, structure: Structure) -> tuple[int, ...]:
-    """Return which of (q, w, angle, load) each segment has to itself."""
+    """Return which of (q, w, angle, load, earlier current) each segment has to itself."""
     angle = (2,) if data.kind == recursion.ANGLE else ()
     own = (1,) if structure.order == 1 else (0, 1)
-    return own + angle + ((3,) if structure.own_load else ())
+    earlier = (4,) if structure.lags else ()
+    return own + angle + ((3,) if structure.own_load else ()) + earlier
 
 
 def gather(

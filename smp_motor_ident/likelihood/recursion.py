@@ -19,6 +19,7 @@ from smp_motor_ident.likelihood.current_sensor import (
     before_move,
     begin_current,
     mark,
+    mark_first,
     observe_lagging,
     sensor_rate,
 )
@@ -188,9 +189,13 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
         for j in range(local.shape[0]):
             if local[j] < 3 and not (at_rest and local[j] == 1):
                 m[local[j] * LANES + n_common + j] = 1.0
-        begin_current(x, m, marks)
-        # The next sample whose window begins; before the record the current was what it is first.
-        ahead = mark(trail, time, first, last, time[first], width, x, m) if averaged else last
+        ahead = last  # the next sample whose window of the current begins
+        if sensor > 0:
+            own = n_common + np.flatnonzero(local == 4)
+            begin_current(initial[g, 4], own, x, m, marks)
+            ahead = first
+            if averaged:
+                ahead = mark_first(trail, time, first, last, width, initial[g, 4], own, x, m)
         load = par[LOAD] + initial[g, 3]
         section = hold_start[g]
         limit = hold_start[g + 1] - 1 if g + 2 < starts.shape[0] else hold_end.shape[0] - 1
