@@ -41,13 +41,13 @@ def sensors(fit: Fit) -> list[Finding]:
 def _current_lag(sensor: str, lag: float) -> Finding:
     """Say how the current's sensor is late."""
     how = (
-        f"the mean over {2e3 * lag:.3g} ms"
+        f"its mean over {2e3 * lag:.3g} ms"
         if sensor == "averaged"
-        else f"low-passed with a time constant of {1e3 * lag:.3g} ms"
+        else f"a low-pass of it with a time constant of {1e3 * lag:.3g} ms"
     )
     return Finding(
         "current_lag",
         "note",
-        f"the current is {how}: L/R is stated without that lag of its sensor",
+        f"the current is read as {how}: L/R is stated without that lag of its sensor",
         {"lag": lag, "sensor": sensor},
     )

@@ -23,6 +23,7 @@ from smp_motor_ident.model.structures import Structure, to_internal
 
 Array = NDArray[np.float64]
 
+LEAST_LAG = 1e-3  # of a sample: of a sensor that shows the current as good as at once
 BLOCKS = 60  # runs of samples whose scores are summed, for the covariance of coloured residuals
 
 
@@ -91,6 +92,8 @@ def gather(
     """Run over the data once; scores are summed over about so many runs of samples."""
     noise = NoiseModel() if noise is None else noise
     par, internal = to_internal(z, structure.order)
+    # A motor drawn at random near another may have any lag: no sensor is early.
+    par[models.CURRENT_LAG] = max(par[models.CURRENT_LAG], LEAST_LAG * data.step)
     slope = (
         np.ascontiguousarray(internal @ structure.matrix()) if differentiate else internal[:, :0]
     )
