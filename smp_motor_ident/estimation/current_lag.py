@@ -1,4 +1,4 @@
-"""A current that its sensor averages or low-passes: asked for by a score, fitted from several starts.
+"""A current that its sensor averages or low-passes: asked for by a score, from several starts.
 
 Left out, the lag of the sensor is taken for that of the winding: L comes out too large.
 Derivation: docs/derivations.md, section 12.
@@ -27,8 +27,7 @@ from smp_motor_ident.model.structures import SENSORS, Structure
 Array = models.Array
 
 LITTLE = 0.01  # of a sample: a lag that is as good as none, for the score
-WINDOW = 0.6  # of a sample: the mean lag of a window that reaches beyond the last change of voltage
-SETTLED = 0.5  # of a sample: of a shorter L/R a smaller window shows next to nothing
+BEYOND = 0.6  # of a sample: the mean lag of a window that reaches beyond the last change of voltage
 SHARES = (0.3, 0.8)  # of the winding's lag that may be the sensor's
 SAMPLES = (0.25, 0.5, 1.5)  # of lag at which a descent begins
 
@@ -72,18 +71,17 @@ def with_lag(fit: Fit, lag: float) -> Fit:
 def _asked_for(data: Experiments, direct: Fit) -> bool:
     """Tell from the score of a window whether a fit with a lag is worth its passes.
 
-    The score is taken at next to no window; of a winding that has settled when its current is
-    read that shows nothing, so there at a window of more than a sample, too.
+    A window of next to nothing shows nothing of a winding that has settled when its current is
+    read, so the score is taken at one of more than a sample, too.
     """
     if not direct.converged:
         return True
     averaged = direct.structure.with_(current_sensor="averaged")
-    short = float(np.exp(direct.z[models.TE])) < SETTLED * data.step
     least = _predicted(data, direct, direct.structure)
     price = 0.5 * float(np.log(direct.samples)) * sandwich_factor(direct)
     return any(
         not least - _predicted(data, with_lag(direct, lag * data.step), averaged) < price
-        for lag in [LITTLE] + [WINDOW] * short
+        for lag in (LITTLE, BEYOND)
     )
 
 

@@ -246,4 +246,5 @@ def rubbing(data: Experiments, near: Fit, value: float) -> tuple[Array, list[Arr
     at_rest = before < max(value, near.z[models.VC_PLUS])
     if not np.any(at_rest & near.initial[:, :2].any(axis=1)):
         return z, [moving]
-    return z, [moving, np.where(at_rest[:, None], np.array([0.0, 0.0, 1.0, 1.0, 0.0]), 1.0) * moving]
+    still = np.array([0.0, 0.0, 1.0, 1.0, 0.0])
+    return z, [moving, np.where(at_rest[:, None], still, 1.0) * moving]

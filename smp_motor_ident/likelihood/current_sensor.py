@@ -55,7 +55,7 @@ def sensor_rate(sensor: int, par: Array) -> float:
         if not near and abs(1.0 - a * te) > APART:
             break
         a *= 1.0 + 2 * APART
-    return a
+    return float(a)
 
 
 @compiled

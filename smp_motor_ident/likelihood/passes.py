@@ -125,7 +125,8 @@ def gather(
             initial, own, noise.gain, whitening(noise.covariance), noise.huber, normal, gradient,
             cost, spread, length, scores, owner, _ring(data, par, p),
             models.SENSORS.index(structure.current_sensor) if structure.current else 0,
-            _trail(data, structure, par), np.zeros((0, 3)) if predicted is None else predicted, data.jittered,
+            _trail(data, structure, par), np.zeros((0, 3)) if predicted is None else predicted,
+            data.jittered,
         )  # fmt: skip
     return Sums(normal, gradient, cost, spread, scores[:used], owner[:used])
 

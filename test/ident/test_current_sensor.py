@@ -1,4 +1,4 @@
-"""A current that its sensor averages or low-passes: shown exactly, found, and told from the winding.
+"""A current that its sensor averages or low-passes: shown exactly, told from the winding.
 
 What a sensor shows of a locked rotor's current is a formula; of a turning motor it is taken of a
 simulation in steps 200 times as small.
@@ -17,6 +17,7 @@ from test_recursion import exact, predict
 
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.likelihood import recursion as rc
+from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.likelihood.noise import NO_GAIN, NoiseModel, kalman_gain
 from smp_motor_ident.likelihood.passes import gather
 from smp_motor_ident.model import structures as models
@@ -74,16 +75,10 @@ def test_a_sensor_shows_the_current_of_a_locked_rotor_as_the_formula_says(sensor
         expected = 1 - both / (te - lag)
     z = models.from_physical(R, L, K, J, B, 10.0 * K / R)  # friction that 5 V do not break
     z[models.CURRENT_LAG] = lag
-    data = replace(motors_data(record), initial=np.zeros((1, 5)))
+    data = replace(prepare([record], True), initial=np.zeros((1, 5)))
     out = predict(data, Structure("electromechanical", current=True, current_sensor=sensor), z)
     # The low-pass is kept 2e-5 apart from the winding's own pole.
     np.testing.assert_allclose(out[:, 2], 5.0 / R * expected, atol=5.0 / R * 2e-5)
-
-
-def motors_data(record: Record):
-    from smp_motor_ident.likelihood.experiments import prepare
-
-    return prepare([record], True)
 
 
 @pytest.mark.parametrize("sensor", SENSORS[1:])
