@@ -29,7 +29,7 @@ Array = models.Array
 LITTLE = 0.01  # of a sample: a lag that is as good as none, for the score
 BEYOND = 0.6  # of a sample: the mean lag of a window that reaches beyond the last change of voltage
 SHARES = (0.3, 0.8)  # of the winding's lag that may be the sensor's
-SAMPLES = (0.25, 0.5, 1.5)  # of lag at which a descent begins
+SAMPLES = (0.25, 0.5, 1.5, 5.0)  # of lag at which a descent begins
 
 
 def with_current_lag(
