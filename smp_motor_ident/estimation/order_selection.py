@@ -294,7 +294,8 @@ def _variations(
         candidates.append(FittedCandidate(other, reason))
         if verdict:
             best = other
-    best = with_current_lag(data, best, options, candidates, say)
+    if best.structure != candidates[0].fit.structure:  # what was added may have hidden it
+        best = with_current_lag(data, best, options, candidates, say)
     return _without_friction(data, best, options, candidates)
 
 
