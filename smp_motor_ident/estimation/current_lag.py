@@ -53,6 +53,9 @@ def with_current_lag(
         near = [best] if best.noise_ratio == 0 else [best, replace(best, noise_ratio=0.0)]
         tried = [descent.refine(data, richer, n, z, options) for z in starts for n in near]
         other = min(tried, key=lambda f: f.deviance)
+        if other.z[models.CURRENT_LAG] < LITTLE * data.step:  # another minimum, of no lag
+            candidates.append(FittedCandidate(other, "no lag of the current shows", whole=False))
+            continue
         verdict, reason = preferred(best, other)
         if verdict and other.noise_ratio > 0:
             other = data_window.grow(data, richer, other, options)
