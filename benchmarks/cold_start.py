@@ -52,7 +52,7 @@ def minimum(record, z, current: bool, friction: bool) -> dict:
     spent = time.perf_counter() - begun
     if found is None:
         return {"right": False, "seconds": spent}
-    near = fit.solve(data, structure, found.at(structure.complete(z), np.zeros((1, 4))))
+    near = fit.solve(data, structure, found.at(structure.complete(z), np.zeros((1, 5))))
     # At or below the deviance that a start from the truth reaches; 0.1 % of noise.
     above = found.deviance - near.deviance
     return {"right": bool(above <= max(10.0, 1e-3 * data.size)), "above": above, "seconds": spent}

@@ -45,7 +45,7 @@ def bound(record, z, current: bool, torque: float) -> dict[str, tuple[float, flo
         gain, scale = kalman_gain(z, 2, rc.ANGLE, step, ratio, relative)
         noise = scale * noise[0, 0] if current else np.diag([scale[0, 0] * noise[0, 0], 1.0])
     z = structure.complete(z)
-    start = np.zeros((1, 4))
+    start = np.zeros((1, 5))
     here = evaluate(data, structure, z, start, start, NoiseModel(noise, gain))
     cov = np.linalg.inv(here.normal)
     m = structure.matrix()

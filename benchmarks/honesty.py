@@ -43,7 +43,7 @@ def least_certain(record, z, current: bool, known: tuple[str, ...]) -> float:
     structure = Structure("bound", current=current, shape=False, fixed=fixed)
     data = prepare([record], current)
     noise = np.diag([QUANTUM**2 / 12, CURRENT_NOISE**2])
-    start = np.zeros((1, 4))
+    start = np.zeros((1, 5))
     here = evaluate(data, structure, structure.complete(z), start, start, NoiseModel(noise))
     cov = np.linalg.inv(here.normal)
     values, gradients = models.physical(z)

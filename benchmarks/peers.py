@@ -72,7 +72,7 @@ def cost(record: Record, x: np.ndarray) -> float:
     structure = Structure("speed", friction="symmetric" if len(x) > 3 else "none", fixed=fixed)
     data = prepare([record], False)
     return (
-        solve(data, structure, Start(np.zeros(11), data.initial, NOISE * np.eye(2))).objective
+        solve(data, structure, Start(np.zeros(12), data.initial, NOISE * np.eye(2))).objective
         * NOISE
     )
 

@@ -44,6 +44,8 @@ def measure(c: Case, rng: np.random.Generator) -> dict[str, object]:
     u = np.concatenate([np.zeros(rest), u])
     n = u.size
     every = int(np.clip(np.ceil(60 * c.step / min(c.tau, 1.0)), 4, 24))
+    if c.sensor.get("i_lowpass") or c.sensor.get("i_window"):  # what it follows is the winding
+        every = int(np.clip(np.ceil(8 * c.step * m.R / m.L), every, 96))
     fine = c.step / every
     values = dict(R=m.R, L=m.L, K=m.K, J=m.J, b=m.b, tc=m.tc, supply=m.supply, gear=m.gear)
     target = np.zeros(n)
@@ -144,7 +146,8 @@ def _current(
     s = c.sensor
     i = out[:, 0]
     if s.get("i_lowpass"):
-        i = _filter(i, 1 - np.exp(-fine / s["i_lowpass"]))
+        # The current runs straight between fine samples: half of each is of the one before.
+        i = _filter(0.5 * (i + np.concatenate(([0.0], i[:-1]))), 1 - np.exp(-fine / s["i_lowpass"]))
     y = i[::every]
     span = s.get("i_window", c.step if c.drive.get("pwm") or s.get("i_supply") else 0.0)
     if span:

@@ -45,7 +45,7 @@ Array = NDArray[np.float64]
 Stated = tuple[str, Quantity, Array]
 """Name, value and gradient by the free coordinates of a number that is stated."""
 
-INTERFACE = ("delay", "averaging_window")
+INTERFACE = ("delay", "averaging_window", "current_lag")
 ROUNDS = 3  # effects that are named at most
 
 

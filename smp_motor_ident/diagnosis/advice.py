@@ -20,6 +20,7 @@ from smp_motor_ident.diagnosis.limits import (
     UNEXPLAINED,
     WINDING_LAG,
 )
+from smp_motor_ident.diagnosis.sensors import sensors
 from smp_motor_ident.diagnosis.validation import within_resolution
 from smp_motor_ident.estimation import prediction, shape_constraint
 from smp_motor_ident.estimation.choice import FittedCandidate, preferred_but_for_descent
@@ -45,7 +46,7 @@ def assess(data: Experiments, fit: Fit, percent: FitPercent, tests: ResidualTest
         *_descent(data, fit),
         *_fit(percent, tests, within_resolution(data, fit)),
         *_resolution(data, fit, tests),
-        *_sensors(fit),
+        *sensors(fit),
         *_second_lag(data, fit),
         *_torque_noise(data, fit),
     ]
@@ -159,34 +160,6 @@ def _resolution(data: Experiments, fit: Fit, tests: ResidualTests) -> list[Findi
                 f"{1 / data.step:.4g} Hz hardly shows",
                 {"radians_a_sample": ring * data.step, "limit": RINGING.value},
                 "sample faster",
-            )
-        )
-    return out
-
-
-def _sensors(fit: Fit) -> list[Finding]:
-    out = []
-    s = fit.structure
-    if s.offset and s.current:
-        offset = float(fit.z[models.OFFSET])
-        out.append(
-            Finding(
-                "current_offset",
-                "warning",
-                f"current has an offset of {1e3 * offset:.3g} mA, removed",
-                {"offset": offset},
-                "zero the current sensor at rest",
-            )
-        )
-    if s.window or "window" in s.fixed:
-        window = float(fit.z[models.WINDOW])
-        out.append(
-            Finding(
-                "averaged_speed",
-                "warning",
-                f"the speed is averaged over {1e3 * window:.3g} ms: {1e3 * window / 2:.3g} ms of "
-                "what looks like a delay is that filter, not the motor",
-                {"window": window},
             )
         )
     return out

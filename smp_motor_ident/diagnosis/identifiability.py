@@ -95,7 +95,7 @@ def _family(estimate: Estimate, current_noise: float) -> tuple[list[Fit], bool]:
     known = {n: q.value for n, q in estimate.parameters.items() if n in PHYSICAL}
     given = known.get("resistance") or estimate.hardware.resistance
     r = given or LARGEST_RESISTANCE
-    z = np.zeros(11)
+    z = np.zeros(len(models.Z_NAMES))
     gain, tau = estimate.value("dc_gain"), estimate.value("time_constant")
     product = estimate.value("time_constant_product") or 0.02 * tau**2
     z[models.A0] = -np.log(gain)

@@ -175,7 +175,7 @@ def _own(data: Experiments, fit: Fit, base: Array) -> list[Array]:
     segments = len(data.starts) - 1
     if segments > SEGMENTS:
         columns = tuple(c for c in columns if c == 2)
-    size = {0: 1e-3, 1: 1e-3 * (1 + np.abs(fit.initial[:, 1]).max()), 2: 1e-3, 3: 1e-3}
+    size = {0: 1e-3, 1: 1e-3 * (1 + np.abs(fit.initial[:, 1]).max()), 2: 1e-3, 3: 1e-3, 4: 1e-3}
     for c in columns:
         initial = fit.initial.copy()
         initial[:, c] += size[c]

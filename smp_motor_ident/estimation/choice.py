@@ -7,7 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from smp_motor_ident.diagnosis.limits import PRIOR_ODDS, SECOND_LAG, SURE_GAIN
+from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import Structure
 
@@ -41,6 +43,8 @@ def label(structure: Structure) -> str:
             (structure.load, "load"),
             (structure.delay, "delay"),
             (structure.window, "averaged speed"),
+            (structure.current_sensor == "averaged", "averaged current"),
+            (structure.current_sensor == "low_passed", "low-passed current"),
             (structure.offset, "current offset"),
             (structure.held == "after", "command held after its row"),
             (structure.held == "interpolated", "command interpolated"),
@@ -64,6 +68,15 @@ def size(structure: Structure) -> int:
 def sandwich_factor(fit: Fit) -> float:
     """Return by how much the scores scatter more than white residuals would let them."""
     return max(1.0, float(np.median(fit.sandwich_factors())))
+
+
+def worth_a_fit(data: Experiments, best: Fit, richer: Structure) -> bool:
+    """Tell from the score whether a fit of more is worth its passes."""
+    if not best.converged:
+        return True
+    gain, _, _ = prediction.predicted_decrease(data, best, richer)
+    price = (size(richer) - size(best.structure)) * float(np.log(best.samples))
+    return not gain < 0.5 * price * sandwich_factor(best)
 
 
 def preferred(best: Fit, other: Fit) -> tuple[bool, str]:
@@ -129,7 +142,7 @@ def _loose(simple: Fit, rich: Fit) -> str:
     for i in set(free) - set(simple.structure.free()):
         name = models.Z_NAMES[i]
         std = float(np.sqrt(cov[free.index(i), free.index(i)]))
-        if name in ("delay", "window") and std > 0.4 * rich.z[i]:
+        if name in ("delay", "window", "current_lag") and std > 0.4 * rich.z[i]:
             return name
         if name == "ln_a2" and std > 0.4:
             return "second time constant"

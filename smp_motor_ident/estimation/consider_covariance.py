@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident.estimation import prediction
+from smp_motor_ident.estimation.current_lag import LITTLE, with_lag
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments
@@ -47,7 +48,8 @@ def consider_clock(data: Experiments, fit: Fit, share: float) -> Fit:
     angle = float(data.kind == rc.ANGLE)
     powers: Array = np.zeros(fit.z.size)
     powers[[models.A0, models.A1, models.A2, models.TE]] = angle, 1 + angle, 2 + angle, 1.0
-    powers[[models.DELAY, models.WINDOW]] = fit.z[[models.DELAY, models.WINDOW]]
+    times = [models.DELAY, models.WINDOW, models.CURRENT_LAG]
+    powers[times] = fit.z[times]
     row = share * powers[list(fit.structure.free())]
     return fit.wider(np.asarray(np.outer(row, row), dtype=np.float64))
 
@@ -79,21 +81,28 @@ def consider_friction(data: Experiments, fit: Fit) -> tuple[Fit, float]:
 
 
 def consider_left_out(data: Experiments, fit: Fit) -> Fit:
-    """Return the fit with its covariance widened by a delay or load not worth its price."""
+    """Return the fit with its covariance widened by what was not worth its price.
+
+    That is a delay, a load, or a lag of the current's sensor.
+    """
     s = fit.structure
     additions = []
     if not s.delay and "delay" not in s.fixed:
         additions.append((s.with_(delay=True), models.DELAY))
     if not s.load and not s.own_load and "load" not in s.fixed:
         additions.append((s.with_(load=True), models.LOAD))
+    if s.current and not s.lags:
+        additions.append((s.with_(current_sensor="averaged"), models.CURRENT_LAG))
     factor = float(np.median(fit.sandwich_factors())) if s.free() else 1.0
     wider = fit
     for richer, coordinate in additions if s.free() else []:
-        beside = _beside(data, fit, richer, coordinate)
-        own = factor * beside.variance
+        little = LITTLE * data.step * (coordinate == models.CURRENT_LAG)
+        beside = _beside(data, with_lag(fit, little) if little else fit, richer, coordinate)
+        own, found = factor * beside.variance, beside.size + little
+        early = little > 0 and found < 0  # which no sensor is
         # Akaike: with it the motor is predicted better.
-        if beside.seen and beside.size**2 > 2 * own:
-            wider = wider.wider(beside.covariance(beside.size**2 - own))
+        if beside.seen and found**2 > 2 * own and not early:
+            wider = wider.wider(beside.covariance(found**2 - own))
     return wider
 
 

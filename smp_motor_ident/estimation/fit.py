@@ -73,7 +73,8 @@ class _Descent:
     def look(self, covariance: Array) -> None:
         """Pass where it is, with this noise and the gain that goes with it."""
         gain = gain_for(self.z, self.structure.order, self.data.kind, self.data.step,
-                        self.noise_ratio, covariance, self.current)  # fmt: skip
+                        self.noise_ratio, covariance,
+                        self.current and not self.structure.lags)  # fmt: skip
         self.noise = NoiseModel(covariance, gain, self.options.huber)
         self.here: Pass = self._pass(self.z, self.initial)
 
@@ -254,13 +255,13 @@ def _physical_steps(z: Array, structure: Structure) -> Array:
 
 def _bounds(fastest: float) -> tuple[Array, Array]:
     """Return bounds of z: what floating point can hold, and no negative volts or seconds."""
-    lower, upper = np.full(11, -np.inf), np.full(11, np.inf)
+    lower, upper = np.full(len(models.Z_NAMES), -np.inf), np.full(len(models.Z_NAMES), np.inf)
     logarithms = [models.A0, models.A1, models.A2, models.TE, models.LN_R]
     lower[logarithms], upper[logarithms] = -LARGEST, LARGEST
     lower[[models.VC_PLUS, models.VC_MINUS, models.DELAY]] = 0.0
-    lower[models.WINDOW] = 1e-9
+    lower[[models.WINDOW, models.CURRENT_LAG]] = 1e-9
     if fastest > 0:
-        lower[models.TE] = math.log(fastest)
+        lower[models.TE], lower[models.CURRENT_LAG] = math.log(fastest), fastest
     return lower, upper
 
 

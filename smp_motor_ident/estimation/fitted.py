@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 NORMAL_95 = 1.96
 """Half a 95 % interval of a normal variable, in its standard deviations."""
 
-PLAUSIBLE = np.array([1e-2, 1e-2, 1e-2, 0.25, 1e-4, 1e-4, 1e-4, 1e-2, 1e-4, 1e-2, 1e-2])
+PLAUSIBLE = np.array([1e-2, 1e-2, 1e-2, 0.25, 1e-4, 1e-4, 1e-4, 1e-2, 1e-4, 1e-2, 1e-2, 1e-2])
 """Inverse squares of how far each coordinate z could be from any value at all."""
 
 
@@ -40,7 +40,7 @@ class Profile:
     """A coordinate followed to both ends of its 95 % interval, all others fitted again."""
 
     coordinate: int  # index into z
-    # shape (11,) each: coordinates of the whole motor at the lower and the upper end
+    # shape (12,) each: coordinates of the whole motor at the lower and the upper end
     ends: tuple[Array, Array]
 
 
@@ -51,7 +51,7 @@ class Options:
     # Bound of the robust loss [standard deviations]; infinite for least squares
     huber: float = np.inf
     priors: tuple[Prior, ...] = ()  # physical parameters that are known
-    # lower, upper: shape (11,): bounds of z
+    # lower, upper: shape (12,): bounds of z
     lower: Array | None = None
     upper: Array | None = None
 
@@ -60,8 +60,8 @@ class Options:
 class Start:
     """Where a descent begins: a motor, how it moved at first, and the noise that is believed."""
 
-    z: Array  # shape (11,): coordinates
-    initial: Array  # shape (g, 4): q, w, angle, load of each segment
+    z: Array  # shape (12,): coordinates
+    initial: Array  # shape (g, 5): q, w, angle, load, earlier current of each segment
     noise: Array  # shape (2, 2): covariance of the innovations of (output, current)
     noise_ratio: float = 0.0  # intensity of the torque noise over the output's noise variance
 

@@ -23,7 +23,9 @@ from smp_motor_ident.estimation.choice import (
     sandwich_factor,
     simplest_left,
     size,
+    worth_a_fit,
 )
+from smp_motor_ident.estimation.current_lag import with_current_lag
 from smp_motor_ident.estimation.delay_and_averaging import (
     delay_without_noise,
     with_averaging,
@@ -60,10 +62,10 @@ def explore(
             first = _initial_fit(data, base, options, say)
         if first is None:
             return []
-        best = first
         candidates.append(
             FittedCandidate(first, "asked for" if not auto else "current is measured")
         )
+        best = with_current_lag(data, first, options, candidates, say)
         if auto and data.kind == rc.SPEED:
             best = _try_average(data, best, options, candidates, say)
     else:
@@ -274,7 +276,7 @@ def _variations(
         if richer == best.structure:
             continue
         hidden = delay_without_noise(data, best, options) if "delay" in change else None
-        if hidden is None and not _worth_a_fit(data, best, richer):
+        if hidden is None and not worth_a_fit(data, best, richer):
             continue
         say(f"trying {label(richer)}")
         z = best.z.copy()
@@ -292,6 +294,8 @@ def _variations(
         candidates.append(FittedCandidate(other, reason))
         if verdict:
             best = other
+    if best.structure != candidates[0].fit.structure:  # what was added may have hidden it
+        best = with_current_lag(data, best, options, candidates, say)
     return _without_friction(data, best, options, candidates)
 
 
@@ -340,15 +344,6 @@ def _orders_again(
         candidates.append(FittedCandidate(other, reason))
         best, s = (other, structure) if better else (best, s)
     return best
-
-
-def _worth_a_fit(data: Experiments, best: Fit, richer: Structure) -> bool:
-    """Tell from the score whether a fit of more is worth its passes."""
-    if not best.converged:
-        return True
-    gain, _, _ = prediction.predicted_decrease(data, best, richer)
-    price = (size(richer) - size(best.structure)) * float(np.log(best.samples))
-    return not gain < 0.5 * price * sandwich_factor(best)
 
 
 def _without_friction(

@@ -33,7 +33,7 @@ from smp_motor_ident.model.structures import to_internal
 Array = NDArray[np.float64]
 
 RISE = float(chdtri(1, 0.05))  # of the deviance at the end of a 95 % interval
-NONLINEAR = (models.VC_PLUS, models.A2, models.DELAY, models.WINDOW)
+NONLINEAR = (models.VC_PLUS, models.A2, models.DELAY, models.WINDOW, models.CURRENT_LAG)
 """Coordinates that act other than linearly, in the order in which they are followed."""
 NEAR = 3.0  # standard deviations to a bound within which no parabola is trusted
 STEPS = 8  # points on each side
@@ -156,7 +156,7 @@ def _range(data: Experiments, fit: Fit, coordinate: int) -> tuple[float, float]:
         back = _back_emf(fit.z) / float(np.exp(fit.z[models.A0]))
         value = float(fit.z[coordinate])
         return 0.0, min(MOST_FRICTION.value * full, value + (1 - back) * max(full - value, 0.0))
-    return (1e-9 if coordinate == models.WINDOW else 0.0), float(np.ptp(data.time))
+    return (0.0 if coordinate == models.DELAY else 1e-9), float(np.ptp(data.time))
 
 
 def _end(
@@ -246,4 +246,5 @@ def rubbing(data: Experiments, near: Fit, value: float) -> tuple[Array, list[Arr
     at_rest = before < max(value, near.z[models.VC_PLUS])
     if not np.any(at_rest & near.initial[:, :2].any(axis=1)):
         return z, [moving]
-    return z, [moving, np.where(at_rest[:, None], np.array([0.0, 0.0, 1.0, 1.0]), 1.0) * moving]
+    still = np.array([0.0, 0.0, 1.0, 1.0, 0.0])
+    return z, [moving, np.where(at_rest[:, None], still, 1.0) * moving]

@@ -200,6 +200,8 @@ def _reported(structure: models.Structure) -> list[str]:
         names.append("delay")
     if structure.window or "window" in structure.fixed:
         names.append("averaging_window")
+    if structure.lags:
+        names.append("current_lag")
     return names
 
 

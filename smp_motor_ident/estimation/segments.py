@@ -142,11 +142,13 @@ def _parted(data: Experiments, fit: Fit, parts: int) -> Experiments:
     starts = np.array(sorted({*map(int, data.starts), *near}), dtype=np.int64)
     owner = np.searchsorted(data.starts, starts[:-1], side="right") - 1
     first = np.empty(starts.size - 1, dtype=np.int64)
-    initial = np.zeros((starts.size - 1, 4))
+    initial = np.zeros((starts.size - 1, 5))
     predicted = np.empty((data.size, 2))
     gather(
         data, fit.structure, fit.z, fit.initial, fit.noise_model(), predicted, differentiate=False
     )
+    current = data.current.copy()
+    reach = 2 * fit.z[models.CURRENT_LAG] * (fit.structure.current_sensor == "averaged")
     for n, (begin, g) in enumerate(zip(starts[:-1], owner, strict=True)):
         a = int(data.hold_start[g])
         last = int(data.hold_start[g + 1]) if g + 2 < data.starts.size else data.hold_end.size
@@ -154,14 +156,18 @@ def _parted(data: Experiments, fit: Fit, parts: int) -> Experiments:
         if begin == data.starts[g]:
             initial[n] = fit.initial[g]
             continue
+        if current.size:  # of which a mean is that of the part before
+            end = int(np.searchsorted(data.time[begin : starts[n + 1]], data.time[begin] + reach))
+            current[begin : begin + end] = np.nan
         voltage = data.hold_value[min(int(first[n]), last - 1)]
         initial[n] = (
             voltage - fit.z[models.LOAD],
             predicted[begin, 0],
             data.output[begin],
             fit.initial[g, 3],
+            0.0,
         )
         if data.kind != rc.ANGLE or not np.isfinite(data.output[begin]):
             initial[n, 2] = predicted[begin, 1] if data.kind == rc.ANGLE else 0.0
     return replace(data, starts=starts, hold_start=np.append(first, data.hold_start[-1]),
-                   initial=initial)  # fmt: skip
+                   initial=initial, current=current)  # fmt: skip

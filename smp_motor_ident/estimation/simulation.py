@@ -57,7 +57,7 @@ def _motor(estimate: Estimate) -> Fit:
     return Fit(
         structure=structure,
         z=z,
-        initial=np.zeros((1, 4)),
+        initial=np.zeros((1, 5)),
         noise=np.eye(2),
         noise_ratio=0.0,
         gain=np.zeros((3, 2)),

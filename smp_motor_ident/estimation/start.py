@@ -136,7 +136,7 @@ def _late(u: Uniform, lag: int) -> Uniform:
 
 def _to_z(theta: Array, order: int) -> Array:
     """Return the coordinates of a0, a1 (, a2) and the volts of friction."""
-    z = np.zeros(11)
+    z = np.zeros(len(models.Z_NAMES))
     z[: order + 1] = np.log(theta[: order + 1])
     if order == 2:
         z[models.TE] = z[models.A2] - z[models.A1]

@@ -12,9 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident._compile import compiled, inlined
+from smp_motor_ident.likelihood.current_sensor import after_move, before_move
 from smp_motor_ident.likelihood.propagator import BE, TE, TM, K, speed_at
 from smp_motor_ident.likelihood.sensitivities import (
     LANES,
+    SENSOR,
     SLOTS,
     SW,
     WHOLE,
@@ -150,11 +152,15 @@ def advance(
     scratch: Array,
 ) -> float:
     """Advance by h at constant v under friction, through all events; return the direction."""
-    left = h
+    left, lags = h, marks[SENSOR] > 0.0
     for _ in range(EVENTS):
         if direction == STUCK:
             wait, direction = _breakaway(left, v, load, par, x)
+            if lags:
+                before_move(x, m)
             stay(wait, par, x, m, v)
+            if lags:
+                after_move(wait, v, 0.0, True, par, x, m, marks)
             left -= wait
             if direction == STUCK:
                 break
@@ -164,8 +170,12 @@ def advance(
         span = t if t >= 0.0 else left
         fill(span, par, m, cache, SLOTS, scratch)
         activate(m, cache, marks, SLOTS)
+        if lags:
+            before_move(x, m)
         slide_columns(m, x[0], x[1], v, f)
         slide_state(m, x, v, f)
+        if lags:
+            after_move(span, v, f, False, par, x, m, marks)
         if t < 0.0:
             break
         direction = _stop(load, f, v, par, x, m)

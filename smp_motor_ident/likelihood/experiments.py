@@ -43,7 +43,9 @@ class Experiments:
     kind: int  # SPEED, ANGLE or MEAN_SPEED
     step: float  # median sampling interval [s]
     quantum: float  # resolution of the output [rad or rad/s]; 0 where it has none
-    initial: Array  # shape (g, 4): first guess of q (0), speed, angle and load of each segment
+    # shape (g, 5), of each segment: first guess of q (0), speed, angle, load, and of what the
+    # current was more [V] before the segment than at its beginning
+    initial: Array
     voltage: Array  # as it was recorded, by the row
     how: str = "before"  # how a row's command ran, as in `Structure.held`
 
@@ -289,7 +291,7 @@ def _join(arrays: Sequence[Array]) -> Array:
 
 
 def _initial(time: Array, output: Array, starts: Integers, kind: int) -> Array:
-    initial = np.zeros((len(starts) - 1, 4))
+    initial = np.zeros((len(starts) - 1, 5))
     for g in range(len(starts) - 1):
         a, b = int(starts[g]), int(min(starts[g + 1], starts[g] + 6))
         y, t = output[a:b], time[a:b]

@@ -17,11 +17,13 @@ from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.linear_pass import run_sliding, squares_sliding
 from smp_motor_ident.likelihood.noise import NoiseModel, whitening
 from smp_motor_ident.likelihood.normal_equations import eliminate
+from smp_motor_ident.likelihood.sensitivities import LANES
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import Structure, to_internal
 
 Array = NDArray[np.float64]
 
+LEAST_LAG = 1e-3  # of a sample: of a sensor that shows the current as good as at once
 BLOCKS = 60  # runs of samples whose scores are summed, for the covariance of coloured residuals
 
 
@@ -70,10 +72,11 @@ class Pass:
 
 
 def own_columns(data: Experiments, structure: Structure) -> tuple[int, ...]:
-    """Return which of (q, w, angle, load) each segment has to itself."""
+    """Return which of (q, w, angle, load, earlier current) each segment has to itself."""
     angle = (2,) if data.kind == recursion.ANGLE else ()
     own = (1,) if structure.order == 1 else (0, 1)
-    return own + angle + ((3,) if structure.own_load else ())
+    earlier = (4,) if structure.lags else ()
+    return own + angle + ((3,) if structure.own_load else ()) + earlier
 
 
 def gather(
@@ -89,6 +92,8 @@ def gather(
     """Run over the data once; scores are summed over about so many runs of samples."""
     noise = NoiseModel() if noise is None else noise
     par, internal = to_internal(z, structure.order)
+    # A motor drawn at random near another may have any lag: no sensor is early.
+    par[models.CURRENT_LAG] = max(par[models.CURRENT_LAG], LEAST_LAG * data.step)
     slope = (
         np.ascontiguousarray(internal @ structure.matrix()) if differentiate else internal[:, :0]
     )
@@ -119,7 +124,9 @@ def gather(
             data.output, data.current, data.kind, structure.friction != "none", par, slope,
             initial, own, noise.gain, whitening(noise.covariance), noise.huber, normal, gradient,
             cost, spread, length, scores, owner, _ring(data, par, p),
-            np.zeros((0, 3)) if predicted is None else predicted, data.jittered,
+            models.SENSORS.index(structure.current_sensor) if structure.current else 0,
+            _trail(data, structure, par), np.zeros((0, 3)) if predicted is None else predicted,
+            data.jittered,
         )  # fmt: skip
     return Sums(normal, gradient, cost, spread, scores[:used], owner[:used])
 
@@ -128,11 +135,22 @@ def _ring(data: Experiments, par: Array, p: int) -> Array:
     """Return the memory for the window of a mean speed."""
     if data.kind != recursion.MEAN_SPEED:
         return np.zeros((0, 0))
+    return np.zeros((_depth(data, par[recursion.WINDOW]), 3 + 2 * p))
+
+
+def _trail(data: Experiments, structure: Structure, par: Array) -> Array:
+    """Return the memory for the window of a mean current."""
+    if not structure.lags or structure.current_sensor != "averaged":
+        return np.zeros((0, 0))
+    return np.zeros((_depth(data, 2 * par[models.CURRENT_LAG]), 2 + LANES))
+
+
+def _depth(data: Experiments, width: float) -> int:
+    """Return how many samples a window may hold."""
     steps = np.diff(data.time)
     # A descent may try any width; one that is no width at all is thrown out by its objective.
-    width = min(max(float(par[recursion.WINDOW]), 0.0), float(np.ptp(data.time)))
-    depth = 4 + math.ceil(width / float(steps[steps > 0].min()))
-    return np.zeros((min(depth, data.size + 1), 3 + 2 * p))
+    width = min(max(float(width), 0.0), float(np.ptp(data.time)))
+    return min(4 + math.ceil(width / float(steps[steps > 0].min())), data.size + 1)
 
 
 def _slides(data: Experiments, structure: Structure, z: Array, noise: NoiseModel) -> bool:

@@ -12,6 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident._compile import compiled, inlined
+from smp_motor_ident.likelihood.current_sensor import (
+    AVERAGED,
+    STATE,
+    after_move,
+    before_move,
+    begin_current,
+    mark,
+    mark_first,
+    observe_lagging,
+    sensor_rate,
+)
 from smp_motor_ident.likelihood.events import STUCK, advance, keeps_turning
 from smp_motor_ident.likelihood.normal_equations import ROOM, TILE, robust, sum_up
 from smp_motor_ident.likelihood.observation import (
@@ -28,6 +39,8 @@ from smp_motor_ident.likelihood.sensitivities import (
     D0,
     D1,
     LANES,
+    RATE,
+    SENSOR,
     SLOPE,
     SQ,
     SW,
@@ -38,7 +51,7 @@ from smp_motor_ident.likelihood.sensitivities import (
     tabulate,
     turn,
 )
-from smp_motor_ident.model.structures import DELAY, LOAD, VC_MINUS, VC_PLUS, WINDOW
+from smp_motor_ident.model.structures import CURRENT_LAG, DELAY, LOAD, VC_MINUS, VC_PLUS, WINDOW
 
 __all__ = ["ANGLE", "MEAN_SPEED", "SPEED", "WINDOW", "run"]
 
@@ -75,9 +88,14 @@ def _move(
         f += par[VC_PLUS] if direction > 0.0 else -par[VC_MINUS]
         if not keeps_turning(m, par, x, direction, v, f):
             return advance(h, v, direction, load, par, x, m, cache, marks, scratch)
+    lags = marks[SENSOR] > 0.0
+    if lags:
+        before_move(x, m)
     if columns:
         slide_columns(m, x[0], x[1], v, f)
     slide_state(m, x, v, f)
+    if lags:
+        after_move(h, v, f, False, par, x, m, marks)
     return direction
 
 
@@ -139,6 +157,8 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
     blocks: Array,
     block_segment: Integers,
     ring: Array,
+    sensor: int,
+    trail: Array,
     predicted: Array,
     usual: float,
 ) -> int:
@@ -151,8 +171,10 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
     delay = par[DELAY]
     late = bool(np.any(slope[DELAY] != 0.0))
     m, cache, marks, scratch = begin(slope, local, friction)
+    marks[SENSOR], marks[RATE] = sensor, sensor_rate(sensor, par)
+    averaged, width = sensor == AVERAGED, 2 * par[CURRENT_LAG]
     table = tabulate(usual, par, m, cache, marks, scratch)
-    x, past, rows = np.zeros(3), np.zeros(1 + p), np.zeros(TILE * ROOM)
+    x, past, rows = np.zeros(STATE), np.zeros(1 + p), np.zeros(TILE * ROOM)
     tile = np.zeros((ROOM, TILE))
     spread[:] = 0.0
     block = -1
@@ -160,13 +182,20 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
         first, last = starts[g], starts[g + 1]
         normal[g], gradient[g], cost[g] = 0.0, 0.0, 0.0
         m[: 3 * LANES] = 0.0
-        x[:] = initial[g, :3]
+        x[:3] = initial[g, :3]
         # A speed of exactly zero under friction is a motor at rest, not a free number: the
         # cost has a kink there.
         at_rest = friction and x[1] == 0.0
         for j in range(local.shape[0]):
             if local[j] < 3 and not (at_rest and local[j] == 1):
                 m[local[j] * LANES + n_common + j] = 1.0
+        ahead = last  # the next sample whose window of the current begins
+        if sensor > 0:
+            own = n_common + np.flatnonzero(local == 4)
+            begin_current(initial[g, 4], own, x, m, marks)
+            ahead = first
+            if averaged:
+                ahead = mark_first(trail, time, first, last, width, initial[g, 4], own, x, m)
         load = par[LOAD] + initial[g, 3]
         section = hold_start[g]
         limit = hold_start[g + 1] - 1 if g + 2 < starts.shape[0] else hold_end.shape[0] - 1
@@ -184,10 +213,14 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
         for k in range(first, last):
             target = time[k]
             while now < target:
+                if averaged:
+                    ahead = mark(trail, time, ahead, last, now, width, x, m)
                 end = target
                 change = hold_end[section] + delay
                 if section < limit and change < target - 1e-9 * (target - now):
                     end = change
+                if averaged and ahead < last:
+                    end = min(end, time[ahead] - width)
                 v = hold_value[section]
                 h = end - now
                 if h > 0.0:
@@ -197,12 +230,16 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
                         scratch, columns,
                     )  # fmt: skip
                 now = end
-                if section < limit and change <= target + 1e-9 * (target - time[k - 1]):
+                if section < limit and change <= end + 1e-9 * (target - time[k - 1]):
                     section += 1
                     if late:
                         _switch(v, hold_value[section], load, direction, friction, par, m)
             y0 = observe(kind, k, first, target, par, x, m, ring, past, columns)
-            y1 = observe_current(par, x, m) if has_current else 0.0
+            y1 = 0.0
+            if has_current and sensor > 0:
+                y1 = observe_lagging(sensor, k, par, x, m, D1, trail)
+            elif has_current:
+                y1 = observe_current(par, x, m)
             if predicted.shape[0] > 0:
                 note(predicted[k], x[1], y0, y1)
             # Residuals, whitened.

@@ -35,18 +35,22 @@ Array = NDArray[np.float64]
 
 LANES = 16
 # Rows: sensitivity of q, w, angle; of the output and of the current; of friction and load in
-# volts, as it is, turning forward, turning backward; by the parameters (11 rows).
+# volts, as it is, turning forward, turning backward; by the parameters (12 rows); of
+# what the current's sensor keeps; of q, w and angle before the last move.
 SQ, SW, ST, D0, D1, DF, FORWARD, BACKWARD, SLOPE = (LANES * n for n in range(9))
-FORCED = SLOPE + 11 * LANES  # 12 rows: derivative of the propagator at hand by each column
+KEPT = SLOPE + 12 * LANES
+BEFORE = KEPT + LANES
+FORCED = BEFORE + 3 * LANES  # 12 rows: derivative of the propagator at hand by each column
 WHOLE = FORCED + ROW * LANES  # the propagator itself, 12 numbers
 SIZE = WHOLE + ROW
 SLOTS = 4  # propagators that are kept, one more is scratch
 SLOT = ROW * LANES + ROW
 CACHE = (SLOTS + 1) * SLOT
 # Beside the propagators: their lengths [s], the next to be overwritten, the length at hand,
-# the middle and half the range of the lengths that are tabulated, and whether there are columns
-# that the propagator's derivatives reach.
-NEXT, ACTIVE, MIDDLE, HALF, REACHED, MARKS = range(SLOTS, SLOTS + 6)
+# the middle and half the range of the lengths that are tabulated, whether there are columns that
+# the propagator's derivatives reach, which sensor shows the current, and
+# the rate of its low-pass [1/s].
+NEXT, ACTIVE, MIDDLE, HALF, REACHED, SENSOR, RATE, MARKS = range(SLOTS, SLOTS + 8)
 
 
 @compiled
@@ -212,9 +216,9 @@ def begin(
     """Return the lanes, cache, marks and scratch of a run."""
     m, cache, marks = _aligned(SIZE), _aligned(CACHE), np.full(MARKS, -1.0)
     n_common = slope.shape[1]
-    marks[NEXT], marks[REACHED] = 0.0, 1.0 if n_common > 0 else 0.0
+    marks[NEXT], marks[REACHED], marks[SENSOR] = 0.0, 1.0 if n_common > 0 else 0.0, 0.0
     for j in range(n_common):
-        for i in range(11):
+        for i in range(12):
             m[SLOPE + LANES * i + j] = slope[i, j]
         m[FORWARD + j] = slope[LOAD, j] + (slope[VC_PLUS, j] if friction else 0.0)
         m[BACKWARD + j] = slope[LOAD, j] - (slope[VC_MINUS, j] if friction else 0.0)

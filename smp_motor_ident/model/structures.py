@@ -39,11 +39,13 @@ Z_NAMES = (
     "current_offset",
     "delay",
     "window",
+    "current_lag",
 )
 """Coordinates of the fit: logarithms of the coefficients of the response, of te and R; volts
 of Coulomb friction in both directions and of load; the current's offset [A]; delay and
-averaging window of the speed [s]."""
+averaging window of the speed, mean lag of the current's sensor [s]."""
 A0, A1, A2, TE, VC_PLUS, VC_MINUS, LOAD, LN_R, OFFSET, DELAY, WINDOW = range(11)
+CURRENT_LAG = 11
 LOGARITHMS = (A0, A1, A2, TE, LN_R)
 
 PHYSICAL = (
@@ -54,6 +56,9 @@ PHYSICAL = (
     "viscous_friction",
     "coulomb_friction",
 )
+SENSORS = ("", "averaged", "low_passed")
+"""What a sensor shows of the current: its value, its mean over a trailing window of twice
+`current_lag`, or a first-order low-pass of it of that time constant."""
 MODELS = ("static_gain", "first_order", "second_order", "electromechanical")
 """The candidate structures, simplest first; ``_asymmetric`` may follow each name."""
 
@@ -73,11 +78,17 @@ class Structure:
     delay: bool = False
     window: bool = False
     offset: bool = False
+    current_sensor: str = ""  # one of `SENSORS`
     # How the command ran: a row's value before it, after it, or interpolated from row to row
     held: str = "before"
     own_load: bool = False  # whether every segment has a constant load of its own
     # Coordinates fixed at a value (by name of `Z_NAMES`)
     fixed: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def lags(self) -> bool:
+        """Whether the measured current lags behind the current."""
+        return self.current and self.current_sensor != ""
 
     def free(self) -> tuple[int, ...]:
         """Return the indices of the free coordinates."""
@@ -97,12 +108,13 @@ class Structure:
             (self.offset and self.current, OFFSET),
             (self.delay, DELAY),
             (self.window, WINDOW),
+            (self.lags, CURRENT_LAG),
         ):
             wanted += [index] if flag else []
         return tuple(i for i in wanted if Z_NAMES[i] not in self.fixed)
 
     def matrix(self) -> Array:
-        """Return dz/dfree, shape (11, free), read-only: the ties between the coordinates."""
+        """Return dz/dfree, shape (12, free), read-only: the ties between the coordinates."""
         return self._matrix
 
     @cached_property
@@ -125,6 +137,7 @@ class Structure:
             (self.load, LOAD),
             (self.offset, OFFSET),
             (self.delay, DELAY),
+            (self.lags, CURRENT_LAG),
         ):
             z[index] = z[index] if there else 0.0
         for name, value in self.fixed.items():
@@ -194,6 +207,7 @@ def combinations(z: Array, order: int) -> tuple[dict[str, float], dict[str, Arra
         ("load_voltage", LOAD),
         ("delay", DELAY),
         ("averaging_window", WINDOW),
+        ("current_lag", CURRENT_LAG),
     ):
         values[name] = z[index]
         gradients[name] = unit[index]

@@ -130,7 +130,7 @@ def estimation_fit() -> Fit:
     """A fit of one free coordinate, of which only that matters here."""
     structure = Structure("static_gain", order=1, friction="none")
     return Fit(
-        np.zeros(11), np.zeros((1, 4)), np.eye(2), structure=structure, gain=np.zeros((3, 2)),
+        np.zeros(12), np.zeros((1, 5)), np.eye(2), structure=structure, gain=np.zeros((3, 2)),
         objective=1.0, deviance=0.0, information=np.eye(1), scores=np.zeros((0, 1)), passes=1,
         converged=True, samples=4000, kind=0,
     )  # fmt: skip

@@ -92,7 +92,7 @@ def test_one_copy_of_the_motor_gives_the_sums_of_the_general_recursion(kind, ext
     z = models.from_physical(3.3, 0.064, 0.03, 1.4e-5, 5.5e-5)
     z[models.A1] += 0.1
     z[models.LOAD] = 0.2
-    initial = data.initial + rng.uniform(-1, 1, (2, 4))
+    initial = data.initial[:, :4] + rng.uniform(-1, 1, (2, 4))
     noise = np.diag([0.3, 1.0])
     z = structure.complete(z)
     fast = gather(data, structure, z, initial, NoiseModel(noise))
@@ -139,8 +139,8 @@ def test_a_column_of_which_only_rounding_is_left_counts_as_unknown():
     eliminate(normal, gradient, np.zeros((1, 1)), 10**18, common, score, np.zeros((1, 1)),
               np.zeros((1, 1, 2)), *no_scores)  # fmt: skip
     assert common[1, 1] == 0.0 or common[1, 1] > 1e-12
-    step, _ = damped_step(common, score, 1e-9, np.eye(11, 2), np.zeros(11),
-                          np.full(11, -np.inf), np.full(11, np.inf))  # fmt: skip
+    step, _ = damped_step(common, score, 1e-9, np.eye(12, 2), np.zeros(12),
+                          np.full(12, -np.inf), np.full(12, np.inf))  # fmt: skip
     assert np.all(np.isfinite(step))
 
 
@@ -167,7 +167,7 @@ def test_a_start_outside_the_bounds_is_taken_to_them():
     record, _ = random_record(1)
     data = prepare([record], False).as_mean_speed()
     structure = Structure("x", friction="none", window=True)
-    z = np.log([0.03, 1e-3, 1e-5, 1e-2, 1, 1, 1, 1, 1, 1, 1])
+    z = np.log([0.03, 1e-3, 1e-5, 1e-2, 1, 1, 1, 1, 1, 1, 1, 1])
     z[models.WINDOW], z[models.TE] = -0.1, 1e4
     fit = solve(data, structure, Start(z, data.initial, first_noise(data)), iterations=3)
     assert fit.z[models.WINDOW] > 0

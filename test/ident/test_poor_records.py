@@ -13,7 +13,7 @@ from smp_motor_ident.errors import DesignError, SignalError
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.likelihood.experiments import prepare
-from smp_motor_ident.model.structures import Structure
+from smp_motor_ident.model.structures import Z_NAMES, Structure
 from smp_motor_ident.record import Hardware, Record
 from smp_motor_ident.tune import Loop, design
 
@@ -38,10 +38,10 @@ def fit_of():
     """Return a fit of a gain and a lag of 16 ms that begins at a speed."""
 
     def made(gain: float, speed: float) -> Fit:
-        z = np.zeros(11)
+        z = np.zeros(len(Z_NAMES))
         z[0], z[1] = -np.log(gain), np.log(0.016 / gain)
         return Fit(
-            z, np.array([[0.0, speed, 0.0, 0.0]]), np.eye(2),
+            z, np.array([[0.0, speed, 0.0, 0.0, 0.0]]), np.eye(2),
             structure=Structure("first_order", order=1, friction="none"), gain=np.zeros((3, 2)),
             objective=1.0, deviance=0.0, information=np.eye(2), scores=np.zeros((0, 2)),
             passes=1, converged=True, samples=2000, kind=0,

@@ -24,7 +24,7 @@ def predict(data, structure, z, gain=NO_GAIN):
 def exact(wheel="front_left", static_voltage=0.5, kind="fourier", seconds=4.0):
     recording = motors.record(wheel, kinds=(kind,), seconds=seconds, static_voltage=static_voltage)
     data = prepare([recording], True)
-    data = replace(data, initial=np.zeros((1, 4)))
+    data = replace(data, initial=np.zeros((1, 5)))
     p = independent.TABLE_1[wheel]
     z = models.from_physical(*p, static_voltage * p[2] / p[0])
     return recording, data, z
@@ -81,7 +81,7 @@ def test_delay_of_whole_samples_equals_a_shifted_input():
     late[models.DELAY] = 2 * data.step
     v = recording.voltage
     shifted = replace(recording, voltage=np.concatenate([[v[0], v[0]], v[:-2]]), current=None)
-    plain = replace(prepare([shifted], False), initial=np.zeros((1, 4)))
+    plain = replace(prepare([shifted], False), initial=np.zeros((1, 5)))
     a = predict(replace(data, current=np.zeros(0)), structure, late)
     b = predict(plain, structure, z)
     np.testing.assert_allclose(a[:, 0], b[:, 0], atol=1e-8)
@@ -107,7 +107,7 @@ def test_irregular_stamps_are_taken_as_they_are():
     recording = replace(motors.record(seconds=2.0), time=t, voltage=v, velocity=None,
                         current=small[:, 0], count=np.zeros(800, dtype=np.int64))  # fmt: skip
     recording = replace(recording, count=(small[:, 2] / motors.QUANTUM).astype(np.int64))
-    data = replace(prepare([recording], True), initial=np.zeros((1, 4)))
+    data = replace(prepare([recording], True), initial=np.zeros((1, 5)))
     z = models.from_physical(*p, 0.2 * p[2] / p[0])
     out = predict(data, Structure("electromechanical", current=True), z)
     np.testing.assert_allclose(out[:, 0], small[:, 1], atol=0.05)  # as above

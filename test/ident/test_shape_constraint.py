@@ -89,7 +89,7 @@ def test_the_gradient_of_an_edge_is_its_slope():
 
 def test_the_edge_of_a_winding_too_short_for_rounding_is_found():
     # a1^2 - 4 share a0 a2 rounds to a1^2 here; the shorter lag at the edge is a2 / a1.
-    z = np.zeros(11)
+    z = np.zeros(len(models.Z_NAMES))
     z[[A0, A1, A2, TE]] = np.log([0.05, 2e-3, 1e-23, 5e-21])
     there = shape_constraint.edge(z, 0.98)
     assert there is not None

@@ -1,0 +1,109 @@
+"""A current that its sensor averages or low-passes: asked for by a score, from several starts.
+
+Left out, the lag of the sensor is taken for that of the winding: L comes out too large.
+Derivation: docs/derivations.md, section 12.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from smp_motor_ident.estimation import data_window, descent, prediction
+from smp_motor_ident.estimation.choice import (
+    FittedCandidate,
+    label,
+    preferred,
+    sandwich_factor,
+)
+from smp_motor_ident.estimation.fit import Fit, Options
+from smp_motor_ident.estimation.ridge import slower_winding
+from smp_motor_ident.likelihood.experiments import Experiments
+from smp_motor_ident.model import structures as models
+from smp_motor_ident.model.structures import SENSORS, Structure
+
+Array = models.Array
+
+LITTLE = 0.01  # of a sample: a lag that is as good as none, for the score
+BEYOND = 0.6  # of a sample: the mean lag of a window that reaches beyond the last change of voltage
+SHARES = (0.3, 0.8)  # of the winding's lag that may be the sensor's
+SAMPLES = (0.25, 0.5, 1.5, 5.0)  # of lag at which a descent begins
+
+
+def with_current_lag(
+    data: Experiments,
+    best: Fit,
+    options: Options,
+    candidates: list[FittedCandidate],
+    say: Callable[[str], None],
+) -> Fit:
+    """Return the fit, or one with the lag of the current's sensor where the data ask for it."""
+    direct = best
+    if not direct.structure.current or direct.structure.lags or not _asked_for(data, direct):
+        return best
+    for sensor in SENSORS[1:]:
+        richer = direct.structure.with_(current_sensor=sensor)
+        if any(r.fit.structure == richer for r in candidates):
+            continue
+        say(f"trying {label(richer)}")
+        starts = _starts(data, direct, richer) + [best.z] * best.structure.lags
+        # What looks like torque noise may be this.
+        near = [best] if best.noise_ratio == 0 else [best, replace(best, noise_ratio=0.0)]
+        tried = [descent.refine(data, richer, n, z, options) for z in starts for n in near]
+        other = min(tried, key=lambda f: f.deviance)
+        if other.z[models.CURRENT_LAG] < LITTLE * data.step:  # another minimum, of no lag
+            candidates.append(FittedCandidate(other, "no lag of the current shows", whole=False))
+            continue
+        verdict, reason = preferred(best, other)
+        if verdict and other.noise_ratio > 0:
+            other = data_window.grow(data, richer, other, options)
+        candidates.append(FittedCandidate(other, reason))
+        best = other if verdict else best
+    return best
+
+
+def with_lag(fit: Fit, lag: float) -> Fit:
+    """Return a fit at another lag of the current's sensor [s]."""
+    z = fit.z.copy()
+    z[models.CURRENT_LAG] = lag
+    return replace(fit, z=z)
+
+
+def _asked_for(data: Experiments, direct: Fit) -> bool:
+    """Tell from the score of a window whether a fit with a lag is worth its passes.
+
+    A window of next to nothing shows nothing of a winding that has settled when its current is
+    read, so the score is taken at one of more than a sample, too.
+    """
+    if not direct.converged:
+        return True
+    averaged = direct.structure.with_(current_sensor="averaged")
+    least = _predicted(data, direct, direct.structure)
+    price = 0.5 * float(np.log(direct.samples)) * sandwich_factor(direct)
+    return any(
+        not least - _predicted(data, with_lag(direct, lag * data.step), averaged) < price
+        for lag in (LITTLE, BEYOND)
+    )
+
+
+def _predicted(data: Experiments, fit: Fit, structure: Structure) -> float:
+    """Return the sum of squares that a step from here would leave; infinite for no lag."""
+    here = prediction.again(data, structure, fit)
+    step = prediction.inverse(here.normal) @ here.gradient
+    if structure.lags and fit.z[models.CURRENT_LAG] + step[-1] <= 0:
+        return np.inf
+    return here.objective - here.local_decrease - float(here.gradient @ step)
+
+
+def _starts(data: Experiments, direct: Fit, richer: Structure) -> list[Array]:
+    """Return starts: lags of so many samples, and those that L/R has taken up."""
+    te = float(np.exp(direct.z[models.TE]))
+    lags = [(samples * data.step, te) for samples in SAMPLES]
+    out = []
+    for lag, left in lags + [(share * te, (1 - share) * te) for share in SHARES]:
+        z = slower_winding(direct.z, float(np.log(left)))
+        z[models.CURRENT_LAG] = lag
+        out.append(richer.complete(z))
+    return out

@@ -1,0 +1,188 @@
+"""A current that its sensor averages or low-passes: shown exactly, told from the winding.
+
+What a sensor shows of a locked rotor's current is a formula; of a turning motor it is taken of a
+simulation in steps 200 times as small.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import independent
+import motors
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+from test_recursion import exact, predict
+
+from smp_motor_ident.estimate import estimate
+from smp_motor_ident.likelihood import recursion as rc
+from smp_motor_ident.likelihood.experiments import prepare
+from smp_motor_ident.likelihood.noise import NO_GAIN, NoiseModel, kalman_gain
+from smp_motor_ident.likelihood.passes import gather
+from smp_motor_ident.model import structures as models
+from smp_motor_ident.model.structures import SENSORS, Structure
+from smp_motor_ident.record import Record
+
+WHEEL = "rear_left"
+R, L, K, J, B = independent.TABLE_1[WHEEL]
+FINE = 200
+
+
+def shown(current: np.ndarray, step: float, sensor: str, lag: float, every: int) -> np.ndarray:
+    """Return what a sensor shows, every so many of the small steps of a current."""
+    if sensor == "low_passed":
+        a = 0.5 * step / lag  # trapezoids
+        out = lfilter([a / (1 + a), a / (1 + a)], [1, (a - 1) / (1 + a)], current)
+        return out[::every]
+    time = step * np.arange(current.size)
+    charge = np.concatenate([[0.0], np.cumsum(0.5 * step * (current[1:] + current[:-1]))])
+    at = time[::every]
+    earlier = np.interp(at - 2 * lag, time, charge, left=0.0)
+    return (charge[::every] - earlier) / (2 * lag)
+
+
+def simulated(
+    rate: float, kind: str, seconds: float, sensor: str, lag: float, inductance: float = L
+) -> Record:
+    """Return a motor's record with the current as a sensor shows it."""
+    made = motors.record(WHEEL, kinds=(kind,), seconds=seconds, rate=rate)
+    v, step = made.voltage, 1 / rate / FINE
+    fine = np.concatenate([v[:1], np.repeat(v[1:], FINE)])
+    time = step * np.arange(fine.size)
+    load = np.zeros(time.size)
+    motion = independent.simulate(time, fine, R, inductance, K, J, B, 0.3 * K / R, load, 2)
+    current = shown(motion[:, 0], step, sensor, lag, FINE)
+    rng = np.random.default_rng(7)
+    count = np.floor(motion[::FINE, 2] / motors.QUANTUM + 0.4).astype(np.int64)
+    noisy = current + 0.01 * rng.standard_normal(current.size)
+    return replace(made, current=noisy, count=count, velocity=None)
+
+
+@pytest.mark.parametrize("sensor", SENSORS[1:])
+@pytest.mark.parametrize("lag", [0.3 * L / R, L / R, 2.2 * L / R])
+def test_a_sensor_shows_the_current_of_a_locked_rotor_as_the_formula_says(sensor, lag):
+    time = 5e-3 * np.arange(60)
+    record = replace(
+        motors.record(WHEEL, kinds=("sine",), seconds=0.3), time=time, voltage=np.full(60, 5.0),
+        current=np.zeros(60), count=np.zeros(60, dtype=np.int64), velocity=None,
+    )  # fmt: skip
+    te, window = L / R, 2 * lag
+    if sensor == "averaged":
+        charge = lambda t: np.where(t > 0, t - te * -np.expm1(-t / te), 0.0)  # noqa: E731
+        expected = (charge(time) - charge(time - window)) / window
+    elif lag == te:
+        expected = 1 - (1 + time / te) * np.exp(-time / te)
+    else:
+        both = te * np.exp(-time / te) - lag * np.exp(-time / lag)
+        expected = 1 - both / (te - lag)
+    z = models.from_physical(R, L, K, J, B, 10.0 * K / R)  # friction that 5 V do not break
+    z[models.CURRENT_LAG] = lag
+    data = replace(prepare([record], True), initial=np.zeros((1, 5)))
+    out = predict(data, Structure("electromechanical", current=True, current_sensor=sensor), z)
+    # The low-pass is kept 2e-5 apart from the winding's own pole.
+    np.testing.assert_allclose(out[:, 2], 5.0 / R * expected, atol=5.0 / R * 2e-5)
+
+
+@pytest.mark.parametrize("sensor", SENSORS[1:])
+@pytest.mark.parametrize("lag", [1.2e-3, 2.5e-3, 7.1e-3])
+def test_a_sensor_shows_the_current_of_a_motor_that_turns_and_sticks(sensor, lag):
+    recording, data, z = exact(WHEEL, static_voltage=0.5, kind="square", seconds=2.0)
+    fine = np.concatenate([recording.voltage[:1], np.repeat(recording.voltage[1:], FINE)])
+    step = data.step / FINE
+    time = step * np.arange(fine.size)
+    motion = independent.simulate(time, fine, R, L, K, J, B, 0.5 * K / R, 0.0 * time, 4)
+    z[models.CURRENT_LAG] = lag
+    out = predict(data, Structure("electromechanical", current=True, current_sensor=sensor), z)
+    # Trapezoids of 25 us on a winding of 20 ms: (h/te)^2/12 = 1.3e-7 of 3.5 A, and four of these.
+    expected = shown(motion[:, 0], step, sensor, lag, FINE)
+    np.testing.assert_allclose(out[:, 2], expected, atol=3e-6)
+
+
+@pytest.mark.parametrize("sensor", SENSORS[1:])
+@pytest.mark.parametrize("delay", [0.0, 0.0033])
+@pytest.mark.parametrize("with_gain", [False, True])
+def test_gradient_by_the_lag_is_that_of_finite_differences(sensor, delay, with_gain):
+    _, data, z = exact(seconds=2.0, kind="square")
+    structure = Structure(
+        "electromechanical", current=True, delay=delay > 0, offset=True, load=True,
+        current_sensor=sensor,
+    )  # fmt: skip
+    matrix = structure.matrix()
+    z = structure.complete(z) + matrix @ np.full(matrix.shape[1], 1e-3)
+    z[models.DELAY], z[models.CURRENT_LAG] = delay, 3.1e-3
+    gain = kalman_gain(z, 2, rc.ANGLE, data.step, 1e7, 0.0)[0] if with_gain else NO_GAIN
+    begun = np.array([[0.3, 2.0, 0.0, 0.0, 0.2]])
+
+    def run(at):
+        return gather(data, structure, at, begun, NoiseModel(np.diag([1e-4, 1e-4]), gain))
+
+    gradient = run(z).gradient[0]
+    for j in range(matrix.shape[1]):
+        step = 1e-6 if structure.free()[j] < models.VC_PLUS else 1e-7
+        up, down = run(z + step * matrix[:, j]).cost, run(z - step * matrix[:, j]).cost
+        numeric = -0.5 * (up[0] - down[0]) / (2 * step)
+        scale = np.abs(gradient).max()
+        # As without a sensor in test_recursion.py.
+        assert gradient[j] == pytest.approx(numeric, rel=2e-3, abs=1e-6 * scale)
+
+
+@pytest.mark.parametrize(
+    ("sensor", "samples"),
+    [("averaged", 0.5), ("averaged", 1.5), ("low_passed", 0.3), ("low_passed", 3.0)],
+)
+def test_the_lag_of_the_sensor_is_not_taken_for_that_of_the_winding(sensor, samples):
+    lag = samples * 5e-3
+    result = estimate(simulated(200.0, "fourier", 8.0, sensor, lag))
+    assert not result.unreliable
+    true = motors.truth(WHEEL, 0.3)
+    for name in ("resistance", "inductance", "motor_constant", "inertia"):
+        q = result.parameters[name]
+        # Four deviations; two thousandths of it are the counter's, which repeats.
+        assert abs(q.value - true[name]) < 4 * q.std + 2e-3 * true[name], name
+        assert q.std < 0.02 * true[name], name  # and it is known
+    found = result.combinations["current_lag"]
+    assert found.unit == "s"
+    assert abs(found.value - lag) < 4 * found.std + 2e-3 * lag
+    said = next(f for f in result.findings if f.code == "current_lag")
+    assert said.severity == "note"
+    assert said.evidence["sensor"] == sensor
+
+
+def test_a_current_that_is_read_at_the_instant_has_no_lag_and_is_not_searched_for_one():
+    result = estimate(motors.record(WHEEL, seconds=4.0))
+    assert "current_lag" not in result.combinations
+    tried = [c.model for c in result.candidates]
+    assert not [m for m in tried if "averaged current" in m or "low-passed current" in m]
+
+
+def test_where_winding_and_sensor_look_alike_the_interval_covers_both():
+    # L/R of 0.3 ms, read every 5 ms through a low-pass of as much.
+    small = 3e-4 * R
+    result = estimate(simulated(200.0, "square", 6.0, "low_passed", 3e-4, small))
+    q = result.parameters["inductance"]
+    assert q.value is None or q.ci95[0] <= small <= q.ci95[1]
+
+
+def test_a_record_may_begin_while_the_current_flows():
+    lag = 7.5e-3
+    whole = simulated(200.0, "square", 8.0, "low_passed", lag)
+    begun = replace(
+        whole, time=whole.time[433:] - whole.time[433], voltage=whole.voltage[433:],
+        current=whole.current[433:], count=whole.count[433:],
+    )  # fmt: skip
+    result = estimate(begun)
+    q, found = result.parameters["inductance"], result.combinations["current_lag"]
+    assert abs(q.value - L) < 4 * q.std + 2e-3 * L  # as above
+    assert abs(found.value - lag) < 4 * found.std + 2e-3 * lag
+
+
+@pytest.mark.parametrize("sensor", SENSORS[1:])
+def test_a_sensor_that_would_be_early_shows_the_current_at_once(sensor):
+    # Motors are drawn at random around an estimate; a window of less than nothing has no end.
+    _, data, z = exact(WHEEL, seconds=1.0)
+    z[models.CURRENT_LAG] = -1e-3
+    early = predict(data, Structure("electromechanical", current=True, current_sensor=sensor), z)
+    direct = predict(data, Structure("electromechanical", current=True), z)
+    # A thousandth of a sample late: 5 us of what 12 V change in L.
+    np.testing.assert_allclose(early[:, 2], direct[:, 2], atol=5e-6 * 2 * 12 / L)
