@@ -213,10 +213,10 @@ EFFECTS = (
     Effect("battery recovers", lambda c, n: c.drive.update(
         rc=(0.1, 0.3, 0.8)[n] * c.motor.R, rc_time=20 * c.tau), ("supply_sag", "drift", ONE_SIZE)),
     Effect("clip at the supply", _drive("clip", (0.95, 0.85, 0.7), _volts), ("clip", ONE_SIZE)),
-    Effect("coast in every PWM period", _pwm, ("coast",)),
+    Effect("coast in every PWM period", _pwm, ("coast", ONE_SIZE)),
     Effect("coast at zero command", _drive("coast_zero", (1.0, 1.0, 1.0)), ("coast",)),
     Effect("slew limit", lambda c, n: c.drive.update(
-        slew=c.amplitude / ((0.3, 1.0, 3.0)[n] * c.tau)), ("slew", "lag")),
+        slew=c.amplitude / ((0.3, 1.0, 3.0)[n] * c.tau)), ("slew", "lag", ONE_SIZE)),
     Effect("driver clock", _stamps("driver", (0.37, 0.83, 1.9), _step), ("timing", "lag")),
     Effect("command delay", _stamps("delay", (0.5, 1.5, 4.2), _step), ("delay", "lag")),
     Effect("two topics", _stamps("topics", (0.2, 0.6, 1.5), _step), ("timing", "lag")),
@@ -268,7 +268,7 @@ EFFECTS = (
     Effect("load per turn", _drive("turn_load", (0.2, 0.6, 1.5), _torque), ("position",)),
     Effect("cogging", _drive("cog", (0.2, 0.6, 1.5), _torque), ("position",)),
     Effect("drag", lambda c, n: c.drive.update(
-        drag=(0.02, 0.08, 0.25)[n] * _stall_torque(c) / c.fastest**2), ("drag",)),
+        drag=(0.02, 0.08, 0.25)[n] * _stall_torque(c) / c.fastest**2), ("drag", ONE_SIZE)),
     Effect("constant load", _drive("load", (0.2, 0.6, 1.2), _torque),
            ("load", "one_direction")),
     Effect("load step", lambda c, n: c.drive.update(

@@ -59,7 +59,7 @@ def _alike(weights: Mapping[str, float]) -> Finding:
 
 def _one_size(data: Experiments) -> float:
     """Return the size of a voltage that is only switched between one size both ways, else 0."""
-    size = np.abs(data.hold_value)
+    size = np.abs(data.levels)
     top = float(size.max())
     driven = size[size > REST.value * top]
     return 0.0 if np.any(np.abs(driven - top) > SAME_LEVEL.value * top) else top
@@ -86,7 +86,7 @@ def _one_swing(data: Experiments) -> float:
 def _one_size_of_voltage(top: float) -> list[Finding]:
     """Say what a voltage of one size both ways, or of one swing, cannot show.
 
-    With a size U a driver that takes a share of it (a dead zone, a drop, a clip) is the
+    With a size U a driver that takes a share of it (a dead zone, a drop, a clip, pulses) is the
     motor of another gain under U: no residual tells the two apart, and next to none a drag by
     the square of a speed that is of one size, too.  Under a sine it is another
     gain of the fundamental (its describing function), and the motor hides the harmonics.
@@ -97,9 +97,10 @@ def _one_size_of_voltage(top: float) -> list[Finding]:
         Finding(
             "one_size_of_voltage",
             "warning",
-            f"the voltage has one size, {top:.3g} V: a driver that puts out less of it (a "
-            "dead zone, a drop, a clip at the supply), or a drag by the square of the speed, looks "
-            "like a motor of another gain; the numbers hold for the voltage as it was recorded",
+            f"the voltage has one size, {top:.3g} V: a driver that puts out less of it (a dead "
+            "zone, a drop, a clip at the supply, coasting between its pulses) or lets it rise "
+            "slowly, and a drag by the square of the speed, look like a motor of another gain or "
+            "lag; the numbers hold for the voltage as it was recorded",
             {"voltage": top},
             "record the voltage at the motor's terminals, or add levels of other sizes",
         )

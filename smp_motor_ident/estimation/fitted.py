@@ -5,6 +5,7 @@ Derivation: docs/derivations.md, section 9.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,6 +25,27 @@ PLAUSIBLE = np.array([1e-2, 1e-2, 1e-2, 0.25, 1e-4, 1e-4, 1e-4, 1e-2, 1e-4, 1e-2
 
 ROUNDING = 1e-13
 """Share of the information in which sums over thousands of samples are exact."""
+
+
+def long_run(sums: Array) -> Array:
+    """Return the variance of the total of sums over successive runs of samples, shape (f,).
+
+    Runs that are shorter than the errors' memory go on in the next: positive correlations count
+    with Bartlett's weights, as far as a first-order autoregression of the sums asks for.
+
+    References
+    ----------
+    D. Andrews, Econometrica 59 (1991), 817, equations 5.3, 6.2 and 6.4.
+    """
+    n = len(sums)
+    squares = np.maximum(np.square(sums).sum(axis=0), 1e-300)
+    share = np.clip((sums[1:] * sums[:-1]).sum(axis=0) / squares, 0.0, 0.97)
+    width = 1.1447 * np.cbrt(4 * np.square(share / (1 - np.square(share))) * n)
+    total = np.ones_like(squares)
+    for k in range(1, min(n - 1, int(np.max(width, initial=0.0)) + 1)):
+        weight = np.maximum(1 - k / np.maximum(width, 1e-9), 0.0)
+        total += 2 * weight * (sums[k:] * sums[:-k]).sum(axis=0) / squares
+    return np.asarray(squares * np.maximum(total, 1.0))
 
 
 @dataclass(frozen=True)
@@ -124,7 +146,7 @@ class Fit(Start):
     def conditional(self) -> Array:
         """Return the covariance with the profiled coordinates fixed, and what is added, (f, f)."""
         cov = self.white()
-        widen = np.sqrt(self.sandwich_factors())
+        widen = np.sqrt(self._widening(long_run))
         cov = cov * np.outer(widen, widen)
         if self.widen is not None:
             cov = cov * np.outer(self.widen, self.widen)
@@ -134,13 +156,19 @@ class Fit(Start):
         return cov if self.added is None else cov + self.added
 
     def sandwich_factors(self) -> Array:
-        """Return by how much each variance is larger than of white residuals, shape (f,)."""
+        """Return by how much each variance is larger than of white residuals, shape (f,).
+
+        For choices between structures: an error that outlasts a run of samples is in all of them.
+        """
+        return self._widening(lambda sums: np.square(sums).sum(axis=0))
+
+    def _widening(self, variance: Callable[[Array], Array]) -> Array:
         cov = self.white()
         n = len(self.scores)
         if n <= 2 * cov.shape[0]:
             return np.ones(cov.shape[0])
         moved = (self.scores - self.scores.mean(axis=0)) @ cov
-        sandwich = np.square(moved).sum(axis=0) * (n / (n - 1))
+        sandwich = variance(moved) * (n / (n - 1))
         return np.asarray(np.maximum(1.0, sandwich / np.maximum(np.diag(cov), 1e-300)))
 
     def white(self) -> Array:

@@ -63,6 +63,11 @@ class Experiments:
         return self.step if np.mean(off) > 0.2 else 0.0
 
     @property
+    def levels(self) -> Array:
+        """The command's levels [V]: as it was held, or the rows between which it ran straight."""
+        return self.voltage if self.how == "interpolated" else self.hold_value
+
+    @property
     def size(self) -> int:
         """Number of samples."""
         return int(self.time.size)

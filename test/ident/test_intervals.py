@@ -4,13 +4,14 @@ from dataclasses import replace
 
 import motors
 import numpy as np
+import pytest
 from scipy.stats import chi2
 
 from smp_motor_control.excitation import Fourier
 from smp_motor_ident.diagnosis.identifiability import what_next
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.estimation.consider_covariance import consider_left_out
-from smp_motor_ident.estimation.fitted import Options
+from smp_motor_ident.estimation.fitted import Options, long_run
 from smp_motor_ident.estimation.hold_choice import instant_deviation
 from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.estimation.prediction import predicted_decrease
@@ -103,6 +104,21 @@ def test_stated_deviations_are_those_of_repeated_recordings():
     # sqrt(chi2(20) / 20) lies outside of 0.54 to 1.51 in one of 500 cases.
     low, high = np.sqrt(chi2.ppf([1e-3, 1 - 1e-3], 20) / 20)
     assert np.all((low < scatter) & (scatter < high)), dict(zip(names, scatter, strict=True))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.4, 0.7])
+def test_what_outlasts_a_run_of_samples_counts(share: float):
+    """The total of n terms of an AR(1) process has n / (1 - share)^2 of its noise's variance."""
+    rng = np.random.default_rng(3)
+    sums = np.zeros((60, 500))
+    sums[0] = rng.standard_normal(500) / np.sqrt(1 - share**2)
+    for k in range(1, 60):
+        sums[k] = share * sums[k - 1] + rng.standard_normal(500)
+    told = np.median(long_run(sums)) * (1 - share) ** 2 / 60
+    alone = np.median(np.square(sums).sum(axis=0)) * (1 - share) ** 2 / 60
+    # Bartlett's weights leave some of a long memory out; chance adds a little where there is none.
+    assert told < 1.1
+    assert told - alone > 0.4 * (1 - alone), (told, alone)
 
 
 def test_a_delay_not_worth_its_price_is_in_the_interval():
