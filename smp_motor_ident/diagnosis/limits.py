@@ -285,9 +285,9 @@ RESIDUAL_LEVEL = Limit(
 # Adequacy of the model.
 
 EFFECT_LEVEL = Limit(
-    0.01,
+    0.001,
     "probability",
-    "that a clean record shows any of the effects, shared among all that are tried (Bonferroni)",
+    "that a clean record shows any effect (Bonferroni): 0.01 would stop one commissioning in 25",
     "test_adequacy.py",
 )
 EFFECT_COVERED = Limit(

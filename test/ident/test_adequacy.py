@@ -109,7 +109,7 @@ def held_against(deviations: float, value: float = 30.0, seed: int = 5):
 
 
 def test_an_effect_that_is_neither_shown_nor_excluded_is_in_the_intervals():
-    # The probability of 2.3 deviations by chance is 2 %: between a finding's 1 % and an
+    # The probability of 2.3 deviations by chance is 2 %: between a finding's 0.1 % and an
     # interval's 5 %; of 1 it is 32 %, of 4 it is 6e-5.
     (found,), moved = held_against(2.3)
     assert found.severity == "note" and found.evidence["quantity"] == "dc_gain"
@@ -122,8 +122,8 @@ def test_an_effect_that_is_neither_shown_nor_excluded_is_in_the_intervals():
 
 def test_intervals_of_clean_errors_are_widened_as_seldom_as_stated():
     widened = sum(held_against(0.0, seed=seed)[1] is not None for seed in range(400))
-    # 4 % of them lie between the two levels: 16, four binomial deviations above them.
-    assert widened <= 16 + 4 * 3.9
+    # 4.9 % of them lie between the two levels: 20, four binomial deviations above them.
+    assert widened <= 20 + 4 * 4.3
 
 
 def estimation_fit() -> Fit:
