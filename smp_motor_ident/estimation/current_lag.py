@@ -18,7 +18,7 @@ from smp_motor_ident.estimation.choice import (
     preferred,
     sandwich_factor,
 )
-from smp_motor_ident.estimation.fit import Fit, Options
+from smp_motor_ident.estimation.fit import Fit, Options, solve
 from smp_motor_ident.estimation.ridge import slower_winding
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model import structures as models
@@ -30,6 +30,7 @@ LITTLE = 0.01  # of a sample: a lag that is as good as none, for the score
 BEYOND = 0.6  # of a sample: the mean lag of a window that reaches beyond the last change of voltage
 SHARES = (0.3, 0.8)  # of the winding's lag that may be the sensor's
 SAMPLES = (0.25, 0.5, 1.5, 5.0)  # of lag at which a descent begins
+FEW, KEPT = 4, 2  # passes after which starts are ranked, and how many go on
 
 
 def with_current_lag(
@@ -48,7 +49,7 @@ def with_current_lag(
         if any(r.fit.structure == richer for r in candidates):
             continue
         say(f"trying {label(richer)}")
-        starts = _starts(data, direct, richer) + [best.z] * best.structure.lags
+        starts = _promising(data, direct, richer, options) + [best.z] * best.structure.lags
         # What looks like torque noise may be this.
         near = [best] if best.noise_ratio == 0 else [best, replace(best, noise_ratio=0.0)]
         tried = [descent.refine(data, richer, n, z, options) for z in starts for n in near]
@@ -81,7 +82,7 @@ def _asked_for(data: Experiments, direct: Fit) -> bool:
         return True
     averaged = direct.structure.with_(current_sensor="averaged")
     least = _predicted(data, direct, direct.structure)
-    price = 0.5 * float(np.log(direct.samples)) * sandwich_factor(direct)
+    price = float(np.log(direct.samples)) * sandwich_factor(direct)
     return any(
         not least - _predicted(data, with_lag(direct, lag * data.step), averaged) < price
         for lag in (LITTLE, BEYOND)
@@ -95,6 +96,15 @@ def _predicted(data: Experiments, fit: Fit, structure: Structure) -> float:
     if structure.lags and fit.z[models.CURRENT_LAG] + step[-1] <= 0:
         return np.inf
     return here.objective - here.local_decrease - float(here.gradient @ step)
+
+
+def _promising(data: Experiments, direct: Fit, richer: Structure, options: Options) -> list[Array]:
+    """Return the starts that are ahead after a few passes: the others cost as much and lose."""
+
+    def soon(z: Array) -> float:
+        return solve(data, richer, direct.at(z), options, FEW).deviance
+
+    return sorted(_starts(data, direct, richer), key=soon)[:KEPT]
 
 
 def _starts(data: Experiments, direct: Fit, richer: Structure) -> list[Array]:
