@@ -215,15 +215,14 @@ class MotorPlant(Node):
 
     def _instant(self) -> tuple[float, Any]:
         """Return one instant on both clocks: hardware stamps when it samples, however busy."""
-        best, instant = math.inf, (0.0, self.get_clock().now())
-        self._reading *= SAME_INSTANT  # a machine may slow down
+        best, limit = math.inf, SAME_INSTANT * self._reading
         for _ in range(READINGS):
             before = time.monotonic()
             stamp = self.get_clock().now()
             after = time.monotonic()
             if after - before < best:
                 best, instant = after - before, (0.5 * (before + after), stamp)
-            if best < self._reading:
+            if best < limit:
                 break
         self._reading = best
         return instant[0], instant[1].to_msg()

@@ -44,8 +44,7 @@ Z_NAMES = (
 """Coordinates of the fit: logarithms of the coefficients of the response, of te and R; volts
 of Coulomb friction in both directions and of load; the current's offset [A]; delay and
 averaging window of the speed, mean lag of the current's sensor [s]."""
-A0, A1, A2, TE, VC_PLUS, VC_MINUS, LOAD, LN_R, OFFSET, DELAY, WINDOW = range(11)
-CURRENT_LAG = 11
+A0, A1, A2, TE, VC_PLUS, VC_MINUS, LOAD, LN_R, OFFSET, DELAY, WINDOW, CURRENT_LAG = range(12)
 LOGARITHMS = (A0, A1, A2, TE, LN_R)
 
 PHYSICAL = (

@@ -8,7 +8,7 @@ import pytest
 from independent import simulate
 from scipy.signal import lfilter
 
-from smp_motor_ident.diagnosis import refusal
+from smp_motor_ident.diagnosis import refusal, scope
 from smp_motor_ident.errors import DesignError, SignalError
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.estimation.fit import Fit
@@ -164,6 +164,14 @@ def test_a_voltage_of_one_size_says_that_a_clip_would_not_show(levels, said):
     found = estimate(Record("motor", t, voltage, velocity=noisy))
     assert ("one_size_of_voltage" in [f.code for f in found.findings]) is said
     assert said or found.unreliable  # with another size the clip itself shows
+
+
+@pytest.mark.parametrize("how", ["before", "interpolated"])
+def test_one_size_is_seen_however_the_command_ran(how):
+    voltage = np.repeat([0.0, 8.0, -8.0, 8.0], 30)
+    t = np.arange(voltage.size) / 200.0
+    data = prepare([Record("motor", t, voltage, velocity=voltage)], False).held(how)
+    assert scope._one_size(data) == 8.0
 
 
 def test_the_rounding_of_counts_hides_no_step():
