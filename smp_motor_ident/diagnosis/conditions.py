@@ -39,11 +39,13 @@ def dependent(fit: Fit, errors: Regression | None) -> tuple[Fit, list[Finding]]:
     size = errors.n_free
     level = CONDITION_LEVEL.value / max(2 * size * len(errors.conditions), 1)
     names = [models.Z_NAMES[i] for i in fit.structure.free()]
+    unweighted = inverse(errors.own.T @ errors.own, 1e-12)
     added, said = np.zeros((size, size)), {}
     for name, condition in errors.conditions.items():
         moves = []
         for sign in (1.0, -1.0):
-            move, p_value = _moved(errors, 1 + sign * CONDITION_WEIGHT.value * condition)
+            weight = 1 + sign * CONDITION_WEIGHT.value * condition
+            move, p_value = _moved(errors, unweighted, weight)
             moves.append(np.where(p_value < level, move, 0.0))
         far = max(moves, key=lambda d: float(np.abs(d).max()))
         if far.any():
@@ -63,14 +65,14 @@ def dependent(fit: Fit, errors: Regression | None) -> tuple[Fit, list[Finding]]:
     ]
 
 
-def _moved(errors: Regression, weight: Array) -> tuple[Array, Array]:
+def _moved(errors: Regression, unweighted: Array, weight: Array) -> tuple[Array, Array]:
     """Return by how much other weights move the coordinates, and how likely chance does that."""
     own, e = errors.own, errors.residual
     free = slice(errors.n_free)
     weighted = own * weight[:, None]
-    unweighted, other = (inverse(own.T @ x, 1e-12)[:, free] for x in (own, weighted))
+    other = inverse(own.T @ weighted, 1e-12)[:, free]
     move = other.T @ (weighted.T @ e)
-    rows = weighted @ other - own @ unweighted  # of the residuals in the move of each coordinate
+    rows = weighted @ other - own @ unweighted[:, free]  # of the residuals in the move of each coordinate
     seen = e != 0.0  # rows without a measurement are zero
     white = float(e @ e) / max(int(seen.sum()) - own.shape[1], 1)
     share = _by_block(np.square(rows) * seen[:, None], errors.block)

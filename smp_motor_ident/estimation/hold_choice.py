@@ -31,7 +31,9 @@ from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import Structure
 from smp_motor_ident.record import Record
 
-FEW = 4_000  # samples on which it is asked whether another hold is worth a search
+LOOKS = (1_000, 4_000)
+"""Samples on which it is asked whether another hold is worth a search: few, where it comes near
+more."""
 EARLIER = {"after": 1.0, "interpolated": 0.5}
 """Samples of delay that a hold takes the place of."""
 
@@ -113,19 +115,30 @@ def _worth_a_search(
     s = best.structure
     if best.samples > HOLD_COST.value or "delay" in s.fixed or not np.ptp(data.hold_value):
         return []
-    known = of_kind(data, best).data_window(FEW * data.step)
-    least = best if known.size == best.samples else refine(known, s, best, best.z, options)
+    looks: dict[float, Fit] = {}
+    for duration in (samples * data.step for samples in LOOKS):
+        part = of_kind(data, best).data_window(duration)
+        whole = part.size == best.samples
+        looks[duration] = best if whole else refine(part, s, best, best.z, options)
+        if whole:
+            break
     late = float(best.z[models.DELAY]) / data.step
-    price = float(np.log(known.size)) + PRIOR_ODDS.value
     out = []
     for other, how in [("held", "before")] * (hold != "held") + [(hold, how) for how in EARLIER]:
         there = data if other == hold else prepare(group, s.current, hold=other)
-        part = of_kind(there.held(how), best).data_window(FEW * data.step)
-        least_there = _delayed(part, least, how, late - EARLIER.get(how, 0.0), options)
-        # One that has not settled, but comes near, tells nothing against a search.
-        near = price if least_there.converged else known.size * (1 + (known.current.size > 0))
-        if least_there.deviance < least.deviance + near:
-            out.append((other, least_there))
+        there, lag = of_kind(there.held(how), best), late - EARLIER.get(how, 0.0)
+        for duration, least in looks.items():
+            part = there.data_window(duration)
+            found = _delayed(part, least, how, lag, options)
+            # What has not settled, or saw little of the data, tells against a search only where
+            # its residuals are of another size.
+            near = part.size * (1.0 + (part.current.size > 0))
+            if least is looks[max(looks)] and found.converged:
+                near = float(np.log(part.size)) + PRIOR_ODDS.value
+            if found.deviance >= least.deviance + near:
+                break
+        else:
+            out.append((other, found))
     return out
 
 

@@ -182,7 +182,8 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
         first, last = starts[g], starts[g + 1]
         normal[g], gradient[g], cost[g] = 0.0, 0.0, 0.0
         m[: 3 * LANES] = 0.0
-        x[:3] = initial[g, :3]
+        for n in range(3):
+            x[n] = initial[g, n]
         # A speed of exactly zero under friction is a motor at rest, not a free number: the
         # cost has a kink there.
         at_rest = friction and x[1] == 0.0

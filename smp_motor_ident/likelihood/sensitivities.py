@@ -110,7 +110,8 @@ def tabulate(
     table, values = _aligned(NODES * SLOT), np.empty(NODES * SLOT)
     for n in range(NODES):
         fill(step + half * POINTS[n], par, m, cache, SLOTS, scratch)
-        values[n * SLOT : (n + 1) * SLOT] = cache[SLOTS * SLOT :]
+        for i in range(SLOT):
+            values[n * SLOT + i] = cache[SLOTS * SLOT + i]
     expand(values, table)
     return table
 
