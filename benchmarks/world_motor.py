@@ -216,30 +216,29 @@ def _two_mass(i, w, angle, w2, angle2, h, v, t, end, noise, p):
     return i, w, angle, w2, angle2
 
 
-@njit(cache=True)
-def simulate(every, step, change, command, target, noise, p):
-    """Return `COLUMNS` on a fine grid, and the command that ran.
+STATE = ("i", "w", "angle", "w_load", "angle_load", "v", "battery", "at", "u")
+I_NOW, W_NOW, ANGLE, W_LOAD, ANGLE_LOAD, VOLTS, BATTERY, AT, ASKED = range(len(STATE))
 
-    ``change`` are the instants at which ``command`` (one a sample) reaches the bridge;
-    ``every`` fine steps of length ``step`` make a sample.  With kp > 0 the command follows
-    ``target`` in closed loop.
+
+def rest():
+    """Return the state of a drive that has had no command."""
+    state = np.zeros(len(STATE))
+    state[AT] = -1
+    return state
+
+
+@njit(cache=True)
+def advance(first, last, step, change, command, noise, p, end, state, out):  # noqa: C901
+    """Advance from fine step ``first`` to ``last``; fill the rows of ``out`` that follow them.
+
+    ``change`` are the instants at which ``command`` (one a sample) reaches the bridge; ``end`` is
+    when what drifts has drifted.
     """
+    i, w, angle, w2, angle2, v, battery, place, u = state
+    at = int(place)
     samples = command.size
-    n = samples * every
-    out = np.zeros((n + 1, 7))
-    i = w = angle = w2 = angle2 = v = battery = integral = 0.0
-    end = n * step
-    at = -1
-    u = 0.0
-    for m in range(n):
+    for m in range(first, last):
         t = m * step
-        if m % every == 0 and p[KP] > 0:
-            s = m // every
-            error = target[s] - out[m, 3]
-            raw = p[KP] * error + integral
-            command[s] = min(max(raw, -p[SUPPLY]), p[SUPPLY])
-            if raw == command[s]:
-                integral += p[KI] * error * every * step
         done = 0.0
         charge = drawn = 0.0
         while done < step * (1 - 1e-9):
@@ -281,4 +280,29 @@ def simulate(every, step, change, command, target, noise, p):
         out[m + 1, 0], out[m + 1, 1], out[m + 1, 2] = i, w, angle
         out[m + 1, 3], out[m + 1, 4] = (w2, angle2) if p[TWO] > 0 else (w, angle)
         out[m + 1, 5], out[m + 1, 6] = charge / step, drawn / step
+    state[:] = np.array([i, w, angle, w2, angle2, v, battery, float(at), u])
+
+
+@njit(cache=True)
+def simulate(every, step, change, command, target, noise, p):
+    """Return `COLUMNS` on a fine grid, and the command that ran.
+
+    ``every`` fine steps of length ``step`` make a sample.  With kp > 0 the command follows
+    ``target`` in closed loop.
+    """
+    samples = command.size
+    n = samples * every
+    out = np.zeros((n + 1, 7))
+    state = np.zeros(len(STATE))
+    state[AT] = -1
+    integral = 0.0
+    for s in range(samples):
+        if p[KP] > 0:
+            error = target[s] - out[s * every, 3]
+            raw = p[KP] * error + integral
+            command[s] = min(max(raw, -p[SUPPLY]), p[SUPPLY])
+            if raw == command[s]:
+                integral += p[KI] * error * every * step
+        first = s * every
+        advance(first, first + every, step, change, command, noise, p, n * step, state, out)
     return out

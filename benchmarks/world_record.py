@@ -43,11 +43,8 @@ def measure(c: Case, rng: np.random.Generator) -> dict[str, object]:
         u = u[np.argmax(np.abs(u) > 0.3 * c.amplitude) :]
     u = np.concatenate([np.zeros(rest), u])
     n = u.size
-    every = int(np.clip(np.ceil(60 * c.step / min(c.tau, 1.0)), 4, 24))
-    if c.sensor.get("i_lowpass") or c.sensor.get("i_window"):  # what it follows is the winding
-        every = int(np.clip(np.ceil(8 * c.step * m.R / m.L), every, 96))
+    every, values = fine_steps(c), plant(c)
     fine = c.step / every
-    values = dict(R=m.R, L=m.L, K=m.K, J=m.J, b=m.b, tc=m.tc, supply=m.supply, gear=m.gear)
     target = np.zeros(n)
     if c.kind == "closed_loop":
         values["kp"] = 0.6 * c.tau / max(c.tau * 0.4, 4 * c.step) / m.truth()["dc_gain"]
@@ -56,17 +53,10 @@ def measure(c: Case, rng: np.random.Generator) -> dict[str, object]:
                          int(max(3, 3 * c.tau * c.rate)))[:n]  # fmt: skip
         target = slow * c.fastest
     p = world_motor.drive(**{**values, **c.drive})
-    change = np.arange(n) * c.step + c.stamps.get("delay", 0.0)
-    period = c.stamps.get("driver", 0.0)
-    if period:
-        change = np.ceil((change + rng.uniform(0, period)) / period) * period
+    change = at_bridge(c, n, rng)
     if c.stamps.get("topics"):
         change = change + 0.3 * c.step
-    noise = np.zeros(n * every)
-    if c.sensor.get("floor"):
-        steps = rng.standard_normal(n * every)
-        a = np.exp(-fine / (3 * c.tau))
-        noise = c.sensor["floor"] * _filter(np.sqrt(1 - a * a) * steps, 1 - a) / (1 - a)
+    noise = floor_torque(c, n * every, fine, rng)
     out = world_motor.simulate(every, fine, change, u, target, noise, p)
     made = _sensed(c, out, every, fine, rng)
     # What the tools write down: the command that ran up to the instant of each row.
@@ -76,7 +66,40 @@ def measure(c: Case, rng: np.random.Generator) -> dict[str, object]:
     return _stamped(c, {"time": np.arange(n + 1) * c.step, "voltage": voltage, **made}, u, rng)
 
 
-def _filter(x: np.ndarray, a: float) -> np.ndarray:
+def fine_steps(c: Case) -> int:
+    """Return how many steps of the simulation make a sample."""
+    m = c.motor
+    every = int(np.clip(np.ceil(60 * c.step / min(c.tau, 1.0)), 4, 24))
+    if c.sensor.get("i_lowpass") or c.sensor.get("i_window"):  # what it follows is the winding
+        every = int(np.clip(np.ceil(8 * c.step * m.R / m.L), every, 96))
+    return every
+
+
+def plant(c: Case) -> dict[str, float]:
+    """Return the parameters of the motor itself."""
+    m = c.motor
+    return dict(R=m.R, L=m.L, K=m.K, J=m.J, b=m.b, tc=m.tc, supply=m.supply, gear=m.gear)
+
+
+def at_bridge(c: Case, n: int, rng: np.random.Generator, late: float = 0.0) -> np.ndarray:
+    """Return when the command of each sample reaches the bridge."""
+    change = np.arange(n) * c.step + c.stamps.get("delay", 0.0) + late
+    period = c.stamps.get("driver", 0.0)
+    if period:
+        change = np.ceil((change + rng.uniform(0, period)) / period) * period
+    return change
+
+
+def floor_torque(c: Case, n: int, fine: float, rng: np.random.Generator) -> np.ndarray:
+    """Return the torque of a floor at every fine step."""
+    if not c.sensor.get("floor"):
+        return np.zeros(n)
+    steps = rng.standard_normal(n)
+    a = np.exp(-fine / (3 * c.tau))
+    return c.sensor["floor"] * filtered(np.sqrt(1 - a * a) * steps, 1 - a) / (1 - a)
+
+
+def filtered(x: np.ndarray, a: float) -> np.ndarray:
     from scipy.signal import lfilter
 
     return lfilter([a], [1, a - 1], x)
@@ -108,7 +131,7 @@ def _speed(
 ) -> np.ndarray:
     s = c.sensor
     if s.get("lowpass"):
-        w = _filter(w, 1 - np.exp(-fine / s["lowpass"]))
+        w = filtered(w, 1 - np.exp(-fine / s["lowpass"]))
     if s.get("window"):
         y = _window(angle, fine, s["window"], at)
     else:
@@ -147,7 +170,7 @@ def _current(
     i = out[:, 0]
     if s.get("i_lowpass"):
         # The current runs straight between fine samples: half of each is of the one before.
-        i = _filter(0.5 * (i + np.concatenate(([0.0], i[:-1]))), 1 - np.exp(-fine / s["i_lowpass"]))
+        i = filtered(0.5 * (i + np.concatenate(([0.0], i[:-1]))), 1 - np.exp(-fine / s["i_lowpass"]))
     y = i[::every]
     span = s.get("i_window", c.step if c.drive.get("pwm") or s.get("i_supply") else 0.0)
     if span:
