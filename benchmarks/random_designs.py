@@ -5,7 +5,8 @@
 Motors of L/R from 10 us to 10 ms and mechanical time constants from 5 ms to 1 s, at 20 Hz to 5 kHz,
 with 11 to 4096 counts, reported, differenced and observed speed, with and without averaging, sensor
 lag and delay.  What a design states is run by the loop's own simulation; an exception that is no
-DesignError, a number that is not finite and an unstable loop count as crashes.
+DesignError, a number that is not finite, an unstable loop and parameters that the running loop
+does not take count as crashes.
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ import numpy as np
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.result import Estimate, Quantity
 from smp_motor_ident.tune import Loop, design
+from smp_motor_ident.tune.verification import loop_settings
+from smp_motor_ident.tune.writing import parameters
 
 
 def draw(seed: int) -> tuple[Estimate, Loop]:
@@ -61,6 +64,7 @@ def attempt(seed: int) -> str:
     """Return ``designed``, ``refused`` or what went wrong."""
     try:
         one = design(*draw(seed), samples=60)
+        loop_settings(parameters(one))
     except DesignError as refusal:
         return f"refused: {refusal}"
     except Exception:

@@ -228,7 +228,7 @@ def rest():
 
 
 @njit(cache=True)
-def advance(first, last, step, change, command, noise, p, end, state, out):  # noqa: C901
+def advance(first, last, step, change, command, noise, p, end, state, out):
     """Advance from fine step ``first`` to ``last``; fill the rows of ``out`` that follow them.
 
     ``change`` are the instants at which ``command`` (one a sample) reaches the bridge; ``end`` is

@@ -170,7 +170,8 @@ def _current(
     i = out[:, 0]
     if s.get("i_lowpass"):
         # The current runs straight between fine samples: half of each is of the one before.
-        i = filtered(0.5 * (i + np.concatenate(([0.0], i[:-1]))), 1 - np.exp(-fine / s["i_lowpass"]))
+        middle = 0.5 * (i + np.concatenate(([0.0], i[:-1])))
+        i = filtered(middle, 1 - np.exp(-fine / s["i_lowpass"]))
     y = i[::every]
     span = s.get("i_window", c.step if c.drive.get("pwm") or s.get("i_supply") else 0.0)
     if span:

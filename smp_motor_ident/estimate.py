@@ -45,6 +45,7 @@ from smp_motor_ident.estimation.segments import heterogeneous
 from smp_motor_ident.estimation.subset import excited
 from smp_motor_ident.estimation.thinning import thinned
 from smp_motor_ident.finding import Finding
+from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments, prepare
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import PHYSICAL, Structure
@@ -245,6 +246,7 @@ def _stated(
         findings=tuple(findings),
         samples=data.size,
         sample_time=data.step,
+        speed_noise=0.0 if data.kind == rc.ANGLE else float(np.sqrt(chosen.noise[0, 0])),
         **_provenance(group),
     )
 

@@ -132,6 +132,9 @@ class Estimate:
         Quantities that ``covariance`` is about, in its order.
     covariance : ndarray, shape (p, p)
         Covariance of the estimation error of ``names``, in their own units squared.
+    speed_noise : float
+        Standard deviation [rad/s] of the noise on the recorded speed that the model was fitted to;
+        0 where it was fitted to an angle.
     """
 
     wheel: str
@@ -147,6 +150,7 @@ class Estimate:
     samples: int = 0
     duration: float = 0.0
     sample_time: float = 0.0
+    speed_noise: float = 0.0
     largest_voltage: float = 0.0
     sources: tuple[str, ...] = ()
     hardware: Hardware = Hardware()
@@ -261,6 +265,7 @@ class Estimate:
             "samples": self.samples,
             "duration": _number(self.duration),
             "sample_time": _number(self.sample_time),
+            "speed_noise": _number(self.speed_noise),
             "largest_voltage": _number(self.largest_voltage),
             "sources": list(self.sources),
             "hardware": {n: _number(x) for n, x in asdict(self.hardware).items()},

@@ -96,6 +96,9 @@ def _add_loop(group: argparse._ArgumentGroup) -> None:
         help="auto compares what each allows, and says why",
     )  # fmt: skip
     group.add_argument("--difference-window", type=int, help="[samples], 1; else as identified")
+    group.add_argument("--speed-noise", type=float,
+                       help="of the reported speed, standard deviation [rad/s, motor]; "
+                       "else as identified")  # fmt: skip
     group.add_argument("--gear-ratio", type=float, help="else as identified")
     group.add_argument("--counts-per-revolution", type=float, help="else as identified")
     group.add_argument("--supply", type=float, help="[V]; else as identified")
@@ -166,6 +169,7 @@ def loop_for(
         supply_voltage=supply,
         speed_source="measured" if arguments.speed_source == "auto" else arguments.speed_source,
         difference_window=1 if window is None else window,
+        speed_noise=_first(arguments.speed_noise, estimate.speed_noise) or 0.0,
         averaging_given=window is not None,
     )
 

@@ -72,7 +72,8 @@ def _moved(errors: Regression, unweighted: Array, weight: Array) -> tuple[Array,
     weighted = own * weight[:, None]
     other = inverse(own.T @ weighted, 1e-12)[:, free]
     move = other.T @ (weighted.T @ e)
-    rows = weighted @ other - own @ unweighted[:, free]  # of the residuals in the move of each coordinate
+    # Of the residuals in the move of each coordinate.
+    rows = weighted @ other - own @ unweighted[:, free]
     seen = e != 0.0  # rows without a measurement are zero
     white = float(e @ e) / max(int(seen.sum()) - own.shape[1], 1)
     share = _by_block(np.square(rows) * seen[:, None], errors.block)

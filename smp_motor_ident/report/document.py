@@ -96,8 +96,8 @@ def _check(estimate: Estimate) -> None:
         value = getattr(hardware, name)
         if value is not None and value <= 0:
             raise ValueError(f"{name} is {value}; it must be positive")
-    if not (0 <= hardware.encoder_bits <= 64 and estimate.sample_time >= 0):
-        raise ValueError("encoder_bits or sample_time is impossible")
+    if not 0 <= hardware.encoder_bits <= 64 or min(estimate.sample_time, estimate.speed_noise) < 0:
+        raise ValueError("encoder_bits, sample_time or speed_noise is impossible")
 
 
 def _known(quantity: Quantity | None) -> bool:

@@ -16,6 +16,7 @@ from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune.case import Case, prepare, solve
 from smp_motor_ident.tune.ensemble import Robustness
 from smp_motor_ident.tune.feedback import Feedback
+from smp_motor_ident.tune.limits import DELAY_BORNE
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.margins import Margins, loop_margins
 from smp_motor_ident.tune.plant import Plant, sample
@@ -221,6 +222,7 @@ def _plan(
         max_acceleration=None if rate is None else rate * ratio,
         transition_time=checked(targets, "transition_time"),
         together=bool(targets.get("together")),
+        bearable=DELAY_BORNE.value * margins.delay,
     )
 
 

@@ -36,6 +36,14 @@ SPEED_NOISE = Limit(
     "test_tune_methods.py",
 )
 
+DELAY_BORNE = Limit(
+    0.5,
+    "of the delay margin",
+    "an answer that is later by this leaves half of the phase margin; of a loop that bears less "
+    "than `delay_doubt` no more is asked",
+    "test_tune_truth.py",
+)
+
 # Loops whose commands are reconstructed.
 COMMAND_RESOLUTION = Limit(
     1 / 255,

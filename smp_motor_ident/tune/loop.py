@@ -51,7 +51,7 @@ class Loop:
         Largest control noise [V rms] that encoder quantisation may cause at the output;
         None takes 4 % of the supply.
     speed_noise : float
-        Standard deviation of the noise on a measured speed [rad/s, motor], beside quantisation.
+        Standard deviation of the noise on a reported speed [rad/s, motor], beside quantisation.
     averaging_given : bool
         Whether ``difference_window`` holds for a reported speed whatever averaging was identified.
 
@@ -108,6 +108,11 @@ class Loop:
     def reports_speed(self) -> bool:
         """Whether the speed of the message is fed back, with all that its sensor does to it."""
         return self.speed_source == "measured"
+
+    @property
+    def reported_noise(self) -> float:
+        """Noise of what is fed back [rad/s], beside quantisation: only a reported speed has any."""
+        return self.speed_noise if self.reports_speed else 0.0
 
     @property
     def loop_delay(self) -> float:

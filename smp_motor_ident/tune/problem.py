@@ -152,7 +152,7 @@ def noise_density(plant: Plant, loop: Loop, omega: Array) -> Array:
     observed.
     """
     density: Array = plant.angle_noise(omega) * loop.count_angle**2 / 12
-    return density + loop.speed_noise**2
+    return density + loop.reported_noise**2
 
 
 def control_noise(problem: Problem, feedback: Feedback) -> float:

@@ -37,6 +37,9 @@ PEAK = 0.95
 CHANGE = 0.5
 """Share of the largest speed that the figures of a design are about."""
 
+LONGEST = 60.0
+"""Duration of a change that the running loop takes at most [s]."""
+
 PEAK_RATE = 1.875
 """Peak acceleration of a minimum-jerk change of unit distance in unit time."""
 
@@ -121,9 +124,14 @@ def plan_reference(
     max_acceleration: float | None = None,
     transition_time: float | None = None,
     together: bool = False,
+    bearable: float = math.inf,
 ) -> Reference:
-    """Return the fastest reference that the motor can follow without overshoot."""
+    """Return the fastest reference that the motor can follow without overshoot.
+
+    Of a delay that may be longer than usual it takes no more than is ``bearable`` [s].
+    """
     ratio = loop.gear_ratio
+    loop = replace(loop, delay_doubt=min(loop.delay_doubt, bearable))
     speed = _reachable(plant, loop, max_velocity)
     plan = _fastest(plant, loop, speed, together)
     plan = _quickest(plant, loop, controller, plan, least)
@@ -195,12 +203,17 @@ def _quickest(
     linear = replace(controller, limit=math.inf, tracking=math.inf)
     grain = max(0.002, loop.sample_time)
     grains = math.ceil(max(0.01, least) / grain)
-    for _ in range(200):
+    while True:
         plan = replace(plan, transition_time=round(grains * grain, 9))
         if all(_overshoot(one, linear, plan) <= most for one, most in trials):
-            break
+            return plan
         grains += max(1, grains // 16)
-    return plan
+        if grains * grain > LONGEST:
+            break
+    raise DesignError(
+        f"every change of set-point shorter than {LONGEST:g} s overshoots; ask for a larger "
+        "phase_margin"
+    )
 
 
 def _overshoot(plant: Plant, controller: Controller, plan: Reference) -> float:

@@ -50,6 +50,7 @@ class Inputs:
     high: Array | None = None
     forward: Array | None = None  # [V]: Feed-forward
     load: Array | None = None  # [V]: what a load takes
+    noise: Array | None = None  # [rad/s]: on the measured speed, shape (n, k)
 
 
 def simulate(
@@ -67,6 +68,7 @@ def simulate(
     numbers = (fb.p, fb.i, fb.d, fb.filter_time, controller.weight, controller.weight_d,
                controller.limit, back)  # fmt: skip
     observer, none = plant.observer or NO_OBSERVER, np.zeros(steps)
+    noise = np.zeros((n, steps)) if inputs.noise is None else inputs.noise
     speed, voltage = _run(
         plant.phi, plant.taps, plant.phi_angle, plant.taps_angle, plant.sample_time, plant.sensor,
         plant.average, observer.advance, observer.by_angle, observer.by_voltage, observer.taps,
@@ -76,7 +78,7 @@ def simulate(
         none if inputs.forward is None else inputs.forward,
         none if inputs.load is None else inputs.load,
         np.zeros(n) if friction is None else np.ascontiguousarray(friction),
-        modelled, count_angle,
+        modelled, count_angle, noise,
     )  # fmt: skip
     return Response(plant.sample_time * np.arange(steps), speed, voltage)
 
@@ -152,6 +154,7 @@ def _run(
     friction: Array,
     modelled: float,
     count_angle: float,
+    noise: Array,
 ) -> tuple[Array, Array]:
     n, m, s = taps.shape
     steps, window = low.size, average.shape[1]
@@ -166,6 +169,7 @@ def _run(
             measured = observer[SPEED] if observer.size else x[sensor]
             if window > 0:
                 measured = _averaged(average[j], angle, count_angle)
+            measured += noise[j, k]
             reference = min(max(measured, low[k]), high[k])
             slope = weight_d * reference - measured
             rate = (filter_time * rate + slope - previous) / (filter_time + T)

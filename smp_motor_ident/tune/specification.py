@@ -125,10 +125,15 @@ def specify(
     plan = planned_change(usual, reference, change, time)
     drawn = case.ensemble.plant.motors.first(max(int(min(DRAWS, WORK / time.size)), FEWEST))
     plant = sample(drawn, loop, believed=nominal) if case.drawn else usual
+    noise = None
+    if loop.reported_noise > 0:
+        shape = (len(plant), time.size)
+        noise = loop.reported_noise * np.random.default_rng(0).standard_normal(shape)
+    forward = plan.forward + known * np.sign(plan.reference + plan.forward)
     run = simulate(
         plant,
         controller,
-        replace(plan.inputs, forward=plan.forward + known * np.sign(plan.reference + plan.forward)),
+        replace(plan.inputs, forward=forward, noise=noise),
         count_angle=0.0 if np.any(plant.motors.sensor_lag > 0) else loop.count_angle,
         friction=drawn.static_voltage if case.drawn else np.array([known]),
         modelled=known,

@@ -9,13 +9,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from smp_motor_ident.cli import tune_arguments
 from smp_motor_ident.cli.tune import main as tune
 from smp_motor_ident.errors import DesignError
+from smp_motor_ident.estimate import estimate as identify
 from smp_motor_ident.finding import Finding
-from smp_motor_ident.record import Hardware
+from smp_motor_ident.record import Hardware, Record
 from smp_motor_ident.report.document import identification_document
 from smp_motor_ident.result import Estimate, FitPercent, Quantity
 from smp_motor_ident.tune import Loop, design
+from smp_motor_ident.tune.case import prepare
+from smp_motor_ident.tune.problem import control_noise
 
 MOTOR = {"dc_gain": 25.0, "time_constant": 0.05, "time_constant_product": 6e-4}
 LOOP = Loop(sample_time=0.01, delay=0.01, gear_ratio=1.0, counts_per_revolution=2000.0)
@@ -238,3 +242,36 @@ def test_any_inductance_at_any_rate_ends_in_stable_gains(seed):
     assert one.margins.stable
     assert one.performance.overshoot < 5.0
     assert math.isfinite(one.specification.settling.value)
+
+
+def test_noise_of_a_recorded_speed_limits_the_gains():
+    """What is fed back shakes the voltage: by little where the design knows of it."""
+    rng = np.random.default_rng(4)
+    T, n, noise = 0.002, 6000, 6.0
+    voltage = np.repeat(rng.uniform(-10.0, 10.0, n // 60), 60)
+    speed = np.zeros(n)
+    decay = math.exp(-T / MOTOR["time_constant"])
+    for k in range(1, n):
+        speed[k] = decay * speed[k - 1] + (1 - decay) * MOTOR["dc_gain"] * voltage[k]
+    shown = speed + noise * rng.standard_normal(n)
+    record = Record("m", T * np.arange(n), voltage, None, shown, None, None)
+    found = identify(replace(record, hardware=Hardware(1.0, None, 0, 12.0)))
+    assert found.speed_noise == pytest.approx(noise, rel=0.05)
+    usual = tune_arguments.parser().parse_args(["identification"])
+    loop = tune_arguments.loop_for(found, usual)
+    assert loop.speed_noise == found.speed_noise
+    one, deaf = design(found, loop), design(found, replace(loop, speed_noise=0.0))
+    heard = prepare(found, loop, "margin", {}).problem
+    assert control_noise(heard, deaf.feedback) > 2 * loop.noise_limit
+    assert one.performance.control_noise < 1.3 * loop.noise_limit
+    assert one.specification.overshoot.high > deaf.specification.overshoot.high
+
+
+def test_of_a_fast_loop_no_more_delay_is_asked_than_it_bears():
+    """Two milliseconds are ten samples at 5 kHz: such an answer would be unstable."""
+    fast = replace(LOOP, sample_time=2e-4, delay=2e-4, counts_per_revolution=None)
+    quick = {"time_constant": 0.01, "time_constant_product": 0.0}
+    one = design(estimate(0.002, **quick), fast, together=False)
+    assert one.margins.delay < 2 * fast.delay_doubt
+    assert one.reference.doubt == pytest.approx(0.5 * one.margins.delay)
+    assert one.reference.transition_time < 0.1
