@@ -95,7 +95,7 @@ def _add_loop(group: argparse._ArgumentGroup) -> None:
         "--speed-source", choices=("auto", *SPEED_SOURCES), default="auto",
         help="auto compares what each allows, and says why",
     )  # fmt: skip
-    group.add_argument("--difference-window", type=int, help="[samples], 1; else as identified")
+    group.add_argument("--difference-window", type=int, help="[samples]; else as identified")
     group.add_argument("--speed-noise", type=float,
                        help="of the reported speed, standard deviation [rad/s, motor]; "
                        "else as identified")  # fmt: skip
@@ -155,6 +155,8 @@ def loop_for(
     else:
         sample_time = estimate.sample_time or 1.0 / DEFAULT_RATE
     window = arguments.difference_window
+    # Of a speed that was recorded what averaging there is was identified.
+    usual_window = int(arguments.speed_source == "difference" or not estimate.speed_noise)
     usual, longest = (None, None) if measured is None else measured.until_applied(sample_time)
     if arguments.delay is not None:
         usual = None  # it is the longest, which nothing measured may pass
@@ -168,7 +170,7 @@ def loop_for(
         ),
         supply_voltage=supply,
         speed_source="measured" if arguments.speed_source == "auto" else arguments.speed_source,
-        difference_window=1 if window is None else window,
+        difference_window=usual_window if window is None else window,
         speed_noise=_first(arguments.speed_noise, estimate.speed_noise) or 0.0,
         averaging_given=window is not None,
     )

@@ -260,8 +260,11 @@ def test_noise_of_a_recorded_speed_limits_the_gains():
     usual = tune_arguments.parser().parse_args(["identification"])
     loop = tune_arguments.loop_for(found, usual)
     assert loop.speed_noise == found.speed_noise
+    # It was recorded as it is at each instant: an average would have been identified.
+    assert loop.difference_window == 0
     one, deaf = design(found, loop), design(found, replace(loop, speed_noise=0.0))
     heard = prepare(found, loop, "margin", {}).problem
+    assert not heard.plant.window
     assert control_noise(heard, deaf.feedback) > 2 * loop.noise_limit
     assert one.performance.control_noise < 1.3 * loop.noise_limit
     assert one.specification.overshoot.high > deaf.specification.overshoot.high
