@@ -18,8 +18,10 @@ from smp_motor_ident.tune.motors import (
     Friction,
     draw_motors,
     friction_of,
+    lag_of_sensor,
     motors_of,
     unreliable_spread,
+    with_lag_of_sensor,
 )
 from smp_motor_ident.tune.plant import sample
 from smp_motor_ident.tune.problem import Method, Problem, RequiredMargins, checked, control_noise
@@ -58,7 +60,8 @@ def prepare(estimate: Estimate, loop: Loop, method: str, targets: dict[str, Any]
     chosen = _method(method, targets)
     findings = list(_reliability(estimate, bool(targets.get("accept_unreliable"))))
     friction = friction_of(estimate, loop.supply_voltage)
-    findings += [friction.finding] if friction.finding is not None else []
+    lag = lag_of_sensor(estimate) if loop.reports_speed else None
+    findings += [one for one in (friction.finding, lag) if one is not None]
     planned = np.array([friction.planned])
     plant = sample(replace(motors_of(estimate), static_voltage=planned), loop)
     problem = Problem(plant, loop, targets)
@@ -69,6 +72,8 @@ def prepare(estimate: Estimate, loop: Loop, method: str, targets: dict[str, Any]
     states = plant.taps.shape[1] + plant.window + 6
     n = max(min(n, int(WORK / states**3)), FEWEST)
     motors = draw_motors(estimate, n, np.random.default_rng(seed), friction)
+    if motors is not None and lag is not None:
+        motors = with_lag_of_sensor(motors)
     draws = plant if motors is None else sample(motors, loop, believed=plant.motors)
     ensemble = UncertaintyEnsemble(draws, required)
     if motors is None:

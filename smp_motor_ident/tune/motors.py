@@ -148,6 +148,37 @@ def draw_motors(
     return motors
 
 
+def lag_of_sensor(estimate: Estimate) -> Finding | None:
+    """Return what is to be said where the second lag may be the reported speed's filter."""
+    if not any(f.code == "second_lag" and f.severity == "warning" for f in estimate.findings):
+        return None
+    return Finding(
+        "second_lag",
+        "warning",
+        "the second lag may be a filter's of the reported speed, which the motor is ahead of: the "
+        "bands of the specification cover both",
+        {},
+        "switch the filter of the firmware off, or record encoder counts or the current",
+    )
+
+
+def with_lag_of_sensor(motors: Motors) -> Motors:
+    """Return the motors with every other one's second lag as the reported speed's filter.
+
+    From voltage to what is reported they answer the same; two lags that would ring, by the error
+    of an estimate, are taken for equal ones.
+    """
+    total, product = motors.a1 / motors.a0, motors.a2 / motors.a0
+    short = 0.5 * (total - np.sqrt(np.maximum(np.square(total) - 4 * product, 0.0)))
+    other = np.arange(len(motors)) % 2 == 1
+    return replace(
+        motors,
+        a1=np.where(other, motors.a0 * (total - short), motors.a1),
+        a2=np.where(other, 0.0, motors.a2),
+        sensor_lag=motors.sensor_lag + np.where(other, short, 0.0),
+    )
+
+
 def _covariance(estimate: Estimate, names: tuple[str, ...], mean: Array) -> Array:
     """Return the covariance of some quantities, zero where there is none, widened if unreliable."""
     covariance = np.zeros((len(names), len(names)))

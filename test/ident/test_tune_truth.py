@@ -124,6 +124,20 @@ def test_gains_are_of_the_speed_that_the_firmware_reports(sensor, name):
     )
 
 
+def test_a_lag_that_may_be_the_sensors_is_in_the_bands():
+    """What is fed back follows as planned; the motor, which is ahead of a filter, overshoots."""
+    doubt = Finding("second_lag", "warning", "two lags, the second 0.5 of the first")
+    lags = {"time_constant": 0.15, "time_constant_product": 0.1 * 0.05}
+    filtered = {**TRUE, "time_constant": 0.1, "time_constant_product": 1e-4}
+    aware = design(estimate(findings=[doubt], **lags), LOOP)
+    ignorant = design(estimate(**lags), LOOP)
+    seen = overshoot(aware, filtered, lag=0.05)
+    assert ignorant.specification.overshoot.high + 5.0 < seen
+    assert seen <= aware.specification.overshoot.high + 0.25
+    assert overshoot(aware, {**TRUE, **lags}) <= aware.specification.overshoot.high + 0.25
+    assert any("filter" in words for words in aware.warnings)
+
+
 def test_drives_within_the_uncertainty_stay_within_the_specified_bands():
     one = design(estimate(std=0.03), LOOP)
     spec, rng, held = one.specification, np.random.default_rng(8), []
