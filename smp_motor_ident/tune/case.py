@@ -20,6 +20,7 @@ from smp_motor_ident.tune.motors import (
     friction_of,
     lag_of_sensor,
     motors_of,
+    one_size_of_voltage,
     unreliable_spread,
     with_lag_of_sensor,
 )
@@ -61,7 +62,8 @@ def prepare(estimate: Estimate, loop: Loop, method: str, targets: dict[str, Any]
     findings = list(_reliability(estimate, bool(targets.get("accept_unreliable"))))
     friction = friction_of(estimate, loop.supply_voltage)
     lag = lag_of_sensor(estimate) if loop.reports_speed else None
-    findings += [one for one in (friction.finding, lag) if one is not None]
+    level = one_size_of_voltage(estimate)
+    findings += [one for one in (friction.finding, lag, level) if one is not None]
     planned = np.array([friction.planned])
     plant = sample(replace(motors_of(estimate), static_voltage=planned), loop)
     problem = Problem(plant, loop, targets)

@@ -11,7 +11,12 @@ from smp_motor_ident.errors import DesignError
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.result import Estimate, Quantity
 from smp_motor_ident.tune.arrays import Array
-from smp_motor_ident.tune.limits import FRICTION_KNOWN, FRICTION_RANGE, UNRELIABLE_SPREAD
+from smp_motor_ident.tune.limits import (
+    FRICTION_KNOWN,
+    FRICTION_RANGE,
+    ONE_SIZE_SPREAD,
+    UNRELIABLE_SPREAD,
+)
 
 PHYSICAL = ("resistance", "inductance", "motor_constant", "inertia", "viscous_friction")
 COMBINATIONS = ("dc_gain", "time_constant", "time_constant_product")
@@ -119,7 +124,8 @@ def draw_motors(
     """Draw motors from the distribution of the estimation error.
 
     What is positive by nature is drawn log-normally, what may be zero normally from there up.
-    An unreliable estimate is drawn at least as wide as what it leaves unexplained.
+    An unreliable estimate is drawn at least as wide as what it leaves unexplained, gain and lag
+    from one size of voltage as wide as they may be at others.
     """
     names = _names(estimate)
     mean = np.array([estimate.value(name) for name in names])
@@ -146,6 +152,20 @@ def draw_motors(
             static = rng.uniform(friction.low, friction.high, n)
         motors = replace(motors, static_voltage=static)
     return motors
+
+
+def one_size_of_voltage(estimate: Estimate) -> Finding | None:
+    """Return what is to be said where the motor was recorded at one size of voltage alone."""
+    if not any(f.code == "one_size_of_voltage" for f in estimate.findings):
+        return None
+    return Finding(
+        "one_size_of_voltage",
+        "warning",
+        "the motor was recorded at one size of voltage: at others its gain and its lag are taken "
+        f"as known to {ONE_SIZE_SPREAD.value:.0%}",
+        {"spread": ONE_SIZE_SPREAD.value},
+        "record several sizes of voltage",
+    )
 
 
 def lag_of_sensor(estimate: Estimate) -> Finding | None:
@@ -185,8 +205,12 @@ def _covariance(estimate: Estimate, names: tuple[str, ...], mean: Array) -> Arra
     known = [k for k, name in enumerate(names) if name in estimate.names]
     index = [estimate.names.index(names[k]) for k in known]
     covariance[np.ix_(known, known)] = estimate.covariance[np.ix_(index, index)]
+    spread = np.zeros(len(names))
+    if one_size_of_voltage(estimate) is not None:
+        spread[:] = [ONE_SIZE_SPREAD.value * (n in ("dc_gain", "time_constant")) for n in names]
     if estimate.unreliable:
-        covariance += np.diag((unreliable_spread(estimate) * mean) ** 2)
+        spread[:] = unreliable_spread(estimate)
+    covariance += np.diag((spread * mean) ** 2)
     return np.where(np.isfinite(covariance), covariance, 0.0)
 
 

@@ -138,6 +138,17 @@ def test_a_lag_that_may_be_the_sensors_is_in_the_bands():
     assert any("filter" in words for words in aware.warnings)
 
 
+def test_gains_from_one_size_of_voltage_hold_at_others():
+    """A driver that is clipped where it was recorded has a fifth more gain at half the speed."""
+    level = Finding("one_size_of_voltage", "warning", "the voltage has one size, 12 V")
+    aware, ignorant = design(estimate(findings=[level]), LOOP), design(estimate(), LOOP)
+    more = {**TRUE, "dc_gain": 1.2 * TRUE["dc_gain"]}
+    assert overshoot(ignorant, more) > ignorant.specification.overshoot.high + 2.0
+    assert overshoot(aware, more) <= aware.specification.overshoot.high + 0.25
+    assert aware.robustness.holds >= 0.99 and aware.gains.i < ignorant.gains.i
+    assert any("one size" in words for words in aware.warnings)
+
+
 def test_drives_within_the_uncertainty_stay_within_the_specified_bands():
     one = design(estimate(std=0.03), LOOP)
     spec, rng, held = one.specification, np.random.default_rng(8), []
