@@ -43,7 +43,7 @@ def widened(data: Experiments, fit: Fit, seed: int = 0) -> Fit:
         spread = REACH**2 * cov * np.sqrt(np.outer(excess, excess))
         errors = _counting_errors(data, fit, own, spread, rng) @ influence
         # Only what the counter does is replayed; what the current's noise does is known.
-        second = metered + np.mean(np.square(errors), axis=0)
+        second = metered + np.square(errors).sum(axis=0) / max(len(errors), 1)
         excess = np.maximum(second / np.maximum(expected, np.diag(cov)), excess)
     return replace(fit, widen=np.sqrt(excess))
 
@@ -71,7 +71,9 @@ def _counting_errors(
     for _ in range(int(np.clip(MOST // data.size, *REPLAYS))):
         near = fit.structure.complete(fit.z + matrix @ (half @ rng.standard_normal(len(half))))
         angle = prediction.outputs(data, replace(fit, z=near))
+        if not np.isfinite(angle).all():
+            continue  # no motor: a coordinate that the data leave open went out of all bounds
         shown = angle + rng.uniform(0, data.quantum) + noise * rng.standard_normal(data.size)
         wrong = np.floor(shown / data.quantum) * data.quantum - angle
         errors.append(wrong - wrong.mean())
-    return np.array(errors)
+    return np.array(errors).reshape(-1, data.size)

@@ -15,6 +15,7 @@ from smp_motor_ident.estimation.fitted import Options, long_run
 from smp_motor_ident.estimation.hold_choice import instant_deviation
 from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.estimation.prediction import predicted_decrease
+from smp_motor_ident.estimation.quantisation import widened
 from smp_motor_ident.estimation.thinning import thinned
 from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import prepare
@@ -42,6 +43,20 @@ def test_two_exact_speeds_widen_the_interval_where_the_counter_repeats_itself():
     for e in (wide, narrow):
         assert abs(e.value("dc_gain") - truth) < 4 * e.combinations["dc_gain"].std
     assert wide.combinations["dc_gain"].std > 1.3 * narrow.combinations["dc_gain"].std
+
+
+def test_motors_out_of_all_bounds_are_not_replayed():
+    """A lag that the data leave open by a factor of e^1000 is none whose counts can be drawn."""
+    square = 12.0 * np.sign(np.sin(2 * np.pi * (np.arange(600) / 200.0 + 1e-6)))
+    recording = motors.record("front_left", current=False, voltage=square, kinds=("x",) * 2)
+    data = prepare([recording], False)
+    fit = initial_fit(data, Structure("second_order", friction="symmetric"), Options())
+    assert fit is not None
+    fit = replace(fit, noise_ratio=0.0, noise=np.diag([data.quantum**2 / 12, 1.0]))
+    free = len(fit.structure.free())
+    far = replace(fit, added=np.diag(np.where(np.arange(free) == 1, 1e6, 0.0)))
+    assert widened(data, fit).widen is not None
+    assert np.isfinite(widened(data, far).widen).all()
 
 
 def test_thinning_keeps_the_charge_and_the_jumps_of_the_input():
