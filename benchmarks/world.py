@@ -19,6 +19,7 @@ import sys
 import time
 import traceback
 from collections import Counter
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
@@ -85,7 +86,6 @@ def judge(job: tuple[int, int, int, bool]) -> tuple[int, str, str]:
     number, level, seed, rich = job
     from smp_motor_ident.errors import SmpError
     from smp_motor_ident.estimate import estimate
-    from smp_motor_ident.record import Hardware, Record
 
     effect = EFFECTS[number]
     rng = np.random.default_rng(seed)
@@ -95,13 +95,7 @@ def judge(job: tuple[int, int, int, bool]) -> tuple[int, str, str]:
         f"turn {c.turn:g} {'current ' if c.current else ''}tau {c.tau:.3g}"
     )
     try:
-        made = measure(c, rng)
-        counted = c.signals.startswith("counts")
-        record = Record(
-            "motor", **made, source="world", starts=segments(made["time"]),
-            hardware=Hardware(c.motor.gear, c.turn if counted else None, 0, c.motor.supply, None),
-        )  # fmt: skip
-        e = estimate(record)
+        e = estimate(recorded(c, rng))
     except SmpError as refusal:
         return number, "right" if effect.expect == "refuse" else "refused", f"{about}: {refusal}"
     except Exception:  # a benchmark wants to go on
@@ -119,9 +113,21 @@ def judge(job: tuple[int, int, int, bool]) -> tuple[int, str, str]:
     return number, "right", words
 
 
-def main() -> None:
-    """Run and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+def recorded(c: Case, rng: np.random.Generator):
+    """Simulate a case; return its record."""
+    from smp_motor_ident.record import Hardware, Record
+
+    made = measure(c, rng)
+    counted = c.signals.startswith("counts")
+    return Record(
+        "motor", **made, source="world", starts=segments(made["time"]),
+        hardware=Hardware(c.motor.gear, c.turn if counted else None, 0, c.motor.supply, None),
+    )  # fmt: skip
+
+
+def table(judge: Callable[..., tuple[int, str, str]], outcomes: Sequence[str], about: str) -> None:
+    """Judge the cases that the command line asks for, and print how many came out how."""
+    parser = argparse.ArgumentParser(description=about)
     parser.add_argument("--motors", type=int, default=3, help="motors an effect")
     parser.add_argument("--seed", type=int, default=None)
     parser.add_argument("--effects", default="")
@@ -140,18 +146,18 @@ def main() -> None:
     begin = time.time()
     counts: dict[int, Counter[str]] = {k: Counter() for k in chosen}
     with ProcessPoolExecutor(args.processes) as pool:
-        for number, outcome, about in pool.map(judge, jobs, chunksize=1):
+        for number, outcome, said in pool.map(judge, jobs, chunksize=1):
             counts[number][outcome] += 1
             if args.list:
-                print(f"{outcome:8} {about}", flush=True)
+                print(f"{outcome:9} {said}", flush=True)
     print(f"\nseed {seed}, {args.motors} motors an effect, {time.time() - begin:.0f} s\n")
-    print("| effect | " + " | ".join(OUTCOMES) + " |\n|" + " --- |" * (1 + len(OUTCOMES)))
+    print("| effect | " + " | ".join(outcomes) + " |\n|" + " --- |" * (1 + len(outcomes)))
     total: Counter[str] = Counter()
     for k in chosen:
         total += counts[k]
-        print(f"| {EFFECTS[k].name} | " + " | ".join(str(counts[k][o]) for o in OUTCOMES) + " |")
-    print("| all | " + " | ".join(str(total[o]) for o in OUTCOMES) + " |")
+        print(f"| {EFFECTS[k].name} | " + " | ".join(str(counts[k][o]) for o in outcomes) + " |")
+    print("| all | " + " | ".join(str(total[o]) for o in outcomes) + " |")
 
 
 if __name__ == "__main__":
-    main()
+    table(judge, OUTCOMES, __doc__)

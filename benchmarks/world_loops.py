@@ -7,18 +7,14 @@ Each case of ``world`` is recorded, identified and tuned as the tools do it with
 wheel's own loop then changes its speed on the simulated drive, with the same effects in driver,
 motor and sensor, by what ``gains.json`` speaks of, from a set-point of zero.  ``kept``: overshoot
 and settling within the stated bands, with what is tolerated of each (`OVER`, `LATE`); ``declined``:
-no estimate, or one that ``tune`` refuses.
+no estimate, one that ``tune`` refuses, or a recording of which a refusal alone is right.
 """
 
 from __future__ import annotations
 
-import argparse
 import os
 import sys
-import time
 import traceback
-from collections import Counter
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -26,9 +22,9 @@ sys.path[:0] = [str(Path(__file__).resolve().parents[1]), str(Path(__file__).res
 
 import numpy as np  # noqa: E402
 import world_motor  # noqa: E402
-from world import segments  # noqa: E402
+from world import recorded, table  # noqa: E402
 from world_effects import EFFECTS, Case  # noqa: E402
-from world_record import at_bridge, case, fine_steps, floor_torque, measure, plant  # noqa: E402
+from world_record import at_bridge, case, fine_steps, floor_torque, plant  # noqa: E402
 
 OUTCOMES = ("kept", "declined", "overshoot", "settling", "unstable", "crash")
 OVER = 2.0  # percentage points: the width of the band of settling
@@ -151,11 +147,12 @@ def judge(job: tuple[int, int, int, bool]) -> tuple[int, str, str]:
     from smp_motor_ident.cli import tune_arguments
     from smp_motor_ident.errors import SmpError
     from smp_motor_ident.estimate import estimate
-    from smp_motor_ident.record import Hardware, Record
     from smp_motor_ident.tune import design
     from smp_motor_ident.tune.source import choose_source
 
     effect = EFFECTS[number]
+    if effect.expect != "answer":
+        return number, "declined", f"{effect.name}: nothing to tune"
     rng = np.random.default_rng(seed)
     c = case(effect, level, rng, rich)
     if c.signals == "angle":
@@ -165,13 +162,7 @@ def judge(job: tuple[int, int, int, bool]) -> tuple[int, str, str]:
         f"turn {c.turn:g} tau {c.tau:.3g}"
     )
     try:
-        made = measure(c, rng)
-        counted = c.signals.startswith("counts")
-        record = Record(
-            "motor", **made, source="world", starts=segments(made["time"]),
-            hardware=Hardware(c.motor.gear, c.turn if counted else None, 0, c.motor.supply, None),
-        )  # fmt: skip
-        found = estimate(record)
+        found = estimate(recorded(c, rng))
         usual = tune_arguments.parser().parse_args(["identification", "--rate", str(c.rate)])
         loop, _ = choose_source(found, tune_arguments.loop_for(found, usual))
         made_for = design(found, loop)
@@ -194,41 +185,5 @@ def judge(job: tuple[int, int, int, bool]) -> tuple[int, str, str]:
     return number, "kept", words
 
 
-def main() -> None:
-    """Run and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--motors", type=int, default=3, help="motors an effect")
-    parser.add_argument("--seed", type=int, default=None)
-    parser.add_argument("--effects", default="")
-    parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--rich", action="store_true", help="only excitation that tells much")
-    parser.add_argument("--list", action="store_true", help="print every case as it comes")
-    args = parser.parse_args()
-    seed = args.seed if args.seed is not None else int(time.time())
-    words = [w.strip().lower() for w in args.effects.split(",") if w.strip()]
-    chosen = [
-        k
-        for k, e in enumerate(EFFECTS)
-        if e.expect == "answer" and (not words or any(w in e.name.lower() for w in words))
-    ]
-    jobs = [
-        (k, n % 3, seed * 1000 + 97 * k + n, args.rich) for k in chosen for n in range(args.motors)
-    ]
-    begin = time.time()
-    counts: dict[int, Counter[str]] = {k: Counter() for k in chosen}
-    with ProcessPoolExecutor(args.processes) as pool:
-        for number, outcome, about in pool.map(judge, jobs, chunksize=1):
-            counts[number][outcome] += 1
-            if args.list:
-                print(f"{outcome:9} {about}", flush=True)
-    print(f"\nseed {seed}, {args.motors} motors an effect, {time.time() - begin:.0f} s\n")
-    print("| effect | " + " | ".join(OUTCOMES) + " |\n|" + " --- |" * (1 + len(OUTCOMES)))
-    total: Counter[str] = Counter()
-    for k in chosen:
-        total += counts[k]
-        print(f"| {EFFECTS[k].name} | " + " | ".join(str(counts[k][o]) for o in OUTCOMES) + " |")
-    print("| all | " + " | ".join(str(total[o]) for o in OUTCOMES) + " |")
-
-
 if __name__ == "__main__":
-    main()
+    table(judge, OUTCOMES, __doc__)
