@@ -20,6 +20,9 @@ from smp_motor_control.reference.profile import Drive, Profile, ProfileLimits, R
 
 SPEED_SOURCES = ("measured", "difference", "observer")
 
+LONGEST_TRANSITION = 60.0
+"""Largest duration of a change of set-point [s]."""
+
 _LEARNING = 20
 """Samples from which the observer learns the usual interval."""
 
@@ -50,7 +53,11 @@ class LoopSettings:
     drive: Drive | None = None
 
     def __post_init__(self) -> None:
-        longest = {"reference_delay": 10.0, "reference_doubt": 1.0, "transition_time": 60.0}
+        longest = {
+            "reference_delay": 10.0,
+            "reference_doubt": 1.0,
+            "transition_time": LONGEST_TRANSITION,
+        }
         for name, most in longest.items():
             check_range(name, getattr(self, name), 0.0, most, "s")
         if self.speed_source not in SPEED_SOURCES:

@@ -156,29 +156,31 @@ def draw_motors(
 
 def one_size_of_voltage(estimate: Estimate) -> Finding | None:
     """Return what is to be said where the motor was recorded at one size of voltage alone."""
-    if not any(f.code == "one_size_of_voltage" for f in estimate.findings):
+    found = next((f for f in estimate.findings if f.code == "one_size_of_voltage"), None)
+    if found is None:
         return None
     return Finding(
-        "one_size_of_voltage",
+        found.code,
         "warning",
         "the motor was recorded at one size of voltage: at others its gain and its lag are taken "
         f"as known to {ONE_SIZE_SPREAD.value:.0%}",
         {"spread": ONE_SIZE_SPREAD.value},
-        "record several sizes of voltage",
+        found.advice,
     )
 
 
 def lag_of_sensor(estimate: Estimate) -> Finding | None:
     """Return what is to be said where the second lag may be the reported speed's filter."""
-    if not any(f.code == "second_lag" and f.severity == "warning" for f in estimate.findings):
+    found = next((f for f in estimate.findings if f.code == "second_lag"), None)
+    if found is None or found.severity != "warning":
         return None
     return Finding(
-        "second_lag",
+        found.code,
         "warning",
         "the second lag may be a filter's of the reported speed, which the motor is ahead of: the "
         "bands of the specification cover both",
-        {},
-        "switch the filter of the firmware off, or record encoder counts or the current",
+        found.evidence,
+        found.advice,
     )
 
 

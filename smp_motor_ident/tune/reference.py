@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from smp_motor_control.reference.profile import Drive, Profile, ProfileLimits
+from smp_motor_control.wheel.loop import LONGEST_TRANSITION
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.tune.arrays import Array
 from smp_motor_ident.tune.feedback import Feedback
@@ -36,9 +37,6 @@ PEAK = 0.95
 
 CHANGE = 0.5
 """Share of the largest speed that the figures of a design are about."""
-
-LONGEST = 60.0
-"""Duration of a change that the running loop takes at most [s]."""
 
 PEAK_RATE = 1.875
 """Peak acceleration of a minimum-jerk change of unit distance in unit time."""
@@ -208,11 +206,11 @@ def _quickest(
         if all(_overshoot(one, linear, plan) <= most for one, most in trials):
             return plan
         grains += max(1, grains // 16)
-        if grains * grain > LONGEST:
+        if grains * grain > LONGEST_TRANSITION:
             break
     raise DesignError(
-        f"every change of set-point shorter than {LONGEST:g} s overshoots; ask for a larger "
-        "phase_margin"
+        f"every change of set-point shorter than {LONGEST_TRANSITION:g} s overshoots; ask for a "
+        "larger phase_margin"
     )
 
 
