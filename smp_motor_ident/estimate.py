@@ -18,6 +18,7 @@ from smp_motor_ident.diagnosis.conditions import dependent
 from smp_motor_ident.diagnosis.current_kind import ARMATURE, current_kind
 from smp_motor_ident.diagnosis.limits import CANDIDATE_WEIGHT, LEAST_FIT, PROFILED
 from smp_motor_ident.diagnosis.model_error import regression
+from smp_motor_ident.diagnosis.noise_or_effect import in_place_of_noise
 from smp_motor_ident.diagnosis.refusal import no_candidate, refuse
 from smp_motor_ident.diagnosis.residuals import residual_tests
 from smp_motor_ident.diagnosis.scope import blames_current, current_left_out, scope
@@ -208,7 +209,8 @@ def _stated(
     """Return what the last candidate says, and how far it can be trusted."""
     chosen, friction_std, change = _certain(data, candidates[-1].fit, request, group, hold)
     final = of_kind(data, chosen)
-    errors = regression(final, chosen, group[0].hardware.gear_ratio)
+    gear = group[0].hardware.gear_ratio
+    errors = regression(final, chosen, gear)
     chosen, parts = dependent(chosen, errors)
 
     def said(fit: Fit) -> tuple[Answer, dict[str, float]]:
@@ -222,7 +224,10 @@ def _stated(
     own, common = _validation(group, request, final, chosen, hold)
     percent = FitPercent(fitted, own)
     tests = residual_tests(final, chosen)
-    lacks, possible = adequacy(errors, data.step, stated(chosen, result), tests)
+    numbers = stated(chosen, result)
+    lacks, possible = adequacy(errors, data.step, numbers, tests)
+    if not any(f.severity == "unreliable" for f in lacks):
+        lacks += in_place_of_noise(final, chosen, errors, gear, numbers)
     if possible is not None:
         result, alike = said(chosen.wider(np.outer(possible, possible).astype(np.float64)))
     findings = [

@@ -78,7 +78,7 @@ def adequacy(
             level = EFFECT_COVERED.value / max(len(evidence), 1)
             return _covered([e for e in evidence if e.p_value < level], out, numbers, step)
         first = max(shown, key=lambda e: e.gain - 2 * len(e.columns))
-        out.append(_finding(first, shown, numbers, step))
+        out.append(as_finding(first, shown, numbers, step))
         named += first.columns
     return out, None
 
@@ -160,7 +160,7 @@ def _without(errors: Regression, named: Sequence[int]) -> Regression:
     return replace(errors, residual=residual, regressors=rest, members=members)
 
 
-def _finding(
+def as_finding(
     first: Evidence, shown: Sequence[Evidence], numbers: Sequence[Stated], step: float
 ) -> Finding:
     worst, times, share = _farthest(first, numbers, step)

@@ -129,6 +129,12 @@ EFFECTS = (
         lambda m: [m.drop * (m.voltage / m.top) ** 2, np.abs(m.voltage / m.top) * m.drop],
     ),
     Effect(
+        "supply_recovers", "voltage", "a supply that sags and recovers slowly",
+        "record the supply's voltage, or the voltage at the terminals",
+        lambda m: [m.voltage / m.top * _lagged(np.abs(m.voltage * m.drop) / m.top, m, c)
+                   for c in (10.0, 100.0)],
+    ),
+    Effect(
         "brush_drop", "voltage", "a voltage drop over brushes or transistors",
         "record the voltage at the terminals; drive slowly through zero",
         lambda m: [np.tanh(20 * m.drop / m.top)],
@@ -165,9 +171,9 @@ EFFECTS = (
         _angles,
     ),
     Effect(
-        "dynamics", "voltage", "linear dynamics that the model lacks (compliance, a filter, a "
-        "supply that recovers)", "sample faster; record the voltage at the terminals",
-        lambda m: [_lagged(m, c) for c in (0.3, 3.0)],
+        "dynamics", "voltage", "linear dynamics that the model lacks (compliance, a filter)",
+        "sample faster; record the voltage at the terminals",
+        lambda m: [_lagged(m.voltage, m, c) for c in (0.3, 3.0)],
     ),
     Effect(
         "slew", "voltage", "a driver that limits how fast the voltage rises",
@@ -218,12 +224,12 @@ EFFECTS = (
 """Explanations in the order in which they are named where the data like them equally."""
 
 
-def _lagged(m: Motion, factor: float) -> Array:
-    """Return the voltage through a first-order lag that is faster or slower than the motor's."""
+def _lagged(signal: Array, m: Motion, factor: float) -> Array:
+    """Return a signal through a first-order lag that is faster or slower than the motor's."""
     speed, voltage = m.speed / m.fastest, m.voltage / m.top
     # The motor's own lag [sections] from how its speed follows its voltage.
     own = max(float(np.abs(voltage - speed).sum() / max(np.abs(np.diff(speed)).sum(), 1e-9)), 1.0)
     a = float(np.exp(-1.0 / max(factor * own, 0.3)))
-    # y[n] - a y[n-1] = (1 - a) v[n]: a filter as a system of equations with two bands.
-    bands = np.array([np.ones(m.voltage.size), np.full(m.voltage.size, -a)])
-    return np.asarray(solve_banded((1, 0), bands, (1 - a) * m.voltage))
+    # y[n] - a y[n-1] = (1 - a) x[n]: a filter as a system of equations with two bands.
+    bands = np.array([np.ones(signal.size), np.full(signal.size, -a)])
+    return np.asarray(solve_banded((1, 0), bands, (1 - a) * signal))

@@ -51,21 +51,21 @@ def regression(data: Experiments, fit: Fit, gear: float) -> Regression | None:
     """Return residuals and responses, whitened, the model's coordinates projected out."""
     if not fit.structure.free() or data.size < 4 * BLOCKS:
         return None
-    base = _predicted(data, fit)
-    columns = [_stacked(data, fit, _measured(data) - base)]
-    columns += [_stacked(data, fit, c) for c in _own(data, fit, base)]
+    base = predicted(data, fit)
+    columns = [stacked(data, fit, measured(data) - base)]
+    columns += [stacked(data, fit, c) for c in own_responses(data, fit, base)]
     n_own = len(columns) - 1
     members: list[tuple[Effect, tuple[int, ...]]] = []
-    sections, samples = _motions(data, fit, gear)
+    sections, samples = motions(data, fit, gear)
     for effect in EFFECTS:
         if effect.place == "current" and not data.current.size:
             continue
-        made = [_response(data, fit, base, effect, s) for s in
+        made = [response(data, fit, base, effect, s) for s in
                 effect.regressors(sections if effect.place == "voltage" else samples)]  # fmt: skip
         if made:
             first = len(columns) - 1 - n_own
             members.append((effect, tuple(range(first, first + len(made)))))
-            columns += [_stacked(data, fit, c) for c in made]
+            columns += [stacked(data, fit, c) for c in made]
     table = np.array(columns).T  # columns stay together in memory
     if np.count_nonzero(columns[0]) < 4 * BLOCKS or not np.isfinite(table).all():
         return None
@@ -122,28 +122,28 @@ def _projected(
                       whole, n_free)  # fmt: skip
 
 
-def _predicted(data: Experiments, fit: Fit) -> Array:
+def predicted(data: Experiments, fit: Fit) -> Array:
     """Return the one-step predictions of the output (and current) as columns."""
     return prediction.simulate(data, fit, gain=True)[:, 1:]
 
 
-def _measured(data: Experiments) -> Array:
+def measured(data: Experiments) -> Array:
     if data.current.size:
         return np.column_stack([data.output, data.current])
     return data.output[:, None]
 
 
-def _stacked(data: Experiments, fit: Fit, columns: Array) -> Array:
+def stacked(data: Experiments, fit: Fit, columns: Array) -> Array:
     """Return output and current below each other, in units of their innovations.
 
     Of long records the sums over so many samples that `ROWS` of each are left, over the root of
     their number: what the effects do is slow, and a sum of errors is as good as they are.
     """
-    measured = _measured(data)
+    values = measured(data)
     begins = np.arange(0, data.size, _together(data))
     parts = []
     for k in range(columns.shape[1]):
-        known = np.where(np.isfinite(measured[:, k]), columns[:, k], 0.0)
+        known = np.where(np.isfinite(values[:, k]), columns[:, k], 0.0)
         sums = np.add.reduceat(known, begins)
         parts.append(sums / np.sqrt(fit.noise[k, k] * _together(data)))
     return np.concatenate(parts)
@@ -160,7 +160,7 @@ def _blocks(data: Experiments) -> NDArray[np.int64]:
     return np.tile(block, 2 if data.current.size else 1)
 
 
-def _own(data: Experiments, fit: Fit, base: Array) -> list[Array]:
+def own_responses(data: Experiments, fit: Fit, base: Array) -> list[Array]:
     """Return the sensitivities to the free coordinates and to each segment's initial state."""
     structure = fit.structure
     # With all others fixed: coordinates that hang together (L/R of next to nothing) leave a
@@ -170,7 +170,7 @@ def _own(data: Experiments, fit: Fit, base: Array) -> list[Array]:
     for j in range(len(structure.free())):
         step = 0.3 * float(np.clip(deviation[j], 1e-9, 0.05))
         z = fit.z + step * structure.matrix()[:, j]
-        out.append((_predicted(data, replace(fit, z=z)) - base) / step)
+        out.append((predicted(data, replace(fit, z=z)) - base) / step)
     columns = own_columns(data, structure)
     segments = len(data.starts) - 1
     if segments > SEGMENTS:
@@ -179,7 +179,7 @@ def _own(data: Experiments, fit: Fit, base: Array) -> list[Array]:
     for c in columns:
         initial = fit.initial.copy()
         initial[:, c] += size[c]
-        moved = (_predicted(data, replace(fit, initial=initial)) - base) / size[c]
+        moved = (predicted(data, replace(fit, initial=initial)) - base) / size[c]
         for a, b in zip(data.starts[:-1], data.starts[1:]):
             part = np.zeros_like(moved)
             part[a:b] = moved[a:b]
@@ -187,7 +187,7 @@ def _own(data: Experiments, fit: Fit, base: Array) -> list[Array]:
     return out
 
 
-def _response(data: Experiments, fit: Fit, base: Array, effect: Effect, signal: Array) -> Array:
+def response(data: Experiments, fit: Fit, base: Array, effect: Effect, signal: Array) -> Array:
     """Return what a unit of the effect changes in the predictions."""
     if effect.place == "voltage":
         size = float(np.sqrt(np.mean(np.square(signal))))
@@ -195,18 +195,18 @@ def _response(data: Experiments, fit: Fit, base: Array, effect: Effect, signal: 
             return np.zeros_like(base)
         step = NUDGE * float(np.sqrt(np.mean(np.square(data.hold_value)))) / size
         nudged = replace(data, hold_value=data.hold_value + step * signal)
-        return (_predicted(nudged, fit) - base) / step
+        return (predicted(nudged, fit) - base) / step
     out = np.zeros_like(base)
     name, column = ("output", 0) if effect.place == "output" else ("current", 1)
     out[:, column] = signal
     if np.any(fit.gain != 0.0):  # the state follows a wrong measurement, too
         step = NUDGE * float(np.sqrt(fit.noise[column, column] / max(np.mean(signal**2), 1e-300)))
         nudged = replace(data, **{name: getattr(data, name) + step * signal})
-        out -= (_predicted(nudged, fit) - base) / step
+        out -= (predicted(nudged, fit) - base) / step
     return out
 
 
-def _motions(data: Experiments, fit: Fit, gear: float) -> tuple[Motion, Motion]:
+def motions(data: Experiments, fit: Fit, gear: float) -> tuple[Motion, Motion]:
     """Return the free run at the sections' middles and at the samples."""
     run = prediction.simulate(data, fit)
     speed = run[:, 0]

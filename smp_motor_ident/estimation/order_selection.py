@@ -268,35 +268,48 @@ def _variations(
     data: Experiments, best: Fit, options: Options, candidates: list[FittedCandidate], say: Say
 ) -> Fit:
     """Add what the data ask for, take away what they do not show."""
-    s = best.structure
     if best.kind == rc.MEAN_SPEED:
         data = data.as_mean_speed()
-    for change in _additions(s):
-        richer = best.structure.with_(**change)
-        if richer == best.structure:
-            continue
-        hidden = delay_without_noise(data, best, options) if "delay" in change else None
-        if hidden is None and not worth_a_fit(data, best, richer):
-            continue
-        say(f"trying {label(richer)}")
-        z = best.z.copy()
-        if "delay" in change:
-            z[models.DELAY] = 0.3 * data.step
-        other = descent.refine(data, richer, best, z, options)
-        other = min(other, hidden or other, key=lambda f: f.deviance)
-        verdict, reason = preferred(best, other)
-        if verdict and "delay" in change and other.z[models.DELAY] < 0.03 * data.step:
-            verdict, reason = False, "a delay of hundredths of a sample is how the input was held"
-        if verdict and other.noise_ratio > 0:  # what looked like torque noise may have been this
-            other = data_window.grow(data, richer, other, options)
-        if verdict and s.current and "load" in change:  # R and K were found where it was missing
-            other = initial_fit(data, richer, options, [other.z], near=other) or other
-        candidates.append(FittedCandidate(other, reason))
-        if verdict:
-            best = other
+    before = None
+    while before != best.structure:  # what was added may have hidden that the rest is there, too
+        before = best.structure
+        for change in _additions(before):
+            best = _with_addition(data, best, change, options, candidates, say)
     if best.structure != candidates[0].fit.structure:  # what was added may have hidden it
         best = with_current_lag(data, best, options, candidates, say)
     return _without_friction(data, best, options, candidates)
+
+
+def _with_addition(
+    data: Experiments,
+    best: Fit,
+    change: dict[str, object],
+    options: Options,
+    candidates: list[FittedCandidate],
+    say: Say,
+) -> Fit:
+    """Return the fit with an addition, if the data ask for it."""
+    richer = best.structure.with_(**change)
+    if richer == best.structure or any(r.fit.structure == richer for r in candidates):
+        return best
+    hidden = delay_without_noise(data, best, options) if "delay" in change else None
+    if hidden is None and not worth_a_fit(data, best, richer):
+        return best
+    say(f"trying {label(richer)}")
+    z = best.z.copy()
+    if "delay" in change:
+        z[models.DELAY] = 0.3 * data.step
+    other = descent.refine(data, richer, best, z, options)
+    other = min(other, hidden or other, key=lambda f: f.deviance)
+    verdict, reason = preferred(best, other)
+    if verdict and "delay" in change and other.z[models.DELAY] < 0.03 * data.step:
+        verdict, reason = False, "a delay of hundredths of a sample is how the input was held"
+    if verdict and other.noise_ratio > 0:  # what looked like torque noise may have been this
+        other = data_window.grow(data, richer, other, options)
+    if verdict and richer.current and "load" in change:  # R and K were found where it was missing
+        other = initial_fit(data, richer, options, [other.z], near=other) or other
+    candidates.append(FittedCandidate(other, reason))
+    return other if verdict else best
 
 
 def _additions(s: Structure) -> list[dict[str, object]]:

@@ -44,8 +44,12 @@ def again(data: Experiments, structure: Structure, fit: Fit, blocks: int = BLOCK
 
 
 def inverse(normal: Array, rcond: float = 1e-13) -> Array:
-    """Return the pseudo-inverse of a normal matrix, whatever the units of its coordinates."""
-    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    """Return the pseudo-inverse of a normal matrix, whatever the units of its coordinates.
+
+    Coordinates of which nothing is known, but for rounding, are zero in it.
+    """
+    known = np.diag(normal)
+    scale = np.sqrt(np.where(known > 1e-200, known, np.inf))
     scaled = np.linalg.pinv(normal / np.outer(scale, scale), rcond=rcond, hermitian=True)
     return np.asarray(scaled / np.outer(scale, scale))
 

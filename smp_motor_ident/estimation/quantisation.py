@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 
 REPLAYS = 8, 32  # fewest and most
 MOST = 500_000  # samples in all replays
+COUNTED = 2.0**45  # counts that a double holds to a hundredth
 REACH = 2.0  # standard deviations to which motions near the estimate are replayed
 
 
@@ -71,7 +72,7 @@ def _counting_errors(
     for _ in range(int(np.clip(MOST // data.size, *REPLAYS))):
         near = fit.structure.complete(fit.z + matrix @ (half @ rng.standard_normal(len(half))))
         angle = prediction.outputs(data, replace(fit, z=near))
-        if not np.isfinite(angle).all():
+        if not np.abs(angle).max() < COUNTED * data.quantum:
             continue  # no motor: a coordinate that the data leave open went out of all bounds
         shown = angle + rng.uniform(0, data.quantum) + noise * rng.standard_normal(data.size)
         wrong = np.floor(shown / data.quantum) * data.quantum - angle

@@ -60,7 +60,7 @@ def test_a_load_that_is_nothing_is_no_number_that_an_effect_moves():
     def finding(shift: float) -> Finding:
         shown = adequacy.Evidence(EFFECTS[0], 1e-6, 200.0, np.array([shift]), (0,))
         numbers = [stated("static_voltage", 0.3, 3e-5, 0.0), stated("load_voltage", -1e-5, 3e-6, 1)]
-        return adequacy._finding(shown, [shown], numbers, 0.005)
+        return adequacy.as_finding(shown, [shown], numbers, 0.005)
 
     # Twice its value, and a ten-thousandth of the friction; then a fifteenth of the friction.
     assert finding(2e-5).severity == "note"
