@@ -227,7 +227,7 @@ def _stated(
     numbers = stated(chosen, result)
     lacks, possible = adequacy(errors, data.step, numbers, tests)
     if not any(f.severity == "unreliable" for f in lacks):
-        lacks += in_place_of_noise(final, chosen, errors, gear, numbers)
+        lacks += in_place_of_noise(final, chosen, gear, numbers, request.options)
     if possible is not None:
         result, alike = said(chosen.wider(np.outer(possible, possible).astype(np.float64)))
     findings = [

@@ -1,7 +1,8 @@
 """What real drives do and the plain motor does not, each as regressors for the model's error.
 
-An effect adds ``sum c_j s_j(t)`` to the voltage, to the measured output, or to the measured
-current.  The ``s_j`` are made of the model's own free run, so they know nothing of the noise.
+An effect adds ``sum c_j s_j(t)`` to the voltage, to the load torque (in volts, as a standing motor
+would show it), to the measured output, or to the measured current.  The ``s_j`` are made of the
+model's own free run, so they know nothing of the noise.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from scipy.linalg import solve_banded
 from smp_motor_ident.likelihood import recursion as rc
 
 Array = NDArray[np.float64]
-Place = Literal["voltage", "output", "current"]
+Place = Literal["voltage", "torque", "output", "current"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +39,9 @@ class Motion:
     fastest: float
     gear: float  # motor revolutions a wheel revolution
     kind: int  # of the output
+    # resistance [ohm] and L/R [s], where the current is measured
+    resistance: float = 0.0
+    electric_lag: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -59,20 +63,21 @@ def _change(m: Motion) -> Array:
     return np.diff(m.voltage, prepend=m.voltage[0])
 
 
-def _slope(values: Array, step: Array) -> Array:
+def slope(values: Array, step: Array) -> Array:
+    """Return the slope of what is given at the ends of intervals of these lengths [s]."""
     out = np.zeros(values.size)
     out[1:-1] = (values[2:] - values[:-2]) / np.maximum(step[1:-1] + step[2:], 1e-12)
     return out
 
 
 def _late(m: Motion) -> list[Array]:
-    first = _slope(m.output, m.step)
-    return [first, _slope(first, m.step)]
+    first = slope(m.output, m.step)
+    return [first, slope(first, m.step)]
 
 
 def _current_late(m: Motion) -> list[Array]:
-    first = _slope(m.current, m.step)
-    return [first, _slope(first, m.step)]
+    first = slope(m.current, m.step)
+    return [first, slope(first, m.step)]
 
 
 def _angles(m: Motion) -> list[Array]:
@@ -150,23 +155,28 @@ EFFECTS = (
         lambda m: [np.ones(m.speed.size), np.abs(m.speed), np.abs(m.voltage)],
     ),
     Effect(
-        "drag", "voltage", "a drag that grows with the square of the speed",
+        "drag", "torque", "a drag that grows with the square of the speed",
         "record at the speeds at which the motor will run",
         lambda m: [m.speed * np.abs(m.speed)],
     ),
     Effect(
-        "stribeck", "voltage", "friction that falls with speed (Stribeck)",
+        "stribeck", "torque", "friction that falls with speed (Stribeck)",
         "record less of the slowest speeds, or slow ramps through zero to see it",
         lambda m: [_sign(m.speed) * np.exp(-np.abs(m.speed) / (c * m.fastest))
                    for c in (0.03, 0.15)],
     ),
     Effect(
-        "drift", "voltage", "a motor, load or supply that changed during the record",
+        "drift", "voltage", "a motor or supply that changed during the record",
         "record after warming up, and shorter; or state the two halves apart",
-        lambda m: [m.share * m.voltage, m.share * m.speed, m.share * _sign(m.speed), m.share],
+        lambda m: [m.share * m.voltage, m.share * m.speed],
     ),
     Effect(
-        "position", "voltage", "a torque that depends on the angle (cogging, an unbalanced wheel)",
+        "drift", "torque", "a friction or load that changed during the record",
+        "record after warming up, and shorter; or state the two halves apart",
+        lambda m: [m.share * _sign(m.speed), m.share],
+    ),
+    Effect(
+        "position", "torque", "a torque that depends on the angle (cogging, an unbalanced wheel)",
         "lift the wheel, or record at higher speed and for more turns",
         _angles,
     ),

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident.diagnosis.effects import EFFECTS, Effect, Motion
+from smp_motor_ident.diagnosis.effects import EFFECTS, Effect, Motion, slope
 from smp_motor_ident.diagnosis.limits import EFFECT_OWN
 from smp_motor_ident.diagnosis.residuals import voltage_at_samples
 from smp_motor_ident.estimation import prediction
@@ -20,7 +20,7 @@ from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.passes import own_columns
-from smp_motor_ident.model.structures import to_internal
+from smp_motor_ident.model.structures import LN_R, TE, to_internal
 
 Array = NDArray[np.float64]
 
@@ -60,8 +60,7 @@ def regression(data: Experiments, fit: Fit, gear: float) -> Regression | None:
     for effect in EFFECTS:
         if effect.place == "current" and not data.current.size:
             continue
-        made = [response(data, fit, base, effect, s) for s in
-                effect.regressors(sections if effect.place == "voltage" else samples)]  # fmt: skip
+        made = [response(data, fit, base, s) for s in signals(effect, sections, samples)]
         if made:
             first = len(columns) - 1 - n_own
             members.append((effect, tuple(range(first, first + len(made)))))
@@ -187,22 +186,68 @@ def own_responses(data: Experiments, fit: Fit, base: Array) -> list[Array]:
     return out
 
 
-def response(data: Experiments, fit: Fit, base: Array, effect: Effect, signal: Array) -> Array:
-    """Return what a unit of the effect changes in the predictions."""
-    if effect.place == "voltage":
-        size = float(np.sqrt(np.mean(np.square(signal))))
-        if size == 0.0 or not np.isfinite(size):
-            return np.zeros_like(base)
-        step = NUDGE * float(np.sqrt(np.mean(np.square(data.hold_value)))) / size
-        nudged = replace(data, hold_value=data.hold_value + step * signal)
-        return (predicted(nudged, fit) - base) / step
+@dataclass(frozen=True, eq=False)
+class Signal:
+    """What an effect adds: to the voltage of each section [V], to the output or to the current."""
+
+    voltage: Array | None = None
+    output: Array | None = None
+    current: Array | None = None  # [A], at the samples
+
+    def within(self, data: Experiments, size: float) -> Experiments:
+        """Return experiments in which the model finds the effect as a part of what is given."""
+        if self.voltage is not None:
+            data = replace(data, hold_value=data.hold_value + size * self.voltage)
+        if self.output is not None:
+            data = replace(data, output=data.output - size * self.output)
+        if self.current is not None:
+            data = replace(data, current=data.current - size * self.current)
+        return data
+
+
+def signals(effect: Effect, sections: Motion, samples: Motion) -> list[Signal]:
+    """Return what a unit of each regressor of an effect adds.
+
+    A load torque T is a voltage ``-(R T + L dT/dt) / K`` beside a current ``T / K`` that is not the
+    model's: ``i - T / K`` then drives a motor without it.
+    """
+    if effect.place == "output":
+        return [Signal(output=s) for s in effect.regressors(samples)]
+    if effect.place == "current":
+        return [Signal(current=s) for s in effect.regressors(samples)]
+    at_sections = effect.regressors(sections)
+    if effect.place == "voltage" or not samples.current.size:
+        return [Signal(voltage=s) for s in at_sections]
+    return [
+        Signal(
+            voltage=s + samples.electric_lag * slope(s, sections.step),
+            current=-there / samples.resistance,
+        )
+        for s, there in zip(at_sections, effect.regressors(samples), strict=True)
+    ]
+
+
+def response(data: Experiments, fit: Fit, base: Array, signal: Signal) -> Array:
+    """Return what a unit of an effect changes in the predictions."""
     out = np.zeros_like(base)
-    name, column = ("output", 0) if effect.place == "output" else ("current", 1)
-    out[:, column] = signal
-    if np.any(fit.gain != 0.0):  # the state follows a wrong measurement, too
-        step = NUDGE * float(np.sqrt(fit.noise[column, column] / max(np.mean(signal**2), 1e-300)))
-        nudged = replace(data, **{name: getattr(data, name) + step * signal})
-        out -= (predicted(nudged, fit) - base) / step
+    if signal.voltage is not None:
+        size = float(np.sqrt(np.mean(np.square(signal.voltage))))
+        if size == 0.0 or not np.isfinite(size):
+            return out
+        step = NUDGE * float(np.sqrt(np.mean(np.square(data.hold_value)))) / size
+        nudged = Signal(voltage=signal.voltage).within(data, step)
+        out += (predicted(nudged, fit) - base) / step
+    for column, added, measured_signal in (
+        (0, signal.output, Signal(output=signal.output)),
+        (1, signal.current, Signal(current=signal.current)),
+    ):
+        if added is None:
+            continue
+        out[:, column] += added
+        if np.any(fit.gain != 0.0):  # the state follows a wrong measurement, too
+            size = max(float(np.mean(np.square(added))), 1e-300)
+            step = NUDGE * float(np.sqrt(fit.noise[column, column] / size))
+            out += (predicted(measured_signal.within(data, step), fit) - base) / step
     return out
 
 
@@ -218,7 +263,11 @@ def motions(data: Experiments, fit: Fit, gear: float) -> tuple[Motion, Motion]:
     voltage = voltage_at_samples(data)
     at_samples = _motion(data, gear, (data.time, voltage, speed, angle), back, np.diff(data.starts))
     at_samples = replace(
-        at_samples, output=run[:, 1], current=run[:, 2] if data.current.size else np.zeros(0)
+        at_samples,
+        output=run[:, 1],
+        current=run[:, 2] if data.current.size else np.zeros(0),
+        resistance=float(np.exp(fit.z[LN_R])),
+        electric_lag=float(np.exp(fit.z[TE])),
     )
     middle, w, theta = (np.empty(data.hold_end.size) for _ in range(3))
     bounds = [*map(int, data.hold_start[: len(data.starts) - 1]), data.hold_end.size]

@@ -88,7 +88,7 @@ def answer(
         if friction_std > 0:
             reach = NORMAL_95 * spread[name]
             interval = values.value[name] - reach, values.value[name] + reach
-        if one_level and name in TRADED:
+        if (one_level and name in TRADED) or _hidden(name, values.value[name], spread[name], fit):
             combinations[name] = Quantity(None, None, _positive(name, interval), UNITS[name],
                                           "unidentifiable")  # fmt: skip
         elif name != "steady_speed" or one_level:
@@ -174,6 +174,15 @@ def _parameters(
     elif "delay" in combinations:
         parameters["delay"] = combinations["delay"]
     return parameters, tuple(loose)
+
+
+def _hidden(name: str, value: float, std: float, fit: Fit) -> bool:
+    """Tell whether a product of lags is that of an inductance that does not show.
+
+    Its logarithm ends where the descent stopped, far below all that the data could tell.
+    """
+    hidden = fit.structure.current and _too_loose("inductance", value, std, fit)
+    return name == "time_constant_product" and hidden
 
 
 def _friction(name: str, fit: Fit) -> float:

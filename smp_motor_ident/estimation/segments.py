@@ -33,6 +33,7 @@ Array = NDArray[np.float64]
 FEWEST = 4  # parts of which a scatter can be taken
 ORDERED = 6  # parts of which a drift is distinguishable from scatter
 LOOSE = 0.3  # e-folds, or of the value: a coordinate known worse from a part is left out
+ROUNDING = 1e-12  # of the largest eigenvalue: what the sums of a part are exact to
 COMPARED = [i for i in range(len(models.Z_NAMES)) if i != models.TE]
 
 
@@ -101,7 +102,7 @@ def _steps(data: Experiments, fit: Fit) -> tuple[Array, Array, Array, list[int]]
         own = inverse_of(normal[f:, f:])
         left = normal[:f, :f] - normal[:f, f:] @ own @ normal[f:, :f]
         score = gradient[:f] - normal[:f, f:] @ own @ gradient[f:]
-        inverse = inverse_of(left + plausible, 1e-15)
+        inverse = _bounded_inverse(left + plausible)
         middle.append(0.5 * (cut.starts[b] + cut.starts[b + 1]) / data.size)
         steps.append(inverse @ score)
         covs.append(inverse * np.outer(factors, factors))
@@ -119,6 +120,14 @@ def _steps(data: Experiments, fit: Fit) -> tuple[Array, Array, Array, list[int]]
         return None
     at = np.ix_(keep, common, common)
     return when[keep] - when[keep].mean(), step[np.ix_(keep, common)], cov[at], common
+
+
+def _bounded_inverse(information: Array) -> Array:
+    """Return a covariance; what a part knows but for rounding is bounded, not negative."""
+    unit = np.sqrt(np.maximum(np.diag(information), 1e-200))
+    values, vectors = np.linalg.eigh(information / np.outer(unit, unit))
+    values = np.maximum(values, ROUNDING * values[-1])
+    return np.asarray((vectors / values) @ vectors.T / np.outer(unit, unit))
 
 
 def _fast_factors(fit: Fit) -> Array:
