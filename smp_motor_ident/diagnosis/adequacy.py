@@ -163,6 +163,7 @@ def _without(errors: Regression, named: Sequence[int]) -> Regression:
 def as_finding(
     first: Evidence, shown: Sequence[Evidence], numbers: Sequence[Stated], step: float
 ) -> Finding:
+    """Say what an effect that is shown does to the stated numbers, and what it may be else."""
     worst, times, share = _farthest(first, numbers, step)
     also = [e.effect.cause for e in shown if e is not first and e.gain > 0.8 * first.gain]
     words = " or ".join([first.effect.cause, *also[:2]])

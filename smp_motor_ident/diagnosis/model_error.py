@@ -127,6 +127,7 @@ def predicted(data: Experiments, fit: Fit) -> Array:
 
 
 def measured(data: Experiments) -> Array:
+    """Return what was measured, output (and current) as columns."""
     if data.current.size:
         return np.column_stack([data.output, data.current])
     return data.output[:, None]

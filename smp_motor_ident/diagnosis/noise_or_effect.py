@@ -63,13 +63,13 @@ def in_place_of_noise(
     price = float(np.log(data.size))
     runs = [(_settled(here, effect, gear), effect) for effect in here.most_likely()]
     run, effect = min(runs, key=lambda r: r[0].deviance + len(r[0].signals) * price)
-    again = data_window.grow(run.data, fit.structure, fit.at(run.fit.z, fit.initial), options)
+    again = data_window.grow(run.data, fit.structure, replace(fit, z=run.fit.z), options)
     gain = (fit.deviance - again.deviance) / sandwich_factor(fit) - len(run.signals) * price
     chance = len(EFFECTS) * float(np.exp(min(-0.5 * gain, 0.0)))
     if chance > EFFECT_LEVEL.value:
         return []
     moved = np.linalg.lstsq(fit.structure.matrix(), again.z - fit.z, rcond=None)[0]
-    shown = Evidence(effect, chance, gain, -moved, ())
+    shown = Evidence(effect, chance, gain, np.asarray(-moved, dtype=np.float64), ())
     return [as_finding(shown, [shown], numbers, data.step)]
 
 

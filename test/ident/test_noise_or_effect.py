@@ -11,44 +11,78 @@ import pytest
 
 from smp_motor_ident.diagnosis.effects import EFFECTS
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.record import Record
+from smp_motor_ident.record import Hardware, Record
+from smp_motor_ident.result import Estimate
 
-STEP = 1 / 200
+RESISTANCE, LAG, CONSTANT, INERTIA, VISCOUS = independent.TABLE_1["rear_left"]
+STATIC = 0.3
+TURN = 5000.0  # counts
 
 
-def dragged(share: float, seed: int = 3) -> Record:
+def dragged(share: float, *, current: bool, seed: int = 3) -> Record:
     """Random steps of a motor with a drag that takes a share of what friction does at 8 V."""
     rng = np.random.default_rng(seed)
-    voltage = np.repeat(rng.uniform(-10.0, 10.0, 40), 50)
-    t = np.arange(voltage.size) * STEP
-    r, el, k, j, b = independent.TABLE_1["rear_left"]
-    fastest = 8.0 * k / (r * b + k * k)
-    drag = share * (0.3 * k / r + b * fastest) / fastest**2
+    voltage = np.repeat(rng.uniform(-10.0, 10.0, 40), 25)
+    t = np.arange(voltage.size) / 200
+    coulomb = STATIC * CONSTANT / RESISTANCE
+    fastest = 8.0 * CONSTANT / (RESISTANCE * VISCOUS + CONSTANT**2)
+    drag = share * (coulomb + VISCOUS * fastest) / fastest**2
     load = np.zeros(t.size)
-    for _ in range(12):  # the speed that the load itself slows
-        out = independent.simulate(t, voltage, r, el, k, j, b, 0.3 * k / r, load, 50)
+    for _ in range(12):  # the speed is that which the load itself slows
+        out = independent.simulate(
+            t, voltage, RESISTANCE, LAG, CONSTANT, INERTIA, VISCOUS, coulomb, load, 50
+        )
         middle = 0.5 * (out[:, 1] + np.concatenate([[0.0], out[:-1, 1]]))
         load = drag * middle * np.abs(middle)
-    angle = np.round(out[:, 2], 6)
-    amps = out[:, 0] + 0.01 * rng.standard_normal(t.size)
-    made = motors.record("rear_left", voltage=voltage, seconds=5.0)
-    return replace(made, count=None, position=angle, velocity=None, current=amps)
+    count = np.floor(out[:, 2] * TURN / (2 * np.pi) + rng.uniform()).astype(np.int64)
+    amps = out[:, 0] + 0.01 * rng.standard_normal(t.size) if current else None
+    return Record(
+        "rear_left", t, voltage, amps, None, None, count,
+        hardware=Hardware(65.5, TURN, 0, 12.0, None), source="bag",
+    )  # fmt: skip
 
 
-def findings(record: Record) -> dict[str, str]:
-    """Return the severity of what real drives do that is spoken of."""
+def severities(found: Estimate) -> dict[str, str]:
+    """Return how severe each effect is that is spoken of."""
     codes = {effect.code for effect in EFFECTS}
-    return {f.code: f.severity for f in estimate(record).findings if f.code in codes}
+    return {f.code: f.severity for f in found.findings if f.code in codes}
 
 
-def test_a_drag_is_not_taken_for_a_load_that_fluctuates() -> None:
-    assert findings(dragged(0.4)).get("drag") == "unreliable"
-    assert "unreliable" not in findings(dragged(0.0)).values()
+@pytest.mark.parametrize("current", [False, True])
+def test_a_drag_is_not_taken_for_a_load_that_fluctuates(current: bool) -> None:
+    found = estimate(dragged(0.1, current=current))
+    assert "torque_noise" in {f.code for f in found.findings}
+    assert severities(found)["drag"] == "unreliable"
+    assert "unreliable" not in severities(estimate(dragged(0.0, current=current))).values()
 
 
-@pytest.mark.parametrize("seed", range(3))
+def test_a_drag_is_a_torque_where_the_current_is_measured() -> None:
+    # A voltage would take the drag's part of the current along: then no number would move by it.
+    found = estimate(dragged(0.2, current=True))
+    (drag,) = (f for f in found.findings if f.code == "drag" and f.severity == "unreliable")
+    friction = found.parameters["viscous_friction"]
+    assert drag.evidence["quantity"] == "viscous_friction"
+    # What the finding says it is off by is what it is off by.
+    off = abs(friction.value - VISCOUS) / friction.value
+    np.testing.assert_allclose(drag.evidence["shift_share"], off, rtol=0.15)
+
+
+@pytest.mark.parametrize("seed", range(4))
 def test_a_load_that_fluctuates_shows_no_effect(seed: int) -> None:
     made = motors.record("rear_left", current=bool(seed % 2), torque_noise=0.5, seed=seed)
-    found = estimate(made).findings
-    assert "torque_noise" in {f.code for f in found}
-    assert "unreliable" not in {f.severity for f in found}
+    found = estimate(made)
+    assert "torque_noise" in {f.code for f in found.findings}
+    assert "unreliable" not in severities(found).values()
+
+
+def test_a_current_offset_is_found_beside_an_offset_of_the_driver() -> None:
+    """A driver's offset is a load and an offset of the current at once, neither alone."""
+    asked = independent.excitation(np.arange(3000) / 200, "square", 6.0)
+    made = motors.record("rear_left", voltage=asked + 0.2, static_voltage=0.3, seconds=5.0)
+    found = estimate(replace(made, voltage=asked, velocity=None))
+    true = motors.truth("rear_left", 0.3)
+    for name in ("inductance", "resistance", "motor_constant", "time_constant"):
+        q = {**found.combinations, **found.parameters}[name]
+        assert abs(q.value - true[name]) < 4.5 * q.std, name
+    load = found.combinations["load_voltage"]
+    assert abs(load.value + 0.2) < 4.5 * load.std

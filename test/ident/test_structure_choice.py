@@ -14,7 +14,7 @@ from independent import simulate
 
 from smp_motor_ident.diagnosis.advice import unsettled_rival
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.estimation import order_selection
+from smp_motor_ident.estimation import variations
 from smp_motor_ident.estimation.choice import (
     FittedCandidate,
     label,
@@ -114,8 +114,8 @@ def test_torque_noise_does_not_hide_a_delay(monkeypatch):
     plain = initial_fit(data, Structure("electromechanical", current=True), Options())
     ratio = noise_ratio_of(bandwidth(plain.z, data), data.step, data.kind)
     noisy = solve(data, plain.structure, plain.at(plain.z, noise_ratio=ratio), Options(), 20)
-    monkeypatch.setattr(order_selection, "worth_a_fit", lambda *_: False)
-    best = order_selection._variations(data, noisy, Options(), [], lambda _: None)
+    monkeypatch.setattr(variations, "worth_a_fit", lambda *_: False)
+    best = variations.varied(data, noisy, Options(), [], lambda _: None)
     assert best.structure.delay
     assert best.z[DELAY] == pytest.approx(data.step, rel=0.05)
 

@@ -1,0 +1,157 @@
+"""What a chosen structure may be added to, and friction that it may lose: as the data ask."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from smp_motor_ident.diagnosis.limits import LITTLE_FRICTION, SUBSET_HOPELESS
+from smp_motor_ident.estimation import data_window, descent, prediction
+from smp_motor_ident.estimation.candidate_starts import of_kind
+from smp_motor_ident.estimation.choice import (
+    FittedCandidate,
+    label,
+    preferred,
+    sandwich_factor,
+    worth_a_fit,
+)
+from smp_motor_ident.estimation.current_lag import with_current_lag
+from smp_motor_ident.estimation.delay_and_averaging import delay_without_noise
+from smp_motor_ident.estimation.fit import Fit, Options, solve
+from smp_motor_ident.estimation.initialisation import initial_fit
+from smp_motor_ident.estimation.profile import RISE, one_level, rubbing
+from smp_motor_ident.likelihood import recursion as rc
+from smp_motor_ident.likelihood.experiments import Experiments
+from smp_motor_ident.model import structures as models
+from smp_motor_ident.model.structures import Structure
+
+Say = Callable[[str], None]
+
+
+def varied(
+    data: Experiments, best: Fit, options: Options, candidates: list[FittedCandidate], say: Say
+) -> Fit:
+    """Add what the data ask for, take away what they do not show."""
+    if best.kind == rc.MEAN_SPEED:
+        data = data.as_mean_speed()
+    before = None
+    while before != best.structure:  # what was added may have hidden that the rest is there, too
+        before = best.structure
+        for change in _additions(before):
+            best = _with_addition(data, best, change, options, candidates, say)
+    if best.structure != candidates[0].fit.structure:  # what was added may have hidden it
+        best = with_current_lag(data, best, options, candidates, say)
+    return _without_friction(data, best, options, candidates)
+
+
+def _with_addition(
+    data: Experiments,
+    best: Fit,
+    change: dict[str, object],
+    options: Options,
+    candidates: list[FittedCandidate],
+    say: Say,
+) -> Fit:
+    """Return the fit with an addition, if the data ask for it."""
+    richer = best.structure.with_(**change)
+    if richer == best.structure or any(r.fit.structure == richer for r in candidates):
+        return best
+    hidden = delay_without_noise(data, best, options) if "delay" in change else None
+    if hidden is None and not worth_a_fit(data, best, richer):
+        return best
+    say(f"trying {label(richer)}")
+    z = best.z.copy()
+    if "delay" in change:
+        z[models.DELAY] = 0.3 * data.step
+    other = descent.refine(data, richer, best, z, options)
+    other = min(other, hidden or other, key=lambda f: f.deviance)
+    verdict, reason = preferred(best, other)
+    if verdict and "delay" in change and other.z[models.DELAY] < 0.03 * data.step:
+        verdict, reason = False, "a delay of hundredths of a sample is how the input was held"
+    if verdict and other.noise_ratio > 0:  # what looked like torque noise may have been this
+        other = data_window.grow(data, richer, other, options)
+    if verdict and richer.current and "load" in change:  # R and K were found where it was missing
+        other = initial_fit(data, richer, options, [other.z], near=other) or other
+    candidates.append(FittedCandidate(other, reason))
+    return other if verdict else best
+
+
+def _additions(s: Structure) -> list[dict[str, object]]:
+    """Return what may be added to a structure, in the order in which it is tried."""
+    trials: list[dict[str, object]] = []
+    if s.current:
+        trials.append({"offset": True})
+        if "delay" not in s.fixed and not s.delay:
+            trials.append({"delay": True})
+    if s.friction != "asymmetric":
+        trials.append({"load": True})
+    if s.friction == "symmetric":
+        trials.append({"friction": "asymmetric", "load": True})
+    return trials
+
+
+def _without_friction(
+    data: Experiments, best: Fit, options: Options, candidates: list[FittedCandidate]
+) -> Fit:
+    """Leave Coulomb friction out where the data show that there is next to none."""
+    s = best.structure
+    if s.friction != "symmetric" or "vc_plus" in s.fixed:
+        return best
+    smooth = s.with_(friction="none", shape=False)
+    subset = of_kind(descent.screening_subset(data), best)
+    if subset.size < data.size:
+        with_it = descent.refine(subset, s, best, best.z, options)
+        without = descent.refine(subset, smooth, with_it, best.z, options)
+        if without.deviance > with_it.deviance + SUBSET_HOPELESS.value * sandwich_factor(with_it):
+            return best
+    plain = descent.refine(data, smooth, best, best.z, options)
+    if plain.deviance < best.deviance:  # then friction has led astray
+        z = plain.z.copy()
+        z[models.VC_PLUS] = 1e-3 * np.abs(data.hold_value).max()
+        again = descent.refine(data, s, plain, s.complete(z), options)
+        best = min(best, again, key=lambda f: f.deviance)
+    # Friction that the data do not show stays where a little would explain them as well:
+    # leaving it out would make the gain certain.  A descent that did not settle is no reason
+    # to believe in none.
+    gained = (plain.deviance - best.deviance) / sandwich_factor(best)
+    if gained <= float(np.log(best.samples)) and not may_rub(data, plain, options):
+        candidates.append(FittedCandidate(plain, "no Coulomb friction shows"))
+        return plain
+    return best
+
+
+def friction_shows(data: Experiments, fit: Fit, surely_small: bool) -> bool:
+    """Tell by the score whether Coulomb friction is there, or may be and is not little."""
+    structure = fit.structure.with_(friction="symmetric")
+    _, step, cov = prediction.predicted_decrease(data, fit, structure)
+    i = structure.free().index(models.VC_PLUS)
+    std = float(np.sqrt(max(cov[i, i], 1e-300)) * np.sqrt(sandwich_factor(fit)))
+    found = max(float(step[i]), 0.0)
+    if not np.isfinite(found) or (found / std) ** 2 > 0.5 * np.log(fit.samples):
+        return True
+    return surely_small and found + 2 * std > _little(data)
+
+
+def _little(data: Experiments) -> float:
+    """Return the friction [V] below which there is next to none."""
+    return LITTLE_FRICTION.value * float(np.abs(data.hold_value).max())
+
+
+def may_rub(data: Experiments, fit: Fit, options: Options) -> bool:
+    """Tell whether a friction that is not little would explain the data as well.
+
+    The score at no friction does not tell: a motor that rests under a little friction is
+    driven by its offset under none.
+    """
+    if one_level(data, fit) or friction_shows(data, fit, True):
+        return True
+    little = _little(data)
+    z, initials = rubbing(data, fit, little)
+    fixed = {**fit.structure.fixed, "vc_plus": little}
+    rubs = fit.structure.with_(friction="symmetric", fixed=fixed)
+    other = min(
+        (solve(data, rubs, fit.at(rubs.complete(z), i), options, 12) for i in initials),
+        key=lambda f: f.deviance,
+    )
+    return other.deviance - fit.deviance < RISE * sandwich_factor(fit)
