@@ -56,9 +56,11 @@ REWEIGHTED = 3  # passes in which each output gets the variance of its own error
 def in_place_of_noise(
     data: Experiments, fit: Fit, gear: float, numbers: Sequence[Stated], options: Options
 ) -> list[Finding]:
-    """Name the effect that explains what was taken for torque noise, if one does."""
+    """Name the effect that explains what was taken for torque noise, where it moves a number."""
+    if not np.any(fit.gain != 0.0):
+        return []
     here = _linearised(data, replace(fit, gain=np.zeros_like(fit.gain)), EFFECTS, gear)
-    if here is None or not np.any(fit.gain != 0.0):
+    if here is None:
         return []
     price = float(np.log(data.size))
     runs = [(_settled(here, effect, gear), effect) for effect in here.most_likely()]
@@ -70,7 +72,8 @@ def in_place_of_noise(
         return []
     moved = np.linalg.lstsq(fit.structure.matrix(), again.z - fit.z, rcond=None)[0]
     shown = Evidence(effect, chance, gain, np.asarray(-moved, dtype=np.float64), ())
-    return [as_finding(shown, [shown], numbers, data.step)]
+    found = as_finding(shown, [shown], numbers, data.step)
+    return [found] if found.severity == "unreliable" else []
 
 
 @dataclass(frozen=True, eq=False)
