@@ -141,6 +141,15 @@ def _friction_sides(c: Case, level: int) -> None:
         c.widen[name] = (1 - a, 1 + a)
 
 
+def _declining(c: Case, level: int) -> None:
+    """A motor that is driven at the end only shows the end's battery, whatever was at the start."""
+    c.drive["decline"] = a = (0.01, 0.04, 0.1)[level]
+    c.widen["dc_gain"] = (1 - a, 1.0)
+    for name in ("static_voltage", "resistance", "inductance", "motor_constant", "inertia",
+                 "viscous_friction", "coulomb_friction"):  # fmt: skip
+        c.widen[name] = (1.0, 1 / (1 - a))
+
+
 def _heating(c: Case, level: int) -> None:
     a = (0.02, 0.08, 0.2)[level]
     c.drive["r_drift"] = a
@@ -209,9 +218,10 @@ EFFECTS = (
            ("driver_offset", "load")),
     Effect("supply sag", _drive("source", (0.05, 0.15, 0.4), lambda c: c.motor.R),
            ("supply_sag", ONE_SIZE)),
-    Effect("battery declines", _drive("decline", (0.01, 0.04, 0.1)), ("drift", "supply_drift")),
+    Effect("battery declines", _declining, ("drift", "supply_drift")),
     Effect("battery recovers", lambda c, n: c.drive.update(
-        rc=(0.1, 0.3, 0.8)[n] * c.motor.R, rc_time=20 * c.tau), ("supply_sag", "drift", ONE_SIZE)),
+        rc=(0.1, 0.3, 0.8)[n] * c.motor.R, rc_time=20 * c.tau),
+        ("supply_sag", "supply_recovers", "drift", ONE_SIZE)),
     Effect("clip at the supply", _drive("clip", (0.95, 0.85, 0.7), _volts), ("clip", ONE_SIZE)),
     Effect("coast in every PWM period", _pwm, ("coast", ONE_SIZE)),
     Effect("coast at zero command", _drive("coast_zero", (1.0, 1.0, 1.0)), ("coast",)),

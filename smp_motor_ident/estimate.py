@@ -21,7 +21,7 @@ from smp_motor_ident.diagnosis.model_error import regression
 from smp_motor_ident.diagnosis.noise_or_effect import in_place_of_noise
 from smp_motor_ident.diagnosis.refusal import no_candidate, refuse
 from smp_motor_ident.diagnosis.residuals import residual_tests
-from smp_motor_ident.diagnosis.scope import blames_current, current_left_out, scope
+from smp_motor_ident.diagnosis.scope import blames_current, contradicted, current_left_out, scope
 from smp_motor_ident.diagnosis.screening import screen
 from smp_motor_ident.errors import InsufficientExcitationError, SignalError, SmpError
 from smp_motor_ident.estimation import flexible_shaft, order_selection, prediction
@@ -130,12 +130,14 @@ def _answered(group: list[Record], request: Request, found: Sequence[Finding]) -
     if not request.may_leave_current:
         return _estimated(group, request, found)
     first: Estimate | None = None
+    blamed: Finding | None = None
     refusal: SmpError | None = None
     try:
         first = _estimated(group, request, found)
-        reason = next((f.code for f in first.findings if blames_current(f)), "")
-        if not reason:
+        blamed = next((f for f in first.findings if blames_current(f)), None)
+        if blamed is None:
             return first
+        reason = blamed.code
     except (SignalError, InsufficientExcitationError) as error:
         refusal, reason = error, "refused"
     bare, other = request.without_current(group)
@@ -148,7 +150,7 @@ def _answered(group: list[Record], request: Request, found: Sequence[Finding]) -
     if first is not None and (second is None or second.unreliable):
         return first
     assert second is not None
-    return second
+    return replace(second, findings=(*second.findings, *contradicted(first, second, blamed)))
 
 
 def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) -> Estimate:

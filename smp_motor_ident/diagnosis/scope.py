@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
 
 from smp_motor_ident.diagnosis.effects import EFFECTS
-from smp_motor_ident.diagnosis.limits import HALF_WIDTH, RESISTANCE_BAND, REST, SAME_LEVEL
+from smp_motor_ident.diagnosis.limits import (
+    HALF_WIDTH,
+    RELEVANT_BIAS,
+    RESISTANCE_BAND,
+    REST,
+    SAME_LEVEL,
+)
 from smp_motor_ident.estimation.quantities import Answer
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import Experiments
+from smp_motor_ident.result import Estimate
 
 FEWEST_SWINGS = 6  # of which it can be said that they are alike
 
@@ -197,3 +205,36 @@ def current_left_out(reason: str) -> Finding:
         {"reason": reason},
         effect.advice if effect else "record the armature's current with its sign, unfiltered",
     )
+
+
+def contradicted(
+    with_it: Estimate | None, without: Estimate, blamed: Finding | None
+) -> list[Finding]:
+    """Say where motor and driver may be to blame as well as the current, and a number hangs on it.
+
+    ``blamed`` is the finding by which the current was left out of an estimate that there was.
+    """
+    if with_it is None or blamed is None:
+        return []
+    others = str(blamed.evidence.get("alternatives") or "").split(", ")
+    if not set(others) - set(OF_CURRENT) - {""}:
+        return []
+    for name in ("dc_gain", "time_constant", "static_voltage"):
+        a, b = with_it.combinations.get(name), without.combinations.get(name)
+        if a is None or b is None or a.value is None or b.value is None:
+            continue
+        apart = abs(a.value - b.value)
+        if apart < RELEVANT_BIAS.value * abs(b.value):
+            continue
+        if apart > HALF_WIDTH.value * math.hypot(a.std or 0.0, b.std or 0.0):
+            return [
+                Finding(
+                    "current_contradicts",
+                    "unreliable",
+                    f"{name} is {a.value:.4g} {a.unit} with the current and {b.value:.4g} without "
+                    "it, and motor or driver may be to blame as well as the current's sensor",
+                    {"quantity": name, "with": a.value, "without": b.value},
+                    "check the current's sensor; " + blamed.advice,
+                )
+            ]
+    return []

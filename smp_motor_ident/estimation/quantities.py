@@ -21,6 +21,9 @@ from smp_motor_ident.result import UNITS, Quantity
 
 Array = NDArray[np.float64]
 
+NO_LAG = 1e-3
+"""Share of the first lag: a second one of less, and not known, may be none or a longer one."""
+
 TRADED = ("dc_gain", "static_voltage", "static_voltage_reverse", "load_voltage")
 """Of a steady speed at one level of voltage only ``dc_gain (level - static_voltage)`` is known."""
 
@@ -179,10 +182,13 @@ def _parameters(
 def _hidden(name: str, value: float, std: float, fit: Fit) -> bool:
     """Tell whether a product of lags is that of an inductance that does not show.
 
-    Its logarithm ends where the descent stopped, far below all that the data could tell.
+    The logarithm of a second lag of next to nothing ends where the descent stopped, far below all
+    that the data could tell.
     """
-    hidden = fit.structure.current and _too_loose("inductance", value, std, fit)
-    return name == "time_constant_product" and hidden
+    if name != "time_constant_product" or not std > LOOSE_QUANTITY.value * abs(value):
+        return False
+    lag = float(np.exp(fit.z[models.A1] - fit.z[models.A0]))
+    return fit.structure.current or value < NO_LAG * lag**2
 
 
 def _friction(name: str, fit: Fit) -> float:

@@ -14,7 +14,7 @@ from smp_motor_ident.estimation.consider_covariance import consider_left_out
 from smp_motor_ident.estimation.fitted import Options, long_run
 from smp_motor_ident.estimation.hold_choice import instant_deviation
 from smp_motor_ident.estimation.initialisation import initial_fit
-from smp_motor_ident.estimation.prediction import predicted_decrease
+from smp_motor_ident.estimation.prediction import inverse, predicted_decrease
 from smp_motor_ident.estimation.quantisation import widened
 from smp_motor_ident.estimation.thinning import thinned
 from smp_motor_ident.likelihood import recursion as rc
@@ -54,9 +54,18 @@ def test_motors_out_of_all_bounds_are_not_replayed():
     assert fit is not None
     fit = replace(fit, noise_ratio=0.0, noise=np.diag([data.quantum**2 / 12, 1.0]))
     free = len(fit.structure.free())
-    far = replace(fit, added=np.diag(np.where(np.arange(free) == 1, 1e6, 0.0)))
     assert widened(data, fit).widen is not None
-    assert np.isfinite(widened(data, far).widen).all()
+    # Where angles are infinite, and where they are past what a counter of 53 bits can hold.
+    for loose, by in ((1, 1e6), (0, 1e4)):
+        far = replace(fit, added=np.diag(np.where(np.arange(free) == loose, by, 0.0)))
+        assert np.isfinite(widened(data, far).widen).all()
+
+
+def test_what_nothing_is_known_of_takes_no_part_in_an_inverse():
+    normal = np.array([[4.0, 0.0, 2.0], [0.0, 1e-280, 1e-150], [2.0, 1e-150, 3.0]])
+    expected = np.zeros((3, 3))
+    expected[np.ix_([0, 2], [0, 2])] = np.array([[3.0, -2.0], [-2.0, 4.0]]) / 8.0
+    np.testing.assert_allclose(inverse(normal), expected, rtol=1e-12, atol=1e-15)
 
 
 def test_thinning_keeps_the_charge_and_the_jumps_of_the_input():

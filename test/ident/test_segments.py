@@ -7,6 +7,7 @@ import motors
 import numpy as np
 
 from smp_motor_ident.estimate import estimate
+from smp_motor_ident.estimation import segments
 from smp_motor_ident.record import Record
 
 
@@ -84,3 +85,13 @@ def test_a_segment_that_begins_in_a_reversal_does_not_begin_with_a_wheel_held_by
     assert not [f for f in found.findings if f.code in ("torque_noise", "not_converged")]
     assert abs(gain.value - true) < 4 * gain.std
     assert gain.std < 1e-3 * true  # 11 s of motion; a torque that fluctuates made it 8e-3
+
+
+def test_what_a_part_knows_but_for_rounding_is_a_covariance():
+    # Two coordinates of which the sum alone is known, to 1 part in 10^8, and rounding.
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        information = 1e16 * np.ones((2, 2)) + np.diag(rng.uniform(-4.0, 4.0, 2))
+        covariance = segments._bounded_inverse(information)
+        assert np.linalg.eigvalsh(covariance)[0] > 0
+        np.testing.assert_allclose(np.ones(2) @ information @ covariance, np.ones(2), rtol=1e-3)
