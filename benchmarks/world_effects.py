@@ -141,6 +141,12 @@ def _friction_sides(c: Case, level: int) -> None:
         c.widen[name] = (1 - a, 1 + a)
 
 
+def _brushes(c: Case, level: int) -> None:
+    c.drive["brush"] = (0.02, 0.05, 0.12)[level] * c.amplitude
+    static = c.motor.truth()["static_voltage"]  # the two together are one at speed
+    c.widen["static_voltage"] = (1.0, 1 + c.drive["brush"] / static)
+
+
 def _declining(c: Case, level: int) -> None:
     """A motor that is driven at the end only shows the end's battery, whatever was at the start."""
     c.drive["decline"] = a = (0.01, 0.04, 0.1)[level]
@@ -232,7 +238,7 @@ EFFECTS = (
     Effect("two topics", _stamps("topics", (0.2, 0.6, 1.5), _step), ("timing", "lag")),
     Effect("duty in few bits", _drive("levels", (127.0, 63.0, 31.0)), ("command_nonlinearity",)),
     Effect("weaker in reverse", _weak, ("asymmetry",)),
-    Effect("brush drop", _drive("brush", (0.02, 0.05, 0.12), _volts),
+    Effect("brush drop", _brushes,
            ("brush_drop", "command_nonlinearity", ONE_SIZE)),
     Effect("jitter of stamps", _stamps("jitter", (0.1, 0.3, 0.6), _step), ("timing",)),
     Effect("exponential latency", _stamps("latency", (0.3, 1.0, 3.0), _step), ("timing",)),

@@ -44,12 +44,12 @@ from smp_motor_ident.model import structures as models
 
 Array = NDArray[np.float64]
 
-COST = 40_000  # samples of all runs in which effects are tried beyond their linear ranking
+COST = 20_000  # samples of all runs in which effects are tried beyond their linear ranking
 STEPS = 12  # of Levenberg and Marquardt at most
 FIRST = 1e-5  # damping at which they begin, of the diagonal
 FARTHEST = 1e12  # rad, rad/s or A that a free run may reach
 ROUNDING = 1e-12  # damping at which normal equations can be solved whatever they are
-SETTLED = 0.01  # of all that was gained, by which a last step lowers the deviance
+SETTLED = 0.01  # of all that was gained, below which a line hopes for no step more
 REWEIGHTED = 3  # passes in which each output gets the variance of its own errors
 
 
@@ -177,14 +177,14 @@ def _settled(here: _Point, effect: Effect, gear: float) -> _Point:
     best = _linearised(here.data, here.fit, [effect], gear) or here
     damping = FIRST
     for _ in range(STEPS):
+        hoped = best.deviance - best.fitted(list(range(best.length.size)))[1]
+        if hoped < SETTLED * (here.deviance - best.deviance) + 1.0 or damping > 1.0:
+            break
         near = best.moved(damping, effect, gear)
         if near is None or not near.deviance < best.deviance:
             damping *= 30
             continue
-        settled = best.deviance - near.deviance < SETTLED * (here.deviance - near.deviance)
         best, damping = near, damping / 10
-        if settled:
-            break
     return best
 
 
