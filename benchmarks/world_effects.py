@@ -221,7 +221,7 @@ EFFECTS = (
     Effect("baseline", _nothing),
     Effect("dead zone", _dead_zone, ("dead_zone", "command_nonlinearity", ONE_SIZE)),
     Effect("driver offset", _drive("offset", (0.005, 0.015, 0.04), _volts),
-           ("driver_offset", "load")),
+           ("driver_offset", "load", "one_direction")),
     Effect("supply sag", _drive("source", (0.05, 0.15, 0.4), lambda c: c.motor.R),
            ("supply_sag", ONE_SIZE)),
     Effect("battery declines", _declining, ("drift", "supply_drift")),

@@ -28,6 +28,8 @@ from smp_motor_ident.model.structures import Structure
 
 Say = Callable[[str], None]
 
+SHARES = (0.1, 0.3)  # of the largest voltage that friction may take, tried where gain and it trade
+
 
 def varied(
     data: Experiments, best: Fit, options: Options, candidates: list[FittedCandidate], say: Say
@@ -109,8 +111,10 @@ def _without_friction(
     if plain.deviance < best.deviance:  # then friction has led astray
         z = plain.z.copy()
         z[models.VC_PLUS] = 1e-3 * np.abs(data.hold_value).max()
-        again = descent.refine(data, s, plain, s.complete(z), options)
-        best = min(best, again, key=lambda f: f.deviance)
+        others = [descent.refine(data, s, plain, s.complete(z), options)]
+        if s.current and one_level(data, plain):  # the same motion, with the friction of another
+            others += _rubbing_more(data, plain, s, options)
+        best = min(best, *others, key=lambda f: f.deviance)
     # Friction that the data do not show stays where a little would explain them as well:
     # leaving it out would make the gain certain.  A descent that did not settle is no reason
     # to believe in none.
@@ -119,6 +123,19 @@ def _without_friction(
         candidates.append(FittedCandidate(plain, "no Coulomb friction shows"))
         return plain
     return best
+
+
+def _rubbing_more(
+    data: Experiments, plain: Fit, structure: Structure, options: Options
+) -> list[Fit]:
+    """Fit from motors that move alike at the one level of voltage and rub far more."""
+    full = float(np.abs(data.hold_value).max())
+    return [
+        solve(data, structure, plain.at(structure.complete(z), initial), options, 30)
+        for share in SHARES
+        for z, initials in [rubbing(data, plain, share * full)]
+        for initial in initials
+    ]
 
 
 def friction_shows(data: Experiments, fit: Fit, surely_small: bool) -> bool:
