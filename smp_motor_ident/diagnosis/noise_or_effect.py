@@ -47,6 +47,7 @@ Array = NDArray[np.float64]
 COST = 20_000  # samples of all runs in which effects are tried beyond their linear ranking
 STEPS = 12  # of Levenberg and Marquardt at most
 FIRST = 1e-5  # damping at which they begin, of the diagonal
+FOLDS = 5.0  # that a coordinate may change by in one step
 FARTHEST = 1e12  # rad, rad/s or A that a free run may reach
 ROUNDING = 1e-12  # damping at which normal equations can be solved whatever they are
 SETTLED = 0.01  # of all that was gained, below which a line hopes for no step more
@@ -134,6 +135,8 @@ class _Point:
         step = self.fitted(list(range(self.length.size)), damping)[0]
         structure = self.fit.structure
         z = self.fit.z + structure.matrix() @ step[: len(structure.free())]
+        if np.abs((z - self.fit.z)[list(models.LOGARITHMS)]).max() > FOLDS:
+            return None
         friction = [models.VC_PLUS, models.VC_MINUS]
         z[friction] = np.maximum(z[friction], 0.0)
         data = self.data
@@ -153,6 +156,8 @@ def _linearised(
     if not (np.abs(base) < FARTHEST).all():
         return None
     sections, samples = motions(data, fit, gear)
+    if not all((np.abs(m.drop) < FARTHEST).all() for m in (sections, samples)):
+        return None
     made = [
         (effect, signal)
         for effect in effects

@@ -9,8 +9,13 @@ import motors
 import numpy as np
 import pytest
 
+from smp_motor_ident.diagnosis import noise_or_effect
 from smp_motor_ident.diagnosis.effects import EFFECTS
 from smp_motor_ident.estimate import estimate
+from smp_motor_ident.estimation.fit import Options
+from smp_motor_ident.estimation.initialisation import initial_fit
+from smp_motor_ident.likelihood.experiments import prepare
+from smp_motor_ident.model.structures import Structure
 from smp_motor_ident.record import Hardware, Record
 from smp_motor_ident.result import Estimate
 
@@ -86,3 +91,16 @@ def test_a_current_offset_is_found_beside_an_offset_of_the_driver() -> None:
         assert abs(q.value - true[name]) < 4.5 * q.std, name
     load = found.combinations["load_voltage"]
     assert abs(load.value + 0.2) < 4.5 * load.std
+
+
+def test_a_step_out_of_all_bounds_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    data = prepare([motors.record("rear_left", current=False, seconds=2.0)], False)
+    fit = initial_fit(data, Structure("second_order"), Options())
+    assert fit is not None
+    here = noise_or_effect._linearised(data, fit, EFFECTS[:1], 1.0)
+    assert here is not None
+    for step, taken in ((1e-3, True), (1e5, False)):
+        sizes = np.full(here.length.size, step)
+        sizes[here.own :] = 0.0
+        monkeypatch.setattr(type(here), "fitted", lambda *_, s=sizes: (s, 0.0))
+        assert (here.moved(0.0, EFFECTS[0], 1.0) is not None) is taken
