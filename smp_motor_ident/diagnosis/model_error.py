@@ -58,8 +58,6 @@ def regression(data: Experiments, fit: Fit, gear: float) -> Regression | None:
     members: list[tuple[Effect, tuple[int, ...]]] = []
     sections, samples = motions(data, fit, gear)
     for effect in EFFECTS:
-        if effect.place == "current" and not data.current.size:
-            continue
         made = [response(data, fit, base, s) for s in signals(effect, sections, samples)]
         if made:
             first = len(columns) - 1 - n_own
@@ -215,7 +213,8 @@ def signals(effect: Effect, sections: Motion, samples: Motion) -> list[Signal]:
     if effect.place == "output":
         return [Signal(output=s) for s in effect.regressors(samples)]
     if effect.place == "current":
-        return [Signal(current=s) for s in effect.regressors(samples)]
+        known = samples.current.size > 0
+        return [Signal(current=s) for s in effect.regressors(samples)] if known else []
     at_sections = effect.regressors(sections)
     if effect.place == "voltage" or not samples.current.size:
         return [Signal(voltage=s) for s in at_sections]

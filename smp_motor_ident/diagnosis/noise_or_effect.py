@@ -121,12 +121,20 @@ class _Point:
             left = np.maximum(left, 1e-14 * squares)
         return size / self.length[columns], _deviance(left, self.error)
 
+    def only(self, effect: Effect) -> _Point:
+        """Return the same run with the responses to one effect alone."""
+        own = [k for k, (e, _) in enumerate(self.signals) if e is effect]
+        keep = [*range(self.own), *(self.own + k for k in own)]
+        return _Point(self.data, self.fit, [self.signals[k] for k in own], self.error,
+                      self.table[:, :, keep], self.length[keep])  # fmt: skip
+
     def most_likely(self) -> list[Effect]:
         """Return the effects that explain most, as far as a line tells."""
         price, tried = float(np.log(self.data.size)), []
         for effect in dict.fromkeys(e for e, _ in self.signals):
-            own = [self.own + k for k, (e, _) in enumerate(self.signals) if e is effect]
-            tried.append((self.fitted([*range(self.own), *own])[1] + price * len(own), effect))
+            alone = self.only(effect)
+            deviance = alone.fitted(list(range(alone.length.size)))[1]
+            tried.append((deviance + price * len(alone.signals), effect))
         tried.sort(key=lambda t: t[0])
         return [effect for _, effect in tried[: max(2, COST // self.data.size)]]
 
@@ -158,12 +166,7 @@ def _linearised(
     sections, samples = motions(data, fit, gear)
     if not all((np.abs(m.drop) < FARTHEST).all() for m in (sections, samples)):
         return None
-    made = [
-        (effect, signal)
-        for effect in effects
-        if effect.place != "current" or data.current.size
-        for signal in signals(effect, sections, samples)
-    ]
+    made = [(effect, signal) for effect in effects for signal in signals(effect, sections, samples)]
     columns = own_responses(data, fit, base)
     columns += [response(data, fit, base, signal) for _, signal in made]
     table = np.array([stacked(data, fit, c) for c in columns])
@@ -179,8 +182,7 @@ def _linearised(
 
 def _settled(here: _Point, effect: Effect, gear: float) -> _Point:
     """Return the free run with an effect at the coordinates and size that fit it best."""
-    best = _linearised(here.data, here.fit, [effect], gear) or here
-    damping = FIRST
+    best, damping = here.only(effect), FIRST
     for _ in range(STEPS):
         hoped = best.deviance - best.fitted(list(range(best.length.size)))[1]
         if hoped < SETTLED * (here.deviance - best.deviance) + 1.0 or damping > 1.0:
