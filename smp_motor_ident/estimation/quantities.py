@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident.diagnosis.limits import LOOSE_QUANTITY, NEGLIGIBLE_FRICTION
+from smp_motor_ident.diagnosis.limits import HIDDEN_LAG, LOOSE_QUANTITY, NEGLIGIBLE_FRICTION
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.fitted import NORMAL_95
 from smp_motor_ident.estimation.inversion import solved_for
@@ -20,9 +20,6 @@ from smp_motor_ident.model.structures import PHYSICAL
 from smp_motor_ident.result import UNITS, Quantity
 
 Array = NDArray[np.float64]
-
-NO_LAG = 1e-3
-"""Share of the first lag: a second one of less, and not known, may be none or a longer one."""
 
 TRADED = ("dc_gain", "static_voltage", "static_voltage_reverse", "load_voltage")
 """Of a steady speed at one level of voltage only ``dc_gain (level - static_voltage)`` is known."""
@@ -188,7 +185,7 @@ def _hidden(name: str, value: float, std: float, fit: Fit) -> bool:
     if name != "time_constant_product" or not std > LOOSE_QUANTITY.value * abs(value):
         return False
     lag = float(np.exp(fit.z[models.A1] - fit.z[models.A0]))
-    return fit.structure.current or value < NO_LAG * lag**2
+    return fit.structure.current or value < HIDDEN_LAG.value * lag**2
 
 
 def _friction(name: str, fit: Fit) -> float:

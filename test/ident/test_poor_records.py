@@ -1,6 +1,7 @@
 """Poor but common records: what is a combination is stated as one, rest teaches nothing."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import motors
 import numpy as np
@@ -11,6 +12,7 @@ from scipy.signal import lfilter
 from smp_motor_ident.diagnosis import refusal, scope
 from smp_motor_ident.errors import DesignError, SignalError
 from smp_motor_ident.estimate import estimate
+from smp_motor_ident.estimation import quantities
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.model.structures import Z_NAMES, Structure
@@ -238,3 +240,16 @@ def test_an_offset_of_the_current_may_be_a_drop_of_the_driver_where_the_motor_tu
     # 5 standard deviations: what is wrong silently.
     assert abs(q.value - tc) < 5 * q.std
     assert q.std < tc
+
+
+def test_a_second_lag_of_next_to_nothing_that_is_not_known_is_not_stated():
+    def hidden(share: float, relative: float, current: bool) -> bool:
+        z = np.zeros(12)
+        z[1] = np.log(0.05)  # a lag of 50 ms
+        fit = SimpleNamespace(z=z, structure=SimpleNamespace(current=current))
+        value = share * 0.05**2
+        return quantities._hidden("time_constant_product", value, relative * value, fit)
+
+    assert hidden(0.9e-3, 0.6, False) and not hidden(1.1e-3, 0.6, False)
+    assert not hidden(0.9e-3, 0.4, False) and not hidden(0.1, 0.4, True)
+    assert hidden(0.1, 0.6, True)  # then the current would tell it
