@@ -213,7 +213,7 @@ def _stated(
     final = of_kind(data, chosen)
     gear = group[0].hardware.gear_ratio
     errors = regression(final, chosen, gear)
-    chosen, parts = dependent(chosen, errors)
+    chosen, parts = dependent(final, chosen, errors)
 
     def said(fit: Fit) -> tuple[Answer, dict[str, float]]:
         own = answer(fit, request.known, friction_std, _level(final))

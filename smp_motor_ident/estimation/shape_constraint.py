@@ -22,6 +22,7 @@ from smp_motor_ident.model.structures import A0, A1, A2, TE, Structure
 Array = NDArray[np.float64]
 
 HAIR = 1e-9  # of a0 by which rounding may pass an edge
+NEAR = 1e-6  # of a0 within which coordinates lie on one
 
 
 def applies(structure: Structure) -> bool:
@@ -31,12 +32,22 @@ def applies(structure: Structure) -> bool:
 
 def passed(z: Array) -> float | None:
     """Return the share of a0 at the edge that coordinates have passed, None within."""
-    a0, a1, a2, te = np.exp(z[[A0, A1, A2, TE]])
-    share = float((a1 - a2 / te) / te / a0)
+    share, most = _share(z), MOST_FRICTION.value
     if share < -HAIR:
         return 0.0
-    most = MOST_FRICTION.value
     return most if share > most + HAIR else None
+
+
+def at_edge(z: Array) -> float | None:
+    """Return the share of a0 at the edge on which coordinates lie, None within."""
+    share = _share(z)
+    return next((e for e in (0.0, MOST_FRICTION.value) if abs(share - e) < NEAR), None)
+
+
+def _share(z: Array) -> float:
+    """Return what share of a0 viscous friction takes."""
+    a0, a1, a2, te = np.exp(z[[A0, A1, A2, TE]])
+    return float((a1 - a2 / te) / te / a0)
 
 
 def edge(z: Array, share: float) -> tuple[float, Array] | None:

@@ -71,6 +71,13 @@ def _row(h: float, te: float, tm: float, k: float, be: float) -> Array:
     return row
 
 
+def transition(z: Array, order: int, step: float) -> Array:
+    """Return how voltage over the resistance, speed and angle follow from those a step before."""
+    par, _ = to_internal(z, order)
+    row = _row(step, par[TE], par[TM], par[K], par[BE])
+    return np.array([[row[0], row[1], 0.0], [row[2], row[3], 0.0], [row[4], row[5], 1.0]])
+
+
 @compiled
 def steady_gain(
     te: float,
