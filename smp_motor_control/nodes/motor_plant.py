@@ -28,7 +28,7 @@ from smp_motor_control.errors import ParameterError
 from smp_motor_control.motor.file import MotorEntry, load_motors, nest, parse_motors
 from smp_motor_control.motor.hardware import DrivenMotor, DriveSettings, Supply
 from smp_motor_control.nodes import runtime
-from smp_motor_control.nodes.settings import Parameters, described, given_parameters, nested
+from smp_motor_control.nodes.settings import Parameters, described, fixed, given_parameters, nested
 from smp_motor_control.wheel.lease import Lease
 
 _FIXED = ParameterDescriptor(description="As in a motor file.", read_only=True)
@@ -50,13 +50,10 @@ _DRIVE_DEFAULTS = DriveSettings(pwm_steps=1000, current_noise=0.01, latch=True)
 class Settings:
     """Parameters of the node, beside ``motors.<wheel>.<key>`` as in a motor file."""
 
-    motors_file: str = described(
-        "", "File of the motors; where none are given, those of the paper.", read_only=True
+    motors_file: str = fixed("", "File of the motors; where none are given, those of the paper.")
+    rate: float = fixed(
+        200.0, "Samples per second of every motor [Hz].", minimum=1.0, maximum=2000.0
     )
-    rate: float = described(
-        200.0, "Samples per second of every motor [Hz].", minimum=1.0, maximum=2000.0,
-        read_only=True,
-    )  # fmt: skip
     drive: DriveSettings = nested(_DRIVE_DEFAULTS, _DRIVE)  # noqa: RUF009
     supply_resistance: float = described(
         0.0, "Inner resistance of the battery that all motors share [ohm].", minimum=0.0
@@ -64,10 +61,8 @@ class Settings:
     battery_voltage: float = described(
         0.0, "Of the battery without load [V]; 0: the supply_voltage of the motors.", minimum=0.0
     )
-    ohmmeter: bool = described(
-        True, "Whether the description tells the resistance, as measured.", read_only=True
-    )
-    seed: int = described(1, "Of all noise.", read_only=True)
+    ohmmeter: bool = fixed(True, "Whether the description tells the resistance, as measured.")
+    seed: int = fixed(1, "Of all noise.")
 
 
 SHORTEST_INTERVAL = 0.5

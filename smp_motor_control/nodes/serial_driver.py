@@ -25,7 +25,7 @@ from smp_motor_control.encoder import Encoder, wrap
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.motor.parameters import Gearbox
 from smp_motor_control.nodes import runtime
-from smp_motor_control.nodes.settings import Parameters, described
+from smp_motor_control.nodes.settings import Parameters, described, fixed
 from smp_motor_control.serial_protocol import (
     CLOCK,
     BoardState,
@@ -52,20 +52,17 @@ RESET = 1.0
 class Settings:
     """Parameters of the node."""
 
-    device: str = described("/dev/ttyACM0", "Serial device of the board.", read_only=True)
-    baud: int = described(115200, "Speed of the line [1/s].", read_only=True)
-    wheel_names: tuple[str, ...] = described(
-        WHEELS, "Wheels in the order of the board's motors.", read_only=True
+    device: str = fixed("/dev/ttyACM0", "Serial device of the board.")
+    baud: int = fixed(115200, "Speed of the line [1/s].")
+    wheel_names: tuple[str, ...] = fixed(WHEELS, "Wheels in the order of the board's motors.")
+    gear_ratio: float = fixed(1.0, "Motor turns of a turn of the wheel.")
+    counts_per_revolution: float = fixed(
+        500.0, "Of the encoder, of a turn of the motor.", minimum=1.0
     )
-    gear_ratio: float = described(1.0, "Motor turns of a turn of the wheel.", read_only=True)
-    counts_per_revolution: float = described(
-        500.0, "Of the encoder, of a turn of the motor.", minimum=1.0, read_only=True
+    encoder_bits: int = fixed(
+        32, "Width of the board's counter; 0: it never wraps.", minimum=0, maximum=63
     )
-    encoder_bits: int = described(
-        32, "Width of the board's counter; 0: it never wraps.", minimum=0, maximum=63,
-        read_only=True,
-    )  # fmt: skip
-    supply_voltage: float = described(12.0, "Nominal supply [V].", minimum=0.1, read_only=True)
+    supply_voltage: float = fixed(12.0, "Nominal supply [V].", minimum=0.1)
     resistance: float = described(math.nan, "Of a motor, by ohmmeter [ohm]; NaN: not measured.")
     command_timeout: float = described(
         0.2, "Silence of a wheel's commands after which it gets 0 V [s].", minimum=0.02

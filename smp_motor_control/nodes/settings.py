@@ -55,6 +55,11 @@ def described(
     return dataclasses.field(default=default, metadata=metadata)
 
 
+def fixed(default: Any, description: str, **limits: float) -> Any:
+    """Return a field as :func:`described` does, of a parameter that only the start can set."""
+    return described(default, description, read_only=True, **limits)
+
+
 def nested(default: Any, descriptions: Mapping[str, str], *, prefix: str = "") -> Any:
     """Return a dataclass field whose own fields become ROS parameters."""
     metadata = {"descriptions": descriptions, "prefix": prefix}

@@ -14,7 +14,7 @@ from smp_motor_control import WHEELS, joint_of
 from smp_motor_control.errors import ParameterError, SmpError
 from smp_motor_control.keyboard import Keyboard, Speeds, keys_of
 from smp_motor_control.nodes import runtime
-from smp_motor_control.nodes.settings import Parameters, described
+from smp_motor_control.nodes.settings import Parameters, described, fixed
 from smp_motor_control.nodes.terminal import Terminal, require_terminal
 
 HELP = """\
@@ -44,17 +44,11 @@ class Settings:
     key_timeout: float = described(
         0.6, "Time without a repeat after which a key counts as released [s].", maximum=5.0
     )
-    rate: float = described(
-        20.0, "Commands per second [Hz].", minimum=5.0, maximum=100.0, read_only=True
-    )
-    use_stamped_vel: bool = described(
-        True, "Publish TwistStamped (true) or Twist (false).", read_only=True
-    )
-    frame_id: str = described("base_link", "Frame of a stamped command.", read_only=True)
+    rate: float = fixed(20.0, "Commands per second [Hz].", minimum=5.0, maximum=100.0)
+    use_stamped_vel: bool = fixed(True, "Publish TwistStamped (true) or Twist (false).")
+    frame_id: str = fixed("base_link", "Frame of a stamped command.")
 
-    wheel_names: tuple[str, ...] = described(
-        WHEELS, "Wheels that the keys 1, 2, ... select.", read_only=True
-    )
+    wheel_names: tuple[str, ...] = fixed(WHEELS, "Wheels that the keys 1, 2, ... select.")
 
     def __post_init__(self) -> None:
         self.speeds()

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.motor.model import MotorModel
-from smp_motor_control.nodes.settings import described, nested
+from smp_motor_control.nodes.settings import described, fixed, nested
 from smp_motor_control.observer import ObserverNoise
 from smp_motor_control.pid import PidGains
 from smp_motor_control.reference.profile import Drive, ProfileLimits
@@ -64,12 +64,8 @@ def _drive(name: str, description: str) -> float:
 class Settings:
     """Parameters of the node."""
 
-    joint_name: str = described(
-        "", "Joint to control; empty for <namespace>_wheel_joint.", read_only=True
-    )
-    autostart: bool = described(
-        True, "Configure and activate without being asked to.", read_only=True
-    )
+    joint_name: str = fixed("", "Joint to control; empty for <namespace>_wheel_joint.")
+    autostart: bool = fixed(True, "Configure and activate without being asked to.")
     setpoint_timeout: float = described(
         0.5, "Silence of set-points after which the wheel is braked [s].", minimum=0.01,
         maximum=60.0,
@@ -119,13 +115,10 @@ class Settings:
     implausible_velocity: float = described(
         1000.0, "Feedback beyond this speed is left out [rad/s, wheel].", minimum=0.0
     )
-    scheduling_priority: int = described(
-        0, "SCHED_FIFO priority; 0 for the usual scheduler.", minimum=0, maximum=99,
-        read_only=True,
-    )  # fmt: skip
-    cpu_affinity: tuple[int, ...] = described(
-        (-1,), "Processors to run on; -1 for any.", read_only=True
+    scheduling_priority: int = fixed(
+        0, "SCHED_FIFO priority; 0 for the usual scheduler.", minimum=0, maximum=99
     )
+    cpu_affinity: tuple[int, ...] = fixed((-1,), "Processors to run on; -1 for any.")
     wheel: WheelSettings = field(init=False, repr=False)  # what they make of the controller
 
     def __post_init__(self) -> None:

@@ -32,7 +32,7 @@ from smp_motor_control import WHEELS, joint_of
 from smp_motor_control.errors import ParameterError, SmpError
 from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.executor import Untouched
-from smp_motor_control.nodes.settings import Parameters, described, nested
+from smp_motor_control.nodes.settings import Parameters, described, fixed, nested
 from smp_motor_ident.bag.window import Window
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.estimation.live import Demands, missing
@@ -56,22 +56,16 @@ MINUTE = 60.0
 class Settings:
     """Parameters of the node."""
 
-    wheels: tuple[str, ...] = described(WHEELS, "Wheels to identify.", read_only=True)
-    window: float = described(
-        60.0, "How much of the past is used [s].", minimum=2.0, maximum=600.0, read_only=True
-    )
-    period: float = described(
-        5.0, "Least interval between two estimates of a wheel [s].", minimum=0.5, read_only=True
-    )
+    wheels: tuple[str, ...] = fixed(WHEELS, "Wheels to identify.")
+    window: float = fixed(60.0, "How much of the past is used [s].", minimum=2.0, maximum=600.0)
+    period: float = fixed(5.0, "Least interval between two estimates of a wheel [s].", minimum=0.5)
     share: float = described(
         0.03, "Most of a processor that estimates take of it in the long run [1].",
         minimum=1e-3, maximum=1.0,
     )  # fmt: skip
     model: str = described("auto", "Model to fit; auto chooses the simplest that holds.")
-    commissioned: str = described(
-        "", "identification.json, or its folder, of the motors to watch.", read_only=True
-    )
-    history: str = described("", "File that what is seen of them is added to.", read_only=True)
+    commissioned: str = fixed("", "identification.json, or its folder, of the motors to watch.")
+    history: str = fixed("", "File that what is seen of them is added to.")
     demands: Demands = nested(  # noqa: RUF009 (returns a field)
         Demands(),
         {
