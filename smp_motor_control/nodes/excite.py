@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 from rclpy.node import Node
 
@@ -21,7 +21,7 @@ from smp_motor_control.errors import ParameterError, SmpError
 from smp_motor_control.excitation import SIGNALS, Bounded, Excitation
 from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.motor_writer import MotorWriter
-from smp_motor_control.nodes.settings import Parameters, fixed
+from smp_motor_control.nodes.settings import Parameters, fields_for, fixed
 from smp_motor_control.wheel.protection import Bounds, Protection
 
 _OTHERS = 0.5
@@ -87,8 +87,7 @@ class Settings:
     def signal_of(self, wheel: int) -> Excitation:
         """Return the bounded signal of the n-th wheel."""
         kind = SIGNALS[self.signal]
-        names = {f.name for f in fields(kind)}
-        given = {n: getattr(self, n) for n in names if hasattr(self, n)}
+        given = fields_for(kind, self)
         if not given.get("hold", 1.0):
             del given["hold"]
         if "seed" in given and self.independent:

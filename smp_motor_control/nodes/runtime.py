@@ -39,7 +39,7 @@ from smp_motor_control.nodes.conventions import (
 )
 from smp_motor_control.nodes.diagnostics import ERROR, OK, STALE, WARN, Diagnostics
 from smp_motor_control.nodes.executor import LeanExecutor
-from smp_motor_control.nodes.keeping_time import collect_garbage, keep_time
+from smp_motor_control.nodes.keeping_time import keep_time
 
 __all__ = [
     "ERROR",
@@ -50,7 +50,6 @@ __all__ = [
     "STREAM_SUBSCRIBER",
     "WARN",
     "Diagnostics",
-    "collect_garbage",
     "finish",
     "keep_time",
     "nanoseconds",

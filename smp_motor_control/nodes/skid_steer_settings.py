@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, make_dataclass
 
 from smp_motor_control import LEFT, RIGHT
 from smp_motor_control.body.kinematics import HeadingHold, SkidSteer, SpeedLimiter
 from smp_motor_control.errors import ParameterError
-from smp_motor_control.nodes.settings import described, fixed, nested
+from smp_motor_control.nodes.settings import described, fields_for, fixed, nested
 
 _LIMITS = {
     "min_velocity": "Lowest velocity; NaN takes the negative of max_velocity.",
@@ -22,6 +22,8 @@ _LIMITS = {
     "min_jerk": "Lowest jerk; NaN takes the negative of max_jerk.",
     "max_jerk": "Highest jerk [m/s^3] or [rad/s^3]; NaN for no limit.",
 }
+AxisLimits = make_dataclass("AxisLimits", [(n, float, math.nan) for n in _LIMITS], frozen=True)
+"""Limits of one component of the body's velocity; NaN for none."""
 
 
 def check_wheels(left: Sequence[str], right: Sequence[str]) -> None:
@@ -35,24 +37,6 @@ def check_wheels(left: Sequence[str], right: Sequence[str]) -> None:
             raise ParameterError(f"wheel name {name!r}: letters, digits and _ only, as in a topic")
     if len(set(both)) < len(both):
         raise ParameterError(f"a wheel is named twice in {', '.join(both)}")
-
-
-@dataclass(frozen=True, kw_only=True)
-class AxisLimits:
-    """Limits of one component of the body's velocity; NaN for none."""
-
-    min_velocity: float = math.nan
-    max_velocity: float = math.nan
-    max_acceleration_reverse: float = math.nan
-    max_acceleration: float = math.nan
-    max_deceleration: float = math.nan
-    max_deceleration_reverse: float = math.nan
-    min_jerk: float = math.nan
-    max_jerk: float = math.nan
-
-    def limiter(self) -> SpeedLimiter:
-        """Return the limiter with these limits."""
-        return SpeedLimiter(**{item.name: getattr(self, item.name) for item in fields(self)})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,22 +99,22 @@ class Settings:
         check_wheels(self.left_wheel_names, self.right_wheel_names)
         self.robot()
         self.hold()
-        for name, axis in (("linear.x", self.linear), ("angular.z", self.angular)):
-            try:
-                axis.limiter()
-            except ParameterError as error:
-                raise ParameterError(f"{name}: {error}") from None
+        self.limiters()
 
     def robot(self) -> SkidSteer:
         """Return the geometry."""
-        return SkidSteer(
-            wheel_separation=self.wheel_separation,
-            wheel_radius=self.wheel_radius,
-            wheel_separation_multiplier=self.wheel_separation_multiplier,
-            left_wheel_radius_multiplier=self.left_wheel_radius_multiplier,
-            right_wheel_radius_multiplier=self.right_wheel_radius_multiplier,
-            max_wheel_speed=self.max_wheel_velocity or math.inf,
-        )
+        most = self.max_wheel_velocity or math.inf
+        return SkidSteer(**fields_for(SkidSteer, self), max_wheel_speed=most)
+
+    def limiters(self) -> list[SpeedLimiter]:
+        """Return the limiters of linear and angular velocity."""
+        made = []
+        for name, axis in (("linear.x", self.linear), ("angular.z", self.angular)):
+            try:
+                made.append(SpeedLimiter(**asdict(axis)))
+            except ParameterError as error:
+                raise ParameterError(f"{name}: {error}") from None
+        return made
 
     def hold(self) -> HeadingHold:
         """Return a heading controller."""
