@@ -2,7 +2,6 @@
 
 ``left = (v - w B/2) / (r m_left)``, ``right = (v + w B/2) / (r m_right)`` with the effective
 separation ``B = wheel_separation * wheel_separation_multiplier``; angles counter-clockwise.
-Odometry, speed limits, commands and heading are in modules of their own and offered here.
 """
 
 from __future__ import annotations
@@ -11,23 +10,7 @@ import math
 from dataclasses import dataclass, fields
 from typing import NamedTuple
 
-from smp_motor_control.body.command import BodyCommand, Verdict
-from smp_motor_control.body.heading import HeadingHold
-from smp_motor_control.body.odometry import Odometry, PoseCovariance
-from smp_motor_control.body.speed_limiter import RateLimiter, SpeedLimiter
 from smp_motor_control.errors import ParameterError
-
-__all__ = [
-    "BodyCommand",
-    "HeadingHold",
-    "Odometry",
-    "PoseCovariance",
-    "RateLimiter",
-    "SideSpeeds",
-    "SkidSteer",
-    "SpeedLimiter",
-    "Verdict",
-]
 
 
 class SideSpeeds(NamedTuple):

@@ -8,7 +8,9 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, make_dataclass
 
 from smp_motor_control import LEFT, RIGHT
-from smp_motor_control.body.kinematics import HeadingHold, SkidSteer, SpeedLimiter
+from smp_motor_control.body.heading import HeadingHold
+from smp_motor_control.body.kinematics import SkidSteer
+from smp_motor_control.body.speed_limiter import SpeedLimiter
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.nodes.settings import described, fields_for, fixed, nested
 
