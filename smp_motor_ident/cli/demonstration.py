@@ -130,7 +130,7 @@ def drive(
     """Drive through :data:`DRIVE` with the gains; return bag, segments and longest stall [s]."""
     from smp_motor_control.nodes.driving import drive_body
 
-    steps.set_gains(robot, gains)
+    robot.client.set_parameters({f"{wheel}/wheel_pid": new for wheel, new in gains.items()})
     robot.switch("activate")
     say("gains set in the running controllers; driving")
     drives = []

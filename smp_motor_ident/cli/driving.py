@@ -99,14 +99,21 @@ def longest_stall(bag: Path, wheels: Sequence[str]) -> float:
     return max(float(np.max(found)) for found in (*gaps, *ages))
 
 
+def wheel_angle(state: Columns, hardware: Hardware) -> Array:
+    """Return the wheel's angle as its counts tell it, where there are counts."""
+    if not hardware.counts_per_revolution:
+        return state.fields["position"]
+    turn = 2 * np.pi / hardware.counts_per_revolution
+    counts = unwrap(state.fields["encoder_count"], hardware.encoder_bits).astype(np.float64)
+    return Gearbox(hardware.gear_ratio).to_wheel(turn) * counts
+
+
 def wheel_speed(state: Columns, hardware: Hardware) -> tuple[Array, Array]:
     """Return the wheel's speed as its encoder saw it."""
-    counts = unwrap(state.fields["encoder_count"], hardware.encoder_bits)
-    turn = 2 * np.pi / float(hardware.counts_per_revolution or 1.0)
-    angle = Gearbox(hardware.gear_ratio).to_wheel(turn) * (counts - counts[0])
+    angle = wheel_angle(state, hardware)
     step = float(np.median(np.diff(state.time)))
     time = np.arange(state.time[0], state.time[-1], step)
-    even = np.interp(time, state.time, angle)
+    even = np.interp(time, state.time, angle - angle[0])
     window = max(2 * round(SMOOTHING / step / 2) + 1, 5)
     speed = np.asarray(savgol_filter(even, window, 2, deriv=1, delta=step), dtype=np.float64)
     return time, speed
