@@ -15,11 +15,6 @@ from smp_motor_control.nodes.conventions import LATCHED, STREAM_PUBLISHER, send_
 _ZEROS = 3
 
 
-def full_name(node: Node) -> str:
-    """Return the name that a process takes wheels under: two of one node are two."""
-    return f"{node.get_fully_qualified_name()}#{os.getpid()}"
-
-
 class MotorWriter:
     """The way of a node to a motor; see :class:`~smp_motor_control.wheel.lease.Lease`.
 
@@ -33,7 +28,8 @@ class MotorWriter:
 
     def __init__(self, node: Node, prefix: str = "") -> None:
         self._node = node
-        self._name = full_name(node)
+        # Two processes of one node are two writers.
+        self._name = f"{node.get_fully_qualified_name()}#{os.getpid()}"
         self._message = MotorCommand()
         self._message.header.frame_id = self._name
         self.publisher = node.create_publisher(

@@ -25,7 +25,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from smp_motor_control.entry import interrupted
 from smp_motor_control.errors import SmpError
-from smp_motor_control.nodes.conventions import (
+from smp_motor_control.nodes.conventions import (  # noqa: F401  (offered by this module)
     LATCHED,
     STREAM_PUBLISHER,
     STREAM_SUBSCRIBER,
@@ -37,31 +37,8 @@ from smp_motor_control.nodes.conventions import (
     steady_timer,
     wheel_of,
 )
-from smp_motor_control.nodes.diagnostics import ERROR, OK, STALE, WARN, Diagnostics
+from smp_motor_control.nodes.diagnostics import ERROR, OK, STALE, WARN, Diagnostics  # noqa: F401
 from smp_motor_control.nodes.executor import LeanExecutor
-from smp_motor_control.nodes.keeping_time import keep_time
-
-__all__ = [
-    "ERROR",
-    "LATCHED",
-    "OK",
-    "STALE",
-    "STREAM_PUBLISHER",
-    "STREAM_SUBSCRIBER",
-    "WARN",
-    "Diagnostics",
-    "finish",
-    "keep_time",
-    "nanoseconds",
-    "refuse_impossible_transitions",
-    "robot_topic",
-    "run",
-    "seconds",
-    "send_last",
-    "share",
-    "steady_timer",
-    "wheel_of",
-]
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGQUIT, signal.SIGHUP)
 

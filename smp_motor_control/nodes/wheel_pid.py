@@ -19,6 +19,7 @@ from smp_motor_control.encoder import Encoder
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.motor.parameters import Gearbox
 from smp_motor_control.nodes import runtime
+from smp_motor_control.nodes.keeping_time import keep_time
 from smp_motor_control.nodes.motor_writer import MotorWriter
 from smp_motor_control.nodes.settings import Parameters, given_parameters
 from smp_motor_control.nodes.wheel_report import WheelReport, pid_state
@@ -79,7 +80,7 @@ class WheelPid(LifecycleNode):
         """Answer feedback from now on; the wheel waits for its first set-point."""
         affinity = tuple(cpu for cpu in self.settings.cpu_affinity if cpu >= 0)
         priority = self.settings.scheduling_priority
-        self._report.timekeeping = runtime.keep_time(self, priority, affinity)
+        self._report.timekeeping = keep_time(self, priority, affinity)
         self._wheel.activate(time.monotonic())
         self._report.update()
         return super().on_activate(state)

@@ -129,20 +129,12 @@ def descriptions(
 ) -> dict[str, MotorDescription]:
     """Return what the hardware says of itself; wheels that say nothing in time are left out."""
     found: dict[str, MotorDescription] = {}
-    made = [
-        client.node.create_subscription(
-            MotorDescription,
-            f"{wheel}/motor_description",
-            lambda message, wheel=wheel: found.update({wheel: message}),
-            LATCHED,
-        )
+    topics = {
+        f"{wheel}/motor_description": lambda message, wheel=wheel: found.update({wheel: message})
         for wheel in wheels
-    ]
-    try:
+    }
+    with client.listen(MotorDescription, topics, LATCHED):
         client.until(lambda: len(found) == len(wheels), patience)
-    finally:
-        for subscription in made:
-            client.node.destroy_subscription(subscription)
     return found
 
 

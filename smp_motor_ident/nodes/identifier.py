@@ -14,7 +14,6 @@ line a wheel to ``history`` every minute, which ``identify --history`` draws.  I
 from __future__ import annotations
 
 import math
-import sys
 import time
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -29,6 +28,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from smp_interfaces.msg import MotorDescription, MotorParameters, MotorState
 from smp_motor_control import WHEELS, joint_of
+from smp_motor_control.encoder import wrap
 from smp_motor_control.errors import ParameterError, SmpError
 from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.executor import Untouched
@@ -121,7 +121,7 @@ class Wheel:
 
     def _on_state(self, message: MotorState, info: Mapping[str, Any]) -> None:
         self.stamp = stamp = message.header.stamp
-        nanoseconds = 1_000_000_000 * stamp.sec + stamp.nanosec
+        nanoseconds = runtime.nanoseconds(stamp)
         voltage, current, position = message.voltage, message.current, message.position
         count = message.encoder_count
         if self.monitor is not None:
@@ -139,10 +139,7 @@ class Wheel:
             return (position - angle) * hardware.gear_ratio
         if before is None:
             return math.nan
-        counts = count - before
-        if hardware.encoder_bits:
-            half = 1 << (hardware.encoder_bits - 1)
-            counts = (counts + half) % (2 * half) - half
+        counts = wrap(count - before, hardware.encoder_bits)
         return counts * 2 * math.pi / hardware.counts_per_revolution
 
     def _on_description(self, message: MotorDescription) -> None:
@@ -305,7 +302,3 @@ def _identify(record: Record, model: str) -> tuple[Estimate | Exception, float]:
 def main(argv: list[str] | None = None) -> int:
     """Run the node."""
     return runtime.run("identifier", Identifier, argv)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
