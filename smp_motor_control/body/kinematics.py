@@ -88,19 +88,9 @@ class SkidSteer:
         return (left + right) / 2.0, (right - left) / self.effective_separation
 
     def reachable_share(self, linear: float, angular: float) -> float:
-        """Return by what a command must be scaled for every wheel to follow.
+        """Return by what a command must be scaled for every wheel to follow, at most 1.
 
         Linear and angular velocity shrink alike, so the path keeps its shape.
-
-        Parameters
-        ----------
-        linear, angular : float
-            Velocity of the body [m/s], [rad/s].
-
-        Returns
-        -------
-        float
-            At most 1.
         """
         fastest = max(map(abs, self.wheel_speeds(linear, angular)))
         if math.isinf(fastest):  # beyond what a number can hold
@@ -108,17 +98,6 @@ class SkidSteer:
         return 1.0 if fastest <= self.max_wheel_speed else self.max_wheel_speed / fastest
 
     def reachable_wheel_speeds(self, linear: float, angular: float) -> SideSpeeds:
-        """Return the wheel speeds for a command, scaled until every wheel can follow.
-
-        Parameters
-        ----------
-        linear, angular : float
-            Velocity of the body [m/s], [rad/s].
-
-        Returns
-        -------
-        SideSpeeds
-            None faster than ``max_wheel_speed``.
-        """
+        """Return the wheel speeds for a command, scaled until every wheel can follow."""
         share = self.reachable_share(linear, angular)
         return self.wheel_speeds(linear * share, angular * share)

@@ -33,15 +33,7 @@ def frame_prefix(enable: bool, prefix: str, namespace: str) -> str:
 
 
 class OdometryOutput:
-    """Publishers of a node that knows where the body is.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-        Owner of the publishers.
-    settings : Settings
-        Names of frames and what to publish.
-    """
+    """Publishers of a node that knows where the body is."""
 
     def __init__(self, node: Node, settings: Settings) -> None:
         prefix = frame_prefix(

@@ -45,17 +45,7 @@ class Tape:
 
 
 class WheelTest:
-    """The test of some wheels; all are heard, one or all are driven.
-
-    Parameters
-    ----------
-    client : RobotClient
-        Whose wheels are paused.
-    counters : mapping of str to callable
-        By wheel that is heard, from a ``MotorState`` to the total count.
-    bounds : Bounds
-        What ends the test.
-    """
+    """The test of some wheels, which the client has paused; all are heard, one or all driven."""
 
     def __init__(
         self, client: RobotClient, counters: Mapping[str, Counter], bounds: Bounds

@@ -103,12 +103,8 @@ class Processes:
     """A set of node processes that ends with the block that holds it, however that ends.
 
     Each is the leader of its own process group, is asked to stop by SIGINT, then by SIGTERM,
-    then killed; the kernel sends it SIGTERM if this process dies without a word.
-
-    Parameters
-    ----------
-    logs : Path
-        Folder for one ``NAME.log`` each.
+    then killed; the kernel sends it SIGTERM if this process dies without a word.  What it says is
+    in a ``NAME.log`` of its own.
     """
 
     def __init__(self, logs: Path) -> None:

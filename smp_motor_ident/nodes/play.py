@@ -45,22 +45,7 @@ class Options:
 
 
 class Player(Node):
-    """Publishes the messages of a bag from a thread of its own.
-
-    Parameters
-    ----------
-    replay : Replay
-        The bag.
-    channels : list of Channel
-        Topics that are wanted.
-    options : Options
-        How to play.
-
-    Raises
-    ------
-    SmpError
-        When none of the topics can be published.
-    """
+    """Publishes the messages of a bag from a thread of its own."""
 
     def __init__(self, replay: Replay, channels: list[Channel], options: Options) -> None:
         super().__init__("play")

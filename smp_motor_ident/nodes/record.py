@@ -86,14 +86,7 @@ def qos_document(qos: QoSProfile) -> dict[str, Any]:
 class Recorder(Node):
     """Finds topics as they appear, and writes what comes on them.
 
-    Parameters
-    ----------
-    writer : BagWriter
-        Open; closed when the node stops.
-    choice : Choice
-        Which topics.
-    duration : float
-        [s]; 0 records until the node is stopped.
+    It closes the writer when it stops, which it does by itself after a duration that is not 0 [s].
     """
 
     def __init__(self, writer: BagWriter, choice: Choice, duration: float = 0.0) -> None:
