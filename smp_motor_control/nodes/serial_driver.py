@@ -17,14 +17,14 @@ from dataclasses import dataclass
 from typing import Any
 
 from rclpy.node import Node
-from std_msgs.msg import String
 
-from smp_interfaces.msg import MotorCommand, MotorDescription, MotorState
+from smp_interfaces.msg import MotorDescription, MotorState
 from smp_motor_control import WHEELS, joint_of
 from smp_motor_control.encoder import Encoder, wrap
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.motor.parameters import Gearbox
 from smp_motor_control.nodes import runtime
+from smp_motor_control.nodes.motor_writer import MotorReader
 from smp_motor_control.nodes.settings import Parameters, described, fixed
 from smp_motor_control.serial_protocol import (
     CLOCK,
@@ -33,7 +33,6 @@ from smp_motor_control.serial_protocol import (
     decode_state,
     encode_voltages,
 )
-from smp_motor_control.wheel.lease import Lease
 
 POLL = 0.002
 """Interval at which the line is read [s]."""
@@ -80,9 +79,8 @@ class Wheel:
 
     def __init__(self, node: Node, name: str, settings: Settings) -> None:
         self.settings, self.voltage, self.commanded = settings, 0.0, -math.inf
-        self._clock = node.get_clock()
-        self.lease = Lease(settings.command_timeout)
-        self._owner = "?"
+        self._commands = MotorReader(node, name, settings.command_timeout, self._command)
+        self.lease = self._commands.lease
         self._gearbox = Gearbox(settings.gear_ratio)
         self._encoder = Encoder(settings.counts_per_revolution, settings.encoder_bits)
         self._state = MotorState(current=math.nan)
@@ -92,10 +90,6 @@ class Wheel:
         self._applied = 0.0
         self._publisher = node.create_publisher(
             MotorState, f"{name}/motor_state", runtime.STREAM_PUBLISHER
-        )
-        self._owners = node.create_publisher(String, f"{name}/motor_owner", runtime.LATCHED)
-        node.create_subscription(
-            MotorCommand, f"{name}/motor_command", self._command, runtime.STREAM_SUBSCRIBER
         )
         self._description = node.create_publisher(
             MotorDescription, f"{name}/motor_description", runtime.LATCHED
@@ -111,19 +105,13 @@ class Wheel:
             )
         )
 
-    def _command(self, message: MotorCommand) -> None:
-        now = time.monotonic()
-        voltage, writer = message.voltage, message.header.frame_id
-        stamps = runtime.nanoseconds(message.header.stamp), self._clock.now().nanoseconds
-        if math.isfinite(voltage) and self.lease.take(writer, voltage, now, *stamps):
+    def _command(self, now: float, voltage: float) -> None:
+        if math.isfinite(voltage):
             self.voltage, self.commanded = voltage, now
 
     def wanted(self, now: float, battery: float) -> float:
         """Return the voltage to command now [V]."""
-        owner = self.lease.owner(now)
-        if owner != self._owner:
-            self._owner = owner
-            self._owners.publish(String(data=owner))
+        self._commands.tell_owner(now)
         if now - self.commanded > self.settings.command_timeout:
             return 0.0
         return min(max(self.voltage, -battery), battery)
