@@ -30,14 +30,12 @@ from smp_motor_control.nodes.conventions import (  # noqa: F401  (offered by thi
     STREAM_PUBLISHER,
     STREAM_SUBSCRIBER,
     nanoseconds,
-    robot_topic,
     seconds,
     send_last,
     share,
     steady_timer,
-    wheel_of,
 )
-from smp_motor_control.nodes.diagnostics import ERROR, OK, STALE, WARN, Diagnostics  # noqa: F401
+from smp_motor_control.nodes.diagnostics import ERROR, OK, WARN, Diagnostics  # noqa: F401
 from smp_motor_control.nodes.executor import LeanExecutor
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGQUIT, signal.SIGHUP)

@@ -15,6 +15,7 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
 from smp_interfaces.msg import MotorDescription, MotorState, PidState
+from smp_motor_control import joint_of
 from smp_motor_control.encoder import Encoder
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.motor.parameters import Gearbox
@@ -41,8 +42,9 @@ class WheelPid(LifecycleNode):
         check = lambda settings: wheel.check(settings.wheel)  # noqa: E731
         self._given = Parameters(self, Settings, self._change, check=check)
         settings = self._given.settings
-        self._joint = settings.joint_name or f"{runtime.wheel_of(self)}_wheel_joint"
-        if self._joint == "_wheel_joint":
+        self._robot, _, name = self.get_namespace().rpartition("/")
+        self._joint = settings.joint_name or joint_of(name)
+        if self._joint == joint_of(""):
             raise ParameterError(
                 "wheel_pid needs joint_name, or a wheel's namespace: -r __ns:=/front_left"
             )
@@ -67,7 +69,7 @@ class WheelPid(LifecycleNode):
             (self.destroy_publisher, self._shown),
             (self.destroy_subscription, listen(MotorState, "motor_state", self._hear, heard)),
             (self.destroy_subscription,
-             listen(JointState, runtime.robot_topic(self, "wheel_setpoints"), self._ask, heard)),
+             listen(JointState, f"{self._robot}/wheel_setpoints", self._ask, heard)),
             (self.destroy_subscription,
              listen(MotorDescription, "motor_description", self._describe, runtime.LATCHED)),
             (self.destroy_service, self.create_service(Trigger, "~/reset", self._reset)),

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from smp_motor_control.motor.file import nest
 from smp_motor_ident.bag.columns import Columns, read_columns
 from smp_motor_ident.cli import steps
 from smp_motor_ident.cli.driving import wheel_angle
@@ -172,7 +173,7 @@ def _changes(
     even, speed = verification.smoothed(
         instants, wheel_angle(state, estimate.hardware)[shown], step
     )
-    parameters = _nested(designed.gains[wheel])
+    parameters = nest(designed.gains[wheel])
     rows = verification.predicted(
         estimate, parameters, document["loop"], asked, (instants, waited), even
     )
@@ -200,11 +201,3 @@ def _begin(wheel: str, setpoint: float, answers: Columns) -> float:
             "fault, or its messages were lost; look at /diagnostics, then go on with --resume"
         )
     return float(answers.time[asked[0]])
-
-
-def _nested(flat: Mapping[str, Any]) -> dict[str, Any]:
-    nested: dict[str, Any] = {}
-    for name, value in flat.items():
-        group, _, key = name.rpartition(".")
-        (nested.setdefault(group, {}) if group else nested)[key] = value
-    return nested
