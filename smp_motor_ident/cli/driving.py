@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -41,36 +41,40 @@ class Answer:
     overshoot: float  # beyond the set-point [% of the change]
 
 
-def read_answers(
-    bag: Path, segments: Sequence[tuple[str, float, float]], hardware: Mapping[str, Hardware]
+Drive = Mapping[str, Columns]
+"""What is judged and drawn of the recording of a drive, by topic."""
+
+
+def read_drive(bag: Path, wheels: Iterable[str]) -> Drive:
+    """Read the samples of wheels and the answers of their controllers."""
+    wanted = {f"/{wheel}/motor_state": ["encoder_count"] for wheel in wheels}
+    return read_columns(bag, wanted | {f"/{w}/pid_state": ["setpoint", "age"] for w in wheels})
+
+
+def answers_of(
+    drive: Drive, segments: Sequence[tuple[str, float, float]], hardware: Mapping[str, Hardware]
 ) -> dict[str, list[Answer]]:
     """Measure rise, settling and overshoot of every wheel in every segment."""
-    wanted = {f"/{wheel}/motor_state": ["encoder_count"] for wheel in hardware}
-    wanted |= {f"/{wheel}/pid_state": ["setpoint"] for wheel in hardware}
-    read = read_columns(bag, wanted)
     answers = {}
     for wheel, known in hardware.items():
-        time, speed = wheel_speed(read[f"/{wheel}/motor_state"], known)
-        asked = read[f"/{wheel}/pid_state"]
+        time, speed = wheel_speed(drive[f"/{wheel}/motor_state"], known)
+        asked = drive[f"/{wheel}/pid_state"]
         found = [_answer(time, speed, asked, *segment) for segment in segments]
         answers[wheel] = [a for a in found if a is not None]
     return answers
 
 
 def drive_figure(
-    bag: Path, sides: Mapping[str, Sequence[str]], hardware: Mapping[str, Hardware]
+    drive: Drive, sides: Mapping[str, Sequence[str]], hardware: Mapping[str, Hardware]
 ) -> str:
     """Return an SVG file: what the wheels of each side were asked for, and what they did."""
     wheels = list(hardware)
-    wanted = {f"/{wheel}/motor_state": ["encoder_count"] for wheel in wheels}
-    wanted |= {f"/{wheel}/pid_state": ["setpoint"] for wheel in wheels}
-    read = read_columns(bag, wanted)
-    begin = min(float(columns.time[0]) for columns in read.values())
+    begin = min(float(columns.time[0]) for columns in drive.values())
     charts = []
     for side, names in sides.items():
-        asked = read[f"/{names[0]}/pid_state"]
+        asked = drive[f"/{names[0]}/pid_state"]
         time = asked.time
-        speeds = {w: wheel_speed(read[f"/{w}/motor_state"], hardware[w]) for w in names}
+        speeds = {w: wheel_speed(drive[f"/{w}/motor_state"], hardware[w]) for w in names}
         curves = [Curve("set-point", asked.fields["setpoint"], "muted")]
         curves += [
             Curve(w, np.interp(time, *speeds[w]), f"wheel-{wheels.index(w) % 4 + 1}") for w in names
@@ -89,13 +93,10 @@ def drive_figure(
     return document(charts, wheels)
 
 
-def longest_stall(bag: Path, wheels: Sequence[str]) -> float:
+def longest_stall(drive: Drive) -> float:
     """Return how long the machine that simulates stood still at worst."""
-    wanted = {f"/{wheel}/motor_state": ["encoder_count"] for wheel in wheels}
-    wanted |= {f"/{wheel}/pid_state": ["age"] for wheel in wheels}
-    read = read_columns(bag, wanted)
-    gaps = (np.diff(c.time) for c in read.values() if "age" not in c.fields)
-    ages = (c.fields["age"] for c in read.values() if "age" in c.fields)
+    gaps = (np.diff(c.time) for c in drive.values() if "age" not in c.fields)
+    ages = (c.fields["age"] for c in drive.values() if "age" in c.fields)
     return max(float(np.max(found)) for found in (*gaps, *ages))
 
 
