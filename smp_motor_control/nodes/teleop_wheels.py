@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from dataclasses import dataclass
 
@@ -11,11 +10,11 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
 from smp_motor_control import WHEELS, joint_of
-from smp_motor_control.errors import ParameterError, SmpError
+from smp_motor_control.errors import ParameterError
 from smp_motor_control.keyboard import Keyboard, Speeds, keys_of
 from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.settings import Parameters, described, fixed
-from smp_motor_control.nodes.terminal import Terminal, require_terminal
+from smp_motor_control.nodes.terminal import Terminal
 
 HELP = """\
 teleop_wheels: hold a key to drive; the wheels stop {timeout:g} s after it is released.
@@ -176,9 +175,4 @@ class TeleopWheels(Node):
 
 def main(argv: list[str] | None = None) -> int:
     """Run the node until x, Ctrl-C or a signal; return its exit code."""
-    try:
-        require_terminal()
-    except SmpError as error:
-        print(f"teleop_wheels: {error}", file=sys.stderr)
-        return error.exit_code
     return runtime.run("teleop_wheels", TeleopWheels, argv)

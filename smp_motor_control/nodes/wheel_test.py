@@ -21,8 +21,6 @@ from smp_motor_control.nodes.motor_writer import MotorWriter
 from smp_motor_control.nodes.robot_client import RobotClient, RobotError
 from smp_motor_control.wheel.protection import Bounds, Protection
 
-COLUMNS = ("time", "age", "command", "voltage", "velocity", "position", "count", "phase")
-
 Law = Callable[[float], float]
 """From the time since a phase began [s] to a voltage [V]."""
 
@@ -33,7 +31,7 @@ Counter = Callable[[MotorState], float]
 class Tape:
     """What one wheel's hardware reported, a row for each sample."""
 
-    # of :data:`COLUMNS`: stamp [s], its age on arrival [s], what had been commanded [V], what
+    # stamp [s], its age on arrival [s], what had been commanded [V], what
     # was reported [V], [rad/s], [rad], [counts], and the number of the phase
     rows: list[tuple[float, ...]] = field(default_factory=list)
 
