@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -45,7 +45,7 @@ Drive = Mapping[str, Columns]
 """What is judged and drawn of the recording of a drive, by topic."""
 
 
-def read_drive(bag: Path, wheels: Iterable[str]) -> Drive:
+def read_drive(bag: Path, wheels: Sequence[str]) -> Drive:
     """Read the samples of wheels and the answers of their controllers."""
     wanted = {f"/{wheel}/motor_state": ["encoder_count"] for wheel in wheels}
     return read_columns(bag, wanted | {f"/{w}/pid_state": ["setpoint", "age"] for w in wheels})
