@@ -83,14 +83,11 @@ class Square(Excitation):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Fourier(Excitation):
-    """A sum of incommensurate tones, its rare peaks clipped."""
+class Band(Excitation):
+    """Base of signals of a range of frequencies, from ``lowest`` to ``highest`` [Hz]."""
 
-    # lowest, highest: range of the tones [Hz], spaced evenly on a logarithmic scale
     lowest: float = 0.1
     highest: float = 20.0
-    tones: int = 24  # their number
-    seed: int = 0  # of the phases; different seeds give signals that hardly correlate
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -98,6 +95,17 @@ class Fourier(Excitation):
             raise ParameterError(
                 f"highest is {self.highest!r} Hz; it must be above lowest, {self.lowest!r} Hz"
             )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fourier(Band):
+    """A sum of incommensurate tones on a logarithmic scale, its rare peaks clipped."""
+
+    tones: int = 24  # their number
+    seed: int = 0  # of the phases; different seeds give signals that hardly correlate
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
         if self.tones < 2:
             raise ParameterError(f"tones is {self.tones!r}; it must be at least 2")
 
@@ -108,7 +116,9 @@ class Fourier(Excitation):
 
     def _shape(self, time: Array) -> Array:
         frequencies, phases, peak = _multisine(self.lowest, self.highest, self.tones, self.seed)
-        return _sum_of_tones(time, frequencies, phases) / peak
+        tones = np.sin(2 * math.pi * np.outer(time, frequencies) + phases)
+        summed: Array = tones.sum(axis=1) / peak
+        return summed
 
 
 def _frequencies(lowest: float, highest: float, tones: int, seed: int) -> Array:
@@ -120,11 +130,6 @@ def _frequencies(lowest: float, highest: float, tones: int, seed: int) -> Array:
     frequencies[0] *= 1 + 1e-3 * (1 + dither[0])
     frequencies[-1] /= 1 + 1e-3 * (1 + dither[-1])
     return frequencies
-
-
-def _sum_of_tones(time: Array, frequencies: Array, phases: Array) -> Array:
-    result: Array = np.sin(2 * math.pi * np.outer(time, frequencies) + phases).sum(axis=1)
-    return result
 
 
 @lru_cache(maxsize=32)
@@ -149,20 +154,10 @@ def _multisine(lowest: float, highest: float, tones: int, seed: int) -> tuple[Ar
 
 
 @dataclass(frozen=True, kw_only=True)
-class Chirp(Excitation):
+class Chirp(Band):
     """A sine whose frequency rises exponentially and falls again, over and over."""
 
-    # lowest, highest: range of the frequency [Hz]
-    lowest: float = 0.1
-    highest: float = 20.0
     sweep: float = 20.0  # time from the lowest to the highest frequency [s]
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.highest <= self.lowest:
-            raise ParameterError(
-                f"highest is {self.highest!r} Hz; it must be above lowest, {self.lowest!r} Hz"
-            )
 
     def _shape(self, time: Array) -> Array:
         sweep = self.sweep * DETUNING

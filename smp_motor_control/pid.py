@@ -77,32 +77,6 @@ class Pid:
     (2.0, 2.5)
     """
 
-    __slots__ = (
-        "_back_calculation",
-        "_conditional",
-        "_d",
-        "_deadband",
-        "_ff_acceleration",
-        "_ff_static",
-        "_ff_velocity",
-        "_filter",
-        "_i",
-        "_i_max",
-        "_i_min",
-        "_last",
-        "_p",
-        "_previous",
-        "_rate",
-        "_seen",
-        "_tracking",
-        "_u_max",
-        "_u_min",
-        "_weight_d",
-        "_weight_p",
-        "gains",
-        "i_term",
-    )
-
     gains: PidGains
     i_term: float
     _previous: float | None  # c r - y of the step before

@@ -51,7 +51,7 @@ def encode(text: str) -> bytes:
 
 
 def encode_voltages(voltages: Sequence[float]) -> bytes:
-    """Return the command of all motors.
+    r"""Return the command of all motors.
 
     Examples
     --------

@@ -44,11 +44,6 @@ class HeadingHold:
     def __init__(
         self, p: float = 2.0, i: float = 0.5, max_correction: float = 0.5, max_error: float = 0.7
     ) -> None:
-        self.configure(p, i, max_correction, max_error)
-        self.reset()
-
-    def configure(self, p: float, i: float, max_correction: float, max_error: float) -> None:
-        """Change the settings; the reference stays."""
         for name, value in {"p": p, "i": i}.items():
             if not 0.0 <= value < math.inf:
                 raise ParameterError(f"heading {name} is {value}: must not be negative")
@@ -57,6 +52,7 @@ class HeadingHold:
                 raise ParameterError(f"heading {name} is {value}: must be positive")
         self._p, self._i = p, i
         self._max_correction, self._max_error = max_correction, max_error
+        self.reset()
 
     def reset(self) -> None:
         """Take the next yaw as the reference; for a body at rest, or without a yaw."""

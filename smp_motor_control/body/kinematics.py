@@ -2,7 +2,6 @@
 
 ``left = (v - w B/2) / (r m_left)``, ``right = (v + w B/2) / (r m_right)`` with the effective
 separation ``B = wheel_separation * wheel_separation_multiplier``; angles counter-clockwise.
-Odometry, speed limits, commands and heading are in modules of their own and offered here.
 """
 
 from __future__ import annotations
@@ -11,23 +10,7 @@ import math
 from dataclasses import dataclass, fields
 from typing import NamedTuple
 
-from smp_motor_control.body.command import BodyCommand, Verdict
-from smp_motor_control.body.heading import HeadingHold
-from smp_motor_control.body.odometry import Odometry, PoseCovariance
-from smp_motor_control.body.speed_limiter import RateLimiter, SpeedLimiter
 from smp_motor_control.errors import ParameterError
-
-__all__ = [
-    "BodyCommand",
-    "HeadingHold",
-    "Odometry",
-    "PoseCovariance",
-    "RateLimiter",
-    "SideSpeeds",
-    "SkidSteer",
-    "SpeedLimiter",
-    "Verdict",
-]
 
 
 class SideSpeeds(NamedTuple):
@@ -105,19 +88,9 @@ class SkidSteer:
         return (left + right) / 2.0, (right - left) / self.effective_separation
 
     def reachable_share(self, linear: float, angular: float) -> float:
-        """Return by what a command must be scaled for every wheel to follow.
+        """Return by what a command must be scaled for every wheel to follow, at most 1.
 
         Linear and angular velocity shrink alike, so the path keeps its shape.
-
-        Parameters
-        ----------
-        linear, angular : float
-            Velocity of the body [m/s], [rad/s].
-
-        Returns
-        -------
-        float
-            At most 1.
         """
         fastest = max(map(abs, self.wheel_speeds(linear, angular)))
         if math.isinf(fastest):  # beyond what a number can hold
@@ -125,17 +98,6 @@ class SkidSteer:
         return 1.0 if fastest <= self.max_wheel_speed else self.max_wheel_speed / fastest
 
     def reachable_wheel_speeds(self, linear: float, angular: float) -> SideSpeeds:
-        """Return the wheel speeds for a command, scaled until every wheel can follow.
-
-        Parameters
-        ----------
-        linear, angular : float
-            Velocity of the body [m/s], [rad/s].
-
-        Returns
-        -------
-        SideSpeeds
-            None faster than ``max_wheel_speed``.
-        """
+        """Return the wheel speeds for a command, scaled until every wheel can follow."""
         share = self.reachable_share(linear, angular)
         return self.wheel_speeds(linear * share, angular * share)

@@ -100,20 +100,7 @@ class Odometry:
         travel_noise: float,
         turn_noise: float,
     ) -> None:
-        """Change the geometry or the noise from the next step on; the pose stays.
-
-        Parameters
-        ----------
-        wheel_separation, left_radius, right_radius : float
-            [m].
-        travel_noise, turn_noise : float
-            [m^2/m], [rad^2/rad].
-
-        Raises
-        ------
-        ParameterError
-            When a length is not positive or a noise negative.
-        """
+        """Change the geometry or the noise from the next step on; the pose stays."""
         lengths = {
             "wheel_separation": wheel_separation,
             "left_radius": left_radius,

@@ -56,16 +56,6 @@ def steady_timer(node: Node, period: float, callback: Callable[[], None]) -> Tim
     return node.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
 
-def wheel_of(node: Node) -> str:
-    """Return the wheel whose namespace a node lives in."""
-    return str(node.get_namespace().rsplit("/", 1)[-1])
-
-
-def robot_topic(node: Node, name: str) -> str:
-    """Return a topic of the robot that a wheel's node belongs to: one namespace up."""
-    return f"{node.get_namespace().rpartition('/')[0]}/{name}"
-
-
 def share(path: str) -> Path:
     """Return a file of this package, installed or in its source tree."""
     places = [Path(__file__).resolve().parents[2]]

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 from rclpy.node import Node
 
@@ -21,7 +21,7 @@ from smp_motor_control.errors import ParameterError, SmpError
 from smp_motor_control.excitation import SIGNALS, Bounded, Excitation
 from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.motor_writer import MotorWriter
-from smp_motor_control.nodes.settings import Parameters, described
+from smp_motor_control.nodes.settings import Parameters, fields_for, fixed
 from smp_motor_control.wheel.protection import Bounds, Protection
 
 _OTHERS = 0.5
@@ -42,52 +42,26 @@ class LimitError(SmpError):
 class Settings:
     """Parameters of the node."""
 
-    signal: str = described("fourier", f"One of {', '.join(SIGNALS)}.", read_only=True)
-    wheel_names: tuple[str, ...] = described(WHEELS, "Wheels of the robot.", read_only=True)
-    wheels: tuple[str, ...] = described(
-        ("all",), "Wheels to excite, or all of wheel_names.", read_only=True
-    )
-    amplitude: float = described(
-        6.0, "Largest voltage of either sign [V].", minimum=0.0, read_only=True
-    )
-    max_voltage: float = described(
-        12.0, "Amplitudes beyond this are refused [V].", minimum=0.0, read_only=True
-    )
-    max_speed: float = described(
-        0.0, "Largest speed of a wheel [rad/s]; 0 for any.", minimum=0.0, read_only=True
-    )
-    max_current: float = described(
-        0.0, "Largest current of a motor [A]; 0 for any.", minimum=0.0, read_only=True
-    )
-    duration: float = described(
-        20.0, "Length of the signal [s].", minimum=0.1, maximum=3600.0, read_only=True
-    )
-    fade: float = described(
-        0.0, "Time over which it grows and shrinks [s].", minimum=0.0, read_only=True
-    )
-    rate: float = described(
-        200.0, "Commands per second [Hz].", minimum=10.0, maximum=1000.0, read_only=True
-    )
-    wait: float = described(
-        10.0, "Longest wait for the motors' driver [s].", minimum=0.0, read_only=True
-    )
-    seed: int = described(0, "Of fourier, prbs and steps.", minimum=0, read_only=True)
-    independent: bool = described(
-        True, "Whether wheels get different fourier, prbs and steps signals.", read_only=True
-    )
-    frequency: float = described(1.0, "Of sine and square [Hz].", minimum=0.0, read_only=True)
-    lowest: float = described(
-        0.1, "Lowest frequency of fourier and chirp [Hz].", minimum=0.0, read_only=True
-    )
-    highest: float = described(
-        20.0, "Highest frequency of fourier and chirp [Hz].", minimum=0.0, read_only=True
-    )
-    tones: int = described(24, "Tones of fourier.", minimum=2, maximum=1000, read_only=True)
-    sweep: float = described(20.0, "One sweep of chirp [s].", minimum=0.0, read_only=True)
-    hold: float = described(
-        0.0, "Of prbs and steps [s]; 0 for their defaults.", minimum=0.0, read_only=True
-    )
-    period: float = described(20.0, "Of ramp [s].", minimum=0.0, read_only=True)
+    signal: str = fixed("fourier", f"One of {', '.join(SIGNALS)}.")
+    wheel_names: tuple[str, ...] = fixed(WHEELS, "Wheels of the robot.")
+    wheels: tuple[str, ...] = fixed(("all",), "Wheels to excite, or all of wheel_names.")
+    amplitude: float = fixed(6.0, "Largest voltage of either sign [V].", minimum=0.0)
+    max_voltage: float = fixed(12.0, "Amplitudes beyond this are refused [V].", minimum=0.0)
+    max_speed: float = fixed(0.0, "Largest speed of a wheel [rad/s]; 0 for any.", minimum=0.0)
+    max_current: float = fixed(0.0, "Largest current of a motor [A]; 0 for any.", minimum=0.0)
+    duration: float = fixed(20.0, "Length of the signal [s].", minimum=0.1, maximum=3600.0)
+    fade: float = fixed(0.0, "Time over which it grows and shrinks [s].", minimum=0.0)
+    rate: float = fixed(200.0, "Commands per second [Hz].", minimum=10.0, maximum=1000.0)
+    wait: float = fixed(10.0, "Longest wait for the motors' driver [s].", minimum=0.0)
+    seed: int = fixed(0, "Of fourier, prbs and steps.", minimum=0)
+    independent: bool = fixed(True, "Whether wheels get different fourier, prbs and steps signals.")
+    frequency: float = fixed(1.0, "Of sine and square [Hz].", minimum=0.0)
+    lowest: float = fixed(0.1, "Lowest frequency of fourier and chirp [Hz].", minimum=0.0)
+    highest: float = fixed(20.0, "Highest frequency of fourier and chirp [Hz].", minimum=0.0)
+    tones: int = fixed(24, "Tones of fourier.", minimum=2, maximum=1000)
+    sweep: float = fixed(20.0, "One sweep of chirp [s].", minimum=0.0)
+    hold: float = fixed(0.0, "Of prbs and steps [s]; 0 for their defaults.", minimum=0.0)
+    period: float = fixed(20.0, "Of ramp [s].", minimum=0.0)
 
     def __post_init__(self) -> None:
         if self.signal not in SIGNALS:
@@ -113,8 +87,7 @@ class Settings:
     def signal_of(self, wheel: int) -> Excitation:
         """Return the bounded signal of the n-th wheel."""
         kind = SIGNALS[self.signal]
-        names = {f.name for f in fields(kind)}
-        given = {n: getattr(self, n) for n in names if hasattr(self, n)}
+        given = fields_for(kind, self)
         if not given.get("hold", 1.0):
             del given["hold"]
         if "seed" in given and self.independent:

@@ -39,16 +39,10 @@ RETURN = 60.0
 
 
 class Watch:
-    """Judges one wheel by its ``pid_state``.
-
-    Parameters
-    ----------
-    supply : float
-        [V].
-    """
+    """Judges one wheel by its ``pid_state``."""
 
     def __init__(self, supply: float) -> None:
-        self.supply = supply
+        self.supply = supply  # [V]
         self.seen: deque[tuple[float, PidState]] = deque()
         self.usual_error = 0.0
         self.usual_swing = 0.0

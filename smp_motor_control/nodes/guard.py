@@ -21,13 +21,7 @@ TRY_FOR = 20.0
 
 
 class Guard:
-    """The tool's end of the guard.
-
-    Parameters
-    ----------
-    arguments : sequence of str
-        ROS arguments of the tool.
-    """
+    """The tool's end of the guard, which joins the graph by the tool's ROS arguments."""
 
     def __init__(self, arguments: Sequence[str]) -> None:
         self._process = subprocess.Popen(

@@ -13,7 +13,7 @@ def keep_time(node: Node, priority: int, affinity: tuple[int, ...]) -> list[str]
     """Ask the system for what a control loop wants, and do without where it says no.
 
     Freezes what is allocated so far out of the garbage collector's sight and turns the
-    collector off; :func:`collect_garbage` is then to be called where it does no harm.
+    collector off; who calls this collects where it does no harm.
     """
     refused = []
     if priority > 0:
@@ -44,8 +44,3 @@ def _threads() -> list[int]:
         return [int(name) for name in os.listdir("/proc/self/task")]
     except OSError:
         return [0]
-
-
-def collect_garbage() -> None:
-    """Collect the few objects made since :func:`keep_time`, while the loop has time."""
-    gc.collect()

@@ -21,15 +21,16 @@ from typing import Any
 
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
-from std_msgs.msg import Float64, String
+from std_msgs.msg import Float64
 
-from smp_interfaces.msg import MotorCommand, MotorDescription, MotorState
+from smp_interfaces.msg import MotorDescription, MotorState
+from smp_motor_control import joint_of
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.motor.file import MotorEntry, load_motors, nest, parse_motors
 from smp_motor_control.motor.hardware import DrivenMotor, DriveSettings, Supply
 from smp_motor_control.nodes import runtime
-from smp_motor_control.nodes.settings import Parameters, described, given_parameters, nested
-from smp_motor_control.wheel.lease import Lease
+from smp_motor_control.nodes.motor_writer import MotorReader
+from smp_motor_control.nodes.settings import Parameters, described, fixed, given_parameters, nested
 
 _FIXED = ParameterDescriptor(description="As in a motor file.", read_only=True)
 _DRIVE = {
@@ -50,13 +51,10 @@ _DRIVE_DEFAULTS = DriveSettings(pwm_steps=1000, current_noise=0.01, latch=True)
 class Settings:
     """Parameters of the node, beside ``motors.<wheel>.<key>`` as in a motor file."""
 
-    motors_file: str = described(
-        "", "File of the motors; where none are given, those of the paper.", read_only=True
+    motors_file: str = fixed("", "File of the motors; where none are given, those of the paper.")
+    rate: float = fixed(
+        200.0, "Samples per second of every motor [Hz].", minimum=1.0, maximum=2000.0
     )
-    rate: float = described(
-        200.0, "Samples per second of every motor [Hz].", minimum=1.0, maximum=2000.0,
-        read_only=True,
-    )  # fmt: skip
     drive: DriveSettings = nested(_DRIVE_DEFAULTS, _DRIVE)  # noqa: RUF009
     supply_resistance: float = described(
         0.0, "Inner resistance of the battery that all motors share [ohm].", minimum=0.0
@@ -64,10 +62,8 @@ class Settings:
     battery_voltage: float = described(
         0.0, "Of the battery without load [V]; 0: the supply_voltage of the motors.", minimum=0.0
     )
-    ohmmeter: bool = described(
-        True, "Whether the description tells the resistance, as measured.", read_only=True
-    )
-    seed: int = described(1, "Of all noise.", read_only=True)
+    ohmmeter: bool = fixed(True, "Whether the description tells the resistance, as measured.")
+    seed: int = fixed(1, "Of all noise.")
 
 
 SHORTEST_INTERVAL = 0.5
@@ -86,26 +82,19 @@ class Wheel:
     def __init__(self, node: MotorPlant, name: str, motor: DrivenMotor) -> None:
         self.name = name
         self.motor = motor
-        self._clock = node.get_clock()
         self.rejected = self.late = 0
-        self.lease = Lease(motor.settings.command_timeout)
-        self._owner = "?"
-        self._owners = node.create_publisher(String, f"{name}/motor_owner", runtime.LATCHED)
+        self._commands = MotorReader(node, name, motor.settings.command_timeout, self._command)
+        self.lease = self._commands.lease
         self.state = MotorState()
-        self.state.header.frame_id = f"{name}_wheel_joint"
+        self.state.header.frame_id = joint_of(name)
         self.publisher = node.create_publisher(
             MotorState, f"{name}/motor_state", runtime.STREAM_PUBLISHER
         )
         self._description = node.create_publisher(
             MotorDescription, f"{name}/motor_description", runtime.LATCHED
         )
-        self._subscriptions = (
-            node.create_subscription(
-                MotorCommand, f"{name}/motor_command", self._command, runtime.STREAM_SUBSCRIBER
-            ),
-            node.create_subscription(
-                Float64, f"{name}/load_torque", self._load, runtime.STREAM_SUBSCRIBER
-            ),
+        node.create_subscription(
+            Float64, f"{name}/load_torque", self._load, runtime.STREAM_SUBSCRIBER
         )
 
     def describe(self, ohmmeter: bool) -> None:
@@ -122,12 +111,8 @@ class Wheel:
             )
         )
 
-    def _command(self, message: MotorCommand) -> None:
-        now = time.monotonic()
-        stamps = runtime.nanoseconds(message.header.stamp), self._clock.now().nanoseconds
-        if not self.lease.take(message.header.frame_id, message.voltage, now, *stamps):
-            return
-        if not self.motor.command(now, message.voltage):
+    def _command(self, now: float, voltage: float) -> None:
+        if not self.motor.command(now, voltage):
             self.rejected += 1
 
     def _load(self, message: Float64) -> None:
@@ -145,10 +130,7 @@ class Wheel:
         state.encoder_count = sample.encoder_count
         state.duty_cycle = sample.duty
         self.publisher.publish(state)
-        owner = self.lease.owner(now)
-        if owner != self._owner:
-            self._owner = owner
-            self._owners.publish(String(data=owner))
+        self._commands.tell_owner(now)
 
 
 class MotorPlant(Node):

@@ -1,23 +1,26 @@
-"""Sends one wheel's commands under the sender's name, and hears who else owns the wheel."""
+"""One wheel's commands, under the sender's name, and who owns the wheel: both of their ends."""
 
 from __future__ import annotations
 
 import os
 import time
+from collections.abc import Callable
 from typing import Any
 
 from rclpy.node import Node
 from std_msgs.msg import String
 
 from smp_interfaces.msg import MotorCommand
-from smp_motor_control.nodes.conventions import LATCHED, STREAM_PUBLISHER, send_last
+from smp_motor_control.nodes.conventions import (
+    LATCHED,
+    STREAM_PUBLISHER,
+    STREAM_SUBSCRIBER,
+    nanoseconds,
+    send_last,
+)
+from smp_motor_control.wheel.lease import Lease
 
 _ZEROS = 3
-
-
-def full_name(node: Node) -> str:
-    """Return the name that a process takes wheels under: two of one node are two."""
-    return f"{node.get_fully_qualified_name()}#{os.getpid()}"
 
 
 class MotorWriter:
@@ -33,7 +36,8 @@ class MotorWriter:
 
     def __init__(self, node: Node, prefix: str = "") -> None:
         self._node = node
-        self._name = full_name(node)
+        # Two processes of one node are two writers.
+        self._name = f"{node.get_fully_qualified_name()}#{os.getpid()}"
         self._message = MotorCommand()
         self._message.header.frame_id = self._name
         self.publisher = node.create_publisher(
@@ -66,3 +70,34 @@ class MotorWriter:
         """Give the topics back."""
         self._node.destroy_publisher(self.publisher)
         self._node.destroy_subscription(self._owners)
+
+
+class MotorReader:
+    """The driver's end: obeys the owner of the wheel's lease, and says who that is.
+
+    ``obey`` gets the instant [s] on a steady clock and the voltage [V].
+    """
+
+    def __init__(
+        self, node: Node, wheel: str, timeout: float, obey: Callable[[float, float], Any]
+    ) -> None:
+        self._clock, self._obey = node.get_clock(), obey
+        self.lease = Lease(timeout)
+        self._owner = "?"
+        self._owners = node.create_publisher(String, f"{wheel}/motor_owner", LATCHED)
+        node.create_subscription(
+            MotorCommand, f"{wheel}/motor_command", self._heard, STREAM_SUBSCRIBER
+        )
+
+    def _heard(self, message: MotorCommand) -> None:
+        now = time.monotonic()
+        stamps = nanoseconds(message.header.stamp), self._clock.now().nanoseconds
+        if self.lease.take(message.header.frame_id, message.voltage, now, *stamps):
+            self._obey(now, message.voltage)
+
+    def tell_owner(self, now: float) -> None:
+        """Publish who owns the wheel, where that is another than before."""
+        owner = self.lease.owner(now)
+        if owner != self._owner:
+            self._owner = owner
+            self._owners.publish(String(data=owner))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Protocol
 
 from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import Odometry as OdometryMessage
@@ -15,6 +14,7 @@ from sensor_msgs.msg import JointState
 from smp_motor_control import joint_of
 from smp_motor_control.body.odometry import Odometry
 from smp_motor_control.body.wheel_travel import WheelSample
+from smp_motor_control.nodes.skid_steer_settings import Settings
 
 UNKNOWN = 1e6
 """Variance of what wheels on a plane cannot tell: height, roll and pitch."""
@@ -26,20 +26,6 @@ STILL = 1e-6
 """Least variance of a velocity, for filters that divide by it."""
 
 
-class FrameSettings(Protocol):
-    """The parameters of the node that are about its output."""
-
-    left_wheel_names: tuple[str, ...]
-    right_wheel_names: tuple[str, ...]
-    odom_frame_id: str
-    base_frame_id: str
-    tf_frame_prefix_enable: bool
-    tf_frame_prefix: str
-    enable_odom_tf: bool
-    publish_rate: float
-    velocity_rolling_window_size: int
-
-
 def frame_prefix(enable: bool, prefix: str, namespace: str) -> str:
     """Return what comes before the names of the frames."""
     inner = (prefix or namespace).strip("/") if enable else ""
@@ -47,17 +33,9 @@ def frame_prefix(enable: bool, prefix: str, namespace: str) -> str:
 
 
 class OdometryOutput:
-    """Publishers of a node that knows where the body is.
+    """Publishers of a node that knows where the body is."""
 
-    Parameters
-    ----------
-    node : rclpy.node.Node
-        Owner of the publishers.
-    settings : FrameSettings
-        Names of frames and what to publish.
-    """
-
-    def __init__(self, node: Node, settings: FrameSettings) -> None:
+    def __init__(self, node: Node, settings: Settings) -> None:
         prefix = frame_prefix(
             settings.tf_frame_prefix_enable, settings.tf_frame_prefix, node.get_namespace()
         )

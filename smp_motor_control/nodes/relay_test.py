@@ -7,7 +7,9 @@ Whatever ends it, the last command is zero and the wheel's controller is as it w
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+
+import numpy as np
 
 from smp_interfaces.msg import MotorState
 from smp_motor_control.nodes import runtime
@@ -24,6 +26,12 @@ MOST_BETWEEN = 0.5
 """Share of samples at whose voltage the relay never is, above which someone else commands."""
 
 
+Oscillation = dict[str, np.ndarray]
+"""What was recorded, around its rest: ``time`` by the stamps [s]; ``voltage`` asked for after each
+sample, and ``applied``, the mean over the interval before it [V]; ``speed`` and ``angle`` of the
+wheel [rad/s], [rad].  ``applied`` and ``angle`` are NaN where the hardware tells none."""
+
+
 @dataclass(frozen=True)
 class Relay:
     """What switches."""
@@ -34,20 +42,6 @@ class Relay:
     hysteresis: float  # the speed must pass this on either side before it switches [rad/s, wheel]
 
 
-@dataclass
-class Oscillation:
-    """What was recorded, around its rest."""
-
-    time: list[float] = field(default_factory=list)  # by the stamps [s]
-    # voltage, applied: asked for after each sample, and mean over the interval before it [V]
-    voltage: list[float] = field(default_factory=list)
-    applied: list[float] = field(default_factory=list)
-    # speed, angle: [rad/s], [rad], wheel; ``applied`` and ``angle`` are NaN where the hardware
-    # tells none
-    speed: list[float] = field(default_factory=list)
-    angle: list[float] = field(default_factory=list)
-
-
 class _Test:
     """Answers every sample with a voltage."""
 
@@ -55,22 +49,20 @@ class _Test:
         self.client, self.wheel, self.relay = client, wheel, relay
         self.centre: float | None = None
         self.output = relay.bias
-        self.seen = Oscillation()
+        # Of each sample stamp, voltage asked for and applied, speed, angle
+        self.seen: list[tuple[float, ...]] = []
         self.writer = MotorWriter(client.node, f"{wheel}/")
 
     def answer(self, message: MotorState) -> None:
-        speed, relay, seen = message.velocity, self.relay, self.seen
+        speed, relay = message.velocity, self.relay
         if not math.isfinite(speed):
             return
         if self.centre is not None and speed > self.centre + relay.hysteresis:
             self.output = relay.bias - relay.amplitude
         elif self.centre is not None and speed < self.centre - relay.hysteresis:
             self.output = relay.bias + relay.amplitude
-        seen.time.append(runtime.seconds(message.header.stamp))
-        seen.speed.append(speed)
-        seen.voltage.append(self.output)
-        seen.applied.append(message.voltage)
-        seen.angle.append(message.position)
+        stamp = runtime.seconds(message.header.stamp)
+        self.seen.append((stamp, self.output, message.voltage, speed, message.position))
         self.writer.send(self.output)
 
     def run(self, duration: float) -> Oscillation:
@@ -79,25 +71,25 @@ class _Test:
             if not self.client.until(self._acts, PATIENCE):
                 raise self._not_followed()
             self.client.spin(SETTLE)
-            if len(seen.speed) < 20:
-                raise RobotError(f"{self.wheel}: {len(seen.speed)} samples came in {SETTLE} s")
-            late = [v for t, v in zip(seen.time, seen.speed) if t > seen.time[-1] - 0.5]
+            first = len(seen)
+            if first < 20:
+                raise RobotError(f"{self.wheel}: {first} samples came in {SETTLE} s")
+            late = [row[3] for row in seen if row[0] > seen[-1][0] - 0.5]
             self.centre = sum(late) / len(late)
-            first = len(seen.speed)
             self.output = self.relay.bias + self.relay.amplitude
             self.client.spin(duration)
         return self._around_rest(first)
 
     def _acts(self) -> bool:
         """Return whether the wheel has the constant voltage, as far as its hardware tells."""
-        if not self.seen.applied or not self.writer.publisher.get_subscription_count():
+        if not self.seen or not self.writer.publisher.get_subscription_count():
             return False
-        off = abs(self.seen.applied[-1] - self.output)
+        off = abs(self.seen[-1][2] - self.output)
         return not off > FOLLOWED * self.relay.amplitude  # NaN: not known
 
     def _not_followed(self) -> RobotError:
         topic = self.writer.publisher.topic_name
-        if not self.seen.applied:
+        if not self.seen:
             return RobotError(f"{self.wheel}/motor_state: no sample came in {PATIENCE:g} s")
         if not self.writer.publisher.get_subscription_count():
             return RobotError(f"{topic}: nobody listens; start motor_plant or the robot's driver")
@@ -107,22 +99,21 @@ class _Test:
         )
 
     def _around_rest(self, first: int) -> Oscillation:
-        seen, centre, bias = self.seen, self.centre or 0.0, self.relay.bias
-        applied = [v - bias for v in seen.applied[first:]]
+        rows = np.array(self.seen[first:]).reshape(-1, 5)
+        time, angle = (rows[:, k] - rows[:1, k] for k in (0, 4))
+        bias, amplitude, centre = self.relay.bias, self.relay.amplitude, self.centre or 0.0
+        applied = rows[:, 2] - bias
         # A relay is at one of its levels but for the samples in which it switches.
-        amplitude = self.relay.amplitude
-        between = sum(abs(abs(v) - amplitude) > FOLLOWED * amplitude for v in applied)
-        if between > MOST_BETWEEN * len(applied):
+        between = np.abs(np.abs(applied) - amplitude) > FOLLOWED * amplitude
+        if np.count_nonzero(between) > MOST_BETWEEN * len(applied):
             raise self._not_followed()
-        time = [t - seen.time[first] for t in seen.time[first:]]
-        turned = [a - seen.angle[first] for a in seen.angle[first:]]
-        return Oscillation(
-            time,
-            [v - bias for v in seen.voltage[first:]],
-            applied,
-            [v - centre for v in seen.speed[first:]],
-            [a - centre * t for a, t in zip(turned, time)],
-        )
+        return {
+            "time": time,
+            "voltage": rows[:, 1] - bias,
+            "applied": applied,
+            "speed": rows[:, 3] - centre,
+            "angle": angle - centre * time,
+        }
 
 
 def oscillate(client: RobotClient, wheel: str, relay: Relay, duration: float) -> Oscillation:

@@ -25,44 +25,18 @@ from rclpy.signals import SignalHandlerOptions
 
 from smp_motor_control.entry import interrupted
 from smp_motor_control.errors import SmpError
-from smp_motor_control.nodes.conventions import (
+from smp_motor_control.nodes.conventions import (  # noqa: F401  (offered by this module)
     LATCHED,
     STREAM_PUBLISHER,
     STREAM_SUBSCRIBER,
     nanoseconds,
-    robot_topic,
     seconds,
     send_last,
     share,
     steady_timer,
-    wheel_of,
 )
-from smp_motor_control.nodes.diagnostics import ERROR, OK, STALE, WARN, Diagnostics
+from smp_motor_control.nodes.diagnostics import ERROR, OK, WARN, Diagnostics  # noqa: F401
 from smp_motor_control.nodes.executor import LeanExecutor
-from smp_motor_control.nodes.keeping_time import collect_garbage, keep_time
-
-__all__ = [
-    "ERROR",
-    "LATCHED",
-    "OK",
-    "STALE",
-    "STREAM_PUBLISHER",
-    "STREAM_SUBSCRIBER",
-    "WARN",
-    "Diagnostics",
-    "collect_garbage",
-    "finish",
-    "keep_time",
-    "nanoseconds",
-    "refuse_impossible_transitions",
-    "robot_topic",
-    "run",
-    "seconds",
-    "send_last",
-    "share",
-    "steady_timer",
-    "wheel_of",
-]
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGQUIT, signal.SIGHUP)
 

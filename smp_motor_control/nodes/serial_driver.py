@@ -17,15 +17,15 @@ from dataclasses import dataclass
 from typing import Any
 
 from rclpy.node import Node
-from std_msgs.msg import String
 
-from smp_interfaces.msg import MotorCommand, MotorDescription, MotorState
+from smp_interfaces.msg import MotorDescription, MotorState
 from smp_motor_control import WHEELS, joint_of
 from smp_motor_control.encoder import Encoder, wrap
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.motor.parameters import Gearbox
 from smp_motor_control.nodes import runtime
-from smp_motor_control.nodes.settings import Parameters, described
+from smp_motor_control.nodes.motor_writer import MotorReader
+from smp_motor_control.nodes.settings import Parameters, described, fixed
 from smp_motor_control.serial_protocol import (
     CLOCK,
     BoardState,
@@ -33,7 +33,6 @@ from smp_motor_control.serial_protocol import (
     decode_state,
     encode_voltages,
 )
-from smp_motor_control.wheel.lease import Lease
 
 POLL = 0.002
 """Interval at which the line is read [s]."""
@@ -52,20 +51,17 @@ RESET = 1.0
 class Settings:
     """Parameters of the node."""
 
-    device: str = described("/dev/ttyACM0", "Serial device of the board.", read_only=True)
-    baud: int = described(115200, "Speed of the line [1/s].", read_only=True)
-    wheel_names: tuple[str, ...] = described(
-        WHEELS, "Wheels in the order of the board's motors.", read_only=True
+    device: str = fixed("/dev/ttyACM0", "Serial device of the board.")
+    baud: int = fixed(115200, "Speed of the line [1/s].")
+    wheel_names: tuple[str, ...] = fixed(WHEELS, "Wheels in the order of the board's motors.")
+    gear_ratio: float = fixed(1.0, "Motor turns of a turn of the wheel.")
+    counts_per_revolution: float = fixed(
+        500.0, "Of the encoder, of a turn of the motor.", minimum=1.0
     )
-    gear_ratio: float = described(1.0, "Motor turns of a turn of the wheel.", read_only=True)
-    counts_per_revolution: float = described(
-        500.0, "Of the encoder, of a turn of the motor.", minimum=1.0, read_only=True
+    encoder_bits: int = fixed(
+        32, "Width of the board's counter; 0: it never wraps.", minimum=0, maximum=63
     )
-    encoder_bits: int = described(
-        32, "Width of the board's counter; 0: it never wraps.", minimum=0, maximum=63,
-        read_only=True,
-    )  # fmt: skip
-    supply_voltage: float = described(12.0, "Nominal supply [V].", minimum=0.1, read_only=True)
+    supply_voltage: float = fixed(12.0, "Nominal supply [V].", minimum=0.1)
     resistance: float = described(math.nan, "Of a motor, by ohmmeter [ohm]; NaN: not measured.")
     command_timeout: float = described(
         0.2, "Silence of a wheel's commands after which it gets 0 V [s].", minimum=0.02
@@ -83,9 +79,8 @@ class Wheel:
 
     def __init__(self, node: Node, name: str, settings: Settings) -> None:
         self.settings, self.voltage, self.commanded = settings, 0.0, -math.inf
-        self._clock = node.get_clock()
-        self.lease = Lease(settings.command_timeout)
-        self._owner = "?"
+        self._commands = MotorReader(node, name, settings.command_timeout, self._command)
+        self.lease = self._commands.lease
         self._gearbox = Gearbox(settings.gear_ratio)
         self._encoder = Encoder(settings.counts_per_revolution, settings.encoder_bits)
         self._state = MotorState(current=math.nan)
@@ -95,10 +90,6 @@ class Wheel:
         self._applied = 0.0
         self._publisher = node.create_publisher(
             MotorState, f"{name}/motor_state", runtime.STREAM_PUBLISHER
-        )
-        self._owners = node.create_publisher(String, f"{name}/motor_owner", runtime.LATCHED)
-        node.create_subscription(
-            MotorCommand, f"{name}/motor_command", self._command, runtime.STREAM_SUBSCRIBER
         )
         self._description = node.create_publisher(
             MotorDescription, f"{name}/motor_description", runtime.LATCHED
@@ -114,19 +105,13 @@ class Wheel:
             )
         )
 
-    def _command(self, message: MotorCommand) -> None:
-        now = time.monotonic()
-        voltage, writer = message.voltage, message.header.frame_id
-        stamps = runtime.nanoseconds(message.header.stamp), self._clock.now().nanoseconds
-        if math.isfinite(voltage) and self.lease.take(writer, voltage, now, *stamps):
+    def _command(self, now: float, voltage: float) -> None:
+        if math.isfinite(voltage):
             self.voltage, self.commanded = voltage, now
 
     def wanted(self, now: float, battery: float) -> float:
         """Return the voltage to command now [V]."""
-        owner = self.lease.owner(now)
-        if owner != self._owner:
-            self._owner = owner
-            self._owners.publish(String(data=owner))
+        self._commands.tell_owner(now)
         if now - self.commanded > self.settings.command_timeout:
             return 0.0
         return min(max(self.voltage, -battery), battery)

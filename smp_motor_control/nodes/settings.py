@@ -55,10 +55,24 @@ def described(
     return dataclasses.field(default=default, metadata=metadata)
 
 
-def nested(default: Any, descriptions: Mapping[str, str], *, prefix: str = "") -> Any:
-    """Return a dataclass field whose own fields become ROS parameters."""
+def fixed(default: Any, description: str, **limits: float) -> Any:
+    """Return a field as :func:`described` does, of a parameter that only the start can set."""
+    return described(default, description, read_only=True, **limits)
+
+
+def nested(default: Any, descriptions: Mapping[str, str] | None = None, *, prefix: str = "") -> Any:
+    """Return a dataclass field whose own fields become ROS parameters; they may be described."""
+    if descriptions is None:
+        inner = dataclasses.fields(default)
+        descriptions = {field.name: field.metadata["description"] for field in inner}
     metadata = {"descriptions": descriptions, "prefix": prefix}
     return dataclasses.field(default=default, metadata=metadata)
+
+
+def fields_for(kind: type, settings: Any, prefix: str = "") -> dict[str, Any]:
+    """Return the settings that are named, behind a prefix, as the fields of another dataclass."""
+    names = [field.name for field in dataclasses.fields(kind)]
+    return {n: getattr(settings, prefix + n) for n in names if hasattr(settings, prefix + n)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -216,20 +230,15 @@ def _descriptor(entry: _Entry) -> ParameterDescriptor:
         # Types are checked by `coerce`, which takes 1 for 1.0 and says what it wants.
         dynamic_typing=True,
     )
-    if entry.minimum is None and entry.maximum is None:
-        return descriptor
     low, high = entry.minimum, entry.maximum
+    if low is None and high is None:
+        return descriptor
     if isinstance(entry.default, float):
-        limits = (-1.8e308 if low is None else low, 1.7e308 if high is None else high)
-        limits = (max(limits[0], -1.7e308), limits[1])
+        low, high = (-1.7e308 if low is None else low), (1.7e308 if high is None else high)
         descriptor.floating_point_range = [
-            FloatingPointRange(from_value=float(limits[0]), to_value=float(limits[1]))
+            FloatingPointRange(from_value=float(low), to_value=float(high))
         ]
     else:
-        descriptor.integer_range = [
-            IntegerRange(
-                from_value=int(-(2**31) if low is None else low),
-                to_value=int(2**31 - 1 if high is None else high),
-            )
-        ]
+        low, high = (-(2**31) if low is None else low), (2**31 - 1 if high is None else high)
+        descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
     return descriptor

@@ -12,8 +12,8 @@ from sensor_msgs.msg import Imu, JointState
 
 from smp_interfaces.msg import MotorState
 from smp_motor_control import joint_of
-from smp_motor_control.body.kinematics import BodyCommand, Odometry, Verdict
-from smp_motor_control.body.odometry import LEAST_STEP
+from smp_motor_control.body.command import BodyCommand, Verdict
+from smp_motor_control.body.odometry import LEAST_STEP, Odometry
 from smp_motor_control.body.wheel_travel import WheelFeedback, WheelSample
 from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.odometry_output import OdometryOutput
@@ -105,7 +105,7 @@ class SkidSteerNode(Node):
     def _configure(self, settings: Settings) -> None:
         robot = settings.robot()
         self._robot = robot
-        self._linear, self._angular = settings.linear.limiter(), settings.angular.limiter()
+        self._linear, self._angular = settings.limiters()
         self._command.configure(settings.cmd_vel_timeout)
         self._feedback.max_speed = IMPLAUSIBLE * min(robot.max_wheel_speed, FASTEST)
         self._hold = settings.hold()

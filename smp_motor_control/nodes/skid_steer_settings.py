@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, make_dataclass
 
 from smp_motor_control import LEFT, RIGHT
-from smp_motor_control.body.kinematics import HeadingHold, SkidSteer, SpeedLimiter
+from smp_motor_control.body.heading import HeadingHold
+from smp_motor_control.body.kinematics import SkidSteer
+from smp_motor_control.body.speed_limiter import SpeedLimiter
 from smp_motor_control.errors import ParameterError
-from smp_motor_control.nodes.settings import described, nested
+from smp_motor_control.nodes.settings import described, fields_for, fixed, nested
 
 _LIMITS = {
     "min_velocity": "Lowest velocity; NaN takes the negative of max_velocity.",
@@ -22,6 +24,8 @@ _LIMITS = {
     "min_jerk": "Lowest jerk; NaN takes the negative of max_jerk.",
     "max_jerk": "Highest jerk [m/s^3] or [rad/s^3]; NaN for no limit.",
 }
+AxisLimits = make_dataclass("AxisLimits", [(n, float, math.nan) for n in _LIMITS], frozen=True)
+"""Limits of one component of the body's velocity; NaN for none."""
 
 
 def check_wheels(left: Sequence[str], right: Sequence[str]) -> None:
@@ -38,33 +42,11 @@ def check_wheels(left: Sequence[str], right: Sequence[str]) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class AxisLimits:
-    """Limits of one component of the body's velocity; NaN for none."""
-
-    min_velocity: float = math.nan
-    max_velocity: float = math.nan
-    max_acceleration_reverse: float = math.nan
-    max_acceleration: float = math.nan
-    max_deceleration: float = math.nan
-    max_deceleration_reverse: float = math.nan
-    min_jerk: float = math.nan
-    max_jerk: float = math.nan
-
-    def limiter(self) -> SpeedLimiter:
-        """Return the limiter with these limits."""
-        return SpeedLimiter(**{item.name: getattr(self, item.name) for item in fields(self)})
-
-
-@dataclass(frozen=True, kw_only=True)
 class Settings:
     """Parameters of the node, validated together."""
 
-    left_wheel_names: tuple[str, ...] = described(
-        LEFT, "Wheels of the left side: their namespaces.", read_only=True
-    )
-    right_wheel_names: tuple[str, ...] = described(
-        RIGHT, "Wheels of the right side: their namespaces.", read_only=True
-    )
+    left_wheel_names: tuple[str, ...] = fixed(LEFT, "Wheels of the left side: their namespaces.")
+    right_wheel_names: tuple[str, ...] = fixed(RIGHT, "Wheels of the right side: their namespaces.")
     wheel_separation: float = described(0.4, "Between left and right wheels [m].")
     wheel_radius: float = described(0.1, "Radius of the wheels [m].")
     wheel_separation_multiplier: float = described(
@@ -75,35 +57,29 @@ class Settings:
     max_wheel_velocity: float = described(
         2.9, "What every wheel reaches [rad/s]; commands beyond are scaled. 0: no limit.", minimum=0
     )
-    publish_rate: float = described(
-        50.0,
-        "Set-points and odometry per second [Hz].",
-        minimum=1.0,
-        maximum=1000.0,
-        read_only=True,
+    publish_rate: float = fixed(
+        50.0, "Set-points and odometry per second [Hz].", minimum=1.0, maximum=1000.0
     )
     cmd_vel_timeout: float = described(
         0.5, "Age of a command at which the body brakes [s]; 0: never.", minimum=0.0
     )
-    use_stamped_vel: bool = described(
-        True,
-        "Which of two publishers is followed: TwistStamped (true) or Twist (false).",
-        read_only=True,
+    use_stamped_vel: bool = fixed(
+        True, "Which of two publishers is followed: TwistStamped (true) or Twist (false)."
     )
     feedback_timeout: float = described(
         0.5, "Silence of a wheel that is reported [s].", minimum=0.01
     )
     open_loop: bool = described(False, "Odometry from commands instead of wheels.")
-    velocity_rolling_window_size: int = described(
-        10, "Steps that the reported velocity is averaged over.", minimum=1, read_only=True
+    velocity_rolling_window_size: int = fixed(
+        10, "Steps that the reported velocity is averaged over.", minimum=1
     )
-    odom_frame_id: str = described("odom", "Frame of the odometry.", read_only=True)
-    base_frame_id: str = described("base_link", "Frame of the body.", read_only=True)
-    tf_frame_prefix_enable: bool = described(
-        True, "Prefix the frames with tf_frame_prefix, or else the namespace.", read_only=True
+    odom_frame_id: str = fixed("odom", "Frame of the odometry.")
+    base_frame_id: str = fixed("base_link", "Frame of the body.")
+    tf_frame_prefix_enable: bool = fixed(
+        True, "Prefix the frames with tf_frame_prefix, or else the namespace."
     )
-    tf_frame_prefix: str = described("", "Prefix of the frames.", read_only=True)
-    enable_odom_tf: bool = described(True, "Publish odom to base on /tf.", read_only=True)
+    tf_frame_prefix: str = fixed("", "Prefix of the frames.")
+    enable_odom_tf: bool = fixed(True, "Publish odom to base on /tf.")
     travel_noise: float = described(
         1e-4, "Variance that one metre of a side's travel adds [m^2/m].", minimum=0.0
     )
@@ -125,22 +101,22 @@ class Settings:
         check_wheels(self.left_wheel_names, self.right_wheel_names)
         self.robot()
         self.hold()
-        for name, axis in (("linear.x", self.linear), ("angular.z", self.angular)):
-            try:
-                axis.limiter()
-            except ParameterError as error:
-                raise ParameterError(f"{name}: {error}") from None
+        self.limiters()
 
     def robot(self) -> SkidSteer:
         """Return the geometry."""
-        return SkidSteer(
-            wheel_separation=self.wheel_separation,
-            wheel_radius=self.wheel_radius,
-            wheel_separation_multiplier=self.wheel_separation_multiplier,
-            left_wheel_radius_multiplier=self.left_wheel_radius_multiplier,
-            right_wheel_radius_multiplier=self.right_wheel_radius_multiplier,
-            max_wheel_speed=self.max_wheel_velocity or math.inf,
-        )
+        most = self.max_wheel_velocity or math.inf
+        return SkidSteer(**fields_for(SkidSteer, self), max_wheel_speed=most)
+
+    def limiters(self) -> list[SpeedLimiter]:
+        """Return the limiters of linear and angular velocity."""
+        made = []
+        for name, axis in (("linear.x", self.linear), ("angular.z", self.angular)):
+            try:
+                made.append(SpeedLimiter(**asdict(axis)))
+            except ParameterError as error:
+                raise ParameterError(f"{name}: {error}") from None
+        return made
 
     def hold(self) -> HeadingHold:
         """Return a heading controller."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from dataclasses import dataclass
 
@@ -11,11 +10,11 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
 from smp_motor_control import WHEELS, joint_of
-from smp_motor_control.errors import ParameterError, SmpError
+from smp_motor_control.errors import ParameterError
 from smp_motor_control.keyboard import Keyboard, Speeds, keys_of
 from smp_motor_control.nodes import runtime
-from smp_motor_control.nodes.settings import Parameters, described
-from smp_motor_control.nodes.terminal import Terminal, require_terminal
+from smp_motor_control.nodes.settings import Parameters, described, fixed
+from smp_motor_control.nodes.terminal import Terminal
 
 HELP = """\
 teleop_wheels: hold a key to drive; the wheels stop {timeout:g} s after it is released.
@@ -44,17 +43,11 @@ class Settings:
     key_timeout: float = described(
         0.6, "Time without a repeat after which a key counts as released [s].", maximum=5.0
     )
-    rate: float = described(
-        20.0, "Commands per second [Hz].", minimum=5.0, maximum=100.0, read_only=True
-    )
-    use_stamped_vel: bool = described(
-        True, "Publish TwistStamped (true) or Twist (false).", read_only=True
-    )
-    frame_id: str = described("base_link", "Frame of a stamped command.", read_only=True)
+    rate: float = fixed(20.0, "Commands per second [Hz].", minimum=5.0, maximum=100.0)
+    use_stamped_vel: bool = fixed(True, "Publish TwistStamped (true) or Twist (false).")
+    frame_id: str = fixed("base_link", "Frame of a stamped command.")
 
-    wheel_names: tuple[str, ...] = described(
-        WHEELS, "Wheels that the keys 1, 2, ... select.", read_only=True
-    )
+    wheel_names: tuple[str, ...] = fixed(WHEELS, "Wheels that the keys 1, 2, ... select.")
 
     def __post_init__(self) -> None:
         self.speeds()
@@ -182,9 +175,4 @@ class TeleopWheels(Node):
 
 def main(argv: list[str] | None = None) -> int:
     """Run the node until x, Ctrl-C or a signal; return its exit code."""
-    try:
-        require_terminal()
-    except SmpError as error:
-        print(f"teleop_wheels: {error}", file=sys.stderr)
-        return error.exit_code
     return runtime.run("teleop_wheels", TeleopWheels, argv)

@@ -43,7 +43,10 @@ class Terminal:
         leave: Callable[[], None],
         resume: Callable[[], None],
     ) -> None:
-        require_terminal()
+        if not sys.stdin.isatty():
+            raise SmpError("standard input is not a terminal: start it in a terminal of its own")
+        if in_background(sys.stdin.fileno()):
+            raise SmpError("runs in the background of its terminal: start it in the foreground")
         self._fd = sys.stdin.fileno()
         self._poll = select.poll()
         self._poll.register(self._fd, select.POLLIN)
@@ -111,11 +114,3 @@ class Terminal:
 def in_background(fd: int) -> bool:
     """Tell whether another process group has the terminal."""
     return os.tcgetpgrp(fd) != os.getpgrp()
-
-
-def require_terminal() -> None:
-    """Refuse to go on without a terminal to read keys from."""
-    if not sys.stdin.isatty():
-        raise SmpError("standard input is not a terminal: start it in a terminal of its own")
-    if in_background(sys.stdin.fileno()):
-        raise SmpError("runs in the background of its terminal: start it in the foreground")

@@ -15,10 +15,12 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
 from smp_interfaces.msg import MotorDescription, MotorState, PidState
+from smp_motor_control import joint_of
 from smp_motor_control.encoder import Encoder
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.motor.parameters import Gearbox
 from smp_motor_control.nodes import runtime
+from smp_motor_control.nodes.keeping_time import keep_time
 from smp_motor_control.nodes.motor_writer import MotorWriter
 from smp_motor_control.nodes.settings import Parameters, given_parameters
 from smp_motor_control.nodes.wheel_report import WheelReport, pid_state
@@ -40,8 +42,9 @@ class WheelPid(LifecycleNode):
         check = lambda settings: wheel.check(settings.wheel)  # noqa: E731
         self._given = Parameters(self, Settings, self._change, check=check)
         settings = self._given.settings
-        self._joint = settings.joint_name or f"{runtime.wheel_of(self)}_wheel_joint"
-        if self._joint == "_wheel_joint":
+        self._robot, _, name = self.get_namespace().rpartition("/")
+        self._joint = settings.joint_name or joint_of(name)
+        if self._joint == joint_of(""):
             raise ParameterError(
                 "wheel_pid needs joint_name, or a wheel's namespace: -r __ns:=/front_left"
             )
@@ -66,7 +69,7 @@ class WheelPid(LifecycleNode):
             (self.destroy_publisher, self._shown),
             (self.destroy_subscription, listen(MotorState, "motor_state", self._hear, heard)),
             (self.destroy_subscription,
-             listen(JointState, runtime.robot_topic(self, "wheel_setpoints"), self._ask, heard)),
+             listen(JointState, f"{self._robot}/wheel_setpoints", self._ask, heard)),
             (self.destroy_subscription,
              listen(MotorDescription, "motor_description", self._describe, runtime.LATCHED)),
             (self.destroy_service, self.create_service(Trigger, "~/reset", self._reset)),
@@ -79,7 +82,7 @@ class WheelPid(LifecycleNode):
         """Answer feedback from now on; the wheel waits for its first set-point."""
         affinity = tuple(cpu for cpu in self.settings.cpu_affinity if cpu >= 0)
         priority = self.settings.scheduling_priority
-        self._report.timekeeping = runtime.keep_time(self, priority, affinity)
+        self._report.timekeeping = keep_time(self, priority, affinity)
         self._wheel.activate(time.monotonic())
         self._report.update()
         return super().on_activate(state)

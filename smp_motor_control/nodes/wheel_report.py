@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Mapping
 from typing import Any
 
@@ -86,7 +87,7 @@ class WheelReport:
             advice.append(UNTUNED)
         if self._diagnostics.due:
             self._reported = totals
-            runtime.collect_garbage()
+            gc.collect()
         wheel, clock = self._wheel, self._wheel.clock
         values: dict[str, object] = {
             "steps": wheel.steps,

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.motor.model import MotorModel
-from smp_motor_control.nodes.settings import described, nested
+from smp_motor_control.nodes.settings import described, fields_for, fixed, nested
 from smp_motor_control.observer import ObserverNoise
 from smp_motor_control.pid import PidGains
 from smp_motor_control.reference.profile import Drive, ProfileLimits
@@ -50,26 +51,16 @@ _NOISE = {
 _NO_NOISE_GIVEN, _NO_GAINS_GIVEN, _NO_FAULTS_GIVEN = ObserverNoise(), PidGains(), FaultLimits()
 
 
-def _model(name: str, description: str) -> float:
-    default: float = described(0.0, description, minimum=0.0, name=f"model.{name}")
-    return default
-
-
-def _drive(name: str, description: str) -> float:
-    default: float = described(0.0, description, minimum=0.0, name=f"drive.{name}")
-    return default
+def _of(group: str, name: str, description: str) -> Any:
+    return described(0.0, description, minimum=0.0, name=f"{group}.{name}")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
     """Parameters of the node."""
 
-    joint_name: str = described(
-        "", "Joint to control; empty for <namespace>_wheel_joint.", read_only=True
-    )
-    autostart: bool = described(
-        True, "Configure and activate without being asked to.", read_only=True
-    )
+    joint_name: str = fixed("", "Joint to control; empty for <namespace>_wheel_joint.")
+    autostart: bool = fixed(True, "Configure and activate without being asked to.")
     setpoint_timeout: float = described(
         0.5, "Silence of set-points after which the wheel is braked [s].", minimum=0.01,
         maximum=60.0,
@@ -93,22 +84,28 @@ class Settings:
     reference_doubt: float = described(
         0.0, "By which that lag may be wrong [s].", minimum=0.0, maximum=1.0
     )
-    drive_top_speed: float = _drive(
-        "top_speed", "Speed at which the voltage for changes is used up [rad/s]; 0: no limit."
+    drive_top_speed: float = _of(
+        "drive",
+        "top_speed",
+        "Speed at which the voltage for changes is used up [rad/s]; 0: no limit.",
     )
-    drive_time_constant: float = _drive(
-        "time_constant", "Sum of the time constants that changes are made for [s]."
+    drive_time_constant: float = _of(
+        "drive", "time_constant", "Sum of the time constants that changes are made for [s]."
     )
-    drive_time_constant_product: float = _drive("time_constant_product", "Their product [s^2].")
+    drive_time_constant_product: float = _of(
+        "drive", "time_constant_product", "Their product [s^2]."
+    )
     speed_source: str = described("measured", "measured, difference or observer.")
     difference_window: int = described(
         4, "Samples to difference counts over.", minimum=1, maximum=1000
     )
-    model_dc_gain: float = _model("dc_gain", "Speed per volt [rad/s/V, motor]; 0: no model.")
-    model_time_constant: float = _model("time_constant", "Sum of the time constants [s].")
-    model_time_constant_product: float = _model("time_constant_product", "Their product [s^2].")
-    model_static_voltage: float = _model("static_voltage", "What dry friction takes [V].")
-    model_delay: float = _model("delay", "From voltage to effect [s].")
+    model_dc_gain: float = _of("model", "dc_gain", "Speed per volt [rad/s/V, motor]; 0: no model.")
+    model_time_constant: float = _of("model", "time_constant", "Sum of the time constants [s].")
+    model_time_constant_product: float = _of(
+        "model", "time_constant_product", "Their product [s^2]."
+    )
+    model_static_voltage: float = _of("model", "static_voltage", "What dry friction takes [V].")
+    model_delay: float = _of("model", "delay", "From voltage to effect [s].")
     observer: ObserverNoise = nested(_NO_NOISE_GIVEN, _NOISE, prefix="observer.")  # noqa: RUF009
     faults: FaultLimits = nested(_NO_FAULTS_GIVEN, _FAULTS)  # noqa: RUF009
     fault_retry: float = described(
@@ -119,13 +116,10 @@ class Settings:
     implausible_velocity: float = described(
         1000.0, "Feedback beyond this speed is left out [rad/s, wheel].", minimum=0.0
     )
-    scheduling_priority: int = described(
-        0, "SCHED_FIFO priority; 0 for the usual scheduler.", minimum=0, maximum=99,
-        read_only=True,
-    )  # fmt: skip
-    cpu_affinity: tuple[int, ...] = described(
-        (-1,), "Processors to run on; -1 for any.", read_only=True
+    scheduling_priority: int = fixed(
+        0, "SCHED_FIFO priority; 0 for the usual scheduler.", minimum=0, maximum=99
     )
+    cpu_affinity: tuple[int, ...] = fixed((-1,), "Processors to run on; -1 for any.")
     wheel: WheelSettings = field(init=False, repr=False)  # what they make of the controller
 
     def __post_init__(self) -> None:
@@ -133,35 +127,19 @@ class Settings:
             self.max_velocity, self.max_acceleration, self.max_jerk
         )
         loop = LoopSettings(
-            gains=self.gains,
+            **fields_for(LoopSettings, self),
             limits=limits,
-            transition_time=self.transition_time,
-            reference_delay=self.reference_delay,
-            reference_doubt=self.reference_doubt,
             drive=self._drive(),
-            speed_source=self.speed_source,
-            difference_window=self.difference_window,
             model=self._motor_model(),
             noise=self.observer,
         )
-        wheel = WheelSettings(
-            loop=loop,
-            faults=self.faults,
-            setpoint_timeout=self.setpoint_timeout,
-            feedback_timeout=self.feedback_timeout,
-            fault_retry=self.fault_retry,
-            implausible_velocity=self.implausible_velocity,
-        )
+        wheel = WheelSettings(**fields_for(WheelSettings, self), loop=loop)
         object.__setattr__(self, "wheel", wheel)
 
     def _drive(self) -> Drive | None:
         if self.drive_top_speed == 0.0:
             return None
-        return Drive(
-            top_speed=self.drive_top_speed,
-            time_constant=self.drive_time_constant,
-            time_constant_product=self.drive_time_constant_product,
-        )
+        return Drive(**fields_for(Drive, self, "drive_"))
 
     def _motor_model(self) -> MotorModel | None:
         given = (self.model_dc_gain, self.model_time_constant)
@@ -169,10 +147,4 @@ class Settings:
             return None
         if 0.0 in given:
             raise ParameterError("model.dc_gain and model.time_constant must be given together")
-        return MotorModel(
-            dc_gain=self.model_dc_gain,
-            time_constant=self.model_time_constant,
-            time_constant_product=self.model_time_constant_product,
-            static_voltage=self.model_static_voltage,
-            delay=self.model_delay,
-        )
+        return MotorModel(**fields_for(MotorModel, self, "model_"))

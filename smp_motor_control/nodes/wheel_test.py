@@ -21,8 +21,6 @@ from smp_motor_control.nodes.motor_writer import MotorWriter
 from smp_motor_control.nodes.robot_client import RobotClient, RobotError
 from smp_motor_control.wheel.protection import Bounds, Protection
 
-COLUMNS = ("time", "age", "command", "voltage", "velocity", "position", "count", "phase")
-
 Law = Callable[[float], float]
 """From the time since a phase began [s] to a voltage [V]."""
 
@@ -33,7 +31,7 @@ Counter = Callable[[MotorState], float]
 class Tape:
     """What one wheel's hardware reported, a row for each sample."""
 
-    # of :data:`COLUMNS`: stamp [s], its age on arrival [s], what had been commanded [V], what
+    # stamp [s], its age on arrival [s], what had been commanded [V], what
     # was reported [V], [rad/s], [rad], [counts], and the number of the phase
     rows: list[tuple[float, ...]] = field(default_factory=list)
 
@@ -45,17 +43,7 @@ class Tape:
 
 
 class WheelTest:
-    """The test of some wheels; all are heard, one or all are driven.
-
-    Parameters
-    ----------
-    client : RobotClient
-        Whose wheels are paused.
-    counters : mapping of str to callable
-        By wheel that is heard, from a ``MotorState`` to the total count.
-    bounds : Bounds
-        What ends the test.
-    """
+    """The test of some wheels, which the client has paused; all are heard, one or all driven."""
 
     def __init__(
         self, client: RobotClient, counters: Mapping[str, Counter], bounds: Bounds
@@ -129,20 +117,12 @@ def descriptions(
 ) -> dict[str, MotorDescription]:
     """Return what the hardware says of itself; wheels that say nothing in time are left out."""
     found: dict[str, MotorDescription] = {}
-    made = [
-        client.node.create_subscription(
-            MotorDescription,
-            f"{wheel}/motor_description",
-            lambda message, wheel=wheel: found.update({wheel: message}),
-            LATCHED,
-        )
+    topics = {
+        f"{wheel}/motor_description": lambda message, wheel=wheel: found.update({wheel: message})
         for wheel in wheels
-    ]
-    try:
+    }
+    with client.listen(MotorDescription, topics, LATCHED):
         client.until(lambda: len(found) == len(wheels), patience)
-    finally:
-        for subscription in made:
-            client.node.destroy_subscription(subscription)
     return found
 
 

@@ -17,12 +17,7 @@ _NO_WEIGHT = 1e-12
 
 
 class ReferencePath:
-    """Leads the reference, and remembers where it was.
-
-    Parameters
-    ----------
-    profile : Profile
-        Source of the reference.
+    """Leads the reference of a profile, and remembers where it was.
 
     Attributes
     ----------

@@ -6,10 +6,7 @@ import math
 from collections.abc import Sequence
 
 from smp_motor_control.errors import ParameterError
-from smp_motor_control.reference.feasibility import peak_voltage, shortest_common_transition
 from smp_motor_control.reference.minimum_jerk import (
-    PEAK_ACCELERATION,
-    PEAK_JERK,
     Limited,
     MinimumJerk,
     ProfileLimits,
@@ -18,20 +15,7 @@ from smp_motor_control.reference.minimum_jerk import (
 )
 from smp_motor_control.reference.time_optimal import Drive, VoltageLimited
 
-__all__ = [
-    "PEAK_ACCELERATION",
-    "PEAK_JERK",
-    "UNLIMITED",
-    "Drive",
-    "Limited",
-    "MinimumJerk",
-    "Profile",
-    "ProfileLimits",
-    "Reference",
-    "minimum_jerk_duration",
-    "peak_voltage",
-    "shortest_common_transition",
-]
+__all__ = ["UNLIMITED", "Drive", "Profile", "ProfileLimits", "Reference"]
 
 UNLIMITED = ProfileLimits()
 """A reference that jumps."""

@@ -20,11 +20,6 @@ class Bounds:
 class Protection:
     """Watches the samples of one wheel under test.
 
-    Parameters
-    ----------
-    bounds : Bounds
-        What it may reach.
-
     Examples
     --------
     >>> watched = Protection(Bounds(speed=10.0))

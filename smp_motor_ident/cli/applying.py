@@ -8,11 +8,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from smp_motor_control.parameter_file import flat, read_parameters
+from smp_motor_control.parameter_file import read_parameters
 from smp_motor_ident.cli.processes import connect
 from smp_motor_ident.errors import ParameterError
-from smp_motor_ident.tune import Design
-from smp_motor_ident.tune.writing import parameters
 
 
 def apply(wanted: Mapping[str, Mapping[str, Any]], arguments: argparse.Namespace) -> int:
@@ -38,11 +36,6 @@ def apply(wanted: Mapping[str, Mapping[str, Any]], arguments: argparse.Namespace
     for wheel in outcome.missing:
         print(f"{wheel} did not return: if it drives on it does so with the new gains")
     return 1
-
-
-def from_designs(designs: Mapping[str, Design]) -> dict[str, dict[str, Any]]:
-    """Return the parameters of designed wheels by their ROS names."""
-    return {wheel: flat(parameters(design)) for wheel, design in designs.items()}
 
 
 def from_file(path: Path) -> dict[str, dict[str, Any]]:

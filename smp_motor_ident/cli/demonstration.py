@@ -14,7 +14,7 @@ from smp_motor_control import LEFT, RIGHT, WHEELS
 from smp_motor_control.motor.file import load_motors
 from smp_motor_ident.cli import steps
 from smp_motor_ident.cli.demo import NAME
-from smp_motor_ident.cli.driving import drive_figure, longest_stall, read_answers
+from smp_motor_ident.cli.driving import Drive, answers_of, drive_figure, longest_stall, read_drive
 from smp_motor_ident.cli.processes import (
     Processes,
     connect,
@@ -65,10 +65,10 @@ def work(arguments: argparse.Namespace) -> int:
         robot = start(steps.Robot(processes, client, WHEELS, folder), motors, arguments.rate)
         say(f"running: motor_plant, {len(WHEELS)} wheel_pid, skid_steer (ROS domain {domain})")
         estimates, gains = learn(robot, say)
-        bag, segments, stall = drive(robot, gains, say)
+        driven, segments, stall = drive(robot, gains, say)
     hardware = {wheel: estimates[wheel].hardware for wheel in WHEELS}
-    answers = read_answers(bag, segments, hardware)
-    figure = drive_figure(bag, {"left": LEFT, "right": RIGHT}, hardware)
+    answers = answers_of(driven, segments, hardware)
+    figure = drive_figure(driven, {"left": LEFT, "right": RIGHT}, hardware)
     (folder / "drive.svg").write_text(figure, encoding="utf-8")
     show(truth, estimates, gains, answers)
     checks = check_estimates(truth, estimates)
@@ -126,11 +126,11 @@ def learn(robot: steps.Robot, say: Any) -> tuple[dict[str, Estimate], dict[str, 
 
 def drive(
     robot: steps.Robot, gains: Mapping[str, Mapping[str, Any]], say: Any
-) -> tuple[Path, list[tuple[str, float, float]], float]:
-    """Drive through :data:`DRIVE` with the gains; return bag, segments and longest stall [s]."""
+) -> tuple[Drive, list[tuple[str, float, float]], float]:
+    """Drive through :data:`DRIVE` with the gains; return recording, segments and stall [s]."""
     from smp_motor_control.nodes.driving import drive_body
 
-    steps.set_gains(robot, gains)
+    robot.client.set_parameters({f"{wheel}/wheel_pid": new for wheel, new in gains.items()})
     robot.switch("activate")
     say("gains set in the running controllers; driving")
     drives = []
@@ -139,12 +139,13 @@ def drive(
         bag = steps.record(robot, name, "motor_command", "pid_state")
         segments = drive_body(robot.client, DRIVE, robot.wheels)
         robot.processes.stop("record")
-        stall = longest_stall(bag, robot.wheels)
-        drives.append((stall, bag, segments))
+        read = read_drive(bag, robot.wheels)
+        stall = longest_stall(read)
+        drives.append((stall, name, read, segments))
         if stall <= STALL:
             break
         say(f"this machine stood still for {1e3 * stall:.0f} ms during drive {attempt}")
     robot.switch("deactivate")
-    stall, bag, segments = min(drives, key=lambda one: one[0])
-    say(f"showing {bag.name}")
-    return bag, segments, stall
+    stall, name, read, segments = min(drives, key=lambda one: one[0])
+    say(f"showing {name}")
+    return read, segments, stall

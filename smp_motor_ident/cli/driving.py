@@ -41,36 +41,40 @@ class Answer:
     overshoot: float  # beyond the set-point [% of the change]
 
 
-def read_answers(
-    bag: Path, segments: Sequence[tuple[str, float, float]], hardware: Mapping[str, Hardware]
+Drive = Mapping[str, Columns]
+"""What is judged and drawn of the recording of a drive, by topic."""
+
+
+def read_drive(bag: Path, wheels: Sequence[str]) -> Drive:
+    """Read the samples of wheels and the answers of their controllers."""
+    wanted = {f"/{wheel}/motor_state": ["encoder_count"] for wheel in wheels}
+    return read_columns(bag, wanted | {f"/{w}/pid_state": ["setpoint", "age"] for w in wheels})
+
+
+def answers_of(
+    drive: Drive, segments: Sequence[tuple[str, float, float]], hardware: Mapping[str, Hardware]
 ) -> dict[str, list[Answer]]:
     """Measure rise, settling and overshoot of every wheel in every segment."""
-    wanted = {f"/{wheel}/motor_state": ["encoder_count"] for wheel in hardware}
-    wanted |= {f"/{wheel}/pid_state": ["setpoint"] for wheel in hardware}
-    read = read_columns(bag, wanted)
     answers = {}
     for wheel, known in hardware.items():
-        time, speed = wheel_speed(read[f"/{wheel}/motor_state"], known)
-        asked = read[f"/{wheel}/pid_state"]
+        time, speed = wheel_speed(drive[f"/{wheel}/motor_state"], known)
+        asked = drive[f"/{wheel}/pid_state"]
         found = [_answer(time, speed, asked, *segment) for segment in segments]
         answers[wheel] = [a for a in found if a is not None]
     return answers
 
 
 def drive_figure(
-    bag: Path, sides: Mapping[str, Sequence[str]], hardware: Mapping[str, Hardware]
+    drive: Drive, sides: Mapping[str, Sequence[str]], hardware: Mapping[str, Hardware]
 ) -> str:
     """Return an SVG file: what the wheels of each side were asked for, and what they did."""
     wheels = list(hardware)
-    wanted = {f"/{wheel}/motor_state": ["encoder_count"] for wheel in wheels}
-    wanted |= {f"/{wheel}/pid_state": ["setpoint"] for wheel in wheels}
-    read = read_columns(bag, wanted)
-    begin = min(float(columns.time[0]) for columns in read.values())
+    begin = min(float(columns.time[0]) for columns in drive.values())
     charts = []
     for side, names in sides.items():
-        asked = read[f"/{names[0]}/pid_state"]
+        asked = drive[f"/{names[0]}/pid_state"]
         time = asked.time
-        speeds = {w: wheel_speed(read[f"/{w}/motor_state"], hardware[w]) for w in names}
+        speeds = {w: wheel_speed(drive[f"/{w}/motor_state"], hardware[w]) for w in names}
         curves = [Curve("set-point", asked.fields["setpoint"], "muted")]
         curves += [
             Curve(w, np.interp(time, *speeds[w]), f"wheel-{wheels.index(w) % 4 + 1}") for w in names
@@ -89,24 +93,28 @@ def drive_figure(
     return document(charts, wheels)
 
 
-def longest_stall(bag: Path, wheels: Sequence[str]) -> float:
+def longest_stall(drive: Drive) -> float:
     """Return how long the machine that simulates stood still at worst."""
-    wanted = {f"/{wheel}/motor_state": ["encoder_count"] for wheel in wheels}
-    wanted |= {f"/{wheel}/pid_state": ["age"] for wheel in wheels}
-    read = read_columns(bag, wanted)
-    gaps = (np.diff(c.time) for c in read.values() if "age" not in c.fields)
-    ages = (c.fields["age"] for c in read.values() if "age" in c.fields)
+    gaps = (np.diff(c.time) for c in drive.values() if "age" not in c.fields)
+    ages = (c.fields["age"] for c in drive.values() if "age" in c.fields)
     return max(float(np.max(found)) for found in (*gaps, *ages))
+
+
+def wheel_angle(state: Columns, hardware: Hardware) -> Array:
+    """Return the wheel's angle as its counts tell it, where there are counts."""
+    if not hardware.counts_per_revolution:
+        return state.fields["position"]
+    turn = 2 * np.pi / hardware.counts_per_revolution
+    counts = unwrap(state.fields["encoder_count"], hardware.encoder_bits).astype(np.float64)
+    return Gearbox(hardware.gear_ratio).to_wheel(turn) * counts
 
 
 def wheel_speed(state: Columns, hardware: Hardware) -> tuple[Array, Array]:
     """Return the wheel's speed as its encoder saw it."""
-    counts = unwrap(state.fields["encoder_count"], hardware.encoder_bits)
-    turn = 2 * np.pi / float(hardware.counts_per_revolution or 1.0)
-    angle = Gearbox(hardware.gear_ratio).to_wheel(turn) * (counts - counts[0])
+    angle = wheel_angle(state, hardware)
     step = float(np.median(np.diff(state.time)))
     time = np.arange(state.time[0], state.time[-1], step)
-    even = np.interp(time, state.time, angle)
+    even = np.interp(time, state.time, angle - angle[0])
     window = max(2 * round(SMOOTHING / step / 2) + 1, 5)
     speed = np.asarray(savgol_filter(even, window, 2, deriv=1, delta=step), dtype=np.float64)
     return time, speed

@@ -50,7 +50,7 @@ def work(
     for path, result in _results(left, settings, arguments.scheduler):
         results[path] = result
         if not result.get("lost"):  # what was not its fault is tried again by the next run
-            _write(files[path], result)
+            write_together({files[path]: json.dumps(result, allow_nan=False)}, force=True)
         if not arguments.quiet:
             print(f"{path}: {result['failure'] or ', '.join(result['motors'])}", flush=True)
     rows = [row for path in files for row in _rows(path, results[path])]
@@ -166,12 +166,6 @@ def on_cluster(
             yield path, future.result() if lost is None else {
                 "failure": f"{path}: {lost}", "motors": {}, "lost": True
             }  # fmt: skip
-
-
-def _write(file: Path, result: dict[str, Any]) -> None:
-    draft = file.with_suffix(".part")
-    draft.write_text(json.dumps(result, allow_nan=False))
-    os.replace(draft, file)
 
 
 def _rows(path: str, result: dict[str, Any]) -> list[fleet.Row]:

@@ -129,13 +129,14 @@ def fixed_parameters(items: Sequence[str]) -> dict[str, float]:
 
 def signal_map(arguments: argparse.Namespace) -> bag.SignalMap | None:
     """Return the mapping that the arguments ask for."""
-    items = [item for group in arguments.map for item in group]
-    if items and arguments.mapping:
+    if arguments.map and arguments.mapping:
         raise ParameterError("--map and --mapping exclude each other; write all into the file")
     if arguments.mapping:
         loaded = bag.load(arguments.mapping)
         return replace(loaded, msg_files=(*loaded.msg_files, *arguments.msg))
-    return bag.parse(items, arguments.msg) if items or arguments.msg else None
+    if not (arguments.map or arguments.msg):
+        return None
+    return bag.parse(arguments.map, arguments.msg)
 
 
 def _read(

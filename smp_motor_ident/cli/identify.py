@@ -47,7 +47,7 @@ def parser() -> argparse.ArgumentParser:
     add("--model", default="auto", help="force a model instead of choosing one")
     add("--fix", action="append", default=[], metavar="NAME=VALUE", help="known parameter, in SI")
     add("--accept-unreliable", action="store_true", help="end with 0 although numbers may be off")
-    add("--map", action="append", nargs="+", default=[], metavar="KEY=VALUE", help="see below")
+    add("--map", action="extend", nargs="+", default=[], metavar="KEY=VALUE", help="see below")
     add("--mapping", metavar="FILE", help="the same as YAML file")
     add("--msg", action="append", default=[], metavar="FILE", help=".msg file of an unknown type")
     add(

@@ -19,7 +19,7 @@ Reconstruct = Callable[[Record], Record]
 
 def signal_map(arguments: argparse.Namespace) -> bag.SignalMap:
     """Return the mapping, the set-point standing where a voltage does."""
-    items = [item for group in arguments.map for item in group]
+    items: list[str] = arguments.map
     if arguments.mapping or not any(_SETPOINT.search(item) for item in items):
         raise ParameterError(
             "--controller needs --map setpoint=... velocity=...: what the loop was given, in its "

@@ -110,11 +110,6 @@ class Schedule:
     Parts of a kind are late alike: what is left is what was planned and, for each part, by how
     much the parts of its kind that are done took longer on average.
 
-    Parameters
-    ----------
-    clock : callable
-        Returns the time [s].
-
     Examples
     --------
     >>> now = 0.0

@@ -15,7 +15,6 @@ import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import IO, Any
 
 from smp_motor_control.entry import wrong_domain
@@ -103,12 +102,8 @@ class Processes:
     """A set of node processes that ends with the block that holds it, however that ends.
 
     Each is the leader of its own process group, is asked to stop by SIGINT, then by SIGTERM,
-    then killed; the kernel sends it SIGTERM if this process dies without a word.
-
-    Parameters
-    ----------
-    logs : Path
-        Folder for one ``NAME.log`` each.
+    then killed; the kernel sends it SIGTERM if this process dies without a word.  What it says is
+    in a ``NAME.log`` of its own.
     """
 
     def __init__(self, logs: Path) -> None:
@@ -120,12 +115,7 @@ class Processes:
         self._logs.mkdir(parents=True, exist_ok=True)
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Stop all; a second Ctrl-C meanwhile does not keep any alive."""
         kept = {s: signal.signal(s, signal.SIG_IGN) for s in (signal.SIGINT, signal.SIGTERM)}
         try:
@@ -173,11 +163,9 @@ class Processes:
                 raise ProcessError(f"{name} is not done after {timeout:.0f} s")
             self.check(but=name)
             time.sleep(0.05)
-        del self._running[name]
         if process.returncode != 0:
-            raise ProcessError(
-                f"{name} ended with exit code {process.returncode}: {self.last_words(name)}"
-            )
+            self.check()
+        del self._running[name]
 
     def stop(self, *names: str) -> None:
         """Stop processes together: politely, then firmly."""

@@ -26,12 +26,7 @@ NAME, REPORT = "commissioning.json", "report.html"
 class Protocol:
     """Findings, figures and verdict of a commissioning, in ``commissioning.json`` and a page.
 
-    Parameters
-    ----------
-    folder : Path
-        Where both files are; a protocol that is there already is gone on with.
-    accepted : sequence of str
-        Codes of findings that stop nothing.
+    One that is in the folder already is gone on with; findings of accepted codes stop nothing.
     """
 
     def __init__(self, folder: Path, accepted: Sequence[str] = ()) -> None:

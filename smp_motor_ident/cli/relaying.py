@@ -46,7 +46,7 @@ def tune_by_relay(arguments: argparse.Namespace, files: Sequence[Path]) -> int:
 
         relay = Relay(bias, amplitude, arguments.relay_hysteresis)
         seen = oscillate(robot, wheel, relay, arguments.relay_seconds)
-    gain, period = read_oscillation(*evenly(vars(seen)))
+    gain, period = read_oscillation(*evenly(seen))
     rule, structure = arguments.rule or "tyreus_luyben", arguments.structure or "pi"
     ruled = by_rule(rule, structure, gain, period)
     line = (

@@ -98,11 +98,6 @@ def _succeed(tool: str, code: int) -> None:
         raise ProcessError(f"{tool} ended with exit code {code}, see above")
 
 
-def set_gains(robot: Robot, gains: Mapping[str, Mapping[str, Any]]) -> None:
-    """Set gains in the running controllers through their parameter services."""
-    robot.client.set_parameters({f"{wheel}/wheel_pid": dict(p) for wheel, p in gains.items()})
-
-
 def config(name: str) -> Path:
     """Return a file of ``config/``, from the installation or from the sources."""
     prefixes = [Path(p) for p in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if p]

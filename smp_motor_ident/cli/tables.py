@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 
 from rich import box
 from rich.console import Console
@@ -11,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from smp_motor_ident.report import words
-from smp_motor_ident.result import Estimate, Quantity
+from smp_motor_ident.result import Estimate
 
 _COLOR = {"estimated": "green", "fixed": "cyan", "unidentifiable": "red"}
 
@@ -21,8 +20,8 @@ def console() -> Console:
     return Console(width=None if sys.stdout.isatty() else 110, highlight=False, markup=False)
 
 
-def table(title: str, *columns: str, left: int = 1) -> Table:
-    """Return an empty table."""
+def table(title: str, *columns: str) -> Table:
+    """Return an empty table; its first column is of words."""
     made = Table(
         title=title or None,
         title_justify="left",
@@ -31,7 +30,7 @@ def table(title: str, *columns: str, left: int = 1) -> Table:
         pad_edge=False,
     )
     for k, column in enumerate(columns):
-        made.add_column(column, justify="left" if k < left else "right", no_wrap=True)
+        made.add_column(column, justify="left" if k == 0 else "right", no_wrap=True)
     return made
 
 
@@ -46,21 +45,16 @@ def estimate_table(estimate: Estimate) -> Table:
     made = table(", ".join(title), "quantity", "value", "std", "95 % interval", "unit", "status")
     made.columns[4].justify = made.columns[5].justify = "left"
     for name, quantity in {**estimate.combinations, **estimate.parameters}.items():
-        made.add_row(*quantity_cells(name, quantity))
+        interval = "—"
+        if quantity.ci95 is not None:
+            low, high = (words.number(bound, quantity.std) for bound in quantity.ci95)
+            interval = f"{low} … {high}"
+        made.add_row(
+            name,
+            words.number(quantity.value, quantity.std),
+            words.spread(quantity.std),
+            interval,
+            quantity.unit,
+            Text(words.status(quantity), style=_COLOR[quantity.status]),
+        )
     return made
-
-
-def quantity_cells(name: str, quantity: Quantity) -> Sequence[str | Text]:
-    """Return one quantity as the cells of a row."""
-    interval = "—"
-    if quantity.ci95 is not None:
-        low, high = (words.number(bound, quantity.std) for bound in quantity.ci95)
-        interval = f"{low} … {high}"
-    return (
-        name,
-        words.number(quantity.value, quantity.std),
-        words.spread(quantity.std),
-        interval,
-        quantity.unit,
-        Text(words.status(quantity), style=_COLOR[quantity.status]),
-    )

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from smp_motor_control.parameter_file import flat
 from smp_motor_ident.bag.transport import measure_delay
 from smp_motor_ident.cli import applying, frame, relaying
 from smp_motor_ident.cli.tune_arguments import TARGETS, loop_for
@@ -22,7 +23,7 @@ from smp_motor_ident.tune.curves import curves
 from smp_motor_ident.tune.exports import FORMATS, export
 from smp_motor_ident.tune.source import choose_source
 from smp_motor_ident.tune.wheels import WheelSet
-from smp_motor_ident.tune.writing import gains_document, gains_yaml, to_json
+from smp_motor_ident.tune.writing import gains_document, gains_yaml, parameters, to_json
 
 
 def work(arguments: argparse.Namespace) -> int:
@@ -47,7 +48,8 @@ def work(arguments: argparse.Namespace) -> int:
     if files:
         _write(files, wheels, estimates, arguments, reasons)
     if arguments.apply:
-        return applying.apply(applying.from_designs(wheels.designs), arguments)
+        gains = {wheel: flat(parameters(design)) for wheel, design in wheels.designs.items()}
+        return applying.apply(gains, arguments)
     return 0
 
 
@@ -72,7 +74,8 @@ def _design(
         if arguments.compare:
             say("comparing the methods")
             method = _compare(estimates, loops, targets)
-            targets = {k: v for k, v in targets.items() if k in _known(method)}
+            known = (*METHODS[method].targets, *COMMON)
+            targets = {k: v for k, v in targets.items() if k in known}
         say("designing")
         wheels = design_wheels(
             estimates, loops, method, arguments.sets, together=not arguments.alone, **targets
@@ -186,10 +189,6 @@ def read_estimates(source: Path) -> dict[str, Estimate]:
             ),
         )
     return estimates
-
-
-def _known(method: str) -> tuple[str, ...]:
-    return (*METHODS[method].targets, *COMMON)
 
 
 def _compare(

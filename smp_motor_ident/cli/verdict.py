@@ -42,22 +42,14 @@ class Check:
         return self.worst <= self.limit
 
 
-def true_quantities(entry: MotorEntry) -> dict[str, float]:
-    """Return all that can be compared with an estimate."""
-    motor = entry.parameters
-    names = ("dc_gain", "time_constant", "time_constant_product", "static_voltage")
-    truth = {name: float(getattr(motor, name)) for name in names}
-    if entry.knows_current:
-        physical = ("resistance", "inductance", "motor_constant", "inertia")
-        physical += ("viscous_friction", "coulomb_friction")  # type: ignore[assignment]
-        truth |= {name: float(getattr(motor, name)) for name in physical}
-    return truth
-
-
 def _compared(entry: MotorEntry, estimate: Estimate) -> list[tuple[str, float, Quantity]]:
     """Return name, truth and estimate of every quantity that the estimate claims to know."""
     held = {**estimate.combinations, **estimate.parameters}
-    truth = true_quantities(entry)
+    names = ["dc_gain", "time_constant", "time_constant_product", "static_voltage"]
+    if entry.knows_current:
+        names += ["resistance", "inductance", "motor_constant", "inertia"]
+        names += ["viscous_friction", "coulomb_friction"]
+    truth = {name: float(getattr(entry.parameters, name)) for name in names}
     return [(n, t, held[n]) for n, t in truth.items() if n in held and held[n].value is not None]
 
 

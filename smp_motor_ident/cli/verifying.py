@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from smp_motor_control.encoder import unwrap
-from smp_motor_control.motor.friction import Gearbox
+from smp_motor_control.motor.file import nest
 from smp_motor_ident.bag.columns import Columns, read_columns
 from smp_motor_ident.cli import steps
+from smp_motor_ident.cli.driving import wheel_angle
 from smp_motor_ident.cli.processes import ProcessError
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.result import Estimate
@@ -170,8 +170,10 @@ def _changes(
     latest = np.searchsorted(answers.time, instants, side="right") - 1
     asked = np.where(latest < 0, 0.0, setpoints[latest])
     step = float(document["loop"]["sample_time"])
-    even, speed = verification.smoothed(instants, _angle(state, estimate)[shown], step)
-    parameters = _nested(designed.gains[wheel])
+    even, speed = verification.smoothed(
+        instants, wheel_angle(state, estimate.hardware)[shown], step
+    )
+    parameters = nest(designed.gains[wheel])
     rows = verification.predicted(
         estimate, parameters, document["loop"], asked, (instants, waited), even
     )
@@ -199,22 +201,3 @@ def _begin(wheel: str, setpoint: float, answers: Columns) -> float:
             "fault, or its messages were lost; look at /diagnostics, then go on with --resume"
         )
     return float(answers.time[asked[0]])
-
-
-def _angle(state: Columns, estimate: Estimate) -> Any:
-    """Return the wheel's angle as its counts tell it, where there are counts."""
-    hardware = estimate.hardware
-    if not hardware.counts_per_revolution:
-        return state.fields["position"]
-    turn = 2 * np.pi / hardware.counts_per_revolution
-    return Gearbox(hardware.gear_ratio).to_wheel(turn) * unwrap(
-        state.fields["encoder_count"], hardware.encoder_bits
-    )
-
-
-def _nested(flat: Mapping[str, Any]) -> dict[str, Any]:
-    nested: dict[str, Any] = {}
-    for name, value in flat.items():
-        group, _, key = name.rpartition(".")
-        (nested.setdefault(group, {}) if group else nested)[key] = value
-    return nested

@@ -1,9 +1,11 @@
-"""What `record` and `play` share: patterns of topics, message classes by name."""
+"""What `record` and `play` share: a choice of topics, message classes by name."""
 
 from __future__ import annotations
 
+import argparse
 import importlib
 import re
+from dataclasses import dataclass
 from typing import Any
 
 from smp_motor_control.errors import SmpError
@@ -21,7 +23,34 @@ def message_class(type_name: str) -> Any | None:
     return found
 
 
-def pattern(option: str, text: str) -> re.Pattern[str] | None:
+@dataclass(frozen=True)
+class Choice:
+    """Which topics are wanted."""
+
+    names: frozenset[str] = frozenset()
+    pattern: re.Pattern[str] | None = None
+    exclude: re.Pattern[str] | None = None
+    hidden: bool = False
+
+    def wants(self, topic: str) -> bool:
+        """Return whether the topic is to be recorded."""
+        if not self.hidden and any(part.startswith("_") for part in topic.split("/")):
+            return topic in self.names
+        if self.exclude and self.exclude.fullmatch(topic):
+            return False
+        if not self.names and not self.pattern:
+            return True
+        return topic in self.names or bool(self.pattern and self.pattern.fullmatch(topic))
+
+
+def chosen(arguments: argparse.Namespace, hidden: bool) -> Choice:
+    """Return what the arguments ask for."""
+    wanted = _pattern("--regex", arguments.regex)
+    unwanted = _pattern("--exclude", arguments.exclude)
+    return Choice(frozenset(arguments.topics), wanted, unwanted, hidden)
+
+
+def _pattern(option: str, text: str) -> re.Pattern[str] | None:
     """Return a compiled regular expression; None where none is given."""
     try:
         return re.compile(text) if text else None

@@ -14,7 +14,6 @@ line a wheel to ``history`` every minute, which ``identify --history`` draws.  I
 from __future__ import annotations
 
 import math
-import sys
 import time
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -29,10 +28,11 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from smp_interfaces.msg import MotorDescription, MotorParameters, MotorState
 from smp_motor_control import WHEELS, joint_of
+from smp_motor_control.encoder import wrap
 from smp_motor_control.errors import ParameterError, SmpError
 from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.executor import Untouched
-from smp_motor_control.nodes.settings import Parameters, described, nested
+from smp_motor_control.nodes.settings import Parameters, described, fixed, nested
 from smp_motor_ident.bag.window import Window
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.estimation.live import Demands, missing
@@ -56,22 +56,16 @@ MINUTE = 60.0
 class Settings:
     """Parameters of the node."""
 
-    wheels: tuple[str, ...] = described(WHEELS, "Wheels to identify.", read_only=True)
-    window: float = described(
-        60.0, "How much of the past is used [s].", minimum=2.0, maximum=600.0, read_only=True
-    )
-    period: float = described(
-        5.0, "Least interval between two estimates of a wheel [s].", minimum=0.5, read_only=True
-    )
+    wheels: tuple[str, ...] = fixed(WHEELS, "Wheels to identify.")
+    window: float = fixed(60.0, "How much of the past is used [s].", minimum=2.0, maximum=600.0)
+    period: float = fixed(5.0, "Least interval between two estimates of a wheel [s].", minimum=0.5)
     share: float = described(
         0.03, "Most of a processor that estimates take of it in the long run [1].",
         minimum=1e-3, maximum=1.0,
     )  # fmt: skip
     model: str = described("auto", "Model to fit; auto chooses the simplest that holds.")
-    commissioned: str = described(
-        "", "identification.json, or its folder, of the motors to watch.", read_only=True
-    )
-    history: str = described("", "File that what is seen of them is added to.", read_only=True)
+    commissioned: str = fixed("", "identification.json, or its folder, of the motors to watch.")
+    history: str = fixed("", "File that what is seen of them is added to.")
     demands: Demands = nested(  # noqa: RUF009 (returns a field)
         Demands(),
         {
@@ -127,7 +121,7 @@ class Wheel:
 
     def _on_state(self, message: MotorState, info: Mapping[str, Any]) -> None:
         self.stamp = stamp = message.header.stamp
-        nanoseconds = 1_000_000_000 * stamp.sec + stamp.nanosec
+        nanoseconds = runtime.nanoseconds(stamp)
         voltage, current, position = message.voltage, message.current, message.position
         count = message.encoder_count
         if self.monitor is not None:
@@ -145,10 +139,7 @@ class Wheel:
             return (position - angle) * hardware.gear_ratio
         if before is None:
             return math.nan
-        counts = count - before
-        if hardware.encoder_bits:
-            half = 1 << (hardware.encoder_bits - 1)
-            counts = (counts + half) % (2 * half) - half
+        counts = wrap(count - before, hardware.encoder_bits)
         return counts * 2 * math.pi / hardware.counts_per_revolution
 
     def _on_description(self, message: MotorDescription) -> None:
@@ -311,7 +302,3 @@ def _identify(record: Record, model: str) -> tuple[Estimate | Exception, float]:
 def main(argv: list[str] | None = None) -> int:
     """Run the node."""
     return runtime.run("identifier", Identifier, argv)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -7,7 +7,7 @@ import sys
 import threading
 import time
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from smp_motor_control.nodes import runtime
 from smp_motor_control.ros_arguments import split_arguments
 from smp_motor_ident.bag.replay import Replay, offered
 from smp_motor_ident.bag.storage import Channel
-from smp_motor_ident.nodes.bag_arguments import message_class, pattern
+from smp_motor_ident.nodes.bag_arguments import chosen, message_class
 
 DEPTH = 1000
 FIND_EACH_OTHER = 1.0
@@ -45,22 +45,7 @@ class Options:
 
 
 class Player(Node):
-    """Publishes the messages of a bag from a thread of its own.
-
-    Parameters
-    ----------
-    replay : Replay
-        The bag.
-    channels : list of Channel
-        Topics that are wanted.
-    options : Options
-        How to play.
-
-    Raises
-    ------
-    SmpError
-        When none of the topics can be published.
-    """
+    """Publishes the messages of a bag from a thread of its own."""
 
     def __init__(self, replay: Replay, channels: list[Channel], options: Options) -> None:
         super().__init__("play")
@@ -236,9 +221,8 @@ def _options(arguments: argparse.Namespace) -> Options:
 
 def _chosen(replay: Replay, arguments: argparse.Namespace) -> list[Channel]:
     """Return the channels that the arguments ask for."""
-    wanted = pattern("--regex", arguments.regex)
-    unwanted = pattern("--exclude", arguments.exclude)
-    names = {name if name.startswith("/") else f"/{name}" for name in arguments.topics}
+    choice = chosen(arguments, hidden=True)
+    names = {name if name.startswith("/") else f"/{name}" for name in choice.names}
     there = {channel.topic for channel in replay.channels}
     if missing := names - there:
         raise SmpError(
@@ -246,13 +230,9 @@ def _chosen(replay: Replay, arguments: argparse.Namespace) -> list[Channel]:
             f"{', '.join(sorted(there)) or 'none'}"
         )
 
-    def chosen(topic: str) -> bool:
-        if (unwanted and unwanted.fullmatch(topic)) or (arguments.clock and topic == "/clock"):
-            return False
-        asked = bool(names) or wanted is not None
-        return not asked or topic in names or bool(wanted and wanted.fullmatch(topic))
-
-    return [channel for channel in replay.channels if chosen(channel.topic)]
+    choice = replace(choice, names=frozenset(names))
+    known = (c for c in replay.channels if not (arguments.clock and c.topic == "/clock"))
+    return [channel for channel in known if choice.wants(channel.topic)]
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -8,7 +8,6 @@ third of the time, and the queue's reception stamps stay exact.
 from __future__ import annotations
 
 import argparse
-import re
 import shutil
 import sys
 from collections import Counter
@@ -32,7 +31,7 @@ from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.executor import Untouched
 from smp_motor_control.ros_arguments import split_arguments
 from smp_motor_ident.bag import BagWriter
-from smp_motor_ident.nodes.bag_arguments import message_class, pattern
+from smp_motor_ident.nodes.bag_arguments import Choice, chosen, message_class
 
 TAKE_PERIOD = 0.004
 LOOK_PERIOD = 0.05
@@ -50,26 +49,6 @@ class Topic:
     reliable: bool
     last_number: int = 0
     lost: int = 0
-
-
-@dataclass(frozen=True)
-class Choice:
-    """Which topics are wanted."""
-
-    names: frozenset[str] = frozenset()
-    pattern: re.Pattern[str] | None = None
-    exclude: re.Pattern[str] | None = None
-    hidden: bool = False
-
-    def wants(self, topic: str) -> bool:
-        """Return whether the topic is to be recorded."""
-        if not self.hidden and any(part.startswith("_") for part in topic.split("/")):
-            return topic in self.names
-        if self.exclude and self.exclude.fullmatch(topic):
-            return False
-        if not self.names and not self.pattern:
-            return True
-        return topic in self.names or bool(self.pattern and self.pattern.fullmatch(topic))
 
 
 def subscription_qos(offered: list[QoSProfile]) -> QoSProfile:
@@ -107,14 +86,7 @@ def qos_document(qos: QoSProfile) -> dict[str, Any]:
 class Recorder(Node):
     """Finds topics as they appear, and writes what comes on them.
 
-    Parameters
-    ----------
-    writer : BagWriter
-        Open; closed when the node stops.
-    choice : Choice
-        Which topics.
-    duration : float
-        [s]; 0 records until the node is stopped.
+    It closes the writer when it stops, which it does by itself after a duration that is not 0 [s].
     """
 
     def __init__(self, writer: BagWriter, choice: Choice, duration: float = 0.0) -> None:
@@ -243,15 +215,6 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
-def _choice(arguments: argparse.Namespace) -> Choice:
-    wanted = pattern("--regex", arguments.regex)
-    unwanted = pattern("--exclude", arguments.exclude)
-    names = frozenset(arguments.topics)
-    if arguments.all:
-        return Choice(exclude=unwanted, hidden=arguments.include_hidden)
-    return Choice(names, wanted, unwanted, arguments.include_hidden)
-
-
 def _make_room(path: Path, force: bool) -> None:
     """Remove a bag that is to be replaced; nothing else is ever removed."""
     if not path.exists():
@@ -270,7 +233,9 @@ def main(argv: list[str] | None = None) -> int:
     output = Path(arguments.output or f"rosbag2_{datetime.now():%Y_%m_%d-%H_%M_%S}")
 
     def make() -> Recorder:
-        choice = _choice(arguments)
+        choice = chosen(arguments, arguments.include_hidden)
+        if arguments.all:
+            choice = replace(choice, names=frozenset(), pattern=None)
         _make_room(output, arguments.force)
         return Recorder(BagWriter(output), choice, arguments.duration)
 

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from smp_motor_control.body.kinematics import BodyCommand, Verdict
+from smp_motor_control.body.command import BodyCommand, Verdict
 from smp_motor_control.errors import ParameterError
 
 

@@ -12,7 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from smp_motor_control.body.kinematics import Odometry, RateLimiter, SkidSteer, SpeedLimiter
+from smp_motor_control.body.kinematics import SkidSteer
+from smp_motor_control.body.odometry import Odometry
+from smp_motor_control.body.speed_limiter import RateLimiter, SpeedLimiter
 from smp_motor_control.errors import ParameterError
 
 FILE = Path(__file__).parent.parent / "data" / "conformance" / "diff_drive_cases.json"

@@ -13,32 +13,15 @@ from scipy.linalg import expm
 from scipy.optimize import linprog
 
 from smp_motor_control.errors import ParameterError
-from smp_motor_control.motor.friction import MotorParameters
-from smp_motor_control.reference.profile import (
+from smp_motor_control.reference.minimum_jerk import (
     PEAK_ACCELERATION,
     PEAK_JERK,
-    Drive,
     MinimumJerk,
-    Profile,
-    ProfileLimits,
-    Reference,
     minimum_jerk_duration,
-    peak_voltage,
-    shortest_common_transition,
 )
+from smp_motor_control.reference.profile import Drive, Profile, ProfileLimits, Reference
 from smp_motor_control.reference.time_optimal import VoltageLimited
 
-# Table 1 of the paper: J, K, L, R, b.
-PAPER = [
-    (1.13e-6, 0.011029, 0.30994, 12.919, 2.40e-5),
-    (6.60e-7, 0.001761, 0.06754, 4.5516, 2.23e-5),
-    (1.40e-5, 0.030117, 0.06383, 3.2843, 5.53e-5),
-    (2.21e-5, 0.035314, 0.03995, 2.7031, 6.45e-5),
-]
-MOTORS = [
-    MotorParameters(inertia=j, motor_constant=k, inductance=l, resistance=r, viscous_friction=b)
-    for j, k, l, r, b in PAPER
-]
 REST = Reference(0.0, 0.0, 0.0)
 
 
@@ -179,22 +162,6 @@ def test_limit_that_stops_everything_is_refused(name: str, value: float) -> None
 
 def test_parameters_of_zero_mean_no_limit() -> None:
     assert ProfileLimits.from_parameters(0.0, 0.0, 0.0) == ProfileLimits()
-
-
-def test_paper_motors_reach_100_rad_s_together_in_about_66_ms_below_11_volts() -> None:
-    duration = shortest_common_transition(MOTORS, [0.0] * 4, [100.0] * 4, 11.0)
-    assert peak_voltage(MOTORS, [0.0] * 4, [100.0] * 4, duration) == pytest.approx(11.0, abs=1e-4)
-    # 62 ms by the linear motors of Table 1; dry friction takes the rest of the 66.
-    assert 0.060 < duration < 0.066
-
-
-def test_speed_that_a_motor_cannot_hold_is_refused_with_the_motor_named() -> None:
-    with pytest.raises(ParameterError, match="motor 2 needs"):
-        shortest_common_transition(MOTORS, [0.0] * 4, [200.0] * 4, 11.0)
-
-
-def test_standing_still_takes_no_time() -> None:
-    assert shortest_common_transition(MOTORS, [5.0] * 4, [5.0] * 4, 11.0) == 0.0
 
 
 drives = st.builds(

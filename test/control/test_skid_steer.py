@@ -10,12 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from smp_motor_control import LEFT, RIGHT
-from smp_motor_control.body.kinematics import (
-    HeadingHold,
-    Odometry,
-    SkidSteer,
-    SpeedLimiter,
-)
+from smp_motor_control.body.heading import HeadingHold
+from smp_motor_control.body.kinematics import SkidSteer
+from smp_motor_control.body.odometry import Odometry
+from smp_motor_control.body.speed_limiter import SpeedLimiter
 from smp_motor_control.errors import ParameterError
 
 ROBOT = SkidSteer(
