@@ -113,7 +113,7 @@ def _views(data: Experiments) -> list[list[Uniform]]:
     if not grids:
         return []
     grids = sorted(grids, key=lambda u: -float(np.ptp(u.output)))[:GRIDS]
-    if any(np.ptp(u.voltage) > METER.value * np.abs(u.voltage).max() for u in grids):
+    if any(np.ptp(u.voltage[1:]) > METER.value * np.abs(u.voltage).max() for u in grids):
         return [grids]
     return [grids, [_from_rest(u, data.kind == rc.ANGLE) for u in grids]]
 

@@ -11,10 +11,14 @@ from numpy.typing import NDArray
 
 from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.hold import held_intervals, rerun
+from smp_motor_ident.likelihood.standstill import stands
 from smp_motor_ident.record import Record
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+HELD = 0.1
+"""Of the largest voltage, what the friction of a geared motor holds as a rule."""
 REST = 10
 """Samples after which an unchanged count is a standstill."""
 JITTER = 2_000
@@ -47,6 +51,7 @@ class Experiments:
     # current was more [V] before the segment than at its beginning
     initial: Array
     voltage: Array  # as it was recorded, by the row
+    stood: Flags  # shape (g,): segments that begin with a standstill, no voltage before them
     how: str = "before"  # how a row's command ran, as in `Structure.held`
 
     @property
@@ -66,6 +71,18 @@ class Experiments:
     def levels(self) -> Array:
         """The command's levels [V]: as it was held, or the rows between which it ran straight."""
         return self.voltage if self.how == "interpolated" else self.hold_value
+
+    @cached_property
+    def known_initial(self) -> Array:
+        """What is known of each segment's initial state beforehand: precisions around zero.
+
+        The voltage over a winding is no larger than the largest that drives it, and that of a
+        motor that stands no larger than what its friction holds, shape (g, 5).
+        """
+        known = np.zeros(self.initial.shape)
+        largest = max(float(np.abs(self.voltage).max(initial=0.0)), 1e-150)
+        known[:, 0] = 1 / np.square(np.where(self.stood, HELD, 1.0) * largest)
+        return known
 
     @property
     def size(self) -> int:
@@ -90,6 +107,8 @@ class Experiments:
             return self
         sections, end, value = rerun(self.time, self.voltage, self.starts[:-1], how)
         first = sections * self.starts
+        for begin in first[:-1][self.stood]:
+            value[begin : begin + sections] = 0.0
         return replace(self, hold_end=end, hold_value=value, hold_start=first, how=how)
 
     def data_window(self, duration: float) -> Experiments:
@@ -137,6 +156,7 @@ class Experiments:
             self.quantum,
             self.initial[:segments],
             self.voltage[:end],
+            self.stood[:segments],
             self.how,
         )
 
@@ -261,7 +281,12 @@ def prepare(
     output = _join([o if quantum else dithered(o, k, rng) for o, k, quantum in outputs])
     currents = [r.current if r.current is not None else np.full(len(r), np.nan) for r in records]
     current = _join([dithered(i, None, rng) for i in currents]) if use_current else np.zeros(0)
-    bounds = np.array(starts, dtype=np.int64)
+    voltage, bounds = _join([r.voltage for r in records]), np.array(starts, dtype=np.int64)
+    stood = stands(time, output, voltage, bounds, outputs[0][1], outputs[0][2])
+    value = _join(values)
+    if stood.any():
+        value = value.copy()
+        value[np.array(hold_start[:-1])[stood]] = 0.0
     steps = np.concatenate([np.diff(r.time[:200_000]) for r in records])
     return Experiments(
         time,
@@ -269,13 +294,14 @@ def prepare(
         current,
         bounds,
         _join(ends),
-        _join(values),
+        value,
         np.array(hold_start, dtype=np.int64),
         outputs[0][1],
         float(np.median(steps)),
         outputs[0][2],
         _initial(time, output, bounds, outputs[0][1]),
-        _join([r.voltage for r in records]),
+        voltage,
+        stood,
     )
 
 

@@ -89,6 +89,8 @@ def eliminate(  # noqa: C901 - plain loops
     normal: Array,
     gradient: Array,
     away: Array,
+    value: Array,
+    known: Array,
     size: int,
     common: Array,
     score: Array,
@@ -99,8 +101,9 @@ def eliminate(  # noqa: C901 - plain loops
 ) -> tuple[float, float]:
     """Eliminate each segment's own columns from the normal equations.
 
-    A wide prior on them keeps a motor at rest, whose speed the data do not touch, solvable;
-    it weighs a hundredth of a sample's information at most.
+    They are zero to within a precision that is known of each.  A wide prior around where they
+    began keeps a motor at rest, whose speed the data do not touch, solvable; it weighs a
+    hundredth of a sample's information at most.
     """
     f, own = score.shape[0], away.shape[1]
     total = decrease = 0.0
@@ -112,9 +115,9 @@ def eliminate(  # noqa: C901 - plain loops
         for j in range(own):
             d = f + j
             precision = 1e-2 * max(1e-12, normal[g, d, d] / size) + 1e-9
-            total += precision * away[g, j] * away[g, j]
-            gradient[g, d] -= precision * away[g, j]
-            normal[g, d, d] += precision
+            total += precision * away[g, j] * away[g, j] + known[g, j] * value[g, j] * value[g, j]
+            gradient[g, d] -= precision * away[g, j] + known[g, j] * value[g, j]
+            normal[g, d, d] += precision + known[g, j]
             scale[j] = math.sqrt(normal[g, d, d])
         common += normal[g, :f, :f]
         score += gradient[g, :f]

@@ -193,9 +193,11 @@ def evaluate(
         common += np.outer(row, row)
         score += row * miss
         total += miss * miss
-    away = (initial - start)[:, list(own)]
-    prior, decrease = eliminate(sums.normal, sums.gradient, away, data.size, common, score, step,
-                               local_gain, sums.scores, sums.owner)  # fmt: skip
+    value, away = initial[:, list(own)], (initial - start)[:, list(own)]
+    prior, decrease = eliminate(
+        sums.normal, sums.gradient, away, value, data.known_initial[:, list(own)], data.size,
+        common, score, step, local_gain, sums.scores, sums.owner,
+    )  # fmt: skip
     total += prior
     if not math.isfinite(total + float(common.sum()) + float(score.sum()) + float(step.sum())):
         return nowhere
