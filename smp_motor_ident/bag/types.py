@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from functools import cache, lru_cache
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,8 @@ from smp_motor_ident.errors import BagError
 Fields = Sequence[tuple[str, Any]]
 Definitions = Mapping[str, Fields]
 """Fields of every message type by its full name; the field's description is rosbags'."""
+Source = Callable[[str], Fields | None]
+"""From a type's full name to its fields, None where they are not known there."""
 
 _STORES = (
     Stores.ROS2_JAZZY,
@@ -57,16 +59,9 @@ def _references(fields: Fields) -> Iterator[str]:
             yield detail
 
 
-class _Store(dict[str, Fields]):
-    """Types of a distribution, loaded when one is asked for."""
-
-    def __init__(self, which: Stores) -> None:
-        super().__init__()
-        self._which = which
-
-    def get(self, name: str, default: Any = None) -> Any:
-        """Return a type's fields."""
-        return _store(self._which).get(name, default)
+def _stored(which: Stores, name: str) -> Fields | None:
+    """Return a type of a distribution, whose types are loaded when one is asked for."""
+    return _store(which).get(name)
 
 
 @cache
@@ -118,15 +113,15 @@ class Types:
         does not define its types, the one that fits the bytes is right.
         """
         name, reasons = channel.type, []
-        stores = [_Store(which) for which in _STORES]
+        stores: list[Source] = [partial(_stored, which) for which in _STORES]
         if channel.definition:
             try:
                 own = _parse(channel.definition, name, channel.definition_format)
-                yield self._closed(name, [own, self._given, *stores])
+                yield self._closed(name, [own.get, self._given.get, *stores])
             except _SPOILT as error:
                 reasons.append(f"the bag's own definition cannot be used: {_line(error)}")
-        given: list[Mapping[str, Fields]] = [self._named(name), self._given]
-        known = [[_Ament(), stores[0]], *([store, _Ament()] for store in stores[1:])]
+        given: list[Source] = [self._named(name).get, self._given.get]
+        known = [[_ament, stores[0]], *([store, _ament] for store in stores[1:])]
         for sources in known:
             try:
                 yield self._closed(name, [*given, *sources])
@@ -145,7 +140,7 @@ class Types:
         same = [key for key in self._given if key.rpartition("/")[2] == name.rpartition("/")[2]]
         return {name: self._given[same[0]]} if len(same) == 1 else {}
 
-    def _closed(self, name: str, sources: Sequence[Mapping[str, Fields]]) -> Definitions:
+    def _closed(self, name: str, sources: Sequence[Source]) -> Definitions:
         """Return the type and all that it refers to, each from the first source that has it."""
         closed: dict[str, Fields] = {}
         open_names = [name]
@@ -153,7 +148,7 @@ class Types:
             key = open_names.pop()
             if key in closed:
                 continue
-            fields = next((f for s in sources if (f := s.get(key)) is not None), None)
+            fields = next((f for source in sources if (f := source(key)) is not None), None)
             if fields is None:
                 raise BagError(f"nothing defines {key!r}")
             closed[key] = fields
@@ -161,12 +156,9 @@ class Types:
         return closed
 
 
-class _Ament(dict[str, Fields]):
-    """Types of the interface packages on AMENT_PREFIX_PATH."""
-
-    def get(self, name: str, default: Any = None) -> Any:
-        """Return a type's fields."""
-        return default if (text := _msg_text(name)) is None else _parse(text, name, "")[name]
+def _ament(name: str) -> Fields | None:
+    """Return a type of the interface packages on AMENT_PREFIX_PATH."""
+    return None if (text := _msg_text(name)) is None else _parse(text, name, "")[name]
 
 
 @cache
