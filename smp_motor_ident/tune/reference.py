@@ -131,7 +131,20 @@ def plan_reference(
     ratio = loop.gear_ratio
     loop = replace(loop, delay_doubt=min(loop.delay_doubt, bearable))
     speed = _reachable(plant, loop, max_velocity)
-    plan = _fastest(plant, loop, speed, together)
+    m = plant.motors
+    drive = Drive(
+        top_speed=(PEAK * loop.supply_voltage - float(m.static_voltage[0])) / float(m.a0[0]),
+        time_constant=float(m.a1[0] / m.a0[0]),
+        time_constant_product=float(m.a2[0] / m.a0[0]),
+    )
+    plan = Reference(
+        max_velocity=speed,
+        max_acceleration=math.inf,
+        transition_time=0.0,
+        lag=measured_lag(plant, loop.expected_delay),
+        doubt=0.0 if together else loop.delay_doubt,
+        drive=drive,
+    )
     plan = _quickest(plant, loop, controller, plan, least)
     quickest = plan.transition_time
     if max_acceleration is not None:
@@ -152,25 +165,6 @@ def plan_reference(
             )
         plan = replace(plan, transition_time=transition_time)
     return plan
-
-
-def _fastest(plant: Plant, loop: Loop, speed: float, together: bool) -> Reference:
-    """Return a plan that keeps to the voltage alone."""
-    m = plant.motors
-    lag = measured_lag(plant, loop.expected_delay)
-    drive = Drive(
-        top_speed=(PEAK * loop.supply_voltage - float(m.static_voltage[0])) / float(m.a0[0]),
-        time_constant=float(m.a1[0] / m.a0[0]),
-        time_constant_product=float(m.a2[0] / m.a0[0]),
-    )
-    return Reference(
-        max_velocity=speed,
-        max_acceleration=math.inf,
-        transition_time=0.0,
-        lag=lag,
-        doubt=0.0 if together else loop.delay_doubt,
-        drive=drive,
-    )
 
 
 def _reachable(plant: Plant, loop: Loop, wished: float | None) -> float:
