@@ -52,14 +52,7 @@ class Layout:
 class Decoder:
     """Reads the wanted fields of one channel, template by template.
 
-    Parameters
-    ----------
-    channel : Channel
-        Type and encoding.
-    candidates : iterable of Definitions
-        What that type may be; the first that fits a message is used from then on.
-    paths : sequence of str
-        Fields that are wanted.
+    Of the ``candidates`` for its type the first that fits a message is used from then on.
     """
 
     KEPT = 64

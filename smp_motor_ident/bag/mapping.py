@@ -181,25 +181,7 @@ def load(path: str | os.PathLike[str]) -> SignalMap:
 
 
 def from_document(document: Any, where: str = "mapping") -> SignalMap:
-    """Read a mapping from plain data, as YAML gives them.
-
-    Parameters
-    ----------
-    document : dict
-        ``motors`` by wheel, ``types``, and options that hold for all motors.
-    where : str
-        What to call it in messages.
-
-    Returns
-    -------
-    SignalMap
-        Validated.
-
-    Raises
-    ------
-    BagError
-        Naming the key and what it may be.
-    """
+    """Read a mapping from plain data, as YAML gives them: ``motors``, ``types`` and options."""
     if not isinstance(document, Mapping):
         raise BagError(f"{where}: must hold keys and values, such as motors:")
     rest = dict(document)

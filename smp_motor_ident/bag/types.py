@@ -80,13 +80,7 @@ def _ament_file(name: str, suffix: str) -> Path | None:
 
 
 class Types:
-    """Finds what a message consists of.
-
-    Parameters
-    ----------
-    files : iterable of path
-        ``.msg`` files, or folders of them, that the user gives.
-    """
+    """Finds what a message consists of; ``files`` are ``.msg`` files, or folders, of the user."""
 
     def __init__(self, files: Iterable[str | os.PathLike[str]] = ()) -> None:
         self._given: dict[str, Fields] = {}
