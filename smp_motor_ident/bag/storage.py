@@ -114,6 +114,11 @@ def gather(data: Bytes, at: Integers, dtype: str) -> NDArray[Any]:
     return every[at]
 
 
+def first_line(error: BaseException) -> str:
+    """Return an error's first line, or its kind where it says nothing."""
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
 def message_type(name: str) -> str:
     """Return a type name with its ``/msg/``, which the oldest bags leave out."""
     return re.sub(r"^(\w+)/(\w+)$", r"\1/msg/\2", name)

@@ -18,7 +18,7 @@ from rosbags.typesys import (
     get_typestore,
 )
 
-from smp_motor_ident.bag.storage import Channel, message_type
+from smp_motor_ident.bag.storage import Channel, first_line, message_type
 from smp_motor_ident.errors import BagError
 
 Fields = Sequence[tuple[str, Any]]
@@ -98,7 +98,7 @@ class Types:
         try:
             self._given.update(_parse(file.read_text(), f"{package}/msg/{file.stem}", "ros2msg"))
         except (TypesysError, OSError, ValueError, RecursionError) as error:
-            raise BagError(f"{file}: not a message definition ({_line(error)})") from None
+            raise BagError(f"{file}: not a message definition ({first_line(error)})") from None
 
     def candidates(self, channel: Channel) -> Iterator[Definitions]:
         """Yield what the channel's type may be, the most trusted first; at least one.
@@ -113,14 +113,14 @@ class Types:
                 own = _parse(channel.definition, name, channel.definition_format)
                 yield self._closed(name, [own.get, self._given.get, *stores])
             except _SPOILT as error:
-                reasons.append(f"the bag's own definition cannot be used: {_line(error)}")
+                reasons.append(f"the bag's own definition cannot be used: {first_line(error)}")
         given: list[Source] = [self._named(name).get, self._given.get]
         known = [[_ament, stores[0]], *([store, _ament] for store in stores[1:])]
         for sources in known:
             try:
                 yield self._closed(name, [*given, *sources])
             except (TypesysError, BagError) as error:
-                reasons.append(_line(error))
+                reasons.append(first_line(error))
         if len(reasons) == len(known) + bool(channel.definition):
             raise BagError(
                 f"{channel.topic}: the message type {name or '(none)'!r} is unknown "
@@ -181,7 +181,3 @@ def definition(name: str) -> tuple[str, str]:
     store = get_typestore(Stores.ROS2_JAZZY)
     store.register({k: ([], list(v)) for k, v in closed.items() if k not in store.fielddefs})
     return store.generate_msgdef(name, ros_version=2)[0], store.hash_rihs01(name)
-
-
-def _line(error: BaseException) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]

@@ -20,6 +20,7 @@ import numpy as np
 
 from smp_motor_ident.bag.readers.columns import ColumnFile
 from smp_motor_ident.bag.readers.format import Format
+from smp_motor_ident.bag.storage import first_line
 from smp_motor_ident.bag.unpack import Budget
 from smp_motor_ident.errors import BagError
 
@@ -55,7 +56,7 @@ def _open_5(path: Path, name: str, budget: Budget) -> ColumnFile:
             cast(Any, io.BytesIO(data)), simplify_cells=True, chars_as_strings=False
         )
     except Exception as error:  # scipy's reader raises whatever its bytes lead it to
-        raise BagError(f"{name}: no readable MATLAB file ({_line(error)})") from None
+        raise BagError(f"{name}: no readable MATLAB file ({first_line(error)[:200]})") from None
     visible = {key: value for key, value in content.items() if not key.startswith("__")}
     return ColumnFile(path, name, dict(_columns("", visible, 0)))
 
@@ -80,7 +81,7 @@ def _open_73(path: Path, name: str, budget: Budget) -> ColumnFile:
         with h5py.File(path, "r") as file:
             file.visititems(take)
     except (OSError, RuntimeError, ValueError, KeyError) as error:
-        raise BagError(f"{name}: no readable MATLAB file ({_line(error)})") from None
+        raise BagError(f"{name}: no readable MATLAB file ({first_line(error)[:200]})") from None
     return ColumnFile(path, name, dict(_columns("", found, 0)))
 
 
@@ -166,10 +167,6 @@ def _check_size(inside: bytes, order: str, name: str) -> None:
         raise BagError(
             f"{name}: a variable is damaged ({product:g} elements in {len(inside)} bytes)"
         )
-
-
-def _line(error: BaseException) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0][:200]
 
 
 FORMAT_5 = Format("MATLAB", (".mat",), b"MATLAB 5.0 MAT", _open_5)

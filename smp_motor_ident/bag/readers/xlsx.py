@@ -9,6 +9,7 @@ from typing import Any
 from smp_motor_ident.bag.readers import grid
 from smp_motor_ident.bag.readers.columns import ColumnFile
 from smp_motor_ident.bag.readers.format import Format
+from smp_motor_ident.bag.storage import first_line
 from smp_motor_ident.bag.unpack import Budget
 from smp_motor_ident.errors import BagError
 
@@ -57,8 +58,7 @@ def _sheets(path: Path, name: str, budget: Budget) -> list[list[tuple[Any, ...]]
     except BagError:
         raise
     except Exception as error:  # openpyxl raises whatever a spoilt XML leads it to
-        reason = (str(error).splitlines() or [type(error).__name__])[0][:200]
-        raise BagError(f"{name}: no readable workbook ({reason})") from None
+        raise BagError(f"{name}: no readable workbook ({first_line(error)[:200]})") from None
 
 
 FORMAT = Format("Excel", (".xlsx",), b"PK\x03\x04", _open)
