@@ -38,7 +38,6 @@ class Recording:
     name: str  # what to call it in messages and results
     files: list[Path]  # in the order in which they were written
     promised: dict[str, int] | None = None  # messages by topic as metadata.yaml counts them
-    distribution: str = ""  # ROS distribution that wrote it, where known
     # What was found amiss, grows while the files are read
     findings: list[Finding] = field(default_factory=list)
     # Whether it was found in a folder with others, so that nobody asked for it by name
@@ -238,7 +237,6 @@ def _bag(path: Path) -> Recording:
         information = _loaded(text)["rosbag2_bagfile_information"]
         listed = [Path(str(file)).name for file in information["relative_file_paths"]]
         bag.promised = _promise(information)
-        bag.distribution = str(information.get("ros_distro") or "")
     except (yaml.YAMLError, LookupError, TypeError, ArithmeticError, *_DAMAGE) as error:
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         bag.findings.append(

@@ -24,7 +24,7 @@ from smp_motor_ident.errors import BagError
 Fields = Sequence[tuple[str, Any]]
 Definitions = Mapping[str, Fields]
 """Fields of every message type by its full name; the field's description is rosbags'."""
-Source = Callable[[str], Fields | None]
+Lookup = Callable[[str], Fields | None]
 """From a type's full name to its fields, None where they are not known there."""
 
 _STORES = (
@@ -107,14 +107,14 @@ class Types:
         does not define its types, the one that fits the bytes is right.
         """
         name, reasons = channel.type, []
-        stores: list[Source] = [partial(_stored, which) for which in _STORES]
+        stores: list[Lookup] = [partial(_stored, which) for which in _STORES]
         if channel.definition:
             try:
                 own = _parse(channel.definition, name, channel.definition_format)
                 yield self._closed(name, [own.get, self._given.get, *stores])
             except _SPOILT as error:
                 reasons.append(f"the bag's own definition cannot be used: {first_line(error)}")
-        given: list[Source] = [self._named(name).get, self._given.get]
+        given: list[Lookup] = [self._named(name).get, self._given.get]
         known = [[_ament, stores[0]], *([store, _ament] for store in stores[1:])]
         for sources in known:
             try:
@@ -134,7 +134,7 @@ class Types:
         same = [key for key in self._given if key.rpartition("/")[2] == name.rpartition("/")[2]]
         return {name: self._given[same[0]]} if len(same) == 1 else {}
 
-    def _closed(self, name: str, sources: Sequence[Source]) -> Definitions:
+    def _closed(self, name: str, sources: Sequence[Lookup]) -> Definitions:
         """Return the type and all that it refers to, each from the first source that has it."""
         closed: dict[str, Fields] = {}
         open_names = [name]

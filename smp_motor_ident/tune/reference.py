@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from smp_motor_control.reference import minimum_jerk
 from smp_motor_control.reference.profile import Drive, Profile, ProfileLimits
 from smp_motor_control.wheel.loop import LONGEST_TRANSITION
 from smp_motor_ident.errors import DesignError
@@ -27,7 +28,7 @@ from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.plant import Plant, sample
 from smp_motor_ident.tune.problem import measured_lag
-from smp_motor_ident.tune.simulation import Controller, Inputs, minimum_jerk, simulate, step_figures
+from smp_motor_ident.tune.simulation import Controller, Inputs, simulate, step_figures
 
 HEADROOM = 0.92
 """Share of the supply that a constant speed may use; the rest is left to the feedback."""
@@ -80,7 +81,6 @@ class Change:
     reference: Array
     high: Array
     forward: Array  # [V]: Feed-forward without dry friction
-    duration: float  # [s]
 
     @property
     def inputs(self) -> Inputs:
@@ -103,7 +103,7 @@ def planned_change(plant: Plant, plan: Reference, distance: float, time: Array) 
         for late in (plan.doubt, 0.0, -min(plan.doubt, plan.lag))
     ]
     low, high = np.min(around, axis=0), np.max(around, axis=0)
-    return Change(low, around[1], high, forward, profile.duration)
+    return Change(low, around[1], high, forward)
 
 
 def top_speed(plant: Plant, supply: float) -> float:
@@ -222,14 +222,15 @@ def _steepest(plant: Plant, loop: Loop, speed: float, quickest: float) -> float:
     """Return the largest acceleration that no change up to ``speed`` takes beyond the supply."""
     room = PEAK * loop.supply_voltage - float(plant.motors.static_voltage[0])
     highest = PEAK_RATE * speed / quickest
-    m = plant.motors
+    m, rest = plant.motors, minimum_jerk.Reference(0.0, 0.0, 0.0)
+    a0, a1, a2 = (float(a[0]) for a in (m.a0, m.a1, m.a2))
     for rate in highest * np.geomspace(1.0, 0.01, 200):
         # A change that just takes the shortest time has the most jerk for its acceleration.
         for change in np.geomspace(rate * quickest / PEAK_RATE, speed, 4):
             duration = PEAK_RATE * change / rate
-            motion = minimum_jerk(change, duration, np.linspace(0.0, duration, 100))
-            needed = sum(float(a[0]) * x for a, x in zip((m.a0, m.a1, m.a2), motion, strict=True))
-            if np.max(needed) > room:
+            motion = minimum_jerk.MinimumJerk(rest, change, duration)
+            rows = [motion.at(t) for t in np.linspace(0.0, duration, 100).tolist()]
+            if max(a0 * r.velocity + a1 * r.acceleration + a2 * r.jerk for r in rows) > room:
                 break
         else:
             break

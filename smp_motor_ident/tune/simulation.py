@@ -35,7 +35,6 @@ class Controller:
 class Response:
     """What the loop did; arrays of shape (n, k) at the sampling instants."""
 
-    time: Array  # shape (k,), [s]
     speed: Array  # shape (n, k), [rad/s]: true speed of the motor
     voltage: Array  # shape (n, k), [V]: output of the controller
 
@@ -80,7 +79,7 @@ def simulate(
         np.zeros(n) if friction is None else np.ascontiguousarray(friction),
         modelled, count_angle, noise,
     )  # fmt: skip
-    return Response(plant.sample_time * np.arange(steps), speed, voltage)
+    return Response(speed, voltage)
 
 
 @compiled
@@ -208,19 +207,6 @@ def _run(
                 observer[:] = _observed(advance, by_angle, by_voltage, observer, swept, delayed)
             x[:] = following
     return speed, voltage
-
-
-def minimum_jerk(distance: float, duration: float, time: Array) -> tuple[Array, Array, Array]:
-    """Return the smoothest change of speed over a duration, its rate and its jerk.
-
-    References
-    ----------
-    T. Flash, N. Hogan, The coordination of arm movements, J. Neuroscience 5 (1985), 1688-1703.
-    """
-    x = np.clip(time / duration, 0.0, 1.0)
-    speed = distance * x**3 * (10 - 15 * x + 6 * x**2)
-    acceleration = distance / duration * 30 * x**2 * (1 - x) ** 2
-    return speed, acceleration, distance / duration**2 * 60 * x * (1 - x) * (1 - 2 * x)
 
 
 @dataclass(frozen=True)
