@@ -13,7 +13,7 @@ from smp_motor_ident.finding import Finding
 from smp_motor_ident.report import figures, templates, words
 from smp_motor_ident.report.chart import Chart
 from smp_motor_ident.report.series import Comparison
-from smp_motor_ident.result import Candidate, Estimate, Quantity
+from smp_motor_ident.result import Estimate, Quantity
 
 if TYPE_CHECKING:
     from smp_motor_ident.report.tuning_page import Tuning
@@ -92,7 +92,8 @@ def _motor(
             if name not in estimate.combinations
         ],
         "alike": _alike(estimate),
-        "candidates": _ranked(estimate.candidates),
+        # By their information criterion, those without one last
+        "candidates": sorted(estimate.candidates, key=lambda c: (c.bic is None, c.bic or 0.0)),
         "correlations": _correlations(estimate),
         "charts": [*fit, *residuals, *frequency, *since],
         "history": since,
@@ -213,11 +214,6 @@ def _same_response(estimate: Estimate) -> dict[str, tuple[float, float]]:
         "inertia": (0.0, a1 * a0 / resistance),
         "viscous_friction": (0.0, steepest * (a0 - steepest) / resistance),
     }
-
-
-def _ranked(candidates: Sequence[Candidate]) -> list[Candidate]:
-    """Order the structures by their information criterion, those without one last."""
-    return sorted(candidates, key=lambda c: (c.bic is None, c.bic or 0.0))
 
 
 def _verdict(estimate: Estimate, findings: Sequence[Finding]) -> tuple[str, str, str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -97,9 +97,4 @@ def back_off(
 
 def softer(feedback: Feedback, factor: float) -> Feedback:
     """Return gains with a lower crossover and the same shape of the loop."""
-    return Feedback(
-        feedback.p * factor,
-        feedback.i * factor**2,
-        feedback.d * factor,
-        feedback.filter_time,
-    )
+    return replace(feedback.scaled(factor), i=feedback.i * factor**2)

@@ -22,7 +22,6 @@ from smp_motor_ident.errors import DesignError
 from smp_motor_ident.tune.arrays import Array
 from smp_motor_ident.tune.feedback import Feedback, spectral_radius
 from smp_motor_ident.tune.methods.simc import SIMC
-from smp_motor_ident.tune.plant import Plant
 from smp_motor_ident.tune.problem import Method, Problem, RequiredMargins
 from smp_motor_ident.tune.simulation import Controller, Inputs, simulate
 
@@ -66,7 +65,6 @@ class _Cost:
         T, model = problem.loop.sample_time, problem.reduced
         span = 6 * (model.delay + model.time_constant)
         self.time = T * np.arange(1, max(int(span / T), 40) + 1)
-        self.plants: dict[int, Plant] = {}
         speed = 0.3 * problem.loop.supply_voltage * model.gain
         self.step = np.full(self.time.size, speed)
         self.scale: Array = np.ones(2)
@@ -75,7 +73,7 @@ class _Cost:
 
     def _errors(self, p: Array, i: Array, d: Array, filter_time: float) -> tuple[Array, Array]:
         """Return the time-weighted errors of set-point and load step, and the overshoot."""
-        plant = self.plants.setdefault(p.size, self.problem.plant.repeated(p.size))
+        plant = self.problem.plant.repeated(p.size)
         gains = Feedback(cast(Any, p), cast(Any, i), cast(Any, d), filter_time)
         with np.errstate(over="ignore", invalid="ignore"):
             limited = Controller(
