@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
@@ -11,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_control.motor.friction import Gearbox
-from smp_motor_ident.bag.axis import Series, on_one_axis, unwrapped
+from smp_motor_ident.bag.axis import Motor, Series, on_one_axis, unwrapped
 from smp_motor_ident.bag.checks import impossible, is_unsigned, signed
 from smp_motor_ident.bag.clock import (
     SAME_CLOCK,
@@ -23,41 +22,15 @@ from smp_motor_ident.bag.clock import (
 )
 from smp_motor_ident.bag.counter import unwrap_angle
 from smp_motor_ident.bag.mapping import MotorMap, Signal
-from smp_motor_ident.bag.storage import Table, found
+from smp_motor_ident.bag.storage import Array, Integers, Table
 from smp_motor_ident.bag.units import FACTORS, check_unit, factor
 from smp_motor_ident.diagnosis.beat import find_beat, moves_on
 from smp_motor_ident.errors import BagError
-from smp_motor_ident.finding import Finding, Severity
 from smp_motor_ident.record import Hardware, Record
-
-Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 _OUTPUTS = ("count", "position", "velocity")
 _MOTION = ("velocity", "position")
 _SECOND = 1_000_000_000
-
-
-@dataclass(eq=False)
-class _Motor:
-    """What is known of one motor while its record is made."""
-
-    wheel: str
-    plan: MotorMap
-    hardware: Hardware
-    gearbox: Gearbox
-    tables: Mapping[str, Table]
-    where: str
-    findings: list[Finding] = field(default_factory=list)
-
-    def tell(self, code: str, text: str, severity: Severity = "note", **evidence: float) -> None:
-        """Note what was found, once."""
-        finding = found(code, text, severity, **evidence)
-        if finding not in self.findings:
-            self.findings.append(finding)
-
-    def table(self, signal: Signal) -> Table:
-        return self.tables[signal.topic]
 
 
 def assemble(
@@ -68,9 +41,7 @@ def assemble(
     source: str,
 ) -> Record:
     """Make one motor's record."""
-    motor = _Motor(
-        wheel, plan, hardware, Gearbox(hardware.gear_ratio), tables, f"{source}: {wheel}"
-    )
+    motor = Motor(wheel, plan, hardware, tables, source)
     for topic in dict.fromkeys(s.topic for s in plan.signals.values()):
         motor.findings += tables[topic].findings
         if not _log(tables[topic]).size:
@@ -90,10 +61,10 @@ def assemble(
     _check(motor, series)
     if plan.signals["voltage"].topic == plan.signals[axis_name].topic:
         _drop_lost(motor, series, axis_name)
-    return on_one_axis(wheel, plan, hardware, series, axis_name, source, motor.findings)
+    return on_one_axis(motor, series, axis_name)
 
 
-def _on_beat(motor: _Motor, topic: str, time: Integers) -> Integers:
+def _on_beat(motor: Motor, topic: str, time: Integers) -> Integers:
     """Return arrival times on the beat of their sender; other times as they are."""
     table = motor.tables[topic]
     if time is not table.log:
@@ -123,7 +94,7 @@ def _on_beat(motor: _Motor, topic: str, time: Integers) -> Integers:
     return beat.time
 
 
-def _check(motor: _Motor, series: dict[str, Series]) -> None:
+def _check(motor: Motor, series: dict[str, Series]) -> None:
     """Leave out values that cannot be, and a current without sign; give a size its direction."""
     if "direction" in series:
         direction = series.pop("direction")
@@ -136,7 +107,7 @@ def _check(motor: _Motor, series: dict[str, Series]) -> None:
     for name in sorted(series, key=lambda name: name != "count"):
         value = series[name].value
         if name == "count":  # which wraps, and that is no jump
-            value = unwrapped(series, motor.plan, motor.hardware).count.astype(np.float64)
+            value = unwrapped(motor, series).count.astype(np.float64)
         bad = impossible(value, steps_allowed=name in ("voltage", "supply", "current"))
         if bad.any():
             worst = float(np.abs(value[bad]).max())
@@ -157,7 +128,7 @@ def _check(motor: _Motor, series: dict[str, Series]) -> None:
         motor.tell("unsigned_current", text, "warning")
 
 
-def _clock(motor: _Motor) -> dict[str, Integers]:
+def _clock(motor: Motor) -> dict[str, Integers]:
     """Return the time [ns] of every topic's messages, all on one clock."""
     topics = list(dict.fromkeys(signal.topic for signal in motor.plan.signals.values()))
     tables = {topic: motor.tables[topic] for topic in topics}
@@ -198,7 +169,7 @@ def _clock(motor: _Motor) -> dict[str, Integers]:
 
 
 def _to_log(
-    motor: _Motor, topic: str, stamp: Integers | None, fits: Mapping[str, ClockFit]
+    motor: Motor, topic: str, stamp: Integers | None, fits: Mapping[str, ClockFit]
 ) -> Integers:
     """Return a topic's stamps on the recorder's clock; its log times where it has none."""
     if topic not in fits or stamp is None:
@@ -213,7 +184,7 @@ def _log(table: Table) -> Integers:
 
 
 def _set_back(
-    motor: _Motor, tables: Mapping[str, Table], stamps: Mapping[str, Integers | None]
+    motor: Motor, tables: Mapping[str, Table], stamps: Mapping[str, Integers | None]
 ) -> dict[str, Integers]:
     """Return times for a recording during which the clock of the stamps was set back."""
     if len(tables) > 1:
@@ -234,7 +205,7 @@ def _set_back(
     return {topic: time}
 
 
-def _stamp(motor: _Motor, table: Table) -> Integers | None:
+def _stamp(motor: Motor, table: Table) -> Integers | None:
     """Return a topic's stamps: the field that the mapping names, else the header's."""
     signal = motor.plan.signals.get("time")
     if signal is None or motor.tables.get(signal.topic) is not table:
@@ -254,7 +225,7 @@ def _stamp(motor: _Motor, table: Table) -> Integers | None:
 
 
 def _tell_offset(
-    motor: _Motor, topic: str, fits: Mapping[str, ClockFit], always: bool = False
+    motor: Motor, topic: str, fits: Mapping[str, ClockFit], always: bool = False
 ) -> None:
     fit = fits[topic]
     if always or abs(fit.offset) > 1e9 or abs(fit.drift) > 1e-4:
@@ -265,9 +236,9 @@ def _tell_offset(
         motor.tell("clock_offset", text, offset=fit.offset * 1e-9, drift=fit.drift)
 
 
-def _series(motor: _Motor, name: str, signal: Signal, time: Integers) -> Series:
+def _series(motor: Motor, name: str, signal: Signal, time: Integers) -> Series:
     """Return one signal in SI at the motor shaft, in order, without what is no sample."""
-    table = motor.table(signal)
+    table = motor.tables[signal.topic]
     column = table.columns.get(signal.field)
     there = table.present.get(signal.field)
     if column is None:
@@ -288,7 +259,7 @@ def _is_identity(order: Integers) -> bool:
     return bool(order[0] == 0 and order[-1] == order.size - 1 and np.all(np.diff(order) == 1))
 
 
-def _order(motor: _Motor, time: Integers, table: Table, topic: str) -> Integers:
+def _order(motor: Motor, time: Integers, table: Table, topic: str) -> Integers:
     """Return the samples' order of time without duplicates; tell what was repaired."""
     steps = np.diff(time)
     if np.all(steps > 0):
@@ -316,7 +287,7 @@ def _order(motor: _Motor, time: Integers, table: Table, topic: str) -> Integers:
     return chosen
 
 
-def _converted(motor: _Motor, name: str, signal: Signal, raw: NDArray[Any]) -> NDArray[Any]:
+def _converted(motor: Motor, name: str, signal: Signal, raw: NDArray[Any]) -> NDArray[Any]:
     """Return values in SI at the motor shaft; counts as int64."""
     if name == "count":
         exact = signal.scale == 1 and signal.offset == 0
@@ -354,11 +325,11 @@ def _converted(motor: _Motor, name: str, signal: Signal, raw: NDArray[Any]) -> N
         if wrapped:
             motor.tell("angle_wraps", "position: it wraps at one turn; wrap undone")
     if name in ("velocity", "position") and shaft == "wheel":
-        values = motor.gearbox.to_motor(values)
+        values = Gearbox(motor.hardware.gear_ratio).to_motor(values)
     return values
 
 
-def _drop_lost(motor: _Motor, series: dict[str, Series], axis_name: str) -> None:
+def _drop_lost(motor: Motor, series: dict[str, Series], axis_name: str) -> None:
     """Leave out the samples of a common topic whose voltage or output is no number."""
     axis, voltage = series[axis_name], series["voltage"]
     if not np.array_equal(axis.time, voltage.time):

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -11,17 +12,38 @@ from numpy.typing import NDArray
 from smp_motor_ident.bag.clock import mean_held, rhythm
 from smp_motor_ident.bag.counter import Unwrapped, unwrap
 from smp_motor_ident.bag.mapping import MotorMap
-from smp_motor_ident.bag.storage import found
+from smp_motor_ident.bag.storage import Array, Integers, Table, found
 from smp_motor_ident.errors import BagError
-from smp_motor_ident.finding import Finding
+from smp_motor_ident.finding import Finding, Severity
 from smp_motor_ident.record import Hardware, Record
 
-Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
 BRIDGED = 2
 """Samples that may be lost in a row before a new segment begins."""
+
+
+@dataclass(eq=False)
+class Motor:
+    """What is known of one motor while its record is made."""
+
+    wheel: str
+    plan: MotorMap
+    hardware: Hardware
+    tables: Mapping[str, Table]
+    source: str
+    findings: list[Finding] = field(default_factory=list)
+
+    @property
+    def where(self) -> str:
+        """What to call it in messages."""
+        return f"{self.source}: {self.wheel}"
+
+    def tell(self, code: str, text: str, severity: Severity = "note", **evidence: float) -> None:
+        """Note what was found, once."""
+        finding = found(code, text, severity, **evidence)
+        if finding not in self.findings:
+            self.findings.append(finding)
 
 
 @dataclass(eq=False)
@@ -43,58 +65,42 @@ class Series:
         return Series(self.time[which], self.value[which], number, self.bits)
 
 
-def on_one_axis(
-    wheel: str,
-    plan: MotorMap,
-    hardware: Hardware,
-    series: dict[str, Series],
-    axis_name: str,
-    source: str,
-    findings: list[Finding],
-) -> Record:
+def on_one_axis(motor: Motor, series: dict[str, Series], axis_name: str) -> Record:
     """Make a record of signals that were sampled each at its own instants."""
-    findings = list(findings)
-    held = plan.held or "after"
+    held = motor.plan.held or "after"
     if "supply" in series:
         _times_supply(series)
     voltage = _finite(series["voltage"])
     axis = series[axis_name].time
     alike = np.array_equal(voltage.time, axis)
-    keep = np.ones(axis.size, bool) if alike else _covered(voltage, axis, findings)
+    keep = np.ones(axis.size, bool) if alike else _covered(motor, voltage, axis)
     if keep.sum() < 2:
-        raise BagError(f"{source}: {wheel}: fewer than 2 samples have a voltage and an output")
+        raise BagError(f"{motor.where}: fewer than 2 samples have a voltage and an output")
     axis = axis[keep]
     values = _mean_voltage(voltage, axis, held, alike)
-    starts = _count_starts(series, plan, hardware, keep, axis_name, findings)
-    starts |= _gaps(axis, plan, alike, held, voltage, values, findings)
-    columns = _outputs(series, axis, keep, findings)
-    if all(column is None for column in columns.values()):
-        raise BagError(f"{source}: {wheel}: no output has a finite value")
-    columns["voltage"] = values
-    axis, columns, starts = _without_stubs(axis, columns, starts, findings)
-    if axis.size < 2:
-        raise BagError(f"{source}: {wheel}: fewer than 2 samples in a row are left")
-    return Record(
-        wheel=wheel,
-        time=(axis - axis[0]) * 1e-9,
-        starts=tuple(np.flatnonzero(starts).tolist()),
-        hardware=hardware,
-        source=source,
-        findings=tuple(f for k, f in enumerate(findings) if f not in findings[:k]),
-        velocity_window=plan.velocity_window,
-        **columns,
-    )
-
-
-def _outputs(
-    series: dict[str, Series], axis: Integers, keep: NDArray[np.bool_], findings: list[Finding]
-) -> dict[str, Any]:
-    """Return what was measured besides the voltage, at the instants of the axis."""
-    return {
-        name: _on_axis(name, series[name], axis, keep, findings)
+    starts = _count_starts(motor, series, keep, axis_name)
+    starts |= _gaps(motor, axis, alike, held, voltage, values)
+    columns: dict[str, Any] = {
+        name: _on_axis(motor, name, series[name], axis, keep)
         for name in ("current", "velocity", "position", "count")
         if name in series
     }
+    if all(column is None for column in columns.values()):
+        raise BagError(f"{motor.where}: no output has a finite value")
+    columns["voltage"] = values
+    axis, columns, starts = _without_stubs(motor, axis, columns, starts)
+    if axis.size < 2:
+        raise BagError(f"{motor.where}: fewer than 2 samples in a row are left")
+    return Record(
+        wheel=motor.wheel,
+        time=(axis - axis[0]) * 1e-9,
+        starts=tuple(np.flatnonzero(starts).tolist()),
+        hardware=motor.hardware,
+        source=motor.source,
+        findings=tuple(f for k, f in enumerate(motor.findings) if f not in motor.findings[:k]),
+        velocity_window=motor.plan.velocity_window,
+        **columns,
+    )
 
 
 def _mean_voltage(voltage: Series, axis: Integers, held: str, alike: bool) -> Array:
@@ -121,12 +127,12 @@ def _times_supply(series: dict[str, Series]) -> None:
     series["voltage"] = Series(voltage.time, voltage.value * measured)
 
 
-def _covered(voltage: Series, axis: Integers, findings: list[Finding]) -> Flags:
+def _covered(motor: Motor, voltage: Series, axis: Integers) -> Flags:
     """Return which output samples lie where the input is known."""
     keep: Flags = axis >= voltage.time[0] if voltage.time.size else np.zeros(axis.size, bool)
     if not keep.all():
         text = f"{int((~keep).sum())} samples before the first voltage were left out"
-        findings.append(found("no_voltage_yet", text))
+        motor.tell("no_voltage_yet", text)
     beat = rhythm(voltage.time)
     if beat.regular:
         limit = beat.gap()
@@ -135,25 +141,18 @@ def _covered(voltage: Series, axis: Integers, findings: list[Finding]) -> Flags:
         stale = keep & (age > limit)
         if stale.any():
             text = f"{int(stale.sum())} samples were left out: no voltage came for more than "
-            findings.append(found("voltage_missing", f"{text}{limit * 1e-9:g} s", "warning"))
+            motor.tell("voltage_missing", f"{text}{limit * 1e-9:g} s", "warning")
         keep &= ~stale
     return keep
 
 
-def _count_starts(
-    series: dict[str, Series],
-    plan: MotorMap,
-    hardware: Hardware,
-    keep: Flags,
-    axis_name: str,
-    findings: list[Finding],
-) -> Flags:
+def _count_starts(motor: Motor, series: dict[str, Series], keep: Flags, axis_name: str) -> Flags:
     """Unwrap the counter in place; return which kept samples begin a segment by a reset."""
     flags = np.zeros(keep.size, bool)
     flags[0] = True
     if axis_name == "count":
-        counter = unwrapped(series, plan, hardware)
-        findings += counter.findings
+        counter = unwrapped(motor, series)
+        motor.findings += counter.findings
         series["count"] = Series(series["count"].time, counter.count)
         flags[counter.resets] = True
     # A reset at a sample that is left out begins a segment at the next that is kept.
@@ -161,14 +160,15 @@ def _count_starts(
     return np.concatenate([[True], np.diff(resets) > 0])
 
 
-def unwrapped(series: dict[str, Series], plan: MotorMap, hardware: Hardware) -> Unwrapped:
+def unwrapped(motor: Motor, series: dict[str, Series]) -> Unwrapped:
     """Return the counter without its wraps."""
     counted = series["count"]
-    bits = hardware.encoder_bits if "encoder_bits" in plan.hardware else counted.bits
+    given = "encoder_bits" in motor.plan.hardware
+    bits = motor.hardware.encoder_bits if given else counted.bits
     raw = counted.value
     if raw.dtype.kind == "f":
         raw = np.rint(raw).astype(np.int64)
-    return unwrap(raw, bits, _expected(series, hardware))
+    return unwrap(raw, bits, _expected(series, motor.hardware))
 
 
 def _expected(series: dict[str, Series], hardware: Hardware) -> Array | None:
@@ -186,22 +186,17 @@ def _expected(series: dict[str, Series], hardware: Hardware) -> Array | None:
 
 
 def _gaps(
-    axis: Integers,
-    plan: MotorMap,
-    alike: bool,
-    held: str,
-    voltage: Series,
-    values: Array,
-    findings: list[Finding],
+    motor: Motor, axis: Integers, alike: bool, held: str, voltage: Series, values: Array
 ) -> Flags:
     """Return where segments begin because samples are missing; bridge the voltage over a few."""
     beat = rhythm(axis)
     steps, missing = np.diff(axis), beat.missing(axis)
     if alike and voltage.number is not None:  # the publisher counted: nothing to be guessed
         missing = np.maximum(np.diff(voltage.number) - 1, 0)
-    limit = plan.gap * 1e9 if plan.gap else beat.gap(averaged=alike and held == "before")
+    given = motor.plan.gap
+    limit = given * 1e9 if given else beat.gap(averaged=alike and held == "before")
     cut = steps > limit
-    if alike and not plan.gap:
+    if alike and not given:
         cut |= missing > BRIDGED
     bridged = (missing > 0) & ~cut
     if alike and bridged.any():
@@ -209,19 +204,19 @@ def _gaps(
     if bridged.any():
         text = f"{int(missing[bridged].sum())} samples missing in {int(bridged.sum())} places"
         text += "; their voltage was interpolated" if alike else "; the voltage there is known"
-        findings.append(found("samples_missing", text, samples=int(missing[bridged].sum())))
+        motor.tell("samples_missing", text, samples=int(missing[bridged].sum()))
     if cut.any():
         lost = int(missing[cut].sum())
         longest = steps[cut].max() * 1e-9
         text = f"{int(cut.sum())} gaps of up to {longest:.3g} s"
         text += f" ({lost} samples missing)" if beat.regular else ""
-        findings.append(found("gaps", f"{text}; a new segment behind each", gaps=int(cut.sum())))
+        motor.tell("gaps", f"{text}; a new segment behind each", gaps=int(cut.sum()))
     if not beat.regular:
         text = (
             f"the sampling is irregular: median {beat.interval * 1e-6:.4g} ms, "
             f"from {steps.min() * 1e-6:.4g} to {steps.max() * 1e-6:.4g} ms"
         )
-        findings.append(found("irregular_sampling", text))
+        motor.tell("irregular_sampling", text)
     return np.concatenate([[True], cut])
 
 
@@ -234,7 +229,7 @@ def _bridge(values: Array, voltage: Array, missing: Integers, which: Flags, held
 
 
 def _on_axis(
-    name: str, series: Series, axis: Integers, keep: Flags, findings: list[Finding]
+    motor: Motor, name: str, series: Series, axis: Integers, keep: Flags
 ) -> NDArray[Any] | None:
     """Return a signal at the axis's instants, NaN where it is not known."""
     if series.time.size == keep.size and np.array_equal(series.time[keep], axis):
@@ -249,21 +244,19 @@ def _on_axis(
         apart = sound.time[after] - sound.time[after - 1]
         exact = np.isin(axis, sound.time)
         values[(apart > 3 * rhythm(sound.time).interval) & ~exact] = np.nan
-        text = f"{name}: interpolated to the instants of the main output"
-        findings.append(found("interpolated", text))
+        motor.tell("interpolated", f"{name}: interpolated to the instants of the main output")
     if name == "count":
         return values
     if not np.isfinite(values).all():
         values = np.where(np.isfinite(values), values, np.nan)
         if np.isnan(values).all():
             return None
-        text = f"{name}: {int(np.isnan(values).sum())} values missing"
-        findings.append(found("values_missing", text))
+        motor.tell("values_missing", f"{name}: {int(np.isnan(values).sum())} values missing")
     return values
 
 
 def _without_stubs(
-    axis: Integers, columns: dict[str, Any], starts: Flags, findings: list[Finding]
+    motor: Motor, axis: Integers, columns: dict[str, Any], starts: Flags
 ) -> tuple[Integers, dict[str, Any], Flags]:
     """Leave out segments of a single sample: they tell nothing."""
     edges = np.append(np.flatnonzero(starts), axis.size)
@@ -272,6 +265,6 @@ def _without_stubs(
         return axis, columns, starts
     keep = np.repeat(~short, np.diff(edges))
     text = f"{int(short.sum())} single samples between gaps were left out"
-    findings.append(found("single_samples", text))
+    motor.tell("single_samples", text)
     kept = {name: None if v is None else v[keep] for name, v in columns.items()}
     return axis[keep], kept, starts[keep]

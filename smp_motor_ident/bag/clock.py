@@ -6,10 +6,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
+from smp_motor_ident.bag.storage import Array, Integers
 
 _SECOND = 1_000_000_000
 _BEATS = 32
@@ -155,19 +153,10 @@ def mean_held(time: Integers, value: Array, held: str, at: Integers) -> Array:
         else np.searchsorted(time, at[0])
     )
     mean[0] = value[min(max(int(side), 0), value.size - 1)]
-    inside = _untouched(time, at)
+    # Between these no input instant divides the interval between outputs.
+    first, last = np.searchsorted(time, at[:-1], "right"), np.searchsorted(time, at[1:], "left")
+    inside = first >= last
     # An interval without a change has exactly the level that holds there.
-    if held == "after":
-        index = np.searchsorted(time, at[:-1], "right") - 1
-    else:
-        index = np.minimum(np.searchsorted(time, at[1:], "left"), value.size - 1)
+    index = first - 1 if held == "after" else np.minimum(last, value.size - 1)
     mean[1:][inside] = value[np.clip(index, 0, value.size - 1)][inside]
     return mean
-
-
-def _untouched(time: Integers, at: Integers) -> NDArray[np.bool_]:
-    """Return which intervals between outputs no input instant divides."""
-    first = np.searchsorted(time, at[:-1], "right")
-    last = np.searchsorted(time, at[1:], "left")
-    divided: NDArray[np.bool_] = first >= last
-    return divided

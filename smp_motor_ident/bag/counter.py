@@ -5,13 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-from smp_motor_ident.bag.storage import found
+from smp_motor_ident.bag.storage import Array, Integers, found
 from smp_motor_ident.finding import Finding
-
-Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 _WIDTHS = (32, 24, 20, 18, 17, 16, 15, 14, 13, 12, 11, 10, 8)
 

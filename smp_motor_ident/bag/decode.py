@@ -26,10 +26,12 @@ class _Collector:
     def __init__(self, topic: str, paths: list[str], types: Types, budget: Budget) -> None:
         self.topic, self.paths, self.types, self.budget = topic, paths, types, budget
         self._decoders: dict[tuple[str, str, str], Decoder] = {}
+        self._count = 0
+        # Of each part, whose messages have one layout: which messages, and what they hold
+        self._rows: list[Integers] = []
         self._log: list[Integers] = []
         self._number: list[Integers | None] = []
         self._columns: dict[str, list[NDArray[Any] | None]] = {}
-        self._present: dict[str, list[NDArray[np.bool_] | None]] = {}
         self.packed = 0
 
     def add(self, batch: Batch) -> None:
@@ -38,19 +40,14 @@ class _Collector:
         if not len(batch):
             return
         decoder = self._decoder(batch.channel)
-        decoded = decoder.decode(batch)
-        if not decoded.rows.size:
-            return
-        self._log.append(batch.log_time[decoded.rows])
-        numbers = batch.sequence
-        self._number.append(None if numbers is None else numbers[decoded.rows])
-        names = decoder.paths
-        for name in {*self.paths, *STAMP}:
-            k = names.index(name) if name in names else -1
-            column = decoded.columns[k] if k >= 0 else None
-            self._columns.setdefault(name, []).append(column)
-            there = decoded.present[k] if k >= 0 else None
-            self._present.setdefault(name, []).append(there)
+        for rows, columns in decoder.decode(batch):
+            self._rows.append(self._count + rows)
+            self._log.append(batch.log_time[rows])
+            self._number.append(None if batch.sequence is None else batch.sequence[rows])
+            held = dict(zip(decoder.paths, columns))
+            for name in {*self.paths, *STAMP}:
+                self._columns.setdefault(name, []).append(held.get(name))
+        self._count += len(batch)
 
     def _decoder(self, channel: Channel) -> Decoder:
         key = (channel.type, channel.definition_format, channel.definition)
@@ -69,28 +66,29 @@ class _Collector:
         return self._decoders[key]
 
     def table(self) -> Table:
-        """Return what was collected, and forget it."""
-        sizes = [part.size for part in self._log]
-        log = np.concatenate(self._log) if self._log else np.zeros(0, np.int64)
+        """Return what was collected, in the order of the messages, and forget it."""
+        none = np.zeros(0, np.int64)
+        rows = np.concatenate([none, *self._rows])
+        order = slice(None) if np.all(np.diff(rows) > 0) else np.argsort(rows)
+        sizes = [part.size for part in self._rows]
+        log = np.concatenate([none, *self._log])[order]
         self._log.clear()
         numbers = [part for part in self._number if part is not None and part.all()]
-        number = np.concatenate(numbers) if 0 < len(numbers) == len(self._number) else None
+        counted = 0 < len(numbers) == len(self._number)
+        number = np.concatenate(numbers)[order] if counted else None
         columns: dict[str, NDArray[Any]] = {}
         present: dict[str, NDArray[np.bool_]] = {}
         for name in list(self._columns):
-            parts, flags = self._columns.pop(name), self._present.pop(name)
-            if all(part is None for part in parts):
+            parts = self._columns.pop(name)
+            known = [part.dtype for part in parts if part is not None]
+            if not known:
                 continue
-            if any(p is None or f is not None for p, f in zip(parts, flags)):
-                present[name] = np.concatenate(
-                    [
-                        np.full(n, p is not None) if f is None else f
-                        for n, p, f in zip(sizes, parts, flags)
-                    ]
-                )
-            columns[name] = np.concatenate(
-                [np.zeros(n) if p is None else p for n, p in zip(sizes, parts)]
-            )
+            if len(known) < len(parts):
+                flags = [np.full(n, part is not None) for n, part in zip(sizes, parts)]
+                present[name] = np.concatenate(flags)[order]
+            kind = np.result_type(*known)
+            filled = [np.zeros(n, kind) if p is None else p for n, p in zip(sizes, parts)]
+            columns[name] = np.concatenate(filled)[order]
         table = Table(log, _stamps(columns), columns, present, number)
         for decoder in self._decoders.values():
             if decoder.undecodable:

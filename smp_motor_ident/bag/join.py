@@ -11,6 +11,7 @@ from smp_motor_ident.bag.storage import found
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.record import Record
 
+_COLUMNS = ("voltage", "current", "velocity", "position", "count")
 BETWEEN = 1.0
 """Time [s] that a joined record leaves between two recordings."""
 
@@ -31,8 +32,8 @@ def join_records(records: list[Record]) -> Record:
     offsets = np.cumsum([0.0, *(r.duration + BETWEEN for r in records)])[:-1]
     lengths = np.cumsum([0, *(len(r) for r in records)])[:-1].tolist()
     findings = [replace(f, message=f"{r.source}: {f.message}") for r in records for f in r.findings]
-    columns: dict[str, Any] = {}
-    for name in ("voltage", "current", "velocity", "position", "count"):
+    columns: dict[str, Any] = dict.fromkeys(_COLUMNS)
+    for name in _COLUMNS:
         parts = [getattr(r, name) for r in records]
         if all(part is None for part in parts):
             continue
@@ -46,10 +47,6 @@ def join_records(records: list[Record]) -> Record:
     return replace(
         first,
         time=np.concatenate([r.time + offset for r, offset in zip(records, offsets)]),
-        current=columns.pop("current", None),
-        velocity=columns.pop("velocity", None),
-        position=columns.pop("position", None),
-        count=columns.pop("count", None),
         starts=tuple(s + n for r, n in zip(records, lengths) for s in r.starts),
         source=", ".join(dict.fromkeys(r.source for r in records)),
         findings=tuple(f for k, f in enumerate(findings) if f not in findings[:k]),

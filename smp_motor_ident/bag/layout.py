@@ -26,6 +26,9 @@ from smp_motor_ident.bag.template import (
 from smp_motor_ident.bag.types import Definitions
 from smp_motor_ident.errors import BagError
 
+Part = tuple[NDArray[np.int64], list[NDArray[Any] | None]]
+"""Which messages of a batch agree, and their columns; a column is None where they have none."""
+
 
 @dataclass(frozen=True, eq=False)
 class Layout:
@@ -49,14 +52,7 @@ class Layout:
 class Decoder:
     """Reads the wanted fields of one channel, template by template.
 
-    Parameters
-    ----------
-    channel : Channel
-        Type and encoding.
-    candidates : iterable of Definitions
-        What that type may be; the first that fits a message is used from then on.
-    paths : sequence of str
-        Fields that are wanted.
+    Of the ``candidates`` for its type the first that fits a message is used from then on.
     """
 
     KEPT = 64
@@ -74,17 +70,15 @@ class Decoder:
         self.undecodable = 0
         self.reason = ""
 
-    def decode(self, batch: Batch) -> Decoded:
+    def decode(self, batch: Batch) -> list[Part]:
         """Decode a batch; messages that are no such messages are missing and counted."""
-        rows: list[NDArray[np.int64]] = []
-        columns: list[list[NDArray[Any] | None]] = []
+        parts: list[Part] = []
         left: NDArray[np.int64] = np.arange(len(batch))
         while left.size:
             rest = batch.take(left)
             for layout in self._layouts:
                 if (same := layout.matches(rest)).any():
-                    rows.append(left[same])
-                    columns.append(_read(rest, same, layout))
+                    parts.append((left[same], _read(rest, same, layout)))
                     left = left[~same]
                     rest = batch.take(left)
                 if not left.size:
@@ -92,7 +86,7 @@ class Decoder:
             if left.size and not self._learn(rest.message(0)):
                 self.undecodable += 1
                 left = left[1:]
-        return Decoded.joined(rows, columns, len(self.paths))
+        return parts
 
     def _candidates(self) -> Iterator[Definitions]:
         """Yield what the type may be; none is looked for before the others have failed."""
@@ -135,51 +129,6 @@ class Decoder:
         self._layouts.insert(0, Layout(len(data), words, tuple(numbers)))
         del self._layouts[self.KEPT :]
         return True
-
-
-@dataclass(frozen=True, eq=False)
-class Decoded:
-    """Columns of a batch.
-
-    ``rows`` tells for each entry which message it comes from; a column is None where no
-    message had it, and ``present`` tells which entries hold a number.
-    """
-
-    rows: NDArray[np.int64]
-    columns: list[NDArray[Any] | None]
-    present: list[NDArray[np.bool_] | None]
-
-    @classmethod
-    def joined(
-        cls,
-        rows: list[NDArray[np.int64]],
-        parts: list[list[NDArray[Any] | None]],
-        width: int,
-    ) -> Decoded:
-        """Return what several layouts gave as one, in the order of the messages."""
-        if not rows:
-            return cls(np.zeros(0, np.int64), [None] * width, [None] * width)
-        if len(rows) == 1:
-            return cls(rows[0], parts[0], [None] * width)
-        every = np.concatenate(rows)
-        order = np.argsort(every, kind="stable")
-        columns: list[NDArray[Any] | None] = []
-        present: list[NDArray[np.bool_] | None] = []
-        for k in range(width):
-            had = [part[k] for part in parts]
-            if all(column is None for column in had):
-                columns.append(None)
-                present.append(None)
-                continue
-            filled = [np.zeros(r.size) if c is None else c for r, c in zip(rows, had)]
-            kinds = {column.dtype for column in had if column is not None}
-            kind = kinds.pop() if len(kinds) == 1 else np.dtype(np.float64)
-            columns.append(np.concatenate([f.astype(kind, copy=False) for f in filled])[order])
-            flags = [np.full(r.size, c is not None) for r, c in zip(rows, had)]
-            present.append(
-                None if all(c is not None for c in had) else np.concatenate(flags)[order]
-            )
-        return cls(every[order], columns, present)
 
 
 def _read(batch: Batch, which: NDArray[np.bool_], layout: Layout) -> list[NDArray[Any] | None]:

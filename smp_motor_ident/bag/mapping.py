@@ -181,25 +181,7 @@ def load(path: str | os.PathLike[str]) -> SignalMap:
 
 
 def from_document(document: Any, where: str = "mapping") -> SignalMap:
-    """Read a mapping from plain data, as YAML gives them.
-
-    Parameters
-    ----------
-    document : dict
-        ``motors`` by wheel, ``types``, and options that hold for all motors.
-    where : str
-        What to call it in messages.
-
-    Returns
-    -------
-    SignalMap
-        Validated.
-
-    Raises
-    ------
-    BagError
-        Naming the key and what it may be.
-    """
+    """Read a mapping from plain data, as YAML gives them: ``motors``, ``types`` and options."""
     if not isinstance(document, Mapping):
         raise BagError(f"{where}: must hold keys and values, such as motors:")
     rest = dict(document)
@@ -288,10 +270,14 @@ def _number(value: Any, place: str) -> float:
     text = text.lstrip("+-").strip()
     if not re.fullmatch(_PRODUCT, text):
         raise BagError(f"{place} is {value!r}; it must be a number or a product such as 12/255")
-    result = sign
-    for operator, factor in re.findall(rf"([*/]?)\s*({_NUMBER})", text):
+    return _times(sign, text, f"{place}: {value!r}")
+
+
+def _times(result: float, factors: str, place: str) -> float:
+    """Multiply by a product such as ``12/255`` or ``*12/255``."""
+    for operator, factor in re.findall(rf"([*/]?)\s*(-?{_NUMBER})", factors):
         if operator == "/" and float(factor) == 0:
-            raise BagError(f"{place}: {value!r} divides by zero")
+            raise BagError(f"{place} divides by zero")
         result = result / float(factor) if operator == "/" else result * float(factor)
     return result
 
@@ -332,11 +318,7 @@ def _written(text: str, place: str) -> Signal:
     if match is None:
         raise BagError(f"{place}: {text!r} is not SOURCE[*SCALE][+OFFSET][:UNIT][@SHAFT]")
     source = match["source"].strip()
-    scale = 1.0
-    for operator, number in re.findall(rf"([*/])\s*(-?{_NUMBER})", match["scale"]):
-        if operator == "/" and float(number) == 0:
-            raise BagError(f"{place}: {text!r} divides by zero")
-        scale = scale / float(number) if operator == "/" else scale * float(number)
+    scale = _times(1.0, match["scale"], f"{place}: {text!r}")
     offset = _number(match["offset"].replace(" ", "") or "0", place)
     named = _TOPIC.fullmatch(source)  # anything else is a column of a CSV file
     topic, path = (named["topic"], named["field"].strip()) if named else ("", source.strip('"'))

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import Any
 
 import numpy as np
 
-from smp_motor_ident.bag.decode import Progress
 from smp_motor_ident.bag.source import Recording
 from smp_motor_ident.bag.template import (
     DecodeError,
     Number,
-    Template,
     names_beside,
     take_apart,
 )
@@ -55,7 +54,7 @@ class Listing:
     findings: list[Finding]  # what is missing or damaged
 
 
-def offers_of(recording: Recording, types: Types, progress: Progress | None) -> list[Offer]:
+def offers_of(recording: Recording, types: Types) -> list[Offer]:
     """Return the topics of a recording with their fields, by its first messages."""
     if recording.is_table:
         return [
@@ -66,7 +65,7 @@ def offers_of(recording: Recording, types: Types, progress: Progress | None) -> 
     spans: dict[str, tuple[int, int]] = {}
     for channel in recording.channels():
         found.setdefault(channel.topic, Offer(channel.topic, channel.type))
-    for fraction, batch in recording.batches(lambda _: True):
+    for _, batch in recording.batches(lambda _: True):
         topic = batch.channel.topic
         offer = found.setdefault(topic, Offer(topic, batch.channel.type))
         if not offer.count:
@@ -76,8 +75,6 @@ def offers_of(recording: Recording, types: Types, progress: Progress | None) -> 
         first, last = spans.get(topic, (2**63 - 1, -(2**63)))
         times = batch.log_time
         spans[topic] = (min(first, int(times.min())), max(last, int(times.max())))
-        if progress is not None:
-            progress(fraction, recording.name)
     for topic, (first, last) in spans.items():
         if last > first:
             found[topic].rate = (found[topic].count - 1) / ((last - first) * 1e-9)
@@ -98,17 +95,15 @@ def _fields(types: Types, batch: Any) -> tuple[list[str], str]:
             except DecodeError as error:
                 reason = str(error)
                 continue
-            return list(fields_of(template)), ""
+            fields = (
+                _paths(name, value, template.root)
+                for name, value in template.root.items()
+                if name != "header"
+            )
+            return list(chain.from_iterable(fields)), ""
     except BagError:
         return [], "unknown type: give its .msg files"
     return [], f"not as its type says: {reason}"
-
-
-def fields_of(template: Template) -> Iterator[str]:
-    """Yield the paths of a message's numbers, without its header."""
-    for name, value in template.root.items():
-        if name != "header":
-            yield from _paths(name, value, template.root)
 
 
 def _paths(path: str, value: Any, parent: dict[str, Any]) -> Iterator[str]:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.special import fdtrc
 
-from smp_motor_ident.bag.decode import Progress, collect
+from smp_motor_ident.bag.decode import collect
 from smp_motor_ident.bag.limits import EXPLAINS
 from smp_motor_ident.bag.mapping import SignalMap, parse
 from smp_motor_ident.bag.offers import Listing, Offer, offers_of
@@ -94,15 +94,13 @@ class _Candidate:
         return hint
 
 
-def list_topics(
-    paths: Any, msg_files: Iterable[str] = (), *, progress: Progress | None = None
-) -> list[Listing]:
+def list_topics(paths: Any, msg_files: Iterable[str] = ()) -> list[Listing]:
     """List what recordings offer, and suggest how to map it."""
     types = Types(msg_files)
     listings = []
     for recording in recordings(paths):
         with one_line(recording):
-            offers = offers_of(recording, types, progress)
+            offers = offers_of(recording, types)
             needed = all(offer.type != STATE for offer in offers)
             items, asked = propose(recording, offers, types) if needed else ([], [])
             if items:

@@ -19,13 +19,7 @@ Entry = tuple[int, int, Batch, int]
 
 
 class Replay:
-    """The messages of one bag.
-
-    Parameters
-    ----------
-    path : Path
-        A bag's folder or a bare file.
-    """
+    """The messages of one bag: a folder or a bare file."""
 
     def __init__(self, path: Path) -> None:
         found = recordings(path)

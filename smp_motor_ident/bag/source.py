@@ -8,23 +8,15 @@ import tempfile
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, cast
 
 import yaml
 
 from smp_motor_ident.bag.readers import BAGS, PACKED, TABLES, is_table, open_source
-from smp_motor_ident.bag.storage import (
-    TABLE,
-    Batch,
-    Channel,
-    Messages,
-    Source,
-    Table,
-    Tables,
-    damaged,
-    found,
-)
+from smp_motor_ident.bag.readers.format import Messages, Tables
+from smp_motor_ident.bag.storage import TABLE, Batch, Channel, Table, damaged, found
 from smp_motor_ident.bag.unpack import Budget
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.finding import Finding
@@ -46,25 +38,25 @@ class Recording:
     name: str  # what to call it in messages and results
     files: list[Path]  # in the order in which they were written
     promised: dict[str, int] | None = None  # messages by topic as metadata.yaml counts them
-    distribution: str = ""  # ROS distribution that wrote it, where known
     # What was found amiss, grows while the files are read
     findings: list[Finding] = field(default_factory=list)
     # Whether it was found in a folder with others, so that nobody asked for it by name
     one_of_many: bool = False
     _sources: dict[Path, Messages | Tables | None] = field(default_factory=dict, repr=False)
-    _folder: tempfile.TemporaryDirectory[str] | None = field(default=None, repr=False)
-    _budget: Budget | None = field(default=None, repr=False)
 
     @property
     def is_table(self) -> bool:
         """Whether it holds columns instead of messages."""
         return is_table(self.files[0])
 
-    @property
+    @cached_property
     def budget(self) -> Budget:
         """Bytes that may be unpacked of it."""
-        self._budget = self._budget or Budget(self.name, self.size())
-        return self._budget
+        return Budget(self.name, self.size())
+
+    @cached_property
+    def _folder(self) -> tempfile.TemporaryDirectory[str]:
+        return tempfile.TemporaryDirectory(prefix="smp_bag_")
 
     def size(self) -> int:
         """Return the bytes of all files."""
@@ -88,10 +80,10 @@ class Recording:
     def table(self, topic: str, fields: Sequence[str]) -> Table:
         """Return columns of a table."""
         for path in self.files:
-            source = self._source(path)
-            for channel in source.channels() if source is not None else []:
-                if self._topic(path, channel) == topic:
-                    return cast(Tables, source).table(channel.topic, fields)
+            if isinstance(source := self._source(path), Tables):
+                for channel in source.channels():
+                    if self._topic(path, channel) == topic:
+                        return source.table(channel.topic, fields)
         raise BagError(f"{self.name}: has no {topic or 'table'}")
 
     def batches(self, wanted: Callable[[Channel], bool]) -> Iterator[tuple[float, Batch]]:
@@ -132,12 +124,11 @@ class Recording:
     def _source(self, path: Path) -> Messages | Tables | None:
         """Open a file; where others remain, one that cannot be read becomes a finding."""
         if path not in self._sources:
-            self._folder = self._folder or tempfile.TemporaryDirectory(prefix="smp_bag_")
             try:
-                source: Source = open_source(path, Path(self._folder.name), self.budget)
+                source = open_source(path, Path(self._folder.name), self.budget)
                 if is_table(path) is not self.is_table:
                     raise BagError(f"{path}: is of another kind than the other files")
-                self._sources[path] = cast("Messages | Tables", source)
+                self._sources[path] = source
             except BagError as error:
                 if len(self.files) == 1 or self.is_table:
                     raise
@@ -246,7 +237,6 @@ def _bag(path: Path) -> Recording:
         information = _loaded(text)["rosbag2_bagfile_information"]
         listed = [Path(str(file)).name for file in information["relative_file_paths"]]
         bag.promised = _promise(information)
-        bag.distribution = str(information.get("ros_distro") or "")
     except (yaml.YAMLError, LookupError, TypeError, ArithmeticError, *_DAMAGE) as error:
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         bag.findings.append(

@@ -1,12 +1,11 @@
-"""What every format gives: channels, and batches of raw messages or tables of columns."""
+"""What recordings consist of: channels, and batches of raw messages or tables of columns."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,37 +104,6 @@ class Table:
     exact: frozenset[str] = frozenset()
 
 
-class Source(Protocol):
-    """One opened file; ``problems`` fills while it is read: everything that was lost."""
-
-    path: Path
-    problems: list[Finding]
-
-    def channels(self) -> list[Channel]:
-        """Return the channels, reading the whole file where it has no index."""
-        ...
-
-
-class Messages(Source, Protocol):
-    """A file of serialized messages."""
-
-    def promised(self) -> dict[str, int] | None:
-        """Return the number of messages by topic where the file itself tells it."""
-        ...
-
-    def batches(self, wanted: Callable[[Channel], bool]) -> Iterator[tuple[float, Batch]]:
-        """Yield the fraction of the file that is read, and a batch."""
-        ...
-
-
-class Tables(Source, Protocol):
-    """A file of columns; its channels have the encoding `TABLE` and name their fields."""
-
-    def table(self, topic: str, fields: Sequence[str]) -> Table:
-        """Return columns of a topic; ``log`` is None where the time is a column, too."""
-        ...
-
-
 def gather(data: Bytes, at: Integers, dtype: str) -> NDArray[Any]:
     """Return the numbers that begin at the given bytes, aligned or not; all must fit."""
     kind = np.dtype(dtype)
@@ -144,6 +112,11 @@ def gather(data: Bytes, at: Integers, dtype: str) -> NDArray[Any]:
         (data.size - kind.itemsize + 1,), kind, data.data, strides=(1,)
     )
     return every[at]
+
+
+def first_line(error: BaseException) -> str:
+    """Return an error's first line, or its kind where it says nothing."""
+    return (str(error).splitlines() or [type(error).__name__])[0]
 
 
 def message_type(name: str) -> str:

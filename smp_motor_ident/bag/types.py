@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from functools import cache, lru_cache
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +18,14 @@ from rosbags.typesys import (
     get_typestore,
 )
 
-from smp_motor_ident.bag.storage import Channel, message_type
+from smp_motor_ident.bag.storage import Channel, first_line, message_type
 from smp_motor_ident.errors import BagError
 
 Fields = Sequence[tuple[str, Any]]
 Definitions = Mapping[str, Fields]
 """Fields of every message type by its full name; the field's description is rosbags'."""
+Lookup = Callable[[str], Fields | None]
+"""From a type's full name to its fields, None where they are not known there."""
 
 _STORES = (
     Stores.ROS2_JAZZY,
@@ -57,16 +59,9 @@ def _references(fields: Fields) -> Iterator[str]:
             yield detail
 
 
-class _Store(dict[str, Fields]):
-    """Types of a distribution, loaded when one is asked for."""
-
-    def __init__(self, which: Stores) -> None:
-        super().__init__()
-        self._which = which
-
-    def get(self, name: str, default: Any = None) -> Any:
-        """Return a type's fields."""
-        return _store(self._which).get(name, default)
+def _stored(which: Stores, name: str) -> Fields | None:
+    """Return a type of a distribution, whose types are loaded when one is asked for."""
+    return _store(which).get(name)
 
 
 @cache
@@ -85,13 +80,7 @@ def _ament_file(name: str, suffix: str) -> Path | None:
 
 
 class Types:
-    """Finds what a message consists of.
-
-    Parameters
-    ----------
-    files : iterable of path
-        ``.msg`` files, or folders of them, that the user gives.
-    """
+    """Finds what a message consists of; ``files`` are ``.msg`` files, or folders, of the user."""
 
     def __init__(self, files: Iterable[str | os.PathLike[str]] = ()) -> None:
         self._given: dict[str, Fields] = {}
@@ -109,7 +98,7 @@ class Types:
         try:
             self._given.update(_parse(file.read_text(), f"{package}/msg/{file.stem}", "ros2msg"))
         except (TypesysError, OSError, ValueError, RecursionError) as error:
-            raise BagError(f"{file}: not a message definition ({_line(error)})") from None
+            raise BagError(f"{file}: not a message definition ({first_line(error)})") from None
 
     def candidates(self, channel: Channel) -> Iterator[Definitions]:
         """Yield what the channel's type may be, the most trusted first; at least one.
@@ -118,20 +107,20 @@ class Types:
         does not define its types, the one that fits the bytes is right.
         """
         name, reasons = channel.type, []
-        stores = [_Store(which) for which in _STORES]
+        stores: list[Lookup] = [partial(_stored, which) for which in _STORES]
         if channel.definition:
             try:
                 own = _parse(channel.definition, name, channel.definition_format)
-                yield self._closed(name, [own, self._given, *stores])
+                yield self._closed(name, [own.get, self._given.get, *stores])
             except _SPOILT as error:
-                reasons.append(f"the bag's own definition cannot be used: {_line(error)}")
-        given: list[Mapping[str, Fields]] = [self._named(name), self._given]
-        known = [[_Ament(), stores[0]], *([store, _Ament()] for store in stores[1:])]
+                reasons.append(f"the bag's own definition cannot be used: {first_line(error)}")
+        given: list[Lookup] = [self._named(name).get, self._given.get]
+        known = [[_ament, stores[0]], *([store, _ament] for store in stores[1:])]
         for sources in known:
             try:
                 yield self._closed(name, [*given, *sources])
             except (TypesysError, BagError) as error:
-                reasons.append(_line(error))
+                reasons.append(first_line(error))
         if len(reasons) == len(known) + bool(channel.definition):
             raise BagError(
                 f"{channel.topic}: the message type {name or '(none)'!r} is unknown "
@@ -145,7 +134,7 @@ class Types:
         same = [key for key in self._given if key.rpartition("/")[2] == name.rpartition("/")[2]]
         return {name: self._given[same[0]]} if len(same) == 1 else {}
 
-    def _closed(self, name: str, sources: Sequence[Mapping[str, Fields]]) -> Definitions:
+    def _closed(self, name: str, sources: Sequence[Lookup]) -> Definitions:
         """Return the type and all that it refers to, each from the first source that has it."""
         closed: dict[str, Fields] = {}
         open_names = [name]
@@ -153,7 +142,7 @@ class Types:
             key = open_names.pop()
             if key in closed:
                 continue
-            fields = next((f for s in sources if (f := s.get(key)) is not None), None)
+            fields = next((f for source in sources if (f := source(key)) is not None), None)
             if fields is None:
                 raise BagError(f"nothing defines {key!r}")
             closed[key] = fields
@@ -161,12 +150,9 @@ class Types:
         return closed
 
 
-class _Ament(dict[str, Fields]):
-    """Types of the interface packages on AMENT_PREFIX_PATH."""
-
-    def get(self, name: str, default: Any = None) -> Any:
-        """Return a type's fields."""
-        return default if (text := _msg_text(name)) is None else _parse(text, name, "")[name]
+def _ament(name: str) -> Fields | None:
+    """Return a type of the interface packages on AMENT_PREFIX_PATH."""
+    return None if (text := _msg_text(name)) is None else _parse(text, name, "")[name]
 
 
 @cache
@@ -195,7 +181,3 @@ def definition(name: str) -> tuple[str, str]:
     store = get_typestore(Stores.ROS2_JAZZY)
     store.register({k: ([], list(v)) for k, v in closed.items() if k not in store.fielddefs})
     return store.generate_msgdef(name, ros_version=2)[0], store.hash_rihs01(name)
-
-
-def _line(error: BaseException) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]

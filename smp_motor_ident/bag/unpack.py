@@ -32,15 +32,7 @@ _ZSTD = zstandard.ZstdDecompressor()
 
 
 class Budget:
-    """Bytes that may still be unpacked of one recording.
-
-    Parameters
-    ----------
-    name : str
-        Of the recording.
-    packed : int
-        Its bytes as they are.
-    """
+    """Bytes that may still be unpacked of one recording, which has ``packed`` as it is."""
 
     def __init__(self, name: str, packed: int) -> None:
         self.name = name

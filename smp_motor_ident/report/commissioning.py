@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
-from importlib import resources
 from typing import TYPE_CHECKING, Any
-
-from markupsafe import Markup
 
 from smp_motor_ident.report import words
 from smp_motor_ident.report.chart import Chart, Curve
-from smp_motor_ident.report.drawing import svg
-from smp_motor_ident.report.templates import template
+from smp_motor_ident.report.templates import page
 
 if TYPE_CHECKING:
     from smp_motor_ident.tune.verification import Change
@@ -55,23 +50,13 @@ def charts(changes: Sequence[Change]) -> list[Chart]:
 
 def render(document: Mapping[str, Any], changes: Sequence[Change]) -> str:
     """Return the page of what ``commissioning.json`` holds and of the drive's curves."""
-    drawn = charts(changes)
-    data = json.dumps([chart.to_document() for chart in drawn], separators=(",", ":"))
-    return template("commissioning.html.jinja").render(
+    return page(
+        "commissioning.html.jinja",
+        charts(changes),
         document=document,
         findings=document.get("findings", []),
         checks=document.get("checks", {}),
         identified=any(f["step"] == "validation" for f in document.get("findings", [])),
         changes=document.get("changes", []),
         columns=COLUMNS,
-        charts=drawn,
-        draw=lambda chart: Markup(svg(chart)),
-        data=Markup(data.replace("<", "\\u003c")),
-        style=Markup(_text("uplot/uPlot.min.css") + _text("colors.css") + _text("report.css")),
-        library=Markup(_text("uplot/uPlot.iife.min.js")),
-        script=Markup(_text("plots.js")),
     )
-
-
-def _text(name: str) -> str:
-    return resources.files("smp_motor_ident.report").joinpath(name).read_text("utf-8")

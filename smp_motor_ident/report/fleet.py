@@ -8,13 +8,11 @@ import math
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from importlib import resources
 
 import numpy as np
-from markupsafe import Markup
 
+from smp_motor_ident.report import templates
 from smp_motor_ident.report.limits import FLEET_DRIFT, FLEET_OUTLIER, FLEET_SIZE
-from smp_motor_ident.report.templates import template
 
 QUANTITIES = ("dc_gain", "time_constant", "static_voltage", "resistance", "motor_constant")
 """What is compared, where the recordings tell it."""
@@ -144,12 +142,10 @@ def table(rows: Sequence[Row]) -> tuple[str, bytes]:
 
 def page(rows: Sequence[Row], marks: Sequence[Mark]) -> str:
     """Return the table as a page that stands alone."""
-    folder = resources.files("smp_motor_ident.report")
-    style = "".join(folder.joinpath(n).read_text("utf-8") for n in ("colors.css", "report.css"))
-    return template("fleet.html.jinja").render(
-        rows=rows, marks=marks, quantities=QUANTITIES, style=Markup(style),
-        robots=len({r.robot for r in rows}), day=_day,
-    )  # fmt: skip
+    robots = len({r.robot for r in rows})
+    return templates.page(
+        "fleet.html.jinja", rows=rows, marks=marks, quantities=QUANTITIES, robots=robots, day=_day
+    )
 
 
 def _day(date: float) -> str:

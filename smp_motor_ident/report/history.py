@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -48,13 +48,7 @@ def append(path: Path, entries: Sequence[Entry]) -> None:
     """Add entries to a file."""
     with path.open("a", encoding="utf-8") as file:
         for one in entries:
-            document = {
-                "stamp": one.stamp,
-                "wheel": one.wheel,
-                "values": {name: list(pair) for name, pair in one.values.items()},
-                "findings": list(one.findings),
-            }
-            file.write(json.dumps(document, allow_nan=False) + "\n")
+            file.write(json.dumps(asdict(one), allow_nan=False) + "\n")
 
 
 def read(path: Path) -> dict[str, list[Entry]]:

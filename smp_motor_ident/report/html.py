@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib import resources
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from markupsafe import Markup
 
 from smp_motor_ident.finding import Finding
-from smp_motor_ident.report import figures, words
-from smp_motor_ident.report.alike import same_response
+from smp_motor_ident.report import figures, templates, words
 from smp_motor_ident.report.chart import Chart
-from smp_motor_ident.report.drawing import svg
 from smp_motor_ident.report.series import Comparison
-from smp_motor_ident.report.templates import template
-from smp_motor_ident.result import Candidate, Estimate, Quantity
+from smp_motor_ident.result import Estimate, Quantity
 
 if TYPE_CHECKING:
     from smp_motor_ident.report.tuning_page import Tuning
@@ -45,22 +39,6 @@ class Report:
     history: Mapping[str, Sequence[Chart]] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class Row:
-    """One line of a table of quantities, in words."""
-
-    symbol: str
-    name: str
-    meaning: str
-    value: str
-    std: str
-    interval: str
-    unit: str
-    status: str
-    kind: str
-    share: str
-
-
 def render(report: Report) -> str:
     """Return the page."""
     motors = {
@@ -69,25 +47,17 @@ def render(report: Report) -> str:
     }
     tuning_charts, tuning_data = _tuning_page(report.tunings)
     charts = [*tuning_charts, *(c for motor in motors.values() for c in motor["charts"])]
-    return template("report.html.jinja").render(
+    return templates.page(
+        "report.html.jinja",
+        charts,
         report=report,
-        style=Markup(_text("uplot/uPlot.min.css") + _text("colors.css") + _text("report.css")),
-        library=Markup(_text("uplot/uPlot.iife.min.js")),
-        licence=_text("uplot/LICENSE"),
-        script=Markup(_text("plots.js")),
-        data=_json([chart.to_document() for chart in charts]),
+        licence=templates.text("uplot/LICENSE"),
         tuning_charts=tuning_charts,
         tuning_data=tuning_data,
-        tuning_json=_json(tuning_data),
-        draw=lambda chart: Markup(svg(chart)),
+        tuning_json=templates.script_data(tuning_data),
         wheels=_side_by_side(report.estimates) if len(report.estimates) > 1 else (),
         motors=motors,
     )
-
-
-def _json(content: Any) -> Markup:
-    """Return data for a script element, which nothing in it may end."""
-    return Markup(json.dumps(content, separators=(",", ":")).replace("<", "\\u003c"))
 
 
 def _tuning_page(tunings: Mapping[str, Tuning]) -> tuple[list[Chart], dict[str, Any]]:
@@ -96,10 +66,6 @@ def _tuning_page(tunings: Mapping[str, Tuning]) -> tuple[list[Chart], dict[str, 
     from smp_motor_ident.report import tuning_page  # loads all of tune, which few reports need
 
     return tuning_page.page_charts(tunings), tuning_page.page_data(tunings)
-
-
-def _text(name: str) -> str:
-    return resources.files("smp_motor_ident.report").joinpath(name).read_text("utf-8")
 
 
 def _motor(
@@ -126,7 +92,8 @@ def _motor(
             if name not in estimate.combinations
         ],
         "alike": _alike(estimate),
-        "candidates": _ranked(estimate.candidates),
+        # By their information criterion, those without one last
+        "candidates": sorted(estimate.candidates, key=lambda c: (c.bic is None, c.bic or 0.0)),
         "correlations": _correlations(estimate),
         "charts": [*fit, *residuals, *frequency, *since],
         "history": since,
@@ -174,14 +141,15 @@ def _cell(q: Quantity, low: float, high: float) -> tuple[str, tuple[float, float
     )
 
 
-def _row(name: str, quantity: Quantity) -> Row:
+def _row(name: str, quantity: Quantity) -> dict[str, str]:
+    """Return one line of a table of quantities, in words."""
     symbol, title, meaning = words.EXPLAINED.get(name, ("", words.label(name), ""))
     std = quantity.std
     interval = "—"
     if quantity.ci95 is not None:
         low, high = (words.number(bound, std) for bound in quantity.ci95)
         interval = f"{low} … {high}"
-    return Row(
+    return dict(
         symbol=symbol,
         name=title,
         meaning=meaning,
@@ -210,7 +178,7 @@ def _share(quantity: Quantity) -> str:
 def _alike(estimate: Estimate) -> list[tuple[str, str, str]]:
     """Return symbol, name and range of what other motors of the same response may have."""
     rows = []
-    for name, (low, high) in same_response(estimate).items():
+    for name, (low, high) in _same_response(estimate).items():
         symbol, title, _ = words.EXPLAINED[name]
         end = f"… {high:.3g}" if math.isfinite(high) else "or more"
         rows.append(
@@ -219,9 +187,33 @@ def _alike(estimate: Estimate) -> list[tuple[str, str, str]]:
     return rows
 
 
-def _ranked(candidates: Sequence[Candidate]) -> list[Candidate]:
-    """Order the structures by their information criterion, those without one last."""
-    return sorted(candidates, key=lambda c: (c.bic is None, c.bic or 0.0))
+def _same_response(estimate: Estimate) -> dict[str, tuple[float, float]]:
+    """Return the ranges of L, K, J and b over all motors of the identified response.
+
+    They are why some parameters are not printed: each would have given the same recording.
+
+    With ``a0 = (R b + K^2)/K``, ``a1 = (R J + L b)/K``, ``a2 = L J/K`` and R known, each K gives
+    ``b = K (a0 - K)/R`` and J as a root of ``R J^2 - a1 K J + a2 K b = 0``, then L.  Both are
+    real and not negative for ``max(0, a0 - a1^2/(4 a2)) <= K <= a0``.  At ``K = a0`` (b = 0) the
+    larger root is ``a1 a0/R``, the smaller one vanishes and takes L to infinity.
+
+    References
+    ----------
+    docs/derivations.md, what voltage and speed can tell.
+    """
+    gain, lag = estimate.value("dc_gain"), estimate.value("time_constant")
+    product, resistance = estimate.value("time_constant_product"), estimate.value("resistance")
+    if "motor_constant" not in estimate.unidentifiable or min(gain, lag, product, resistance) <= 0:
+        return {}
+    a0, a1, a2 = 1 / gain, lag / gain, product / gain
+    lowest = max(a0 - a1**2 / (4 * a2), 0.0)
+    steepest = max(lowest, a0 / 2)  # where K (a0 - K) is largest
+    return {
+        "inductance": (a2 * resistance / a1, math.inf),
+        "motor_constant": (lowest, a0),
+        "inertia": (0.0, a1 * a0 / resistance),
+        "viscous_friction": (0.0, steepest * (a0 - steepest) / resistance),
+    }
 
 
 def _verdict(estimate: Estimate, findings: Sequence[Finding]) -> tuple[str, str, str]:

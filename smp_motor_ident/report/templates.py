@@ -1,14 +1,22 @@
-"""The templates of the pages."""
+"""Pages that stand alone: a template, with all that it needs in itself."""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Sequence
+from importlib import resources
+from typing import Any
+
 import jinja2
+from markupsafe import Markup
 
 from smp_motor_ident.report import words
+from smp_motor_ident.report.chart import Chart
+from smp_motor_ident.report.drawing import svg
 
 
-def template(name: str) -> jinja2.Template:
-    """Return a template; what is not given to it is an error."""
+def page(name: str, charts: Sequence[Chart] | None = None, **content: Any) -> str:
+    """Return a page by its template, with what draws ``charts``; what is not given is an error."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("smp_motor_ident.report", "."),
         autoescape=True,
@@ -17,4 +25,24 @@ def template(name: str) -> jinja2.Template:
         lstrip_blocks=True,
     )
     environment.filters |= {"label": words.label, "number": words.number}
-    return environment.get_template(name)
+    style = text("colors.css") + text("report.css")
+    if charts is not None:
+        style = text("uplot/uPlot.min.css") + style
+        content |= {
+            "charts": charts,
+            "data": script_data([chart.to_document() for chart in charts]),
+            "draw": lambda chart: Markup(svg(chart)),
+            "library": Markup(text("uplot/uPlot.iife.min.js")),
+            "script": Markup(text("plots.js")),
+        }
+    return environment.get_template(name).render(style=Markup(style), **content)
+
+
+def text(name: str) -> str:
+    """Return a file of this folder."""
+    return resources.files("smp_motor_ident.report").joinpath(name).read_text("utf-8")
+
+
+def script_data(content: Any) -> Markup:
+    """Return data for a script element, which nothing in it may end."""
+    return Markup(json.dumps(content, separators=(",", ":")).replace("<", "\\u003c"))

@@ -54,19 +54,7 @@ class Tuning:
 
 
 def tuning_of(estimate: Estimate, loop: Loop) -> Tuning:
-    """Design one wheel's controller at every place of the sliders.
-
-    Parameters
-    ----------
-    estimate : Estimate
-        Of the motor.
-    loop : Loop
-        That will run.
-
-    Returns
-    -------
-    Tuning
-    """
+    """Design one wheel's controller at every place of the sliders."""
     try:
         own = design(estimate, loop, samples=SAMPLES)
     except SmpError as error:

@@ -111,7 +111,7 @@ def solve(case: Case) -> tuple[Feedback, float, Robustness]:
     """Find the feedback gains, backed off as far as the uncertainty asks for it."""
     ruled = case.method.solve(case.problem)
     quiet, calm = _within_clamp(case.problem, ruled)
-    feedback, factor, robustness = back_off(case.ensemble, quiet)
+    feedback, factor, robustness = back_off(case.ensemble.assess, quiet)
     factor *= calm
     if factor == 0.0:
         raise DesignError(

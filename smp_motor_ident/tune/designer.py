@@ -23,7 +23,7 @@ from smp_motor_ident.tune.plant import Plant, sample
 from smp_motor_ident.tune.problem import checked, control_noise
 from smp_motor_ident.tune.reference import Reference, controller_for, plan_reference
 from smp_motor_ident.tune.simulation import Controller
-from smp_motor_ident.tune.specification import Performance, Specification, measure, specify
+from smp_motor_ident.tune.specification import Performance, Specification, figures_of
 
 
 @dataclass(frozen=True)
@@ -115,29 +115,14 @@ def design(estimate: Estimate, loop: Loop, method: str = "margin", **targets: An
 
 
 def finish(case: Case, feedback: Feedback, factor: float, robustness: Robustness) -> Design:
-    """Add feed-forward, reference, figures and words to feedback gains.
-
-    Parameters
-    ----------
-    case : Case
-        From :func:`prepare`.
-    feedback : Feedback
-        At the motor shaft.
-    factor : float
-        By which the rule's gains were backed off; 1 where they were not.
-    robustness : Robustness
-        Of these gains.
-
-    Returns
-    -------
-    Design
-    """
+    """Add feed-forward, reference, figures and words to gains of which ``factor`` is left."""
     problem, plant, loop = case.problem, case.problem.plant, case.problem.loop
     controller = controller_for(loop, feedback)
     usual = _usual(case)
     margins = loop_margins(plant, feedback)
     reference = _plan(usual, loop, controller, margins, problem.targets)
-    figures = measure(problem, usual, controller, reference, control_noise(problem, feedback))
+    noise = control_noise(problem, feedback)
+    figures, bands = figures_of(case, usual, controller, reference, margins, noise)
     reason, findings = _explain(case, margins, factor, robustness, figures)
     m = plant.motors
     return Design(
@@ -148,7 +133,7 @@ def finish(case: Case, feedback: Feedback, factor: float, robustness: Robustness
         loop=loop,
         robustness=robustness,
         performance=figures,
-        specification=specify(case, controller, reference, margins, figures),
+        specification=bands,
         reference=reference,
         motor={
             "dc_gain": 1 / float(m.a0[0]),
@@ -170,11 +155,10 @@ def finish(case: Case, feedback: Feedback, factor: float, robustness: Robustness
 def with_reference(case: Case, one: Design, reference: Reference) -> Design:
     """Return a design with another reference, and the figures that go with it."""
     controller = controller_for(one.loop, one.feedback)
-    figures = measure(
-        case.problem, _usual(case), controller, reference, one.performance.control_noise
+    figures, bands = figures_of(
+        case, _usual(case), controller, reference, one.margins, one.performance.control_noise
     )
-    spec = specify(case, controller, reference, one.margins, figures)
-    return replace(one, reference=reference, performance=figures, specification=spec)
+    return replace(one, reference=reference, performance=figures, specification=bands)
 
 
 def _usual(case: Case) -> Plant:

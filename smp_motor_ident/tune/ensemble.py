@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Protocol
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -29,23 +29,8 @@ class Robustness:
     sensitivity: float
 
 
-class Assessor(Protocol):
-    """Whoever can say what gains do over some motors."""
-
-    def assess(self, feedback: Feedback) -> Robustness:
-        """Return what the gains do; see :meth:`UncertaintyEnsemble.assess`."""
-
-
 class UncertaintyEnsemble:
-    """Assesses gains over a batch of motors, whose response is computed once.
-
-    Parameters
-    ----------
-    plant : Plant
-        The draws.
-    required : RequiredMargins
-        What the gains must keep.
-    """
+    """Assesses gains over a batch of motors, whose response is computed once."""
 
     def __init__(self, plant: Plant, required: RequiredMargins) -> None:
         self.plant = plant
@@ -77,30 +62,32 @@ class UncertaintyEnsemble:
         )
 
 
-def back_off(ensemble: Assessor, feedback: Feedback) -> tuple[Feedback, float, Robustness]:
+def back_off(
+    assess: Callable[[Feedback], Robustness], feedback: Feedback
+) -> tuple[Feedback, float, Robustness]:
     """Scale gains down until 99 % of the motors keep the required margins.
 
     Proportional and derivative action shrink with the factor, integral action with its square,
     so that the loop keeps its shape while its crossover moves down.
     """
-    found = ensemble.assess(feedback)
+    found = assess(feedback)
     if found.holds >= SHARE:
         return feedback, 1.0, found
     good, bad = None, 1.0
     factor = 0.97
     while factor > 0.01:
         trial = softer(feedback, factor)
-        found = ensemble.assess(trial)
+        found = assess(trial)
         if found.holds >= SHARE:
             good = factor, trial, found
             break
         bad, factor = factor, factor * factor
     if good is None:
-        return feedback, 0.0, ensemble.assess(feedback)
+        return feedback, 0.0, assess(feedback)
     for _ in range(6):
         middle = 0.5 * (good[0] + bad)
         trial = softer(feedback, middle)
-        found = ensemble.assess(trial)
+        found = assess(trial)
         if found.holds >= SHARE:
             good = middle, trial, found
         else:
@@ -110,9 +97,4 @@ def back_off(ensemble: Assessor, feedback: Feedback) -> tuple[Feedback, float, R
 
 def softer(feedback: Feedback, factor: float) -> Feedback:
     """Return gains with a lower crossover and the same shape of the loop."""
-    return Feedback(
-        feedback.p * factor,
-        feedback.i * factor**2,
-        feedback.d * factor,
-        feedback.filter_time,
-    )
+    return replace(feedback.scaled(factor), i=feedback.i * factor**2)

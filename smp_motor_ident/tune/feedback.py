@@ -34,7 +34,7 @@ class Feedback:
         return self.p + self.i * integral + self.d * derivative
 
 
-def terms(omega: Array, sample_time: float, filter_time: float) -> tuple[Complex, Complex]:
+def terms(omega: Array, sample_time: float, filter_time: float | Array) -> tuple[Complex, Complex]:
     """Return the responses of integrator and filtered derivative, each with unit gain."""
     z = np.exp(1j * np.asarray(omega) * sample_time)
     keep = filter_time / (filter_time + sample_time)

@@ -63,6 +63,16 @@ class Problem:
         return response
 
     @cached_property
+    def noise(self) -> Array:
+        """Noise density of the measured speed on the grid, shape (f,)."""
+        return noise_density(self.plant, self.loop, self.omega)
+
+    def shaken(self, response: Complex) -> Array:
+        """Return the rms that measurement noise causes by responses to it, shape (..., f)."""
+        power = np.trapezoid(np.abs(response) ** 2 * self.noise, self.omega, axis=-1)
+        return np.asarray(np.sqrt(power / self.omega[-1]))
+
+    @cached_property
     def reduced(self) -> FirstOrderDelay:
         """Half-rule reduction; hold, averaging window and the sensor's lag count as delay.
 
@@ -140,11 +150,6 @@ def measured_lag(plant: Plant, delay: float) -> float:
     return late + float(plant.motors.sensor_lag[0])
 
 
-def noise_filter(problem: Problem, omega: Array) -> Array:
-    """Return the noise density of the measured speed of a problem's own plant."""
-    return noise_density(problem.plant, problem.loop, omega)
-
-
 def noise_density(plant: Plant, loop: Loop, omega: Array) -> Array:
     """Return the noise density of the measured speed.
 
@@ -157,8 +162,5 @@ def noise_density(plant: Plant, loop: Loop, omega: Array) -> Array:
 
 def control_noise(problem: Problem, feedback: Feedback) -> float:
     """Return the voltage that measurement noise causes at the controller's output."""
-    omega = problem.omega
-    control = feedback.response(omega, problem.loop.sample_time)
-    through = np.abs(control / (1 + problem.response * control)) ** 2
-    power = np.trapezoid(through * noise_filter(problem, omega), omega) / omega[-1]
-    return math.sqrt(float(power))
+    control = feedback.response(problem.omega, problem.loop.sample_time)
+    return float(problem.shaken(control / (1 + problem.response * control)))

@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from smp_motor_control.reference import minimum_jerk
 from smp_motor_control.reference.profile import Drive, Profile, ProfileLimits
 from smp_motor_control.wheel.loop import LONGEST_TRANSITION
 from smp_motor_ident.errors import DesignError
@@ -27,7 +28,7 @@ from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.plant import Plant, sample
 from smp_motor_ident.tune.problem import measured_lag
-from smp_motor_ident.tune.simulation import Controller, Inputs, minimum_jerk, simulate, step_figures
+from smp_motor_ident.tune.simulation import Controller, Inputs, simulate, step_figures
 
 HEADROOM = 0.92
 """Share of the supply that a constant speed may use; the rest is left to the feedback."""
@@ -80,7 +81,6 @@ class Change:
     reference: Array
     high: Array
     forward: Array  # [V]: Feed-forward without dry friction
-    duration: float  # [s]
 
     @property
     def inputs(self) -> Inputs:
@@ -103,7 +103,7 @@ def planned_change(plant: Plant, plan: Reference, distance: float, time: Array) 
         for late in (plan.doubt, 0.0, -min(plan.doubt, plan.lag))
     ]
     low, high = np.min(around, axis=0), np.max(around, axis=0)
-    return Change(low, around[1], high, forward, profile.duration)
+    return Change(low, around[1], high, forward)
 
 
 def top_speed(plant: Plant, supply: float) -> float:
@@ -131,7 +131,20 @@ def plan_reference(
     ratio = loop.gear_ratio
     loop = replace(loop, delay_doubt=min(loop.delay_doubt, bearable))
     speed = _reachable(plant, loop, max_velocity)
-    plan = _fastest(plant, loop, speed, together)
+    m = plant.motors
+    drive = Drive(
+        top_speed=(PEAK * loop.supply_voltage - float(m.static_voltage[0])) / float(m.a0[0]),
+        time_constant=float(m.a1[0] / m.a0[0]),
+        time_constant_product=float(m.a2[0] / m.a0[0]),
+    )
+    plan = Reference(
+        max_velocity=speed,
+        max_acceleration=math.inf,
+        transition_time=0.0,
+        lag=measured_lag(plant, loop.expected_delay),
+        doubt=0.0 if together else loop.delay_doubt,
+        drive=drive,
+    )
     plan = _quickest(plant, loop, controller, plan, least)
     quickest = plan.transition_time
     if max_acceleration is not None:
@@ -152,25 +165,6 @@ def plan_reference(
             )
         plan = replace(plan, transition_time=transition_time)
     return plan
-
-
-def _fastest(plant: Plant, loop: Loop, speed: float, together: bool) -> Reference:
-    """Return a plan that keeps to the voltage alone."""
-    m = plant.motors
-    lag = measured_lag(plant, loop.expected_delay)
-    drive = Drive(
-        top_speed=(PEAK * loop.supply_voltage - float(m.static_voltage[0])) / float(m.a0[0]),
-        time_constant=float(m.a1[0] / m.a0[0]),
-        time_constant_product=float(m.a2[0] / m.a0[0]),
-    )
-    return Reference(
-        max_velocity=speed,
-        max_acceleration=math.inf,
-        transition_time=0.0,
-        lag=lag,
-        doubt=0.0 if together else loop.delay_doubt,
-        drive=drive,
-    )
 
 
 def _reachable(plant: Plant, loop: Loop, wished: float | None) -> float:
@@ -228,14 +222,15 @@ def _steepest(plant: Plant, loop: Loop, speed: float, quickest: float) -> float:
     """Return the largest acceleration that no change up to ``speed`` takes beyond the supply."""
     room = PEAK * loop.supply_voltage - float(plant.motors.static_voltage[0])
     highest = PEAK_RATE * speed / quickest
-    m = plant.motors
+    m, rest = plant.motors, minimum_jerk.Reference(0.0, 0.0, 0.0)
+    a0, a1, a2 = (float(a[0]) for a in (m.a0, m.a1, m.a2))
     for rate in highest * np.geomspace(1.0, 0.01, 200):
         # A change that just takes the shortest time has the most jerk for its acceleration.
         for change in np.geomspace(rate * quickest / PEAK_RATE, speed, 4):
             duration = PEAK_RATE * change / rate
-            motion = minimum_jerk(change, duration, np.linspace(0.0, duration, 100))
-            needed = sum(float(a[0]) * x for a, x in zip((m.a0, m.a1, m.a2), motion, strict=True))
-            if np.max(needed) > room:
+            motion = minimum_jerk.MinimumJerk(rest, change, duration)
+            rows = [motion.at(t) for t in np.linspace(0.0, duration, 100).tolist()]
+            if max(a0 * r.velocity + a1 * r.acceleration + a2 * r.jerk for r in rows) > room:
                 break
         else:
             break

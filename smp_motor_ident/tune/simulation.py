@@ -35,7 +35,6 @@ class Controller:
 class Response:
     """What the loop did; arrays of shape (n, k) at the sampling instants."""
 
-    time: Array  # shape (k,), [s]
     speed: Array  # shape (n, k), [rad/s]: true speed of the motor
     voltage: Array  # shape (n, k), [V]: output of the controller
 
@@ -80,7 +79,7 @@ def simulate(
         np.zeros(n) if friction is None else np.ascontiguousarray(friction),
         modelled, count_angle, noise,
     )  # fmt: skip
-    return Response(plant.sample_time * np.arange(steps), speed, voltage)
+    return Response(speed, voltage)
 
 
 @compiled
@@ -210,19 +209,6 @@ def _run(
     return speed, voltage
 
 
-def minimum_jerk(distance: float, duration: float, time: Array) -> tuple[Array, Array, Array]:
-    """Return the smoothest change of speed over a duration, its rate and its jerk.
-
-    References
-    ----------
-    T. Flash, N. Hogan, The coordination of arm movements, J. Neuroscience 5 (1985), 1688-1703.
-    """
-    x = np.clip(time / duration, 0.0, 1.0)
-    speed = distance * x**3 * (10 - 15 * x + 6 * x**2)
-    acceleration = distance / duration * 30 * x**2 * (1 - x) ** 2
-    return speed, acceleration, distance / duration**2 * 60 * x * (1 - x) * (1 - 2 * x)
-
-
 @dataclass(frozen=True)
 class StepFigures:
     """Figures of a step response."""
@@ -233,38 +219,20 @@ class StepFigures:
     peak_voltage: float  # largest magnitude [V]
 
 
+def settled(time: Array, outside: Array) -> float:
+    """Return when a signal is outside of its band no more; NaN where it is at the end."""
+    last = int(np.flatnonzero(outside)[-1]) if np.any(outside) else -1
+    return float(time[last + 1]) if last + 1 < time.size else math.nan
+
+
 def step_figures(time: Array, speed: Array, voltage: Array, final: float) -> StepFigures:
     """Read a step response."""
     relative = speed / final
-    outside = np.flatnonzero(np.abs(relative - 1) > 0.02)
-    last = int(outside[-1]) if outside.size else -1
-    settled = last + 1 < time.size
     low, high = np.argmax(relative >= 0.1), np.argmax(relative >= 0.9)
     rose = bool(np.any(relative >= 0.9))
     return StepFigures(
         rise=float(time[high] - time[low]) if rose else math.nan,
-        settling=float(time[last + 1]) if settled else math.nan,
+        settling=settled(time, np.abs(relative - 1) > 0.02),
         overshoot=float(max(100 * (relative.max() - 1), 0.0)),
         peak_voltage=float(np.abs(voltage).max()),
-    )
-
-
-@dataclass(frozen=True)
-class LoadFigures:
-    """Figures of the response to a load step, per volt that the load takes."""
-
-    peak: float  # largest loss of speed [rad/s/V]
-    integral: float  # integral of the magnitude of the error [rad/V]
-    recovery: float  # until the loss stays within a tenth of its peak [s]; NaN where it does not
-
-
-def load_figures(time: Array, speed: Array) -> LoadFigures:
-    """Read the response to a load of 1 V at time 0 around a speed of 0."""
-    loss = np.abs(speed)
-    outside = np.flatnonzero(loss > 0.1 * loss.max())
-    last = int(outside[-1]) + 1
-    return LoadFigures(
-        peak=float(loss.max()),
-        integral=float(np.trapezoid(loss, time)),
-        recovery=float(time[last]) if last < time.size else math.nan,
     )

@@ -17,7 +17,8 @@ from smp_motor_ident.tune.reference import CHANGE, Reference, planned_change
 from smp_motor_ident.tune.simulation import (
     Controller,
     Inputs,
-    load_figures,
+    StepFigures,
+    settled,
     simulate,
     step_figures,
 )
@@ -40,41 +41,6 @@ class Performance:
     load_recovery: float  # until a tenth of the loss is left [s]
     peak_voltage: float  # largest voltage of the set-point step [V]
     control_noise: float  # voltage from quantisation at constant speed [V rms]
-
-
-def measure(
-    problem: Problem,
-    usual: Plant,
-    controller: Controller,
-    reference: Reference,
-    control_noise: float,
-) -> Performance:
-    """Simulate set-point and load steps of one design."""
-    fb = controller.feedback
-    change = CHANGE * reference.max_velocity
-    time = _instants(problem, fb, reference)
-    plan = planned_change(usual, reference, change, time)
-    run = simulate(usual, controller, plan.inputs)
-    planned = step_figures(time, run.speed[0], run.voltage[0], change)
-    # Small, so that saturation does not hide the loop.
-    alone = Controller(fb)
-    run_step = simulate(problem.plant, alone, Inputs(np.ones(time.size)))
-    abrupt = step_figures(time, run_step.speed[0], run_step.voltage[0], 1.0)
-    push = Inputs(np.zeros(time.size), load=np.ones(time.size))
-    pushed = simulate(problem.plant, alone, push)
-    load = load_figures(time, pushed.speed[0])
-    return Performance(
-        rise=planned.rise,
-        settling=planned.settling,
-        overshoot=planned.overshoot,
-        step_settling=abrupt.settling,
-        step_overshoot=abrupt.overshoot,
-        load_peak=load.peak,
-        load_integral=load.integral,
-        load_recovery=load.recovery,
-        peak_voltage=planned.peak_voltage,
-        control_noise=control_noise,
-    )
 
 
 @dataclass(frozen=True)
@@ -113,16 +79,19 @@ WORK, FEWEST = 1e6, 100
 """Samples that are simulated for a specification, and least motors."""
 
 
-def specify(
-    case: Case, controller: Controller, reference: Reference, margins: Margins, figures: Performance
-) -> Specification:
-    """Simulate the loop over the motors that the estimate allows."""
+def figures_of(
+    case: Case, usual: Plant, controller: Controller, reference: Reference, margins: Margins,
+    control_noise: float,
+) -> tuple[Performance, Specification]:  # fmt: skip
+    """Simulate a design: the nominal motor, ``usual`` as it is sampled, and those that may be."""
     problem, known = case.problem, case.friction.known
     nominal, loop = problem.plant.motors, replace(problem.loop, delay=problem.loop.expected_delay)
     change = CHANGE * reference.max_velocity
-    usual = sample(nominal, loop)
     time = _instants(problem, controller.feedback, reference)
     plan = planned_change(usual, reference, change, time)
+    run = simulate(usual, controller, plan.inputs)
+    planned = step_figures(time, run.speed[0], run.voltage[0], change)
+    figures = _performance(problem, controller.feedback, time, planned, control_noise)
     drawn = case.ensemble.plant.motors.first(max(int(min(DRAWS, WORK / time.size)), FEWEST))
     plant = sample(drawn, loop, believed=nominal) if case.drawn else usual
     noise = None
@@ -143,7 +112,7 @@ def specify(
         for speed, volts in zip(run.speed, run.voltage, strict=True)
     ]
     found = case.ensemble.margins(controller.feedback)
-    return Specification(
+    return figures, Specification(
         samples=len(each) if case.drawn else 0,
         change=change,
         overshoot=_band(figures.overshoot, [one.overshoot for one in each]),
@@ -151,6 +120,29 @@ def specify(
         phase_margin=_band(margins.phase, found.phase),
         gain_margin=_band(margins.gain, found.gain),
         sensitivity=_band(margins.sensitivity, found.sensitivity),
+    )
+
+
+def _performance(
+    problem: Problem, feedback: Feedback, time: Array, planned: StepFigures, control_noise: float
+) -> Performance:
+    """Add what the feedback alone does, small, so that saturation does not hide the loop."""
+    alone = Controller(feedback)
+    run = simulate(problem.plant, alone, Inputs(np.ones(time.size)))
+    abrupt = step_figures(time, run.speed[0], run.voltage[0], 1.0)
+    push = Inputs(np.zeros(time.size), load=np.ones(time.size))
+    loss = np.abs(simulate(problem.plant, alone, push).speed[0])
+    return Performance(
+        rise=planned.rise,
+        settling=planned.settling,
+        overshoot=planned.overshoot,
+        step_settling=abrupt.settling,
+        step_overshoot=abrupt.overshoot,
+        load_peak=float(loss.max()),
+        load_integral=float(np.trapezoid(loss, time)),
+        load_recovery=settled(time, loss > 0.1 * loss.max()),
+        peak_voltage=planned.peak_voltage,
+        control_noise=control_noise,
     )
 
 

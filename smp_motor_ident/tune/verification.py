@@ -241,26 +241,10 @@ def _run(
 def bands_of(
     rows: Array, time: Array, setpoint: float, specification: Mapping[str, Any], unsure: float
 ) -> Bands:
-    """Return what the design and the motors that may be allow.
+    """Return the widest that the design and the motors that may be allow.
 
-    Parameters
-    ----------
-    rows : ndarray, shape (n, k), [rad/s]
-        As :func:`predicted` returns them.
-    time : ndarray, shape (k,), [s]
-        Since the change.
-    setpoint : float
-        [rad/s, wheel].
-    specification : mapping
-        Of the wheel, from ``gains.json``.
-    unsure : float
-        Resolution of the speed [rad/s].
-
-    Returns
-    -------
-    Bands
-        The widest of design and simulations, these as prediction limits, and what sampling and
-        resolution add.
+    Simulations (as :func:`predicted` returns them) count as prediction limits; what sampling and
+    the resolution of the speed, ``unsure`` [rad/s], add comes on top.
     """
     margin = SIGMAS * unsure / abs(setpoint)
     simulated = [read(time, row, setpoint, SETTLED.value + margin) for row in rows]

@@ -130,31 +130,25 @@ def common_drive(designs: Mapping[str, Design]) -> Drive:
     return common
 
 
-class _AllWheels:
-    """All wheels' ensembles as one: gains, per wheel rad/s, are as good as on the worst wheel."""
-
-    def __init__(self, cases: Mapping[str, Case]) -> None:
-        self.cases = cases
-
-    def assess(self, feedback: Feedback) -> Robustness:
-        found = [
-            case.ensemble.assess(feedback.scaled(1 / case.problem.loop.gear_ratio))
-            for case in self.cases.values()
-        ]
-        return min(found, key=lambda one: one.holds)
-
-
 def _choose(
     cases: Mapping[str, Case], own: Mapping[str, Design], sets: Sets
 ) -> tuple[Feedback | None, str]:
     """Return the feedback for all, per wheel rad/s, or None, and why."""
     if sets == "each" or len(own) == 1:
         return None, "one set of gains each"
-    everyone = _AllWheels(cases)
+
+    def on_worst_wheel(gains: Feedback) -> Robustness:
+        """Return what gains, per wheel rad/s, do on the wheel where they hold least."""
+        found = [
+            case.ensemble.assess(gains.scaled(1 / case.problem.loop.gear_ratio))
+            for case in cases.values()
+        ]
+        return min(found, key=lambda one: one.holds)
+
     best: tuple[float, Feedback] | None = None
     for wheel, one in own.items():
         candidate = one.feedback.scaled(cases[wheel].problem.loop.gear_ratio)
-        shared, factor, _ = back_off(everyone, candidate)
+        shared, factor, _ = back_off(on_worst_wheel, candidate)
         if factor == 0.0:
             continue
         loss = max(other.feedback.i * other.loop.gear_ratio / shared.i for other in own.values())

@@ -71,7 +71,10 @@ def _entry(design: Design) -> dict[str, Any]:
         "robustness": dataclasses.asdict(design.robustness),
         "findings": [one.to_document() for one in design.findings],
         "performance": dataclasses.asdict(design.performance),
-        "specification": _specification(design),
+        "specification": {
+            **dataclasses.asdict(design.specification),
+            "change": design.specification.change / design.loop.gear_ratio,
+        },
         "reference": {
             "max_velocity": design.reference.max_velocity / design.loop.gear_ratio,
             "max_acceleration": design.reference.max_acceleration / design.loop.gear_ratio,
@@ -86,11 +89,6 @@ def _entry(design: Design) -> dict[str, Any]:
     }
     plain: dict[str, Any] = _plain(entry)
     return plain
-
-
-def _specification(design: Design) -> dict[str, Any]:
-    entry = dataclasses.asdict(design.specification)
-    return {**entry, "change": design.specification.change / design.loop.gear_ratio}
 
 
 def _plain(value: Any) -> Any:

@@ -19,7 +19,7 @@ from smp_motor_ident.tune.methods.relay import oscillate, read_oscillation
 from smp_motor_ident.tune.methods.ziegler_nichols import from_ultimate
 from smp_motor_ident.tune.motors import Motors
 from smp_motor_ident.tune.plant import sample
-from smp_motor_ident.tune.problem import FirstOrderDelay, Problem, control_noise, noise_filter
+from smp_motor_ident.tune.problem import FirstOrderDelay, Problem, control_noise
 
 # The paper's Table 1 as a0, a1, a2 [V s/rad and its powers].
 PAPER = (
@@ -205,7 +205,7 @@ def test_margin_method_does_not_let_counts_shake_the_wheel_out_of_its_band():
     omega, T = one.omega, 0.01
     control = feedback.response(omega, T)
     through = np.abs(control * one.true_response / (1 + control * one.response)) ** 2
-    shaking = np.sqrt(np.trapezoid(through * noise_filter(one, omega), omega) / omega[-1])
+    shaking = np.sqrt(np.trapezoid(through * one.noise, omega) / omega[-1])
     # Four times that is 2 % of half the top speed.
     assert shaking <= 2.5e-3 * 12 * 34.0 * 1.01
 

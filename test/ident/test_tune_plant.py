@@ -9,12 +9,13 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from smp_motor_control.pid import Pid, PidGains
+from smp_motor_control.reference.minimum_jerk import MinimumJerk, Reference
 from smp_motor_ident.tune.feedback import Feedback, closed_loop, spectral_radius
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.margins import batch_margins, grid_for, loop_margins
 from smp_motor_ident.tune.motors import Motors
 from smp_motor_ident.tune.plant import sample
-from smp_motor_ident.tune.simulation import Controller, Inputs, minimum_jerk, simulate
+from smp_motor_ident.tune.simulation import Controller, Inputs, simulate
 
 # Motor 1 of the paper's Table 1, and a first-order motor.
 MOTOR_1 = (0.039142, 0.0019981, 3.1755e-5)
@@ -101,7 +102,8 @@ def test_simulated_controller_is_the_running_one():
     feedback = Feedback(0.05, 1.2, 0.0009, 0.003)
     controller = Controller(feedback, 0.6, 0.9, limit, 0.05)
     time = T * np.arange(300)
-    reference, rate, _ = minimum_jerk(100.0, 0.1, time)
+    change = MinimumJerk(Reference(0.0, 0.0, 0.0), 100.0, 0.1)
+    reference, rate, _ = np.array([change.at(t) for t in time.tolist()]).T
     forward = 0.03 * reference + 0.001 * rate
     run = simulate(plant, controller, Inputs(reference, forward=forward))
     pid = Pid(

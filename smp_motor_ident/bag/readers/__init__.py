@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from smp_motor_ident.bag.readers import csv, json, mat, mcap, ros1, sqlite, wpilog, xlsx
-from smp_motor_ident.bag.readers.format import Format
-from smp_motor_ident.bag.storage import Messages, Tables, damaged
+from smp_motor_ident.bag.readers.format import Format, Messages, Tables
+from smp_motor_ident.bag.storage import damaged
 from smp_motor_ident.bag.unpack import MAGIC, Budget, unpack_file
 from smp_motor_ident.errors import BagError
 
@@ -37,7 +37,7 @@ def open_source(path: Path, folder: Path, budget: Budget) -> Messages | Tables:
     try:
         if form is None:
             raise BagError(f"{path}: {_what(path, head)}")
-        source: Messages | Tables = form.open(plain, path.name, budget)
+        source = form.open(plain, path.name, budget)
     except BagError as error:
         raise BagError("; ".join(filter(None, [str(error), problem]))) from None
     if problem:

@@ -9,27 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from smp_motor_ident.bag.readers.format import Tables
 from smp_motor_ident.bag.storage import TABLE, Channel, Table
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.finding import Finding
 
 
-class ColumnFile:
-    """A file of columns, one table of the topic ``""``.
-
-    Parameters
-    ----------
-    path : Path
-        Of the file.
-    name : str
-        For messages.
-    columns : mapping of str to ndarray
-        By name.
-    units : mapping of str to str
-        What the file says of them.
-    dates : collection of str
-        Columns of nanoseconds that the file writes as dates.
-    """
+class ColumnFile(Tables):
+    """A file of columns, one table of the topic ``""``; ``dates`` are columns of nanoseconds."""
 
     def __init__(
         self,
@@ -38,10 +25,10 @@ class ColumnFile:
         columns: Mapping[str, NDArray[Any]],
         units: Mapping[str, str] | None = None,
         dates: Collection[str] = (),
+        problems: Sequence[Finding] = (),
     ) -> None:
-        self.path = path
-        self.name = name
-        self.problems: list[Finding] = []
+        super().__init__(path, name)
+        self.problems += problems
         if not columns:
             raise BagError(f"{name}: holds no column of numbers")
         self._columns = columns

@@ -12,22 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident.bag.readers import grid
-from smp_motor_ident.bag.readers.format import Format
+from smp_motor_ident.bag.readers.format import Format, Tables
 from smp_motor_ident.bag.storage import TABLE, Channel, Table
 from smp_motor_ident.bag.unpack import Budget
 from smp_motor_ident.errors import BagError
-from smp_motor_ident.finding import Finding
 
 _COMMENTS = ("#", "%", "//")
 
 
-class _CsvFile:
+class _CsvFile(Tables):
     """A text of rows, separated by comma, semicolon, tab, bar or blanks."""
 
     def __init__(self, path: Path, name: str, budget: Budget) -> None:
-        self.path = path
-        self.name = name
-        self.problems: list[Finding] = []
+        super().__init__(path, name)
         self._lines = _text(path).splitlines()
         filled = [k for k, s in enumerate(self._lines) if s.strip() and not s.startswith(_COMMENTS)]
         if not filled:

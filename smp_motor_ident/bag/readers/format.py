@@ -1,13 +1,64 @@
-"""What the registry knows of a format."""
+"""What every format gives, and what the registry knows of it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
+from smp_motor_ident.bag.storage import Batch, Channel, Table, damaged
 from smp_motor_ident.bag.unpack import Budget
+from smp_motor_ident.finding import Finding
+
+
+class Source(ABC):
+    """One opened file; ``problems`` fills while it is read: everything that was lost."""
+
+    def __init__(self, path: Path, name: str) -> None:
+        self.path = path
+        self.name = name  # for messages, where ``path`` is a temporary copy
+        self.problems: list[Finding] = []
+
+    @abstractmethod
+    def channels(self) -> list[Channel]:
+        """Return the channels, reading the whole file where it has no index."""
+
+    def _amiss(self, text: str) -> None:
+        self.problems.append(damaged(f"{self.name}: {text}"))
+
+
+class Messages(Source):
+    """A file of serialized messages, whose channels a walk over all of them finds."""
+
+    def __init__(self, path: Path, name: str, budget: Budget) -> None:
+        super().__init__(path, name)
+        self._budget = budget
+        self._channels: dict[int, Channel] = {}
+        self._scanned = False
+
+    def channels(self) -> list[Channel]:
+        """Return the channels of the file."""
+        if not self._scanned:
+            for _ in self.batches(lambda _: False):
+                pass
+        return [self._channels[key] for key in sorted(self._channels)]
+
+    def promised(self) -> dict[str, int] | None:
+        """Return the number of messages by topic where the file itself tells it."""
+        return None
+
+    @abstractmethod
+    def batches(self, wanted: Callable[[Channel], bool]) -> Iterator[tuple[float, Batch]]:
+        """Yield the fraction of the file that is read, and a batch."""
+
+
+class Tables(Source):
+    """A file of columns; its channels have the encoding `TABLE` and name their fields."""
+
+    @abstractmethod
+    def table(self, topic: str, fields: Sequence[str]) -> Table:
+        """Return columns of a topic; ``log`` is None where the time is a column, too."""
 
 
 @dataclass(frozen=True)
@@ -19,6 +70,6 @@ class Format:
     # How they begin; a file that begins otherwise is none, whatever its name.  Empty for plain
     # text, which only its name tells.
     magic: bytes
-    # ``open(path, name, budget)`` gives a `Messages` or a `Tables`; raises `BagError`
-    open: Callable[[Path, str, Budget], Any]
+    # ``open(path, name, budget)``; raises `BagError`
+    open: Callable[[Path, str, Budget], Messages | Tables]
     tables: bool = True  # whether it holds columns of numbers instead of serialized messages

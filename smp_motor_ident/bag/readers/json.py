@@ -33,38 +33,39 @@ _WIDEST = 64
 _MOST_CELLS = 20_000_000
 
 
-class _JsonFile(ColumnFile):
-    """One ``.json`` or ``.jsonl`` file."""
-
-    def __init__(self, path: Path, name: str, budget: Budget) -> None:
-        problem = ""
+def _open(path: Path, name: str, budget: Budget) -> ColumnFile:
+    """Read a ``.json`` or ``.jsonl`` file."""
+    try:
+        text = path.read_text("utf-8-sig")
+    except OSError as error:
+        raise BagError(f"{path}: cannot be read ({error.strerror})") from None
+    except UnicodeDecodeError as error:
+        raise BagError(f"{name}: no readable JSON ({_reason(error)})") from None
+    document, problem = _parsed(text, name, whole=path.suffix.lower() == ".json")
+    units: dict[str, str] = {}
+    dates: set[str] = set()
+    if isinstance(document, Mapping) and any(test in document for test in _TESTS):
+        columns, units = _sysid(document, name)
+    else:
         try:
-            text = path.read_text("utf-8-sig")
-            if path.suffix.lower() == ".json":
-                document = json.loads(text)
-            else:
-                document, problem = _lines(text, name)
+            columns = dict(_columns("", document, 0, dates))
+        except RecursionError:
+            raise BagError(f"{name}: is nested too deeply") from None
+    return ColumnFile(path, name, columns, units, dates, [damaged(problem)] if problem else [])
+
+
+def _parsed(text: str, name: str, *, whole: bool) -> tuple[Any, str]:
+    """Return what a text holds and what is amiss; lines of JSON may be called ``.json``, too."""
+    reason = ""
+    if whole:
+        try:
+            return json.loads(text), ""
         except (ValueError, RecursionError) as error:
-            if isinstance(error, UnicodeDecodeError) or path.suffix.lower() != ".json":
-                raise BagError(f"{name}: no readable JSON ({_reason(error)})") from None
-            try:
-                document, problem = _lines(text, name)
-            except (ValueError, RecursionError):
-                raise BagError(f"{name}: no readable JSON ({_reason(error)})") from None
-        except OSError as error:
-            raise BagError(f"{path}: cannot be read ({error.strerror})") from None
-        units: dict[str, str] = {}
-        dates: set[str] = set()
-        if isinstance(document, Mapping) and any(test in document for test in _TESTS):
-            columns, units = _sysid(document, name)
-        else:
-            try:
-                columns = dict(_columns("", document, 0, dates))
-            except RecursionError:
-                raise BagError(f"{name}: is nested too deeply") from None
-        super().__init__(path, name, columns, units, dates)
-        if problem:
-            self.problems.append(damaged(problem))
+            reason = _reason(error)
+    try:
+        return _lines(text, name)
+    except (ValueError, RecursionError) as error:
+        raise BagError(f"{name}: no readable JSON ({reason or _reason(error)})") from None
 
 
 def _lines(text: str, name: str) -> tuple[list[Any], str]:
@@ -168,4 +169,4 @@ def _reason(error: BaseException) -> str:
     return "nested too deeply" if isinstance(error, RecursionError) else str(error)[:200]
 
 
-FORMAT = Format("JSON", (".json", ".jsonl", ".ndjson"), b"", _JsonFile)
+FORMAT = Format("JSON", (".json", ".jsonl", ".ndjson"), b"", _open)

@@ -20,6 +20,7 @@ import numpy as np
 
 from smp_motor_ident.bag.readers.columns import ColumnFile
 from smp_motor_ident.bag.readers.format import Format
+from smp_motor_ident.bag.storage import first_line
 from smp_motor_ident.bag.unpack import Budget
 from smp_motor_ident.errors import BagError
 
@@ -44,48 +45,44 @@ def _check_survivable(data: bytes, name: str) -> None:
         raise BagError(f"{name}: damaged MATLAB file (scipy's reader ends by {-done.returncode})")
 
 
-class _MatFile(ColumnFile):
-    """One file of version 5."""
+def _open_5(path: Path, name: str, budget: Budget) -> ColumnFile:
+    """Read a file of version 5."""
+    data = _unpacked(path.read_bytes(), name, budget)
+    _check_survivable(data, name)
+    from scipy import io as scipy_io  # takes a while to load, for one of many formats
 
-    def __init__(self, path: Path, name: str, budget: Budget) -> None:
-        data = _unpacked(path.read_bytes(), name, budget)
-        _check_survivable(data, name)
-        from scipy import io as scipy_io  # takes a while to load, for one of many formats
-
-        try:
-            content = scipy_io.loadmat(
-                cast(Any, io.BytesIO(data)), simplify_cells=True, chars_as_strings=False
-            )
-        except Exception as error:  # scipy's reader raises whatever its bytes lead it to
-            raise BagError(f"{name}: no readable MATLAB file ({_line(error)})") from None
-        visible = {key: value for key, value in content.items() if not key.startswith("__")}
-        super().__init__(path, name, dict(_columns("", visible, 0)))
+    try:
+        content = scipy_io.loadmat(
+            cast(Any, io.BytesIO(data)), simplify_cells=True, chars_as_strings=False
+        )
+    except Exception as error:  # scipy's reader raises whatever its bytes lead it to
+        raise BagError(f"{name}: no readable MATLAB file ({first_line(error)[:200]})") from None
+    visible = {key: value for key, value in content.items() if not key.startswith("__")}
+    return ColumnFile(path, name, dict(_columns("", visible, 0)))
 
 
-class _MatFile73(ColumnFile):
-    """One file of version 7.3, which is HDF5."""
+def _open_73(path: Path, name: str, budget: Budget) -> ColumnFile:
+    """Read a file of version 7.3, which is HDF5."""
+    try:
+        import h5py
+    except ImportError:
+        raise BagError(
+            f"{name}: is a MATLAB file of version 7.3, which needs h5py (pip install h5py); "
+            "or save it in MATLAB with -v7"
+        ) from None
+    found: dict[str, Any] = {}
 
-    def __init__(self, path: Path, name: str, budget: Budget) -> None:
-        try:
-            import h5py
-        except ImportError:
-            raise BagError(
-                f"{name}: is a MATLAB file of version 7.3, which needs h5py (pip install h5py); "
-                "or save it in MATLAB with -v7"
-            ) from None
-        found: dict[str, Any] = {}
+    def take(key: str, item: Any) -> None:
+        if isinstance(item, h5py.Dataset) and item.dtype.kind in "fiub" and "#" not in key:
+            budget.take(item.nbytes)
+            found[key.replace("/", ".")] = np.asarray(item).T  # MATLAB counts columns first
 
-        def take(key: str, item: Any) -> None:
-            if isinstance(item, h5py.Dataset) and item.dtype.kind in "fiub" and "#" not in key:
-                budget.take(item.nbytes)
-                found[key.replace("/", ".")] = np.asarray(item).T  # MATLAB counts columns first
-
-        try:
-            with h5py.File(path, "r") as file:
-                file.visititems(take)
-        except (OSError, RuntimeError, ValueError, KeyError) as error:
-            raise BagError(f"{name}: no readable MATLAB file ({_line(error)})") from None
-        super().__init__(path, name, dict(_columns("", found, 0)))
+    try:
+        with h5py.File(path, "r") as file:
+            file.visititems(take)
+    except (OSError, RuntimeError, ValueError, KeyError) as error:
+        raise BagError(f"{name}: no readable MATLAB file ({first_line(error)[:200]})") from None
+    return ColumnFile(path, name, dict(_columns("", found, 0)))
 
 
 def _columns(prefix: str, value: Any, depth: int) -> Iterator[tuple[str, np.ndarray[Any, Any]]]:
@@ -172,9 +169,5 @@ def _check_size(inside: bytes, order: str, name: str) -> None:
         )
 
 
-def _line(error: BaseException) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0][:200]
-
-
-FORMAT_5 = Format("MATLAB", (".mat",), b"MATLAB 5.0 MAT", _MatFile)
-FORMAT_73 = Format("MATLAB 7.3", (".mat",), b"MATLAB 7.3 MAT", _MatFile73)
+FORMAT_5 = Format("MATLAB", (".mat",), b"MATLAB 5.0 MAT", _open_5)
+FORMAT_73 = Format("MATLAB 7.3", (".mat",), b"MATLAB 7.3 MAT", _open_73)

@@ -22,19 +22,17 @@ from mcap.exceptions import McapError
 from mcap.reader import SeekingReader
 from mcap.summary import Summary
 
-from smp_motor_ident.bag.readers.format import Format
+from smp_motor_ident.bag.readers.format import Format, Messages
 from smp_motor_ident.bag.storage import (
     Batch,
     Bytes,
     Channel,
     Integers,
-    damaged,
     gather,
     message_type,
 )
 from smp_motor_ident.bag.unpack import Budget, decompress
 from smp_motor_ident.errors import BagError
-from smp_motor_ident.finding import Finding
 
 MAGIC = b"\x89MCAP0\r\n"
 NUMBERED = "publication_sequence"
@@ -46,21 +44,17 @@ _BLOCK = 1 << 22
 _DAMAGE = (McapError, struct.error, ValueError, OverflowError, MemoryError, KeyError)
 
 
-class _McapFile:
-    """One ``.mcap`` file; its name for messages, where ``path`` is a temporary copy."""
+class _McapFile(Messages):
+    """One ``.mcap`` file."""
 
     def __init__(self, path: Path, name: str, budget: Budget) -> None:
-        self.path = path
-        self.name = name
-        self.problems: list[Finding] = []
-        self._budget = budget
+        super().__init__(path, name, budget)
         with path.open("rb") as file:
             if file.read(8) != MAGIC:
                 raise BagError(f"{self.name}: does not begin like an MCAP file")
         self._schemas: dict[int, mcap.records.Schema] = {}
-        self._channels: dict[int, Channel] = {}
         self._summary = self._read_summary()
-        self._scanned = False
+        self._scanned = self._summary is not None
 
     def _read_summary(self) -> Summary | None:
         """Return the summary of a file that was closed properly."""
@@ -81,13 +75,6 @@ class _McapFile:
         for channel in summary.channels.values():
             self._add_channel(channel)
         return summary
-
-    def channels(self) -> list[Channel]:
-        """Return the channels of the file, by a scan where it has no summary."""
-        if self._summary is None and not self._scanned:
-            for _ in self.batches(lambda _: False):
-                pass
-        return [self._channels[key] for key in sorted(self._channels)]
 
     def promised(self) -> dict[str, int] | None:
         """Return what the summary counts."""
@@ -167,7 +154,7 @@ class _McapFile:
         sound = len(data) == size and (not crc or zlib.crc32(data) == crc)
         if whole and not sound:
             self._amiss(
-                f"{self.name}: the chunk at byte {start} is damaged and was left out"
+                f"the chunk at byte {start} is damaged and was left out"
                 f"{self._count_of_chunk(start)}"
             )
             return
@@ -176,7 +163,7 @@ class _McapFile:
             self._cut(start, f"inside a chunk of which {len(positions)} messages could be read")
         elif end != len(data):
             self._amiss(
-                f"{self.name}: the chunk at byte {start} ends inside a record; "
+                f"the chunk at byte {start} ends inside a record; "
                 f"{len(data) - end} of its bytes were left out"
             )
         yield from self._split(data, positions, wanted)
@@ -212,7 +199,7 @@ class _McapFile:
         at = np.array(positions, np.int64)
         length: Integers = gather(raw, at + 1, "<i8") - 22
         if (length < 0).any():
-            self._amiss(f"{self.name}: {int((length < 0).sum())} messages too short")
+            self._amiss(f"{int((length < 0).sum())} messages too short")
             at, length = at[length >= 0], length[length >= 0]
         ids = gather(raw, at + 9, "<u2")
         for key in np.unique(ids).tolist():
@@ -220,7 +207,7 @@ class _McapFile:
             which = ids == key
             if channel is None:
                 self._amiss(
-                    f"{self.name}: {int(which.sum())} messages of channel {key}, "
+                    f"{int(which.sum())} messages of channel {key}, "
                     "which the file does not describe, were left out"
                 )
             elif wanted(channel):
@@ -286,13 +273,10 @@ class _McapFile:
             return {}
         return {index.chunk_start_offset: index for index in self._summary.chunk_indexes}
 
-    def _amiss(self, text: str) -> None:
-        self.problems.append(damaged(text))
-
     def _cut(self, start: int, where: str) -> None:
         size = self.path.stat().st_size
         what = "damaged" if self._summary is not None else "cut off or damaged"
-        self._amiss(f"{self.name}: {what} at byte {start} of {size} {where}".rstrip())
+        self._amiss(f"{what} at byte {start} of {size} {where}".rstrip())
 
 
 FORMAT = Format("MCAP", (".mcap",), MAGIC, _McapFile, tables=False)

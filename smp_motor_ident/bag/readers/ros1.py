@@ -16,11 +16,10 @@ from rosbags.rosbag1 import ReaderError
 from rosbags.rosbag1.reader import Header, RecordType
 from rosbags.typesys.msg import normalize_msgtype
 
-from smp_motor_ident.bag.readers.format import Format
-from smp_motor_ident.bag.storage import Batch, Channel, damaged, join
+from smp_motor_ident.bag.readers.format import Format, Messages
+from smp_motor_ident.bag.storage import Batch, Channel, join
 from smp_motor_ident.bag.unpack import Budget, decompress
 from smp_motor_ident.errors import BagError
-from smp_motor_ident.finding import Finding
 
 MAGIC = b"#ROSBAG V"
 _FIRST_LINE = b"#ROSBAG V2.0\n"
@@ -28,31 +27,15 @@ _COMPRESSION = {"none": "", "bz2": "bz2", "lz4": "lz4"}
 _DAMAGE = (ReaderError, LookupError, ValueError, OverflowError)
 
 
-class _Ros1Bag:
+class _Ros1Bag(Messages):
     """One ``.bag`` file."""
 
     def __init__(self, path: Path, name: str, budget: Budget) -> None:
-        self.path = path
-        self.name = name
-        self.problems: list[Finding] = []
-        self._budget = budget
-        self._channels: dict[int, Channel] = {}
-        self._scanned = False
+        super().__init__(path, name, budget)
         with path.open("rb") as file:
             if (line := file.readline(32)) != _FIRST_LINE:
                 version = line[len(MAGIC) - 1 :].strip().decode("latin-1")
                 raise BagError(f"{name}: is a ROS 1 bag of version {version!r}; only 2.0 is read")
-
-    def channels(self) -> list[Channel]:
-        """Return the connections of the file."""
-        if not self._scanned:
-            for _ in self.batches(lambda _: False):
-                pass
-        return [self._channels[key] for key in sorted(self._channels)]
-
-    def promised(self) -> dict[str, int] | None:
-        """Return None: what the index counts is what the walk finds."""
-        return None
 
     def batches(self, wanted: Callable[[Channel], bool]) -> Iterator[tuple[float, Batch]]:
         """Walk over the file, a chunk at a time."""
@@ -111,9 +94,6 @@ class _Ros1Bag:
         text = inner.get_string("message_definition")
         topic = "/" + header.get_string("topic").strip("/")
         self._channels[key] = Channel(key, topic, kind, "ros1", text, "ros1msg")
-
-    def _amiss(self, text: str) -> None:
-        self.problems.append(damaged(f"{self.name}: {text}"))
 
 
 FORMAT = Format("ROS 1 bag", (".bag",), MAGIC, _Ros1Bag, tables=False)

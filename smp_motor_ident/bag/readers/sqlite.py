@@ -12,46 +12,38 @@ from urllib.parse import quote
 
 import numpy as np
 
-from smp_motor_ident.bag.readers.format import Format
+from smp_motor_ident.bag.readers.format import Format, Messages
 from smp_motor_ident.bag.salvage import salvage
 from smp_motor_ident.bag.storage import (
     Batch,
     Bytes,
     Channel,
     Integers,
-    damaged,
     join,
     message_type,
 )
 from smp_motor_ident.bag.unpack import Budget
 from smp_motor_ident.errors import BagError
-from smp_motor_ident.finding import Finding
 
 MAGIC = b"SQLite format 3\0"
 _ROWS = 8192
 _BLOCK = 1 << 25
 
 
-class _SqliteFile:
-    """One ``.db3`` file, which is not changed; its name where ``path`` is a temporary copy."""
+class _SqliteFile(Messages):
+    """One ``.db3`` file, which is not changed."""
 
     def __init__(self, path: Path, name: str, budget: Budget) -> None:
-        self.path = path
-        self.name = name
-        self.problems: list[Finding] = []
-        self._budget = budget
+        super().__init__(path, name, budget)
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         self._cut_off = False
         self._path_read = self._with_journal()
         self._database = self._connect(self._path_read)
         try:
-            self._channels = self._read_channels()
+            self._topics = self._read_channels()
         except (sqlite3.Error, UnicodeDecodeError, TypeError) as error:
             reasons = "; ".join([" ".join(str(error).split()), *(p.message for p in self.problems)])
             raise BagError(f"{self.name}: not a readable bag ({reasons})") from None
-
-    def _amiss(self, text: str) -> None:
-        self.problems.append(damaged(text))
 
     def _with_journal(self) -> Path:
         """Return the file, or where a journal lies beside it a copy of both.
@@ -71,9 +63,7 @@ class _SqliteFile:
         copy = Path(self._folder.name) / self.path.name
         for original in (self.path, *journals):
             shutil.copyfile(original, copy.with_name(original.name))
-        self._amiss(
-            f"{self.name}: was not closed; its journal {journals[0].name} was applied to a copy"
-        )
+        self._amiss(f"was not closed; its journal {journals[0].name} was applied to a copy")
         return copy
 
     def _connect(self, path: Path) -> sqlite3.Connection:
@@ -89,7 +79,7 @@ class _SqliteFile:
         page = 65536 if page == 1 else page
         pages = int.from_bytes(head[28:32], "big")
         if self._folder is None and size < pages * page:
-            self._amiss(f"{self.name}: cut off at byte {size} of {pages * page} that it had")
+            self._amiss(f"cut off at byte {size} of {pages * page} that it had")
             self._cut_off = True
             # With this, SQLite reads a file that is shorter than its head says.
             database.execute("PRAGMA writable_schema=ON")
@@ -106,7 +96,7 @@ class _SqliteFile:
                 rows = self._database.execute(f"{query} FROM message_definitions").fetchall()
             except sqlite3.DatabaseError as error:
                 rows = []
-                self._amiss(f"{self.name}: its definitions cannot be read ({error})")
+                self._amiss(f"its definitions cannot be read ({error})")
             for kind, text, encoding in rows:
                 definitions[message_type(kind)] = (text, encoding)
         optional = [
@@ -128,7 +118,7 @@ class _SqliteFile:
 
     def channels(self) -> list[Channel]:
         """Return the topics of the file."""
-        return self._channels
+        return self._topics
 
     def promised(self) -> dict[str, int] | None:
         """Return None: the file holds no count besides its messages."""
@@ -136,7 +126,7 @@ class _SqliteFile:
 
     def batches(self, wanted: Callable[[Channel], bool]) -> Iterator[tuple[float, Batch]]:
         """Read the messages in the order in which they were written."""
-        asked = {channel.id: channel for channel in self._channels if wanted(channel)}
+        asked = {channel.id: channel for channel in self._topics if wanted(channel)}
         if not asked:
             return
         last, total = -(2**63), self._last_row()
@@ -148,13 +138,13 @@ class _SqliteFile:
                     yield min(1.0, last / total) if total > 0 else 1.0, batch
         except sqlite3.DatabaseError as error:
             if not self._cut_off:
-                self._amiss(f"{self.name}: damaged behind message {last} ({error})")
+                self._amiss(f"damaged behind message {last} ({error})")
             yield from self._salvaged(asked, last)
 
     def _reads(self, asked: dict[int, Channel]) -> Iterator[tuple[int, list[Batch]]]:
         """Yield the last row that is read, and some rows by topic."""
         ids = ",".join(str(key) for key in asked)
-        among = "" if len(asked) == len(self._channels) else f"AND topic_id IN ({ids}) "
+        among = "" if len(asked) == len(self._topics) else f"AND topic_id IN ({ids}) "
         source = (
             "FROM (SELECT id, topic_id, timestamp, data FROM messages "
             f"WHERE id > ? {among}ORDER BY id LIMIT {_ROWS})"
@@ -213,7 +203,7 @@ class _SqliteFile:
         for column in table[:-1]:
             log = log * 10 + (column - 48)
         raw: Bytes = np.frombuffer(data, np.uint8)
-        channel = self._channels[0]  # the caller tells topics apart
+        channel = self._topics[0]  # the caller tells topics apart
         return last, topic, Batch(channel, raw, np.cumsum(length) - length, length, log)
 
     def _salvaged(self, asked: dict[int, Channel], last: int) -> Iterator[tuple[float, Batch]]:
@@ -242,9 +232,7 @@ class _SqliteFile:
             joined = join(every, list(blobs), np.array(times, np.int64))
         except (TypeError, OverflowError):
             sound = [r for r in rows if isinstance(r[3], bytes) and isinstance(r[2], int)]
-            self._amiss(
-                f"{self.name}: {len(rows) - len(sound)} messages without data were left out"
-            )
+            self._amiss(f"{len(rows) - len(sound)} messages without data were left out")
             if sound:
                 yield from self._split(sound, asked)
             return

@@ -13,11 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-from smp_motor_ident.bag.readers.format import Format
-from smp_motor_ident.bag.storage import TABLE, Channel, Table, damaged
+from smp_motor_ident.bag.readers.format import Format, Tables
+from smp_motor_ident.bag.storage import TABLE, Channel, Table
 from smp_motor_ident.bag.unpack import Budget
 from smp_motor_ident.errors import BagError
-from smp_motor_ident.finding import Finding
 
 MAGIC = b"WPILOG"
 _KINDS = {"double": "<f8", "float": "<f4", "int64": "<i8", "boolean": "u1"}
@@ -34,13 +33,11 @@ class _Entry:
     sizes: list[int] = field(default_factory=list)
 
 
-class _Wpilog:
+class _Wpilog(Tables):
     """One ``.wpilog`` file."""
 
     def __init__(self, path: Path, name: str, budget: Budget) -> None:
-        self.path = path
-        self.name = name
-        self.problems: list[Finding] = []
+        super().__init__(path, name)
         self._data = path.read_bytes()
         self._entries: dict[str, _Entry] = {}
         if len(self._data) < 12 or self._data[7] != 1:
@@ -57,7 +54,7 @@ class _Wpilog:
             c = b + 1 + (sizes >> 4 & 7)
             size = int.from_bytes(data[a:b], "little")
             if c + size > end:
-                self.problems.append(damaged(f"{self.name}: cut off at byte {at} of {end}"))
+                self._amiss(f"cut off at byte {at} of {end}")
                 return
             key = int.from_bytes(data[at + 1 : a], "little")
             if key == 0:

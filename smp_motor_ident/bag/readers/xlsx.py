@@ -9,39 +9,36 @@ from typing import Any
 from smp_motor_ident.bag.readers import grid
 from smp_motor_ident.bag.readers.columns import ColumnFile
 from smp_motor_ident.bag.readers.format import Format
+from smp_motor_ident.bag.storage import first_line
 from smp_motor_ident.bag.unpack import Budget
 from smp_motor_ident.errors import BagError
 
 
-class _Workbook(ColumnFile):
-    """The first sheet of an ``.xlsx`` file that holds numbers."""
-
-    def __init__(self, path: Path, name: str, budget: Budget) -> None:
-        reason = f"{name}: holds no sheet"
-        for rows in _sheets(path, name, budget):
-            filled = [row for row in rows if any(cell is not None for cell in row)]
+def _open(path: Path, name: str, budget: Budget) -> ColumnFile:
+    """Read the first sheet of a workbook that holds numbers."""
+    reason = f"{name}: holds no sheet"
+    for rows in _sheets(path, name, budget):
+        filled = [row for row in rows if any(cell is not None for cell in row)]
+        try:
+            top = grid.head(filled, name)
+        except BagError as error:
+            reason = str(error)
+            continue
+        body, first_row = filled[top.first :], top.first + 1
+        columns, dates, findings = {}, set(), list(top.findings)
+        for j, title in enumerate(top.names):
             try:
-                top = grid.head(filled, name)
-            except BagError as error:
-                reason = str(error)
-                continue
-            body, first_row = filled[top.first :], top.first + 1
-            columns, dates, findings = {}, set(), list(top.findings)
-            for j, title in enumerate(top.names):
-                try:
-                    values, more, timed = grid.columns(
-                        body, [j], [title], name, range(first_row, len(filled) + 1)
-                    )
-                except BagError:
-                    continue  # a column of words
-                if values[0].size == len(body):
-                    columns[title] = values[0]
-                    dates |= timed
-                    findings += more
-            super().__init__(path, name, columns, top.units, dates)
-            self.problems += findings
-            return
-        raise BagError(reason)
+                values, more, timed = grid.columns(
+                    body, [j], [title], name, range(first_row, len(filled) + 1)
+                )
+            except BagError:
+                continue  # a column of words
+            if values[0].size == len(body):
+                columns[title] = values[0]
+                dates |= timed
+                findings += more
+        return ColumnFile(path, name, columns, top.units, dates, findings)
+    raise BagError(reason)
 
 
 def _sheets(path: Path, name: str, budget: Budget) -> list[list[tuple[Any, ...]]]:
@@ -61,8 +58,7 @@ def _sheets(path: Path, name: str, budget: Budget) -> list[list[tuple[Any, ...]]
     except BagError:
         raise
     except Exception as error:  # openpyxl raises whatever a spoilt XML leads it to
-        reason = (str(error).splitlines() or [type(error).__name__])[0][:200]
-        raise BagError(f"{name}: no readable workbook ({reason})") from None
+        raise BagError(f"{name}: no readable workbook ({first_line(error)[:200]})") from None
 
 
-FORMAT = Format("Excel", (".xlsx",), b"PK\x03\x04", _Workbook)
+FORMAT = Format("Excel", (".xlsx",), b"PK\x03\x04", _open)

@@ -75,19 +75,18 @@ MILLISECOND = 1e-3
 """By which an interval in milliseconds may miss a whole number, as rates of six digits do."""
 
 
-def plant_of(design: Design, loop: Loop) -> Plant:
-    """Return the sampled motor that a design is for."""
+def plant_of(design: Design) -> Plant:
+    """Return the sampled motor that a design is for, in its loop."""
     a0 = 1 / design.motor["dc_gain"]
     a1, a2 = a0 * design.motor["time_constant"], a0 * design.motor["time_constant_product"]
     values = (a0, a1, a2, design.motor["delay"], design.motor["static_voltage"])
     sensor = (design.sensor["averaging_window"], design.sensor["sensor_lag"])
-    return sample(Motors(*(np.array([x]) for x in (*values, *sensor))), loop)
+    return sample(Motors(*(np.array([x]) for x in (*values, *sensor))), design.loop)
 
 
 def check(design: Design, gains: Gains) -> Check:
     """Compute margins and step response of the loop that the target runs."""
-    loop = design.loop
-    plant = plant_of(design, loop)
+    loop, plant = design.loop, plant_of(design)
     target = CHANGE * design.reference.max_velocity
     time = loop.sample_time * np.arange(int(duration(design, gains) / loop.sample_time))
     controller = Controller(
@@ -151,6 +150,6 @@ def ticks(loop: Loop) -> float:
     return 1 / loop.count_angle if loop.count_angle else math.nan
 
 
-def rounded(value: float, digits: int = 5) -> float:
+def rounded(value: float) -> float:
     """Return a number as it is printed."""
-    return float(f"{value:.{digits}g}")
+    return float(f"{value:.5g}")

@@ -28,7 +28,7 @@ PHASE, GAIN, SENSITIVITY, PEAK = 60.0, 2.0, 1.4, 1.01
 
 def _proportional(design: Design) -> float:
     """Return the largest proportional gain that keeps the margins without an integral."""
-    plant = plant_of(design, design.loop)
+    plant = plant_of(design)
     omega = grid_for(plant)
     gains = np.geomspace(1e-3, 1e3, 1201) / design.motor["dc_gain"]
     loop = gains[:, None] * plant.response(omega)

@@ -18,12 +18,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from smp_motor_ident.errors import DesignError
-from smp_motor_ident.tune.arrays import Array, Complex
-from smp_motor_ident.tune.feedback import Feedback, spectral_radius
+from smp_motor_ident.tune.arrays import Array
+from smp_motor_ident.tune.feedback import Feedback, spectral_radius, terms
 from smp_motor_ident.tune.limits import SPEED_NOISE
 from smp_motor_ident.tune.margins import loop_margins
 from smp_motor_ident.tune.methods.simc import SIMC
-from smp_motor_ident.tune.problem import Method, Problem, RequiredMargins, noise_filter
+from smp_motor_ident.tune.problem import Method, Problem, RequiredMargins
 
 FOCUS = ("balanced", "tracking", "load")
 MORE_NOISE, ENOUGH = 8, 1.2
@@ -192,7 +192,7 @@ def _candidates(problem: Problem, crossovers: Array, margins: Array, shares: Arr
     d = share * np.abs(needed) / w
     filter_time = np.array([problem.filter_time(0.1 / x) for x in crossovers])
     filter_time = np.repeat(filter_time, margins.size * shares.size)
-    integral, derivative = _terms(w, T, filter_time)
+    integral, derivative = terms(w, T, filter_time)
     rest = needed - d * derivative
     i = rest.imag / integral.imag
     p = rest.real - i * integral.real
@@ -200,16 +200,10 @@ def _candidates(problem: Problem, crossovers: Array, margins: Array, shares: Arr
     return _Candidates(*(x[keep] for x in (p, i, d, filter_time, w, pm, share)))
 
 
-def _terms(omega: Array, T: float, filter_time: Array) -> tuple[Complex, Complex]:
-    z = np.exp(1j * omega * T)
-    keep = filter_time / (filter_time + T)
-    return T / (z - 1), (1 - keep) * (z - 1) / (T * (z - keep))
-
-
 def _hold(problem: Problem, c: _Candidates, margin: float, peak: float, hump: float) -> Array:
     """Return which candidates keep Ms, the hump of T, phase and gain margin, and control noise."""
     omega, T = problem.omega, problem.loop.sample_time
-    integral, derivative = _terms(omega, T, c.filter_time[:, None])
+    integral, derivative = terms(omega, T, c.filter_time[:, None])
     control = c.p[:, None] + c.i[:, None] * integral + c.d[:, None] * derivative
     loop = control * problem.response
     back = 1 / (1 + loop)
@@ -222,12 +216,10 @@ def _hold(problem: Problem, c: _Candidates, margin: float, peak: float, hump: fl
     # Outside the unit circle of Ms there may still be a later crossover: check each of them.
     near = np.abs(np.abs(loop) - 1) < 0.1
     good &= np.where(near, np.abs(np.angle(-loop)), np.pi).min(axis=1) >= np.deg2rad(0.9 * margin)
-    power = np.abs(control * back) ** 2 * noise_filter(problem, omega)
-    control_noise = np.sqrt(np.trapezoid(power, omega, axis=1) / omega[-1])
-    good &= control_noise <= problem.loop.noise_limit
-    shaking = np.trapezoid(power * np.abs(problem.true_response) ** 2, omega, axis=1) / omega[-1]
+    good &= problem.shaken(control * back) <= problem.loop.noise_limit
+    shaking = problem.shaken(control * back * problem.true_response)
     top = problem.loop.supply_voltage / float(problem.plant.motors.a0[0])
-    return np.asarray(good & (np.sqrt(shaking) <= SPEED_NOISE.value * top))
+    return np.asarray(good & (shaking <= SPEED_NOISE.value * top))
 
 
 def _at_bandwidth(problem: Problem, wished: float, margin: float, peak: float) -> Feedback:

@@ -22,8 +22,7 @@ from smp_motor_ident.errors import DesignError
 from smp_motor_ident.tune.arrays import Array
 from smp_motor_ident.tune.feedback import Feedback, spectral_radius
 from smp_motor_ident.tune.methods.simc import SIMC
-from smp_motor_ident.tune.plant import Plant
-from smp_motor_ident.tune.problem import Method, Problem, RequiredMargins, noise_filter
+from smp_motor_ident.tune.problem import Method, Problem, RequiredMargins
 from smp_motor_ident.tune.simulation import Controller, Inputs, simulate
 
 POPULATION, ELITE, GENERATIONS = 48, 10, 14
@@ -66,7 +65,6 @@ class _Cost:
         T, model = problem.loop.sample_time, problem.reduced
         span = 6 * (model.delay + model.time_constant)
         self.time = T * np.arange(1, max(int(span / T), 40) + 1)
-        self.plants: dict[int, Plant] = {}
         speed = 0.3 * problem.loop.supply_voltage * model.gain
         self.step = np.full(self.time.size, speed)
         self.scale: Array = np.ones(2)
@@ -75,7 +73,7 @@ class _Cost:
 
     def _errors(self, p: Array, i: Array, d: Array, filter_time: float) -> tuple[Array, Array]:
         """Return the time-weighted errors of set-point and load step, and the overshoot."""
-        plant = self.plants.setdefault(p.size, self.problem.plant.repeated(p.size))
+        plant = self.problem.plant.repeated(p.size)
         gains = Feedback(cast(Any, p), cast(Any, i), cast(Any, d), filter_time)
         with np.errstate(over="ignore", invalid="ignore"):
             limited = Controller(
@@ -91,17 +89,13 @@ class _Cost:
     def __call__(self, p: Array, i: Array, d: Array, filter_time: float) -> Array:
         problem = self.problem
         errors, over = self._errors(p, i, d, filter_time)
-        omega, T = problem.omega, problem.loop.sample_time
-        z = np.exp(1j * omega * T)
-        keep = filter_time / (filter_time + T)
-        control = p[:, None] + i[:, None] * T / (z - 1)
-        control = control + d[:, None] * (1 - keep) * (z - 1) / (T * (z - keep))
+        column = [cast(Any, gain[:, None]) for gain in (p, i, d)]
+        each = Feedback(column[0], column[1], column[2], filter_time)
+        control = each.response(problem.omega, problem.loop.sample_time)
         back = 1 / (1 + control * problem.response)
         peak = np.abs(back).max(axis=1)
-        power = np.abs(control * back) ** 2 * noise_filter(problem, omega)
-        control_noise = np.sqrt(np.trapezoid(power, omega, axis=1) / omega[-1])
         excess = np.maximum(peak - REQUIRED.sensitivity, 0) * 20
-        excess += np.maximum(control_noise / problem.loop.noise_limit - 1, 0) * 20
+        excess += np.maximum(problem.shaken(control * back) / problem.loop.noise_limit - 1, 0) * 20
         value = errors.sum(axis=0) + 10 * np.maximum(over - 0.1, 0) + excess
         return np.where(np.isfinite(value), value, 1e9)
 

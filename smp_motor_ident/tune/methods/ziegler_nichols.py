@@ -42,16 +42,12 @@ def by_rule(rule: str, structure: str, gain: float, period: float) -> Feedback:
     return Feedback(p, p / (integral * period), p * td, td / 10)
 
 
-def _solve(rule: str, problem: Problem) -> Feedback:
-    return from_ultimate(problem, rule, *problem.ultimate)
-
-
 ZIEGLER_NICHOLS = Method(
     "ziegler_nichols",
     "Ziegler-Nichols from the ultimate point",
     "Ziegler and Nichols 1942",
     RequiredMargins(phase=20.0, gain=1.5, sensitivity=3.5),
-    lambda problem: _solve("ziegler_nichols", problem),
+    lambda problem: from_ultimate(problem, "ziegler_nichols", *problem.ultimate),
     ("structure",),
 )
 TYREUS_LUYBEN = Method(
@@ -59,6 +55,6 @@ TYREUS_LUYBEN = Method(
     "Tyreus-Luyben from the ultimate point",
     "Tyreus and Luyben 1992",
     RequiredMargins(phase=30.0, gain=2.0, sensitivity=2.2),
-    lambda problem: _solve("tyreus_luyben", problem),
+    lambda problem: from_ultimate(problem, "tyreus_luyben", *problem.ultimate),
     ("structure",),
 )
