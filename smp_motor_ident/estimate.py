@@ -17,6 +17,7 @@ from smp_motor_ident.diagnosis.bunched import merge_bunches
 from smp_motor_ident.diagnosis.conditions import dependent
 from smp_motor_ident.diagnosis.current_kind import ARMATURE, current_kind
 from smp_motor_ident.diagnosis.limits import CANDIDATE_WEIGHT, LEAST_FIT, PROFILED
+from smp_motor_ident.diagnosis.misfit import widened_by_misfit
 from smp_motor_ident.diagnosis.model_error import regression
 from smp_motor_ident.diagnosis.noise_or_effect import in_place_of_noise
 from smp_motor_ident.diagnosis.refusal import no_candidate, refuse
@@ -40,7 +41,7 @@ from smp_motor_ident.estimation.fit import Fit, Prior
 from smp_motor_ident.estimation.hold_choice import chosen_hold, instant_deviation, otherwise
 from smp_motor_ident.estimation.profile import profiled
 from smp_motor_ident.estimation.quantisation import widened
-from smp_motor_ident.estimation.quantities import Answer, answer
+from smp_motor_ident.estimation.quantities import Answer, answer, driven_longest
 from smp_motor_ident.estimation.request import Request, base_structure, checked
 from smp_motor_ident.estimation.segments import heterogeneous
 from smp_motor_ident.estimation.subset import excited
@@ -213,10 +214,10 @@ def _stated(
     final = of_kind(data, chosen)
     gear = group[0].hardware.gear_ratio
     errors = regression(final, chosen, gear)
-    chosen, parts = dependent(final, chosen, errors)
+    chosen, parts = dependent(chosen, errors)
 
     def said(fit: Fit) -> tuple[Answer, dict[str, float]]:
-        own = answer(fit, request.known, friction_std, _level(final))
+        own = answer(fit, request.known, friction_std, driven_longest(final))
         return _covering(data, candidates, own, request.known)
 
     result, alike = said(chosen)
@@ -230,13 +231,13 @@ def _stated(
     lacks, possible = adequacy(errors, data.step, numbers, tests)
     if not any(f.severity == "unreliable" for f in lacks):
         lacks += in_place_of_noise(final, chosen, gear, numbers, request.options)
-    if possible is not None:
-        result, alike = said(chosen.wider(np.outer(possible, possible).astype(np.float64)))
+    (result, alike), beside = widened_by_misfit(final, chosen, possible, said)
     findings = [
         *found,
         *assess(final, chosen, FitPercent(fitted, common), tests),
         *lacks,
         *parts,
+        *beside,
         *unsettled_rival(candidates, result, request.known),
         *advise(chosen, result, request.known),
         *scope(final, result, change, alike, group[0].hardware.resistance),
@@ -292,13 +293,6 @@ def _certain(
     chosen, friction_std = consider_friction(final, consider_left_out(final, timed))
     chosen, change = heterogeneous(final, chosen)
     return chosen, friction_std, change
-
-
-def _level(data: Experiments) -> float:
-    """Return the voltage [V] at which the motor was driven longest."""
-    value = np.abs(data.hold_value)
-    driven = data.hold_value[value > 0.5 * value.max()]
-    return float(np.copysign(np.median(np.abs(driven)), driven.sum()))
 
 
 def _covering(

@@ -8,8 +8,7 @@ the current); with sensitivities S, residuals e and W = 1 + r u the other estima
     d = (S' W S)^-1 S' W e,
 
 whose covariance under a right model follows from sums of scores over blocks of samples.  A
-coordinate that moves by more than that is known no better than it moves.  Where torque noise is
-fitted, the frequency is such a condition: `observers`.
+coordinate that moves by more than that is known no better than it moves.
 
 References
 ----------
@@ -25,17 +24,15 @@ from scipy.special import fdtrc
 
 from smp_motor_ident.diagnosis.limits import CONDITION_LEVEL, CONDITION_WEIGHT
 from smp_motor_ident.diagnosis.model_error import Regression
-from smp_motor_ident.diagnosis.observers import moved_by_slower
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.prediction import inverse
 from smp_motor_ident.finding import Finding
-from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model import structures as models
 
 Array = NDArray[np.float64]
 
 
-def dependent(data: Experiments, fit: Fit, errors: Regression | None) -> tuple[Fit, list[Finding]]:
+def dependent(fit: Fit, errors: Regression | None) -> tuple[Fit, list[Finding]]:
     """Return the fit with its covariance widened by what the conditions move, and say which."""
     if errors is None:
         return fit, []
@@ -43,24 +40,21 @@ def dependent(data: Experiments, fit: Fit, errors: Regression | None) -> tuple[F
     level = CONDITION_LEVEL.value / max(2 * size * len(errors.conditions), 1)
     names = [models.Z_NAMES[i] for i in fit.structure.free()]
     unweighted = inverse(errors.own.T @ errors.own, 1e-12)
-    found = {"frequency": moved_by_slower(data, fit)}
+    added, said = np.zeros((size, size)), {}
     for name, condition in errors.conditions.items():
-        either = []
+        moves = []
         for sign in (1.0, -1.0):
             weight = 1 + sign * CONDITION_WEIGHT.value * condition
             move, p_value = _moved(errors, unweighted, weight)
-            either.append(np.where(p_value < level, move, 0.0))
-        found[name] = max(either, key=lambda d: float(np.abs(d).max()))
-    far = {name: move for name, move in found.items() if move.any()}
-    if not far:
+            moves.append(np.where(p_value < level, move, 0.0))
+        far = max(moves, key=lambda d: float(np.abs(d).max()))
+        if far.any():
+            added += np.outer(far, far)
+            said[name] = ", ".join(n for n, d in zip(names, far, strict=True) if d)
+    if not said:
         return fit, []
-    moves = np.array(list(far.values()))
-    said = {
-        name: ", ".join(n for n, d in zip(names, move, strict=True) if d)
-        for name, move in far.items()
-    }
     message = "the numbers hang on the part of the motion that one looks at (" + "; ".join(said)
-    return fit.wider(moves.T @ moves), [
+    return fit.wider(added), [
         Finding(
             "conditions",
             "note",

@@ -31,8 +31,10 @@ from smp_motor_ident.diagnosis.model_error import measured, own_responses, predi
 from smp_motor_ident.estimation import shape_constraint
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.prediction import inverse
+from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.noise import gain_for, transition
+from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import LN_R, TE
 
 Array = NDArray[np.float64]
@@ -43,6 +45,25 @@ SLOWER = (0.5, 0.25, 0.1)
 
 LEAST = 0.5
 """Of a coordinate's deviation: to that a descent ends in its minimum, and a line is one."""
+
+
+def slower(data: Experiments, fit: Fit) -> tuple[Fit, list[Finding]]:
+    """Return the fit with its covariance widened by what slower observers move, and say which."""
+    move = moved_by_slower(data, fit)
+    if not move.any():
+        return fit, []
+    names = [models.Z_NAMES[i] for i in fit.structure.free()]
+    said = ", ".join(n for n, d in zip(names, move, strict=True) if d)
+    return fit.along(move), [
+        Finding(
+            "torque_noise_frequency",
+            "note",
+            "what looks like a load that fluctuates leads to other numbers where one follows the "
+            f"motor more slowly ({said}): the intervals cover them",
+            {"coordinates": said},
+            "record at the motor's terminals, without load, and sample faster: it may be no load",
+        )
+    ]
 
 
 def moved_by_slower(data: Experiments, fit: Fit) -> Array:

@@ -38,6 +38,16 @@ def consider_timing(data: Experiments, fit: Fit, instant: float) -> Fit:
     return fit.wider(beside.covariance(instant**2))
 
 
+def consider_late(data: Experiments, fit: Fit, late: float) -> Fit:
+    """Return the fit with its covariance widened by a delay [s] beside that which was fitted."""
+    structure = fit.structure
+    if not structure.delay:
+        return consider_timing(data, fit, late)
+    answer = _beside(data, fit, structure, models.DELAY).answer
+    row = np.insert(answer, structure.free().index(models.DELAY), 1.0)
+    return fit.along(late * row)
+
+
 def consider_clock(data: Experiments, fit: Fit, share: float) -> Fit:
     """Return the fit with its covariance widened by a clock that is known to a share only.
 
@@ -51,7 +61,7 @@ def consider_clock(data: Experiments, fit: Fit, share: float) -> Fit:
     times = [models.DELAY, models.WINDOW, models.CURRENT_LAG]
     powers[times] = fit.z[times]
     row = share * powers[list(fit.structure.free())]
-    return fit.wider(np.asarray(np.outer(row, row), dtype=np.float64))
+    return fit.along(row)
 
 
 def consider_drop(data: Experiments, fit: Fit) -> Fit:
@@ -67,7 +77,7 @@ def consider_drop(data: Experiments, fit: Fit) -> Fit:
     row: Array = np.zeros(len(free))
     drop = float(np.exp(fit.z[models.LN_R]) * fit.z[models.OFFSET])
     row[[free.index(i) for i in (models.VC_PLUS, models.VC_MINUS) if i in free]] = drop
-    return fit.wider(np.asarray(np.outer(row, row), dtype=np.float64))
+    return fit.along(row)
 
 
 def consider_friction(data: Experiments, fit: Fit) -> tuple[Fit, float]:

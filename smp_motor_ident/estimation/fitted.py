@@ -124,6 +124,10 @@ class Fit(Start):
         """Return the fit with a covariance added that the likelihood does not see."""
         return replace(self, added=added if self.added is None else self.added + added)
 
+    def along(self, move: Array) -> Fit:
+        """Return the fit with its covariance widened by a move of the free coordinates."""
+        return self.wider(np.outer(move, move).astype(np.float64))
+
     def noise_model(self) -> NoiseModel:
         """Return how the residuals weigh."""
         return NoiseModel(self.noise, self.gain)

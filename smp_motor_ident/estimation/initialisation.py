@@ -49,6 +49,8 @@ def candidates(data: Experiments, structure: Structure) -> list[Array]:
             z[models.A2] = 2 * z[models.A1] - z[models.A0] - np.log(20)
             z[models.TE] = z[models.A2] - z[models.A1]
             found.append(z)
+    if not found and structure.order == 1:
+        found = start.speed_candidates(data, 2)
     most = MOVES * float(np.abs(data.hold_value).max(initial=0.0))
     for z in found:
         if structure.window:

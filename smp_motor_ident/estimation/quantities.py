@@ -15,6 +15,7 @@ from smp_motor_ident.diagnosis.limits import HIDDEN_LAG, LOOSE_QUANTITY, NEGLIGI
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.fitted import NORMAL_95
 from smp_motor_ident.estimation.inversion import solved_for
+from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import PHYSICAL
 from smp_motor_ident.result import UNITS, Quantity
@@ -257,3 +258,10 @@ def _positive(name: str, interval: tuple[float, float]) -> tuple[float, float]:
 
 def _quantity(name: str, value: float, std: float, interval: tuple[float, float]) -> Quantity:
     return Quantity(float(value), float(std), _positive(name, interval), UNITS[name])
+
+
+def driven_longest(data: Experiments) -> float:
+    """Return the voltage [V] at which the motor was driven longest."""
+    value = np.abs(data.hold_value)
+    driven = data.hold_value[value > 0.5 * value.max()]
+    return float(np.copysign(np.median(np.abs(driven)), driven.sum()))

@@ -207,8 +207,9 @@ def _repeats(count: Integers, starts: Sequence[int]) -> NDArray[np.bool_]:
 
 def angle_quantum(angle: Array) -> float:
     """Return the step [rad] in which an angle comes, as counts or rounding make it; 0 for none."""
-    moves = np.abs(np.diff(angle[:20_000]))
-    moves = np.sort(moves[moves > FINEST_ENCODER])  # lost samples compare as smaller
+    moves = np.abs(np.diff(angle))
+    # A slow motor moves once in a hundred rows; lost samples compare as smaller.
+    moves = np.sort(moves[moves > FINEST_ENCODER][:20_000])
     if moves.size < 50:
         return 0.0
     moves = moves[:: -(-moves.size // FEW)]

@@ -7,6 +7,7 @@ acceleration lets it.
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -29,7 +30,7 @@ def stands(
     """Tell of each segment whether the motor still stands while it is driven, shape (g,)."""
     out = np.zeros(len(starts) - 1, dtype=np.bool_)
     on = ON * float(np.abs(voltage).max(initial=0.0))
-    for g, (a, b) in enumerate(zip(starts[:-1], starts[1:])):
+    for g, (a, b) in enumerate(itertools.pairwise(starts)):
         driven = b - a > 8 and on > 0 and bool((np.abs(voltage[a + 1 : a + 3]) > on).all())
         known = np.flatnonzero(np.isfinite(output[a:b])) + a
         if driven and known.size > 8:
@@ -45,9 +46,10 @@ def _stands(t: Array, y: Array, kind: int, quantum: float) -> bool:
     else:
         stride, speed = 1, y
     fastest = float(np.quantile(np.abs(speed), 0.98))
-    spans = t[2 * stride :: stride] - t[stride:-stride:stride]
-    surge = np.abs(np.diff(speed[::stride]))[: spans.size] / spans[: np.diff(speed[::stride]).size]
-    acceleration = float(np.quantile(surge, 0.9)) if surge.size else 0.0
+    change = np.abs(np.diff(speed[::stride]))
+    if not change.size:
+        return False
+    acceleration = float(np.quantile(change, 0.9)) / (stride * float(np.median(np.diff(t))))
     if not (fastest > 0 and acceleration > 0):
         return False
     turning = SLOW * fastest / acceleration
@@ -63,6 +65,9 @@ def _stands(t: Array, y: Array, kind: int, quantum: float) -> bool:
 
 def _stride(y: Array, quantum: float) -> int:
     """Return over how many rows an angle moves by ten of its steps, as a rule."""
-    moved = float(np.median(np.abs(np.diff(y))[np.abs(np.diff(y)) > 0.5 * quantum], axis=0)) \
-        if (np.abs(np.diff(y)) > 0.5 * quantum).any() else 0.0
-    return int(np.clip(math.ceil(10 * quantum / moved), 1, max(y.size // 8, 1))) if moved else 1
+    moves = np.abs(np.diff(y))
+    moves = moves[moves > 0.5 * quantum]
+    if not moves.size:
+        return 1
+    rows = math.ceil(10 * quantum / float(np.median(moves)))
+    return int(np.clip(rows, 1, max(y.size // 8, 1)))

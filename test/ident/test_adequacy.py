@@ -13,7 +13,6 @@ from smp_motor_ident.diagnosis.effects import EFFECTS
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.finding import Finding
-from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.model.structures import Structure
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import Quantity, ResidualTests
@@ -74,7 +73,7 @@ def test_numbers_that_hang_on_the_size_of_the_voltage_cover_both_sizes():
     rng = np.random.default_rng(4)
     volts = rng.choice([-1.0, 1.0], 4000) * rng.choice([2.0, 8.0], 4000)
     small = np.abs(volts) < 5.0
-    fit, data = estimation_fit(), prepare([motors.record("rear_left")], False)
+    fit = estimation_fit()
     for lost in (0.0, 1.0):
         speed = (10.0 - lost * ~small) * volts + 0.5 * rng.standard_normal(4000)
         gain = float(speed @ volts / (volts @ volts))
@@ -83,7 +82,7 @@ def test_numbers_that_hang_on_the_size_of_the_voltage_cover_both_sizes():
             np.zeros((1, 0)), np.arange(4000) * 40 // 4000, [], volts[:, None] / 0.5, 1,
             {"size of the voltage": np.where(small, -1.0, 1.0)},
         )  # fmt: skip
-        wider, said = dependent(data, fit, errors)
+        wider, said = dependent(fit, errors)
         assert bool(said) is bool(lost)
         if lost:  # the small voltages, nine times as heavy, ask for what they know of the gain
             assert 0.1 < float(np.sqrt(wider.added[0, 0])) < 1.0

@@ -56,8 +56,11 @@ def test_initial_fit_is_the_least_squares_optimum_that_scipy_finds_from_the_trut
     data = prepare([record], False)
     fit = initial_fit(data, Structure("linear", friction="none"), Options())
 
+    weight = np.sqrt(fit.noise[0, 0]) / np.abs(record.voltage).max()  # of the winding at first
+
     def residual(x):
-        return reference(record.voltage, *np.exp(x[:3]), *x[3:]) - data.output
+        missed = reference(record.voltage, *np.exp(x[:3]), *x[3:]) - data.output
+        return np.append(missed, weight * x[3])
 
     start = np.concatenate([truth, [0.0, record.velocity[0]]])
     found = least_squares(residual, start, x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15)
@@ -120,7 +123,8 @@ def test_elimination_is_the_schur_complement():
     common, score = np.zeros((f, f)), np.zeros(f)
     step, gain = np.zeros((segments, own)), np.zeros((segments, own, f))
     no_scores = np.zeros((0, f + own)), np.zeros(0, dtype=np.int64)
-    eliminate(normal, gradient, np.zeros((segments, own)), 10**9, common, score, step, gain,
+    nothing = [np.zeros((segments, own))] * 3  # neither moved nor known beforehand
+    eliminate(normal, gradient, *nothing, 10**9, common, score, step, gain,
               *no_scores)  # fmt: skip
     # The prior weighs 1e-11 of a segment's information here.
     expected = np.linalg.inv(np.linalg.inv(whole)[:f, :f])
@@ -136,7 +140,7 @@ def test_a_column_of_which_only_rounding_is_left_counts_as_unknown():
     normal[0, 1, 1] -= 1e-15  # the second common column is the segment's own
     gradient = np.ones((1, 3))
     no_scores = np.zeros((0, 3)), np.zeros(0, dtype=np.int64)
-    eliminate(normal, gradient, np.zeros((1, 1)), 10**18, common, score, np.zeros((1, 1)),
+    eliminate(normal, gradient, *[np.zeros((1, 1))] * 3, 10**18, common, score, np.zeros((1, 1)),
               np.zeros((1, 1, 2)), *no_scores)  # fmt: skip
     assert common[1, 1] == 0.0 or common[1, 1] > 1e-12
     step, _ = damped_step(common, score, 1e-9, np.eye(12, 2), np.zeros(12),

@@ -1,0 +1,92 @@
+"""Whether commands took effect at instants that scatter: a test by the variance of the residuals.
+
+A driver on its own clock, a bus or arrival stamps put every change of the command off by a time
+of its own.  With independent times of mean zero and variance s2, residuals ``e`` of variance one
+have the variance
+
+    1 + s2 x,   x_t = sum_k (d yhat_t / d t_k)^2,
+
+over the changes ``k`` of the command, where no other noise knows when it changed.  The regression
+of ``e^2`` on ``x`` gives s2, with a standard deviation that allows for any other variance (White).
+Times that are never negative have a mean beside their scatter: of those between nothing and a
+period, uniformly, it is three times the variance that the mean has for its square.
+
+References
+----------
+T. Breusch, A. Pagan, A simple test for heteroscedasticity, Econometrica 47 (1979), 1287;
+H. White, Econometrica 48 (1980), 817.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import erfc
+
+from smp_motor_ident.diagnosis.limits import CONDITION_LEVEL
+from smp_motor_ident.diagnosis.model_error import measured, predicted
+from smp_motor_ident.estimation.consider_covariance import consider_late
+from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.finding import Finding
+from smp_motor_ident.likelihood.experiments import Experiments
+
+Array = NDArray[np.float64]
+
+PATTERNS = 8  # of random signs, whose mean square is the sum over the changes
+NUDGE = 1e-3  # of a sample: small against what bends
+MOST = 4.0  # deviations at which a residual is cut off: outliers are no scatter
+
+
+def jittered(data: Experiments, fit: Fit) -> tuple[Fit, list[Finding]]:
+    """Return the fit with its covariance widened by instants that scatter, and say so."""
+    scatter = _scatter(data, fit) if fit.structure.free() else 0.0
+    if scatter <= 0.0:
+        return fit, []
+    late = math.sqrt(3.0 * scatter)
+    wider = consider_late(data, fit, late)
+    return wider, [
+        Finding(
+            "command_jitter",
+            "note",
+            f"right after changes of the command the residuals scatter as if it took effect up to "
+            f"{2e3 * late:.2g} ms late, each time by another: the intervals cover that",
+            {"delay": late, "scatter": math.sqrt(scatter)},
+            "record the voltage at the motor's terminals, with the stamps of one clock",
+        )
+    ]
+
+
+def _scatter(data: Experiments, fit: Fit) -> float:
+    """Return the variance [s^2] of the instants, nothing where chance may be it."""
+    rng = np.random.default_rng(0)
+    voltage, values = data.hold_value, measured(data)
+    base, deviation = predicted(data, fit), np.sqrt(np.diag(fit.noise))[: values.shape[1]]
+    change = np.diff(voltage, prepend=voltage[0])
+    change[data.hold_start[:-1]] = 0.0
+    length = np.maximum(np.diff(data.hold_end, prepend=data.hold_end[0] - data.step), 0.0)
+    length[data.hold_start[:-1]] = data.step
+    moved = (
+        NUDGE
+        * data.step
+        * np.divide(change, length, out=np.zeros_like(change), where=length > 1e-3 * data.step)
+    )
+    x = np.zeros_like(base)
+    for _ in range(PATTERNS):
+        sign = rng.choice([-1.0, 1.0], voltage.size)
+        other = replace(data, hold_value=voltage + sign * moved)
+        x += np.square((predicted(other, fit) - base) / (NUDGE * data.step * deviation)) / PATTERNS
+    known = np.isfinite(values)
+    square = np.minimum(np.square((values - base) / deviation)[known], MOST**2)
+    away = x[known] - x[known].mean()
+    spread = float(away @ away)
+    if not spread > 0.0:
+        return 0.0
+    found = float(away @ square) / spread
+    left = square - square.mean() - found * away
+    robust = math.sqrt(float(np.square(away * left).sum())) / spread
+    plain = float(square.std()) / math.sqrt(spread)
+    surprise = found / max(robust, plain, 1e-300)
+    return found if 0.5 * erfc(surprise / math.sqrt(2)) < CONDITION_LEVEL.value else 0.0

@@ -1,0 +1,58 @@
+"""Commands that take effect at instants that scatter are noticed, and the intervals cover them."""
+
+from __future__ import annotations
+
+import independent
+import motors
+import numpy as np
+import pytest
+
+from smp_motor_ident.estimate import estimate
+from smp_motor_ident.record import Record
+from smp_motor_ident.result import Estimate
+
+RATE = 200.0
+FINER = 20  # steps of the driver's clock to a sample
+
+
+def recorded(latest: float, seed: int) -> Record:
+    """Random steps that reach the motor up to so many samples late, each by a time of its own."""
+    rng = np.random.default_rng(seed)
+    asked = np.repeat(rng.uniform(-10.0, 10.0, 200), 10)
+    fine = np.repeat(asked, FINER)
+    changes = np.flatnonzero(np.diff(fine)) + 1
+    given = fine.copy()
+    for k, late in zip(changes, rng.integers(0, int(latest * FINER) + 1, changes.size)):
+        given[k : k + late] = fine[k - 1]
+    t = np.arange(given.size) / (RATE * FINER)
+    out = independent.simulate(
+        t, given, *independent.TABLE_1["rear_left"], 0.0, np.zeros(t.size), 4
+    )
+    rows = np.arange(FINER - 1, given.size, FINER)  # a row holds what ran up to its instant
+    speed = out[rows, 1] + 0.2 * rng.standard_normal(rows.size)
+    return Record("rear_left", t[rows] - t[rows[0]], asked, velocity=speed)
+
+
+def jitter(found: Estimate) -> float:
+    return max(
+        (float(f.evidence["delay"]) for f in found.findings if f.code == "command_jitter"),
+        default=0.0,
+    )
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_commands_on_the_beat_show_no_scatter(seed: int) -> None:
+    # One in a hundred of such records may.
+    assert jitter(estimate(recorded(0.0, seed))) == 0.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_scatter_of_commands_is_found_and_covered(seed: int) -> None:
+    found = estimate(recorded(1.0, seed))
+    # The root of three variances of a uniform time is its mean: half a sample, to a third.
+    assert jitter(found) == pytest.approx(0.5 / RATE, rel=0.35)
+    true = motors.truth("rear_left", 0.0)
+    for name in ("dc_gain", "time_constant", "time_constant_product"):
+        quantity = found.combinations[name]
+        assert quantity.value is not None and quantity.std is not None
+        assert abs(quantity.value - true[name]) < 3.5 * quantity.std, name
