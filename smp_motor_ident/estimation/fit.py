@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from smp_motor_ident.diagnosis.limits import MOST_FRICTION
 from smp_motor_ident.estimation import shape_constraint
 from smp_motor_ident.estimation.fitted import Fit, Options, Prior, Start
 from smp_motor_ident.likelihood.experiments import Experiments
@@ -215,6 +216,9 @@ def solve(
     """
     options = options or Options()
     lower, upper = _bounds(FASTEST * data.step if data.current.size else 0.0)
+    # Friction next to the largest voltage would put off a motor's start as long as one likes.
+    most = MOST_FRICTION.value * float(np.abs(data.hold_value).max(initial=0.0))
+    upper[[models.VC_PLUS, models.VC_MINUS]] = max(most, 1e-9)
     if data.quantum > 0:  # a speed in coarse steps is a difference of counts, over a sample or more
         lower[models.WINDOW] = data.step
     bounds = (

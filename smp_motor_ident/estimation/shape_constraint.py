@@ -1,7 +1,8 @@
 """Keep back-EMF and damping of one sign where voltage and speed alone give the shape.
 
 With te = L/R, ``be = (a1 - a2/te)/te`` is what viscous friction takes of a0 and ``K = a0 - be`` the
-rest: ``0 <= be <= MOST_FRICTION a0``.  At either edge ``share a0 te^2 - a1 te + a2 = 0`` ties te to
+rest: ``0 <= be <= MOST_FRICTION a0``, and of the two windings that answer alike not the one that
+would be slower than any rotor.  At either edge ``share a0 te^2 - a1 te + a2 = 0`` ties te to
 the coefficients of the response; a step that would leave is taken along the edge (active set).
 
 References
@@ -22,6 +23,7 @@ from smp_motor_ident.model.structures import A0, A1, A2, TE, Structure
 Array = NDArray[np.float64]
 
 HAIR = 1e-9  # of a0 by which rounding may pass an edge
+SLOWEST = 10.0  # a winding, times ``R J / K``: those of motors are faster than that itself
 NEAR = 1e-6  # of a0 within which coordinates lie on one
 
 
@@ -35,13 +37,18 @@ def passed(z: Array) -> float | None:
     share, most = _share(z), MOST_FRICTION.value
     if share < -HAIR:
         return 0.0
-    return most if share > most + HAIR else None
+    return most if share > most + HAIR or _slow(z[TE], z) else None
 
 
 def at_edge(z: Array) -> float | None:
     """Return the share of a0 at the edge on which coordinates lie, None within."""
     share = _share(z)
     return next((e for e in (0.0, MOST_FRICTION.value) if abs(share - e) < NEAR), None)
+
+
+def _slow(ln_te: float, z: Array) -> bool:
+    """Tell whether a winding would be far slower than the rotor, ``te > 10 a2 / te``."""
+    return bool(2 * ln_te > z[A2] + math.log(SLOWEST))
 
 
 def _share(z: Array) -> float:
@@ -60,7 +67,7 @@ def edge(z: Array, share: float) -> tuple[float, Array] | None:
         return None
     larger = a1 + math.sqrt(root)  # a difference would lose a short winding to rounding
     both = 2 * a2 / larger, larger / (2 * share * a0)
-    te = float(min(both, key=lambda x: abs(math.log(x) - z[TE])))
+    te = float(min(both, key=lambda x: (_slow(math.log(x), z), abs(math.log(x) - z[TE]))))
     slope = a1 * te - 2 * share * a0 * te * te
     if slope == 0.0:
         return None

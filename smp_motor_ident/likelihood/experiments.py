@@ -207,9 +207,10 @@ def _repeats(count: Integers, starts: Sequence[int]) -> NDArray[np.bool_]:
 
 def angle_quantum(angle: Array) -> float:
     """Return the step [rad] in which an angle comes, as counts or rounding make it; 0 for none."""
-    moves = np.abs(np.diff(angle))
+    every = np.abs(np.diff(angle))
     # A slow motor moves once in a hundred rows; lost samples compare as smaller.
-    moves = np.sort(moves[moves > FINEST_ENCODER][:20_000])
+    moves = np.sort(every[every > FINEST_ENCODER][:20_000])
+    rests = moves.size < 0.5 * every.size
     if moves.size < 50:
         return 0.0
     moves = moves[:: -(-moves.size // FEW)]
@@ -222,7 +223,8 @@ def angle_quantum(angle: Array) -> float:
         whole = np.round(moves / quantum)
         levels = np.unique(whole).size
         off = np.abs(moves / quantum - whole)
-        if (levels > 2 and np.mean(off < 0.05) > 0.95) or (levels == 2 and off.max() < 0.005):
+        single = levels == 2 or (levels == 1 and rests)
+        if (levels > 2 and np.mean(off < 0.05) > 0.95) or (single and off.max() < 0.005):
             return quantum
     return 0.0
 

@@ -8,7 +8,6 @@ acceleration lets it.
 from __future__ import annotations
 
 import itertools
-import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +19,9 @@ Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
 SLOW = 0.02  # of the fastest speed: what stands
+SLIGHT = 1e-3  # of all that it turned: the same of an angle
 LONGER = 3.0  # than a motor takes to turn around
+ROWS = 3  # at least
 ON = 0.05  # of the largest voltage
 
 
@@ -39,35 +40,20 @@ def stands(
 
 
 def _stands(t: Array, y: Array, kind: int, quantum: float) -> bool:
-    """Tell whether one segment begins with a standstill."""
+    """Tell whether one segment begins with a standstill.
+
+    What starts or turns around at a constant acceleration takes twice as long from one speed to
+    its treble, or from one angle to nine times it, as it took to get there.
+    """
     if kind == rc.ANGLE:
-        stride = _stride(y, quantum)
-        speed = (y[stride:] - y[:-stride]) / (t[stride:] - t[:-stride])
+        away = np.abs(y - y[0])
+        near = max(1.5 * quantum, SLIGHT * float(np.ptp(y)))
+        far = 9 * near
     else:
-        stride, speed = 1, y
-    fastest = float(np.quantile(np.abs(speed), 0.98))
-    change = np.abs(np.diff(speed[::stride]))
-    if not change.size:
+        away = np.abs(y)
+        near = SLOW * float(np.quantile(away, 0.98))
+        far = 3 * near
+    left, gone = int(np.argmax(away > near)), int(np.argmax(away > far))
+    if not (near > 0 and gone >= left >= ROWS):
         return False
-    acceleration = float(np.quantile(change, 0.9)) / (stride * float(np.median(np.diff(t))))
-    if not (fastest > 0 and acceleration > 0):
-        return False
-    turning = SLOW * fastest / acceleration
-    still = SLOW * fastest
-    away = np.abs(y) > still
-    if kind == rc.ANGLE:
-        still = max(1.5 * quantum, 0.5 * acceleration * turning**2)
-        turning = math.sqrt(2 * still / acceleration)
-        away = np.abs(y - y[0]) > still
-    first = int(np.argmax(away))
-    return bool(away[first]) and first >= 3 and float(t[first] - t[0]) > LONGER * turning
-
-
-def _stride(y: Array, quantum: float) -> int:
-    """Return over how many rows an angle moves by ten of its steps, as a rule."""
-    moves = np.abs(np.diff(y))
-    moves = moves[moves > 0.5 * quantum]
-    if not moves.size:
-        return 1
-    rows = math.ceil(10 * quantum / float(np.median(moves)))
-    return int(np.clip(rows, 1, max(y.size // 8, 1)))
+    return float(t[left] - t[0]) > LONGER * 0.5 * float(t[gone] - t[left])
