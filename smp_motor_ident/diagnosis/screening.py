@@ -16,6 +16,7 @@ from smp_motor_ident.diagnosis.limits import (
     SIGN_ALIKE,
     SIGN_SURE,
 )
+from smp_motor_ident.diagnosis.silence import silent
 from smp_motor_ident.errors import InsufficientExcitationError, SignalError
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.record import Record
@@ -39,7 +40,7 @@ def screen(records: Sequence[Record]) -> list[Finding]:
         _ratio(record)
     _standing(records, where)
     for record in records:
-        _frozen(record)
+        silent(record, _where([record]))
     _motion(records, where)
     _signs(records, where)
     for record in records:
@@ -243,29 +244,6 @@ def _abrupt(x: Array, at: NDArray[np.bool_]) -> bool:
     if not enters.size or np.unique(rest).size < 0.5 * rest.size:
         return False
     return bool(np.median(np.abs(x[enters] - x[enters - 1])) > 1e-3 * np.ptp(x))
-
-
-def _frozen(record: Record) -> None:
-    """Refuse a sensor that stops half-way while the voltage goes on."""
-    for name in ("count", "position", "velocity"):
-        values = getattr(record, name)
-        if values is None or len(record) < 200:
-            continue
-        # A speed may well be constant; only at zero does it say that nothing turns.
-        moves = values != 0 if name == "velocity" else np.diff(values, prepend=np.nan) != 0
-        edges = np.concatenate([[0], np.flatnonzero(moves), [len(record) - 1]])
-        longest = int(np.argmax(np.diff(edges)))
-        a, b = int(edges[longest]), int(edges[longest + 1])
-        if b - a < max(100, 0.1 * len(record)):
-            continue
-        still, rest = record.voltage[a + 1 : b], np.delete(record.voltage, np.arange(a, b))
-        if np.abs(still).mean() > 0.5 * np.abs(rest).mean():
-            raise SignalError(
-                f"{_where([record])}: dead encoder, the {name} stays at {values[a + 1]:.6g} from "
-                f"t = {record.time[a]:.4g} s to {record.time[b]:.4g} s while the voltage reaches "
-                f"{np.abs(still).max():.3g} V; check the encoder's cable, or that nothing "
-                "blocks the motor"
-            )
 
 
 def _standing(records: Sequence[Record], where: str) -> None:
