@@ -256,15 +256,30 @@ LARGEST_OFFSET = Limit(
 SIGN_SURE = Limit(
     4.0,
     "standard deviations",
-    "of the correlation of two signals that have no part in each other; the largest of twelve "
-    "lags exceeds it by chance once in 2000 records of a standing motor",
-    "test_screening.py",
+    "of the correlation of two signals that have no part in each other; the largest of its lags "
+    "exceeds it by chance once in 2000 records of a standing motor",
+    "test_signs.py",
 )
 SIGN_ALIKE = Limit(
     0.5,
-    "correlation",
-    "a quarter of the motion follows the voltage: it turns, however slowly the voltage changes",
-    "test_screening.py",
+    "correlation, or share of one",
+    "a quarter of the motion follows the voltage: it turns, however slowly the voltage changes; "
+    "the cosine of 60 degrees, twice what delays between those tried may miss (SIGN_TOLD)",
+    "test_signs.py",
+)
+SIGN_TOLD = Limit(
+    0.87,
+    "share of a correlation",
+    "physical: cosine of 30 degrees; at three samples to a period, delays that are tried in halves "
+    "of a sample come so near to any phase, and the sign of what is nearer tells nothing",
+    "test_signs.py",
+)
+SIGN_LATE = Limit(
+    2.0,
+    "samples",
+    "physical: a driver and an encoder of one clock each are half a sample late on average and one "
+    "at most; a longer transport is long beside a sample, not beside a motor",
+    "test_signs.py",
 )
 RESIDUAL_LEVEL = Limit(
     0.05, "probability", "that any lag of clean residuals leaves its band", "test_findings.py"
