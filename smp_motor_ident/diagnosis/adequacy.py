@@ -119,8 +119,8 @@ def _test(
     if np.linalg.cond(normal / np.outer(scale, scale)) > 1e8:
         return _test(errors, effect, columns[:1], white) if len(columns) > 1 else None
     size = np.linalg.solve(normal, z.T @ e)
-    own = float(np.square(z @ size).sum()) / float(np.square(errors.whole[:, columns] @ size).sum())
-    if own < EFFECT_OWN.value:
+    own, whole = np.square(z @ size).sum(), np.square(errors.whole[:, columns] @ size).sum()
+    if own <= EFFECT_OWN.value * whole:  # nothing of nothing where no error is in its rows
         return None  # what is left of it is smaller than what is not known of its shape
     left = e - z @ size
     n, q = int(np.count_nonzero(e)), len(columns)  # rows without a measurement are zero

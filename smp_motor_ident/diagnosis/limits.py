@@ -96,10 +96,7 @@ HOLD_COST = Limit(
     "test_mirror.py",
 )
 HOLD_HOPELESS = Limit(
-    100.0,
-    "deviance",
-    "cost: no more data make up for odds of e^50 to 1 on the screening subset",
-    "test_mirror.py",
+    100.0, "deviance", "cost: nothing makes up for odds of e^50 to 1 on a subset", "test_mirror.py"
 )
 HOLD_EVIDENCE = Limit(
     30.0,
@@ -158,10 +155,7 @@ LITTLE_FRICTION = Limit(
     "test_estimate.py: a linear motor is recovered without friction",
 )
 TORQUE_NOISE = Limit(
-    12.0,
-    "deviance",
-    "significance: odds of e^6 to 1 for a load that nobody recorded",
-    "test_intervals.py",
+    12.0, "deviance", "significance: odds of e^6 to 1 for an unrecorded load", "test_intervals.py"
 )
 MOST_FRICTION = Limit(
     0.98,
@@ -221,34 +215,33 @@ WINDING_LAG = Limit(
     "test_findings.py: a speed that is filtered as slowly as the motor turns",
 )
 SQUARE_LEVEL = Limit(
-    0.03,
-    "share of the level",
-    "what a voltmeter scatters around a level",
-    "test_estimate.py",
+    0.03, "share of the level", "what a voltmeter scatters around a level", "test_estimate.py"
 )
 FRICTION_SHOWN = Limit(
-    0.5,
-    "relative standard deviation",
-    "beyond it zero lies inside the 95 % interval",
-    "test_findings.py",
+    0.5, "relative standard deviation", "beyond it the 95 % interval holds zero", "test_findings.py"
 )
 FEWEST = Limit(
-    40,
-    "samples",
-    "ten for each of gain, lag, friction and initial state",
-    "test_screening.py",
+    40, "samples", "ten for each of gain, lag, friction and initial state", "test_screening.py"
 )
 MOST_LOST = Limit(
-    0.3,
-    "share of the samples",
-    "beyond it the sensor, not the transport, is at fault",
-    "test_screening.py",
+    0.3, "share of the samples", "beyond it the sensor is at fault", "test_screening.py"
 )
 METER = Limit(
-    0.01,
-    "share of the supply or of a level",
-    "what a voltmeter scatters",
-    "test_screening.py",
+    0.01, "share of the supply or of a level", "what a voltmeter scatters", "test_screening.py"
+)
+SILENT_SWING = Limit(
+    2.0,
+    "smallest steps of the sensor",
+    "physical: rounding hides a swing of up to one; the other is for the winding's lag and for "
+    "friction, of which what the voltage lets expect has no more than the first order",
+    "test_silence.py",
+)
+FLICKER = Limit(
+    3.0,
+    "ratio of changes of level",
+    "physical: counts differenced faster than they come change level at most samples, a rounded "
+    "speed once a crossing; what is expected of the motion is known to a factor of two",
+    "test_silence.py",
 )
 OFFSET_SURE = Limit(
     6.0,
@@ -258,29 +251,38 @@ OFFSET_SURE = Limit(
     "test_screening.py",
 )
 LARGEST_OFFSET = Limit(
-    0.2,
-    "share of the largest current",
-    "a sensor so far from its zero is not calibrated",
-    "test_screening.py",
+    0.2, "share of the largest current", "beyond it a sensor is not calibrated", "test_screening.py"
 )
 SIGN_SURE = Limit(
     4.0,
     "standard deviations",
-    "of the correlation of two signals that have no part in each other; the largest of twelve "
-    "lags exceeds it by chance once in 2000 records of a standing motor",
-    "test_screening.py",
+    "of the correlation of two signals that have no part in each other; the largest of its lags "
+    "exceeds it by chance once in 2000 records of a standing motor",
+    "test_signs.py",
 )
 SIGN_ALIKE = Limit(
     0.5,
-    "correlation",
-    "a quarter of the motion follows the voltage: it turns, however slowly the voltage changes",
-    "test_screening.py",
+    "correlation, or share of one",
+    "a quarter of the motion follows the voltage: it turns, however slowly the voltage changes; "
+    "the cosine of 60 degrees, twice what delays between those tried may miss (SIGN_TOLD)",
+    "test_signs.py",
+)
+SIGN_TOLD = Limit(
+    0.87,
+    "share of a correlation",
+    "physical: cosine of 30 degrees; at three samples to a period, delays that are tried in halves "
+    "of a sample come so near to any phase, and the sign of what is nearer tells nothing",
+    "test_signs.py",
+)
+SIGN_LATE = Limit(
+    2.0,
+    "samples",
+    "physical: a driver and an encoder of one clock each are half a sample late on average and one "
+    "at most; a longer transport is long beside a sample, not beside a motor",
+    "test_signs.py",
 )
 RESIDUAL_LEVEL = Limit(
-    0.05,
-    "probability",
-    "that any of the lags of clean residuals leaves its band",
-    "test_findings.py",
+    0.05, "probability", "that any lag of clean residuals leaves its band", "test_findings.py"
 )
 
 # Adequacy of the model.
@@ -329,10 +331,7 @@ BUNCHED = Limit(
     "test_bunched.py",
 )
 HALF_WIDTH = Limit(
-    1.96,
-    "standard deviations",
-    "the half-width of the 95 % interval that is stated",
-    "test_adequacy.py",
+    1.96, "standard deviations", "half-width of the stated 95 % interval", "test_adequacy.py"
 )
 RELEVANT_BIAS = Limit(
     0.02,
@@ -381,10 +380,7 @@ BEAT_FLOOR = Limit(
     "test_beat.py",
 )
 BEAT_JITTER = Limit(
-    0.02,
-    "sample",
-    "cost: instants that are off by less change an estimate less than their rounding",
-    "test_beat.py",
+    0.02, "sample", "cost: instants off by less matter less than their rounding", "test_beat.py"
 )
 BEAT_LOST = Limit(
     0.02,

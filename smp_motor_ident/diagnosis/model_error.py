@@ -292,6 +292,9 @@ def _motion(
     time, voltage, speed, angle = signals
     step = np.maximum(np.diff(time, prepend=time[0] - data.step), 0.0)
     step[np.cumsum(lengths)[:-1]] = data.step
+    fastest = float(np.abs(speed).max()) or 1.0
+    # A motor at rest turns by no rounding error, of which a large coefficient would make an effect.
+    speed = np.where(np.abs(speed) > np.finfo(float).eps * fastest, speed, 0.0)
     return Motion(
         share=np.linspace(-1.0, 1.0, time.size, dtype=np.float64),
         step=step,
@@ -302,7 +305,7 @@ def _motion(
         drop=voltage - back * speed,
         current=np.zeros(0),
         top=float(np.abs(voltage).max()) or 1.0,
-        fastest=float(np.abs(speed).max()) or 1.0,
+        fastest=fastest,
         gear=gear,
         kind=data.kind,
     )

@@ -15,7 +15,10 @@ from smp_motor_ident.diagnosis.limits import (
     OFFSET_SURE,
     SIGN_ALIKE,
     SIGN_SURE,
+    SIGN_TOLD,
 )
+from smp_motor_ident.diagnosis.signs import likeness
+from smp_motor_ident.diagnosis.silence import silent
 from smp_motor_ident.errors import InsufficientExcitationError, SignalError
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.record import Record
@@ -39,7 +42,7 @@ def screen(records: Sequence[Record]) -> list[Finding]:
         _ratio(record)
     _standing(records, where)
     for record in records:
-        _frozen(record)
+        silent(record, _where([record]))
     _motion(records, where)
     _signs(records, where)
     for record in records:
@@ -245,29 +248,6 @@ def _abrupt(x: Array, at: NDArray[np.bool_]) -> bool:
     return bool(np.median(np.abs(x[enters] - x[enters - 1])) > 1e-3 * np.ptp(x))
 
 
-def _frozen(record: Record) -> None:
-    """Refuse a sensor that stops half-way while the voltage goes on."""
-    for name in ("count", "position", "velocity"):
-        values = getattr(record, name)
-        if values is None or len(record) < 200:
-            continue
-        # A speed may well be constant; only at zero does it say that nothing turns.
-        moves = values != 0 if name == "velocity" else np.diff(values, prepend=np.nan) != 0
-        edges = np.concatenate([[0], np.flatnonzero(moves), [len(record) - 1]])
-        longest = int(np.argmax(np.diff(edges)))
-        a, b = int(edges[longest]), int(edges[longest + 1])
-        if b - a < max(100, 0.1 * len(record)):
-            continue
-        still, rest = record.voltage[a + 1 : b], np.delete(record.voltage, np.arange(a, b))
-        if np.abs(still).mean() > 0.5 * np.abs(rest).mean():
-            raise SignalError(
-                f"{_where([record])}: dead encoder, the {name} stays at {values[a + 1]:.6g} from "
-                f"t = {record.time[a]:.4g} s to {record.time[b]:.4g} s while the voltage reaches "
-                f"{np.abs(still).max():.3g} V; check the encoder's cable, or that nothing "
-                "blocks the motor"
-            )
-
-
 def _standing(records: Sequence[Record], where: str) -> None:
     """Refuse a speed that never changes, at 0 or at a sensor's offset, whatever the voltage."""
     speeds = [s[np.isfinite(s)] for s in map(measured_speed, records)]
@@ -292,31 +272,37 @@ def _motion(records: Sequence[Record], where: str) -> None:
 
 
 def _signs(records: Sequence[Record], where: str) -> None:
-    """Refuse speed or current that answers the voltage with the wrong sign."""
+    """Refuse speed or current that answers the voltage with the wrong sign, or so late that a late
+    answer is a reversed one.
+    """
     for what, remedy in (
         ("speed", "swap the motor's leads or the encoder's channels"),
         ("current", "swap the current sensor's sign"),
     ):
-        total = power = chance = 0.0
-        for record in records:
-            y = measured_speed(record) if what == "speed" else record.current
-            if y is None:
-                continue
-            ok = np.isfinite(y)
-            if ok.sum() < 20:
-                continue
-            v, x = averaged_runs(record, y)
-            together = float(np.einsum("i,i->", v, x))
-            total += together if what == "current" else _slow_product(v, x)
-            size = float(np.sqrt(np.square(v).sum() * np.square(x).sum()))
-            power += size
-            chance += (size * _chance(v, x)) ** 2
-        least = min(SIGN_SURE.value * float(np.sqrt(chance)), SIGN_ALIKE.value * power)
-        if power > 0 and total < -max(0.2 * power, least):
+        kept = [r for r in records if what == "speed" or r.current is not None]
+        signals = [measured_speed(r) if what == "speed" else r.current for r in kept]
+        found = likeness(kept, [s for s in signals if s is not None], lags=what == "speed")
+        if found is None:
+            continue
+        sure = SIGN_SURE.value * found.chance
+        if found.wrong - found.right > max(0.2, min(sure, SIGN_ALIKE.value * found.wrong)):
             raise SignalError(
                 f"{where}: swapped sign, {what} runs against the voltage "
-                f"(correlation {total / power:.2f}); {remedy}"
+                f"(correlation {-found.wrong:.2f}); {remedy}"
             )
+        follows = found.wrong > max(0.2, min(sure, SIGN_ALIKE.value))
+        if what == "speed" and follows and found.wrong > SIGN_TOLD.value * found.right:
+            raise InsufficientExcitationError(
+                f"{where}: the voltage changes too fast for its sampling, {_period(records):.2g} "
+                "samples a period: a speed that comes late looks like one of the other sign; "
+                "excite more slowly, or sample faster"
+            )
+
+
+def _period(records: Sequence[Record]) -> float:
+    """Return how many samples there are between every second change of the voltage's sign."""
+    changes = sum(np.count_nonzero(np.diff(np.sign(r.voltage))) for r in records)
+    return 2 * sum(len(r) for r in records) / max(changes, 1)
 
 
 def averaged_runs(record: Record, values: Array) -> tuple[Array, Array]:
@@ -357,23 +343,3 @@ def _offset(record: Record) -> None:
             f"{_where([record])}: current has an offset of {offset:.2g} A where it reaches "
             f"{largest:.3g} A; zero the current sensor at rest and record again"
         )
-
-
-def _chance(v: Array, y: Array) -> float:
-    """Return the standard deviation of the correlation of two signals that have no part in
-    each other (Bartlett): the sum of the product of their autocorrelations over n.
-    """
-    size = 2 * len(v)
-    own = [np.fft.irfft(np.abs(np.fft.rfft(x, size)) ** 2, size)[: len(v)] for x in (v, y)]
-    if own[0][0] == 0 or own[1][0] == 0:
-        return 1.0
-    product = (own[0] / own[0][0]) * (own[1] / own[1][0])
-    return float(np.sqrt(max(1.0, 2 * product.sum() - 1) / len(v)))
-
-
-def _slow_product(v: Array, y: Array) -> float:
-    """Return the largest (by size) inner product of voltage and a later speed."""
-    n = len(v)
-    lags = np.unique(np.minimum(np.geomspace(1, max(2, n // 50), 12).astype(int), n // 4)) - 1
-    products = [float(np.einsum("i,i->", v[: n - k], y[k:])) for k in lags]
-    return max(products, key=abs)

@@ -13,6 +13,7 @@ from smp_motor_ident.diagnosis.effects import EFFECTS
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.finding import Finding
+from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.model.structures import Structure
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import Quantity, ResidualTests
@@ -134,3 +135,25 @@ def estimation_fit() -> Fit:
         objective=1.0, deviance=0.0, information=np.eye(1), scores=np.zeros((0, 1)), passes=1,
         converged=True, samples=4000, kind=0,
     )  # fmt: skip
+
+
+def test_an_effect_whose_rows_hold_no_error_is_not_tried_and_nothing_breaks():
+    """A sensor without noise leaves no error at rest, where alone coasting would show."""
+    shape = np.where(np.arange(4000) < 400, 1e-32, 0.0)[:, None]
+    errors = replace(
+        error_with(0.0, 5),
+        residual=np.where(shape[:, 0] > 0, 0.0, error_with(0.0, 5).residual),
+        regressors=shape,
+        whole=shape,
+    )
+    numbers = [("dc_gain", Quantity(30.0, 0.3, (0.0, 60.0), "rad/(V s)"), np.ones(1))]
+    assert adequacy.adequacy(errors, 0.005, numbers, ResidualTests(True, True)) == ([], None)
+
+
+def test_a_motor_at_rest_turns_by_no_rounding_error():
+    record = motors.record("rear_left", current=False, seconds=2.0)
+    data, size = prepare([record], False), len(record)
+    speed = np.where(np.arange(size) < size // 2, 1e-28, 30.0)
+    signals = (data.time, record.voltage, speed, np.zeros(size))
+    motion = model_error._motion(data, 1.0, signals, 0.1, np.array([size]))
+    assert not motion.speed[: size // 2].any() and motion.speed[-1] == motion.fastest == 30.0

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from smp_motor_ident.diagnosis.identifiability import what_next
-from smp_motor_ident.diagnosis.screening import _signs
 from smp_motor_ident.errors import InsufficientExcitationError, SignalError
 from smp_motor_ident.estimate import estimate
 
@@ -121,19 +120,6 @@ def test_one_step_does_not_pretend_to_separate_gain_from_friction(first):
         assert found.combinations[name].status == "unidentifiable"
     speed, truth = found.combinations["steady_speed"], motors.truth("rear_left", 0.3)
     assert abs(speed.value - truth["dc_gain"] * 7.7) < 3 * speed.std
-
-
-def test_a_motor_that_stands_has_no_swapped_sign():
-    """What a noisy sensor says of a standing motor has no sign, however it falls out."""
-    for seed in range(12):
-        rng = np.random.default_rng(seed)
-        slow = np.cumsum(rng.standard_normal(N))  # drifts as a command does
-        slow = 5.0 * (slow - slow.mean()) / np.abs(slow - slow.mean()).max()
-        noise = rng.standard_normal(N)
-        noise = replace(GOOD, voltage=slow, count=None, current=None, velocity=noise)
-        _signs([noise], "record")
-    with pytest.raises(SignalError, match="swapped sign"):
-        _signs([replace(GOOD, count=-GOOD.count, velocity=-GOOD.velocity)], "record")
 
 
 def test_what_next_stays_within_what_the_recording_had():

@@ -1,0 +1,97 @@
+"""How well a signal follows the voltage, and how well the reversed voltage: told from mere lag.
+
+A motor answers late: by its lag, at most a quarter of a period, and by what sampling and transport
+take.  Where that comes to half a period, a late answer is a reversed one, and nothing tells them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import irfft, next_fast_len, rfft
+from scipy.signal import lfilter
+
+from smp_motor_ident.diagnosis.limits import SIGN_LATE
+from smp_motor_ident.record import Record
+
+Array = NDArray[np.float64]
+
+LAGS = 16  # between a sampling interval and a quarter of the record: each 1.5 to 2 times the last
+RUNS = 2_000  # stretches over which signals are averaged: in them a counter's noise is small
+
+
+@dataclass(frozen=True)
+class Likeness:
+    """The largest correlations of a signal with the voltage that came through a lag."""
+
+    right: float  # as it is
+    wrong: float  # with the other sign
+    chance: float  # standard deviation of the latter, where the signals have no part in each other
+
+
+def likeness(records: Sequence[Record], signals: Sequence[Array], lags: bool) -> Likeness | None:
+    """Hold signals against the voltage, as late as they may be; None where they are nothing."""
+    pairs = [pair for r, y in zip(records, signals, strict=True) if (pair := _smooth(r, y))]
+    power = sum(float(y @ y) for _, _, y in pairs)
+    if power == 0.0:
+        return None
+    times = [0.0]
+    if lags:
+        shortest = min(step for step, _, _ in pairs)
+        longest = max(step * v.size for step, v, _ in pairs) / 4
+        times = [0.0, *np.geomspace(shortest, max(longest, 2 * shortest), LAGS)]
+    best, worst, reverse = 0.0, 0.0, [(v, y) for _, v, y in pairs]
+    for lag in times:
+        for half in (1, 2):  # a mean of two comes half a sample later
+            late = [(_means(_lagged(v, lag / step), half), y) for step, v, y in pairs]
+            size = float(np.sqrt(sum(float(x @ x) for x, _ in late) * power)) or 1.0
+            for k in range(int(SIGN_LATE.value) + 2 - half):
+                alike = sum(float(x[: x.size - k] @ y[k:]) for x, y in late) / size
+                best = max(best, alike)
+                if alike < worst:
+                    worst, reverse = alike, late
+    sizes = [float(np.sqrt((x @ x) * (y @ y))) for x, y in reverse]
+    spread = [size * _chance(x, y) for size, (x, y) in zip(sizes, reverse, strict=True)]
+    chance = float(np.linalg.norm(spread)) / (sum(sizes) or 1.0)
+    return Likeness(best, -worst, chance)
+
+
+def _smooth(record: Record, signal: Array) -> tuple[float, Array, Array] | None:
+    """Return sampling interval, voltage and signal, both as means over runs that it outlives."""
+    known = np.isfinite(signal)
+    if known.sum() < 20:
+        return None
+    step = float(np.median(np.diff(record.time)))
+    y, there = np.where(known, signal, 0.0), known.astype(np.float64)
+    k, volts = max(1, len(record) // RUNS), record.voltage
+    while k > 1 and 2 * np.square(_means(volts, k)).sum() < np.square(volts).sum():
+        k //= 2
+    return step, _means(volts, k), _means(y, k) / np.maximum(_means(there, k), 1e-9 + 0.5 / k)
+
+
+def _means(values: Array, k: int) -> Array:
+    """Return the means of k neighbours, in the places of their last."""
+    return np.asarray(lfilter(np.full(k, 1 / k), [1.0], values)) if k > 1 else values
+
+
+def _lagged(values: Array, samples: float) -> Array:
+    """Return a signal through a lag of the first order."""
+    if samples == 0.0:
+        return values
+    keeps = float(np.exp(-1 / samples))
+    return np.asarray(lfilter([1 - keeps], [1, -keeps], values))
+
+
+def _chance(v: Array, y: Array) -> float:
+    """Return the standard deviation of the correlation of two signals that have no part in
+    each other (Bartlett): the sum of the product of their autocorrelations over n.
+    """
+    size = next_fast_len(2 * len(v), real=True)
+    own = [irfft(np.abs(rfft(x, size)) ** 2, size)[: len(v)] for x in (v, y)]
+    if own[0][0] == 0 or own[1][0] == 0:
+        return 1.0
+    product = (own[0] / own[0][0]) * (own[1] / own[1][0])
+    return float(np.sqrt(max(1.0, 2 * product.sum() - 1) / len(v)))

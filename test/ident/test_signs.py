@@ -1,0 +1,88 @@
+"""A reversed answer is told from a late one, and said to be neither where nothing tells them."""
+
+from dataclasses import replace
+
+import motors
+import numpy as np
+import pytest
+
+from smp_motor_ident.diagnosis.screening import _signs
+from smp_motor_ident.diagnosis.signs import likeness
+from smp_motor_ident.errors import InsufficientExcitationError, SignalError
+
+GOOD = motors.record("rear_left", seconds=4.0)
+N = len(GOOD)
+
+
+def sine(samples, rate=100.0, seconds=10.0):
+    """Return a record of a sine of so many samples a period, from counts."""
+    volts = 10.0 * np.sin(2 * np.pi * np.arange(int(rate * seconds)) / samples + 0.1)
+    return motors.record("rear_left", voltage=volts, rate=rate)
+
+
+def steps(rate=100.0):
+    held = np.random.default_rng(1).choice([-10.0, 10.0], 40)
+    return motors.record("rear_left", voltage=np.repeat(held, 25), rate=rate)
+
+
+def swapped(record):
+    return replace(record, count=-record.count, velocity=-record.velocity)
+
+
+def late(record, samples):
+    """Return a record whose counts come late by whole samples."""
+    k = np.maximum(np.arange(len(record)) - samples, 0)
+    return replace(record, count=record.count[k], velocity=record.velocity[k])
+
+
+SLOW = {"steps": steps, "a slow sine": lambda: sine(150.0), "a sine of 25": lambda: sine(25.0)}
+
+
+@pytest.mark.parametrize("name", SLOW)
+def test_swapped_leads_are_found_and_right_ones_left_alone(name):
+    for delay in (0, 1, 2):
+        record = late(SLOW[name](), delay)
+        _signs([record], "record")
+        with pytest.raises(SignalError, match="swapped sign, speed"):
+            _signs([swapped(record)], "record")
+
+
+def test_a_current_of_the_wrong_sign_is_found_and_the_right_one_left_alone():
+    for name, make in SLOW.items():
+        record = make()
+        _signs([record], name)
+        with pytest.raises(SignalError, match="swapped sign, current"):
+            _signs([replace(record, current=-record.current)], name)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("samples", [2.9, 3.0, 3.1])
+def test_three_samples_to_a_period_tell_no_sign(samples, sign):
+    """Lag, sampling and a driver's clock may come to any phase there: no wrong cause is named."""
+    record = sine(samples) if sign > 0 else swapped(sine(samples))
+    found = likeness([record], [record.velocity], lags=True)
+    # Half a sample is 60 degrees: the nearest delay misses the phase by 30 at most.
+    assert min(found.right, found.wrong) > 0.8 * max(found.right, found.wrong)
+    with pytest.raises(InsufficientExcitationError, match=r"too fast .* samples a period"):
+        _signs([record], "record")
+
+
+def test_a_motor_that_stands_has_no_swapped_sign():
+    """What a noisy sensor says of a standing motor has no sign, however it falls out."""
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        slow = np.cumsum(rng.standard_normal(N))  # drifts as a command does
+        slow = 5.0 * (slow - slow.mean()) / np.abs(slow - slow.mean()).max()
+        noise = rng.standard_normal(N)
+        noise = replace(GOOD, voltage=slow, count=None, current=None, velocity=noise)
+        _signs([noise], "record")
+    with pytest.raises(SignalError, match="swapped sign"):
+        _signs([swapped(GOOD)], "record")
+
+
+def test_a_reversed_motor_among_gaps_and_of_a_noisy_sensor_is_found():
+    rng = np.random.default_rng(2)
+    speed = -GOOD.velocity + 200.0 * rng.standard_normal(N)
+    speed[rng.random(N) < 0.2] = np.nan
+    with pytest.raises(SignalError, match="swapped sign, speed"):
+        _signs([replace(GOOD, count=None, velocity=speed)], "record")

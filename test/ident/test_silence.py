@@ -1,0 +1,67 @@
+"""A sensor that falls silent is dead where the voltage would have moved it, and only there."""
+
+from dataclasses import replace
+
+import motors
+import numpy as np
+import pytest
+
+from smp_motor_ident.diagnosis.silence import silent
+from smp_motor_ident.errors import SignalError
+
+RATE = 2000.0
+TIME = np.arange(int(10 * RATE)) / RATE
+CHIRP = 10.0 * np.sin(2 * np.pi * (0.3 * TIME + 10.0 * TIME**2))  # to 200 Hz
+
+
+def coarse(signal, volts=CHIRP, rate=RATE):
+    """Return a record of one signal, of an encoder of 50 steps a turn."""
+    whole = motors.record("rear_left", current=False, voltage=volts, rate=rate)
+    count = whole.count // 10
+    speed = np.diff(count, prepend=0) * (2 * np.pi / 50 * rate)
+    values = {"count": count, "position": count * (2 * np.pi / 50), "velocity": speed}
+    return replace(whole, **{**dict.fromkeys(values), signal: values[signal]})
+
+
+def cut(record, signal, share):
+    """Return a record whose sensor's cable comes off."""
+    row = np.arange(len(record))
+    off = row > share * len(record)
+    values = getattr(record, signal)
+    kept = 0.0 if signal == "velocity" else values[np.argmax(off)]
+    return replace(record, **{signal: np.where(off, kept, values).astype(values.dtype)})
+
+
+@pytest.mark.parametrize("signal", ["count", "position", "velocity"])
+def test_a_chirp_that_outruns_the_motor_leaves_its_encoder_alive(signal):
+    alive = coarse(signal)
+    values = getattr(alive, signal)
+    assert np.ptp(values[int(0.85 * len(values)) :]) == 0.0  # a silence in which the motor swings
+    silent(alive, "record")
+
+
+@pytest.mark.parametrize("signal", ["count", "position", "velocity"])
+def test_an_encoder_whose_cable_comes_off_in_a_chirp_is_dead(signal):
+    with pytest.raises(SignalError, match=f"dead encoder, the {signal} stays"):
+        silent(cut(coarse(signal), signal, 0.1), "record")
+
+
+@pytest.mark.parametrize("signal", ["count", "position", "velocity"])
+@pytest.mark.parametrize("kind", ["sine", "square", "fourier"])
+def test_an_encoder_whose_cable_comes_off_half_way_is_dead(signal, kind):
+    volts = motors.independent.excitation(np.arange(2000) / 200.0, kind, 10.0)
+    silent(coarse(signal, volts, 200.0), "record")
+    for share in (0.2, 0.5, 0.85):
+        with pytest.raises(SignalError, match=f"dead encoder, the {signal} stays"):
+            silent(cut(coarse(signal, volts, 200.0), signal, share), "record")
+
+
+@pytest.mark.parametrize("signal", ["count", "velocity"])
+def test_a_speed_below_the_step_of_its_sensor_is_no_dead_one(signal):
+    """A speed in whole steps of 60 rad/s, or the counts of the same motor, in ever faster turns."""
+    record = coarse(signal)
+    speed = np.gradient(motors.record("rear_left", voltage=CHIRP, rate=RATE).count * 0.01257, TIME)
+    if signal == "velocity":
+        slow = np.convolve(speed, np.ones(20) / 20, "same")
+        record = replace(record, velocity=60.0 * np.round(slow / 60.0))
+    silent(record, "record")
