@@ -20,6 +20,7 @@ from smp_motor_ident.bag.limits import EXPLAINS
 from smp_motor_ident.bag.mapping import SignalMap, parse
 from smp_motor_ident.bag.offers import Listing, Offer, offers_of
 from smp_motor_ident.bag.read import STATE, one_line, read_recording
+from smp_motor_ident.bag.runs import runs
 from smp_motor_ident.bag.source import Recording, recordings
 from smp_motor_ident.bag.storage import Array, found
 from smp_motor_ident.bag.tables import TIME_NAMES, time_unit
@@ -190,6 +191,8 @@ def _candidates(
         clock = table.stamp if table.stamp is not None and table.stamp.all() else table.log
         if clock is None and time is not None and time.path in table.columns:
             clock = table.columns[time.path]
+            if len(runs(clock, {})) > 1:  # in the order in which they were written
+                clock = None
         at = np.arange(value.size) if clock is None else clock
         there = table.present.get(path)
         kept = np.isfinite(value) & (True if there is None else there)

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from smp_motor_ident.bag.mapping import MotorMap, Signal
+from smp_motor_ident.bag.runs import laid_out
 from smp_motor_ident.bag.source import Recording
 from smp_motor_ident.bag.storage import TABLE, Channel, Integers, Table, found
 from smp_motor_ident.bag.units import FACTORS, check_unit
@@ -126,11 +127,13 @@ def timed(
 ) -> dict[str, Table]:
     """Return a plan's tables with their times in nanoseconds; rows without one are left out."""
     result = {}
+    written = []
     for topic in dict.fromkeys(signal.topic for signal in plan.signals.values()):
         table = tables[topic]
         findings = list(table.findings)
         log = table.log
         if log is None:
+            written.append(topic)
             signal = _time_signal(recording, plan, topic, channels)
             size = next(iter(table.columns.values())).size
             if signal is None:
@@ -149,7 +152,8 @@ def timed(
         if not log.size:
             raise BagError(f"{recording.files[0]}: has no rows with a time")
         result[topic] = Table(log, None, columns, findings=findings, clocked=True)
-    return result
+    rows = {topic: result[topic] for topic in written}
+    return result | laid_out(rows, plan.gap, recording.name)
 
 
 _NEVER = -(2**62)
