@@ -59,6 +59,45 @@ def test_every_usual_kind_of_csv_is_read(tmp_path: Path, text: str) -> None:
     np.testing.assert_allclose(record.voltage[1:], U[:-1])
 
 
+@pytest.mark.parametrize(
+    ("above", "separator", "names"),
+    [
+        ("# t,u,y", ",", ["t", "u", "y"]),
+        ("# time, u, w", ",", ["time", "u", "w"]),
+        ("# t u y", " ", ["t", "u", "y"]),
+        ("# t, u, y", " ", ["t", "u", "y"]),
+        ("%t\tu\ty", "\t", ["t", "u", "y"]),
+        ("// t;u;y", ";", ["t", "u", "y"]),
+        ("# made by a scope\n# 24 V, at rest\n## t, u, y", ",", ["t", "u", "y"]),
+        ("# t,u,y\n# s,mV,deg/s", ",", ["t", "u", "y"]),
+        ('# "t [s]","u","y"', ",", ["t [s]", "u", "y"]),
+        ("# made by scope", ",", ["c1", "c2", "c3"]),
+        ("# t,u", ",", ["c1", "c2", "c3"]),
+        ("# t,,y", ",", ["c1", "c2", "c3"]),
+        ("# 0.0,1.0,2.0", ",", ["c1", "c2", "c3"]),
+        ("# a,b,c\nt,u,y", ",", ["t", "u", "y"]),
+    ],
+)
+def test_a_comment_right_above_the_numbers_may_name_the_columns(
+    tmp_path: Path, above: str, separator: str, names: list[str]
+) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text(above + "\n" + table(separator).partition("\n")[2])
+    listing = list_topics(path)[0]
+    assert listing.offers[0].fields == names
+    told = "no_column_names" in [finding.code for finding in listing.findings]
+    assert told is (names[0] == "c1")
+    record = read_records(path, [f"voltage={names[1]}:V velocity={names[2]}:deg/s sample_time=1"])
+    np.testing.assert_allclose(record["motor"].velocity, np.deg2rad(Y))
+
+
+def test_units_in_a_comment_below_the_names_are_understood(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text("# t,u,y\n# s,mV,deg/s\n" + table().partition("\n")[2])
+    record = read_records(tmp_path / "log.csv", ["voltage=u velocity=y time=t"])["motor"]
+    np.testing.assert_allclose(record.voltage[1:], 1e-3 * U[:-1])
+    np.testing.assert_allclose(record.velocity, np.deg2rad(Y))
+
+
 def test_a_voltage_may_have_been_held_up_to_its_row(tmp_path: Path) -> None:
     (tmp_path / "log.csv").write_text(table())
     record = read_records(tmp_path / "log.csv", [*MAP, "held=before"])["motor"]
