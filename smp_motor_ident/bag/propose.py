@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -103,21 +103,39 @@ def list_topics(paths: Any, msg_files: Iterable[str] = ()) -> list[Listing]:
         with one_line(recording):
             offers = offers_of(recording, types)
             needed = all(offer.type != STATE for offer in offers)
-            items, asked = propose(recording, offers, types) if needed else ([], [])
-            if items:
+            proposal = propose(recording, offers, types) if needed else Proposal()
+            if proposal.items:
                 try:
-                    read_recording(recording, _filled(items), types, None)
+                    read_recording(recording, _filled(proposal.items), types, None)
                 except BagError as error:
                     text = f"a mapping was proposed by names and cannot be read: {error}"
                     recording.findings.append(found("proposal_failed", text))
-                    items, asked = [], []
-        listing = Listing(recording.name, offers, items, asked, needed, recording.findings)
-        listings.append(listing)
+                    proposal = Proposal(remark="no mapping is suggested that can be read")
+        listings.append(
+            Listing(
+                recording.name,
+                offers,
+                proposal.items,
+                proposal.asked,
+                needed,
+                recording.findings,
+                proposal.remark,
+            )
+        )
     return listings
 
 
-def propose(recording: Recording, offers: list[Offer], types: Types) -> tuple[list[str], list[str]]:
-    """Return items for ``--map`` that read the recording, and what the user must add to them."""
+@dataclass(frozen=True)
+class Proposal:
+    """Items for ``--map`` that read a recording."""
+
+    items: list[str] = field(default_factory=list)
+    asked: list[str] = field(default_factory=list)  # what the user must add to them
+    remark: str = ""  # why there are none, or what the data could not confirm
+
+
+def propose(recording: Recording, offers: list[Offer], types: Types) -> Proposal:
+    """Return a mapping by names that the data confirm, as far as they can."""
     time = _time(offers)
     wheels: dict[str, list[_Candidate]] = {}
     for candidate in _candidates(recording, offers, types, time):
@@ -125,9 +143,13 @@ def propose(recording: Recording, offers: list[Offer], types: Types) -> tuple[li
     shared = [c for c in wheels.get("", []) if c.role == "voltage"]
     items: list[str] = []
     asked: dict[str, str] = {}
+    remarks: list[str] = []
     for wheel, fields in sorted(wheels.items()):
         voltages = [c for c in fields if c.role == "voltage"] or shared
-        chosen = _explained(voltages, [c for c in fields if c.role in _MOTIONS])
+        motions = [c for c in fields if c.role in _MOTIONS]
+        chosen = _explained(voltages, motions)
+        if not chosen and (chosen := _untestable(voltages, motions)):
+            remarks.append(_unconfirmed(chosen[0]))
         if not chosen:
             continue
         chosen += [c for c in fields if c.role == "current"][:1]
@@ -139,9 +161,42 @@ def propose(recording: Recording, offers: list[Offer], types: Types) -> tuple[li
             asked["pwm_full_scale"] = f"the value that is 100 % (the largest here is {largest:g})"
         if voltage.unit in (":pwm", ":duty", ":%"):
             asked["supply_voltage"] = "in volts"
-    if items and time:
+    if not items:
+        return Proposal(remark=_reason([c for fields in wheels.values() for c in fields]))
+    if time:
         items.append(f"time={time.source}{time.unit}")
-    return (items, [f"{key}=… {why}" for key, why in asked.items()]) if items else ([], [])
+    return Proposal(items, [f"{key}=… {why}" for key, why in asked.items()], "; ".join(remarks))
+
+
+def _untestable(voltages: list[_Candidate], motions: list[_Candidate]) -> list[_Candidate]:
+    """Return a voltage that changes less often than a test needs, and a motion, by their names."""
+    seldom = [c for c in voltages if c.value.size and _changes(c) < _LAGS]
+    moving = [c for role in _MOTIONS for c in motions if c.role == role and np.ptp(c.value) > 0]
+    return [seldom[0], moving[0]] if seldom and moving else []
+
+
+def _changes(voltage: _Candidate) -> int:
+    return int(np.count_nonzero(np.diff(voltage.value)))
+
+
+def _unconfirmed(voltage: _Candidate) -> str:
+    """Return what the data could not tell of a voltage."""
+    times = _changes(voltage)
+    how = f"changes {times} time{'s' * (times > 1)} only" if times else "is constant"
+    return (
+        f"{voltage.source} {how}, so that the data cannot confirm that it drives the motor; "
+        "this is by the names alone"
+    )
+
+
+def _reason(fields: list[_Candidate]) -> str:
+    """Return why nothing is proposed."""
+    roles = {c.role for c in fields}
+    missing = [] if "voltage" in roles else ["a voltage"]
+    missing += [] if roles & set(_MOTIONS) else ["a motion"]
+    if missing:
+        return f"no field is called {' or '.join(missing)}"
+    return "no field that is called a voltage explains one that is called a motion"
 
 
 def _filled(items: Sequence[str]) -> SignalMap:
