@@ -17,15 +17,15 @@ from scipy.special import fdtrc
 
 from smp_motor_ident.bag.decode import collect
 from smp_motor_ident.bag.limits import EXPLAINS
-from smp_motor_ident.bag.mapping import SignalMap, parse
+from smp_motor_ident.bag.mapping import DEFAULT_MOTOR, SignalMap, parse
 from smp_motor_ident.bag.offers import Listing, Offer, offers_of
 from smp_motor_ident.bag.read import STATE, one_line, read_recording
 from smp_motor_ident.bag.runs import runs
 from smp_motor_ident.bag.source import Recording, recordings
 from smp_motor_ident.bag.storage import Array, found
-from smp_motor_ident.bag.tables import TIME_NAMES, time_unit
+from smp_motor_ident.bag.tables import TIME_NAMES, self_described, time_unit
 from smp_motor_ident.bag.types import Types
-from smp_motor_ident.bag.units import check_unit
+from smp_motor_ident.bag.units import check_unit, of_the_rim
 from smp_motor_ident.errors import BagError
 
 _ROLES = {
@@ -52,6 +52,7 @@ _HINTS = (
     ("current", r"(?:^|_)m(?:illi)?a(?:mp|$|_)", ":mA"),
 )
 _SIDES = ("front", "rear", "back", "left", "right", "fl", "fr", "rl", "rr", "bl", "br")
+_RADIUS = "in metres: what is measured is the way of the rim"
 _MOST = 20_000
 """Samples that are looked at."""
 _LAGS, _OWN = 6, 2
@@ -135,7 +136,9 @@ class Proposal:
 
 
 def propose(recording: Recording, offers: list[Offer], types: Types) -> Proposal:
-    """Return a mapping by names that the data confirm, as far as they can."""
+    """Return what the file says itself, or a mapping by names that the data confirm if they can."""
+    if own := _of_the_file(recording):
+        return own
     time = _time(offers)
     wheels: dict[str, list[_Candidate]] = {}
     for candidate in _candidates(recording, offers, types, time):
@@ -161,11 +164,33 @@ def propose(recording: Recording, offers: list[Offer], types: Types) -> Proposal
             asked["pwm_full_scale"] = f"the value that is 100 % (the largest here is {largest:g})"
         if voltage.unit in (":pwm", ":duty", ":%"):
             asked["supply_voltage"] = "in volts"
+        if any(of_the_rim(c.role, c.unit[1:]) for c in chosen):
+            asked["wheel_radius"] = _RADIUS
     if not items:
         return Proposal(remark=_reason([c for fields in wheels.values() for c in fields]))
     if time:
         items.append(f"time={time.source}{time.unit}")
     return Proposal(items, [f"{key}=… {why}" for key, why in asked.items()], "; ".join(remarks))
+
+
+def _of_the_file(recording: Recording) -> Proposal | None:
+    """Return the mapping of a table that names its columns and units as the signals are."""
+    if not recording.is_table:
+        return None
+    try:
+        plans = self_described(recording, recording.channels(), SignalMap())
+    except BagError:
+        return None
+    items, rim = [], False
+    for wheel, plan in plans.items():
+        for name, signal in plan.signals.items():
+            prefix = f"{wheel}." if name != "time" and wheel != DEFAULT_MOTOR else ""
+            source = f"{signal.topic}.{signal.field}" if signal.topic else signal.field
+            items.append(f"{prefix}{name}={source}" + (f":{signal.unit}" if signal.unit else ""))
+            rim |= of_the_rim(name, signal.unit)
+    asked = [f"wheel_radius=… {_RADIUS}"] if rim else []
+    alone = "wheel_radius alone is enough" if rim else "no mapping is needed"
+    return Proposal(list(dict.fromkeys(items)), asked, f"the file says this itself: {alone}")
 
 
 def _untestable(voltages: list[_Candidate], motions: list[_Candidate]) -> list[_Candidate]:
@@ -203,7 +228,9 @@ def _filled(items: Sequence[str]) -> SignalMap:
     """Return the mapping of a proposal, with any value for what the user must add."""
     given = parse(items)
     motors = {
-        wheel: replace(motor, hardware={"supply_voltage": 12.0}, pwm_full_scale=1.0)
+        wheel: replace(
+            motor, hardware={"supply_voltage": 12.0}, pwm_full_scale=1.0, wheel_radius=1.0
+        )
         for wheel, motor in given.motors.items()
     }
     return replace(given, motors=motors)

@@ -146,3 +146,11 @@ def test_why_nothing_is_proposed_is_told(
     listing = list_topics(path)[0]
     assert listing.suggestion == []
     assert listing.remark.startswith(reason)
+
+
+def test_a_mapping_of_the_rim_asks_for_the_wheels_radius(tmp_path: Path) -> None:
+    path = write(tmp_path / "log.csv", **dict(zip(("t", "u", "speed (m/s)"), (T, *motor(9)))))
+    listing = list_topics(path)[0]
+    assert listing.suggestion[1] == 'velocity="speed (m/s)":m/s'
+    assert [text.partition("=")[0] for text in listing.asked] == ["wheel_radius"]
+    assert len(read_records(path, [*listing.suggestion, "wheel_radius=0.05"])["motor"]) == N

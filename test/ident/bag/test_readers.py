@@ -133,6 +133,40 @@ def test_a_sysid_file_describes_itself(tmp_path: Path) -> None:
     assert record.starts == (0, 100)
 
 
+def drivetrain(path: Path) -> Path:
+    """Write a SysId file of a drivetrain in metres, whose left wheel has a radius of 50 mm."""
+    way = np.cumsum(SPEED) * np.diff(TIME, prepend=0)
+    left, right = (VOLTAGE, 0.05 * way, 0.05 * SPEED), (-VOLTAGE, -0.05 * way, -0.05 * SPEED)
+    sides = [column for both in zip(left, right) for column in both]
+    rows = np.stack([TIME, *sides, np.zeros(N), np.zeros(N)], axis=1)
+    document = {"sysid": True, "test": "Drivetrain", "units": "Meters", "unitsPerRotation": 0.3142}
+    path.write_text(json.dumps(document | {"slow-forward": rows.tolist()}))
+    return path
+
+
+def test_a_sysid_drivetrain_in_metres_needs_the_wheels_radius_only(tmp_path: Path) -> None:
+    path = drivetrain(tmp_path / "sysid.json")
+    with pytest.raises(BagError, match="give --map wheel_radius=METRES"):
+        read_records(path)
+    records = read_records(path, ["wheel_radius=0.05"])
+    np.testing.assert_allclose(records["left"].velocity, SPEED, atol=1e-9)
+    np.testing.assert_allclose(records["right"].velocity, -SPEED, atol=1e-9)
+    np.testing.assert_allclose(records["right"].voltage[1:], -VOLTAGE[:-1])
+    apart = read_records(path, ["wheel_radius=0.05", "right.wheel_radius=0.1"])
+    np.testing.assert_allclose(apart["left"].velocity, SPEED, atol=1e-9)
+    np.testing.assert_allclose(apart["right"].velocity, -0.5 * SPEED, atol=1e-9)
+
+
+def test_what_is_suggested_for_a_drivetrain_in_metres_asks_for_the_radius(tmp_path: Path) -> None:
+    path = drivetrain(tmp_path / "sysid.json")
+    listing = list_topics(path)[0]
+    assert "left.velocity=left_velocity:m/s" in listing.suggestion
+    assert [text.partition("=")[0] for text in listing.asked] == ["wheel_radius"]
+    assert listing.remark == "the file says this itself: wheel_radius alone is enough"
+    records = read_records(path, [*listing.suggestion, "wheel_radius=0.05"])
+    np.testing.assert_allclose(records["left"].velocity, SPEED, atol=1e-9)
+
+
 @pytest.mark.parametrize("form", ["rows", "columns", "lines", "nested"])
 def test_json_logs_of_any_shape_are_read(tmp_path: Path, form: str) -> None:
     rows = [
