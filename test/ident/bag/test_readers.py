@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import struct
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +56,46 @@ def test_fields_of_a_matlab_structure_and_columns_of_a_matrix_have_paths(tmp_pat
     scipy.io.savemat(path, {"log": log}, do_compression=True)
     mapping = ["voltage=log.signals.values[0] velocity=log.signals.values[1]:rad/s time=log.time"]
     assert_motor(read_records(path, mapping)["motor"])
+
+
+def matlab_object(name: str, kind: str, order: str = "<") -> bytes:
+    """Return an object as MATLAB saves it: texts and references, without dimensions."""
+
+    def element(number: int, body: bytes) -> bytes:
+        return struct.pack(order + "II", number, len(body)) + body + bytes(-len(body) % 8)
+
+    def small(body: bytes) -> bytes:
+        return struct.pack(order + "I", len(body) << 16 | 1) + body.ljust(4, b"\0")
+
+    shape = element(5, struct.pack(order + "2i", 6, 1))
+    numbers = struct.pack(order + "6I", 0xDD000000, 2, 1, 1, 1, 28)
+    header = element(6, struct.pack(order + "2I", 13, 0))
+    references = element(14, header + shape + element(1, b"") + element(6, numbers))
+    flags = element(6, struct.pack(order + "2I", 17, 0))
+    texts = element(1, name.encode()) + small(b"MCOS") + element(1, kind.encode())
+    return element(14, flags + texts + references)
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_objects_of_matlab_are_named_and_the_other_variables_read(
+    tmp_path: Path, compressed: bool
+) -> None:
+    path = tmp_path / "log.mat"
+    scipy.io.savemat(path, {"t": TIME, "u": VOLTAGE, "y": SPEED}, do_compression=compressed)
+    one, two = matlab_object("speedSeries", "timeseries"), matlab_object("out", "Simulink.Data")
+    if compressed:
+        packed = [zlib.compress(one), zlib.compress(two)]
+        one, two = (struct.pack("<II", 15, len(data)) + data for data in packed)
+    whole = path.read_bytes()
+    path.write_bytes(whole[:128] + one + whole[128:] + two)
+    record = read_records(path, MAP)["motor"]
+    assert_motor(record)
+    told = [f.message for f in record.findings if f.code == "matlab_object"]
+    assert len(told) == 1
+    assert "speedSeries (timeseries), out (Simulink.Data)" in told[0]
+    path.write_bytes(whole[:128] + one)
+    with pytest.raises(BagError, match=r"speedSeries \(timeseries\); save its Time and Data as"):
+        list_topics(path)
 
 
 def test_a_matlab_file_of_another_version_or_cut_off_is_one_line(tmp_path: Path) -> None:
