@@ -30,6 +30,8 @@ class _CsvFile(Tables):
         if not filled:
             raise BagError(f"{path}: is empty")
         seen = filled[:60]
+        if sum(map(_is_quoted_row, (self._lines[k] for k in seen))) > len(seen) / 2:
+            self._lines = [s.strip()[1:-1] if _is_quoted_row(s) else s for s in self._lines]
         self._separator = _separator([self._lines[k] for k in seen])
         rows = [self._row(self._lines[k]) for k in seen]
         self._grid = grid.head(rows, str(path))
@@ -105,6 +107,14 @@ class _CsvFile(Tables):
             return next(csv.reader([line], delimiter=self._separator, skipinitialspace=True), [])
         except csv.Error:
             return line.split(self._separator)
+
+
+def _is_quoted_row(line: str) -> bool:
+    """Return whether a whole row is in quotes, which would make one cell of it."""
+    text = line.strip()
+    if text.count('"') != 2 or not (text[0] == text[-1] == '"'):
+        return False
+    return not grid.is_data([text[1:-1]]) and any(mark in text for mark in ";\t|, ")
 
 
 def _separator(lines: list[str]) -> str:

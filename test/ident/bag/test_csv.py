@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -47,6 +48,10 @@ def test_text_of_old_and_wide_encodings_is_read(tmp_path: Path, encoding: str) -
         "\ufeff" + table(),
         "# made by a scope\n#\n" + table() + "\n# the end\n",
         table(head='"t","u","y"'),
+        re.sub(r"(?m)^(.+)$", r'"\1"', table(", ")),
+        re.sub(r"(?m)^(\d.+)$", r'"\1"', table()),
+        re.sub(r"(?m)^(.+)$", r'"\1"', table("\t")),
+        re.sub(r"([^,\n]+)", r'"\1"', table()),
     ],
 )
 def test_every_usual_kind_of_csv_is_read(tmp_path: Path, text: str) -> None:
@@ -111,6 +116,11 @@ def test_empty_cells_are_missing_values(tmp_path: Path) -> None:
     assert np.isnan(record.velocity).sum() == 10
     assert record.current is None
     assert "velocity: 10 values missing" in " ".join(f.message for f in record.findings)
+
+
+def test_quoted_cells_with_decimal_commas_are_no_quoted_rows(tmp_path: Path) -> None:
+    (tmp_path / "u.csv").write_text('"u"\n' + "".join(f'"{x:g}"\n'.replace(".", ",") for x in U))
+    assert list_topics(tmp_path / "u.csv")[0].offers[0].fields == ["u"]
 
 
 def test_a_file_without_time_has_a_sample_time(tmp_path: Path) -> None:
