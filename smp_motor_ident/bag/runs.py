@@ -18,6 +18,8 @@ from smp_motor_ident.errors import BagError
 Parts = list[tuple[int, int]]
 
 _ROWS = round(SET_BACK.value)
+_BEFORE = 1000
+"""Rows before that are looked at in any case; all since the last fall, so that many cost little."""
 _SECOND = 1_000_000_000
 
 
@@ -58,13 +60,18 @@ def _parts(time: NDArray[Any], columns: Mapping[str, NDArray[Any]]) -> Parts:
     back = np.flatnonzero(np.diff(time) < -SET_BACK.value * np.median(moved)) + 1
     if back.size * 2 * _ROWS > time.size:  # shuffled, not restarted
         return [(0, time.size)]
-    edges = [0]
-    for k, end in pairwise([*back.tolist(), time.size]):
-        before, after = slice(max(edges[-1], k - _ROWS), k), time[k : k + _ROWS]
-        if np.median(after) >= np.median(time[before]):
-            continue  # a single row that came early or late
-        if _covers_again(time, columns, slice(edges[-1], k), slice(k, end)):
+    # Not a single row that came early or late: most rows that follow are earlier than those before
+    falls = [
+        k
+        for k in back.tolist()
+        if np.median(time[k : k + _ROWS]) < np.median(time[max(0, k - _ROWS) : k])
+    ]
+    edges, fell = [0], 0
+    for k, end in pairwise([*falls, time.size]):
+        begin = max(edges[-1], min(fell, k - _BEFORE))
+        if _covers_again(time, columns, slice(begin, k), slice(k, end)):
             edges.append(k)
+        fell = k
     return list(pairwise([*edges, time.size]))
 
 
@@ -75,7 +82,9 @@ def _covers_again(
     earlier, later = np.sort(time[old]), time[new]
     inside = later[(later >= earlier[0]) & (later <= earlier[-1])]
     holes = np.unique(np.searchsorted(earlier, inside, "right"))
-    if holes.size <= max(1, min(_ROWS, inside.size - 1)):  # a block that came late fills one
+    # A block that came late fills one hole, a few late rows one each; a last run may be short.
+    least = _ROWS if later.size > 2 * _ROWS else max(1, min(_ROWS, inside.size - 1))
+    if holes.size <= least:
         return False
     _, first, second = np.intersect1d(time[old], later, return_indices=True)
     twice = bool(columns) and all(
