@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -22,6 +21,7 @@ from smp_motor_ident.bag.clock import (
 )
 from smp_motor_ident.bag.counter import unwrap_angle
 from smp_motor_ident.bag.mapping import MotorMap, Signal
+from smp_motor_ident.bag.runs import one_after_another, pause_between
 from smp_motor_ident.bag.storage import Array, Integers, Table
 from smp_motor_ident.bag.units import FACTORS, check_unit, factor
 from smp_motor_ident.diagnosis.beat import find_beat, moves_on
@@ -30,7 +30,6 @@ from smp_motor_ident.record import Hardware, Record
 
 _OUTPUTS = ("count", "position", "velocity")
 _MOTION = ("velocity", "position")
-_SECOND = 1_000_000_000
 
 
 def assemble(
@@ -195,11 +194,10 @@ def _set_back(
     topic, table = next(iter(tables.items()))
     stamp = stamps[topic]
     assert stamp is not None
-    time, parts = stamp.copy(), epochs(stamp)
-    pause = 3 * round(rhythm(np.sort(stamp)).gap()) + _SECOND
-    for (_, before), (begin, end) in pairwise(parts):
-        away = max(int(_log(table)[begin] - _log(table)[before - 1]), 0)
-        time[begin:end] += time[:begin].max() + max(away, pause) - time[begin:end].min()
+    parts, log = epochs(stamp), _log(table)
+    least = pause_between(stamp, parts, motor.plan.gap)
+    pauses = [max(int(log[begin] - log[begin - 1]), least) for begin, _ in parts[1:]]
+    time = one_after_another([stamp], [parts], pauses)[0]
     text = f"{topic}: the clock of the header stamps was set back {len(parts) - 1} times"
     motor.tell("clock_set_back", f"{text}; a new segment each", "warning")
     return {topic: time}

@@ -49,3 +49,10 @@ EXPLAINS = Limit(
     "significance: with a thousand pairs of fields tried, one in a thousand listings is wrong",
     "test_propose.py",
 )
+SET_BACK = Limit(
+    5.0,
+    "sample",
+    "physical: jitter moves a row by less than as many intervals; a clock that starts again goes "
+    "back by more, and as many rows go on from there",
+    "test_runs.py",
+)

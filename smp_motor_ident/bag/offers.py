@@ -52,6 +52,7 @@ class Listing:
     asked: list[str]  # what the user must add to them, such as the full scale of a PWM
     needs_mapping: bool  # false where the recording holds our own messages
     findings: list[Finding]  # what is missing or damaged
+    remark: str = ""  # why nothing is suggested, or what the data could not confirm
 
 
 def offers_of(recording: Recording, types: Types) -> list[Offer]:

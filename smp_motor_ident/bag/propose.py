@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -17,14 +17,15 @@ from scipy.special import fdtrc
 
 from smp_motor_ident.bag.decode import collect
 from smp_motor_ident.bag.limits import EXPLAINS
-from smp_motor_ident.bag.mapping import SignalMap, parse
+from smp_motor_ident.bag.mapping import DEFAULT_MOTOR, SignalMap, parse
 from smp_motor_ident.bag.offers import Listing, Offer, offers_of
 from smp_motor_ident.bag.read import STATE, one_line, read_recording
+from smp_motor_ident.bag.runs import runs
 from smp_motor_ident.bag.source import Recording, recordings
 from smp_motor_ident.bag.storage import Array, found
-from smp_motor_ident.bag.tables import TIME_NAMES, time_unit
+from smp_motor_ident.bag.tables import TIME_NAMES, self_described, time_unit
 from smp_motor_ident.bag.types import Types
-from smp_motor_ident.bag.units import check_unit
+from smp_motor_ident.bag.units import check_unit, of_the_rim
 from smp_motor_ident.errors import BagError
 
 _ROLES = {
@@ -51,6 +52,7 @@ _HINTS = (
     ("current", r"(?:^|_)m(?:illi)?a(?:mp|$|_)", ":mA"),
 )
 _SIDES = ("front", "rear", "back", "left", "right", "fl", "fr", "rl", "rr", "bl", "br")
+_RADIUS = "in metres: what is measured is the way of the rim"
 _MOST = 20_000
 """Samples that are looked at."""
 _LAGS, _OWN = 6, 2
@@ -102,21 +104,41 @@ def list_topics(paths: Any, msg_files: Iterable[str] = ()) -> list[Listing]:
         with one_line(recording):
             offers = offers_of(recording, types)
             needed = all(offer.type != STATE for offer in offers)
-            items, asked = propose(recording, offers, types) if needed else ([], [])
-            if items:
+            proposal = propose(recording, offers, types) if needed else Proposal()
+            if proposal.items:
                 try:
-                    read_recording(recording, _filled(items), types, None)
+                    read_recording(recording, _filled(proposal.items), types, None)
                 except BagError as error:
                     text = f"a mapping was proposed by names and cannot be read: {error}"
                     recording.findings.append(found("proposal_failed", text))
-                    items, asked = [], []
-        listing = Listing(recording.name, offers, items, asked, needed, recording.findings)
-        listings.append(listing)
+                    proposal = Proposal(remark="no mapping is suggested that can be read")
+        listings.append(
+            Listing(
+                recording.name,
+                offers,
+                proposal.items,
+                proposal.asked,
+                needed,
+                recording.findings,
+                proposal.remark,
+            )
+        )
     return listings
 
 
-def propose(recording: Recording, offers: list[Offer], types: Types) -> tuple[list[str], list[str]]:
-    """Return items for ``--map`` that read the recording, and what the user must add to them."""
+@dataclass(frozen=True)
+class Proposal:
+    """Items for ``--map`` that read a recording."""
+
+    items: list[str] = field(default_factory=list)
+    asked: list[str] = field(default_factory=list)  # what the user must add to them
+    remark: str = ""  # why there are none, or what the data could not confirm
+
+
+def propose(recording: Recording, offers: list[Offer], types: Types) -> Proposal:
+    """Return what the file says itself, or a mapping by names that the data confirm if they can."""
+    if own := _of_the_file(recording):
+        return own
     time = _time(offers)
     wheels: dict[str, list[_Candidate]] = {}
     for candidate in _candidates(recording, offers, types, time):
@@ -124,9 +146,13 @@ def propose(recording: Recording, offers: list[Offer], types: Types) -> tuple[li
     shared = [c for c in wheels.get("", []) if c.role == "voltage"]
     items: list[str] = []
     asked: dict[str, str] = {}
+    remarks: list[str] = []
     for wheel, fields in sorted(wheels.items()):
         voltages = [c for c in fields if c.role == "voltage"] or shared
-        chosen = _explained(voltages, [c for c in fields if c.role in _MOTIONS])
+        motions = [c for c in fields if c.role in _MOTIONS]
+        chosen = _explained(voltages, motions)
+        if not chosen and (chosen := _untestable(voltages, motions)):
+            remarks.append(_unconfirmed(chosen[0]))
         if not chosen:
             continue
         chosen += [c for c in fields if c.role == "current"][:1]
@@ -138,16 +164,73 @@ def propose(recording: Recording, offers: list[Offer], types: Types) -> tuple[li
             asked["pwm_full_scale"] = f"the value that is 100 % (the largest here is {largest:g})"
         if voltage.unit in (":pwm", ":duty", ":%"):
             asked["supply_voltage"] = "in volts"
-    if items and time:
+        if any(of_the_rim(c.role, c.unit[1:]) for c in chosen):
+            asked["wheel_radius"] = _RADIUS
+    if not items:
+        return Proposal(remark=_reason([c for fields in wheels.values() for c in fields]))
+    if time:
         items.append(f"time={time.source}{time.unit}")
-    return (items, [f"{key}=… {why}" for key, why in asked.items()]) if items else ([], [])
+    return Proposal(items, [f"{key}=… {why}" for key, why in asked.items()], "; ".join(remarks))
+
+
+def _of_the_file(recording: Recording) -> Proposal | None:
+    """Return the mapping of a table that names its columns and units as the signals are."""
+    if not recording.is_table:
+        return None
+    try:
+        plans = self_described(recording, recording.channels(), SignalMap())
+    except BagError:
+        return None
+    items, rim = [], False
+    for wheel, plan in plans.items():
+        for name, signal in plan.signals.items():
+            prefix = f"{wheel}." if name != "time" and wheel != DEFAULT_MOTOR else ""
+            source = f"{signal.topic}.{signal.field}" if signal.topic else signal.field
+            items.append(f"{prefix}{name}={source}" + (f":{signal.unit}" if signal.unit else ""))
+            rim |= of_the_rim(name, signal.unit)
+    asked = [f"wheel_radius=… {_RADIUS}"] if rim else []
+    alone = "wheel_radius alone is enough" if rim else "no mapping is needed"
+    return Proposal(list(dict.fromkeys(items)), asked, f"the file says this itself: {alone}")
+
+
+def _untestable(voltages: list[_Candidate], motions: list[_Candidate]) -> list[_Candidate]:
+    """Return a voltage that changes less often than a test needs, and a motion, by their names."""
+    seldom = [c for c in voltages if c.value.size and _changes(c) < _LAGS]
+    moving = [c for role in _MOTIONS for c in motions if c.role == role and np.ptp(c.value) > 0]
+    return [seldom[0], moving[0]] if seldom and moving else []
+
+
+def _changes(voltage: _Candidate) -> int:
+    return int(np.count_nonzero(np.diff(voltage.value)))
+
+
+def _unconfirmed(voltage: _Candidate) -> str:
+    """Return what the data could not tell of a voltage."""
+    times = _changes(voltage)
+    how = f"changes {times} time{'s' * (times > 1)} only" if times else "is constant"
+    return (
+        f"{voltage.source} {how}, so that the data cannot confirm that it drives the motor; "
+        "this is by the names alone"
+    )
+
+
+def _reason(fields: list[_Candidate]) -> str:
+    """Return why nothing is proposed."""
+    roles = {c.role for c in fields}
+    missing = [] if "voltage" in roles else ["a voltage"]
+    missing += [] if roles & set(_MOTIONS) else ["a motion"]
+    if missing:
+        return f"no field is called {' or '.join(missing)}"
+    return "no field that is called a voltage explains one that is called a motion"
 
 
 def _filled(items: Sequence[str]) -> SignalMap:
     """Return the mapping of a proposal, with any value for what the user must add."""
     given = parse(items)
     motors = {
-        wheel: replace(motor, hardware={"supply_voltage": 12.0}, pwm_full_scale=1.0)
+        wheel: replace(
+            motor, hardware={"supply_voltage": 12.0}, pwm_full_scale=1.0, wheel_radius=1.0
+        )
         for wheel, motor in given.motors.items()
     }
     return replace(given, motors=motors)
@@ -190,6 +273,8 @@ def _candidates(
         clock = table.stamp if table.stamp is not None and table.stamp.all() else table.log
         if clock is None and time is not None and time.path in table.columns:
             clock = table.columns[time.path]
+            if len(runs(clock, {})) > 1:  # in the order in which they were written
+                clock = None
         at = np.arange(value.size) if clock is None else clock
         there = table.present.get(path)
         kept = np.isfinite(value) & (True if there is None else there)

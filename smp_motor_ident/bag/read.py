@@ -214,7 +214,7 @@ def _plans(recording: Recording, asked: SignalMap, channels: list[Channel]) -> d
                     )
         return plans
     if recording.is_table:
-        return {mappings.DEFAULT_MOTOR: self_described(recording, channels, asked.defaults)}
+        return self_described(recording, channels, asked)
     states = sorted(channel.topic for channel in channels if channel.type == STATE)
     if not states:
         raise BagError(

@@ -5,10 +5,12 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 
-from smp_motor_ident.bag.mapping import MotorMap, Signal
+from smp_motor_ident.bag.mapping import DEFAULT_MOTOR, MotorMap, Signal, SignalMap
+from smp_motor_ident.bag.runs import laid_out
 from smp_motor_ident.bag.source import Recording
 from smp_motor_ident.bag.storage import TABLE, Channel, Integers, Table, found
 from smp_motor_ident.bag.units import FACTORS, check_unit
@@ -23,6 +25,7 @@ _EPOCHS = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
 """A number of time beyond each is of today in that unit since 1970."""
 
 _MOTIONS = ("velocity", "position", "count")
+_WHEELS = ((DEFAULT_MOTOR, ""), ("left", "left_"), ("right", "right_"))
 
 
 def time_unit(name: str) -> str:
@@ -71,13 +74,28 @@ def _unit(name: str, signal: Signal, channel: Channel, field: str) -> str:
         return ""
 
 
-def self_described(recording: Recording, channels: list[Channel], defaults: MotorMap) -> MotorMap:
-    """Return the plan of a table whose columns and units are named as the signals are."""
-    for channel in channels:
-        named = {name for name in ("time", "voltage", *_MOTIONS) if name in channel.fields}
-        if {"time", "voltage"} < named and any(name in channel.units for name in _MOTIONS):
-            signals = {name: Signal(channel.topic, name) for name in named}
-            return resolved(replace(defaults, signals=signals), channels)
+def self_described(
+    recording: Recording, channels: list[Channel], asked: SignalMap
+) -> dict[str, MotorMap]:
+    """Return the plans of a table whose columns and units are named as the signals are.
+
+    Those of a drivetrain have their side before the name, such as ``left_voltage``.
+    """
+    plans: dict[str, MotorMap] = {}
+    for channel, (wheel, before) in product(channels, _WHEELS):
+        named = {
+            name: before + name
+            for name in ("voltage", *_MOTIONS)
+            if before + name in channel.fields and wheel not in plans
+        }
+        moves = any(column in channel.units for name, column in named.items() if name in _MOTIONS)
+        if "time" in channel.fields and "voltage" in named and moves:
+            signals = {name: Signal(channel.topic, column) for name, column in named.items()}
+            signals["time"] = Signal(channel.topic, "time")
+            given = asked.motors.get(wheel, asked.defaults)
+            plans[wheel] = resolved(replace(given, signals=signals), channels)
+    if plans:
+        return plans
     raise BagError(
         f"{recording.files[0]}: a table needs a mapping, such as "
         "voltage=u velocity=y:deg/s time=t (identify --topics suggests one)"
@@ -126,11 +144,13 @@ def timed(
 ) -> dict[str, Table]:
     """Return a plan's tables with their times in nanoseconds; rows without one are left out."""
     result = {}
+    written = []
     for topic in dict.fromkeys(signal.topic for signal in plan.signals.values()):
         table = tables[topic]
         findings = list(table.findings)
         log = table.log
         if log is None:
+            written.append(topic)
             signal = _time_signal(recording, plan, topic, channels)
             size = next(iter(table.columns.values())).size
             if signal is None:
@@ -149,7 +169,8 @@ def timed(
         if not log.size:
             raise BagError(f"{recording.files[0]}: has no rows with a time")
         result[topic] = Table(log, None, columns, findings=findings, clocked=True)
-    return result
+    rows = {topic: result[topic] for topic in written}
+    return result | laid_out(rows, plan.gap, recording.name)
 
 
 _NEVER = -(2**62)

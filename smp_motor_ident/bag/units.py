@@ -88,6 +88,11 @@ def check_unit(signal: str, unit: str) -> str:
     raise BagError(f"{signal} cannot be in {unit!r}; use one of {', '.join(known)}")
 
 
+def of_the_rim(signal: str, unit: str) -> bool:
+    """Return whether a unit is a length, or a length in time, which needs the wheel's radius."""
+    return unit in _METRES.get(signal, {})
+
+
 def written_unit(text: str) -> str | None:
     """Return the unit that a file writes beside a column's name; None where it is none."""
     if text.strip() in ("", "-", "1", "."):
@@ -112,9 +117,11 @@ def factor(
     """Return what a value in the unit must be multiplied by; BagError names what is missing."""
     if unit in FACTORS[signal]:
         return FACTORS[signal][unit]
-    if unit in _METRES.get(signal, {}):
+    if of_the_rim(signal, unit):
         if not wheel_radius:
-            raise BagError(f"a {signal} in {unit!r} needs wheel_radius")
+            raise BagError(
+                f"a {signal} in {unit!r} needs wheel_radius: give --map wheel_radius=METRES"
+            )
         return _METRES[signal][unit] / wheel_radius
     if unit == _PWM and not pwm_full_scale:
         raise BagError("a voltage in 'pwm' needs pwm_full_scale, the value that is 100 %")

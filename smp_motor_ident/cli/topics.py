@@ -34,11 +34,10 @@ def list_topics(paths: Sequence[str], msg_files: Sequence[str], program: str) ->
             out.print(f"suggestion: --map {given}", soft_wrap=True)
             for text in listing.asked:
                 out.print(f"  to be added: {text}", soft_wrap=True)
+            if listing.remark:
+                out.print(f"  note: {listing.remark}", soft_wrap=True)
         else:
-            out.print(
-                "no field that is called a voltage explains one that is called a motion; "
-                "see docs/mapping.md"
-            )
+            out.print(f"{listing.remark}; see docs/mapping.md", soft_wrap=True)
     return 0
 
 

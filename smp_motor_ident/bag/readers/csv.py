@@ -30,9 +30,14 @@ class _CsvFile(Tables):
         if not filled:
             raise BagError(f"{path}: is empty")
         seen = filled[:60]
+        if sum(map(_is_quoted_row, (self._lines[k] for k in seen))) > len(seen) / 2:
+            self._lines = [s.strip()[1:-1] if _is_quoted_row(s) else s for s in self._lines]
         self._separator = _separator([self._lines[k] for k in seen])
-        self._grid = grid.head([self._row(self._lines[k]) for k in seen], str(path))
+        rows = [self._row(self._lines[k]) for k in seen]
+        self._grid = grid.head(rows, str(path))
         self._first = seen[self._grid.first]
+        if not self._grid.named and (above := self._commented(len(rows[self._grid.first]))):
+            self._grid = grid.head([*above, *rows[self._grid.first :]], str(path))
         self.problems += self._grid.findings
 
     def channels(self) -> list[Channel]:
@@ -74,6 +79,27 @@ class _CsvFile(Tables):
             return None
         return [values[:, k].copy() for k in range(len(use))]
 
+    def _commented(self, width: int) -> list[list[str]]:
+        """Return the comments right above the numbers that name columns, and their units."""
+        above: list[list[str]] = []
+        for line in reversed(self._lines[: self._first]):
+            text = line.strip()
+            if not text.startswith(_COMMENTS):
+                break
+            cells = self._cells(text.lstrip("#%/ \t"), width)
+            if not cells or grid.is_data(cells):
+                break
+            above.insert(0, cells)
+        return above[-2:]
+
+    def _cells(self, text: str, width: int) -> list[str]:
+        """Return the cells of a comment where it has as many as the rows, none of them empty."""
+        marks = dict.fromkeys([*self._separator.strip(), *";\t|,"])
+        several = [[cell.strip(' \t"') for cell in text.split(mark)] for mark in marks]
+        if self._separator == " ":
+            several.append(text.split())
+        return next((c for c in several if len(c) == width and all(c)), [])
+
     def _row(self, line: str) -> list[str]:
         if self._separator == " ":
             return line.split()
@@ -81,6 +107,14 @@ class _CsvFile(Tables):
             return next(csv.reader([line], delimiter=self._separator, skipinitialspace=True), [])
         except csv.Error:
             return line.split(self._separator)
+
+
+def _is_quoted_row(line: str) -> bool:
+    """Return whether a whole row is in quotes, which would make one cell of it."""
+    text = line.strip()
+    if text.count('"') != 2 or not (text[0] == text[-1] == '"'):
+        return False
+    return not grid.is_data([text[1:-1]]) and any(mark in text for mark in ";\t|, ")
 
 
 def _separator(lines: list[str]) -> str:

@@ -38,6 +38,11 @@ class Grid:
     first: int
     findings: list[Finding] = field(default_factory=list)
 
+    @property
+    def named(self) -> bool:
+        """Whether the columns have names of the file."""
+        return all(finding.code != "no_column_names" for finding in self.findings)
+
 
 def head(rows: Sequence[Row], where: str) -> Grid:
     """Tell the row of names, and of units, from those of numbers."""
@@ -46,7 +51,7 @@ def head(rows: Sequence[Row], where: str) -> Grid:
         (
             k
             for k, row in enumerate(seen)
-            if _is_data(row) and all(map(_is_data, seen[k + 1 : k + 2]))
+            if is_data(row) and all(map(is_data, seen[k + 1 : k + 2]))
         ),
         None,
     )
@@ -83,7 +88,7 @@ def _bare(cell: Any) -> str:
     return str(cell).strip().strip("[]()")
 
 
-def _is_data(row: Row) -> bool:
+def is_data(row: Row) -> bool:
     """Return whether at least half of a row's cells are numbers."""
     cells = [cell for cell in row if not _empty(cell)]
     good = sum(_sound(cell) for cell in cells)

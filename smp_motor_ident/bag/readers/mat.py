@@ -11,6 +11,7 @@ import io
 import struct
 import subprocess
 import sys
+import warnings
 import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -20,11 +21,15 @@ import numpy as np
 
 from smp_motor_ident.bag.readers.columns import ColumnFile
 from smp_motor_ident.bag.readers.format import Format
-from smp_motor_ident.bag.storage import first_line
+from smp_motor_ident.bag.storage import first_line, found
 from smp_motor_ident.bag.unpack import Budget
 from smp_motor_ident.errors import BagError
 
 _COMPRESSED, _MATRIX = 15, 14
+_OPAQUE = 17
+"""Class of a matrix that is an object of MATLAB."""
+_TOLD = 4
+"""Objects that are named in a message."""
 _DEEPEST = 16
 _WIDEST = 64
 """Columns of a matrix that are taken as signals; a wider one is something else."""
@@ -47,18 +52,27 @@ def _check_survivable(data: bytes, name: str) -> None:
 
 def _open_5(path: Path, name: str, budget: Budget) -> ColumnFile:
     """Read a file of version 5."""
-    data = _unpacked(path.read_bytes(), name, budget)
+    objects: list[str] = []
+    data = _unpacked(path.read_bytes(), name, budget, objects)
     _check_survivable(data, name)
     from scipy import io as scipy_io  # takes a while to load, for one of many formats
 
     try:
-        content = scipy_io.loadmat(
-            cast(Any, io.BytesIO(data)), simplify_cells=True, chars_as_strings=False
-        )
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of objects, which have no names there
+            content = scipy_io.loadmat(
+                cast(Any, io.BytesIO(data)), simplify_cells=True, chars_as_strings=False
+            )
     except Exception as error:  # scipy's reader raises whatever its bytes lead it to
         raise BagError(f"{name}: no readable MATLAB file ({first_line(error)[:200]})") from None
     visible = {key: value for key, value in content.items() if not key.startswith("__")}
-    return ColumnFile(path, name, dict(_columns("", visible, 0)))
+    columns = dict(_columns("", visible, 0))
+    if objects and not columns:
+        raise BagError(f"{name}: {_advice(objects)}")
+    file = ColumnFile(path, name, columns)
+    if objects:
+        file.problems.append(found("matlab_object", f"{name}: {_advice(objects)}", "warning"))
+    return file
 
 
 def _open_73(path: Path, name: str, budget: Budget) -> ColumnFile:
@@ -70,19 +84,19 @@ def _open_73(path: Path, name: str, budget: Budget) -> ColumnFile:
             f"{name}: is a MATLAB file of version 7.3, which needs h5py (pip install h5py); "
             "or save it in MATLAB with -v7"
         ) from None
-    found: dict[str, Any] = {}
+    taken: dict[str, Any] = {}
 
     def take(key: str, item: Any) -> None:
         if isinstance(item, h5py.Dataset) and item.dtype.kind in "fiub" and "#" not in key:
             budget.take(item.nbytes)
-            found[key.replace("/", ".")] = np.asarray(item).T  # MATLAB counts columns first
+            taken[key.replace("/", ".")] = np.asarray(item).T  # MATLAB counts columns first
 
     try:
         with h5py.File(path, "r") as file:
             file.visititems(take)
     except (OSError, RuntimeError, ValueError, KeyError) as error:
         raise BagError(f"{name}: no readable MATLAB file ({first_line(error)[:200]})") from None
-    return ColumnFile(path, name, dict(_columns("", found, 0)))
+    return ColumnFile(path, name, dict(_columns("", taken, 0)))
 
 
 def _columns(prefix: str, value: Any, depth: int) -> Iterator[tuple[str, np.ndarray[Any, Any]]]:
@@ -104,8 +118,8 @@ def _columns(prefix: str, value: Any, depth: int) -> Iterator[tuple[str, np.ndar
                 yield f"{prefix}[{k}]", rows[:, k]
 
 
-def _unpacked(data: bytes, name: str, budget: Budget) -> bytes:
-    """Return the file with its elements unpacked, each within what holds it."""
+def _unpacked(data: bytes, name: str, budget: Budget, objects: list[str]) -> bytes:
+    """Return the file with its elements unpacked, each within what holds it; note its objects."""
     if len(data) < 128 or data[126:128] not in (b"IM", b"MI"):
         raise BagError(f"{name}: is cut off or no MATLAB file of version 5")
     order = "<" if data[126:128] == b"IM" else ">"
@@ -119,7 +133,7 @@ def _unpacked(data: bytes, name: str, budget: Budget) -> bytes:
             body = _inflated(body, name, budget)
         else:
             body = data[at : at + 8] + body
-        _check(body, order, name, 0)
+        _check(body, order, name, 0, objects)
         parts.append(body)
         at += 8 + size
     return b"".join(parts)
@@ -137,7 +151,7 @@ def _inflated(body: bytes, name: str, budget: Budget) -> bytes:
     return b"".join(parts)
 
 
-def _check(body: bytes, order: str, name: str, depth: int) -> None:
+def _check(body: bytes, order: str, name: str, depth: int, objects: list[str]) -> None:
     """Refuse an element that says it is longer than what holds it, or has more cells."""
     at = 0
     while at + 8 <= len(body):
@@ -149,9 +163,37 @@ def _check(body: bytes, order: str, name: str, depth: int) -> None:
             raise BagError(f"{name}: a variable is damaged (an element of {size} bytes)")
         inside = body[at + 8 : at + 8 + size]
         if kind == _MATRIX and size:
-            _check_size(inside, order, name)
-            _check(inside, order, name, depth + 1)
+            if struct.unpack_from(order + "I", inside.ljust(12, b"\0"), 8)[0] & 0xFF == _OPAQUE:
+                objects.append(_object(inside, order))  # which has no dimensions
+            else:
+                _check_size(inside, order, name)
+            _check(inside, order, name, depth + 1, objects)
         at += 8 + size + -size % 8
+
+
+def _object(inside: bytes, order: str) -> str:
+    """Return the name and class of an object: behind its flags, about the kind of system."""
+    texts: list[str] = []
+    at = 16
+    while len(texts) < 3 and at + 8 <= len(inside):
+        kind, size = struct.unpack_from(order + "II", inside, at)
+        small = kind >> 16  # type and size share four bytes
+        begin, size, step = (at + 4, small, 8) if small else (at + 8, size, 8 + size + -size % 8)
+        text = inside[begin : begin + size].decode("latin-1")
+        texts.append("".join(filter(str.isprintable, text))[:80])
+        at += step
+    name, _, kind_of = (*texts, "", "", "")[:3]
+    return f"{name or 'a field'} ({kind_of or 'of an unknown class'})"
+
+
+def _advice(objects: list[str]) -> str:
+    """Return what to do about objects, which MATLAB alone can open."""
+    some = ", ".join(list(dict.fromkeys(objects))[:_TOLD])
+    return (
+        "holds MATLAB objects, such as a timeseries or a Simulink Dataset, which only MATLAB can "
+        f"read: {some}; save its Time and Data as arrays there: "
+        "t = x.Time; y = x.Data; save('log.mat', 't', 'y')"
+    )
 
 
 def _check_size(inside: bytes, order: str, name: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -47,6 +48,10 @@ def test_text_of_old_and_wide_encodings_is_read(tmp_path: Path, encoding: str) -
         "\ufeff" + table(),
         "# made by a scope\n#\n" + table() + "\n# the end\n",
         table(head='"t","u","y"'),
+        re.sub(r"(?m)^(.+)$", r'"\1"', table(", ")),
+        re.sub(r"(?m)^(\d.+)$", r'"\1"', table()),
+        re.sub(r"(?m)^(.+)$", r'"\1"', table("\t")),
+        re.sub(r"([^,\n]+)", r'"\1"', table()),
     ],
 )
 def test_every_usual_kind_of_csv_is_read(tmp_path: Path, text: str) -> None:
@@ -57,6 +62,45 @@ def test_every_usual_kind_of_csv_is_read(tmp_path: Path, text: str) -> None:
     np.testing.assert_allclose(record.velocity, np.deg2rad(Y))
     # Applied from its row on: the mean over the interval that ends at a row is the one before.
     np.testing.assert_allclose(record.voltage[1:], U[:-1])
+
+
+@pytest.mark.parametrize(
+    ("above", "separator", "names"),
+    [
+        ("# t,u,y", ",", ["t", "u", "y"]),
+        ("# time, u, w", ",", ["time", "u", "w"]),
+        ("# t u y", " ", ["t", "u", "y"]),
+        ("# t, u, y", " ", ["t", "u", "y"]),
+        ("%t\tu\ty", "\t", ["t", "u", "y"]),
+        ("// t;u;y", ";", ["t", "u", "y"]),
+        ("# made by a scope\n# 24 V, at rest\n## t, u, y", ",", ["t", "u", "y"]),
+        ("# t,u,y\n# s,mV,deg/s", ",", ["t", "u", "y"]),
+        ('# "t [s]","u","y"', ",", ["t [s]", "u", "y"]),
+        ("# made by scope", ",", ["c1", "c2", "c3"]),
+        ("# t,u", ",", ["c1", "c2", "c3"]),
+        ("# t,,y", ",", ["c1", "c2", "c3"]),
+        ("# 0.0,1.0,2.0", ",", ["c1", "c2", "c3"]),
+        ("# a,b,c\nt,u,y", ",", ["t", "u", "y"]),
+    ],
+)
+def test_a_comment_right_above_the_numbers_may_name_the_columns(
+    tmp_path: Path, above: str, separator: str, names: list[str]
+) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text(above + "\n" + table(separator).partition("\n")[2])
+    listing = list_topics(path)[0]
+    assert listing.offers[0].fields == names
+    told = "no_column_names" in [finding.code for finding in listing.findings]
+    assert told is (names[0] == "c1")
+    record = read_records(path, [f"voltage={names[1]}:V velocity={names[2]}:deg/s sample_time=1"])
+    np.testing.assert_allclose(record["motor"].velocity, np.deg2rad(Y))
+
+
+def test_units_in_a_comment_below_the_names_are_understood(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text("# t,u,y\n# s,mV,deg/s\n" + table().partition("\n")[2])
+    record = read_records(tmp_path / "log.csv", ["voltage=u velocity=y time=t"])["motor"]
+    np.testing.assert_allclose(record.voltage[1:], 1e-3 * U[:-1])
+    np.testing.assert_allclose(record.velocity, np.deg2rad(Y))
 
 
 def test_a_voltage_may_have_been_held_up_to_its_row(tmp_path: Path) -> None:
@@ -72,6 +116,11 @@ def test_empty_cells_are_missing_values(tmp_path: Path) -> None:
     assert np.isnan(record.velocity).sum() == 10
     assert record.current is None
     assert "velocity: 10 values missing" in " ".join(f.message for f in record.findings)
+
+
+def test_quoted_cells_with_decimal_commas_are_no_quoted_rows(tmp_path: Path) -> None:
+    (tmp_path / "u.csv").write_text('"u"\n' + "".join(f'"{x:g}"\n'.replace(".", ",") for x in U))
+    assert list_topics(tmp_path / "u.csv")[0].offers[0].fields == ["u"]
 
 
 def test_a_file_without_time_has_a_sample_time(tmp_path: Path) -> None:

@@ -107,3 +107,50 @@ def test_of_two_voltages_the_one_that_explains_the_speed_is_proposed(tmp_path: P
 def test_nothing_is_proposed_where_nothing_explains_the_speed(tmp_path: Path) -> None:
     path = write(tmp_path / "log.csv", t=T, voltage=motor(6)[0], speed=motor(7)[1])
     assert list_topics(path)[0].suggestion == []
+
+
+@pytest.mark.parametrize(
+    ("begin", "end", "told"),
+    [
+        pytest.param(0, N, "is constant", id="constant"),
+        pytest.param(0, N - 1, "changes 1 time only", id="switched off at the last sample"),
+        pytest.param(100, 500, "changes 2 times only", id="on and off"),
+    ],
+)
+def test_a_step_that_no_test_can_confirm_is_proposed_by_names(
+    tmp_path: Path, begin: int, end: int, told: str
+) -> None:
+    voltage = np.where((np.arange(N) >= begin) & (np.arange(N) < end), 12.0, 0.0)
+    speed = 240 * (1 - np.exp(-np.maximum(T - T[begin], 0) / 0.1))
+    speed += np.random.default_rng(8).normal(0, 5, N)
+    path = write(tmp_path / "log.csv", Time_sec=T, Voltage_V=voltage, Speed_rad_s=speed)
+    listing = list_topics(path)[0]
+    assert listing.suggestion == ["voltage=Voltage_V", "velocity=Speed_rad_s", "time=Time_sec"]
+    assert listing.remark.startswith(f"Voltage_V {told}, so that the data cannot confirm")
+    assert len(read_records(path, listing.suggestion)["motor"]) == N
+
+
+@pytest.mark.parametrize(
+    ("names", "reason"),
+    [
+        (("t", "voltage", "temperature"), "no field is called a motion"),
+        (("t", "temperature", "speed"), "no field is called a voltage"),
+        (("t", "heat", "light"), "no field is called a voltage or a motion"),
+        (("t", "voltage", "speed"), "no field that is called a voltage explains one that"),
+    ],
+)
+def test_why_nothing_is_proposed_is_told(
+    tmp_path: Path, names: tuple[str, str, str], reason: str
+) -> None:
+    path = write(tmp_path / "log.csv", **dict(zip(names, (T, motor(6)[0], motor(7)[1]))))
+    listing = list_topics(path)[0]
+    assert listing.suggestion == []
+    assert listing.remark.startswith(reason)
+
+
+def test_a_mapping_of_the_rim_asks_for_the_wheels_radius(tmp_path: Path) -> None:
+    path = write(tmp_path / "log.csv", **dict(zip(("t", "u", "speed (m/s)"), (T, *motor(9)))))
+    listing = list_topics(path)[0]
+    assert listing.suggestion[1] == 'velocity="speed (m/s)":m/s'
+    assert [text.partition("=")[0] for text in listing.asked] == ["wheel_radius"]
+    assert len(read_records(path, [*listing.suggestion, "wheel_radius=0.05"])["motor"]) == N

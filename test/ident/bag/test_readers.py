@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import struct
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +56,46 @@ def test_fields_of_a_matlab_structure_and_columns_of_a_matrix_have_paths(tmp_pat
     scipy.io.savemat(path, {"log": log}, do_compression=True)
     mapping = ["voltage=log.signals.values[0] velocity=log.signals.values[1]:rad/s time=log.time"]
     assert_motor(read_records(path, mapping)["motor"])
+
+
+def matlab_object(name: str, kind: str, order: str = "<") -> bytes:
+    """Return an object as MATLAB saves it: texts and references, without dimensions."""
+
+    def element(number: int, body: bytes) -> bytes:
+        return struct.pack(order + "II", number, len(body)) + body + bytes(-len(body) % 8)
+
+    def small(body: bytes) -> bytes:
+        return struct.pack(order + "I", len(body) << 16 | 1) + body.ljust(4, b"\0")
+
+    shape = element(5, struct.pack(order + "2i", 6, 1))
+    numbers = struct.pack(order + "6I", 0xDD000000, 2, 1, 1, 1, 28)
+    header = element(6, struct.pack(order + "2I", 13, 0))
+    references = element(14, header + shape + element(1, b"") + element(6, numbers))
+    flags = element(6, struct.pack(order + "2I", 17, 0))
+    texts = element(1, name.encode()) + small(b"MCOS") + element(1, kind.encode())
+    return element(14, flags + texts + references)
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_objects_of_matlab_are_named_and_the_other_variables_read(
+    tmp_path: Path, compressed: bool
+) -> None:
+    path = tmp_path / "log.mat"
+    scipy.io.savemat(path, {"t": TIME, "u": VOLTAGE, "y": SPEED}, do_compression=compressed)
+    one, two = matlab_object("speedSeries", "timeseries"), matlab_object("out", "Simulink.Data")
+    if compressed:
+        packed = [zlib.compress(one), zlib.compress(two)]
+        one, two = (struct.pack("<II", 15, len(data)) + data for data in packed)
+    whole = path.read_bytes()
+    path.write_bytes(whole[:128] + one + whole[128:] + two)
+    record = read_records(path, MAP)["motor"]
+    assert_motor(record)
+    told = [f.message for f in record.findings if f.code == "matlab_object"]
+    assert len(told) == 1
+    assert "speedSeries (timeseries), out (Simulink.Data)" in told[0]
+    path.write_bytes(whole[:128] + one)
+    with pytest.raises(BagError, match=r"speedSeries \(timeseries\); save its Time and Data as"):
+        list_topics(path)
 
 
 def test_a_matlab_file_of_another_version_or_cut_off_is_one_line(tmp_path: Path) -> None:
@@ -131,6 +172,40 @@ def test_a_sysid_file_describes_itself(tmp_path: Path) -> None:
     record = read_records(path)["motor"]
     np.testing.assert_allclose(record.velocity, 2 * np.pi * SPEED)  # a rotation is two pi
     assert record.starts == (0, 100)
+
+
+def drivetrain(path: Path) -> Path:
+    """Write a SysId file of a drivetrain in metres, whose left wheel has a radius of 50 mm."""
+    way = np.cumsum(SPEED) * np.diff(TIME, prepend=0)
+    left, right = (VOLTAGE, 0.05 * way, 0.05 * SPEED), (-VOLTAGE, -0.05 * way, -0.05 * SPEED)
+    sides = [column for both in zip(left, right) for column in both]
+    rows = np.stack([TIME, *sides, np.zeros(N), np.zeros(N)], axis=1)
+    document = {"sysid": True, "test": "Drivetrain", "units": "Meters", "unitsPerRotation": 0.3142}
+    path.write_text(json.dumps(document | {"slow-forward": rows.tolist()}))
+    return path
+
+
+def test_a_sysid_drivetrain_in_metres_needs_the_wheels_radius_only(tmp_path: Path) -> None:
+    path = drivetrain(tmp_path / "sysid.json")
+    with pytest.raises(BagError, match="give --map wheel_radius=METRES"):
+        read_records(path)
+    records = read_records(path, ["wheel_radius=0.05"])
+    np.testing.assert_allclose(records["left"].velocity, SPEED, atol=1e-9)
+    np.testing.assert_allclose(records["right"].velocity, -SPEED, atol=1e-9)
+    np.testing.assert_allclose(records["right"].voltage[1:], -VOLTAGE[:-1])
+    apart = read_records(path, ["wheel_radius=0.05", "right.wheel_radius=0.1"])
+    np.testing.assert_allclose(apart["left"].velocity, SPEED, atol=1e-9)
+    np.testing.assert_allclose(apart["right"].velocity, -0.5 * SPEED, atol=1e-9)
+
+
+def test_what_is_suggested_for_a_drivetrain_in_metres_asks_for_the_radius(tmp_path: Path) -> None:
+    path = drivetrain(tmp_path / "sysid.json")
+    listing = list_topics(path)[0]
+    assert "left.velocity=left_velocity:m/s" in listing.suggestion
+    assert [text.partition("=")[0] for text in listing.asked] == ["wheel_radius"]
+    assert listing.remark == "the file says this itself: wheel_radius alone is enough"
+    records = read_records(path, [*listing.suggestion, "wheel_radius=0.05"])
+    np.testing.assert_allclose(records["left"].velocity, SPEED, atol=1e-9)
 
 
 @pytest.mark.parametrize("form", ["rows", "columns", "lines", "nested"])

@@ -1,0 +1,171 @@
+"""Tables whose clock starts again hold several runs; rows that are merely late are sorted."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from smp_motor_ident.bag import list_topics, read_records
+from smp_motor_ident.bag.runs import runs
+from smp_motor_ident.errors import BagError
+from smp_motor_ident.record import Record
+
+MAP = ["voltage=u velocity=w time=t"]
+STEP = 0.01
+
+
+def run(n: int, seed: int, begin: float = 0.0) -> np.ndarray:
+    """Return rows of time, voltage and speed of a motor, 20 rad/s/V and 0.1 s, with noise."""
+    rng = np.random.default_rng(seed)
+    voltage = np.repeat(rng.uniform(-6, 6, n // 10 + 1), 10)[:n]
+    speed = np.zeros(n)
+    for k in range(1, n):
+        speed[k] = speed[k - 1] + (1 - np.exp(-STEP / 0.1)) * (20 * voltage[k - 1] - speed[k - 1])
+    return np.stack([begin + STEP * np.arange(n), voltage, speed + rng.normal(0, 0.1, n)], axis=1)
+
+
+def write(path: Path, rows: np.ndarray, names: str = "t,u,w") -> Path:
+    np.savetxt(path, rows, "%.6f", ",", header=names, comments="")
+    return path
+
+
+def read(path: Path, rows: np.ndarray, mapping: list[str] = MAP) -> Record:
+    return read_records(write(path, rows), mapping)["motor"]
+
+
+def codes(record: Record) -> list[str]:
+    return [finding.code for finding in record.findings]
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        pytest.param([run(300, 1), run(300, 2)], id="twice from zero"),
+        pytest.param([run(300, k) for k in range(9)], id="nine from zero"),
+        pytest.param([run(300, 1, 0.5), run(200, 2, 0.2), run(400, 3)], id="each from elsewhere"),
+        pytest.param([run(300, 1), run(8, 2), run(300, 3)], id="with a start that was given up"),
+        pytest.param([run(300, 1), run(300, 2, 2.9)], id="set back by a tenth of a second"),
+        pytest.param([run(60, 1), run(60, 2)], id="short ones"),
+    ],
+)
+def test_runs_below_one_another_are_segments_of_their_own(
+    tmp_path: Path, parts: list[np.ndarray]
+) -> None:
+    record = read(tmp_path / "log.csv", np.concatenate(parts))
+    lengths = [len(part) for part in parts]
+    assert record.starts == tuple(np.cumsum([0, *lengths])[:-1].tolist())
+    np.testing.assert_allclose(record.velocity, np.concatenate(parts)[:, 2], atol=1e-6)
+    found = [f for f in record.findings if f.code == "clock_set_back"]
+    assert [f.evidence["times"] for f in found] == [len(parts) - 1]
+    assert {"samples_reordered", "duplicate_samples"}.isdisjoint(codes(record))
+
+
+def test_a_gap_that_the_user_allows_does_not_join_runs(tmp_path: Path) -> None:
+    rows = np.concatenate([run(300, 1), run(300, 2)])
+    assert read(tmp_path / "log.csv", rows, [*MAP, "gap=30"]).starts == (0, 300)
+
+
+def test_slow_samples_keep_their_runs_apart(tmp_path: Path) -> None:
+    rows = np.concatenate([run(50, 1), run(50, 2)])
+    rows[:, 0] *= 50  # two a second
+    assert read(tmp_path / "log.csv", rows).starts == (0, 50)
+
+
+def moved(rows: np.ndarray, row: int, to: int) -> np.ndarray:
+    order = np.insert(np.delete(np.arange(len(rows)), row), to, row)
+    return rows[order]
+
+
+def shuffled(rows: np.ndarray) -> np.ndarray:
+    return np.random.default_rng(5).permutation(rows)
+
+
+@pytest.mark.parametrize(
+    "late",
+    [
+        pytest.param(lambda rows: moved(rows, 20, 23), id="a row that came late by little"),
+        pytest.param(lambda rows: moved(rows, 20, 250), id="a row that came late by much"),
+        pytest.param(lambda rows: moved(rows, 250, 20), id="a row that came early"),
+        pytest.param(lambda rows: moved(rows, 20, 299), id="a row at the end"),
+        pytest.param(
+            lambda rows: np.concatenate([rows[:50], rows[80:120], rows[50:80], rows[120:]]),
+            id="a block that was flushed late",
+        ),
+        pytest.param(lambda rows: np.concatenate([rows[150:], rows[:150]]), id="halves swapped"),
+        pytest.param(lambda rows: rows[::-1], id="the newest first"),
+        pytest.param(shuffled, id="shuffled"),
+    ],
+)
+def test_rows_that_are_merely_out_of_order_are_sorted(tmp_path: Path, late: object) -> None:
+    rows = run(300, 4)
+    record = read(tmp_path / "log.csv", late(rows))  # type: ignore[operator]
+    np.testing.assert_allclose(record.velocity, rows[:, 2], atol=1e-6)
+    assert record.starts == (0,)
+    assert "samples_reordered" in codes(record)
+    assert "clock_set_back" not in codes(record)
+
+
+def test_rows_that_are_there_twice_are_no_run_of_their_own(tmp_path: Path) -> None:
+    rows = run(300, 6)
+    record = read(tmp_path / "log.csv", np.concatenate([rows[:200], rows[100:]]))
+    np.testing.assert_allclose(record.velocity, rows[:, 2], atol=1e-6)
+    assert "duplicate_samples" in codes(record)
+    assert "clock_set_back" not in codes(record)
+
+
+def test_rows_of_two_kinds_that_were_written_in_turn_are_no_runs() -> None:
+    time = np.concatenate(
+        [np.arange(50.0), np.arange(50.0), 50 + np.arange(50), 50 + np.arange(50)]
+    )
+    first = np.where(np.arange(200) // 50 % 2 == 0, 1.0, np.nan)
+    second = np.where(np.isnan(first), 2.0, np.nan)
+    assert runs(time, {"u": first, "w": second}) == [(0, 200)]
+
+
+def test_late_blocks_and_rows_do_not_hide_a_clock_that_starts_again() -> None:
+    """Each late block is held against what came since the last, so that many cost little."""
+    blocks = np.arange(20_000.0).reshape(-1, 20)
+    late = blocks.reshape(-1, 2, 20)[:, ::-1].ravel()
+    assert runs(late, {}) == [(0, late.size)]
+    stray = np.arange(20_000.0)
+    stray[1000::1000] -= 50
+    twice = np.concatenate([late, stray, stray])
+    assert runs(twice, {}) == [(0, 20_000), (20_000, 40_000), (40_000, 60_000)]
+
+
+def test_two_tables_of_one_clock_start_again_together(tmp_path: Path) -> None:
+    parts = [run(300, 1), run(300, 2)]
+    rows = np.concatenate(parts)
+    files = [
+        write(tmp_path / "set.csv", np.concatenate([p[:, :2] for p in parts]), "t,u"),
+        write(tmp_path / "state.csv", rows[:, [0, 2]], "t,w"),
+    ]
+    record = read_records(files, ["voltage=/set.u velocity=/state.w time=t"])["motor"]
+    assert record.starts == (0, 300)
+    np.testing.assert_allclose(record.velocity, rows[:, 2], atol=1e-6)
+    np.testing.assert_allclose(record.voltage[301:], rows[300:-1, 1], atol=1e-6)
+
+
+def test_two_tables_that_start_again_differently_are_refused(tmp_path: Path) -> None:
+    rows = np.concatenate([run(300, 1), run(300, 2)])
+    files = [
+        write(tmp_path / "set.csv", run(600, 3)[:, :2], "t,u"),
+        write(tmp_path / "state.csv", rows[:, [0, 2]], "t,w"),
+    ]
+    with pytest.raises(BagError, match=r"0 times in /set, 1 times in /state.*files of its own"):
+        read_records(files, ["voltage=/set.u velocity=/state.w time=t"])
+
+
+def test_files_of_several_runs_are_joined_with_others(tmp_path: Path) -> None:
+    two, one = np.concatenate([run(300, 1), run(300, 2)]), run(200, 3)
+    paths = [write(tmp_path / "a.csv", two), write(tmp_path / "b.csv", one)]
+    record = read_records(paths, MAP)["motor"]
+    assert record.starts == (0, 300, 600)
+
+
+def test_runs_below_one_another_do_not_hide_what_explains_the_speed(tmp_path: Path) -> None:
+    rows = np.concatenate([run(300, k) for k in range(4)])
+    path = write(tmp_path / "log.csv", rows)
+    assert list_topics(path)[0].suggestion == ["voltage=u", "velocity=w", "time=t"]
