@@ -232,8 +232,8 @@ METER = Limit(
 SILENT_SWING = Limit(
     2.0,
     "smallest steps of the sensor",
-    "physical: rounding hides a swing of up to one; the other is for the winding's lag and for "
-    "friction, of which what the voltage lets expect has no more than the first order",
+    "physical: rounding hides a swing of up to one; the other is for what the rest of a record "
+    "does not tell of the lag, the winding and the friction that make the swing small",
     "test_silence.py",
 )
 FLICKER = Limit(

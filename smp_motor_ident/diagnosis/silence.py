@@ -2,17 +2,29 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize
 from scipy.signal import lfilter
 
+from smp_motor_ident._compile import compiled
 from smp_motor_ident.diagnosis.limits import FEWEST, FLICKER, SILENT_SWING
 from smp_motor_ident.errors import SignalError
 from smp_motor_ident.record import Record
 
 Array = NDArray[np.float64]
 
-LAGS = 20  # between a sampling interval and a quarter of the record: each 1.5 times the last
+LAGS = 12  # between a sampling interval and a quarter of the record, from which a descent starts
+FRICTIONS = (
+    0.0,
+    0.1,
+    0.2,
+    0.35,
+    0.5,
+    0.7,
+)  # of the largest voltage: from none to what hardly turns
 
 
 def silent(record: Record, where: str) -> None:
@@ -43,8 +55,8 @@ def silent(record: Record, where: str) -> None:
 def _swing(record: Record, name: str, a: int, b: int) -> float:
     """Return by how many of its smallest steps the voltage lets a sensor move in a silence.
 
-    The rest of the record says how: ``speed = g x - f sign(x)``, where ``x`` is the voltage through
-    a first-order lag.  An angle swings by what the speed covers between two changes of its sign.
+    The rest of the record says how: by a motor of a lag, a winding and a friction that fits it
+    best.  An angle swings by what the speed covers between two changes of its sign.
     """
     values, step = getattr(record, name), np.diff(record.time, prepend=record.time[0])
     levels = np.diff(np.unique(values[np.isfinite(values)]))
@@ -70,16 +82,42 @@ def _swing(record: Record, name: str, a: int, b: int) -> float:
 
 def _answer(record: Record, speed: Array, known: NDArray[np.bool_]) -> Array:
     """Return the speed that the voltage lets expect, by what is known of it."""
-    step = float(np.median(np.diff(record.time)))
-    best: Array = np.zeros(len(record))
-    least = np.inf
-    for lag in np.geomspace(step, record.duration / 4, LAGS):
-        keeps = float(np.exp(-step / lag))
-        x = lfilter([1 - keeps], [1, -keeps], record.voltage)
-        columns = np.column_stack([x, np.sign(x)])
-        answer, *_ = np.linalg.lstsq(columns[known], speed[known], rcond=1e-8)
-        left = float(np.square(speed[known] - columns[known] @ answer).sum())
-        if left < least:
-            moved = columns @ answer  # friction does not drive
-            best, least = np.where(moved * answer[0] * x > 0, moved, 0.0), left
-    return best
+    step, volts = float(np.median(np.diff(record.time))), record.voltage
+    top, y = float(np.abs(volts).max()), speed[known]
+
+    def run(motor: Array) -> tuple[Array, float]:
+        """Return the motion, and what of the squares it leaves, for two log lags and friction."""
+        keeps = np.exp(-step / np.exp(np.minimum(motor[:2], 50.0)))
+        torque = np.asarray(lfilter([1 - keeps[1]], [1, -keeps[1]], volts))
+        x = _sliding(torque, float(keeps[0]), abs(float(motor[2])) * top)
+        size, alike = float(x[known] @ x[known]), float(x[known] @ y)
+        return x * (alike / size if size > 0 else 0.0), -(alike**2) / size if size > 0 else 0.0
+
+    lags = np.linspace(np.log(step), np.log(record.duration / 4), LAGS)
+    tried = [
+        np.array([lag, winding, friction])
+        for k, lag in enumerate(lags)
+        for winding in (lags[0] - 2.0, *lags[: k + 1])
+        for friction in FRICTIONS
+    ]
+    start: Array = min(tried, key=lambda motor: run(motor)[1])
+    corners = start + np.vstack([np.zeros(3), np.diag([0.3, 0.5, 0.05])])
+    options = {"initial_simplex": corners, "maxfev": 200, "xatol": 1e-3, "fatol": 0.0}
+    descend: Any = minimize  # its stubs know no initial simplex
+    found = descend(lambda motor: run(motor)[1], start, method="Nelder-Mead", options=options)
+    return run(found.x)[0]
+
+
+@compiled
+def _sliding(torque: Array, keeps: float, friction: float) -> Array:
+    """Return the speed, in volts, of a motor of one lag that sticks and slides."""
+    out = np.zeros(torque.size)
+    for n in range(1, torque.size):
+        before = out[n - 1]
+        sign = np.sign(before) if before != 0.0 else np.sign(torque[n])
+        if before == 0.0 and abs(torque[n]) <= friction:
+            continue
+        target = torque[n] - sign * friction
+        after = target + (before - target) * keeps
+        out[n] = after if after * sign > 0.0 else 0.0
+    return out

@@ -105,7 +105,9 @@ def held_out(records: Sequence[Record], fit: Fit, hold: str, scatter: float) -> 
     """Return the fit percent on records that the fit has not seen.
 
     Of their own scatter, and of that of the records that the fit has seen: where the motor
-    hardly moves, its own scatter is what the sensor adds.
+    hardly moves, its own scatter is what the sensor adds.  The latter is NaN where the motion is
+    followed as closely as the sensor lets anything: what is left then is the sensor's, not the
+    motor's, and differences of few counts make a large speed of it.
     """
     kind = "speed" if fit.kind != rc.ANGLE else "auto"
     data = prepare(records, False, kind, hold)
@@ -113,7 +115,10 @@ def held_out(records: Sequence[Record], fit: Fit, hold: str, scatter: float) -> 
         data = data.as_mean_speed()
     data = data.held(fit.structure.held)
     settled = prediction.settle(data, fit)
-    return speed_fit(records, data, settled), speed_fit(records, data, settled, scatter)
+    own = speed_fit(records, data, settled)
+    if within_resolution(data, settled):
+        return own, float("nan")
+    return own, speed_fit(records, data, settled, scatter)
 
 
 def split(records: Sequence[Record], share: float = 0.7) -> tuple[list[Record], list[Record]]:

@@ -65,3 +65,11 @@ def test_a_speed_below_the_step_of_its_sensor_is_no_dead_one(signal):
         slow = np.convolve(speed, np.ones(20) / 20, "same")
         record = replace(record, velocity=60.0 * np.round(slow / 60.0))
     silent(record, "record")
+
+
+@pytest.mark.parametrize("wheel", ["front_left", "front_right", "rear_left", "rear_right"])
+def test_a_motor_that_its_friction_stops_in_a_fast_chirp_has_no_dead_encoder(wheel):
+    volts = 10.0 * np.sin(2 * np.pi * (0.3 * TIME + 5.0 * TIME**2))
+    stops = motors.record(wheel, current=False, voltage=volts, rate=RATE, static_voltage=2.0)
+    assert np.ptp(stops.count[int(0.8 * len(stops)) :]) == 0
+    silent(replace(stops, velocity=None), "record")
