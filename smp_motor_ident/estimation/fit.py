@@ -180,6 +180,7 @@ class _Descent:
             noise, value = renewed(here.spread, noise, self.current), deviance(here.spread)
             own = list(self.own)
             value += float((self.data.known_initial * np.square(self.initial))[:, own].sum())
+            value += here.occam
             if not self.current:
                 grow = self.noise.covariance[0, 0] / noise[0, 0]
                 information, scores = information * grow, scores * grow

@@ -76,12 +76,12 @@ class Experiments:
     def known_initial(self) -> Array:
         """What is known of each segment's initial state beforehand: precisions around zero.
 
-        The voltage over a winding is no larger than the largest that drives it, and that of a
-        motor that stands no larger than what its friction holds, shape (g, 5).
+        Over a winding there is no more than the largest voltage and as much of back-EMF, and in
+        a motor that stands no more than what its friction holds, shape (g, 5).
         """
         known = np.zeros(self.initial.shape)
         largest = max(float(np.abs(self.voltage).max(initial=0.0)), 1e-150)
-        known[:, 0] = 1 / np.square(np.where(self.stood, HELD, 1.0) * largest)
+        known[:, 0] = 1 / np.square(np.where(self.stood, HELD, 2.0) * largest)
         return known
 
     @property

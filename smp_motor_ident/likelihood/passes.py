@@ -58,6 +58,8 @@ class Pass:
     local_decrease: float  # by how much the own steps alone lower the objective
     spread: Array  # shape (6,): as in `Sums`
     scores: Array  # shape (blocks, f): scores summed over runs of samples
+    # What windings that could begin as they like cost in likelihood (Laplace's approximation)
+    occam: float = 0.0
 
     def scaled(self, factor: float) -> Pass:
         """Return the same under residuals that weigh otherwise."""
@@ -193,12 +195,15 @@ def evaluate(
         common += np.outer(row, row)
         score += row * miss
         total += miss * miss
+    known = data.known_initial
+    occam = float(np.log1p(sums.normal[:, f, f] / known[:, 0]).sum()) if own[0] == 0 else 0.0
     value, away = initial[:, list(own)], (initial - start)[:, list(own)]
     prior, decrease = eliminate(
-        sums.normal, sums.gradient, away, value, data.known_initial[:, list(own)], data.size,
+        sums.normal, sums.gradient, away, value, known[:, list(own)], data.size,
         common, score, step, local_gain, sums.scores, sums.owner,
     )  # fmt: skip
     total += prior
     if not math.isfinite(total + float(common.sum()) + float(score.sum()) + float(step.sum())):
         return nowhere
-    return Pass(total, common, score, step, local_gain, decrease, sums.spread, sums.scores[:, :f])
+    return Pass(total, common, score, step, local_gain, decrease, sums.spread, sums.scores[:, :f],
+                occam)  # fmt: skip

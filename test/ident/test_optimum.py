@@ -56,7 +56,7 @@ def test_initial_fit_is_the_least_squares_optimum_that_scipy_finds_from_the_trut
     data = prepare([record], False)
     fit = initial_fit(data, Structure("linear", friction="none"), Options())
 
-    weight = np.sqrt(fit.noise[0, 0]) / np.abs(record.voltage).max()  # of the winding at first
+    weight = np.sqrt(data.known_initial[0, 0] * fit.noise[0, 0])  # of the winding at first
 
     def residual(x):
         missed = reference(record.voltage, *np.exp(x[:3]), *x[3:]) - data.output
@@ -66,7 +66,7 @@ def test_initial_fit_is_the_least_squares_optimum_that_scipy_finds_from_the_trut
     found = least_squares(residual, start, x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15)
     ours = np.concatenate([fit.z[:3], fit.initial[0, :2]])
     cost = (residual(ours) ** 2).sum()
-    # The prior on the initial state and the last step cost less than 1e-12, measured.
+    # A wide prior on the initial states and the last step cost less than 1e-12, measured.
     assert cost == pytest.approx(2 * found.cost, rel=1e-9)
     deviation = np.sqrt(np.diag(fit.covariance()))
     np.testing.assert_array_less(np.abs(fit.z[:3] - found.x[:3]), 1e-4 * deviation)

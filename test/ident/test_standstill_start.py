@@ -8,6 +8,9 @@ import pytest
 
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.likelihood.experiments import angle_quantum, prepare
+from smp_motor_ident.likelihood.noise import NoiseModel
+from smp_motor_ident.likelihood.passes import evaluate
+from smp_motor_ident.model.structures import Structure
 from smp_motor_ident.record import Record
 
 RATE = 500.0
@@ -58,10 +61,26 @@ def test_a_motor_that_turns_around_does_not_stand(angle: bool) -> None:
 
 
 def test_a_winding_begins_with_no_more_than_what_drives_it() -> None:
+    stood, moved = prepare([stepped()], False), prepare([stepped(before=-8.0, dead=0.0)], False)
+    # A tenth of the largest voltage where friction holds the motor, else twice it.
+    assert stood.known_initial[0, 0] == pytest.approx(1 / 0.8**2)
+    assert moved.known_initial[0, 0] == pytest.approx(1 / 16.0**2)
+    assert not stood.known_initial[:, 1:].any()
+
+
+def test_a_winding_that_may_begin_as_it_likes_has_its_price() -> None:
     data = prepare([stepped()], False)
-    # Precisions: a tenth of the largest voltage where friction holds the motor.
-    assert data.known_initial[0, 0] == pytest.approx(1 / 0.8**2)
-    assert not data.known_initial[:, 1:].any()
+    z = np.zeros(12)
+    z[:4] = np.log([0.05, 0.05 * LAG, 0.05 * LAG * 1e-3, 1e-3])
+    second = Structure("second_order", order=2, friction="none")
+    first = Structure("first_order", order=1, friction="none")
+    noise = NoiseModel(np.diag([0.05**2, 1.0]))
+    here = evaluate(data, second, z, data.initial, data.initial, noise)
+    # A volt over the winding for a millisecond, and the speed falls off with the motor's lag.
+    answer = 1e-3 / (0.05 * LAG) * np.exp(-data.time / LAG)
+    told = np.square(answer / 0.05).sum() * 0.8**2
+    assert here.occam == pytest.approx(np.log1p(told), rel=0.1)
+    assert evaluate(data, first, z, data.initial, data.initial, noise).occam == 0.0
 
 
 def test_the_steps_of_an_angle_show_though_few_rows_move() -> None:
