@@ -196,7 +196,8 @@ def evaluate(
         score += row * miss
         total += miss * miss
     known = data.known_initial
-    occam = float(np.log1p(sums.normal[:, f, f] / known[:, 0]).sum()) if own[0] == 0 else 0.0
+    unseen = own[0] == 0 and not structure.current  # a measured current tells how it began
+    occam = float(np.log1p(sums.normal[:, f, f] / known[:, 0]).sum()) if unseen else 0.0
     value, away = initial[:, list(own)], (initial - start)[:, list(own)]
     prior, decrease = eliminate(
         sums.normal, sums.gradient, away, value, known[:, list(own)], data.size,
