@@ -17,14 +17,7 @@ from smp_motor_ident.record import Record
 Array = NDArray[np.float64]
 
 LAGS = 12  # between a sampling interval and a quarter of the record, from which a descent starts
-FRICTIONS = (
-    0.0,
-    0.1,
-    0.2,
-    0.35,
-    0.5,
-    0.7,
-)  # of the largest voltage: from none to what hardly turns
+FRICTIONS = (0.0, 0.1, 0.2, 0.35, 0.5, 0.7)  # of the largest voltage: to what hardly turns
 
 
 def silent(record: Record, where: str) -> None:
@@ -35,6 +28,7 @@ def silent(record: Record, where: str) -> None:
             continue
         # A speed may well be constant; only at zero does it say that nothing turns.
         moves = values != 0 if name == "velocity" else np.diff(values, prepend=np.nan) != 0
+        moves[list(record.starts)] = True  # what stood in one run says nothing of the next
         edges = np.concatenate([[0], np.flatnonzero(moves), [len(record) - 1]])
         longest = int(np.argmax(np.diff(edges)))
         a, b = int(edges[longest]), int(edges[longest + 1])

@@ -73,3 +73,13 @@ def test_a_motor_that_its_friction_stops_in_a_fast_chirp_has_no_dead_encoder(whe
     stops = motors.record(wheel, current=False, voltage=volts, rate=RATE, static_voltage=2.0)
     assert np.ptp(stops.count[int(0.8 * len(stops)) :]) == 0
     silent(replace(stops, velocity=None), "record")
+
+
+def test_what_stands_at_the_end_of_one_run_says_nothing_of_the_next():
+    volts = motors.independent.excitation(np.arange(2000) / 200.0, "sine", 10.0)
+    whole = coarse("count", volts, 200.0)
+    stands = (np.arange(2000) >= 850) & (np.arange(2000) < 1150)
+    kept = np.where(stands, whole.count[850], whole.count).astype(np.int64)
+    with pytest.raises(SignalError, match="dead encoder"):
+        silent(replace(whole, count=kept), "record")
+    silent(replace(whole, count=kept, starts=(0, 1000)), "two runs")  # 150 rows each: too few
