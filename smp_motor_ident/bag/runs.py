@@ -124,9 +124,9 @@ def laid_out(tables: Mapping[str, Table], gap: float, where: str) -> dict[str, T
     if not any(numbers.values()):
         return dict(tables)
     if len(set(numbers.values())) > 1:
-        told = ", ".join(f"{number} times in {topic}" for topic, number in numbers.items())
+        times_in = ", ".join(f"{number} times in {topic}" for topic, number in numbers.items())
         raise BagError(
-            f"{where}: the time goes back {told}, so that nobody knows which run belongs to which; "
+            f"{where}: the time goes back {times_in}, and which run belongs to which is not known; "
             "give each run files of its own"
         )
     times = [log for _, _, log in _clocked(tables)]
@@ -134,9 +134,9 @@ def laid_out(tables: Mapping[str, Table], gap: float, where: str) -> dict[str, T
     count = next(iter(numbers.values()))
     moved = one_after_another(times, list(every.values()), [pause] * count)
     text = f"{where}: the time starts again {count} times, as of runs written one below another"
-    told_once = found("clock_set_back", f"{text}; a new segment each", "warning", times=count)
+    warning = found("clock_set_back", f"{text}; a new segment each", "warning", times=count)
     return {
-        topic: replace(table, log=time, findings=[*table.findings, told_once])
+        topic: replace(table, log=time, findings=[*table.findings, warning])
         for (topic, table, _), time in zip(_clocked(tables), moved)
     }
 

@@ -320,7 +320,7 @@ EFFECT_BLOCKS = Limit(
 EFFECT_OWN = Limit(
     1e-2,
     "share of the sum of squares",
-    "an effect's shape is known to a tenth at best: what the model imitates to that is not told",
+    "an effect's shape is known to a tenth at best: what the model imitates so far shows nothing",
     "test_adequacy.py",
 )
 BUNCHED = Limit(

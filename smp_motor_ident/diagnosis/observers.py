@@ -33,7 +33,7 @@ from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.prediction import inverse
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import Experiments
-from smp_motor_ident.likelihood.noise import gain_for, transition
+from smp_motor_ident.likelihood.noise import gain_for, transition, whitening
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import LN_R, TE
 
@@ -113,17 +113,13 @@ def _linearised(data: Experiments, fit: Fit, ways: Array) -> tuple[Array, Array]
     """Return innovations, shape (n, o), and sensitivities, shape (n, o, p), by their noise."""
     base, values = predicted(data, fit), measured(data)
     known = np.isfinite(values)
-    white = _whitening(fit, values.shape[1])
+    outputs = values.shape[1]
+    white = whitening(fit.noise)[:outputs, :outputs]
     errors = np.where(known, values - base, 0.0) @ white.T
     columns = np.stack(own_responses(data, fit, base), axis=-1)
     free = len(ways)
     columns = np.concatenate([columns[:, :, :free] @ ways, columns[:, :, free:]], axis=-1)
     return errors, white @ np.where(known[:, :, None], columns, 0.0)
-
-
-def _whitening(fit: Fit, outputs: int) -> Array:
-    """Return what makes innovations white and of unit variance, shape (o, o)."""
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(fit.noise[:outputs, :outputs])))
 
 
 def _estimator(responses: Array, free: int) -> Array:
@@ -135,23 +131,25 @@ def _estimator(responses: Array, free: int) -> Array:
 def _on_innovations(data: Experiments, fit: Fit, gain: Array, weights: Array) -> Array:
     """Return ``H' weights``: what weights of a slower observer's errors are on the innovations."""
     outputs = weights.shape[1]
-    seen = np.zeros((outputs, 3))
-    seen[0, 2] = 1.0
+    output = np.zeros((outputs, 3))
+    output[0, 2] = 1.0
     if outputs == 2:
-        seen[1, 0] = np.exp(-fit.z[LN_R])
+        output[1, 0] = np.exp(-fit.z[LN_R])
     step = transition(fit.z, fit.structure.order, data.step)
     difference = step @ (gain - fit.gain)[:, :outputs]
-    closed = step @ (np.eye(3) - gain[:, :outputs] @ seen)
-    white = _whitening(fit, outputs)
+    closed = step @ (np.eye(3) - gain[:, :outputs] @ output)
+    white = whitening(fit.noise)[:outputs, :outputs]
     ends = np.zeros(data.size, dtype=np.bool_)
     ends[np.asarray(data.starts[1:]) - 1] = True
-    raw = _backwards(white.T @ weights, ends, closed, difference, seen)
+    raw = _backwards(white.T @ weights, ends, closed, difference, output)
     return np.asarray(np.linalg.solve(white.T, raw))
 
 
 @compiled
-def _backwards(weights: Array, ends: Flags, closed: Array, difference: Array, seen: Array) -> Array:
-    """Run the adjoint of ``d+ = closed d + difference e, f = e - seen d`` through each segment."""
+def _backwards(
+    weights: Array, ends: Flags, closed: Array, difference: Array, output: Array
+) -> Array:
+    """Run the adjoint of ``d+ = closed d + difference e, f = e - output d`` in each segment."""
     out = weights.copy()
     adjoint = np.zeros((3, weights.shape[2]))
     last = adjoint.copy()
@@ -167,7 +165,7 @@ def _backwards(weights: Array, ends: Flags, closed: Array, difference: Array, se
                 for i in range(3):
                     total += closed[i, j] * adjoint[i, c]
                 for o in range(weights.shape[1]):
-                    total -= seen[o, j] * weights[t, o, c]
+                    total -= output[o, j] * weights[t, o, c]
                 last[j, c] = total
         adjoint, last = last, adjoint
     return out

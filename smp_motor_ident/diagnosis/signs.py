@@ -1,4 +1,4 @@
-"""How well a signal follows the voltage, and how well the reversed voltage: told from mere lag.
+"""How well a signal follows the voltage, and how well the reversed voltage: apart from mere lag.
 
 A motor answers late: by its lag, at most a quarter of a period, and by what sampling and transport
 take.  Where that comes to half a period, a late answer is a reversed one, and nothing tells them.

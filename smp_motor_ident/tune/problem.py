@@ -67,7 +67,7 @@ class Problem:
         """Noise density of the measured speed on the grid, shape (f,)."""
         return noise_density(self.plant, self.loop, self.omega)
 
-    def shaken(self, response: Complex) -> Array:
+    def noise_rms(self, response: Complex) -> Array:
         """Return the rms that measurement noise causes by responses to it, shape (..., f)."""
         power = np.trapezoid(np.abs(response) ** 2 * self.noise, self.omega, axis=-1)
         return np.asarray(np.sqrt(power / self.omega[-1]))
@@ -163,4 +163,4 @@ def noise_density(plant: Plant, loop: Loop, omega: Array) -> Array:
 def control_noise(problem: Problem, feedback: Feedback) -> float:
     """Return the voltage that measurement noise causes at the controller's output."""
     control = feedback.response(problem.omega, problem.loop.sample_time)
-    return float(problem.shaken(control / (1 + problem.response * control)))
+    return float(problem.noise_rms(control / (1 + problem.response * control)))

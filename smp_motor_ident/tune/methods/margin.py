@@ -216,8 +216,8 @@ def _hold(problem: Problem, c: _Candidates, margin: float, peak: float, hump: fl
     # Outside the unit circle of Ms there may still be a later crossover: check each of them.
     near = np.abs(np.abs(loop) - 1) < 0.1
     good &= np.where(near, np.abs(np.angle(-loop)), np.pi).min(axis=1) >= np.deg2rad(0.9 * margin)
-    good &= problem.shaken(control * back) <= problem.loop.noise_limit
-    shaking = problem.shaken(control * back * problem.true_response)
+    good &= problem.noise_rms(control * back) <= problem.loop.noise_limit
+    shaking = problem.noise_rms(control * back * problem.true_response)
     top = problem.loop.supply_voltage / float(problem.plant.motors.a0[0])
     return np.asarray(good & (shaking <= SPEED_NOISE.value * top))
 

@@ -95,7 +95,9 @@ class _Cost:
         back = 1 / (1 + control * problem.response)
         peak = np.abs(back).max(axis=1)
         excess = np.maximum(peak - REQUIRED.sensitivity, 0) * 20
-        excess += np.maximum(problem.shaken(control * back) / problem.loop.noise_limit - 1, 0) * 20
+        excess += (
+            np.maximum(problem.noise_rms(control * back) / problem.loop.noise_limit - 1, 0) * 20
+        )
         value = errors.sum(axis=0) + 10 * np.maximum(over - 0.1, 0) + excess
         return np.where(np.isfinite(value), value, 1e9)
 
