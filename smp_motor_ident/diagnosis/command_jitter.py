@@ -8,8 +8,8 @@ have the variance
 
 over the changes ``k`` of the command, where no other noise knows when it changed.  The regression
 of ``e^2`` on ``x`` gives s2, with a standard deviation that allows for any other variance (White).
-Times that are never negative have a mean beside their scatter: of those between nothing and a
-period, uniformly, it is three times the variance that the mean has for its square.
+Times that are never negative have a mean beside their scatter: where they are uniform from nothing
+to a period, the square of the mean is three times the variance.
 
 References
 ----------

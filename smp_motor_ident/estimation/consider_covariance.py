@@ -41,7 +41,7 @@ def consider_timing(data: Experiments, fit: Fit, instant: float) -> Fit:
 def consider_late(data: Experiments, fit: Fit, late: float) -> Fit:
     """Return the fit with its covariance widened by a delay [s] beside that which was fitted."""
     structure = fit.structure
-    if not structure.delay:
+    if models.DELAY not in structure.free():
         return consider_timing(data, fit, late)
     answer = _beside(data, fit, structure, models.DELAY).answer
     row = np.insert(answer, structure.free().index(models.DELAY), 1.0)

@@ -62,3 +62,11 @@ def test_the_scatter_of_commands_is_found_and_covered(seed: int) -> None:
         quantity = found.combinations[name]
         assert quantity.value is not None and quantity.std is not None
         assert abs(quantity.value - true[name]) < 3.5 * quantity.std, name
+
+
+def test_a_delay_that_is_declared_stays_so_under_scatter() -> None:
+    found = estimate(recorded(1.0, 0), fixed={"delay": 0.5 / RATE})
+    assert found.combinations["delay"].value == 0.5 / RATE
+    lag = found.combinations["time_constant"]
+    assert lag.value is not None and lag.std is not None
+    assert abs(lag.value - motors.truth("rear_left", 0.0)["time_constant"]) < 3.5 * lag.std
