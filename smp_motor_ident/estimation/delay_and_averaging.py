@@ -12,7 +12,7 @@ import numpy as np
 from smp_motor_ident.estimation import data_window, descent, start
 from smp_motor_ident.estimation.choice import preferred
 from smp_motor_ident.estimation.fit import Fit, Options
-from smp_motor_ident.estimation.initialisation import initial_fit
+from smp_motor_ident.estimation.initialisation import first_fit
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import Structure
@@ -21,6 +21,20 @@ DELAYS = (0.3, 1.5, 3.5)  # samples at which a delay is begun that torque noise 
 
 
 def with_delay(
+    data: Experiments, delayed: Structure, options: Options, plain: Fit | None
+) -> Fit | None:
+    """Fit with a delay, and with a whole number of samples of it."""
+    first = first_with_delay(data, delayed, options, plain)
+    return first and settled(data, first, options, plain)
+
+
+def settled(data: Experiments, first: Fit, options: Options, near: Fit | None) -> Fit:
+    """Carry a first fit on to all data, and to its torque noise."""
+    fit = data_window.grow(data, first.structure, first, options, near)
+    return _snap(data, fit, options) if first.structure.delay else fit
+
+
+def first_with_delay(
     data: Experiments, delayed: Structure, options: Options, plain: Fit | None
 ) -> Fit | None:
     """Fit with a delay, started from several: the surface has a minimum for each sample."""
@@ -35,18 +49,15 @@ def with_delay(
         for z in start.lagged_candidates(data, structure, lag):
             z[models.DELAY] = max(lag - 0.5, 0.1) * data.step
             starts.append(z)
-    fit = initial_fit(data, delayed, options, starts, keep=4, own=False, near=plain)
-    return _snap(data, fit, options)
+    return first_fit(data, delayed, options, starts, keep=4, own=False)
 
 
-def _snap(data: Experiments, fit: Fit | None, options: Options) -> Fit | None:
+def _snap(data: Experiments, fit: Fit, options: Options) -> Fit:
     """Try a whole number of samples of delay: the surface has a kink there.
 
     A switch of the input that falls on a sampling instant makes the derivative by the delay
     jump; a descent that comes near such a point stays short of it.
     """
-    if fit is None:
-        return None
     best = fit
     for n in {int(fit.z[models.DELAY] / data.step), int(fit.z[models.DELAY] / data.step) + 1}:
         whole = fit.structure.with_(fixed={**fit.structure.fixed, "delay": n * data.step})
@@ -56,7 +67,7 @@ def _snap(data: Experiments, fit: Fit | None, options: Options) -> Fit | None:
     return best
 
 
-def with_averaging(
+def first_with_averaging(
     data: Experiments, structure: Structure, options: Options, twin: Fit | None
 ) -> Fit | None:
     """Fit a speed averaged over a window, started from what looked like a delay."""
@@ -79,10 +90,8 @@ def with_averaging(
             z[models.A2] = z[models.A1] + np.log(0.3 * lag)
             z[models.TE] = z[models.A2] - z[models.A1]
         starts.append(z)
-    mean = data.as_mean_speed()
     own = structure.order == 2 and not structure.delay
-    fitted = initial_fit(mean, structure, options, starts, keep=3, own=own)
-    return _snap(mean, fitted, options) if structure.delay else fitted
+    return first_fit(data.as_mean_speed(), structure, options, starts, keep=3, own=own)
 
 
 def delay_without_noise(data: Experiments, best: Fit, options: Options) -> Fit | None:

@@ -70,6 +70,19 @@ def initial_fit(
     near: Fit | None = None,
 ) -> Fit | None:
     """Fit a structure without any guess."""
+    first = first_fit(data, structure, options, extra, keep, own)
+    return first and grow(data, structure, first, options, near)
+
+
+def first_fit(
+    data: Experiments,
+    structure: Structure,
+    options: Options,
+    extra: Sequence[Array] = (),
+    keep: int = 3,
+    own: bool = True,
+) -> Fit | None:
+    """Fit a structure to the beginning of the data: the likeliest of several starts."""
     subset = data.data_window(min(8.0, SCREENING_SAMPLES * data.step))
     found = [*extra, *(candidates(data, structure) if own else [])]
     starts = [z for z in map(structure.complete, found) if np.all(np.isfinite(z))]
@@ -100,7 +113,7 @@ def initial_fit(
     assert best is not None
     if structure.current:
         best = _elsewhere(subset, structure, best, options)
-    return grow(data, structure, best, options, near)
+    return best
 
 
 def _elsewhere(subset: Experiments, structure: Structure, best: Fit, options: Options) -> Fit:

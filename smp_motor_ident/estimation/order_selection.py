@@ -26,11 +26,13 @@ from smp_motor_ident.estimation.choice import (
 )
 from smp_motor_ident.estimation.current_lag import with_current_lag
 from smp_motor_ident.estimation.delay_and_averaging import (
-    with_averaging,
+    first_with_averaging,
+    first_with_delay,
+    settled,
     with_delay,
 )
 from smp_motor_ident.estimation.fit import Fit, Options
-from smp_motor_ident.estimation.initialisation import initial_fit
+from smp_motor_ident.estimation.initialisation import first_fit, initial_fit
 from smp_motor_ident.estimation.ridge import random_restart, slower_winding
 from smp_motor_ident.estimation.thinning import thinned
 from smp_motor_ident.estimation.variations import friction_shows, may_rub, varied
@@ -118,17 +120,16 @@ def _orders(
     Candidates that the screening subset rejects by far are not fitted to all of a long record.
     """
     part = descent.screening_subset(thinned(data))
-    tried = _on_subset(
-        part, _structures(base, data.kind == rc.SPEED, data.quantum > 0), options, say
-    )
-    least = min((f.deviance for f in tried), default=0.0)
+    structures = _structures(base, data.kind == rc.SPEED, data.quantum > 0)
+    tried = _first_fits(part, structures, options, say)
+    if part is not data:
+        tried = _left(data, tried, candidates)
+    tried = _on_subset(part, tried, options)
+    if part is not data:
+        tried = _left(data, tried, candidates)
     best: Fit | None = None
     for fitted in tried:
         if part is not data:
-            if fitted.deviance > least + SUBSET_HOPELESS.value * sandwich_factor(fitted):
-                reason = f"rejected on {part.size} samples"
-                candidates.append(FittedCandidate(_projected(data, fitted), reason, whole=False))
-                continue
             fitted = _on_all(data, fitted, [r.fit for r in candidates if r.whole], options)
         if best is None:
             better, reason = True, "the simplest left" if candidates else "the simplest"
@@ -139,17 +140,48 @@ def _orders(
     return best and simplest_left(next(r for r in candidates if r.fit is best), candidates)
 
 
-def _on_subset(
+def _first_fits(
     part: Experiments, structures: list[Structure], options: Options, say: Say
 ) -> list[Fit]:
-    """Fit all candidates to the screening subset, each started from the others' answers too."""
+    """Fit all candidates to the beginning of the screening subset."""
     tried: list[Fit] = []
     for structure in structures:
         say(f"fitting {label(structure)}")
-        fitted = _one(part, structure, options, tried)
-        if fitted is not None:
-            tried.append(no_worse(of_kind(part, fitted), fitted, tried, options))
+        fitted = _first(part, structure, options, tried)
+        tried += [fitted] if fitted is not None else []
+    return tried
+
+
+def _left(data: Experiments, tried: list[Fit], candidates: list[FittedCandidate]) -> list[Fit]:
+    """Return the fits that the samples so far do not reject by far; note the others."""
+    least = min((f.deviance for f in tried), default=0.0)
+    left = []
+    for fit in tried:
+        if fit.deviance > least + SUBSET_HOPELESS.value * sandwich_factor(fit):
+            reason = f"rejected on {fit.samples} samples"
+            candidates.append(FittedCandidate(_projected(data, fit), reason, whole=False))
+        else:
+            left.append(fit)
+    return left
+
+
+def _on_subset(part: Experiments, firsts: list[Fit], options: Options) -> list[Fit]:
+    """Fit candidates to the screening subset, each started from the others' answers too."""
+    tried: list[Fit] = []
+    for first in firsts:
+        there = of_kind(part, first)
+        fitted = settled(there, first, options, _near(first.structure, tried))
+        tried.append(no_worse(there, fitted, tried, options))
     return from_rivals(part, from_richer(part, tried, options), options)
+
+
+def _near(structure: Structure, known: list[Fit]) -> Fit | None:
+    """Return the fit whose torque noise a candidate is likely to have."""
+    if structure.window:
+        return None
+    if structure.delay:
+        return _find(known, structure.with_(delay=False))
+    return min(known, key=lambda f: f.deviance, default=None)
 
 
 def _on_all(data: Experiments, fit: Fit, known: list[Fit], options: Options) -> Fit:
@@ -198,16 +230,19 @@ def _structures(base: Structure, speed: bool, coarse: bool) -> list[Structure]:
     return [r for r in candidates if not (r.delay and "delay" in base.fixed)]
 
 
-def _one(data: Experiments, structure: Structure, options: Options, known: list[Fit]) -> Fit | None:
-    """Fit one candidate, started from what the simpler ones found."""
+def _first(
+    data: Experiments, structure: Structure, options: Options, known: list[Fit]
+) -> Fit | None:
+    """Fit one candidate first, started from what the simpler ones found."""
     if structure.window:
         late = replace(structure, name="first_order", order=1, shape=False, delay=True)
         twin = _find(known, late) or _find(known, late.with_(window=False))
         if twin is None or structure.order == 1:
             twin = _find(known, structure.with_(window=False, delay=True))
-        return with_averaging(data, structure, options, twin)
+        return first_with_averaging(data, structure, options, twin)
     if structure.delay:
-        return with_delay(data, structure, options, _find(known, structure.with_(delay=False)))
+        plain = _find(known, structure.with_(delay=False))
+        return first_with_delay(data, structure, options, plain)
     extra = []
     if structure.order == 2 and known:
         z = min(known, key=lambda f: f.deviance).z.copy()
@@ -216,8 +251,7 @@ def _one(data: Experiments, structure: Structure, options: Options, known: list[
         z[models.TE] = z[models.A2] - z[models.A1]
         z[models.DELAY] = 0.0
         extra = [z]
-    near = min(known, key=lambda f: f.deviance, default=None)
-    return initial_fit(data, structure, options, extra, near=near)
+    return first_fit(data, structure, options, extra)
 
 
 def _find(known: list[Fit], structure: Structure) -> Fit | None:
