@@ -28,6 +28,7 @@ from smp_motor_ident.model.structures import Structure
 
 Array = NDArray[np.float64]
 
+ALIKE = 0.05  # e-folds or volts by which starts differ that end alike
 SHAPES = 6  # of the same linear response that are refined
 OPEN = 0.02  # standard deviation of ln L/R or ln R above which other starts are tried
 WINDING = 0.2  # of a sample: a shorter L/R has settled to a hundredth when the current is read
@@ -91,14 +92,10 @@ def first_fit(
     noise = first_noise(subset)
     ranked = _ranked(subset, structure, starts, noise)
     best: Fit | None = None
-    tried: list[Array] = []
     if models.TE in structure.free() and not structure.current:
-        shaped = [other for z in _distinct(ranked, data.step, 2) for other in shapes(z)]
+        shaped = [other for z in ranked[:2] for other in shapes(z)]
         ranked, keep = _ranked(subset, structure, shaped, noise), SHAPES
-    for z in ranked:
-        if any(_alike(z, other, data.step) for other in tried):
-            continue
-        tried.append(z)
+    for z in ranked[:keep]:
         noise_ratio = noise_ratio_of(bandwidth(z, subset), subset.step, subset.kind)
         begun = Start(z, subset.initial, noise, noise_ratio)
         one = solve(subset, structure, begun, options, 25, 0.1)
@@ -108,8 +105,6 @@ def first_fit(
         agreed = again and models.TE not in structure.free()
         if (agreed or structure.friction == "none") and one.converged:
             break  # two starts agree, or the surface is smooth
-        if len(tried) == keep:
-            break
     assert best is not None
     if structure.current:
         best = _elsewhere(subset, structure, best, options)
@@ -149,25 +144,27 @@ def _likelier(subset: Experiments, z: Array, best: Fit, options: Options) -> Fit
     return other if other.deviance < best.deviance - 1 else best
 
 
-def _distinct(ranked: Sequence[Array], step: float, keep: int) -> list[Array]:
+def _distinct(starts: Sequence[Array], step: float) -> list[Array]:
+    """Return starts without those from which a descent would end as from one before them."""
+    apart = np.full(len(models.Z_NAMES), np.inf)
+    apart[: models.VC_PLUS + 1] = ALIKE
+    apart[[models.DELAY, models.WINDOW]] = 0.5 * step
+    scaled = np.array(starts) / apart
+    left = np.arange(len(starts))
     out: list[Array] = []
-    for z in ranked:
-        if len(out) < keep and not any(_alike(z, other, step) for other in out):
-            out.append(z)
+    while left.size:
+        out.append(starts[left[0]])
+        left = left[np.abs(scaled[left] - scaled[left[0]]).max(axis=1) >= 1]
     return out
-
-
-def _alike(z: Array, other: Array, step: float) -> bool:
-    d = np.abs(z - other)
-    late = max(d[models.DELAY], d[models.WINDOW]) / step
-    return bool(d[:5].max() < 0.05 and late < 0.5)
 
 
 def _ranked(
     subset: Experiments, structure: Structure, starts: list[Array], noise: Array
 ) -> list[Array]:
-    """Return starts, the likeliest first."""
-    return sorted(starts, key=lambda z: _score(subset, structure, z, noise))
+    """Return starts, the likeliest first; of those that are alike, one."""
+    return sorted(
+        _distinct(starts, subset.step), key=lambda z: _score(subset, structure, z, noise)
+    )
 
 
 def _score(subset: Experiments, structure: Structure, z: Array, noise: Array) -> float:

@@ -197,7 +197,8 @@ def evaluate(
         total += miss * miss
     known = data.known_initial
     unseen = own[0] == 0 and not structure.current  # a measured current tells how it began
-    occam = float(np.log1p(sums.normal[:, f, f] / known[:, 0]).sum()) if unseen else 0.0
+    both = np.stack([known[:, 0], known[:, 0] + sums.normal[:, f, f]])
+    occam = float(np.diff(np.log(both), axis=0).sum()) if unseen else 0.0
     value, away = initial[:, list(own)], (initial - start)[:, list(own)]
     prior, decrease = eliminate(
         sums.normal, sums.gradient, away, value, known[:, list(own)], data.size,
