@@ -162,9 +162,7 @@ def _ranked(
     subset: Experiments, structure: Structure, starts: list[Array], noise: Array
 ) -> list[Array]:
     """Return starts, the likeliest first; of those that are alike, one."""
-    return sorted(
-        _distinct(starts, subset.step), key=lambda z: _score(subset, structure, z, noise)
-    )
+    return sorted(_distinct(starts, subset.step), key=lambda z: _score(subset, structure, z, noise))
 
 
 def _score(subset: Experiments, structure: Structure, z: Array, noise: Array) -> float:
