@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from smp_motor_ident.diagnosis.limits import LARGEST_OFFSET, LOOSE_QUANTITY, WORST_FIT
-from smp_motor_ident.diagnosis.validation import speed_fit, within_resolution
+from smp_motor_ident.diagnosis.validation import speed_fit, stands, within_resolution
 from smp_motor_ident.errors import CurrentError, InsufficientExcitationError, SignalError
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.prediction import simulate
@@ -36,6 +36,11 @@ def refuse(
 ) -> None:
     """Refuse what the model does not explain, and what the data hardly tell."""
     explained = np.isfinite(fitted) and fitted >= WORST_FIT.value
+    if not explained and stands(data, fit):
+        raise InsufficientExcitationError(
+            f"{where(group)}: the motor stands: what its angle moves is the sensor's scatter, "
+            f"while the voltage reaches {np.abs(data.hold_value).max():.3g} V; drive harder"
+        )
     if not explained and not within_resolution(data, fit) and not _follows(group, data, fit):
         raise SignalError(
             f"{where(group)}: the voltage does not explain the motion (fit {fitted:.0f} %); check "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,6 +66,15 @@ def within_resolution(data: Experiments, fit: Fit) -> bool:
     scatter = _roughness(data.output)
     own = max(data.quantum**2 / 12, scatter if moved < SMOOTH * scatter else 0.0)
     return bool(fit.noise[0, 0] < UNEXPLAINED.value * own)
+
+
+def stands(data: Experiments, fit: Fit) -> bool:
+    """Tell whether the free run of an angle stays within what its sensor scatters."""
+    if data.kind != rc.ANGLE or fit.noise_ratio > 0:
+        return False
+    angle = prediction.outputs(data, fit)
+    parts = (angle[a:b] for a, b in pairwise(data.starts))
+    return bool(max(np.var(part) for part in parts) < UNEXPLAINED.value * fit.noise[0, 0])
 
 
 def _roughness(angle: Array) -> float:

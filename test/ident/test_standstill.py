@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from smp_motor_ident.errors import InsufficientExcitationError
+from smp_motor_ident.estimate import estimate
 from smp_motor_ident.likelihood.experiments import REST, prepare
 from smp_motor_ident.record import Hardware, Record
 
@@ -39,3 +41,22 @@ def test_slow_motion_is_left_as_it_is() -> None:
 @pytest.mark.parametrize("rest", [REST, 10 * REST])
 def test_how_long_it_stands_adds_nothing(rest: int) -> None:
     assert len(told(counted([0, 1, 2, *[3] * rest, 4, 5]))) == 6
+
+
+def test_a_motor_that_stands_under_a_noisy_angle_is_refused_whatever_its_current_tells() -> None:
+    resistance, inductance, step = 4.0, 0.02, 0.01
+    rng = np.random.default_rng(3)
+    voltage = np.repeat(rng.choice([-0.1, 0.0, 0.1], 40), 15)
+    decay = np.exp(-step * resistance / inductance)
+    current = np.zeros(voltage.size)
+    for k in range(1, voltage.size):  # a row's voltage ran before it
+        current[k] = decay * current[k - 1] + (1 - decay) * voltage[k] / resistance
+    record = Record(
+        "w",
+        step * np.arange(voltage.size),
+        voltage,
+        position=1e-3 * rng.standard_normal(voltage.size),
+        current=current + 1e-4 * rng.standard_normal(voltage.size),
+    )
+    with pytest.raises(InsufficientExcitationError, match="the motor stands"):
+        estimate(record)
