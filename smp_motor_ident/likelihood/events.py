@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 
 from smp_motor_ident._compile import compiled, inlined
 from smp_motor_ident.likelihood.current_sensor import after_move, before_move
-from smp_motor_ident.likelihood.propagator import BE, TE, TM, K, speed_at
+from smp_motor_ident.likelihood.propagator import BE, ROW, TE, TM, K, speed_at
 from smp_motor_ident.likelihood.sensitivities import (
+    FORCED,
     LANES,
     SENSOR,
     SLOTS,
     SW,
-    WHOLE,
     activate,
     fill,
     slide_columns,
@@ -91,15 +91,25 @@ def _zero_crossing(  # noqa: C901 - one search, branches for how it starts
 
 
 @inlined
-def keeps_turning(m: Array, par: Array, x: Array, sign: float, v: float, f: float) -> bool:
+def keeps_turning(m: Array, at: int, par: Array, x: Array, sign: float, v: float, f: float) -> bool:
     """Tell from the propagator at hand that the speed does not reach zero on the way."""
     q, w = x[0], x[1]
-    end = m[WHOLE + 2] * q + m[WHOLE + 3] * w + m[WHOLE + 7] * v - m[WHOLE + 10] * f
+    end = (
+        m[at + ROW * LANES + 2] * q
+        + m[at + ROW * LANES + 3] * w
+        + m[at + ROW * LANES + 7] * v
+        - m[at + ROW * LANES + 10] * f
+    )
     if sign * end < 0.0 or sign * w <= 0.0:
         return False
     if par[TE] == 0.0:
         return True
-    drive = m[WHOLE] * q + m[WHOLE + 1] * w + m[WHOLE + 6] * v - m[WHOLE + 9] * f
+    drive = (
+        m[at + ROW * LANES] * q
+        + m[at + ROW * LANES + 1] * w
+        + m[at + ROW * LANES + 6] * v
+        - m[at + ROW * LANES + 9] * f
+    )
     return not (sign * (q - par[BE] * w - f) < 0.0 and sign * (drive - par[BE] * end - f) > 0.0)
 
 
@@ -169,11 +179,11 @@ def advance(
         t = _zero_crossing(left, par, x, direction, v, f)
         span = t if t >= 0.0 else left
         fill(span, par, m, cache, SLOTS, scratch)
-        activate(m, cache, marks, SLOTS)
+        activate(m, cache, marks, SLOTS, 0)
         if lags:
             before_move(x, m)
-        slide_columns(m, x[0], x[1], v, f)
-        slide_state(m, x, v, f)
+        slide_columns(m, FORCED, x[0], x[1], v, f)
+        slide_state(m, FORCED, x, v, f)
         if lags:
             after_move(span, v, f, False, par, x, m, marks)
         if t < 0.0:

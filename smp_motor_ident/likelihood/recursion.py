@@ -36,9 +36,12 @@ from smp_motor_ident.likelihood.observation import (
 from smp_motor_ident.likelihood.propagator import TE, TM
 from smp_motor_ident.likelihood.sensitivities import (
     ACTIVE,
+    BESIDE,
     D0,
     D1,
+    FORCED,
     LANES,
+    OTHER,
     RATE,
     SENSOR,
     SLOPE,
@@ -62,6 +65,37 @@ ON_DELAY = SLOPE + DELAY * LANES
 
 
 @inlined
+def _slide(
+    at: int,
+    h: float,
+    v: float,
+    direction: float,
+    load: float,
+    friction: bool,
+    par: Array,
+    x: Array,
+    m: Array,
+    marks: Array,
+    columns: bool,
+) -> bool:
+    """Advance with the propagator of a bank, if the motor turns on."""
+    f = load
+    if friction:
+        f += par[VC_PLUS] if direction > 0.0 else -par[VC_MINUS]
+        if not keeps_turning(m, at, par, x, direction, v, f):
+            return False
+    lags = marks[SENSOR] > 0.0
+    if lags:
+        before_move(x, m)
+    if columns:
+        slide_columns(m, at, x[0], x[1], v, f)
+    slide_state(m, at, x, v, f)
+    if lags:
+        after_move(h, v, f, False, par, x, m, marks)
+    return True
+
+
+@inlined
 def _move(
     h: float,
     slack: float,
@@ -81,21 +115,18 @@ def _move(
     """Advance by h at constant v; return the direction of motion."""
     if direction == STUCK:
         return advance(h, v, direction, load, par, x, m, cache, marks, scratch)
-    if abs(marks[ACTIVE] - h) > slack:
-        prepare_slide(h, slack, par, m, cache, marks, table, scratch)
-    f = load
-    if friction:
-        f += par[VC_PLUS] if direction > 0.0 else -par[VC_MINUS]
-        if not keeps_turning(m, par, x, direction, v, f):
-            return advance(h, v, direction, load, par, x, m, cache, marks, scratch)
-    lags = marks[SENSOR] > 0.0
-    if lags:
-        before_move(x, m)
-    if columns:
-        slide_columns(m, x[0], x[1], v, f)
-    slide_state(m, x, v, f)
-    if lags:
-        after_move(h, v, f, False, par, x, m, marks)
+    if abs(marks[ACTIVE] - h) <= slack:
+        bank = 0
+    elif abs(marks[BESIDE] - h) <= slack:
+        bank = 1
+    else:
+        bank = prepare_slide(h, slack, par, m, cache, marks, table, scratch)
+    if bank == 0:
+        turns = _slide(FORCED, h, v, direction, load, friction, par, x, m, marks, columns)
+    else:
+        turns = _slide(OTHER, h, v, direction, load, friction, par, x, m, marks, columns)
+    if not turns:
+        return advance(h, v, direction, load, par, x, m, cache, marks, scratch)
     return direction
 
 

@@ -42,15 +42,16 @@ KEPT = SLOPE + 12 * LANES
 BEFORE = KEPT + LANES
 FORCED = BEFORE + 3 * LANES  # 12 rows: derivative of the propagator at hand by each column
 WHOLE = FORCED + ROW * LANES  # the propagator itself, 12 numbers
-SIZE = WHOLE + ROW
+OTHER = WHOLE + ROW + 4  # the same of a second propagator: a delay cuts intervals in two
+SIZE = OTHER + ROW * LANES + ROW
 SLOTS = 4  # propagators that are kept, one more is scratch
 SLOT = ROW * LANES + ROW
 CACHE = (SLOTS + 1) * SLOT
-# Beside the propagators: their lengths [s], the next to be overwritten, the length at hand,
-# the middle and half the range of the lengths that are tabulated, whether there are columns that
-# the propagator's derivatives reach, which sensor shows the current, and
+# Beside the propagators: their lengths [s], the next to be overwritten, the lengths in both banks,
+# the bank that is next, the middle and half the range of the lengths that are tabulated, whether
+# there are columns that the propagator's derivatives reach, which sensor shows the current, and
 # the rate of its low-pass [1/s].
-NEXT, ACTIVE, MIDDLE, HALF, REACHED, SENSOR, RATE, MARKS = range(SLOTS, SLOTS + 8)
+NEXT, ACTIVE, BESIDE, BANK, MIDDLE, HALF, REACHED, SENSOR, RATE, MARKS = range(SLOTS, SLOTS + 10)
 
 
 @compiled
@@ -85,17 +86,16 @@ def fill(h: float, par: Array, m: Array, cache: Array, slot: int, scratch: Array
 
 
 @compiled
-def activate(m: Array, cache: Array, marks: Array, slot: int) -> None:
-    """Put a slot's propagator where `slide` finds it."""
-    at = slot * SLOT
+def activate(m: Array, cache: Array, marks: Array, slot: int, bank: int) -> None:
+    """Put a slot's propagator into a bank, where `slide` finds it."""
+    at, to = slot * SLOT, FORCED if bank == 0 else OTHER
     if marks[REACHED] > 0.0:
         for n in range(SLOT):
-            m[FORCED + n] = cache[at + n]
+            m[to + n] = cache[at + n]
     else:
-        at += SLOT - ROW
-        for n in range(ROW):
-            m[WHOLE + n] = cache[at + n]
-    marks[ACTIVE] = marks[slot] if slot < SLOTS else -1.0
+        for n in range(SLOT - ROW, SLOT):
+            m[to + n] = cache[at + n]
+    marks[ACTIVE + bank] = marks[slot] if slot < SLOTS else -1.0
 
 
 @compiled
@@ -126,69 +126,92 @@ def prepare_slide(
     marks: Array,
     table: Array,
     scratch: Array,
-) -> None:
-    """Have the propagator over h at hand: tabulated, kept, or computed."""
+) -> int:
+    """Return the bank that has the propagator over h: tabulated, kept, or computed."""
     if table.shape[0] > 0 and abs(h - marks[MIDDLE]) <= marks[HALF]:
         evaluate(table, (h - marks[MIDDLE]) / marks[HALF], m, FORCED)
         marks[ACTIVE] = h
-        return
+        return 0
+    bank = int(marks[BANK])
+    marks[BANK] = 1 - bank
     for n in range(SLOTS):
         if abs(marks[n] - h) <= slack:
-            activate(m, cache, marks, n)
-            return
+            activate(m, cache, marks, n, bank)
+            return bank
     slot = int(marks[NEXT])
     marks[NEXT] = (slot + 1) % SLOTS
     marks[slot] = h
     fill(h, par, m, cache, slot, scratch)
-    activate(m, cache, marks, slot)
+    activate(m, cache, marks, slot, bank)
+    return bank
 
 
-@compiled
-def slide_columns(m: Array, q: float, w: float, v: float, f: float) -> None:
+@inlined
+def slide_columns(m: Array, at: int, q: float, w: float, v: float, f: float) -> None:
     """Advance all columns over the interval at hand; q, w: state at its beginning."""
-    e00, e01, e10, e11 = m[WHOLE], m[WHOLE + 1], m[WHOLE + 2], m[WHOLE + 3]
-    h0, h1 = m[WHOLE + 4], m[WHOLE + 5]
-    g0, g1, g2 = m[WHOLE + 9], m[WHOLE + 10], m[WHOLE + 11]
+    e00, e01, e10, e11 = (
+        m[at + ROW * LANES],
+        m[at + ROW * LANES + 1],
+        m[at + ROW * LANES + 2],
+        m[at + ROW * LANES + 3],
+    )
+    h0, h1 = m[at + ROW * LANES + 4], m[at + ROW * LANES + 5]
+    g0, g1, g2 = m[at + ROW * LANES + 9], m[at + ROW * LANES + 10], m[at + ROW * LANES + 11]
     for j in range(LANES):
         a, b, c = m[SQ + j], m[SW + j], m[DF + j]
         new_q = (
             e00 * a
             + e01 * b
             - g0 * c
-            + m[FORCED + j] * q
-            + m[FORCED + LANES + j] * w
-            + m[FORCED + 6 * LANES + j] * v
-            - m[FORCED + 9 * LANES + j] * f
+            + m[at + j] * q
+            + m[at + LANES + j] * w
+            + m[at + 6 * LANES + j] * v
+            - m[at + 9 * LANES + j] * f
         )
         new_w = (
             e10 * a
             + e11 * b
             - g1 * c
-            + m[FORCED + 2 * LANES + j] * q
-            + m[FORCED + 3 * LANES + j] * w
-            + m[FORCED + 7 * LANES + j] * v
-            - m[FORCED + 10 * LANES + j] * f
+            + m[at + 2 * LANES + j] * q
+            + m[at + 3 * LANES + j] * w
+            + m[at + 7 * LANES + j] * v
+            - m[at + 10 * LANES + j] * f
         )
         m[ST + j] += (
             h0 * a
             + h1 * b
             - g2 * c
-            + m[FORCED + 4 * LANES + j] * q
-            + m[FORCED + 5 * LANES + j] * w
-            + m[FORCED + 8 * LANES + j] * v
-            - m[FORCED + 11 * LANES + j] * f
+            + m[at + 4 * LANES + j] * q
+            + m[at + 5 * LANES + j] * w
+            + m[at + 8 * LANES + j] * v
+            - m[at + 11 * LANES + j] * f
         )
         m[SQ + j] = new_q
         m[SW + j] = new_w
 
 
 @inlined
-def slide_state(m: Array, x: Array, v: float, f: float) -> None:
+def slide_state(m: Array, at: int, x: Array, v: float, f: float) -> None:
     """Advance the state over the interval at hand."""
     q, w = x[0], x[1]
-    x[0] = m[WHOLE] * q + m[WHOLE + 1] * w + m[WHOLE + 6] * v - m[WHOLE + 9] * f
-    x[1] = m[WHOLE + 2] * q + m[WHOLE + 3] * w + m[WHOLE + 7] * v - m[WHOLE + 10] * f
-    x[2] += m[WHOLE + 4] * q + m[WHOLE + 5] * w + m[WHOLE + 8] * v - m[WHOLE + 11] * f
+    x[0] = (
+        m[at + ROW * LANES] * q
+        + m[at + ROW * LANES + 1] * w
+        + m[at + ROW * LANES + 6] * v
+        - m[at + ROW * LANES + 9] * f
+    )
+    x[1] = (
+        m[at + ROW * LANES + 2] * q
+        + m[at + ROW * LANES + 3] * w
+        + m[at + ROW * LANES + 7] * v
+        - m[at + ROW * LANES + 10] * f
+    )
+    x[2] += (
+        m[at + ROW * LANES + 4] * q
+        + m[at + ROW * LANES + 5] * w
+        + m[at + ROW * LANES + 8] * v
+        - m[at + ROW * LANES + 11] * f
+    )
 
 
 @compiled
@@ -217,7 +240,8 @@ def begin(
     """Return the lanes, cache, marks and scratch of a run."""
     m, cache, marks = _aligned(SIZE), _aligned(CACHE), np.full(MARKS, -1.0)
     n_common = slope.shape[1]
-    marks[NEXT], marks[REACHED], marks[SENSOR] = 0.0, 1.0 if n_common > 0 else 0.0, 0.0
+    marks[NEXT] = marks[BANK] = 0.0
+    marks[REACHED], marks[SENSOR] = 1.0 if n_common > 0 else 0.0, 0.0
     for j in range(n_common):
         for i in range(12):
             m[SLOPE + LANES * i + j] = slope[i, j]
