@@ -48,6 +48,7 @@ from smp_motor_ident.likelihood.sensitivities import (
     SQ,
     SW,
     begin,
+    fade,
     prepare_slide,
     slide_columns,
     slide_state,
@@ -300,6 +301,7 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
             cost[g] += loss0 + loss1
             if filled >= block_length or count > TILE - 2:
                 sum_up(rows, count, p, tile, normal[g], gradient[g], blocks[block])
+                fade(m)
                 count = 0
             if filled >= block_length:
                 block += 1

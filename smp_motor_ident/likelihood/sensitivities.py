@@ -44,6 +44,7 @@ FORCED = BEFORE + 3 * LANES  # 12 rows: derivative of the propagator at hand by 
 WHOLE = FORCED + ROW * LANES  # the propagator itself, 12 numbers
 OTHER = WHOLE + ROW + 4  # the same of a second propagator: a delay cuts intervals in two
 SIZE = OTHER + ROW * LANES + ROW
+GONE = 1e-100  # of a sensitivity: its square is still a normal number
 SLOTS = 4  # propagators that are kept, one more is scratch
 SLOT = ROW * LANES + ROW
 CACHE = (SLOTS + 1) * SLOT
@@ -224,6 +225,14 @@ def stay(h: float, par: Array, x: Array, m: Array, v: float) -> None:
     x[0] = v + (x[0] - v) * e
     for j in range(LANES):
         m[SQ + j] = e * m[SQ + j] + d * m[SLOPE + j]
+
+
+@compiled
+def fade(m: Array) -> None:
+    """Put to nothing what has decayed so far: numbers too small to be normal cost ten times more."""
+    for j in range(3 * LANES):
+        if abs(m[j]) < GONE:
+            m[j] = 0.0
 
 
 @compiled

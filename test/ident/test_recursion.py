@@ -120,3 +120,14 @@ def test_coordinates_that_are_no_numbers_are_no_motor_and_no_crash():
     z = np.full(len(models.Z_NAMES), np.nan)  # as a descent's overflow leaves it
     found = evaluate(data, structure, z, data.initial, data.initial, NoiseModel())
     assert found.objective == np.inf
+
+
+def test_a_beginning_that_has_faded_is_nothing_and_costs_nothing():
+    recording = motors.record("rear_right", current=False, kinds=("sine",), seconds=60.0)
+    data = prepare([recording], False, "speed")
+    structure = Structure("second_order")
+    z = models.from_physical(*independent.TABLE_1["rear_right"])
+    sums = gather(data, structure, z, data.initial)
+    own = np.abs(sums.scores[-1, -2:])
+    # After a thousand time constants; a number that is not normal would take ten times as long.
+    assert not own.any()
