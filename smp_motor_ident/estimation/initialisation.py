@@ -30,6 +30,7 @@ Array = NDArray[np.float64]
 
 ALIKE = 0.05  # e-folds or volts by which starts differ that end alike
 SHAPES = 6  # of the same linear response that are refined
+LAGS, SAMPLES = 50.0, 2_000  # of a motor, and at least, on which starts are compared
 OPEN = 0.02  # standard deviation of ln L/R or ln R above which other starts are tried
 WINDING = 0.2  # of a sample: a shorter L/R has settled to a hundredth when the current is read
 
@@ -61,6 +62,17 @@ def candidates(data: Experiments, structure: Structure) -> list[Array]:
     return found
 
 
+def beginning(data: Experiments) -> Experiments:
+    """Return as much of the data as tells starts apart: some seconds, or less of a quick motor."""
+    whole = data.data_window(min(8.0, SCREENING_SAMPLES * data.step))
+    lags = [np.exp(z[models.A1] - z[models.A0]) for z in start.speed_candidates(whole, 1)]
+    if not lags:
+        return data
+    few = data.data_window(max(LAGS * float(np.median(lags)), SAMPLES * data.step))
+    moved = np.ptp(few.voltage) > 0.5 * np.ptp(whole.voltage)  # of the same both ways
+    return few if moved and few.size < whole.size else data
+
+
 def initial_fit(
     data: Experiments,
     structure: Structure,
@@ -71,7 +83,7 @@ def initial_fit(
     near: Fit | None = None,
 ) -> Fit | None:
     """Fit a structure without any guess."""
-    first = first_fit(data, structure, options, extra, keep, own)
+    first = first_fit(beginning(data), structure, options, extra, keep, own)
     return first and grow(data, structure, first, options, near)
 
 

@@ -32,7 +32,7 @@ from smp_motor_ident.estimation.delay_and_averaging import (
     with_delay,
 )
 from smp_motor_ident.estimation.fit import Fit, Options
-from smp_motor_ident.estimation.initialisation import first_fit, initial_fit
+from smp_motor_ident.estimation.initialisation import beginning, first_fit, initial_fit
 from smp_motor_ident.estimation.ridge import random_restart, slower_winding
 from smp_motor_ident.estimation.thinning import thinned
 from smp_motor_ident.estimation.variations import friction_shows, may_rub, varied
@@ -145,6 +145,7 @@ def _first_fits(
 ) -> list[Fit]:
     """Fit all candidates to the beginning of the screening subset."""
     tried: list[Fit] = []
+    part = beginning(part)
     for structure in structures:
         say(f"fitting {label(structure)}")
         fitted = _first(part, structure, options, tried)
