@@ -45,8 +45,9 @@ class _Descent:
         start: Start,
         options: Options,
         bounds: tuple[Array, Array],
+        known: Fit | None,
     ) -> None:
-        self.data, self.structure, self.options = data, structure, options
+        self.data, self.structure, self.options, self.known = data, structure, options, known
         self.noise_ratio, self.bounds = start.noise_ratio, bounds
         self.matrix = structure.matrix()
         self.own = own_columns(data, structure)
@@ -107,6 +108,13 @@ class _Descent:
         """Tell whether an undamped step would stay within half a standard deviation."""
         return self._solved(1e-9)[1] < 0.5
 
+    def arrived(self) -> bool:
+        """Tell whether it is within a standard deviation of a fit that is known: it ends there."""
+        if self.known is None or not self.known.converged:
+            return False
+        away = (self.z - self.known.z)[list(self.structure.free())]
+        return bool(away @ self.known.information @ away < 1.0)
+
     def _solved(self, damping: float) -> tuple[Array, float]:
         """Return the damped step and its length; along the edge of a motor's shapes, if there."""
         normal, gradient = self.here.normal, self.here.gradient
@@ -156,6 +164,8 @@ class _Descent:
                 return
             if new.objective <= before * (1 + 1e-12):
                 self.z, self.initial, self.here = z, initial, new
+                if self.arrived():
+                    return
                 self.damping = max(self.damping * 0.1, 1e-9)
                 if small or (gained < 1e-9 * new.objective and self.damping < FREE):
                     self.converged = True
@@ -209,11 +219,13 @@ def solve(
     options: Options | None = None,
     iterations: int = 40,
     tolerance: float = 1e-2,
+    known: Fit | None = None,
 ) -> Fit:
     """Minimise the innovations' sum of squares from a start, noise covariance included.
 
     Levenberg-Marquardt in z with the initial states eliminated; the noise covariance is
-    re-estimated from the residuals until it stays (concentrated likelihood).
+    re-estimated from the residuals until it stays (concentrated likelihood).  A descent that
+    comes as near to a fit that is ``known`` as the data tell would end there: that is returned.
     """
     options = options or Options()
     lower, upper = _bounds(FASTEST * data.step if data.current.size else 0.0)
@@ -226,11 +238,13 @@ def solve(
         lower if options.lower is None else options.lower,
         upper if options.upper is None else options.upper,
     )
-    descent = _Descent(data, structure, start, options, bounds)
+    descent = _Descent(data, structure, start, options, bounds, known)
     for n in range(ROUNDS):
         if not math.isfinite(descent.here.objective):
             break
         descent.descend(iterations, tolerance, n == 0)
+        if known is not None and descent.arrived():
+            return known
         before = descent.noise.covariance
         fresh = renewed(descent.here.spread, before, descent.current)
         same = np.abs(np.log(np.diag(fresh) / np.diag(before))).max() < 2e-2

@@ -110,7 +110,7 @@ def first_fit(
     for z in ranked[:keep]:
         noise_ratio = noise_ratio_of(bandwidth(z, subset), subset.step, subset.kind)
         begun = Start(z, subset.initial, noise, noise_ratio)
-        one = solve(subset, structure, begun, options, 25, 0.1)
+        one = solve(subset, structure, begun, options, 25, 0.1, best)
         again = best is not None and abs(one.deviance - best.deviance) < 0.1
         if best is None or better(one, best):
             best = one

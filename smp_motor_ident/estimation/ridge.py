@@ -112,7 +112,7 @@ def slower_winding(z: Array, ln_te: float) -> Array:
 
 def _from(z: Array, part: Experiments, structure: Structure, best: Fit, options: Options) -> Fit:
     """Descend from other coordinates in the surroundings of the best fit so far."""
-    return solve(part, structure, best.at(structure.complete(z)), options, 30)
+    return solve(part, structure, best.at(structure.complete(z)), options, 30, known=best)
 
 
 def _along_lag(part: Experiments, structure: Structure, best: Fit, options: Options) -> Fit:
