@@ -216,9 +216,11 @@ def _stated(
     errors = regression(final, chosen, gear)
     chosen, parts = dependent(chosen, errors)
 
+    weight = _weights(data, candidates)
+
     def said(fit: Fit) -> tuple[Answer, dict[str, float]]:
         own = answer(fit, request.known, friction_std, driven_longest(final))
-        return _covering(data, candidates, own, request.known)
+        return _covering(weight, candidates, own, request.known)
 
     result, alike = said(chosen)
     fitted = validate.speed_fit(group, final, chosen)
@@ -295,24 +297,32 @@ def _certain(
     return chosen, friction_std, change
 
 
+def _weights(data: Experiments, candidates: Sequence[FittedCandidate]) -> dict[int, float]:
+    """Return the weights of the structures that explain the data as well, by their places."""
+    last = len(candidates) - 1
+    places = [n for n, r in enumerate(candidates) if n < last and r.whole and r.fit.converged]
+    if data.quantum > 0:  # a speed in coarse steps is a difference of counts, by its making
+        places = [n for n in places if candidates[n].fit.kind == candidates[last].fit.kind]
+    if not places:
+        return {}
+    places = [last, *places]
+    found = weights(lambda fit: of_kind(data, fit), [candidates[n].fit for n in places])
+    return dict(zip(places, map(float, found), strict=True))
+
+
 def _covering(
-    data: Experiments,
+    weight: Mapping[int, float],
     candidates: Sequence[FittedCandidate],
     result: Answer,
     known: Mapping[str, float],
 ) -> tuple[Answer, dict[str, float]]:
     """Return the answer over all structures that explain the data as well, and their weights."""
-    whole = [r for r in candidates[:-1] if r.whole and r.fit.converged]
-    if data.quantum > 0:  # a speed in coarse steps is a difference of counts, by its making
-        whole = [r for r in whole if r.fit.kind == candidates[-1].fit.kind]
-    if not whole or result.level:
+    if not weight or result.level:
         return result, {}
-    fits = [candidates[-1].fit, *(r.fit for r in whole)]
-    weight = weights(lambda fit: of_kind(data, fit), fits)
-    found = averaged(result, weight, [answer(f, known) for f in fits[1:]])
-    labels = [candidates[-1].label, *(r.label for r in whole)]
-    alike = {n: float(w) for n, w in zip(labels, weight, strict=True) if w > CANDIDATE_WEIGHT.value}
-    return found, alike if len(alike) > 1 else {}
+    others = [answer(candidates[n].fit, known) for n in list(weight)[1:]]
+    found = averaged(result, np.array(list(weight.values())), others)
+    likely = {candidates[n].label: w for n, w in weight.items() if w > CANDIDATE_WEIGHT.value}
+    return found, likely if len(likely) > 1 else {}
 
 
 def _name(structure: Structure) -> str:

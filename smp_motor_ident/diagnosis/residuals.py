@@ -31,7 +31,7 @@ def residual_tests(data: Experiments, fit: Fit, lags: int = 25) -> ResidualTests
     ----------
     L. Ljung, *System Identification: Theory for the User*, 2nd ed., section 16.6.
     """
-    residual = data.output - prediction.outputs(data, fit, gain=True)
+    residual = data.output - prediction.simulate(data, fit, gain=True)[:, 1]
     voltage = voltage_at_samples(data)
     ok = np.isfinite(residual)
     e = np.where(ok, residual - residual[ok].mean(), 0.0)[:MOST]

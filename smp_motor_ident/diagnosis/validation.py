@@ -62,7 +62,7 @@ def within_resolution(data: Experiments, fit: Fit) -> bool:
     """
     if data.kind != rc.ANGLE or fit.noise_ratio > 0:
         return False
-    moved = _roughness(prediction.outputs(data, fit))
+    moved = _roughness(prediction.simulate(data, fit)[:, 1])
     scatter = _roughness(data.output)
     own = max(data.quantum**2 / 12, scatter if moved < SMOOTH * scatter else 0.0)
     return bool(fit.noise[0, 0] < UNEXPLAINED.value * own)
@@ -72,7 +72,7 @@ def stands(data: Experiments, fit: Fit) -> bool:
     """Tell whether the free run of an angle stays within what its sensor scatters."""
     if data.kind != rc.ANGLE or fit.noise_ratio > 0:
         return False
-    angle = prediction.outputs(data, fit)
+    angle = prediction.simulate(data, fit)[:, 1]
     parts = (angle[a:b] for a, b in pairwise(data.starts))
     return bool(max(np.var(part) for part in parts) < UNEXPLAINED.value * fit.noise[0, 0])
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident.estimation.fit import Fit, solve
+from smp_motor_ident.estimation.memory import remembered
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.noise import NO_GAIN, NoiseModel
 from smp_motor_ident.likelihood.passes import BLOCKS, Pass, evaluate, gather
@@ -19,28 +20,39 @@ from smp_motor_ident.model.structures import Structure
 
 Array = NDArray[np.float64]
 
+PASSES = 8  # normal equations that are kept of each data
+
 
 def simulate(data: Experiments, fit: Fit, gain: bool = False) -> Array:
-    """Return speed, output and current as the fitted motor predicts them."""
-    return _predict(data, fit, gain, 3 if data.current.size else 2)
+    """Return speed, output and current as the fitted motor predicts them; not to be changed."""
+    own = fit.gain if gain and fit.gain.any() else NO_GAIN
+    columns = 3 if data.current.size else 2
+    question = (fit.structure, fit.z, fit.initial, own)
+    return remembered(data, "run", 1, question, lambda: _predict(data, fit, own, columns))
 
 
-def outputs(data: Experiments, fit: Fit, gain: bool = False) -> Array:
+def outputs(data: Experiments, fit: Fit) -> Array:
     """Return the output alone as the fitted motor predicts it."""
-    return _predict(data, fit, gain, 1)[:, 0]
+    return _predict(data, fit, NO_GAIN, 1)[:, 0]
 
 
-def _predict(data: Experiments, fit: Fit, gain: bool, columns: int) -> Array:
+def _predict(data: Experiments, fit: Fit, gain: Array, columns: int) -> Array:
     predicted = np.empty((data.size, columns))
-    noise = NoiseModel(fit.noise, fit.gain if gain else NO_GAIN)
+    noise = NoiseModel(fit.noise, gain)
     gather(data, fit.structure, fit.z, fit.initial, noise, predicted, differentiate=False)
+    predicted.flags.writeable = False
     return predicted
 
 
 def again(data: Experiments, structure: Structure, fit: Fit, blocks: int = BLOCKS) -> Pass:
     """Return normal equations of experiments at a fit, with the coordinates of a structure."""
-    z, noise = structure.complete(fit.z), fit.noise_model()
-    return evaluate(data, structure, z, fit.initial, fit.initial, noise, blocks=blocks)
+
+    def run() -> Pass:
+        z, noise = structure.complete(fit.z), fit.noise_model()
+        return evaluate(data, structure, z, fit.initial, fit.initial, noise, blocks=blocks)
+
+    question = (structure, blocks, fit.z, fit.initial, fit.noise, fit.gain)
+    return remembered(data, "pass", PASSES, question, run)
 
 
 def inverse(normal: Array, rcond: float = 1e-13) -> Array:

@@ -23,6 +23,7 @@ from smp_motor_ident.diagnosis.limits import HOMOGENEITY, SEGMENT_INFORMATION, S
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.fitted import NORMAL_95, PLAUSIBLE
 from smp_motor_ident.estimation.prediction import inverse as inverse_of
+from smp_motor_ident.estimation.prediction import simulate
 from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.passes import gather
@@ -152,10 +153,7 @@ def _parted(data: Experiments, fit: Fit, parts: int) -> Experiments:
     owner = np.searchsorted(data.starts, starts[:-1], side="right") - 1
     first = np.empty(starts.size - 1, dtype=np.int64)
     initial = np.zeros((starts.size - 1, 5))
-    predicted = np.empty((data.size, 2))
-    gather(
-        data, fit.structure, fit.z, fit.initial, fit.noise_model(), predicted, differentiate=False
-    )
+    predicted = simulate(data, fit, gain=True)
     current = data.current.copy()
     reach = 2 * fit.z[models.CURRENT_LAG] * (fit.structure.current_sensor == "averaged")
     for n, (begin, g) in enumerate(zip(starts[:-1], owner, strict=True)):
