@@ -163,6 +163,16 @@ def may_rub(data: Experiments, fit: Fit, options: Options) -> bool:
     """
     if one_level(data, fit) or friction_shows(data, fit, True):
         return True
+    subset = of_kind(descent.screening_subset(data), fit)
+    if subset.size < data.size:
+        there = descent.refine(subset, fit.structure, fit, fit.z, options)
+        if _lost_by_rubbing(subset, there, options) > SUBSET_HOPELESS.value:
+            return False
+    return _lost_by_rubbing(data, fit, options) < RISE
+
+
+def _lost_by_rubbing(data: Experiments, fit: Fit, options: Options) -> float:
+    """Return by how much worse a friction that is just not little explains the data [deviance]."""
     little = _little(data)
     z, initials = rubbing(data, fit, little)
     fixed = {**fit.structure.fixed, "vc_plus": little}
@@ -171,4 +181,4 @@ def may_rub(data: Experiments, fit: Fit, options: Options) -> bool:
         (solve(data, rubs, fit.at(rubs.complete(z), i), options, 12) for i in initials),
         key=lambda f: f.deviance,
     )
-    return other.deviance - fit.deviance < RISE * sandwich_factor(fit)
+    return (other.deviance - fit.deviance) / sandwich_factor(fit)
