@@ -389,7 +389,9 @@ def _candidates(
     for n, candidate in enumerate(candidates):
         last = n == len(candidates) - 1
         fit = chosen if last else candidate.fit
-        value = validate.speed_fit(group, of_kind(data, fit), fit)
+        part = candidate.on
+        seen = (group, data) if part is None else ([], part)
+        value = validate.speed_fit(seen[0], of_kind(seen[1], fit), fit)
         if value < LEAST_FIT.value and not last:
             value = float("nan")  # a descent that left the motor behind has no fit to speak of
         out.append(

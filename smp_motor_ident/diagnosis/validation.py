@@ -47,7 +47,7 @@ def speed_fit(
     lag = _lag(data, predicted[:, 1])
     best = percent(_means(data, _filled(data), lag), _means(data, predicted[:, 1], lag), scatter)
     given = [r.velocity for r in records]
-    if all(v is not None for v in given):
+    if given and all(v is not None for v in given):
         velocity = np.concatenate([v for v in given if v is not None])
         means = _means(data, predicted[:, 1], 1)
         reported = percent(velocity, at_once, scatter), percent(velocity, means, scatter)

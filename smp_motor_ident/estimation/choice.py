@@ -21,6 +21,7 @@ class FittedCandidate:
     fit: Fit
     reason: str = ""
     whole: bool = True
+    on: Experiments | None = None  # the part of the data that it was fitted to, if not all
 
     @property
     def label(self) -> str:
@@ -77,6 +78,22 @@ def worth_a_fit(data: Experiments, best: Fit, richer: Structure) -> bool:
     gain, _, _ = prediction.predicted_decrease(data, best, richer)
     price = (size(richer) - size(best.structure)) * float(np.log(best.samples))
     return not gain < 0.5 * price * sandwich_factor(best)
+
+
+def more_shows(part: Experiments, data: Experiments, best: Fit, on_part: Fit, rich: Fit) -> bool:
+    """Tell whether a richer fit of a part of the data is worth one of all of them.
+
+    It is not where it gains next to nothing on the part, and the score of all data neither: to
+    first order a speed averaged over a window is one that comes late by half of it.
+    """
+    s = rich.structure
+    late = s.with_(window=False, delay=True) if rich.kind != best.kind else s
+    if best.noise_ratio > 0 or not set(best.structure.free()) < set(late.free()):
+        return True
+    price = float(np.log(part.size)) + PRIOR_ODDS.value
+    if on_part.deviance - rich.deviance > price or not rich.converged:
+        return True
+    return worth_a_fit(data, best, late)
 
 
 def preferred(best: Fit, other: Fit) -> tuple[bool, str]:

@@ -19,6 +19,7 @@ from smp_motor_ident.estimation.candidate_starts import (
 from smp_motor_ident.estimation.choice import (
     FittedCandidate,
     label,
+    more_shows,
     preferred,
     sandwich_factor,
     simplest_left,
@@ -123,20 +124,27 @@ def _orders(
     structures = _structures(base, data.kind == rc.SPEED, data.quantum > 0)
     tried = _first_fits(part, structures, options, say)
     if part is not data:
-        tried = _left(data, tried, candidates)
+        tried = _left(data, part, tried, candidates)
     tried = _on_subset(part, tried, options)
     if part is not data:
-        tried = _left(data, tried, candidates)
+        tried = _left(data, part, tried, candidates)
     best: Fit | None = None
-    for fitted in tried:
+    on_part: Fit | None = None  # the best, as it was there
+    for there in tried:
+        fitted = there
         if part is not data:
-            fitted = _on_all(data, fitted, [r.fit for r in candidates if r.whole], options)
+            if best and on_part and not more_shows(part, data, best, on_part, there):
+                words = f"no better than {label(best.structure)} by its score"
+                deviance = best.deviance - (on_part.deviance - there.deviance)
+                candidates.append(_rejected(data, part, there, words, deviance))
+                continue
+            fitted = _on_all(data, there, [r.fit for r in candidates if r.whole], options)
         if best is None:
             better, reason = True, "the simplest left" if candidates else "the simplest"
         else:
             better, reason = preferred(best, fitted)
         candidates.append(FittedCandidate(fitted, reason))
-        best = fitted if better else best
+        best, on_part = (fitted, there) if better else (best, on_part)
     return best and simplest_left(next(r for r in candidates if r.fit is best), candidates)
 
 
@@ -153,14 +161,17 @@ def _first_fits(
     return tried
 
 
-def _left(data: Experiments, tried: list[Fit], candidates: list[FittedCandidate]) -> list[Fit]:
+def _left(
+    data: Experiments, part: Experiments, tried: list[Fit], candidates: list[FittedCandidate]
+) -> list[Fit]:
     """Return the fits that the samples so far do not reject by far; note the others."""
     least = min((f.deviance for f in tried), default=0.0)
     left = []
     for fit in tried:
         if fit.deviance > least + SUBSET_HOPELESS.value * sandwich_factor(fit):
             reason = f"rejected on {fit.samples} samples"
-            candidates.append(FittedCandidate(_projected(data, fit), reason, whole=False))
+            projected = fit.deviance * data.size / fit.samples
+            candidates.append(_rejected(data, part, fit, reason, projected))
         else:
             left.append(fit)
     return left
@@ -201,14 +212,13 @@ def _on_all(data: Experiments, fit: Fit, known: list[Fit], options: Options) -> 
     return no_worse(every, fit, known, options)
 
 
-def _projected(data: Experiments, fit: Fit) -> Fit:
-    """Return a fit of the screening subset with its deviance projected to all data."""
-    return replace(
-        fit,
-        initial=descent.initial_of(data, fit),
-        deviance=fit.deviance * data.size / fit.samples,
-        samples=data.size,
-    )
+def _rejected(
+    data: Experiments, part: Experiments, fit: Fit, reason: str, deviance: float
+) -> FittedCandidate:
+    """Return a fit of a part as one of all data, of which the deviance is what it would be."""
+    initial = descent.initial_of(data, fit)
+    fit = replace(fit, initial=initial, deviance=deviance, samples=data.size)
+    return FittedCandidate(fit, reason, whole=False, on=part)
 
 
 def _structures(base: Structure, speed: bool, coarse: bool) -> list[Structure]:
