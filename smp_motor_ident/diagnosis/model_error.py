@@ -1,12 +1,12 @@
 """The model's error and its responses to effects, the model's own coordinates projected out.
 
-Every column is a difference of two passes over the data, so it bends, sticks, is delayed and is
-corrected by the measurements as the model is.
+Every column is carried through a pass over the data beside the motor, as its sensitivities are: it
+sticks, is delayed and is corrected by the measurements as the model is.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -19,14 +19,15 @@ from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments
-from smp_motor_ident.likelihood.passes import own_columns
+from smp_motor_ident.likelihood.passes import answers, own_columns, row_starts
+from smp_motor_ident.likelihood.sensitivities import LANES
 from smp_motor_ident.model.structures import LN_R, TE, to_internal
 
 Array = NDArray[np.float64]
 
 BLOCKS = 40  # whose sums of scores give the covariance
 ROWS = 6_000  # of each output that the regression has at most
-NUDGE = 1e-3  # of a signal's size: small against what bends, large against rounding
+ROOM = 16_000_000  # numbers in a table of signals
 SEGMENTS = 20  # beyond which only the angle's offset of each is projected out
 
 
@@ -51,22 +52,25 @@ def regression(data: Experiments, fit: Fit, gear: float) -> Regression | None:
     """Return residuals and responses, whitened, the model's coordinates projected out."""
     if not fit.structure.free() or data.size < 4 * BLOCKS:
         return None
-    base = predicted(data, fit)
-    columns = [stacked(data, fit, measured(data) - base)]
-    columns += [stacked(data, fit, c) for c in own_responses(data, fit, base)]
-    n_own = len(columns) - 1
-    members: list[tuple[Effect, tuple[int, ...]]] = []
     sections, samples = motions(data, fit, gear)
-    for effect in EFFECTS:
-        made = [response(data, fit, base, s) for s in signals(effect, sections, samples)]
-        if made:
-            first = len(columns) - 1 - n_own
-            members.append((effect, tuple(range(first, first + len(made)))))
-            columns += [stacked(data, fit, c) for c in made]
+    members: list[tuple[Effect, tuple[int, ...]]] = []
+
+    def made() -> Iterator[Signal]:
+        count = 0
+        for effect in EFFECTS:
+            several = signals(effect, sections, samples)
+            if several:
+                members.append((effect, tuple(range(count, count + len(several)))))
+            count += len(several)
+            yield from several
+
+    own = whitened(data, fit, own_responses(data, fit, together(data)))
+    error = stacked(data, fit, measured(data) - predicted(data, fit))
+    columns = [error, *own, *whitened(data, fit, responses(data, fit, made()))]
     table = np.array(columns).T  # columns stay together in memory
     if np.count_nonzero(columns[0]) < 4 * BLOCKS or not np.isfinite(table).all():
         return None
-    whole = _projected(table, n_own, _blocks(data), members, len(fit.structure.free()))
+    whole = _projected(table, len(own), _blocks(data), members, len(fit.structure.free()))
     return replace(whole, conditions=_conditions(data, samples))
 
 
@@ -80,7 +84,7 @@ def _conditions(data: Experiments, m: Motion) -> dict[str, Array]:
         "direction": np.sign(m.speed),
         "braking": np.sign(power),
     }
-    begins = np.arange(0, data.size, _together(data))
+    begins = row_starts(data, together(data))
     out = {name: half[begins] for name, half in kinds.items()}
     if data.current.size:
         out = {name: np.tile(half, 2) for name, half in out.items()}
@@ -137,52 +141,54 @@ def stacked(data: Experiments, fit: Fit, columns: Array) -> Array:
     Of long records the sums over so many samples that `ROWS` of each are left, over the root of
     their number: what the effects do is slow, and a sum of errors is as good as they are.
     """
-    values = measured(data)
-    begins = np.arange(0, data.size, _together(data))
-    parts = []
-    for k in range(columns.shape[1]):
-        known = np.where(np.isfinite(values[:, k]), columns[:, k], 0.0)
-        sums = np.add.reduceat(known, begins)
-        parts.append(sums / np.sqrt(fit.noise[k, k] * _together(data)))
-    return np.concatenate(parts)
+    known = np.where(np.isfinite(measured(data)), columns, 0.0)
+    sums = np.add.reduceat(known, row_starts(data, together(data)), axis=0)
+    return whitened(data, fit, sums[:, :, None])[0]
 
 
-def _together(data: Experiments) -> int:
+def whitened(data: Experiments, fit: Fit, sums: Array) -> list[Array]:
+    """Return the same of sums by rows, shape (rows, o, c): c columns."""
+    count = np.diff(row_starts(data, together(data)), append=data.size)
+    outputs = sums.shape[1]
+    unit = np.sqrt(count[:, None] * np.diag(fit.noise)[:outputs])
+    return list((sums / unit[:, :, None]).transpose(2, 1, 0).reshape(sums.shape[2], -1))
+
+
+def together(data: Experiments) -> int:
     """Return how many samples make a row."""
     return max(1, data.size // ROWS)
 
 
 def _blocks(data: Experiments) -> NDArray[np.int64]:
-    begins = np.arange(0, data.size, _together(data))
+    begins = row_starts(data, together(data))
     block = begins * BLOCKS // data.size
     return np.tile(block, 2 if data.current.size else 1)
 
 
-def own_responses(data: Experiments, fit: Fit, base: Array) -> list[Array]:
-    """Return the sensitivities to the free coordinates and to each segment's initial state."""
-    structure = fit.structure
-    # With all others fixed: coordinates that hang together (L/R of next to nothing) leave a
-    # motor for other physics within their joint deviations.
-    deviation = 1 / np.sqrt(np.maximum(np.diag(fit.information), 1e-300))
-    out = []
-    for j in range(len(structure.free())):
-        step = 0.3 * float(np.clip(deviation[j], 1e-9, 0.05))
-        z = fit.z + step * structure.matrix()[:, j]
-        out.append((predicted(data, replace(fit, z=z)) - base) / step)
-    columns = own_columns(data, structure)
-    segments = len(data.starts) - 1
-    if segments > SEGMENTS:
-        columns = tuple(c for c in columns if c == 2)
-    size = {0: 1e-3, 1: 1e-3 * (1 + np.abs(fit.initial[:, 1]).max()), 2: 1e-3, 3: 1e-3, 4: 1e-3}
-    for c in columns:
-        initial = fit.initial.copy()
-        initial[:, c] += size[c]
-        moved = (predicted(data, replace(fit, initial=initial)) - base) / size[c]
-        for a, b in zip(data.starts[:-1], data.starts[1:]):
-            part = np.zeros_like(moved)
-            part[a:b] = moved[a:b]
-            out.append(part)
-    return out
+def own_responses(data: Experiments, fit: Fit, together: int = 1) -> Array:
+    """Return the sensitivities to the free coordinates and to each segment's initial state.
+
+    Shape (rows, o, f + s), summed over rows of so many samples.
+    """
+    none = np.zeros((0, 0)), np.zeros((0, 0, 0))
+    sums = _answers(data, fit, none, together, True)
+    free, columns = len(fit.structure.free()), own_columns(data, fit.structure)
+    begins, segments = row_starts(data, together), len(data.starts) - 1
+    parts = [sums[:, :, :free]]
+    for n, c in enumerate(columns):
+        if segments <= SEGMENTS or c == 2:
+            owner = begins[:, None] >= data.starts[:-1]
+            owner &= begins[:, None] < data.starts[1:]
+            parts.append(sums[:, :, free + n, None] * owner[:, None, :])
+    return np.concatenate(parts, axis=2)
+
+
+def _answers(
+    data: Experiments, fit: Fit, made: tuple[Array, Array], together: int, own: bool
+) -> Array:
+    """Return `answers` at a fit, of the outputs that there are."""
+    sums = answers(data, fit.structure, fit.z, fit.initial, fit.noise_model(), made, together, own)
+    return sums[:, : 1 + (data.current.size > 0)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,28 +233,64 @@ def signals(effect: Effect, sections: Motion, samples: Motion) -> list[Signal]:
     ]
 
 
-def response(data: Experiments, fit: Fit, base: Array, signal: Signal) -> Array:
-    """Return what a unit of an effect changes in the predictions."""
-    out = np.zeros_like(base)
-    if signal.voltage is not None:
-        size = float(np.sqrt(np.mean(np.square(signal.voltage))))
-        if size == 0.0 or not np.isfinite(size):
-            return out
-        step = NUDGE * float(np.sqrt(np.mean(np.square(data.hold_value)))) / size
-        nudged = Signal(voltage=signal.voltage).within(data, step)
-        out += (predicted(nudged, fit) - base) / step
-    for column, added, measured_signal in (
-        (0, signal.output, Signal(output=signal.output)),
-        (1, signal.current, Signal(current=signal.current)),
-    ):
-        if added is None:
+def responses(data: Experiments, fit: Fit, made: Iterable[Signal]) -> Array:
+    """Return what a unit of each signal changes in the predictions, shape (rows, o, r).
+
+    As many at a time as a pass carries; of a long record fewer, for their room.
+    """
+    corrected = bool(fit.gain.any())  # the state follows a wrong measurement, too
+    most = min(LANES, max(1, ROOM // data.size))
+    out: list[Array] = []
+    waiting: list[Signal] = []
+    places: list[int] = []
+    for signal in made:
+        if signal.voltage is None and not corrected:
+            out.append(_as_it_is(data, signal))
             continue
-        out[:, column] += added
-        if np.any(fit.gain != 0.0):  # the state follows a wrong measurement, too
-            size = max(float(np.mean(np.square(added))), 1e-300)
-            step = NUDGE * float(np.sqrt(fit.noise[column, column] / size))
-            out += (predicted(measured_signal.within(data, step), fit) - base) / step
-    return out
+        places.append(len(out))
+        out.append(np.zeros(0))
+        waiting.append(signal)
+        if len(waiting) == most:
+            _put_answers(data, fit, waiting, places, out)
+    if waiting:
+        _put_answers(data, fit, waiting, places, out)
+    return np.stack(out, axis=2)
+
+
+def _put_answers(
+    data: Experiments, fit: Fit, waiting: list[Signal], places: list[int], out: list[Array]
+) -> None:
+    """Put the responses to waiting signals into their places; none waits then."""
+    sums = _answers(data, fit, _tables(data, waiting), together(data), False)
+    for n, place in enumerate(places):
+        out[place] = sums[:, :, n]
+    waiting.clear()
+    places.clear()
+
+
+def _tables(data: Experiments, made: Sequence[Signal]) -> tuple[Array, Array]:
+    """Return the signals as `Beside` takes them."""
+    volts, added = np.zeros((0, 0)), np.zeros((0, 0, 0))
+    if any(s.voltage is not None for s in made):
+        volts = np.zeros((data.hold_end.size, len(made)))
+    if any(s.output is not None or s.current is not None for s in made):
+        added = np.zeros((2, data.size, len(made)))
+    for n, signal in enumerate(made):
+        if signal.voltage is not None:
+            volts[:, n] = signal.voltage
+        if signal.output is not None:
+            added[0, :, n] = signal.output
+        if signal.current is not None:
+            added[1, :, n] = signal.current
+    return volts, added
+
+
+def _as_it_is(data: Experiments, signal: Signal) -> Array:
+    """Return sums by rows of what is added to the measurements alone."""
+    outputs = 1 + (data.current.size > 0)
+    added = _tables(data, [signal])[1][:outputs, :, 0].T
+    known = np.where(np.isfinite(measured(data)), added, 0.0)
+    return np.asarray(np.add.reduceat(known, row_starts(data, together(data)), axis=0))
 
 
 def motions(data: Experiments, fit: Fit, gear: float) -> tuple[Motion, Motion]:

@@ -31,9 +31,11 @@ from smp_motor_ident.diagnosis.model_error import (
     motions,
     own_responses,
     predicted,
-    response,
+    responses,
     signals,
     stacked,
+    together,
+    whitened,
 )
 from smp_motor_ident.estimation import data_window
 from smp_motor_ident.estimation.choice import sandwich_factor
@@ -167,9 +169,8 @@ def _linearised(
     if not all((np.abs(m.drop) < FARTHEST).all() for m in (sections, samples)):
         return None
     made = [(effect, signal) for effect in effects for signal in signals(effect, sections, samples)]
-    columns = own_responses(data, fit, base)
-    columns += [response(data, fit, base, signal) for _, signal in made]
-    table = np.array([stacked(data, fit, c) for c in columns])
+    own = whitened(data, fit, own_responses(data, fit, together(data)))
+    table = np.array([*own, *whitened(data, fit, responses(data, fit, (s for _, s in made)))])
     if not np.isfinite(table).all():
         return None
     length = np.sqrt(np.square(table).sum(axis=1))

@@ -116,7 +116,7 @@ def _linearised(data: Experiments, fit: Fit, ways: Array) -> tuple[Array, Array]
     outputs = values.shape[1]
     white = whitening(fit.noise)[:outputs, :outputs]
     errors = np.where(known, values - base, 0.0) @ white.T
-    columns = np.stack(own_responses(data, fit, base), axis=-1)
+    columns = own_responses(data, fit)
     free = len(ways)
     columns = np.concatenate([columns[:, :, :free] @ ways, columns[:, :, free:]], axis=-1)
     return errors, white @ np.where(known[:, :, None], columns, 0.0)

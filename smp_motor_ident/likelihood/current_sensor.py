@@ -20,6 +20,7 @@ from smp_motor_ident.likelihood.sensitivities import (
     DF,
     KEPT,
     LANES,
+    PUSH,
     RATE,
     SENSOR,
     SLOPE,
@@ -104,6 +105,7 @@ def _charge(h: float, v: float, par: Array, x: Array, m: Array) -> None:
             + te * (m[SQ + j] - m[BEFORE + j])
             + m[SLOPE + 2 * LANES + j] * dth
             + m[SLOPE + j] * te * dq
+            - h * m[PUSH + j]
         )
 
 
@@ -132,7 +134,8 @@ def _low_pass(
         de = -h * e * da
         dte, dtm = te * m[SLOPE + j], tm * m[SLOPE + LANES + j]
         d1 = (
-            -v * de
+            m[PUSH + j] * gone
+            - v * de
             - (da * te + a * dte) * (dq - iq)
             - a * te * (m[SQ + j] - e * m[BEFORE + j] - de * x[Q0])
             - m[SLOPE + 2 * LANES + j] * iw

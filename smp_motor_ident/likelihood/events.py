@@ -17,11 +17,13 @@ from smp_motor_ident.likelihood.propagator import BE, ROW, TE, TM, K, speed_at
 from smp_motor_ident.likelihood.sensitivities import (
     FORCED,
     LANES,
+    PUSHED,
     SENSOR,
     SLOTS,
     SW,
     activate,
     fill,
+    push_columns,
     slide_columns,
     slide_state,
     stay,
@@ -183,6 +185,8 @@ def advance(
         if lags:
             before_move(x, m)
         slide_columns(m, FORCED, x[0], x[1], v, f)
+        if marks[PUSHED] > 0.0:
+            push_columns(m, FORCED)
         slide_state(m, FORCED, x, v, f)
         if lags:
             after_move(span, v, f, False, par, x, m, marks)

@@ -5,6 +5,7 @@ Derivation: docs/derivations.md, sections 6 to 8.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -73,6 +74,47 @@ class Pass:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class Beside:
+    """Signals beside what was given, each of which the motor answers."""
+
+    voltage: Array  # shape (sections, r): to the voltage of each section [V]; (0, 0) for none
+    # shape (2, n, r): to what output and current show, which may correct the state; (0, 0, 0)
+    added: Array
+    # shape (rows, 2, p + r): sums, over runs of samples, of what the own columns and the signals
+    # change in output and current
+    answers: Array
+    together: int  # samples in a row, fewer at the end of a segment
+
+
+NOTHING = Beside(np.zeros((0, 0)), np.zeros((0, 0, 0)), np.zeros((0, 0, 0)), 1)
+
+
+def row_starts(data: Experiments, together: int) -> NDArray[np.int64]:
+    """Return where rows of so many samples begin, each in one segment."""
+    parts = [np.arange(a, b, together) for a, b in itertools.pairwise(data.starts)]
+    return np.concatenate(parts)
+
+
+def answers(
+    data: Experiments,
+    structure: Structure,
+    z: Array,
+    initial: Array,
+    noise: NoiseModel,
+    signals: tuple[Array, Array],
+    together: int,
+    own: bool,
+) -> Array:
+    """Return what own columns and signals (`Beside`) change in the predictions, summed by rows."""
+    count = own * (structure.matrix().shape[1] + len(own_columns(data, structure)))
+    width = count + max(signals[0].shape[-1], signals[1].shape[-1])
+    sums = np.zeros((row_starts(data, together).size, 2, width))
+    beside = Beside(*signals, sums, together)
+    gather(data, structure, z, initial, noise, differentiate=own, beside=beside)
+    return sums
+
+
 def own_columns(data: Experiments, structure: Structure) -> tuple[int, ...]:
     """Return which of (q, w, angle, load, earlier current) each segment has to itself."""
     angle = (2,) if data.kind == recursion.ANGLE else ()
@@ -90,6 +132,7 @@ def gather(
     predicted: Array | None = None,
     differentiate: bool = True,
     blocks: int = BLOCKS,
+    beside: Beside = NOTHING,
 ) -> Sums:
     """Run over the data once; scores are summed over about so many runs of samples."""
     noise = NoiseModel() if noise is None else noise
@@ -107,7 +150,7 @@ def gather(
     normal, gradient, cost = np.empty((segments, p, p)), np.empty((segments, p)), np.zeros(segments)
     spread = np.zeros(6)
     angle = data.kind == recursion.ANGLE
-    if predicted is None and _slides(data, structure, z, noise):
+    if predicted is None and beside is NOTHING and _slides(data, structure, z, noise):
         if p == 0:
             spread[0], spread[3] = squares_sliding(
                 data.time, data.starts, data.hold_value, data.output, angle, par, initial,
@@ -125,10 +168,10 @@ def gather(
             data.time, data.starts, data.hold_end, data.hold_value, data.hold_start,
             data.output, data.current, data.kind, structure.friction != "none", par, slope,
             initial, own, noise.gain, whitening(noise.covariance), noise.huber, normal, gradient,
-            cost, spread, length, scores, owner, _ring(data, par, p),
+            cost, spread, length, scores, owner, _ring(data, par, max(p, beside.answers.shape[-1])),
             models.SENSORS.index(structure.current_sensor) if structure.current else 0,
             _trail(data, structure, par), np.zeros((0, 3)) if predicted is None else predicted,
-            data.jittered,
+            data.jittered, beside.voltage, beside.added, beside.answers, beside.together,
         )  # fmt: skip
     return Sums(normal, gradient, cost, spread, scores[:used], owner[:used])
 

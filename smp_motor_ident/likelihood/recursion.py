@@ -42,6 +42,8 @@ from smp_motor_ident.likelihood.sensitivities import (
     FORCED,
     LANES,
     OTHER,
+    PUSH,
+    PUSHED,
     RATE,
     SENSOR,
     SLOPE,
@@ -50,6 +52,7 @@ from smp_motor_ident.likelihood.sensitivities import (
     begin,
     fade,
     prepare_slide,
+    push_columns,
     slide_columns,
     slide_state,
     tabulate,
@@ -90,6 +93,8 @@ def _slide(
         before_move(x, m)
     if columns:
         slide_columns(m, at, x[0], x[1], v, f)
+        if marks[PUSHED] > 0.0:
+            push_columns(m, at)
     slide_state(m, at, x, v, f)
     if lags:
         after_move(h, v, f, False, par, x, m, marks)
@@ -149,6 +154,20 @@ def _switch(
 
 
 @inlined
+def _put(values: Array, m: Array, row: int, first: int, add: bool) -> None:
+    """Put values into a row of lanes from the first on, or add them."""
+    for j in range(values.shape[0]):
+        m[row + first + j] = values[j] + (m[row + first + j] if add else 0.0)
+
+
+@inlined
+def _answer(m: Array, row: int, sums: Array) -> None:
+    """Add a row of lanes to sums over samples."""
+    for j in range(sums.shape[0]):
+        sums[j] += m[row + j]
+
+
+@inlined
 def _correct(
     gain: Array, e0: float, e1: float, ok0: bool, ok1: bool, stuck: bool, x: Array, m: Array
 ) -> None:
@@ -193,23 +212,29 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
     trail: Array,
     predicted: Array,
     usual: float,
+    beside: Array,
+    added: Array,
+    answers: Array,
+    together: int,
 ) -> int:
     """Run over all segments; fill the sums in place."""
     n_common = slope.shape[1]
     p = n_common + local.shape[0]
-    columns = p > 0
+    pushed, answered = beside.shape[0] > 0, answers.shape[0] > 0
+    columns = p > 0 or answered
     has_current = current.shape[0] > 0
     has_gain = bool(np.any(gain != 0.0))
     delay = par[DELAY]
     late = bool(np.any(slope[DELAY] != 0.0))
     m, cache, marks, scratch = begin(slope, local, friction)
     marks[SENSOR], marks[RATE] = sensor, sensor_rate(sensor, par)
+    marks[PUSHED] = 1.0 if pushed else 0.0
     averaged, width = sensor == AVERAGED, 2 * par[CURRENT_LAG]
     table = tabulate(usual, par, m, cache, marks, scratch)
-    x, past, rows = np.zeros(STATE), np.zeros(1 + p), np.zeros(TILE * ROOM)
+    x, past, rows = np.zeros(STATE), np.zeros(1 + max(p, answers.shape[-1])), np.zeros(TILE * ROOM)
     tile = np.zeros((ROOM, TILE))
     spread[:] = 0.0
-    block = -1
+    block = line = -1
     for g in range(starts.shape[0] - 1):
         first, last = starts[g], starts[g + 1]
         normal[g], gradient[g], cost[g] = 0.0, 0.0, 0.0
@@ -243,6 +268,8 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
         filled = count = 0
         while section < limit and hold_end[section] + delay <= now:
             section += 1
+        if pushed:
+            _put(beside[section], m, PUSH, p, False)
         for k in range(first, last):
             target = time[k]
             while now < target:
@@ -265,6 +292,8 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
                 now = end
                 if section < limit and change <= end + 1e-9 * (target - time[k - 1]):
                     section += 1
+                    if pushed:
+                        _put(beside[section], m, PUSH, p, False)
                     if late:
                         _switch(v, hold_value[section], load, direction, friction, par, m)
             y0 = observe(kind, k, first, target, par, x, m, ring, past, columns)
@@ -273,6 +302,9 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
                 y1 = observe_lagging(sensor, k, par, x, m, D1, trail)
             elif has_current:
                 y1 = observe_current(par, x, m)
+            if added.shape[0] > 0:
+                _put(added[0, k], m, D0, p, True)
+                _put(added[1, k], m, D1, p, True)
             if predicted.shape[0] > 0:
                 note(predicted[k], x[1], y0, y1)
             # Residuals, whitened.
@@ -309,12 +341,18 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
                 blocks[block] = 0.0
                 filled = 0
             filled += 1
-            if ok0 and columns:
+            if answered:
+                line += (k - first) % together == 0
+                if ok0:
+                    _answer(m, D0, answers[line, 0])
+                if ok1:
+                    _answer(m, D1, answers[line, 1])
+            if ok0 and p > 0:
                 for j in range(LANES):
                     rows[count * ROOM + j] = u0 * w00 * m[D0 + j]
                 rows[count * ROOM + LANES] = u0 * w00 * e0
                 count += 1
-            if ok1 and columns:
+            if ok1 and p > 0:
                 for j in range(LANES):
                     rows[count * ROOM + j] = u1 * (w10 * m[D0 + j] + w11 * m[D1 + j])
                 rows[count * ROOM + LANES] = u1 * (w10 * e0 + w11 * e1)

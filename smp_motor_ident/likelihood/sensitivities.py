@@ -39,7 +39,8 @@ LANES = 16
 # what the current's sensor keeps; of q, w and angle before the last move.
 SQ, SW, ST, D0, D1, DF, FORWARD, BACKWARD, SLOPE = (LANES * n for n in range(9))
 KEPT = SLOPE + 12 * LANES
-BEFORE = KEPT + LANES
+PUSH = KEPT + LANES  # [V] beside the voltage, of the columns that are answers to a signal
+BEFORE = PUSH + LANES
 FORCED = BEFORE + 3 * LANES  # 12 rows: derivative of the propagator at hand by each column
 WHOLE = FORCED + ROW * LANES  # the propagator itself, 12 numbers
 OTHER = WHOLE + ROW + 4  # the same of a second propagator: a delay cuts intervals in two
@@ -50,9 +51,11 @@ SLOT = ROW * LANES + ROW
 CACHE = (SLOTS + 1) * SLOT
 # Beside the propagators: their lengths [s], the next to be overwritten, the lengths in both banks,
 # the bank that is next, the middle and half the range of the lengths that are tabulated, whether
-# there are columns that the propagator's derivatives reach, which sensor shows the current, and
-# the rate of its low-pass [1/s].
-NEXT, ACTIVE, BESIDE, BANK, MIDDLE, HALF, REACHED, SENSOR, RATE, MARKS = range(SLOTS, SLOTS + 10)
+# there are columns that the propagator's derivatives reach, which sensor shows the current, the
+# rate of its low-pass [1/s], and whether there are columns that answer to signals.
+NEXT, ACTIVE, BESIDE, BANK, MIDDLE, HALF, REACHED, SENSOR, RATE, PUSHED, MARKS = range(
+    SLOTS, SLOTS + 11
+)
 
 
 @compiled
@@ -192,6 +195,16 @@ def slide_columns(m: Array, at: int, q: float, w: float, v: float, f: float) -> 
 
 
 @inlined
+def push_columns(m: Array, at: int) -> None:
+    """Let the signals beside the voltage act over the interval at hand."""
+    v0, v1, v2 = m[at + ROW * LANES + 6], m[at + ROW * LANES + 7], m[at + ROW * LANES + 8]
+    for j in range(LANES):
+        m[SQ + j] += v0 * m[PUSH + j]
+        m[SW + j] += v1 * m[PUSH + j]
+        m[ST + j] += v2 * m[PUSH + j]
+
+
+@inlined
 def slide_state(m: Array, at: int, x: Array, v: float, f: float) -> None:
     """Advance the state over the interval at hand."""
     q, w = x[0], x[1]
@@ -224,7 +237,7 @@ def stay(h: float, par: Array, x: Array, m: Array, v: float) -> None:
     d = (x[0] - v) * e * h / par[TE]
     x[0] = v + (x[0] - v) * e
     for j in range(LANES):
-        m[SQ + j] = e * m[SQ + j] + d * m[SLOPE + j]
+        m[SQ + j] = e * m[SQ + j] + d * m[SLOPE + j] + (1.0 - e) * m[PUSH + j]
 
 
 @compiled
@@ -250,7 +263,7 @@ def begin(
     m, cache, marks = _aligned(SIZE), _aligned(CACHE), np.full(MARKS, -1.0)
     n_common = slope.shape[1]
     marks[NEXT] = marks[BANK] = 0.0
-    marks[REACHED], marks[SENSOR] = 1.0 if n_common > 0 else 0.0, 0.0
+    marks[REACHED], marks[SENSOR], marks[PUSHED] = 1.0 if n_common > 0 else 0.0, 0.0, 0.0
     for j in range(n_common):
         for i in range(12):
             m[SLOPE + LANES * i + j] = slope[i, j]

@@ -10,7 +10,7 @@ import pytest
 from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.likelihood.noise import NO_GAIN, NoiseModel, kalman_gain
-from smp_motor_ident.likelihood.passes import evaluate, gather
+from smp_motor_ident.likelihood.passes import answers, evaluate, gather
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import Structure
 
@@ -131,3 +131,29 @@ def test_a_beginning_that_has_faded_is_nothing_and_costs_nothing():
     own = np.abs(sums.scores[-1, -2:])
     # After a thousand time constants; a number that is not normal would take ten times as long.
     assert not own.any()
+
+
+@pytest.mark.parametrize("sensor", ["", "averaged", "low_passed"])
+@pytest.mark.parametrize("with_gain", [False, True])
+def test_answer_to_a_signal_is_what_little_of_it_changes(sensor, with_gain):
+    _, data, z = exact(static_voltage=0.3, kind="sine", seconds=3.0)
+    structure = Structure("electromechanical", current=True, current_sensor=sensor, delay=True)
+    z[[models.DELAY, models.CURRENT_LAG]] = 0.3 * data.step, 0.7 * data.step
+    gain = kalman_gain(z, 2, rc.ANGLE, data.step, 1e7, 0.5)[0] if with_gain else NO_GAIN
+    signal = np.cos(3 * data.hold_end)
+    shown = 1e-2 * np.sin(5 * data.time)
+    found = answers(
+        data, structure, z, data.initial, NoiseModel(gain=gain),
+        (signal[:, None], np.array([shown, 0 * shown])[:, :, None]), 7, False,
+    )[:, :, 0]  # fmt: skip
+    size = 1e-4
+    nudged = replace(
+        data, hold_value=data.hold_value + size * signal, output=data.output - size * shown
+    )
+    change = (predict(nudged, structure, z, gain) - predict(data, structure, z, gain)) / size
+    change[:, 1] += shown
+    rows = np.arange(0, data.size, 7)
+    for output in (0, 1):
+        expected = np.add.reduceat(change[:, 1 + output], rows)
+        # A stop or a start that comes a little earlier or later bends the answer.
+        assert np.abs(found[:, output] - expected).max() < 2e-3 * np.abs(expected).max()
