@@ -36,7 +36,7 @@ from smp_motor_ident.estimation.consider_covariance import (
     consider_left_out,
     consider_timing,
 )
-from smp_motor_ident.estimation.descent import refine
+from smp_motor_ident.estimation.descent import ROUGHLY, refine
 from smp_motor_ident.estimation.fit import Fit, Prior
 from smp_motor_ident.estimation.hold_choice import chosen_hold, instant_deviation, otherwise
 from smp_motor_ident.estimation.profile import profiled
@@ -376,7 +376,7 @@ def _validation(
         if np.ptp(part.hold_value) == 0 or all(np.ptp(r.voltage) == 0 for r in kept):
             return None, None
         start = Fit(**{**vars(fit), "initial": part.initial})
-        refined = refine(part, fit.structure, start, fit.z, options)
+        refined = refine(part, fit.structure, start, fit.z, options, ROUGHLY)
         found = validate.held_out(kept, refined, hold, scatter)
     own, common = (x if np.isfinite(x) else None for x in found)
     return own, common

@@ -15,6 +15,7 @@ from smp_motor_ident.model.structures import Structure
 
 Array = NDArray[np.float64]
 
+ROUGHLY = 0.3  # standard deviations of where a descent ends: its deviance is known to a tenth
 SCREENING_SAMPLES = 12_000  # samples on which candidates and noise levels are compared
 
 
@@ -62,13 +63,22 @@ def initial_of(data: Experiments, fit: Fit) -> Array:
     return initial
 
 
-def refine(data: Experiments, structure: Structure, near: Fit, z: Array, options: Options) -> Fit:
+def refine(
+    data: Experiments,
+    structure: Structure,
+    near: Fit,
+    z: Array,
+    options: Options,
+    tolerance: float = 1e-2,
+) -> Fit:
     """Fit a structure from another's answer on the same data."""
-    fit = solve(data, structure, near.at(z, initial_of(data, near)), options, 30)
-    return at_rest(data, structure, fit, options)
+    fit = solve(data, structure, near.at(z, initial_of(data, near)), options, 30, tolerance)
+    return at_rest(data, structure, fit, options, tolerance)
 
 
-def at_rest(data: Experiments, structure: Structure, fit: Fit, options: Options) -> Fit:
+def at_rest(
+    data: Experiments, structure: Structure, fit: Fit, options: Options, tolerance: float = 1e-2
+) -> Fit:
     """Try whether segments that begin slowly began at rest: friction makes that a kink."""
     if structure.friction == "none":
         return fit
@@ -78,7 +88,7 @@ def at_rest(data: Experiments, structure: Structure, fit: Fit, options: Options)
         return fit
     initial = fit.initial.copy()
     initial[slow, :2] = 0.0
-    other = solve(data, structure, fit.at(fit.z, initial), options, 12)
+    other = solve(data, structure, fit.at(fit.z, initial), options, 12, tolerance)
     return other if other.deviance < fit.deviance else fit
 
 

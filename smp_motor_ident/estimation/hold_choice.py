@@ -19,7 +19,7 @@ from smp_motor_ident.estimation import order_selection
 from smp_motor_ident.estimation.candidate_starts import of_kind
 from smp_motor_ident.estimation.choice import FittedCandidate
 from smp_motor_ident.estimation.data_window import extend, grow
-from smp_motor_ident.estimation.descent import refine, restate, screening_subset
+from smp_motor_ident.estimation.descent import ROUGHLY, refine, restate, screening_subset
 from smp_motor_ident.estimation.fit import Fit, Options
 from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.estimation.request import Request
@@ -119,7 +119,7 @@ def _worth_a_search(
     for duration in (samples * data.step for samples in LOOKS):
         part = of_kind(data, best).data_window(duration)
         whole = part.size == best.samples
-        looks[duration] = best if whole else refine(part, s, best, best.z, options)
+        looks[duration] = best if whole else refine(part, s, best, best.z, options, ROUGHLY)
         if whole:
             break
     late = float(best.z[models.DELAY]) / data.step
@@ -127,9 +127,10 @@ def _worth_a_search(
     for other, how in [("held", "before")] * (hold != "held") + [(hold, how) for how in EARLIER]:
         there = data if other == hold else prepare(group, s.current, hold=other)
         there, lag = of_kind(there.held(how), best), late - EARLIER.get(how, 0.0)
+        found: Fit | None = None
         for duration, least in looks.items():
             part = there.data_window(duration)
-            found = _delayed(part, least, how, lag, options)
+            found = _delayed(part, least, how, lag, options, found)
             # What has not settled, or saw little of the data, tells against a search only where
             # its residuals are of another size.
             near = part.size * (1.0 + (part.current.size > 0))
@@ -138,14 +139,17 @@ def _worth_a_search(
             if found.deviance >= least.deviance + near:
                 break
         else:
+            assert found is not None
             out.append((other, found))
     return out
 
 
-def _delayed(part: Experiments, best: Fit, how: str, lag: float, options: Options) -> Fit:
+def _delayed(
+    part: Experiments, best: Fit, how: str, lag: float, options: Options, before: Fit | None
+) -> Fit:
     """Return a fit from the choice's coordinates, as late as that many samples.
 
-    Earlier than no delay only a shorter second lag is.
+    Earlier than no delay only a shorter second lag is.  What a shorter look found is gone on from.
     """
     starts = {max(lag, 0.0): best.z, float(max(round(lag), 0)): best.z}
     if lag < 0 and best.structure.order == 2:
@@ -153,6 +157,8 @@ def _delayed(part: Experiments, best: Fit, how: str, lag: float, options: Option
         z = best.z.copy()
         z[[models.A2, models.TE]] += np.log(max(te + lag * part.step, 0.1 * te) / te)
         starts[-1.0] = z
+    if before is not None:
+        starts = {float(before.z[models.DELAY]) / part.step: before.z}
     near = [best] if best.noise_ratio == 0 else [best, replace(best, noise_ratio=0.0)]
     fits = []
     for samples, start in starts.items():
@@ -161,7 +167,7 @@ def _delayed(part: Experiments, best: Fit, how: str, lag: float, options: Option
         z = start.copy()
         z[models.DELAY] = delay
         fixed = structure.with_(delay=False, fixed={**structure.fixed, "delay": delay})
-        whole = [refine(part, fixed, n, fixed.complete(z), options) for n in near]
+        whole = [refine(part, fixed, n, fixed.complete(z), options, ROUGHLY) for n in near]
         fits.append((min(whole, key=lambda f: f.deviance), structure))
     fit, structure = min(fits, key=lambda f: f[0].deviance)
     return restate(part, structure, fit, options)
