@@ -20,14 +20,13 @@ H. White, Econometrica 48 (1980), 817.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erfc
 
 from smp_motor_ident.diagnosis.limits import CONDITION_LEVEL
-from smp_motor_ident.diagnosis.model_error import measured, predicted
+from smp_motor_ident.diagnosis.model_error import answered, carried, measured, predicted
 from smp_motor_ident.estimation.consider_covariance import consider_late
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.finding import Finding
@@ -36,7 +35,6 @@ from smp_motor_ident.likelihood.experiments import Experiments
 Array = NDArray[np.float64]
 
 PATTERNS = 8  # of random signs, whose mean square is the sum over the changes
-NUDGE = 1e-3  # of a sample: small against what bends
 MOST = 4.0  # deviations at which a residual is cut off: outliers are no scatter
 
 
@@ -68,16 +66,14 @@ def _scatter(data: Experiments, fit: Fit) -> float:
     change[data.hold_start[:-1]] = 0.0
     length = np.maximum(np.diff(data.hold_end, prepend=data.hold_end[0] - data.step), 0.0)
     length[data.hold_start[:-1]] = data.step
-    moved = (
-        NUDGE
-        * data.step
-        * np.divide(change, length, out=np.zeros_like(change), where=length > 1e-3 * data.step)
-    )
+    moved = np.divide(change, length, out=np.zeros_like(change), where=length > 1e-3 * data.step)
     x = np.zeros_like(base)
-    for _ in range(PATTERNS):
-        sign = rng.choice([-1.0, 1.0], voltage.size)
-        other = replace(data, hold_value=voltage + sign * moved)
-        x += np.square((predicted(other, fit) - base) / (NUDGE * data.step * deviation)) / PATTERNS
+    several = carried(data, PATTERNS)
+    for n in range(0, PATTERNS, several):
+        signs = rng.choice([-1.0, 1.0], (voltage.size, min(several, PATTERNS - n)))
+        made = signs * moved[:, None], np.zeros((0, 0, 0))
+        x += np.square(answered(data, fit, made, 1, False)).sum(axis=2) / PATTERNS
+    x /= np.square(deviation)
     known = np.isfinite(values)
     square = np.minimum(np.square((values - base) / deviation)[known], MOST**2)
     away = x[known] - x[known].mean()

@@ -171,7 +171,7 @@ def own_responses(data: Experiments, fit: Fit, together: int = 1) -> Array:
     Shape (rows, o, f + s), summed over rows of so many samples.
     """
     none = np.zeros((0, 0)), np.zeros((0, 0, 0))
-    sums = _answers(data, fit, none, together, True)
+    sums = answered(data, fit, none, together, True)
     free, columns = len(fit.structure.free()), own_columns(data, fit.structure)
     begins, segments = row_starts(data, together), len(data.starts) - 1
     parts = [sums[:, :, :free]]
@@ -183,7 +183,7 @@ def own_responses(data: Experiments, fit: Fit, together: int = 1) -> Array:
     return np.concatenate(parts, axis=2)
 
 
-def _answers(
+def answered(
     data: Experiments, fit: Fit, made: tuple[Array, Array], together: int, own: bool
 ) -> Array:
     """Return `answers` at a fit, of the outputs that there are."""
@@ -236,10 +236,10 @@ def signals(effect: Effect, sections: Motion, samples: Motion) -> list[Signal]:
 def responses(data: Experiments, fit: Fit, made: Iterable[Signal]) -> Array:
     """Return what a unit of each signal changes in the predictions, shape (rows, o, r).
 
-    As many at a time as a pass carries; of a long record fewer, for their room.
+    As many at a time as a pass carries.
     """
     corrected = bool(fit.gain.any())  # the state follows a wrong measurement, too
-    most = min(LANES, max(1, ROOM // data.size))
+    most = carried(data, LANES)
     out: list[Array] = []
     waiting: list[Signal] = []
     places: list[int] = []
@@ -257,11 +257,16 @@ def responses(data: Experiments, fit: Fit, made: Iterable[Signal]) -> Array:
     return np.stack(out, axis=2)
 
 
+def carried(data: Experiments, most: int) -> int:
+    """Return how many signals a pass carries, of a long record few."""
+    return min(most, max(1, ROOM // data.size))
+
+
 def _put_answers(
     data: Experiments, fit: Fit, waiting: list[Signal], places: list[int], out: list[Array]
 ) -> None:
     """Put the responses to waiting signals into their places; none waits then."""
-    sums = _answers(data, fit, _tables(data, waiting), together(data), False)
+    sums = answered(data, fit, _tables(data, waiting), together(data), False)
     for n, place in enumerate(places):
         out[place] = sums[:, :, n]
     waiting.clear()
