@@ -54,7 +54,8 @@ def from_richer(data: Experiments, tried: list[Fit], options: Options) -> list[F
             if fit.structure.order == 2 and late > 0:
                 z[models.A2] = np.logaddexp(z[models.A2], z[models.A1] + np.log(late))
             part = of_kind(data, fit)
-            again = descent.refine(part, fit.structure, best, fit.structure.complete(z), options)
+            z = fit.structure.complete(z)
+            again = descent.refine(part, fit.structure, best, z, options, known=fit)
             fit = min(fit, again, key=lambda f: f.deviance)
         out.append(fit)
     return out
@@ -71,7 +72,8 @@ def from_rivals(data: Experiments, tried: list[Fit], options: Options) -> list[F
         if rival is winner or rival.kind != winner.kind:
             continue
         z = winner.structure.complete(_translated(rival, winner.structure, data.step))
-        again = descent.refine(of_kind(data, winner), winner.structure, rival, z, options)
+        part = of_kind(data, winner)
+        again = descent.refine(part, winner.structure, rival, z, options, known=winner)
         if again.deviance < winner.deviance:
             out[best] = again
     return out

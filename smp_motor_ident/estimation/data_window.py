@@ -61,7 +61,9 @@ def grow(
     return extend(data, structure, best, options)
 
 
-def extend(data: Experiments, structure: Structure, best: Fit, options: Options) -> Fit:
+def extend(
+    data: Experiments, structure: Structure, best: Fit, options: Options, known: Fit | None = None
+) -> Fit:
     """Carry a fit of the screening subset on to all data, on a growing data window."""
     part = data.data_window(min(SCREENING_SAMPLES * data.step, 60.0))
     if best.samples == data.size and best.converged:
@@ -72,7 +74,8 @@ def extend(data: Experiments, structure: Structure, best: Fit, options: Options)
         longer = data.data_window(samples * data.step)
         best = solve(longer, structure, best.at(best.z, initial_of(longer, best)), options, 8)
         samples *= 6
-    return solve(data, structure, best.at(best.z, initial_of(data, best)), options, 25)
+    start = best.at(best.z, initial_of(data, best))
+    return solve(data, structure, start, options, 25, known=known)
 
 
 def _find_noise_ratio(

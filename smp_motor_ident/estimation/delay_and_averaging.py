@@ -61,7 +61,7 @@ def _snap(data: Experiments, fit: Fit, options: Options) -> Fit:
     best = fit
     for n in {int(fit.z[models.DELAY] / data.step), int(fit.z[models.DELAY] / data.step) + 1}:
         whole = fit.structure.with_(fixed={**fit.structure.fixed, "delay": n * data.step})
-        other = descent.refine(data, whole, fit, fit.z, options)
+        other = descent.refine(data, whole, fit, fit.z, options, known=best)
         if other.deviance < best.deviance - 1:
             best = descent.restate(data, fit.structure, other, options)
     return best

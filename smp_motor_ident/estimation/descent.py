@@ -70,10 +70,12 @@ def refine(
     z: Array,
     options: Options,
     tolerance: float = 1e-2,
+    known: Fit | None = None,
 ) -> Fit:
     """Fit a structure from another's answer on the same data."""
-    fit = solve(data, structure, near.at(z, initial_of(data, near)), options, 30, tolerance)
-    return at_rest(data, structure, fit, options, tolerance)
+    start = near.at(z, initial_of(data, near))
+    fit = solve(data, structure, start, options, 30, tolerance, known)
+    return fit if fit is known else at_rest(data, structure, fit, options, tolerance)
 
 
 def at_rest(

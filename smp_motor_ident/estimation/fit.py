@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident.diagnosis.limits import MOST_FRICTION
+from smp_motor_ident.diagnosis.limits import MOST_FRICTION, SUBSET_HOPELESS
 from smp_motor_ident.estimation import shape_constraint
 from smp_motor_ident.estimation.fitted import Fit, Options, Prior, Start
 from smp_motor_ident.likelihood.experiments import Experiments
@@ -27,6 +27,7 @@ __all__ = ["Fit", "Options", "Prior", "Start", "solve"]
 Array = NDArray[np.float64]
 
 STALL = 4, 0.02  # passes that together gain less deviance than this end a descent
+PACE = 4  # passes by which it is judged how fast a descent goes
 FIRST = 1e-3  # damping at which a descent begins
 FREE = 0.1  # damping (relative to the diagonal) below which a step counts as undamped
 LARGEST = 80.0  # logarithm of a coordinate: 1e35
@@ -58,6 +59,7 @@ class _Descent:
         self.smooth = structure.friction == "none" and not structure.delay
         self.only_scale = not self.current and options.huber == math.inf and start.noise_ratio == 0
         self.damping, self.passes, self.converged = FIRST, 0, False
+        self.trail: list[float] = []
         self.look(proper(start.noise))
 
     def _allowed(self, z: Array) -> Array:
@@ -110,10 +112,19 @@ class _Descent:
 
     def arrived(self) -> bool:
         """Tell whether it is within a standard deviation of a fit that is known: it ends there."""
-        if self.known is None or not self.known.converged:
+        known = self.known
+        if known is None or not known.converged or known.structure != self.structure:
             return False
-        away = (self.z - self.known.z)[list(self.structure.free())]
-        return bool(away @ self.known.information @ away < 1.0)
+        away = (self.z - known.z)[list(self.structure.free())]
+        return bool(away @ known.information @ away < 1.0)
+
+    def hopeless(self, left: int) -> bool:
+        """Tell whether steps as they have been of late do not lead near what is known in time."""
+        self.trail.append(deviance(self.here.spread))
+        if self.known is None or self.known.samples != self.data.size or len(self.trail) <= PACE:
+            return False
+        above = self.trail[-1] - self.known.deviance - SUBSET_HOPELESS.value
+        return above > left * (self.trail[-1 - PACE] - self.trail[-1]) / PACE
 
     def _solved(self, damping: float) -> tuple[Array, float]:
         """Return the damped step and its length; along the edge of a motor's shapes, if there."""
@@ -144,7 +155,7 @@ class _Descent:
         """Step until the end, or (the first time) until the noise is worth another look."""
         recent: list[float] = []
         self.converged = False
-        while self.passes < iterations:
+        while self.passes < iterations and not self.hopeless(iterations - self.passes):
             before = self.here.objective
             z, initial, size = self.step()
             near = tolerance if self.smooth else tolerance * CLOSE
@@ -226,6 +237,7 @@ def solve(
     Levenberg-Marquardt in z with the initial states eliminated; the noise covariance is
     re-estimated from the residuals until it stays (concentrated likelihood).  A descent that
     comes as near to a fit that is ``known`` as the data tell would end there: that is returned.
+    One that is far above it and does not come nearer in its passes is given up.
     """
     options = options or Options()
     lower, upper = _bounds(FASTEST * data.step if data.current.size else 0.0)

@@ -104,7 +104,7 @@ def _without_friction(
     subset = of_kind(descent.screening_subset(data), best)
     if subset.size < data.size:
         with_it = descent.refine(subset, s, best, best.z, options)
-        without = descent.refine(subset, smooth, with_it, best.z, options)
+        without = descent.refine(subset, smooth, with_it, best.z, options, known=with_it)
         if without.deviance > with_it.deviance + SUBSET_HOPELESS.value * sandwich_factor(with_it):
             return best
     plain = descent.refine(data, smooth, best, best.z, options)
@@ -178,7 +178,7 @@ def _lost_by_rubbing(data: Experiments, fit: Fit, options: Options) -> float:
     fixed = {**fit.structure.fixed, "vc_plus": little}
     rubs = fit.structure.with_(friction="symmetric", fixed=fixed)
     other = min(
-        (solve(data, rubs, fit.at(rubs.complete(z), i), options, 12) for i in initials),
+        (solve(data, rubs, fit.at(rubs.complete(z), i), options, 12, known=fit) for i in initials),
         key=lambda f: f.deviance,
     )
     return (other.deviance - fit.deviance) / sandwich_factor(fit)
