@@ -375,7 +375,7 @@ def _validation(
         part = of_kind(prepare(fitted, fit.structure.current, hold=hold), fit)
         if np.ptp(part.hold_value) == 0 or all(np.ptp(r.voltage) == 0 for r in kept):
             return None, None
-        start = Fit(**{**vars(fit), "initial": part.initial})
+        start = replace(fit, initial=part.initial)
         refined = refine(part, fit.structure, start, fit.z, options, ROUGHLY)
         found = validate.held_out(kept, refined, hold, scatter)
     own, common = (x if np.isfinite(x) else None for x in found)

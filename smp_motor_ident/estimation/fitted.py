@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -149,6 +150,10 @@ class Fit(Start):
 
     def conditional(self) -> Array:
         """Return the covariance with the profiled coordinates fixed, and what is added, (f, f)."""
+        return self._conditional
+
+    @cached_property
+    def _conditional(self) -> Array:
         cov = self.white()
         widen = np.sqrt(self._widening(long_run))
         cov = cov * np.outer(widen, widen)
@@ -157,7 +162,9 @@ class Fit(Start):
         for profile in self.profiles:
             i = self.structure.free().index(profile.coordinate)
             cov = cov - np.outer(cov[:, i], cov[i]) / max(float(cov[i, i]), 1e-300)
-        return cov if self.added is None else cov + self.added
+        cov = cov if self.added is None else cov + self.added
+        cov.flags.writeable = False
+        return cov
 
     def sandwich_factors(self) -> Array:
         """Return by how much each variance is larger than of white residuals, shape (f,).
@@ -177,6 +184,10 @@ class Fit(Start):
 
     def white(self) -> Array:
         """Return the covariance of white residuals, shape (f, f)."""
+        return self._white
+
+    @cached_property
+    def _white(self) -> Array:
         # Every coordinate lies within some e-folds or volts of any motor's: without that a
         # direction that the data leave open would count as known.
         information = self.information + np.diag(PLAUSIBLE[list(self.structure.free())])
@@ -187,4 +198,5 @@ class Fit(Start):
         plausible = np.diag(PLAUSIBLE[list(self.structure.free())])
         alone = np.einsum("ij,ik,kj->j", vectors, plausible, vectors)
         cov: Array = (vectors / np.where(values > ROUNDING, values, alone)) @ vectors.T
+        cov.flags.writeable = False
         return cov
