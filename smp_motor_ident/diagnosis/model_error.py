@@ -186,9 +186,9 @@ def own_responses(data: Experiments, fit: Fit, together: int = 1) -> Array:
 def answered(
     data: Experiments, fit: Fit, made: tuple[Array, Array], together: int, own: bool
 ) -> Array:
-    """Return `answers` at a fit, of the outputs that there are."""
-    sums = answers(data, fit.structure, fit.z, fit.initial, fit.noise_model(), made, together, own)
-    return sums[:, : 1 + (data.current.size > 0)]
+    """Return `answers` at a fit."""
+    noise = fit.noise_model()
+    return answers(data, fit.structure, fit.z, fit.initial, noise, made, together, own)
 
 
 @dataclass(frozen=True, eq=False)

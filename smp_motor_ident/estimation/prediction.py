@@ -6,6 +6,7 @@ Derivation: docs/derivations.md, sections 6 to 9.
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +14,8 @@ from numpy.typing import NDArray
 from smp_motor_ident.estimation.fit import Fit, solve
 from smp_motor_ident.estimation.memory import remembered
 from smp_motor_ident.likelihood.experiments import Experiments
-from smp_motor_ident.likelihood.noise import NO_GAIN, NoiseModel
-from smp_motor_ident.likelihood.passes import BLOCKS, Pass, evaluate, gather
+from smp_motor_ident.likelihood.noise import NO_GAIN, NoiseModel, whitening
+from smp_motor_ident.likelihood.passes import Pass, answers, evaluate, gather
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import Structure
 
@@ -31,11 +32,6 @@ def simulate(data: Experiments, fit: Fit, gain: bool = False) -> Array:
     return remembered(data, "run", 1, question, lambda: _predict(data, fit, own, columns))
 
 
-def outputs(data: Experiments, fit: Fit) -> Array:
-    """Return the output alone as the fitted motor predicts it."""
-    return _predict(data, fit, NO_GAIN, 1)[:, 0]
-
-
 def _predict(data: Experiments, fit: Fit, gain: Array, columns: int) -> Array:
     predicted = np.empty((data.size, columns))
     noise = NoiseModel(fit.noise, gain)
@@ -44,14 +40,14 @@ def _predict(data: Experiments, fit: Fit, gain: Array, columns: int) -> Array:
     return predicted
 
 
-def again(data: Experiments, structure: Structure, fit: Fit, blocks: int = BLOCKS) -> Pass:
+def again(data: Experiments, structure: Structure, fit: Fit) -> Pass:
     """Return normal equations of experiments at a fit, with the coordinates of a structure."""
 
     def run() -> Pass:
         z, noise = structure.complete(fit.z), fit.noise_model()
-        return evaluate(data, structure, z, fit.initial, fit.initial, noise, blocks=blocks)
+        return evaluate(data, structure, z, fit.initial, fit.initial, noise)
 
-    question = (structure, blocks, fit.z, fit.initial, fit.noise, fit.gain)
+    question = (structure, fit.z, fit.initial, fit.noise, fit.gain)
     return remembered(data, "pass", PASSES, question, run)
 
 
@@ -71,21 +67,23 @@ def information(data: Experiments, fit: Fit) -> Array:
     return again(data, fit.structure, fit).normal
 
 
-def influence(data: Experiments, fit: Fit) -> Array:
-    """Return how an error of one in each output moves the coordinates, shape (n, f).
+def influence(data: Experiments, fit: Fit) -> tuple[Array, Array]:
+    """Return how an error of one in each output moves the coordinates, and they the output, (n, f).
 
     The motion stays the one that the fit predicts, so the Gauss-Newton step is a sum over the
-    samples; an error of a tenth of the noise asks for it, which no robust loss weighs otherwise.
+    samples.
     """
-    predicted = simulate(data, fit)
-    error = 0.1 * float(np.sqrt(fit.noise[0, 0]))
-    output = np.where(np.isnan(data.output), np.nan, predicted[:, 1] + error)
-    current = data.current
-    if current.size:
-        current = np.where(np.isnan(current), np.nan, predicted[:, 2])
-    there = replace(data, output=output, current=current)
-    here = again(there, fit.structure, fit, blocks=data.size)
-    return np.asarray(here.scores @ inverse(here.normal) / error)
+    here, free = again(data, fit.structure, fit), len(fit.structure.free())
+    none = np.zeros((0, 0)), np.zeros((0, 0, 0))
+    moved = answers(data, fit.structure, fit.z, fit.initial, fit.noise_model(), none, 1, True)
+    weight = whitening(fit.noise)
+    score = weight[0, 0] ** 2 * moved[:, 0]
+    if data.current.size:
+        both = np.isfinite(data.current)[:, None]
+        score += both * weight[1, 0] * (weight[1, 0] * moved[:, 0] + weight[1, 1] * moved[:, 1])
+    for g, (a, b) in enumerate(pairwise(data.starts)):  # the initial states follow
+        score[a:b, :free] -= score[a:b, free:] @ here.local_gain[g]
+    return score[:, :free] @ inverse(here.normal), moved[:, 0, :free]
 
 
 def predicted_decrease(

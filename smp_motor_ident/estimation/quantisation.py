@@ -37,12 +37,12 @@ def widened(data: Experiments, fit: Fit, seed: int = 0) -> Fit:
     counted, metered = (np.diag(share) for share in _shares(data, fit))
     expected = np.maximum(metered + counted, 1e-300)
     rng = np.random.default_rng(seed)
-    excess, influence = np.ones(len(cov)), prediction.influence(data, fit)
+    excess, (influence, slope) = np.ones(len(cov)), prediction.influence(data, fit)
     # How the counter errs hangs on the motion itself, known as well as the estimate tells:
     # a first round shows how well that is, the second takes it from there.
     for _ in range(2):
         spread = REACH**2 * cov * np.sqrt(np.outer(excess, excess))
-        errors = _counting_errors(data, fit, own, spread, rng) @ influence
+        errors = _counting_errors(data, fit, own, slope @ _half(spread), rng) @ influence
         # Only what the counter does is replayed; what the current's noise does is known.
         second = metered + np.square(errors).sum(axis=0) / max(len(errors), 1)
         excess = np.maximum(second / np.maximum(expected, np.diag(cov)), excess)
@@ -60,18 +60,21 @@ def _shares(data: Experiments, fit: Fit) -> tuple[Array, Array]:
     return inverse @ counter @ inverse, inverse @ (whole - counter) @ inverse
 
 
+def _half(spread: Array) -> Array:
+    """Return a matrix that makes draws of this covariance from draws of unit variance."""
+    values, vectors = np.linalg.eigh(spread)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
 def _counting_errors(
-    data: Experiments, fit: Fit, own: float, spread: Array, rng: np.random.Generator
+    data: Experiments, fit: Fit, own: float, moves: Array, rng: np.random.Generator
 ) -> Array:
     """Return what a counter adds to the angle of motions near the fit's, shape (replays, n)."""
-    matrix = fit.structure.matrix()
     noise = np.sqrt(max(fit.noise[0, 0] - own, 0.0))
+    there = prediction.simulate(data, fit)[:, 1]
     errors = []
-    values, vectors = np.linalg.eigh(spread)
-    half = vectors * np.sqrt(np.maximum(values, 0.0))
     for _ in range(int(np.clip(MOST // data.size, *REPLAYS))):
-        near = fit.structure.complete(fit.z + matrix @ (half @ rng.standard_normal(len(half))))
-        angle = prediction.outputs(data, replace(fit, z=near))
+        angle = there + moves @ rng.standard_normal(moves.shape[1])
         if not np.abs(angle).max() < COUNTED * data.quantum:
             continue  # no motor: a coordinate that the data leave open went out of all bounds
         shown = angle + rng.uniform(0, data.quantum) + noise * rng.standard_normal(data.size)

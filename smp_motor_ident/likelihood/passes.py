@@ -81,7 +81,7 @@ class Beside:
     voltage: Array  # shape (sections, r): to the voltage of each section [V]; (0, 0) for none
     # shape (2, n, r): to what output and current show, which may correct the state; (0, 0, 0)
     added: Array
-    # shape (rows, 2, p + r): sums, over runs of samples, of what the own columns and the signals
+    # shape (rows, o, p + r): sums, over runs of samples, of what the own columns and the signals
     # change in output and current
     answers: Array
     together: int  # samples in a row, fewer at the end of a segment
@@ -109,7 +109,7 @@ def answers(
     """Return what own columns and signals (`Beside`) change in the predictions, summed by rows."""
     count = own * (structure.matrix().shape[1] + len(own_columns(data, structure)))
     width = count + max(signals[0].shape[-1], signals[1].shape[-1])
-    sums = np.zeros((row_starts(data, together).size, 2, width))
+    sums = np.zeros((row_starts(data, together).size, 1 + (data.current.size > 0), width))
     beside = Beside(*signals, sums, together)
     gather(data, structure, z, initial, noise, differentiate=own, beside=beside)
     return sums
@@ -220,7 +220,6 @@ def evaluate(
     start: Array,
     noise: NoiseModel,
     priors: Sequence[tuple[Array, float]] = (),
-    blocks: int = BLOCKS,
 ) -> Pass:
     """Run, add what is known beforehand, and eliminate the initial states."""
     own = own_columns(data, structure)
@@ -232,7 +231,7 @@ def evaluate(
                    np.zeros((0, f)))  # fmt: skip
     if not np.isfinite(z).all():  # what predicts no number misses no measurement
         return nowhere
-    sums = gather(data, structure, z, initial, noise, blocks=blocks)
+    sums = gather(data, structure, z, initial, noise)
     total = float(sums.cost.sum())
     for row, miss in priors:
         common += np.outer(row, row)
