@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident.diagnosis.limits import TORQUE_NOISE
+from smp_motor_ident.diagnosis.limits import SUBSET_HOPELESS, TORQUE_NOISE
 from smp_motor_ident.estimation.descent import (
     SCREENING_SAMPLES,
     at_rest,
@@ -39,10 +39,19 @@ def grow(
     first: Fit,
     options: Options,
     near: Fit | None = None,
+    rival: Fit | None = None,
 ) -> Fit:
-    """Find the process-to-measurement noise ratio on a growing data window, then fit all data."""
+    """Find the process-to-measurement noise ratio on a growing data window, then fit all data.
+
+    What a rival on the same data is far above then is not sought along its ridges.
+    """
     part = data.data_window(min(SCREENING_SAMPLES * data.step, 60.0))
     best = _find_noise_ratio(part, structure, first, options, near)
+    if rival is not None and rival.samples == part.size:
+        price = SUBSET_HOPELESS.value * max(1.0, float(np.median(best.sandwich_factors())))
+        if best.deviance > rival.deviance + price:
+            whole = best.samples == data.size
+            return best if whole else extend(data, structure, best, options, rival)
     found = along_friction(part, structure, best, options)
     if found.noise_ratio > 0 and found.deviance < best.deviance - TORQUE_NOISE.value:
         again = _find_noise_ratio(part, structure, found, options, found)

@@ -28,9 +28,11 @@ def with_delay(
     return first and settled(data, first, options, plain)
 
 
-def settled(data: Experiments, first: Fit, options: Options, near: Fit | None) -> Fit:
+def settled(
+    data: Experiments, first: Fit, options: Options, near: Fit | None, rival: Fit | None = None
+) -> Fit:
     """Carry a first fit on to all data, and to its torque noise."""
-    fit = data_window.grow(data, first.structure, first, options, near)
+    fit = data_window.grow(data, first.structure, first, options, near, rival)
     return _snap(data, fit, options) if first.structure.delay else fit
 
 

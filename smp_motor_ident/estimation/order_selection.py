@@ -182,9 +182,10 @@ def _left(
 def _on_subset(part: Experiments, firsts: list[Fit], options: Options) -> list[Fit]:
     """Fit candidates to the screening subset, each started from the others' answers too."""
     tried: list[Fit] = []
+    rival = min(firsts, key=lambda f: f.deviance, default=None)
     for first in firsts:
         there = of_kind(part, first)
-        fitted = settled(there, first, options, _near(first.structure, tried))
+        fitted = settled(there, first, options, _near(first.structure, tried), rival)
         tried.append(no_worse(there, fitted, tried, options))
     return from_rivals(part, from_richer(part, tried, options), options)
 
