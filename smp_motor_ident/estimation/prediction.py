@@ -15,7 +15,8 @@ from smp_motor_ident.estimation.fit import Fit, solve
 from smp_motor_ident.estimation.memory import remembered
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.noise import NO_GAIN, NoiseModel, whitening
-from smp_motor_ident.likelihood.passes import Pass, answers, evaluate, gather
+from smp_motor_ident.likelihood.passes import Pass, answers, evaluate, gather, own_columns
+from smp_motor_ident.likelihood.sensitivities import LANES
 from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import Structure
 
@@ -41,14 +42,40 @@ def _predict(data: Experiments, fit: Fit, gain: Array, columns: int) -> Array:
 
 
 def again(data: Experiments, structure: Structure, fit: Fit) -> Pass:
-    """Return normal equations of experiments at a fit, with the coordinates of a structure."""
+    """Return normal equations of experiments at a fit, with the coordinates of a structure.
+
+    One pass serves for all that may be asked beside it, too.
+    """
+    more = _beside(data, structure)
 
     def run() -> Pass:
-        z, noise = structure.complete(fit.z), fit.noise_model()
-        return evaluate(data, structure, z, fit.initial, fit.initial, noise)
+        z, noise = more.complete(fit.z), fit.noise_model()
+        return evaluate(data, more, z, fit.initial, fit.initial, noise)
 
-    question = (structure, fit.z, fit.initial, fit.noise, fit.gain)
-    return remembered(data, "pass", PASSES, question, run)
+    question = (more, fit.z, fit.initial, fit.noise, fit.gain)
+    here = remembered(data, "pass", PASSES, question, run)
+    # How each of its coordinates moves those of the pass.
+    move = np.linalg.lstsq(more.matrix(), structure.matrix(), rcond=None)[0]
+    return replace(
+        here,
+        normal=move.T @ here.normal @ move,
+        gradient=here.gradient @ move,
+        local_gain=here.local_gain @ move,
+        scores=here.scores @ move,
+    )
+
+
+def _beside(data: Experiments, structure: Structure) -> Structure:
+    """Return a structure with all free that is asked for beside a fit, if a pass has the room."""
+    free = structure.friction == "symmetric" and models.VC_PLUS in structure.free()
+    more = structure.with_(
+        load=not structure.own_load,
+        delay=structure.delay or "delay" not in structure.fixed,
+        offset=structure.current,
+        friction="asymmetric" if free else structure.friction,
+    )
+    room = len(more.free()) + len(own_columns(data, more)) <= LANES
+    return more if room else structure
 
 
 def inverse(normal: Array, rcond: float = 1e-13) -> Array:
