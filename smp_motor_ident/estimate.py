@@ -16,7 +16,7 @@ from smp_motor_ident.diagnosis.beat import clock_share, on_beat
 from smp_motor_ident.diagnosis.bunched import merge_bunches
 from smp_motor_ident.diagnosis.conditions import dependent
 from smp_motor_ident.diagnosis.current_kind import ARMATURE, current_kind
-from smp_motor_ident.diagnosis.limits import CANDIDATE_WEIGHT, LEAST_FIT, PROFILED
+from smp_motor_ident.diagnosis.limits import LEAST_FIT, PROFILED
 from smp_motor_ident.diagnosis.misfit import widened_by_misfit
 from smp_motor_ident.diagnosis.model_error import regression
 from smp_motor_ident.diagnosis.noise_or_effect import in_place_of_noise
@@ -26,7 +26,7 @@ from smp_motor_ident.diagnosis.scope import blames_current, contradicted, curren
 from smp_motor_ident.diagnosis.screening import screen
 from smp_motor_ident.errors import InsufficientExcitationError, SignalError, SmpError
 from smp_motor_ident.estimation import flexible_shaft, order_selection, prediction
-from smp_motor_ident.estimation.averaging import averaged, weights
+from smp_motor_ident.estimation.averaging import candidate_weights, covering
 from smp_motor_ident.estimation.candidate_starts import of_kind
 from smp_motor_ident.estimation.choice import FittedCandidate, size
 from smp_motor_ident.estimation.consider_covariance import (
@@ -37,7 +37,7 @@ from smp_motor_ident.estimation.consider_covariance import (
     consider_timing,
 )
 from smp_motor_ident.estimation.descent import ROUGHLY, refine
-from smp_motor_ident.estimation.fit import Fit, Prior
+from smp_motor_ident.estimation.fit import Fit, Prior, solve
 from smp_motor_ident.estimation.hold_choice import chosen_hold, instant_deviation, otherwise
 from smp_motor_ident.estimation.profile import profiled
 from smp_motor_ident.estimation.quantisation import widened
@@ -216,11 +216,11 @@ def _stated(
     errors = regression(final, chosen, gear)
     chosen, parts = dependent(chosen, errors)
 
-    weight = _weights(data, candidates)
+    weight = candidate_weights(data, candidates)
 
     def said(fit: Fit) -> tuple[Answer, dict[str, float]]:
         own = answer(fit, request.known, friction_std, driven_longest(final))
-        return _covering(weight, candidates, own, request.known)
+        return covering(weight, candidates, own, request.known)
 
     result, alike = said(chosen)
     fitted = validate.speed_fit(group, final, chosen)
@@ -297,34 +297,6 @@ def _certain(
     return chosen, friction_std, change
 
 
-def _weights(data: Experiments, candidates: Sequence[FittedCandidate]) -> dict[int, float]:
-    """Return the weights of the structures that explain the data as well, by their places."""
-    last = len(candidates) - 1
-    places = [n for n, r in enumerate(candidates) if n < last and r.whole and r.fit.converged]
-    if data.quantum > 0:  # a speed in coarse steps is a difference of counts, by its making
-        places = [n for n in places if candidates[n].fit.kind == candidates[last].fit.kind]
-    if not places:
-        return {}
-    places = [last, *places]
-    found = weights(lambda fit: of_kind(data, fit), [candidates[n].fit for n in places])
-    return dict(zip(places, map(float, found), strict=True))
-
-
-def _covering(
-    weight: Mapping[int, float],
-    candidates: Sequence[FittedCandidate],
-    result: Answer,
-    known: Mapping[str, float],
-) -> tuple[Answer, dict[str, float]]:
-    """Return the answer over all structures that explain the data as well, and their weights."""
-    if not weight or result.level:
-        return result, {}
-    others = [answer(candidates[n].fit, known) for n in list(weight)[1:]]
-    found = averaged(result, np.array(list(weight.values())), others)
-    likely = {candidates[n].label: w for n, w in weight.items() if w > CANDIDATE_WEIGHT.value}
-    return found, likely if len(likely) > 1 else {}
-
-
 def _name(structure: Structure) -> str:
     return structure.name + ("_asymmetric" if structure.friction == "asymmetric" else "")
 
@@ -376,7 +348,7 @@ def _validation(
         if np.ptp(part.hold_value) == 0 or all(np.ptp(r.voltage) == 0 for r in kept):
             return None, None
         start = replace(fit, initial=part.initial)
-        refined = refine(part, fit.structure, start, fit.z, options, ROUGHLY)
+        refined = solve(part, fit.structure, start, options, 30, ROUGHLY)
         found = validate.held_out(kept, refined, hold, scatter)
     own, common = (x if np.isfinite(x) else None for x in found)
     return own, common

@@ -20,10 +20,11 @@ from numpy.typing import NDArray
 
 from smp_motor_ident.diagnosis.limits import CANDIDATE_WEIGHT, PRIOR_ODDS
 from smp_motor_ident.estimation import prediction
-from smp_motor_ident.estimation.choice import size
+from smp_motor_ident.estimation.candidate_starts import of_kind
+from smp_motor_ident.estimation.choice import FittedCandidate, size
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.fitted import NORMAL_95
-from smp_motor_ident.estimation.quantities import Answer
+from smp_motor_ident.estimation.quantities import Answer, answer
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.result import Quantity
 
@@ -81,6 +82,34 @@ def averaged(result: Answer, weight: Array, others: Sequence[Answer]) -> Answer:
         parameters=_shifted(result.parameters, shift),
         covariance=result.covariance + between,
     )
+
+
+def candidate_weights(data: Experiments, candidates: Sequence[FittedCandidate]) -> dict[int, float]:
+    """Return the weights of the structures that explain the data as well, by their places."""
+    last = len(candidates) - 1
+    places = [n for n, r in enumerate(candidates) if n < last and r.whole and r.fit.converged]
+    if data.quantum > 0:  # a speed in coarse steps is a difference of counts, by its making
+        places = [n for n in places if candidates[n].fit.kind == candidates[last].fit.kind]
+    if not places:
+        return {}
+    places = [last, *places]
+    found = weights(lambda fit: of_kind(data, fit), [candidates[n].fit for n in places])
+    return dict(zip(places, map(float, found), strict=True))
+
+
+def covering(
+    weight: Mapping[int, float],
+    candidates: Sequence[FittedCandidate],
+    result: Answer,
+    known: Mapping[str, float],
+) -> tuple[Answer, dict[str, float]]:
+    """Return the answer over all structures that explain the data as well, and their weights."""
+    if not weight or result.level:
+        return result, {}
+    others = [answer(candidates[n].fit, known) for n in list(weight)[1:]]
+    found = averaged(result, np.array(list(weight.values())), others)
+    likely = {candidates[n].label: w for n, w in weight.items() if w > CANDIDATE_WEIGHT.value}
+    return found, likely if len(likely) > 1 else {}
 
 
 def _value(answer: Answer, name: str, own: float) -> float:
