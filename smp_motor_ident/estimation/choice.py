@@ -80,7 +80,7 @@ def worth_a_fit(data: Experiments, best: Fit, richer: Structure) -> bool:
     return not gain < 0.5 * price * sandwich_factor(best)
 
 
-def more_shows(part: Experiments, data: Experiments, best: Fit, on_part: Fit, rich: Fit) -> bool:
+def more_shows(data: Experiments, best: Fit, on_part: Fit, rich: Fit) -> bool:
     """Tell whether a richer fit of a part of the data is worth one of all of them.
 
     It is not where it gains next to nothing on the part, and the score of all data neither: to
@@ -90,7 +90,7 @@ def more_shows(part: Experiments, data: Experiments, best: Fit, on_part: Fit, ri
     late = s.with_(window=False, delay=True) if rich.kind != best.kind else s
     if best.noise_ratio > 0 or not set(best.structure.free()) < set(late.free()):
         return True
-    price = float(np.log(part.size)) + PRIOR_ODDS.value
+    price = float(np.log(rich.samples)) + PRIOR_ODDS.value
     if on_part.deviance - rich.deviance > price or not rich.converged:
         return True
     return worth_a_fit(data, best, late)

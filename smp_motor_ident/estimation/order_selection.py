@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from smp_motor_ident.diagnosis.limits import SUBSET_HOPELESS
+from smp_motor_ident.diagnosis.limits import PRIOR_ODDS, SUBSET_HOPELESS
 from smp_motor_ident.estimation import data_window, descent
 from smp_motor_ident.estimation.candidate_starts import (
     from_richer,
@@ -127,6 +127,9 @@ def _orders(
     # Of a short record torque noise may stand for a load that is not asked for yet.
     if part is not data or data.kind == rc.SPEED:
         tried = _left(data, part, tried, candidates)
+    alone = _alone(data, part, tried, options, candidates) if part is not data else None
+    if alone is not None:
+        return alone
     tried = _on_subset(part, tried, options)
     if part is not data:
         tried = _left(data, part, tried, candidates)
@@ -135,10 +138,8 @@ def _orders(
     for there in tried:
         fitted = there
         if part is not data:
-            if best and on_part and not more_shows(part, data, best, on_part, there):
-                words = f"no better than {label(best.structure)} by its score"
-                deviance = best.deviance - (on_part.deviance - there.deviance)
-                candidates.append(_rejected(data, part, there, words, deviance))
+            if best and on_part and not more_shows(data, best, on_part, there):
+                candidates.append(_no_better(data, part, best, on_part, there))
                 continue
             fitted = _on_all(data, there, [r.fit for r in candidates if r.whole], options)
         if best is None:
@@ -148,6 +149,39 @@ def _orders(
         candidates.append(FittedCandidate(fitted, reason))
         best, on_part = (fitted, there) if better else (best, on_part)
     return best and simplest_left(next(r for r in candidates if r.fit is best), candidates)
+
+
+def _alone(
+    data: Experiments,
+    part: Experiments,
+    firsts: list[Fit],
+    options: Options,
+    candidates: list[FittedCandidate],
+) -> Fit | None:
+    """Return the simplest candidate left where neither the beginning nor any score asks for more.
+
+    Of an angle torque noise may stand for what is missing, and tells no score of it.
+    """
+    if not firsts or data.kind != rc.SPEED:
+        return None
+    simple, *others = firsts
+    price = float(np.log(simple.samples)) + PRIOR_ODDS.value
+    if any(simple.deviance - r.deviance > price for r in others):
+        return None
+    fit = _on_all(data, settled(part, simple, options, None), [], options)
+    if not fit.converged or any(more_shows(data, fit, simple, r) for r in others):
+        return None
+    candidates += [_no_better(data, part, fit, simple, r) for r in others]
+    candidates.append(FittedCandidate(fit, "the simplest left"))
+    return fit
+
+
+def _no_better(
+    data: Experiments, part: Experiments, best: Fit, on_part: Fit, rich: Fit
+) -> FittedCandidate:
+    """Return a richer candidate that neither a part of the data nor the score of all asks for."""
+    reason = f"no better than {label(best.structure)} by its score"
+    return _rejected(data, part, rich, reason, best.deviance - (on_part.deviance - rich.deviance))
 
 
 def _first_fits(
