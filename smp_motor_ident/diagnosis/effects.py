@@ -13,7 +13,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_banded
+from scipy.signal import lfilter
 
 from smp_motor_ident.likelihood import recursion as rc
 
@@ -240,6 +240,4 @@ def _lagged(signal: Array, m: Motion, factor: float) -> Array:
     # The motor's own lag [sections] from how its speed follows its voltage.
     own = max(float(np.abs(voltage - speed).sum() / max(np.abs(np.diff(speed)).sum(), 1e-9)), 1.0)
     a = float(np.exp(-1.0 / max(factor * own, 0.3)))
-    # y[n] - a y[n-1] = (1 - a) x[n]: a filter as a system of equations with two bands.
-    bands = np.array([np.ones(signal.size), np.full(signal.size, -a)])
-    return np.asarray(solve_banded((1, 0), bands, (1 - a) * signal))
+    return np.asarray(lfilter([1 - a], [1.0, -a], signal))

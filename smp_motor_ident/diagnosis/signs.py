@@ -74,7 +74,11 @@ def _smooth(record: Record, signal: Array) -> tuple[float, Array, Array] | None:
 
 def _means(values: Array, k: int) -> Array:
     """Return the means of k neighbours, in the places of their last."""
-    return np.asarray(lfilter(np.full(k, 1 / k), [1.0], values)) if k > 1 else values
+    if k <= 1:
+        return values
+    sums = np.cumsum(values)
+    sums[k:] -= sums[:-k].copy()
+    return sums / k
 
 
 def _lagged(values: Array, samples: float) -> Array:
