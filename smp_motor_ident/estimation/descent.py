@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident.estimation.fit import Fit, Options, solve
+from smp_motor_ident.estimation.memory import remembered
 from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model import structures as models
@@ -21,8 +22,12 @@ SCREENING_SAMPLES = 12_000  # samples on which candidates and noise levels are c
 
 def screening_subset(data: Experiments) -> Experiments:
     """Return the part on which models are compared, or all where that is little more."""
-    part = data.data_window(SCREENING_SAMPLES * data.step)
-    return part if data.size > 3 * part.size else data
+
+    def cut() -> Experiments:
+        part = data.data_window(SCREENING_SAMPLES * data.step)
+        return part if data.size > 3 * part.size else data
+
+    return remembered(data, "subset", 1, (), cut)
 
 
 def noise_ratio_of(bandwidth: float, step: float, kind: int) -> float:

@@ -19,6 +19,7 @@ from smp_motor_ident.estimation.descent import (
     noise_ratio_of,
 )
 from smp_motor_ident.estimation.fit import Fit, Options, Start, solve
+from smp_motor_ident.estimation.memory import remembered
 from smp_motor_ident.estimation.ridge import better, shapes, slower_winding
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.noise import NoiseModel, deviance, kalman_gain
@@ -64,6 +65,10 @@ def candidates(data: Experiments, structure: Structure) -> list[Array]:
 
 def beginning(data: Experiments) -> Experiments:
     """Return as much of the data as tells starts apart: some seconds, or less of a quick motor."""
+    return remembered(data, "beginning", 1, (), lambda: _beginning(data))
+
+
+def _beginning(data: Experiments) -> Experiments:
     whole = data.data_window(min(8.0, SCREENING_SAMPLES * data.step))
     lags = [np.exp(z[models.A1] - z[models.A0]) for z in start.speed_candidates(whole, 1)]
     if not lags:
