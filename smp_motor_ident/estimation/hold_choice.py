@@ -31,9 +31,9 @@ from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import Structure
 from smp_motor_ident.record import Record
 
-LOOKS = (1_000, 4_000)
+LOOKS = (1_000, 4_000, np.inf)
 """Samples on which it is asked whether another hold is worth a search: few, where it comes near
-more."""
+more, and all before the search."""
 EARLIER = {"after": 1.0, "interpolated": 0.5}
 """Samples of delay that a hold takes the place of."""
 
@@ -134,7 +134,7 @@ def _worth_a_search(
             # What has not settled, or saw little of the data, tells against a search only where
             # its residuals are of another size.
             near = part.size * (1.0 + (part.current.size > 0))
-            if least is looks[max(looks)] and found.converged:
+            if (duration > min(looks) or len(looks) == 1) and found.converged:
                 near = float(np.log(part.size)) + PRIOR_ODDS.value
             if found.deviance >= least.deviance + near:
                 break

@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 
 ALIKE = 0.05  # e-folds or volts by which starts differ that end alike
 SHAPES = 6  # of the same linear response that are refined
-LAGS, SAMPLES = 50.0, 2_000  # of a motor, and at least, on which starts are compared
+LAGS, SAMPLES = 20.0, 2_000  # of a motor, and at least, on which starts are compared
 OPEN = 0.02  # standard deviation of ln L/R or ln R above which other starts are tried
 WINDING = 0.2  # of a sample: a shorter L/R has settled to a hundredth when the current is read
 
