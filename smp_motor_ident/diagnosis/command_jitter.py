@@ -72,7 +72,7 @@ def _scatter(data: Experiments, fit: Fit) -> float:
     for n in range(0, PATTERNS, several):
         signs = rng.choice([-1.0, 1.0], (voltage.size, min(several, PATTERNS - n)))
         made = signs * moved[:, None], np.zeros((0, 0, 0))
-        x += np.square(answered(data, fit, made, 1, False)).sum(axis=2) / PATTERNS
+        x += np.square(answered(data, fit, made, 1)).sum(axis=2) / PATTERNS
     x /= np.square(deviation)
     known = np.isfinite(values)
     square = np.minimum(np.square((values - base) / deviation)[known], MOST**2)

@@ -1,13 +1,14 @@
 """The model's error and its responses to effects, the model's own coordinates projected out.
 
-Every column is carried through a pass over the data beside the motor, as its sensitivities are: it
-sticks, is delayed and is corrected by the measurements as the model is.
+The columns of effects are carried through a pass over the data beside the motor, as its
+sensitivities are: they stick, are delayed and are corrected by the measurements as the model is.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -141,9 +142,7 @@ def stacked(data: Experiments, fit: Fit, columns: Array) -> Array:
     Of long records the sums over so many samples that `ROWS` of each are left, over the root of
     their number: what the effects do is slow, and a sum of errors is as good as they are.
     """
-    known = np.where(np.isfinite(measured(data)), columns, 0.0)
-    sums = np.add.reduceat(known, row_starts(data, together(data)), axis=0)
-    return whitened(data, fit, sums[:, :, None])[0]
+    return whitened(data, fit, _summed(data, columns, together(data))[:, :, None])[0]
 
 
 def whitened(data: Experiments, fit: Fit, sums: Array) -> list[Array]:
@@ -168,27 +167,45 @@ def _blocks(data: Experiments) -> NDArray[np.int64]:
 def own_responses(data: Experiments, fit: Fit, together: int = 1) -> Array:
     """Return the sensitivities to the free coordinates and to each segment's initial state.
 
-    Shape (rows, o, f + s), summed over rows of so many samples.
+    Shape (rows, o, f + s), summed over rows of so many samples.  They are differences over a part
+    of what the data leave open: where coordinates hang together, slopes at a point are less apart.
     """
-    none = np.zeros((0, 0)), np.zeros((0, 0, 0))
-    sums = answered(data, fit, none, together, True)
-    free, columns = len(fit.structure.free()), own_columns(data, fit.structure)
+    structure, base = fit.structure, predicted(data, fit)
+    # With all others fixed: coordinates that hang together (L/R of next to nothing) leave a
+    # motor for other physics within their joint deviations.
+    deviation = 1 / np.sqrt(np.maximum(np.diag(fit.information), 1e-300))
+    out = []
+    for j in range(len(structure.free())):
+        step = 0.3 * float(np.clip(deviation[j], 1e-9, 0.05))
+        z = fit.z + step * structure.matrix()[:, j]
+        moved = prediction.once(data, replace(fit, z=z), gain=True)[:, 1:]
+        out.append(_summed(data, (moved - base) / step, together))
     begins, segments = row_starts(data, together), len(data.starts) - 1
-    parts = [sums[:, :, :free]]
-    for n, c in enumerate(columns):
-        if segments <= SEGMENTS or c == 2:
-            owner = begins[:, None] >= data.starts[:-1]
-            owner &= begins[:, None] < data.starts[1:]
-            parts.append(sums[:, :, free + n, None] * owner[:, None, :])
-    return np.concatenate(parts, axis=2)
+    columns = own_columns(data, structure)
+    if segments > SEGMENTS:
+        columns = tuple(c for c in columns if c == 2)
+    size = {0: 1e-3, 1: 1e-3 * (1 + np.abs(fit.initial[:, 1]).max()), 2: 1e-3, 3: 1e-3, 4: 1e-3}
+    for c in columns:
+        initial = fit.initial.copy()
+        initial[:, c] += size[c]
+        moved = prediction.once(data, replace(fit, initial=initial), gain=True)[:, 1:]
+        moved = _summed(data, (moved - base) / size[c], together)
+        for a, b in pairwise(data.starts):
+            within = (begins >= a) & (begins < b)
+            out.append(np.where(within[:, None], moved, 0.0))
+    return np.stack(out, axis=2)
 
 
-def answered(
-    data: Experiments, fit: Fit, made: tuple[Array, Array], together: int, own: bool
-) -> Array:
+def _summed(data: Experiments, columns: Array, together: int) -> Array:
+    """Return sums over rows of so many samples, of those that were measured."""
+    known = np.where(np.isfinite(measured(data)), columns, 0.0)
+    return np.asarray(np.add.reduceat(known, row_starts(data, together), axis=0))
+
+
+def answered(data: Experiments, fit: Fit, made: tuple[Array, Array], together: int) -> Array:
     """Return `answers` at a fit."""
     noise = fit.noise_model()
-    return answers(data, fit.structure, fit.z, fit.initial, noise, made, together, own)
+    return answers(data, fit.structure, fit.z, fit.initial, noise, made, together, False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,7 +283,7 @@ def _put_answers(
     data: Experiments, fit: Fit, waiting: list[Signal], places: list[int], out: list[Array]
 ) -> None:
     """Put the responses to waiting signals into their places; none waits then."""
-    sums = answered(data, fit, _tables(data, waiting), together(data), False)
+    sums = answered(data, fit, _tables(data, waiting), together(data))
     for n, place in enumerate(places):
         out[place] = sums[:, :, n]
     waiting.clear()
@@ -294,8 +311,7 @@ def _as_it_is(data: Experiments, signal: Signal) -> Array:
     """Return sums by rows of what is added to the measurements alone."""
     outputs = 1 + (data.current.size > 0)
     added = _tables(data, [signal])[1][:outputs, :, 0].T
-    known = np.where(np.isfinite(measured(data)), added, 0.0)
-    return np.asarray(np.add.reduceat(known, row_starts(data, together(data)), axis=0))
+    return _summed(data, added, together(data))
 
 
 def motions(data: Experiments, fit: Fit, gear: float) -> tuple[Motion, Motion]:

@@ -27,15 +27,14 @@ PASSES = 8  # normal equations that are kept of each data
 
 def simulate(data: Experiments, fit: Fit, gain: bool = False) -> Array:
     """Return speed, output and current as the fitted motor predicts them; not to be changed."""
-    own = fit.gain if gain and fit.gain.any() else NO_GAIN
-    columns = 3 if data.current.size else 2
-    question = (fit.structure, fit.z, fit.initial, own)
-    return remembered(data, "run", 1, question, lambda: _predict(data, fit, own, columns))
+    question = (fit.structure, fit.z, fit.initial, fit.gain if gain and fit.gain.any() else NO_GAIN)
+    return remembered(data, "run", 1, question, lambda: once(data, fit, gain))
 
 
-def _predict(data: Experiments, fit: Fit, gain: Array, columns: int) -> Array:
-    predicted = np.empty((data.size, columns))
-    noise = NoiseModel(fit.noise, gain)
+def once(data: Experiments, fit: Fit, gain: bool = False) -> Array:
+    """Return the same of a motor that nobody else asks for."""
+    predicted = np.empty((data.size, 3 if data.current.size else 2))
+    noise = NoiseModel(fit.noise, fit.gain if gain else NO_GAIN)
     gather(data, fit.structure, fit.z, fit.initial, noise, predicted, differentiate=False)
     predicted.flags.writeable = False
     return predicted
