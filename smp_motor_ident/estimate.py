@@ -28,7 +28,6 @@ from smp_motor_ident.errors import InsufficientExcitationError, SignalError, Smp
 from smp_motor_ident.estimation import flexible_shaft, order_selection, prediction
 from smp_motor_ident.estimation.averaging import averaged, weights
 from smp_motor_ident.estimation.candidate_starts import of_kind
-from smp_motor_ident.estimation.choice import FittedCandidate, size
 from smp_motor_ident.estimation.consider_covariance import (
     consider_clock,
     consider_drop,
@@ -44,13 +43,14 @@ from smp_motor_ident.estimation.quantisation import widened
 from smp_motor_ident.estimation.quantities import Answer, answer, driven_longest
 from smp_motor_ident.estimation.request import Request, base_structure, checked
 from smp_motor_ident.estimation.segments import heterogeneous
+from smp_motor_ident.estimation.selection import FittedCandidate
 from smp_motor_ident.estimation.subset import excited
 from smp_motor_ident.estimation.thinning import thinned
 from smp_motor_ident.finding import Finding
-from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments, prepare
-from smp_motor_ident.model import structures as models
-from smp_motor_ident.model.structures import PHYSICAL, Structure
+from smp_motor_ident.model.measurement import ANGLE
+from smp_motor_ident.model.physical import PHYSICAL, physical
+from smp_motor_ident.model.structures import Structure
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import Candidate, Estimate, FitPercent
 
@@ -80,7 +80,7 @@ def estimate(
         ``auto``, or a candidate structure: ``static_gain``, ``first_order``,
         ``second_order``, ``electromechanical``.
     fixed : mapping of str to float, optional
-        Parameters that the user knows, by the names of `models.PHYSICAL` or ``delay``,
+        Parameters that the user knows, by the names of `model.physical.PHYSICAL` or ``delay``,
         ``averaging_window``; SI, at the motor shaft.
     bounds : mapping of str to (float, float), optional
         Limits of physical parameters, where current is measured.
@@ -181,7 +181,7 @@ def _in_turn(candidates: list[FittedCandidate]) -> list[list[FittedCandidate]]:
     others = [
         r
         for r in candidates[:-1]
-        if r.whole and r.fit.converged and size(r.fit.structure) <= size(chosen.structure)
+        if r.whole and r.fit.converged and r.fit.structure.size <= chosen.structure.size
     ]
     others.sort(key=lambda r: r.bic)
     return [candidates, *([*(o for o in candidates if o is not r), r] for r in others)]
@@ -243,7 +243,7 @@ def _stated(
         *scope(final, result, change, alike, group[0].hardware.resistance),
     ]
     return Estimate(
-        model=_name(chosen.structure),
+        model=chosen.structure.title,
         parameters=result.parameters,
         combinations=result.combinations,
         names=result.names,
@@ -254,7 +254,7 @@ def _stated(
         findings=tuple(findings),
         samples=data.size,
         sample_time=data.step,
-        speed_noise=0.0 if data.kind == rc.ANGLE else float(np.sqrt(chosen.noise[0, 0])),
+        speed_noise=0.0 if data.kind == ANGLE else float(np.sqrt(chosen.noise[0, 0])),
         **_provenance(group),
     )
 
@@ -315,16 +315,12 @@ def _covering(
     return found, alike if len(alike) > 1 else {}
 
 
-def _name(structure: Structure) -> str:
-    return structure.name + ("_asymmetric" if structure.friction == "asymmetric" else "")
-
-
 def _constrain(data: Experiments, fit: Fit, request: Request) -> Fit:
     """Refit under what the user holds fixed or bounded, and what physics forbids."""
     if not fit.structure.current:
         return fit
     known = request.known
-    values, _ = models.physical(fit.z)
+    values = physical(fit.z)
     scale = {n: abs(values[n]) for n in PHYSICAL}
     scale["viscous_friction"] = values["motor_constant"] ** 2 / values["resistance"]
     priors = [

@@ -136,6 +136,12 @@ SURE_GAIN = Limit(
     "significance: 5e-14 for a parameter of 500 samples, whatever the richer one leaves loose",
     "test_structure_choice.py",
 )
+LOOSE_ADDITION = Limit(
+    0.4,
+    "of its value, or e-folds",
+    "significance: 2.5 deviations from nothing, one addition in eighty that is not there",
+    "test_structure_choice.py: an addition that is hardly known",
+)
 SUBSET_HOPELESS = Limit(
     40.0,
     "deviance",

@@ -18,12 +18,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident.diagnosis.limits import CANDIDATE_WEIGHT, PRIOR_ODDS
+from smp_motor_ident.diagnosis.limits import CANDIDATE_WEIGHT
 from smp_motor_ident.estimation import prediction
-from smp_motor_ident.estimation.choice import size
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.fitted import NORMAL_95
 from smp_motor_ident.estimation.quantities import Answer
+from smp_motor_ident.estimation.selection import POLICY
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.result import Quantity
 
@@ -56,7 +56,7 @@ def weights(data: Callable[[Fit], Experiments], fits: Sequence[Fit], seed: int =
     runs = np.array(rows)
     rng = np.random.default_rng(seed)
     shares = rng.dirichlet(np.ones(BLOCKS), DRAWS) * BLOCKS
-    price = np.array([size(f.structure) * (np.log(f.samples) + PRIOR_ODDS.value) for f in fits])
+    price = np.array([POLICY.price(f.structure.size, f.samples) for f in fits])
     total = shares @ runs.T + price
     each = np.exp(-0.5 * (total - total.min(axis=1, keepdims=True)))
     return np.asarray((each / each.sum(axis=1, keepdims=True)).mean(axis=0))

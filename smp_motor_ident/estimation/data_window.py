@@ -20,8 +20,8 @@ from smp_motor_ident.estimation.descent import (
 )
 from smp_motor_ident.estimation.fit import Fit, Options, solve
 from smp_motor_ident.estimation.ridge import along_friction
-from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments
+from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.model.structures import Structure
 
 Array = NDArray[np.float64]
@@ -88,7 +88,7 @@ def _find_noise_ratio(
     # A speed output survives torque noise in free run, and free run has no bias where the
     # model is not the motor; the innovations form is for angles, which drift.
     free_run = fitted(first, 0.0, 30)
-    if part.kind != rc.ANGLE:
+    if part.kind != ANGLE:
         return free_run
     # Residuals no larger than the counter's own resolution leave nothing for torque noise.
     quiet = free_run.noise[0, 0] < FLOOR * part.quantum**2 / 12

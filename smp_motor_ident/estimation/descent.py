@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident.estimation.fit import Fit, Options, solve
-from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments
-from smp_motor_ident.model import structures as models
+from smp_motor_ident.model.coordinates import Coordinates
+from smp_motor_ident.model.measurement import Measurement
 from smp_motor_ident.model.structures import Structure
 
 Array = NDArray[np.float64]
@@ -24,14 +24,14 @@ def screening_subset(data: Experiments) -> Experiments:
     return part if data.size > 3 * part.size else data
 
 
-def noise_ratio_of(bandwidth: float, step: float, kind: int) -> float:
+def noise_ratio_of(bandwidth: float, step: float, kind: Measurement) -> float:
     """Return the process-to-measurement noise ratio that gives the innovations a bandwidth."""
-    return bandwidth ** (4 if kind == rc.ANGLE else 2) * step
+    return float(bandwidth ** (2 + 2 * kind.integrals) * step)
 
 
-def bandwidth(z: Array, data: Experiments) -> float:
+def bandwidth(z: Coordinates, data: Experiments) -> float:
     """Return the motor's own bandwidth, as far as the sampling shows it."""
-    return float(min(np.exp(z[models.A0] - z[models.A1]), 0.2 / data.step))
+    return min(float(np.exp(z.ln_a0 - z.ln_a1)), 0.2 / data.step)
 
 
 def first_noise(data: Experiments) -> Array:
@@ -62,7 +62,9 @@ def initial_of(data: Experiments, fit: Fit) -> Array:
     return initial
 
 
-def refine(data: Experiments, structure: Structure, near: Fit, z: Array, options: Options) -> Fit:
+def refine(
+    data: Experiments, structure: Structure, near: Fit, z: Coordinates, options: Options
+) -> Fit:
     """Fit a structure from another's answer on the same data."""
     fit = solve(data, structure, near.at(z, initial_of(data, near)), options, 30)
     return at_rest(data, structure, fit, options)
@@ -73,7 +75,7 @@ def at_rest(data: Experiments, structure: Structure, fit: Fit, options: Options)
     if structure.friction == "none":
         return fit
     first = np.abs(fit.initial[:, 1])
-    slow = (first > 0) & (first < 0.05 * np.exp(-fit.z[models.A0]) * np.abs(data.hold_value).max())
+    slow = (first > 0) & (first < 0.05 * fit.z.dc_gain * np.abs(data.hold_value).max())
     if not slow.any():
         return fit
     initial = fit.initial.copy()

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from smp_motor_ident.diagnosis.limits import SUBSET_HOPELESS
 from smp_motor_ident.estimation import data_window, descent
 from smp_motor_ident.estimation.candidate_starts import (
     from_richer,
@@ -15,14 +14,6 @@ from smp_motor_ident.estimation.candidate_starts import (
     no_worse,
     of_kind,
     under_load,
-)
-from smp_motor_ident.estimation.choice import (
-    FittedCandidate,
-    label,
-    preferred,
-    sandwich_factor,
-    simplest_left,
-    size,
 )
 from smp_motor_ident.estimation.current_lag import with_current_lag
 from smp_motor_ident.estimation.delay_and_averaging import (
@@ -34,12 +25,12 @@ from smp_motor_ident.estimation.delay_and_averaging import (
 from smp_motor_ident.estimation.fit import Fit, Options
 from smp_motor_ident.estimation.initialisation import first_fit, initial_fit
 from smp_motor_ident.estimation.ridge import random_restart, slower_winding
+from smp_motor_ident.estimation.selection import POLICY, FittedCandidate
 from smp_motor_ident.estimation.thinning import thinned
 from smp_motor_ident.estimation.variations import friction_shows, may_rub, varied
-from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments
-from smp_motor_ident.model import structures as models
-from smp_motor_ident.model.structures import Structure
+from smp_motor_ident.model.measurement import SPEED
+from smp_motor_ident.model.structures import FirstOrder, SecondOrder, Structure
 
 Say = Callable[[str], None]
 
@@ -66,7 +57,7 @@ def explore(
             FittedCandidate(first, "asked for" if not auto else "current is measured")
         )
         best = with_current_lag(data, first, options, candidates, say)
-        if auto and data.kind == rc.SPEED:
+        if auto and data.kind == SPEED:
             best = _try_average(data, best, options, candidates, say)
     else:
         found = _orders(data, base, options, say, candidates)
@@ -80,7 +71,7 @@ def explore(
 
 
 def _initial_fit(data: Experiments, s: Structure, options: Options, say: Say) -> Fit | None:
-    say(f"fitting {label(s)}")
+    say(f"fitting {s.label}")
     if s.delay:
         return with_delay(data, s, options, None)
     return initial_fit(data, s, options)
@@ -96,7 +87,7 @@ def _frictionless(
     """
     if base.current or base.friction != "symmetric" or options.priors or data.quantum > 0:
         return []
-    plain = base.with_(friction="none", shape=False)
+    plain = base.frictionless()
     subset = descent.screening_subset(data)
     quick = initial_fit(subset, plain, options)
     if quick is None or not quick.converged or friction_shows(subset, quick, False):
@@ -120,7 +111,7 @@ def _orders(
     Candidates that the screening subset rejects by far are not fitted to all of a long record.
     """
     part = descent.screening_subset(thinned(data))
-    structures = _structures(base, data.kind == rc.SPEED, data.quantum > 0)
+    structures = _structures(base, data.kind == SPEED, data.quantum > 0)
     tried = _first_fits(part, structures, options, say)
     if part is not data:
         tried = _left(data, tried, candidates)
@@ -134,10 +125,10 @@ def _orders(
         if best is None:
             better, reason = True, "the simplest left" if candidates else "the simplest"
         else:
-            better, reason = preferred(best, fitted)
+            better, reason = POLICY.preferred(best, fitted)
         candidates.append(FittedCandidate(fitted, reason))
         best = fitted if better else best
-    return best and simplest_left(next(r for r in candidates if r.fit is best), candidates)
+    return best and POLICY.simplest_left(next(r for r in candidates if r.fit is best), candidates)
 
 
 def _first_fits(
@@ -146,7 +137,7 @@ def _first_fits(
     """Fit all candidates to the beginning of the screening subset."""
     tried: list[Fit] = []
     for structure in structures:
-        say(f"fitting {label(structure)}")
+        say(f"fitting {structure.label}")
         fitted = _first(part, structure, options, tried)
         tried += [fitted] if fitted is not None else []
     return tried
@@ -157,7 +148,7 @@ def _left(data: Experiments, tried: list[Fit], candidates: list[FittedCandidate]
     least = min((f.deviance for f in tried), default=0.0)
     left = []
     for fit in tried:
-        if fit.deviance > least + SUBSET_HOPELESS.value * sandwich_factor(fit):
+        if POLICY.rejects_on_subset(fit, least):
             reason = f"rejected on {fit.samples} samples"
             candidates.append(FittedCandidate(_projected(data, fit), reason, whole=False))
         else:
@@ -216,9 +207,10 @@ def _structures(base: Structure, speed: bool, coarse: bool) -> list[Structure]:
     A speed that comes in coarse steps is a difference of counts, a mean over a window by its
     making: a second time constant is asked for beside that window, not in its place.
     """
-    first = replace(base, name="first_order", order=1, shape=False)
-    second = replace(base, name="second_order", order=2, shape=True)
+    first = FirstOrder.like(base)
+    second = SecondOrder.like(base, shape=True)
     late, late2 = first.with_(delay=True), second.with_(delay=True)
+    candidates: list[Structure]
     if not speed:
         candidates = [first, late, second, late2]
     elif coarse:
@@ -235,7 +227,7 @@ def _first(
 ) -> Fit | None:
     """Fit one candidate first, started from what the simpler ones found."""
     if structure.window:
-        late = replace(structure, name="first_order", order=1, shape=False, delay=True)
+        late = FirstOrder.like(structure, delay=True)
         twin = _find(known, late) or _find(known, late.with_(window=False))
         if twin is None or structure.order == 1:
             twin = _find(known, structure.with_(window=False, delay=True))
@@ -245,12 +237,9 @@ def _first(
         return first_with_delay(data, structure, options, plain)
     extra = []
     if structure.order == 2 and known:
-        z = min(known, key=lambda f: f.deviance).z.copy()
-        slow = np.exp(z[models.A1] - z[models.A0])
-        z[models.A2] = z[models.A1] + np.log(max(z[models.DELAY] + z[models.WINDOW], 0.05 * slow))
-        z[models.TE] = z[models.A2] - z[models.A1]
-        z[models.DELAY] = 0.0
-        extra = [z]
+        z = min(known, key=lambda f: f.deviance).z
+        late_by = max(z.delay + z.window, 0.05 * z.time_constant)
+        extra = [z.with_second_lag(late_by).with_(delay=0.0)]
     return first_fit(data, structure, options, extra)
 
 
@@ -272,18 +261,14 @@ def _orders_again(
         structure = known.structure.with_(load=True, friction=s.friction)
         if any(r.fit.structure == structure for r in candidates):
             continue
-        say(f"trying {label(structure)}")
+        say(f"trying {structure.label}")
         there = of_kind(data, known)
         start = replace(known, noise=best.noise, noise_ratio=best.noise_ratio)
         fits = [
             descent.refine(there, structure, start, z, options) for z in under_load(known, best)
         ]
         other = no_worse(there, min(fits, key=lambda f: f.deviance), [best], options)
-        if size(structure) < size(s):
-            verdict, reason = preferred(other, best)
-            better = not verdict
-        else:
-            better, reason = preferred(best, other)
+        better, reason = POLICY.replaces(best, other)
         if better and other.noise_ratio > 0:  # what looked like torque noise may have been this
             other = data_window.grow(there, structure, other, options)
         candidates.append(FittedCandidate(other, reason))
@@ -296,15 +281,11 @@ def _try_average(
 ) -> Fit:
     """Try a speed averaged over a window of a sample or more, current being measured."""
     structure = best.structure.with_(window=True)
-    say(f"trying {label(structure)}")
-    starts = []
-    for width in (1.02, 2.0, 4.0):
-        z = best.z.copy()
-        z[models.WINDOW] = width * data.step
-        starts.append(z)
+    say(f"trying {structure.label}")
+    starts = [best.z.with_(window=width * data.step) for width in (1.02, 2.0, 4.0)]
     fitted = initial_fit(data.as_mean_speed(), structure, options, starts, keep=3, own=False)
     if fitted is None:
         return best
-    verdict, reason = preferred(best, fitted)
+    verdict, reason = POLICY.preferred(best, fitted)
     candidates.append(FittedCandidate(fitted, reason))
     return fitted if verdict else best

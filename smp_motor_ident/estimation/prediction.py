@@ -14,7 +14,6 @@ from smp_motor_ident.estimation.fit import Fit, solve
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.noise import NO_GAIN, NoiseModel
 from smp_motor_ident.likelihood.passes import BLOCKS, Pass, evaluate, gather
-from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import Structure
 
 Array = NDArray[np.float64]
@@ -88,12 +87,8 @@ def predicted_decrease(
 
 def settle(data: Experiments, fit: Fit, iterations: int = 12) -> Fit:
     """Fit only the initial states and constant loads of other data (free run)."""
-    free = fit.structure.free()
-    fixed = {**fit.structure.fixed, **{models.Z_NAMES[i]: float(fit.z[i]) for i in free}}
-    if models.TE not in free and "ln_te" not in fixed:
-        fixed["ln_te"] = float(fit.z[models.TE])
-    if fit.structure.friction == "symmetric":
-        fixed["vc_minus"] = float(fit.z[models.VC_MINUS])
+    free = fit.structure.free
+    fixed = {**fit.structure.fixed, **{n: fit.z.value(n) for n in (*free, "ln_te", "vc_minus")}}
     structure = fit.structure.with_(fixed=fixed, own_load=True)
     done = solve(data, structure, fit.at(fit.z, data.initial, 0.0), iterations=iterations)
     return replace(done, structure=fit.structure, z=fit.z)

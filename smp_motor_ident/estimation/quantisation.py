@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.fit import Fit
-from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments
+from smp_motor_ident.model.measurement import ANGLE
 
 Array = NDArray[np.float64]
 
@@ -28,10 +28,10 @@ REACH = 2.0  # standard deviations to which motions near the estimate are replay
 
 def widened(data: Experiments, fit: Fit, seed: int = 0) -> Fit:
     """Return the fit with its covariance widened where quantisation repeats."""
-    if data.kind != rc.ANGLE or data.quantum == 0 or fit.noise_ratio > 0:
+    if data.kind != ANGLE or data.quantum == 0 or fit.noise_ratio > 0:
         return fit
     own = data.quantum**2 / 12
-    if fit.noise[0, 0] > 3 * own or not fit.structure.free():
+    if fit.noise[0, 0] > 3 * own or not fit.structure.free:
         return fit
     cov = fit.covariance()
     counted, metered = (np.diag(share) for share in _shares(data, fit))
@@ -64,13 +64,13 @@ def _counting_errors(
     data: Experiments, fit: Fit, own: float, spread: Array, rng: np.random.Generator
 ) -> Array:
     """Return what a counter adds to the angle of motions near the fit's, shape (replays, n)."""
-    matrix = fit.structure.matrix()
+    matrix = fit.structure.matrix
     noise = np.sqrt(max(fit.noise[0, 0] - own, 0.0))
     errors = []
     values, vectors = np.linalg.eigh(spread)
     half = vectors * np.sqrt(np.maximum(values, 0.0))
     for _ in range(int(np.clip(MOST // data.size, *REPLAYS))):
-        near = fit.structure.complete(fit.z + matrix @ (half @ rng.standard_normal(len(half))))
+        near = fit.structure.complete(fit.z.moved(matrix @ (half @ rng.standard_normal(len(half)))))
         angle = prediction.outputs(data, replace(fit, z=near))
         if not np.abs(angle).max() < COUNTED * data.quantum:
             continue  # no motor: a coordinate that the data leave open went out of all bounds

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from smp_motor_ident.estimation.fit import Fit, Options, solve
 from smp_motor_ident.likelihood.experiments import Experiments
-from smp_motor_ident.model import structures as models
+from smp_motor_ident.model.coordinates import Coordinates
 from smp_motor_ident.model.structures import Structure
 
 Array = NDArray[np.float64]
@@ -27,17 +27,16 @@ def along_friction(part: Experiments, structure: Structure, best: Fit, options: 
 
     Without current the two trade against each other along a long curved ridge of the likelihood.
     """
-    if structure.current or models.VC_PLUS not in structure.free():
+    if structure.current or "vc_plus" not in structure.free:
         return best
     full = float(np.abs(part.hold_value).max())
     for share in (0.01, 0.025, 0.06):
-        z = best.z.copy()
-        z[models.VC_PLUS] = share * full
-        z[models.A0] += np.log((full - share * full) / max(full - best.z[models.VC_PLUS], 1e-9))
+        left = (full - share * full) / max(full - best.z.vc_plus, 1e-9)
+        z = best.z.with_(vc_plus=share * full, ln_a0=best.z.ln_a0 + np.log(left))
         starts = [z]
-        if models.TE in structure.free() and best.z[models.VC_PLUS] < 1e-3 * full:
-            starts.append(z.copy())  # none at all may only be the other lag's friction
-            starts[1][models.TE] = z[models.A2] - z[models.A1] + 0.3
+        if "ln_te" in structure.free and best.z.vc_plus < 1e-3 * full:
+            # None at all may only be the other lag's friction.
+            starts.append(z.with_(ln_te=z.undamped().ln_te + 0.3))
         for z in starts:
             other = _from(z, part, structure, best, options)
             if better(other, best):
@@ -54,10 +53,10 @@ def better(one: Fit, other: Fit) -> bool:
     """Tell which of two fits to keep: the likelier; of two alike the one that claims less."""
     if one.deviance < other.deviance - ALIKE:
         return True
-    free = one.structure.free()
-    if one.deviance > other.deviance + ALIKE or models.VC_PLUS not in free:
+    free = one.structure.free
+    if one.deviance > other.deviance + ALIKE or "vc_plus" not in free:
         return one.deviance < other.deviance
-    i = free.index(models.VC_PLUS)
+    i = free.index("vc_plus")
     mine, theirs = one.covariance()[i, i], other.covariance()[i, i]
     return bool(mine > 4 * theirs or (mine > theirs / 4 and one.deviance < other.deviance))
 
@@ -65,69 +64,62 @@ def better(one: Fit, other: Fit) -> bool:
 def random_restart(part: Experiments, structure: Structure, best: Fit, options: Options) -> Fit:
     """Restart at random around a descent that did not settle: a kink holds it at one place only."""
     rng = np.random.default_rng(len(part.starts))
-    matrix = structure.matrix()
+    matrix = structure.matrix
     for n in range(RESTARTS):
         if best.converged:
             break
         values, vectors = np.linalg.eigh(best.covariance())
         length = RESTART_LENGTHS[n % len(RESTART_LENGTHS)]
         move = vectors @ (np.sqrt(np.maximum(values, 0.0)) * rng.standard_normal(len(values)))
-        largest = float(np.abs(matrix @ move)[[models.A0, models.A1, models.A2, models.TE]].max())
-        z = best.z + matrix @ move * min(length, length / max(largest, 1e-12))
+        ways = Coordinates.of(matrix @ move)
+        largest = max(abs(x) for x in (ways.ln_a0, ways.ln_a1, ways.ln_a2, ways.ln_te))
+        z = best.z.moved(matrix @ move * min(length, length / max(largest, 1e-12)))
         other = _from(z, part, structure, best, options)
         if other.deviance < best.deviance:
             best = other
     return best
 
 
-def shapes(z: Array) -> list[Array]:
+def shapes(z: Coordinates) -> list[Coordinates]:
     """Return motors of the same linear response, by shares of the back-EMF in what limits it.
 
     ``K = a0 - be`` and ``be te^2 - a1 te + a2 = 0``: which of two lags is the electric one,
     and how much the motor brakes itself, is identifiable by friction alone.
     """
-    a0, a1, a2 = np.exp(z[: models.A2 + 1])
     out = []
     for share in SHARES:
-        roots = np.roots([(1 - share) * a0, -a1, a2])
-        for te in roots[np.abs(roots.imag) < 1e-9 * np.abs(roots)].real:
-            if te > 0:
-                shaped = z.copy()
-                shaped[models.TE] = np.log(te)
-                out.append(shaped)
+        roots = np.roots([(1 - share) * z.a0, -z.a1, z.a2])
+        real = roots[np.abs(roots.imag) < 1e-9 * np.abs(roots)].real
+        out += [z.with_(ln_te=np.log(te)) for te in real if te > 0]
     return out or [z]
 
 
-def slower_winding(z: Array, ln_te: float) -> Array:
+def slower_winding(z: Coordinates, ln_te: float) -> Coordinates:
     """Return the coordinates of the same rotor under another L/R."""
-    before, after = np.exp(z[models.TE]), np.exp(ln_te)
-    a1, a2 = np.exp(z[[models.A1, models.A2]])
-    tm = a2 / before
-    damping = float(np.clip((a1 - tm) / before, 0.0, np.exp(z[models.A0])))
-    moved = z.copy()
-    moved[models.A1], moved[models.A2] = np.log(tm + after * damping), np.log(after * tm)
-    moved[models.TE] = ln_te
-    return moved
+    before, after = np.float64(z.electrical_time_constant), float(np.exp(ln_te))
+    tm = z.a2 / before
+    damping = float(np.clip((z.a1 - tm) / before, 0.0, z.a0))
+    return z.with_(ln_a1=np.log(tm + after * damping), ln_a2=np.log(after * tm), ln_te=ln_te)
 
 
-def _from(z: Array, part: Experiments, structure: Structure, best: Fit, options: Options) -> Fit:
+def _from(
+    z: Coordinates, part: Experiments, structure: Structure, best: Fit, options: Options
+) -> Fit:
     """Descend from other coordinates in the surroundings of the best fit so far."""
     return solve(part, structure, best.at(structure.complete(z)), options, 30)
 
 
 def _along_lag(part: Experiments, structure: Structure, best: Fit, options: Options) -> Fit:
     """Try other lags and shapes where the fit leaves them open, or what it leaves is not noise."""
-    free = structure.free()
-    if models.A2 not in free or models.TE not in free:
+    free = structure.free
+    if "ln_a2" not in free or "ln_te" not in free:
         return best
-    i = free.index(models.A2)
+    i = free.index("ln_a2")
     starts = shapes(best.z) if best.noise_ratio > 0 or not best.converged else []
     if not best.converged or best.covariance()[i, i] > OPEN**2:
         for share in (0.05, 0.2, 0.6):
-            z = best.z.copy()
-            z[models.A2] = 2 * z[models.A1] - z[models.A0] + np.log(share)
-            z[models.TE] = z[models.A2] - z[models.A1] + 0.02
-            starts.append(z)
+            z = best.z.with_second_lag(share * best.z.time_constant)
+            starts.append(z.with_(ln_te=z.ln_te + 0.02))
     for z in starts:
         other = _from(z, part, structure, best, options)
         if other.deviance < best.deviance - 1:
@@ -148,9 +140,8 @@ def _scan_friction(
     def at(level: float) -> Fit:
         if level not in profile:
             near = min(profile.values(), key=lambda f: abs(_level(f) - level), default=best)
-            z = near.z.copy()
             left, before = (max(full - x, 1e-9) for x in (level, _level(near)))
-            z[models.A0] += np.log(left / before)
+            z = near.z.with_(ln_a0=near.z.ln_a0 + np.log(left / before))
             fixed = structure.with_(fixed={**structure.fixed, "vc_plus": level})
             start = near.at(fixed.complete(z), noise_ratio=best.noise_ratio)
             profile[level] = solve(part, fixed, start, options, 12, 0.1)
@@ -172,4 +163,4 @@ def _scan_friction(
 
 
 def _level(fit: Fit) -> float:
-    return float(fit.z[models.VC_PLUS])
+    return fit.z.vc_plus

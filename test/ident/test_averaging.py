@@ -10,7 +10,7 @@ from smp_motor_ident.estimation.fitted import Options
 from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.estimation.quantities import Answer
 from smp_motor_ident.likelihood.experiments import prepare
-from smp_motor_ident.model.structures import LN_R, Structure
+from smp_motor_ident.model.structures import Electromechanical
 from smp_motor_ident.result import Quantity
 
 
@@ -41,8 +41,8 @@ def test_a_candidate_that_is_rejected_changes_nothing():
 
 def test_a_candidate_that_only_the_current_rejects_has_no_weight():
     data = prepare([motors.record("rear_left", seconds=2.0)], True)
-    fit = initial_fit(data, Structure("electromechanical", current=True), Options())
+    fit = initial_fit(data, Electromechanical(), Options())
     # Of another resistance, and all torques with it, the motor turns just alike.
-    other = replace(fit, z=fit.z + 0.02 * np.eye(fit.z.size)[LN_R])
+    other = replace(fit, z=fit.z.with_(ln_r=fit.z.ln_r + 0.02))
     assert weights(lambda _: data, [fit, other])[1] < 1e-6
     assert np.ptp(weights(lambda _: data, [fit, fit])) < 1e-9
