@@ -140,7 +140,7 @@ LOOSE_ADDITION = Limit(
     0.4,
     "of its value, or e-folds",
     "significance: 2.5 deviations from nothing, one addition in eighty that is not there",
-    "test_structure_choice.py: an addition that is hardly known",
+    "test_structure_choice.py: what is not known to two fifths",
 )
 SUBSET_HOPELESS = Limit(
     40.0,
