@@ -108,7 +108,7 @@ WORST_FIT = Limit(
     30.0,
     "% of the speed",
     "below it half of the motion's variance comes from elsewhere: what is fitted is not the motor",
-    "test_screening.py",
+    "test_data_quality.py",
 )
 LEAST_FIT = Limit(
     -100.0,
@@ -227,13 +227,13 @@ FRICTION_SHOWN = Limit(
     0.5, "relative standard deviation", "beyond it the 95 % interval holds zero", "test_findings.py"
 )
 FEWEST = Limit(
-    40, "samples", "ten for each of gain, lag, friction and initial state", "test_screening.py"
+    40, "samples", "ten for each of gain, lag, friction and initial state", "test_data_quality.py"
 )
 MOST_LOST = Limit(
-    0.3, "share of the samples", "beyond it the sensor is at fault", "test_screening.py"
+    0.3, "share of the samples", "beyond it the sensor is at fault", "test_data_quality.py"
 )
 METER = Limit(
-    0.01, "share of the supply or of a level", "what a voltmeter scatters", "test_screening.py"
+    0.01, "share of the supply or of a level", "what a voltmeter scatters", "test_data_quality.py"
 )
 SILENT_SWING = Limit(
     2.0,
@@ -254,10 +254,13 @@ OFFSET_SURE = Limit(
     "standard deviations",
     "of an offset of the current, with errors of neighbouring runs that "
     "hang together allowed for; chance exceeds it once in 5e8",
-    "test_screening.py",
+    "test_data_quality.py",
 )
 LARGEST_OFFSET = Limit(
-    0.2, "share of the largest current", "beyond it a sensor is not calibrated", "test_screening.py"
+    0.2,
+    "share of the largest current",
+    "beyond it a sensor is not calibrated",
+    "test_data_quality.py",
 )
 SIGN_SURE = Limit(
     4.0,

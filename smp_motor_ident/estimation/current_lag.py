@@ -43,7 +43,7 @@ def with_current_lag(
         if any(r.fit.structure == richer for r in candidates):
             continue
         say(f"trying {richer.label}")
-        starts = _promising(data, direct, richer, options) + [best.z] * best.structure.lags
+        starts = _leading(data, direct, richer, options) + [best.z] * best.structure.lags
         # What looks like torque noise may be this.
         near = [best] if best.noise_ratio == 0 else [best, replace(best, noise_ratio=0.0)]
         tried = [descent.refine(data, richer, n, z, options) for z in starts for n in near]
@@ -90,7 +90,7 @@ def _predicted(data: Experiments, fit: Fit, structure: Structure) -> float:
     return here.objective - here.local_decrease - float(here.gradient @ step)
 
 
-def _promising(
+def _leading(
     data: Experiments, direct: Fit, richer: Structure, options: Options
 ) -> list[Coordinates]:
     """Return the starts that are ahead after a few passes: the others cost as much and lose."""

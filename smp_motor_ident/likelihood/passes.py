@@ -196,9 +196,9 @@ def evaluate(
         score += row * miss
         total += miss * miss
     known = data.known_initial
-    unseen = own[0] == 0 and not structure.current  # a measured current tells how it began
+    uncurbed = own[0] == 0 and not structure.current  # a measured current tells how it began
     both = np.stack([known[:, 0], known[:, 0] + sums.normal[:, f, f]])
-    occam = float(np.diff(np.log(both), axis=0).sum()) if unseen else 0.0
+    occam = float(np.diff(np.log(both), axis=0).sum()) if uncurbed else 0.0
     value, away = initial[:, list(own)], (initial - start)[:, list(own)]
     prior, decrease = eliminate(
         sums.normal, sums.gradient, away, value, known[:, list(own)], data.size,
