@@ -13,8 +13,8 @@ import numpy as np
 
 from smp_motor_ident.estimation import data_window, descent, prediction
 from smp_motor_ident.estimation.fit import Fit, Options, solve
-from smp_motor_ident.estimation.ridge import slower_winding
 from smp_motor_ident.estimation.selection import POLICY, FittedCandidate, sandwich_factor
+from smp_motor_ident.estimation.trials import slower_winding
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.coordinates import Coordinates
 from smp_motor_ident.model.structures import SENSORS, Electromechanical, Structure

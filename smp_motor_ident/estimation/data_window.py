@@ -19,7 +19,8 @@ from smp_motor_ident.estimation.descent import (
     noise_ratio_of,
 )
 from smp_motor_ident.estimation.fit import Fit, Options, solve
-from smp_motor_ident.estimation.ridge import along_friction
+from smp_motor_ident.estimation.multistart import tried
+from smp_motor_ident.estimation.trials import RIDGE
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.model.structures import Structure
@@ -43,7 +44,7 @@ def grow(
     """Find the process-to-measurement noise ratio on a growing data window, then fit all data."""
     part = data.data_window(min(SCREENING_SAMPLES * data.step, 60.0))
     best = _find_noise_ratio(part, structure, first, options, near)
-    found = along_friction(part, structure, best, options)
+    found = tried(part, best, RIDGE, options)
     if found.noise_ratio > 0 and found.deviance < best.deviance - TORQUE_NOISE.value:
         again = _find_noise_ratio(part, structure, found, options, found)
         found = min(found, again, key=lambda f: f.deviance)
@@ -56,7 +57,7 @@ def grow(
             free_run.noise[0, 0] < FLOOR * part.quantum**2 / 12
             or free_run.deviance < found.deviance + TORQUE_NOISE.value
         ):
-            found = along_friction(part, structure, free_run, options)
+            found = tried(part, free_run, RIDGE, options)
     best = found
     return extend(data, structure, best, options)
 

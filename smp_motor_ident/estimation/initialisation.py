@@ -18,8 +18,9 @@ from smp_motor_ident.estimation.descent import (
     noise_ratio_of,
 )
 from smp_motor_ident.estimation.fit import Fit, Options, Start, solve
-from smp_motor_ident.estimation.ridge import better, shapes, slower_winding
+from smp_motor_ident.estimation.multistart import better, tried
 from smp_motor_ident.estimation.start import FilteredData
+from smp_motor_ident.estimation.trials import WINDINGS, shapes
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.noise import NoiseModel, deviance, kalman_gain
 from smp_motor_ident.likelihood.passes import gather
@@ -30,8 +31,6 @@ Array = NDArray[np.float64]
 
 ALIKE = 0.05  # e-folds or volts by which starts differ that end alike
 SHAPES = 6  # of the same linear response that are refined
-OPEN = 0.02  # standard deviation of ln L/R or ln R above which other starts are tried
-WINDING = 0.2  # of a sample: a shorter L/R has settled to a hundredth when the current is read
 
 
 MOVES = 0.5
@@ -95,37 +94,8 @@ def first_fit(
             break  # two starts agree, or the surface is smooth
     assert best is not None
     if structure.current:
-        best = _elsewhere(subset, structure, best, options)
+        best = tried(subset, best, WINDINGS, options, 25, 0.1)
     return best
-
-
-def _elsewhere(subset: Experiments, structure: Structure, best: Fit, options: Options) -> Fit:
-    """Try other L, and other R at the same L, where the fit leaves them open.
-
-    An L/R of less than a sample, or an R that next to nothing falls off at, leaves a surface so
-    flat that a descent ends where it began.
-    """
-    free = structure.free
-    std = np.sqrt(np.diag(best.covariance()))
-    if not any(n in free and std[free.index(n)] > OPEN for n in ("ln_te", "ln_r")):
-        return best
-    for way in (direction(ln_a2=1.0, ln_te=1.0), direction(ln_te=1.0, ln_r=-1.0)):
-        for factor in (0.2, 0.5, 2.0, 5.0):
-            best = _likelier(subset, best.z.moved(way * np.log(factor)), best, options)
-    if best.z.ln_te > np.log(WINDING * subset.step):
-        return best
-    # Below that L/R shows in nothing: what a descent left behind on its way there shows.
-    slow = best.z.time_constant
-    for te in np.geomspace(WINDING * subset.step, max(WINDING * subset.step, 0.2 * slow), 4):
-        best = _likelier(subset, slower_winding(best.z, float(np.log(te))), best, options)
-    return best
-
-
-def _likelier(subset: Experiments, z: Coordinates, best: Fit, options: Options) -> Fit:
-    """Return the better of a fit and of a descent from other coordinates."""
-    s = best.structure
-    other = solve(subset, s, best.at(s.complete(z)), options, 25, 0.1)
-    return other if other.deviance < best.deviance - 1 else best
 
 
 def _distinct(starts: Sequence[Coordinates], step: float) -> list[Coordinates]:

@@ -24,9 +24,10 @@ from smp_motor_ident.estimation.delay_and_averaging import (
 )
 from smp_motor_ident.estimation.fit import Fit, Options
 from smp_motor_ident.estimation.initialisation import first_fit, initial_fit
-from smp_motor_ident.estimation.ridge import random_restart, slower_winding
+from smp_motor_ident.estimation.multistart import tried
 from smp_motor_ident.estimation.selection import POLICY, FittedCandidate
 from smp_motor_ident.estimation.thinning import thinned
+from smp_motor_ident.estimation.trials import RANDOM, slower_winding
 from smp_motor_ident.estimation.variations import friction_shows, may_rub, varied
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.measurement import SPEED
@@ -187,7 +188,7 @@ def _on_all(data: Experiments, fit: Fit, known: list[Fit], options: Options) -> 
             starts.append(replace(fit, noise_ratio=0.0, z=fit.structure.complete(z)))
     fits = [data_window.extend(every, fit.structure, start, options) for start in starts]
     fit = min(fits, key=lambda f: f.deviance)
-    fit = random_restart(every, fit.structure, fit, options)
+    fit = tried(every, fit, RANDOM, options)
     return no_worse(every, fit, known, options)
 
 

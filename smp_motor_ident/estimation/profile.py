@@ -24,7 +24,7 @@ from smp_motor_ident.estimation.descent import initial_of
 from smp_motor_ident.estimation.fit import Fit, Options, solve
 from smp_motor_ident.estimation.fitted import NORMAL_95, Profile
 from smp_motor_ident.estimation.prediction import simulate
-from smp_motor_ident.estimation.ridge import slower_winding
+from smp_motor_ident.estimation.trials import slower_winding
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.passes import own_columns
 from smp_motor_ident.model.coordinates import Coordinates, direction
