@@ -16,13 +16,14 @@ from pathlib import Path
 import numpy as np
 from known_motors import CURRENT_NOISE, QUANTUM, TABLE_1, recording, table
 
+from smp_motor_control.motor.parameters import PHYSICAL
 from smp_motor_ident.errors import SmpError
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.likelihood.noise import NoiseModel, kalman_gain
 from smp_motor_ident.likelihood.passes import evaluate
 from smp_motor_ident.model.measurement import ANGLE
-from smp_motor_ident.model.physical import PHYSICAL, physical_gradients
+from smp_motor_ident.model.physical import physical_gradients
 from smp_motor_ident.model.structures import Electromechanical, SecondOrder
 
 COMBINATIONS = ("dc_gain", "time_constant", "time_constant_product")

@@ -14,13 +14,14 @@ from collections.abc import Iterator
 import numpy as np
 from known_motors import CURRENT_NOISE, QUANTUM, TABLE_1, recording, table
 
+from smp_motor_control.motor.parameters import PHYSICAL
 from smp_motor_ident.diagnosis.limits import LOOSE_QUANTITY
 from smp_motor_ident.errors import SmpError
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.likelihood.noise import NoiseModel
 from smp_motor_ident.likelihood.passes import evaluate
-from smp_motor_ident.model.physical import PHYSICAL, physical, physical_gradients
+from smp_motor_ident.model.physical import physical, physical_gradients
 from smp_motor_ident.model.structures import Electromechanical, SecondOrder
 
 CASES = (

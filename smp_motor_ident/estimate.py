@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from smp_motor_control.motor.parameters import PHYSICAL
 from smp_motor_ident.diagnosis import validation as validate
 from smp_motor_ident.diagnosis.adequacy import adequacy, stated
 from smp_motor_ident.diagnosis.advice import advise, assess, unsettled_rival
@@ -49,7 +50,7 @@ from smp_motor_ident.estimation.thinning import thinned
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import Experiments, prepare
 from smp_motor_ident.model.measurement import ANGLE
-from smp_motor_ident.model.physical import PHYSICAL, physical
+from smp_motor_ident.model.physical import physical
 from smp_motor_ident.model.structures import Structure
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import Candidate, Estimate, FitPercent

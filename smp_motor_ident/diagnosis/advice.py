@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from smp_motor_control.motor.parameters import PHYSICAL
 from smp_motor_ident.diagnosis.limits import (
     FIT_EXPLAINS,
     FIT_HOLDS,
@@ -31,7 +32,6 @@ from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.passes import evaluate
 from smp_motor_ident.model.coordinates import Coordinates, direction
 from smp_motor_ident.model.measurement import ANGLE
-from smp_motor_ident.model.physical import PHYSICAL
 from smp_motor_ident.result import FitPercent, ResidualTests
 
 Array = NDArray[np.float64]

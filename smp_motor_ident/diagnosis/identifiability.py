@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from smp_motor_control.motor.parameters import PHYSICAL
 from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.fit import Fit
@@ -20,7 +21,7 @@ from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.likelihood.noise import NO_GAIN
 from smp_motor_ident.model.coordinates import Coordinates
 from smp_motor_ident.model.measurement import ANGLE
-from smp_motor_ident.model.physical import PHYSICAL, physical_gradients
+from smp_motor_ident.model.physical import physical_gradients
 from smp_motor_ident.model.structures import Electromechanical
 from smp_motor_ident.record import Hardware, Record
 from smp_motor_ident.result import Estimate

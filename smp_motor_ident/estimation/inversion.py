@@ -10,9 +10,9 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from smp_motor_control.motor.parameters import PHYSICAL
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.model.coordinates import direction
-from smp_motor_ident.model.physical import PHYSICAL
 
 Array = NDArray[np.float64]
 RESPONSE = ("ln_a0", "ln_a1", "ln_a2")

@@ -11,13 +11,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from smp_motor_control.motor.parameters import PHYSICAL
 from smp_motor_ident.diagnosis.limits import HIDDEN_LAG, LOOSE_QUANTITY, NEGLIGIBLE_FRICTION
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.fitted import NORMAL_95
 from smp_motor_ident.estimation.inversion import solved_for
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.coordinates import Coordinates, direction
-from smp_motor_ident.model.physical import PHYSICAL, physical, physical_gradients
+from smp_motor_ident.model.physical import physical, physical_gradients
 from smp_motor_ident.model.structure import Gradients
 from smp_motor_ident.model.structures import Structure
 from smp_motor_ident.result import UNITS, Quantity

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from smp_motor_control.motor.parameters import PHYSICAL
 from smp_motor_ident.diagnosis.limits import CURRENT_THERE
 from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.estimation.fit import Options
-from smp_motor_ident.model.physical import PHYSICAL
 from smp_motor_ident.model.structures import (
     CANDIDATES,
     MODELS,

@@ -8,15 +8,6 @@ from smp_motor_ident.model.coordinates import Coordinates, direction
 from smp_motor_ident.model.second_order import internal
 from smp_motor_ident.model.structure import Gradients
 
-PHYSICAL = (
-    "resistance",
-    "inductance",
-    "motor_constant",
-    "inertia",
-    "viscous_friction",
-    "coulomb_friction",
-)
-
 
 def physical(z: Coordinates) -> dict[str, float]:
     """Return the physical parameters of a second-order structure."""

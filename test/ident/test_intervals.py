@@ -8,6 +8,7 @@ import pytest
 from scipy.stats import chi2
 
 from smp_motor_control.excitation import Fourier
+from smp_motor_control.motor.parameters import PHYSICAL
 from smp_motor_ident.diagnosis.identifiability import what_next
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.estimation.consider_covariance import consider_left_out
@@ -19,7 +20,6 @@ from smp_motor_ident.estimation.quantisation import widened
 from smp_motor_ident.estimation.thinning import thinned
 from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.model.measurement import ANGLE
-from smp_motor_ident.model.physical import PHYSICAL
 from smp_motor_ident.model.structures import SecondOrder
 from smp_motor_ident.record import Record
 
