@@ -18,7 +18,7 @@ from smp_motor_ident.diagnosis.bunched import merge_bunches
 from smp_motor_ident.diagnosis.conditions import dependent
 from smp_motor_ident.diagnosis.current_kind import ARMATURE, current_kind
 from smp_motor_ident.diagnosis.data_quality import screen
-from smp_motor_ident.diagnosis.limits import CANDIDATE_WEIGHT, LEAST_FIT, PROFILED
+from smp_motor_ident.diagnosis.limits import LEAST_FIT, PROFILED
 from smp_motor_ident.diagnosis.misfit import widened_by_misfit
 from smp_motor_ident.diagnosis.model_error import regression
 from smp_motor_ident.diagnosis.noise_or_effect import in_place_of_noise
@@ -27,7 +27,7 @@ from smp_motor_ident.diagnosis.residuals import residual_tests
 from smp_motor_ident.diagnosis.scope import blames_current, contradicted, current_left_out, scope
 from smp_motor_ident.errors import InsufficientExcitationError, SignalError, SmpError
 from smp_motor_ident.estimation import flexible_shaft, order_selection, prediction
-from smp_motor_ident.estimation.averaging import averaged, weights
+from smp_motor_ident.estimation.averaging import covering
 from smp_motor_ident.estimation.candidate_starts import of_kind
 from smp_motor_ident.estimation.consider_covariance import (
     consider_clock,
@@ -219,7 +219,7 @@ def _stated(
 
     def said(fit: Fit) -> tuple[Answer, dict[str, float]]:
         own = answer(fit, request.known, friction_std, driven_longest(final))
-        return _covering(data, candidates, own, request.known)
+        return covering(data, candidates, own, request.known)
 
     result, alike = said(chosen)
     fitted = validate.speed_fit(group, final, chosen)
@@ -294,26 +294,6 @@ def _certain(
     chosen, friction_std = consider_friction(final, consider_left_out(final, timed))
     chosen, change = heterogeneous(final, chosen)
     return chosen, friction_std, change
-
-
-def _covering(
-    data: Experiments,
-    candidates: Sequence[FittedCandidate],
-    result: Answer,
-    known: Mapping[str, float],
-) -> tuple[Answer, dict[str, float]]:
-    """Return the answer over all structures that explain the data as well, and their weights."""
-    whole = [r for r in candidates[:-1] if r.whole and r.fit.converged]
-    if data.quantum > 0:  # a speed in coarse steps is a difference of counts, by its making
-        whole = [r for r in whole if r.fit.kind == candidates[-1].fit.kind]
-    if not whole or result.level:
-        return result, {}
-    fits = [candidates[-1].fit, *(r.fit for r in whole)]
-    weight = weights(lambda fit: of_kind(data, fit), fits)
-    found = averaged(result, weight, [answer(f, known) for f in fits[1:]])
-    labels = [candidates[-1].label, *(r.label for r in whole)]
-    alike = {n: float(w) for n, w in zip(labels, weight, strict=True) if w > CANDIDATE_WEIGHT.value}
-    return found, alike if len(alike) > 1 else {}
 
 
 def _constrain(data: Experiments, fit: Fit, request: Request) -> Fit:

@@ -20,10 +20,11 @@ from numpy.typing import NDArray
 
 from smp_motor_ident.diagnosis.limits import CANDIDATE_WEIGHT
 from smp_motor_ident.estimation import prediction
+from smp_motor_ident.estimation.candidate_starts import of_kind
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.fitted import NORMAL_95
-from smp_motor_ident.estimation.quantities import Answer
-from smp_motor_ident.estimation.selection import POLICY
+from smp_motor_ident.estimation.quantities import Answer, answer
+from smp_motor_ident.estimation.selection import POLICY, FittedCandidate
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.result import Quantity
 
@@ -35,6 +36,29 @@ ABSENT = (
     "delay", "averaging_window", "time_constant_product", "load_voltage", "current_lag",
 )  # fmt: skip
 """Quantities that are nothing in a structure that does not have them."""
+
+
+def covering(
+    data: Experiments,
+    candidates: Sequence[FittedCandidate],
+    result: Answer,
+    known: Mapping[str, float],
+) -> tuple[Answer, dict[str, float]]:
+    """Return the answer over all structures that explain the data as well, and their weights.
+
+    One that has not settled explains them at least as well as that.
+    """
+    whole = [r for r in candidates[:-1] if r.whole and np.isfinite(r.fit.deviance)]
+    if data.quantum > 0:  # a speed in coarse steps is a difference of counts, by its making
+        whole = [r for r in whole if r.fit.kind == candidates[-1].fit.kind]
+    if not whole or result.level:
+        return result, {}
+    fits = [candidates[-1].fit, *(r.fit for r in whole)]
+    weight = weights(lambda fit: of_kind(data, fit), fits)
+    found = averaged(result, weight, [answer(f, known) for f in fits[1:]])
+    labels = [candidates[-1].label, *(r.label for r in whole)]
+    alike = {n: float(w) for n, w in zip(labels, weight, strict=True) if w > CANDIDATE_WEIGHT.value}
+    return found, alike if len(alike) > 1 else {}
 
 
 def weights(data: Callable[[Fit], Experiments], fits: Sequence[Fit], seed: int = 0) -> Array:

@@ -86,7 +86,7 @@ class SelectionPolicy:
         if other.structure.size > best.structure.size:
             return self.needed(best, other)
         # Every motor has a second lag, few have a delay: alike, the lag is believed.
-        lag = other.structure.order > best.structure.order
+        lag = other.structure.order - best.structure.order
         better = other.deviance < best.deviance + self.second_lag * sandwich_factor(other) * lag
         return better, f"fits {'better' if better else 'worse'} than {best.structure.label}"
 

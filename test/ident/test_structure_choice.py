@@ -52,6 +52,13 @@ def test_one_more_parameter_is_worth_its_price(gain: float, richer: bool) -> Non
     assert reason.endswith("(gain 12, price 12)")
 
 
+@pytest.mark.parametrize(("gain", "lag"), [(19.9, True), (20.1, False)])
+def test_a_lag_is_believed_up_to_odds_of_e_to_the_ten_whichever_came_first(gain, lag) -> None:
+    second, late = fit(SECOND, 0.0), fit(FirstOrder(delay=True), -gain)
+    assert POLICY.preferred(late, second)[0] is lag
+    assert POLICY.preferred(second, late)[0] is not lag
+
+
 @pytest.mark.parametrize(("gain", "richer"), [(2 * PRICE - 0.01, False), (2 * PRICE + 0.01, True)])
 def test_two_more_parameters_are_worth_twice_that(gain: float, richer: bool) -> None:
     rich = SecondOrder(delay=True)
