@@ -193,16 +193,19 @@ def _compare(record: Record, angle: Array, what: str, other_values: Array, other
             f"{where}: dead encoder, the {what} stays while the {other} "
             f"reaches {np.abs(b).max():.3g} rad/s; check the encoder's cable"
         )
-    slope = float(a @ b / (a @ a))
     together = float(a @ b / np.sqrt((a @ a) * (b @ b)))
     if together < -0.5:
         raise SignalError(
             f"{where}: {what} runs against the {other} (swapped sign); exchange the "
             f"encoder's channels A and B or the sign of the {other}"
         )
-    if together > 0.9 and not 0.95 < slope < 1.05:
+    if together <= 0.9:
+        return
+    # Where either is noisy, or late, their ratio lies between the two regressions (Frisch 1934).
+    low, high = float(a @ b / (a @ a)), float(b @ b / (a @ b))
+    if low > 1.05 or high < 0.95:
         raise SignalError(
-            f"{where}: {other} is {slope:.4g} times what the {what} says; wrong gear "
+            f"{where}: {other} is {np.sqrt(low * high):.4g} times what the {what} says; wrong gear "
             f"ratio (now {record.hardware.gear_ratio:g}) or counts per revolution (now "
             f"{record.hardware.counts_per_revolution or 0:g}), correct the motor description"
         )

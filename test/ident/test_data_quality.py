@@ -105,6 +105,14 @@ def test_a_small_offset_of_the_current_is_removed_and_said():
     assert result.value("resistance") == pytest.approx(3.2843, rel=2e-3)  # 5 of its std
 
 
+def test_a_speed_that_a_filter_makes_late_and_small_has_the_gear_ratio_of_its_angle():
+    """The lag is 30 ms, of a motor that takes 50 ms: what is left is 0.8 of the speed or so."""
+    slow = np.zeros(N)
+    for n in range(1, N):
+        slow[n] = slow[n - 1] + (GOOD.velocity[n] - slow[n - 1]) * 0.005 / 0.035
+    screen([replace(GOOD, current=None, velocity=slow)])
+
+
 @pytest.mark.parametrize("offset", [0.0, 1.2])
 def test_a_noisy_speed_makes_no_offset_of_the_current(offset):
     """Its noise takes a share of its coefficient, which driven one way looks like an offset."""
