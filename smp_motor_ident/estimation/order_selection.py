@@ -84,14 +84,17 @@ def _frictionless(
     """Climb without friction where the score of a linear motor asks for none.
 
     Where there is none, a descent with friction has no bottom to find: L/R beside the
-    response's own coefficients is identifiable by friction alone.
+    response's own coefficients is identifiable by friction alone.  Torque noise hides it from
+    the score.
     """
     if base.current or base.friction != "symmetric" or options.priors or data.quantum > 0:
         return []
     plain = base.frictionless()
     subset = descent.screening_subset(data)
     quick = initial_fit(subset, plain, options)
-    if quick is None or not quick.converged or friction_shows(subset, quick, False):
+    if quick is None or not quick.converged or quick.noise_ratio > 0:
+        return []
+    if friction_shows(subset, quick, False):
         return []
     candidates = explore(data, plain, options, auto, say, quick if subset is data else None)
     if not candidates or may_rub(of_kind(data, candidates[-1].fit), candidates[-1].fit, options):

@@ -211,3 +211,18 @@ def test_a_constant_load_hides_no_resistance(seed: int) -> None:
         q = {**found.parameters, **found.combinations}[name]
         assert q.value is not None and abs(q.value - value) < 4 * q.std, name
         assert q.std < 0.02 * abs(value), name
+
+
+def test_friction_is_not_taken_for_torque_noise():
+    """A staircase of an angle known to a milliradian, of which friction takes an eighth."""
+    r, el, k, j, b, tc = 6.65, 0.058, 0.0319, 2.5e-5, 3.27e-5, 6.83e-3
+    n, scatter = 8738, 0.3 * 2 * np.pi / 2000
+    levels = np.concatenate([np.linspace(0, 1, 7), np.linspace(1, -1, 13)])
+    t, volts = np.arange(n) / 1000.0, 11.9 * np.repeat(levels, n // 20 + 1)[:n]
+    angle = simulate(t, volts, r, el, k, j, b, tc, np.zeros(n), 10)[:, 2]
+    noisy = angle + scatter * np.random.default_rng(0).standard_normal(n)
+    found = estimate(Record("motor", t, volts, position=noisy))
+    assert not found.unreliable
+    # The test's own integration is good to a ten thousandth.
+    assert found.value("static_voltage") == pytest.approx(r * tc / k, rel=1e-3)
+    assert found.value("dc_gain") == pytest.approx(1 / (k + r * b / k), rel=1e-3)
