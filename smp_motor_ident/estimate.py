@@ -19,6 +19,7 @@ from smp_motor_ident.diagnosis.conditions import dependent
 from smp_motor_ident.diagnosis.current_kind import ARMATURE, current_kind
 from smp_motor_ident.diagnosis.data_quality import screen
 from smp_motor_ident.diagnosis.limits import LEAST_FIT, PROFILED
+from smp_motor_ident.diagnosis.lost_rows import bridged
 from smp_motor_ident.diagnosis.misfit import widened_by_misfit
 from smp_motor_ident.diagnosis.model_error import regression
 from smp_motor_ident.diagnosis.noise_or_effect import in_place_of_noise
@@ -116,7 +117,7 @@ def estimate(
         rigid = estimate(group, "second_order", fixed=fixed, loss=loss, progress=progress)
         return flexible_shaft.flexible_shaft(group, rigid)
     request = checked(group, model, fixed, bounds, loss, validation, progress)
-    group = [merge_bunches(on_beat(r)) for r in group]
+    group = [bridged(merge_bunches(on_beat(r))) for r in group]
     kind = current_kind(group) if request.may_leave_current else ARMATURE
     if kind != ARMATURE:
         group, request = request.without_current(group)

@@ -339,6 +339,9 @@ BUNCHED = Limit(
     "points as there are samples at this share, and without end where stamps are equal",
     "test_bunched.py",
 )
+ROWS_LOST = Limit(
+    2, "samples", "physical: over more of them a command is no straight line", "test_lost_rows.py"
+)
 HALF_WIDTH = Limit(
     1.96, "standard deviations", "half-width of the stated 95 % interval", "test_adequacy.py"
 )
