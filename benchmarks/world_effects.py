@@ -130,7 +130,7 @@ def _magnets(c: Case, level: int) -> None:
     c.drive["k_asym"] = a
     for name in ("dc_gain", "motor_constant"):
         c.widen[name] = (1 - a, 1 + a)
-    for name in ("time_constant", "static_voltage"):
+    for name in ("time_constant", "time_constant_product", "static_voltage"):
         c.widen[name] = (1 - 2 * a, 1 + 2 * a)
 
 
