@@ -171,3 +171,34 @@ def test_stamps_that_scatter_leave_the_instant_of_one_step_open():
     # A stamp's own deviation for one step; divided by the root of their number for many.
     assert 1e-4 < instant_deviation([step], "held") < 4e-4
     assert instant_deviation([many], "held") < 1e-4
+
+
+def _rounded(seed: int) -> tuple[Record, dict[str, float]]:
+    """A motor of first order at four speeds, which are given in steps of 4 rad/s."""
+    rng = np.random.default_rng(seed)
+    gain, lag, friction, rate = 7.0 * rng.uniform(0.8, 1.2), 0.017, 1.0, 500.0
+    volts = np.repeat(rng.choice([8.0, 12.0, 16.0, 20.0], 12), 100)
+    keep, w = np.exp(-1 / rate / lag), np.zeros(volts.size)
+    for k in range(1, w.size):
+        w[k] = keep * w[k - 1] + (1 - keep) * gain * (volts[k] - friction)
+    shown = 4.0 * np.rint((w + 0.3 * rng.standard_normal(w.size)) / 4.0)
+    truth = {"dc_gain": gain, "static_voltage": friction, "time_constant": lag}
+    return Record("motor", np.arange(w.size) / rate, volts, velocity=shown), truth
+
+
+def test_a_rounded_speed_is_not_averaged_where_the_motor_keeps_it() -> None:
+    for seed in range(8):
+        record, truth = _rounded(seed)
+        found = estimate(record)
+        for name, true in truth.items():
+            q = found.combinations[name]
+            # 5 standard deviations are a wrong number; 14 of them were one of the eight.
+            assert q.value is None or abs(q.value - true) < 5 * q.std, (seed, name)
+
+
+def test_a_speed_that_is_a_difference_of_counts_is_right_on_average() -> None:
+    record = motors.record("rear_left", current=False, seconds=3.0)
+    data = prepare([replace(record, count=None)], False)
+    assert data.quantum > 0
+    fit = initial_fit(data, Structure("first_order", order=1), Options())
+    assert widened(data, fit) is fit
