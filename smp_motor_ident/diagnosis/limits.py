@@ -117,10 +117,7 @@ LEAST_FIT = Limit(
     "test_estimate.py: a candidate that left the motor behind has no fit",
 )
 PROFILED = Limit(
-    20_000,
-    "samples",
-    "cost: ends of an interval are found on as few samples as tell the same, each a descent",
-    "test_intervals.py",
+    20_000, "samples", "cost: each end of an interval is found by a descent", "test_intervals.py"
 )
 
 # Choice of a candidate structure.
@@ -129,6 +126,9 @@ PRIOR_ODDS = Limit(
     "deviance per parameter",
     "significance: prior odds of e^2 to 1 against any addition, because many are tried",
     "test_structure_choice.py",
+)
+COLOURED = Limit(
+    4.0, "ratio of variances", "significance: 1e-22 for 60 white runs", "test_structure_choice.py"
 )
 SURE_GAIN = Limit(
     3.0,
@@ -295,7 +295,6 @@ RESIDUAL_LEVEL = Limit(
 )
 
 # Adequacy of the model.
-
 EFFECT_LEVEL = Limit(
     0.001,
     "probability",

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from smp_motor_ident.diagnosis.limits import COLOURED
 from smp_motor_ident.estimation import data_window, descent
 from smp_motor_ident.estimation.candidate_starts import (
     from_richer,
@@ -25,7 +26,7 @@ from smp_motor_ident.estimation.delay_and_averaging import (
 from smp_motor_ident.estimation.fit import Fit, Options
 from smp_motor_ident.estimation.initialisation import first_fit, initial_fit
 from smp_motor_ident.estimation.multistart import tried
-from smp_motor_ident.estimation.selection import POLICY, FittedCandidate
+from smp_motor_ident.estimation.selection import POLICY, FittedCandidate, sandwich_factor
 from smp_motor_ident.estimation.thinning import thinned
 from smp_motor_ident.estimation.trials import RANDOM, slower_winding
 from smp_motor_ident.estimation.variations import friction_shows, may_rub, varied
@@ -84,8 +85,8 @@ def _frictionless(
     """Climb without friction where the score of a linear motor asks for none.
 
     Where there is none, a descent with friction has no bottom to find: L/R beside the
-    response's own coefficients is identifiable by friction alone.  Torque noise hides it from
-    the score.
+    response's own coefficients is identifiable by friction alone.  The score is believed where
+    nothing else is left, which torque noise or coloured residuals are.
     """
     if base.current or base.friction != "symmetric" or options.priors or data.quantum > 0:
         return []
@@ -94,7 +95,7 @@ def _frictionless(
     quick = initial_fit(subset, plain, options)
     if quick is None or not quick.converged or quick.noise_ratio > 0:
         return []
-    if friction_shows(subset, quick, False):
+    if sandwich_factor(quick) > COLOURED.value or friction_shows(subset, quick, False):
         return []
     candidates = explore(data, plain, options, auto, say, quick if subset is data else None)
     if not candidates or may_rub(of_kind(data, candidates[-1].fit), candidates[-1].fit, options):

@@ -213,16 +213,32 @@ def test_a_constant_load_hides_no_resistance(seed: int) -> None:
         assert q.std < 0.02 * abs(value), name
 
 
+def _staircase(r, el, k, j, b, tc, top, rate, n):
+    """Return times, voltages, speeds and angles of a motor that a staircase of 20 steps drives."""
+    levels = np.concatenate([np.linspace(0, 1, 7), np.linspace(1, -1, 13)])
+    t, volts = np.arange(n) / rate, top * np.repeat(levels, n // 20 + 1)[:n]
+    out = simulate(t, volts, r, el, k, j, b, tc, np.zeros(n), 10)
+    return t, volts, out[:, 1], out[:, 2]
+
+
 def test_friction_is_not_taken_for_torque_noise():
     """A staircase of an angle known to a milliradian, of which friction takes an eighth."""
-    r, el, k, j, b, tc = 6.65, 0.058, 0.0319, 2.5e-5, 3.27e-5, 6.83e-3
-    n, scatter = 8738, 0.3 * 2 * np.pi / 2000
-    levels = np.concatenate([np.linspace(0, 1, 7), np.linspace(1, -1, 13)])
-    t, volts = np.arange(n) / 1000.0, 11.9 * np.repeat(levels, n // 20 + 1)[:n]
-    angle = simulate(t, volts, r, el, k, j, b, tc, np.zeros(n), 10)[:, 2]
-    noisy = angle + scatter * np.random.default_rng(0).standard_normal(n)
-    found = estimate(Record("motor", t, volts, position=noisy))
+    r, k, b, tc = 6.65, 0.0319, 3.27e-5, 6.83e-3
+    t, volts, _, angle = _staircase(r, 0.058, k, 2.5e-5, b, tc, 11.9, 1000.0, 8738)
+    noise = 0.3 * 2 * np.pi / 2000 * np.random.default_rng(0).standard_normal(t.size)
+    found = estimate(Record("motor", t, volts, position=angle + noise))
     assert not found.unreliable
     # The test's own integration is good to a ten thousandth.
+    assert found.value("static_voltage") == pytest.approx(r * tc / k, rel=1e-3)
+    assert found.value("dc_gain") == pytest.approx(1 / (k + r * b / k), rel=1e-3)
+
+
+def test_friction_is_asked_for_where_a_linear_motor_leaves_coloured_residuals():
+    """A staircase whose score of no friction tells nothing: friction takes a quarter of it."""
+    r, k, b, tc = 3.24, 0.0183, 2.13e-5, 8.8e-3
+    t, volts, speed, _ = _staircase(r, 1.7e-3, k, 3.83e-6, b, tc, 6.0, 5000.0, 15000)
+    noise = 0.8 * np.random.default_rng(0).standard_normal(t.size)
+    found = estimate(Record("motor", t, volts, velocity=speed + noise))
+    assert not found.unreliable
     assert found.value("static_voltage") == pytest.approx(r * tc / k, rel=1e-3)
     assert found.value("dc_gain") == pytest.approx(1 / (k + r * b / k), rel=1e-3)
