@@ -62,6 +62,11 @@ def initial_fit(
     return first and grow(data, structure, first, options, near)
 
 
+def beginning(data: Experiments) -> Experiments:
+    """Return the part that first fits are of."""
+    return data.data_window(min(8.0, SCREENING_SAMPLES * data.step))
+
+
 def first_fit(
     data: Experiments,
     structure: Structure,
@@ -71,7 +76,7 @@ def first_fit(
     own: bool = True,
 ) -> Fit | None:
     """Fit a structure to the beginning of the data: the likeliest of several starts."""
-    subset = data.data_window(min(8.0, SCREENING_SAMPLES * data.step))
+    subset = beginning(data)
     found = [*extra, *(candidates(data, structure) if own else [])]
     starts = [z for z in map(structure.complete, found) if np.all(np.isfinite(z.array))]
     if not starts:

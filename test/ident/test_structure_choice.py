@@ -213,11 +213,12 @@ def test_a_constant_load_hides_no_resistance(seed: int) -> None:
         assert q.std < 0.02 * abs(value), name
 
 
-def _staircase(r, el, k, j, b, tc, top, rate, n):
+def _staircase(r, el, k, j, b, tc, top, rate, n, weaker=0.0):
     """Return times, voltages, speeds and angles of a motor that a staircase of 20 steps drives."""
     levels = np.concatenate([np.linspace(0, 1, 7), np.linspace(1, -1, 13)])
     t, volts = np.arange(n) / rate, top * np.repeat(levels, n // 20 + 1)[:n]
-    out = simulate(t, volts, r, el, k, j, b, tc, np.zeros(n), 10)
+    given = np.where(volts < 0, (1 - weaker) * volts, volts)
+    out = simulate(t, given, r, el, k, j, b, tc, np.zeros(n), 10)
     return t, volts, out[:, 1], out[:, 2]
 
 
@@ -231,6 +232,19 @@ def test_friction_is_not_taken_for_torque_noise():
     # The test's own integration is good to a ten thousandth.
     assert found.value("static_voltage") == pytest.approx(r * tc / k, rel=1e-3)
     assert found.value("dc_gain") == pytest.approx(1 / (k + r * b / k), rel=1e-3)
+
+
+def test_no_structure_is_rejected_for_the_torque_noise_that_another_began_with():
+    """The same staircase by a driver that is a hundredth weaker in reverse, which looks like
+    torque noise: the bandwidth of a wrong motor, which follows whatever comes, asks for more."""
+    r, k, b, tc = 6.65, 0.0319, 3.27e-5, 6.83e-3
+    t, volts, _, angle = _staircase(r, 0.058, k, 2.5e-5, b, tc, 11.9, 1000.0, 8738, weaker=0.01)
+    noise = 0.3 * 2 * np.pi / 2000 * np.random.default_rng(0).standard_normal(t.size)
+    found = estimate(Record("motor", t, volts, position=angle + noise))
+    # Twice the hundredth by which the motor is none.
+    assert found.value("static_voltage") == pytest.approx(r * tc / k, rel=2e-2)
+    assert found.value("dc_gain") == pytest.approx(1 / (k + r * b / k), rel=2e-2)
+    assert found.value("time_constant") == pytest.approx(0.1362, rel=2e-2)
 
 
 def test_friction_is_asked_for_where_a_linear_motor_leaves_coloured_residuals():
