@@ -257,10 +257,7 @@ OFFSET_SURE = Limit(
     "test_data_quality.py",
 )
 LARGEST_OFFSET = Limit(
-    0.2,
-    "share of the largest current",
-    "beyond it a sensor is not calibrated",
-    "test_data_quality.py",
+    0.2, "share of the largest current", "no calibrated sensor has more", "test_data_quality.py"
 )
 SIGN_SURE = Limit(
     4.0,
@@ -308,10 +305,7 @@ EFFECT_COVERED = Limit(
     "test_adequacy.py",
 )
 CONDITION_LEVEL = Limit(
-    0.01,
-    "probability",
-    "that a clean record's numbers seem to hang on any condition (Bonferroni)",
-    "test_adequacy.py",
+    0.01, "probability", "that clean numbers seem to hang on a condition", "test_adequacy.py"
 )
 CONDITION_WEIGHT = Limit(
     0.8,
@@ -393,12 +387,7 @@ BEAT_FLOOR = Limit(
 BEAT_JITTER = Limit(
     0.02, "sample", "cost: instants off by less matter less than their rounding", "test_beat.py"
 )
-BEAT_LOST = Limit(
-    0.02,
-    "1",
-    "cost: with more samples lost the number of a sample, and with it its instant, is a guess",
-    "test_beat.py",
-)
+BEAT_LOST = Limit(0.02, "1", "cost: with more lost a sample's number is a guess", "test_beat.py")
 SMOOTHER = Limit(
     3.1,
     "standard deviations",

@@ -155,11 +155,11 @@ def _under_one_noise(part: Experiments, tried: list[Fit], options: Options) -> l
 
     Each believes in as much as its own motor's bandwidth asks for, and a wrong one's may be any.
     """
-    best = min(tried, key=lambda f: f.deviance, default=None)
     out = []
     for fit in tried:
-        less = best is not None and fit.noise_ratio < best.noise_ratio
-        if best is not None and less and POLICY.rejects_on_subset(fit, best.deviance):
+        best = min(tried, key=lambda f: f.deviance)
+        less = fit.noise_ratio < best.noise_ratio
+        if less and POLICY.rejects_on_subset(fit, best.deviance):
             start = fit.at(fit.z, noise_ratio=best.noise_ratio)
             again = solve(beginning(of_kind(part, fit)), fit.structure, start, options, NOISE)
             fit = min(fit, again, key=lambda f: f.deviance)

@@ -20,7 +20,7 @@ from smp_motor_ident.estimation.quantisation import widened
 from smp_motor_ident.estimation.thinning import thinned
 from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.model.measurement import ANGLE
-from smp_motor_ident.model.structures import SecondOrder
+from smp_motor_ident.model.structures import FirstOrder, SecondOrder
 from smp_motor_ident.record import Record
 
 
@@ -200,5 +200,5 @@ def test_a_speed_that_is_a_difference_of_counts_is_right_on_average() -> None:
     record = motors.record("rear_left", current=False, seconds=3.0)
     data = prepare([replace(record, count=None)], False)
     assert data.quantum > 0
-    fit = initial_fit(data, Structure("first_order", order=1), Options())
+    fit = initial_fit(data, FirstOrder(), Options())
     assert widened(data, fit) is fit
