@@ -6,8 +6,8 @@ import motors
 import numpy as np
 import pytest
 
+from smp_motor_ident.diagnosis.data_quality import screen
 from smp_motor_ident.diagnosis.identifiability import what_next
-from smp_motor_ident.diagnosis.screening import screen
 from smp_motor_ident.errors import InsufficientExcitationError, SignalError
 from smp_motor_ident.estimate import estimate
 
