@@ -178,14 +178,13 @@ def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) 
 
 
 def _in_turn(candidates: list[FittedCandidate]) -> list[list[FittedCandidate]]:
-    """Return the candidates with the choice last, then with each that is no richer in its place."""
-    chosen = candidates[-1].fit
-    others = [
-        r
-        for r in candidates[:-1]
-        if r.whole and r.fit.converged and r.fit.structure.size <= chosen.structure.size
-    ]
-    others.sort(key=lambda r: r.bic)
+    """Return the candidates with the choice last, then with each that is no richer in its place.
+
+    Those whose descent did not settle come last.
+    """
+    most = candidates[-1].fit.structure.size
+    others = [r for r in candidates[:-1] if r.whole and r.fit.structure.size <= most]
+    others.sort(key=lambda r: (not r.fit.converged, r.bic))
     return [candidates, *([*(o for o in candidates if o is not r), r] for r in others)]
 
 
