@@ -20,7 +20,8 @@ from known_motors import TABLE_1, independent, table
 
 from smp_motor_ident.errors import SmpError
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.model import structures as models
+from smp_motor_ident.model.physical import from_physical, physical
+from smp_motor_ident.model.structures import SecondOrder
 from smp_motor_ident.record import Hardware, Record
 
 WAVES = ("sine", "square", "fourier", "prbs", "steps", "chirp", "ramps")
@@ -94,8 +95,8 @@ def sound(
         hardware=Hardware(30.0, turn if counted else None, 0, supply, None),
         source=f"record {seed}",
     )  # fmt: skip
-    z = models.from_physical(r, el, k, j, b, static * k / r)
-    truth = {**models.physical(z)[0], **models.combinations(z, 2)[0]}
+    z = from_physical(r, el, k, j, b, static * k / r)
+    truth = {**physical(z), **{n: v for n, (v, _) in SecondOrder().combinations(z).items()}}
     about = {"seed": seed, "rate": rate, "wave": str(kind), "signals": str(signals), "tau": tau,
              "current": current is not None, "static": static, "torque": noise, "turn": turn,
              "samples": t.size}  # fmt: skip

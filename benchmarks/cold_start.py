@@ -21,8 +21,8 @@ from smp_motor_ident.estimation import fit
 from smp_motor_ident.estimation.fit import Options
 from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.likelihood.experiments import prepare
-from smp_motor_ident.model import structures as models
-from smp_motor_ident.model.structures import Structure
+from smp_motor_ident.model.physical import physical
+from smp_motor_ident.model.structures import Electromechanical, SecondOrder
 
 CASES = {
     "linear, voltage only": (False, False, 0.0),
@@ -42,10 +42,8 @@ def motor(rng: np.random.Generator) -> tuple[float, ...]:
 
 def minimum(record, z, current: bool, friction: bool) -> dict:
     """Return whether the descent from cold ends as low as one from the truth, and its time."""
-    structure = Structure(
-        "trial", friction="symmetric" if friction else "none", current=current,
-        shape=friction and not current,
-    )  # fmt: skip
+    rubs = "symmetric" if friction else "none"
+    structure = Electromechanical(rubs) if current else SecondOrder(rubs, shape=friction)
     data = prepare([record], current)
     begun = time.perf_counter()
     found = initial_fit(data, structure, Options())
@@ -65,7 +63,7 @@ def answer(record, z) -> dict:
         e = estimate(record)
     except SmpError as refusal:
         return {"says": "refused", "words": str(refusal), "spent": time.perf_counter() - begun}
-    values = {**models.physical(z)[0], **models.combinations(z, 2)[0]}
+    values = {**physical(z), **{n: v for n, (v, _) in SecondOrder().combinations(z).items()}}
     claims = {n: q for n, q in {**e.combinations, **e.parameters}.items()
               if q.status == "estimated" and q.std and n in values}  # fmt: skip
     errors = {n: abs(q.value - values[n]) / q.std for n, q in claims.items()}

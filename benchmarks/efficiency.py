@@ -16,14 +16,15 @@ from pathlib import Path
 import numpy as np
 from known_motors import CURRENT_NOISE, QUANTUM, TABLE_1, recording, table
 
+from smp_motor_control.motor.parameters import PHYSICAL
 from smp_motor_ident.errors import SmpError
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.likelihood.noise import NoiseModel, kalman_gain
 from smp_motor_ident.likelihood.passes import evaluate
-from smp_motor_ident.model import structures as models
-from smp_motor_ident.model.structures import PHYSICAL, Structure
+from smp_motor_ident.model.measurement import ANGLE
+from smp_motor_ident.model.physical import physical_gradients
+from smp_motor_ident.model.structures import Electromechanical, SecondOrder
 
 COMBINATIONS = ("dc_gain", "time_constant", "time_constant_product")
 KINDS = ("sine", "square", "fourier", "plain square")
@@ -32,30 +33,30 @@ TELLS = 0.3  # a quantity is identifiable where the bound's std is below this pa
 
 def bound(record, z, current: bool, torque: float) -> dict[str, tuple[float, float]]:
     """Return the truth and the Cramer-Rao variance of every quantity, at the truth."""
-    structure = Structure("bound", current=current, shape=not current)
+    structure = Electromechanical() if current else SecondOrder(shape=True)
     data = prepare([record], current)
     step = data.step
     noise = np.diag([QUANTUM**2 / 12, CURRENT_NOISE**2])
     gain = np.zeros((3, 2))
     if torque > 0:
         # White torque of `torque` volts held for a sample, as intensity on the acceleration.
-        par, _ = models.to_internal(z, 2)
+        par, _ = structure.internal(z)
         ratio = (torque / par[1]) ** 2 * step / noise[0, 0]
         relative = noise[1, 1] / noise[0, 0] if current else 0.0
-        gain, scale = kalman_gain(z, 2, rc.ANGLE, step, ratio, relative)
+        gain, scale = kalman_gain(structure, z, ANGLE, step, ratio, relative)
         noise = scale * noise[0, 0] if current else np.diag([scale[0, 0] * noise[0, 0], 1.0])
     z = structure.complete(z)
     start = np.zeros((1, 5))
     here = evaluate(data, structure, z, start, start, NoiseModel(noise, gain))
     cov = np.linalg.inv(here.normal)
-    m = structure.matrix()
-    values, gradients = models.combinations(z, 2)
+    m = structure.matrix
+    known = structure.combinations(z)
     names = list(COMBINATIONS)
     if current:
-        physical, rows = models.physical(z)
-        values, gradients = {**values, **physical}, {**gradients, **rows}
+        known |= physical_gradients(z)
         names += PHYSICAL[:5]
-    return {n: (values[n], float(gradients[n] @ m @ cov @ m.T @ gradients[n])) for n in names}
+    rows = {n: (known[n][0], known[n][1] @ m) for n in names}
+    return {n: (value, float(row @ cov @ row)) for n, (value, row) in rows.items()}
 
 
 def realisation(wheel: str, kind: str, current: bool, seed: int, args) -> dict:

@@ -17,7 +17,7 @@ from smp_motor_ident.estimate import estimate
 from smp_motor_ident.estimation.fit import Options
 from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.likelihood.experiments import prepare
-from smp_motor_ident.model.structures import Structure
+from smp_motor_ident.model.structures import SecondOrder
 from smp_motor_ident.record import Hardware, Record
 
 CASES = (
@@ -56,7 +56,7 @@ def _load(folder: Path, counts: bool) -> Record:
 def child(folder: str, counts: bool, friction: bool, whole: bool) -> None:
     """Fit what lies in a folder and print time and memory as JSON."""
     record = _load(Path(folder), counts)
-    structure = Structure("speed", friction="symmetric" if friction else "none")
+    structure = SecondOrder(friction="symmetric" if friction else "none")
 
     def call(given: Record) -> list[float]:
         if whole:
@@ -64,7 +64,8 @@ def child(folder: str, counts: bool, friction: bool, whole: bool) -> None:
             gain, tau = e.value("dc_gain"), e.value("time_constant")
             product = e.value("time_constant_product")
             return [float(x) for x in np.log([1 / gain, tau / gain, product / gain])]
-        return [float(x) for x in initial_fit(prepare([given], False), structure, Options()).z[:3]]
+        z = initial_fit(prepare([given], False), structure, Options()).z
+        return [z.ln_a0, z.ln_a1, z.ln_a2]
 
     call(record.slice(0, min(len(record), 8_000)))  # compiled code into memory
     gc.collect()
@@ -131,7 +132,7 @@ def _one(what: str, kind: str, friction: float, n: int) -> tuple[tuple[object, .
         f"{size:.1f} MiB",
         f"{told['more']:.1f} MiB",
         f"{told['more'] / size:.1f}",
-        f"{np.abs(np.array(told['z']) - z[:3]).max():.1e}",
+        f"{np.abs(np.array(told['z']) - z.array[:3]).max():.1e}",
     )
     return row, told["processor"]
 

@@ -14,14 +14,15 @@ from collections.abc import Iterator
 import numpy as np
 from known_motors import CURRENT_NOISE, QUANTUM, TABLE_1, recording, table
 
+from smp_motor_control.motor.parameters import PHYSICAL
 from smp_motor_ident.diagnosis.limits import LOOSE_QUANTITY
 from smp_motor_ident.errors import SmpError
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.likelihood.noise import NoiseModel
 from smp_motor_ident.likelihood.passes import evaluate
-from smp_motor_ident.model import structures as models
-from smp_motor_ident.model.structures import PHYSICAL, Structure
+from smp_motor_ident.model.physical import physical, physical_gradients
+from smp_motor_ident.model.structures import Electromechanical, SecondOrder
 
 CASES = (
     (True, ()),
@@ -37,18 +38,19 @@ def least_certain(record, z, current: bool, known: tuple[str, ...]) -> float:
     """Return the bound's largest relative std of R, L, K, J, b as far as they are not known."""
     fixed = {}
     if "resistance" in known and current:
-        fixed["ln_r"] = float(z[models.LN_R])
+        fixed["ln_r"] = z.ln_r
     if "inductance" in known:
-        fixed["ln_te"] = float(z[models.TE])
-    structure = Structure("bound", current=current, shape=False, fixed=fixed)
+        fixed["ln_te"] = z.ln_te
+    structure = (Electromechanical if current else SecondOrder)(fixed=fixed)
     data = prepare([record], current)
     noise = np.diag([QUANTUM**2 / 12, CURRENT_NOISE**2])
     start = np.zeros((1, 5))
     here = evaluate(data, structure, structure.complete(z), start, start, NoiseModel(noise))
     cov = np.linalg.inv(here.normal)
-    values, gradients = models.physical(z)
-    rows = {n: gradients[n] @ structure.matrix() for n in PHYSICAL[:5] if n not in known}
-    return max(float(np.sqrt(r @ cov @ r)) / values[n] for n, r in rows.items())
+    found = physical_gradients(z)
+    wanted = [found[n] for n in PHYSICAL[:5] if n not in known]
+    rows = [(value, gradient @ structure.matrix) for value, gradient in wanted]
+    return max(float(np.sqrt(row @ cov @ row)) / value for value, row in rows)
 
 
 def separable(parameters: dict[str, float], current: bool, fixed: tuple[str, ...]) -> bool:
@@ -75,7 +77,7 @@ def separable(parameters: dict[str, float], current: bool, fixed: tuple[str, ...
 
 def theory(record, z, current: bool, known: tuple[str, ...]) -> tuple[bool, str]:
     """Return whether theory separates all parameters from these data, and why."""
-    p = {n: v for n, v in models.physical(z)[0].items() if n in PHYSICAL[:5]}
+    p = {n: v for n, v in physical(z).items() if n in PHYSICAL[:5]}
     if not separable(p, current, known):
         return False, "rank"
     if known == ("resistance", "viscous_friction"):

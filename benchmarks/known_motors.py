@@ -16,7 +16,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "test" / "ident")]
 
 import independent  # noqa: E402
 
-from smp_motor_ident.model import structures as models  # noqa: E402
+from smp_motor_ident.model.physical import from_physical  # noqa: E402
 from smp_motor_ident.record import Hardware, Record  # noqa: E402
 
 QUANTUM = 2 * np.pi / 500
@@ -88,7 +88,7 @@ def recording(
         hardware=hardware,
         source="simulated",
     )
-    return made, models.from_physical(r, el, k, j, b, static_voltage * k / r)
+    return made, from_physical(r, el, k, j, b, static_voltage * k / r)
 
 
 def table(head: tuple[str, ...], rows: list[tuple[object, ...]]) -> str:

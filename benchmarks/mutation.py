@@ -50,7 +50,7 @@ TESTS = {
     CONTROL + "wheel.acceptance": "control/test_acceptance.py",
     CONTROL + "body.odometry": "control/test_odometry.py",
     CONTROL + "body.command": "control/test_body_command.py",
-    "smp_motor_ident.estimation.choice": "ident/test_structure_choice.py",
+    "smp_motor_ident.estimation.selection": "ident/test_structure_choice.py",
     BAG + "counter": "ident/bag/test_counter.py",
     BAG + "salvage": "ident/bag/test_salvage.py",
     BAG + "unpack": "ident/bag/test_unpack.py",

@@ -14,7 +14,8 @@ from scipy.signal import cont2discrete, lfilter
 
 from smp_motor_ident.estimation.fit import Start, solve
 from smp_motor_ident.likelihood.experiments import prepare
-from smp_motor_ident.model.structures import Structure
+from smp_motor_ident.model.coordinates import Coordinates
+from smp_motor_ident.model.structures import SecondOrder
 from smp_motor_ident.record import Record
 
 GUESS = (0.1, 1e-2, 1e-4)
@@ -69,10 +70,10 @@ def cost(record: Record, x: np.ndarray) -> float:
     if not np.all(np.isfinite(x)):
         return float("nan")
     fixed = dict(zip(("ln_a0", "ln_a1", "ln_a2", "vc_plus"), map(float, x)))
-    structure = Structure("speed", friction="symmetric" if len(x) > 3 else "none", fixed=fixed)
+    structure = SecondOrder(friction="symmetric" if len(x) > 3 else "none", fixed=fixed)
     data = prepare([record], False)
     return (
-        solve(data, structure, Start(np.zeros(12), data.initial, NOISE * np.eye(2))).objective
+        solve(data, structure, Start(Coordinates(), data.initial, NOISE * np.eye(2))).objective
         * NOISE
     )
 

@@ -31,7 +31,8 @@ from smp_motor_ident.estimate import estimate  # noqa: E402
 from smp_motor_ident.estimation.fit import Options  # noqa: E402
 from smp_motor_ident.estimation.initialisation import initial_fit  # noqa: E402
 from smp_motor_ident.likelihood.experiments import prepare  # noqa: E402
-from smp_motor_ident.model.structures import Structure  # noqa: E402
+from smp_motor_ident.model.coordinates import Coordinates  # noqa: E402
+from smp_motor_ident.model.structures import SecondOrder  # noqa: E402
 from smp_motor_ident.record import Record  # noqa: E402
 
 NOISE = 2.0  # rad/s
@@ -50,11 +51,16 @@ class Run:
     cost: float
 
 
+def shown(z: Coordinates, friction: bool) -> np.ndarray:
+    """Return what voltage and speed tell: the response, and the friction where there is some."""
+    return np.array([z.ln_a0, z.ln_a1, z.ln_a2, *([z.vc_plus] if friction else [])])
+
+
 def ours(record: Record, friction: bool) -> np.ndarray:
     """Return the coordinates from cold: the fit alone."""
     kind = "symmetric" if friction else "none"
-    fit = initial_fit(prepare([record], False), Structure("speed", friction=kind), Options())
-    return fit.z[[0, 1, 2, 4]] if friction else fit.z[:3]
+    fit = initial_fit(prepare([record], False), SecondOrder(friction=kind), Options())
+    return shown(fit.z, friction)
 
 
 def whole(record: Record, friction: bool, model: str = "second_order") -> np.ndarray:
@@ -88,7 +94,7 @@ def noisy(samples: int, friction: bool) -> tuple[Record, np.ndarray]:
         static_voltage=STATIC if friction else 0.0,
     )
     speed = made.velocity + NOISE * np.random.default_rng(0).standard_normal(len(made))
-    truth = z[[0, 1, 2, 4]] if friction else z[:3]
+    truth = shown(z, friction)
     return Record("motor", made.time, made.voltage, velocity=speed), truth
 
 

@@ -16,7 +16,7 @@ from known_motors import CURRENT_NOISE, QUANTUM, TABLE_1, independent, recording
 from smp_motor_control.excitation import Fourier
 from smp_motor_ident.diagnosis.identifiability import what_next
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.model import structures as models
+from smp_motor_ident.model.physical import physical
 from smp_motor_ident.record import Hardware, Record
 
 
@@ -50,7 +50,7 @@ def main() -> None:
     for wheel, p in TABLE_1.items():
         first, z = recording(p, "all", current=False, static_voltage=args.friction, seconds=10.0)
         proposal = what_next(estimate(first), args.accuracy, current_noise=CURRENT_NOISE)
-        truth = models.physical(z)[0]
+        truth = physical(z)
         stated: dict[str, list[float]] = {}
         errors: dict[str, list[float]] = {}
         for seed in range(args.recordings):

@@ -130,7 +130,7 @@ def _magnets(c: Case, level: int) -> None:
     c.drive["k_asym"] = a
     for name in ("dc_gain", "motor_constant"):
         c.widen[name] = (1 - a, 1 + a)
-    for name in ("time_constant", "static_voltage"):
+    for name in ("time_constant", "time_constant_product", "static_voltage"):
         c.widen[name] = (1 - 2 * a, 1 + 2 * a)
 
 
@@ -207,6 +207,8 @@ def _swapped(c: Case, level: int) -> None:
 
 
 def _standing(c: Case, level: int) -> None:
+    if c.kind == "closed_loop":  # which drives as hard as it takes
+        c.kind = "square"
     c.amplitude = (0.9, 0.6, 0.3)[level] * c.motor.truth()["static_voltage"]
 
 

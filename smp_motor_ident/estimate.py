@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from smp_motor_control.motor.parameters import PHYSICAL
 from smp_motor_ident.diagnosis import validation as validate
 from smp_motor_ident.diagnosis.adequacy import adequacy, stated
 from smp_motor_ident.diagnosis.advice import advise, assess, unsettled_rival
@@ -16,19 +17,19 @@ from smp_motor_ident.diagnosis.beat import clock_share, on_beat
 from smp_motor_ident.diagnosis.bunched import merge_bunches
 from smp_motor_ident.diagnosis.conditions import dependent
 from smp_motor_ident.diagnosis.current_kind import ARMATURE, current_kind
+from smp_motor_ident.diagnosis.data_quality import screen
 from smp_motor_ident.diagnosis.limits import LEAST_FIT, PROFILED
+from smp_motor_ident.diagnosis.lost_rows import bridged
 from smp_motor_ident.diagnosis.misfit import widened_by_misfit
 from smp_motor_ident.diagnosis.model_error import regression
 from smp_motor_ident.diagnosis.noise_or_effect import in_place_of_noise
 from smp_motor_ident.diagnosis.refusal import no_candidate, refuse
 from smp_motor_ident.diagnosis.residuals import residual_tests
 from smp_motor_ident.diagnosis.scope import blames_current, contradicted, current_left_out, scope
-from smp_motor_ident.diagnosis.screening import screen
 from smp_motor_ident.errors import InsufficientExcitationError, SignalError, SmpError
 from smp_motor_ident.estimation import flexible_shaft, order_selection, prediction
 from smp_motor_ident.estimation.averaging import candidate_weights, covering
 from smp_motor_ident.estimation.candidate_starts import of_kind
-from smp_motor_ident.estimation.choice import FittedCandidate, size
 from smp_motor_ident.estimation.consider_covariance import (
     consider_clock,
     consider_drop,
@@ -44,13 +45,14 @@ from smp_motor_ident.estimation.quantisation import widened
 from smp_motor_ident.estimation.quantities import Answer, answer, driven_longest
 from smp_motor_ident.estimation.request import Request, base_structure, checked
 from smp_motor_ident.estimation.segments import heterogeneous
+from smp_motor_ident.estimation.selection import FittedCandidate
 from smp_motor_ident.estimation.subset import excited
 from smp_motor_ident.estimation.thinning import thinned
 from smp_motor_ident.finding import Finding
-from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments, prepare
-from smp_motor_ident.model import structures as models
-from smp_motor_ident.model.structures import PHYSICAL, Structure
+from smp_motor_ident.model.measurement import ANGLE
+from smp_motor_ident.model.physical import physical
+from smp_motor_ident.model.structures import Structure
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import Candidate, Estimate, FitPercent
 
@@ -80,7 +82,7 @@ def estimate(
         ``auto``, or a candidate structure: ``static_gain``, ``first_order``,
         ``second_order``, ``electromechanical``.
     fixed : mapping of str to float, optional
-        Parameters that the user knows, by the names of `models.PHYSICAL` or ``delay``,
+        Parameters that the user knows, by the names of `model.physical.PHYSICAL` or ``delay``,
         ``averaging_window``; SI, at the motor shaft.
     bounds : mapping of str to (float, float), optional
         Limits of physical parameters, where current is measured.
@@ -115,7 +117,7 @@ def estimate(
         rigid = estimate(group, "second_order", fixed=fixed, loss=loss, progress=progress)
         return flexible_shaft.flexible_shaft(group, rigid)
     request = checked(group, model, fixed, bounds, loss, validation, progress)
-    group = [merge_bunches(on_beat(r)) for r in group]
+    group = [bridged(merge_bunches(on_beat(r))) for r in group]
     kind = current_kind(group) if request.may_leave_current else ARMATURE
     if kind != ARMATURE:
         group, request = request.without_current(group)
@@ -176,14 +178,13 @@ def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) 
 
 
 def _in_turn(candidates: list[FittedCandidate]) -> list[list[FittedCandidate]]:
-    """Return the candidates with the choice last, then with each that is no richer in its place."""
-    chosen = candidates[-1].fit
-    others = [
-        r
-        for r in candidates[:-1]
-        if r.whole and r.fit.converged and size(r.fit.structure) <= size(chosen.structure)
-    ]
-    others.sort(key=lambda r: r.bic)
+    """Return the candidates with the choice last, then with each that is no richer in its place.
+
+    Those whose descent did not settle come last.
+    """
+    most = candidates[-1].fit.structure.size
+    others = [r for r in candidates[:-1] if r.whole and r.fit.structure.size <= most]
+    others.sort(key=lambda r: (not r.fit.converged, r.bic))
     return [candidates, *([*(o for o in candidates if o is not r), r] for r in others)]
 
 
@@ -245,7 +246,7 @@ def _stated(
         *scope(final, result, change, alike, group[0].hardware.resistance),
     ]
     return Estimate(
-        model=_name(chosen.structure),
+        model=chosen.structure.title,
         parameters=result.parameters,
         combinations=result.combinations,
         names=result.names,
@@ -256,7 +257,7 @@ def _stated(
         findings=tuple(findings),
         samples=data.size,
         sample_time=data.step,
-        speed_noise=0.0 if data.kind == rc.ANGLE else float(np.sqrt(chosen.noise[0, 0])),
+        speed_noise=0.0 if data.kind == ANGLE else float(np.sqrt(chosen.noise[0, 0])),
         **_provenance(group),
     )
 
@@ -297,16 +298,12 @@ def _certain(
     return chosen, friction_std, change
 
 
-def _name(structure: Structure) -> str:
-    return structure.name + ("_asymmetric" if structure.friction == "asymmetric" else "")
-
-
 def _constrain(data: Experiments, fit: Fit, request: Request) -> Fit:
     """Refit under what the user holds fixed or bounded, and what physics forbids."""
     if not fit.structure.current:
         return fit
     known = request.known
-    values, _ = models.physical(fit.z)
+    values = physical(fit.z)
     scale = {n: abs(values[n]) for n in PHYSICAL}
     scale["viscous_friction"] = values["motor_constant"] ** 2 / values["resistance"]
     priors = [

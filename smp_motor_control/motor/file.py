@@ -23,17 +23,9 @@ from typing import Any
 from smp_motor_control.encoder import Encoder
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.motor.friction import Gearbox, MotorParameters
+from smp_motor_control.motor.parameters import COMBINATIONS, PHYSICAL
 from smp_motor_control.parameter_file import read_yaml
 
-PHYSICAL = (
-    "resistance",
-    "inductance",
-    "motor_constant",
-    "inertia",
-    "viscous_friction",
-    "coulomb_friction",
-)
-COMBINATIONS = ("dc_gain", "time_constant", "time_constant_product", "static_voltage")
 HARDWARE = {
     "gear_ratio": 1.0,
     "counts_per_revolution": 500.0,

@@ -18,6 +18,12 @@ _UNITS = {
     "viscous_friction": "N m s/rad",
     "coulomb_friction": "N m",
 }
+PHYSICAL = tuple(_UNITS)
+"""Names of a motor's physical parameters."""
+
+COMBINATIONS = ("dc_gain", "time_constant", "time_constant_product", "static_voltage")
+"""Names of what voltage and speed tell of a motor."""
+
 _MAY_BE_ZERO = ("inductance", "viscous_friction", "coulomb_friction")
 Motion = TypeVar("Motion", float, NDArray[np.float64])
 

@@ -37,7 +37,7 @@ class Recording:
 
     name: str  # what to call it in messages and results
     files: list[Path]  # in the order in which they were written
-    promised: dict[str, int] | None = None  # messages by topic as metadata.yaml counts them
+    declared: dict[str, int] | None = None  # messages by topic as metadata.yaml counts them
     # What was found amiss, grows while the files are read
     findings: list[Finding] = field(default_factory=list)
     # Whether it was found in a folder with others, so that nobody asked for it by name
@@ -102,24 +102,24 @@ class Recording:
                 asked = {c.topic for c in source.channels() if wanted(c)}
                 seen |= asked
                 self._note(*source.problems)
-                for topic, count in (source.promised() or {}).items():
+                for topic, count in (source.declared() or {}).items():
                     if topic in asked and mine[topic] < count:
                         self._lost(path.name, topic, mine[topic], count)
                 counts += mine
             before += size
-        for topic, count in (self.promised or {}).items():
+        for topic, count in (self.declared or {}).items():
             if topic in seen and counts[topic] < count:
                 self._lost("metadata.yaml", topic, counts[topic], count)
 
     def _note(self, *findings: Finding) -> None:
         self.findings += [f for f in findings if f not in self.findings]
 
-    def _lost(self, who: str, topic: str, have: int, promised: int) -> None:
+    def _lost(self, who: str, topic: str, have: int, declared: int) -> None:
         text = (
-            f"{self.name}: {topic}: {have} of {promised} messages could be read "
-            f"({who} counts {promised}; {promised - have} are lost)"
+            f"{self.name}: {topic}: {have} of {declared} messages could be read "
+            f"({who} counts {declared}; {declared - have} are lost)"
         )
-        self._note(found("messages_lost", text, "warning", read=have, counted=promised))
+        self._note(found("messages_lost", text, "warning", read=have, counted=declared))
 
     def _source(self, path: Path) -> Messages | Tables | None:
         """Open a file; where others remain, one that cannot be read becomes a finding."""
@@ -236,13 +236,13 @@ def _bag(path: Path) -> Recording:
         text = (path / "metadata.yaml").read_text("utf-8", "replace")
         information = _loaded(text)["rosbag2_bagfile_information"]
         listed = [Path(str(file)).name for file in information["relative_file_paths"]]
-        bag.promised = _promise(information)
+        bag.declared = _declared(information)
     except (yaml.YAMLError, LookupError, TypeError, ArithmeticError, *_DAMAGE) as error:
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         bag.findings.append(
             damaged(f"{name}: metadata.yaml is damaged ({reason}); all files are read")
         )
-        bag.promised, listed = None, []
+        bag.declared, listed = None, []
     there = _storages(sorted(path.iterdir()))
     for file in listed:
         options = [file, file.removesuffix(Path(file).suffix), f"{file}.zstd", f"{file}.lz4"]
@@ -265,7 +265,7 @@ def _bag(path: Path) -> Recording:
     return bag
 
 
-def _promise(information: dict[str, Any]) -> dict[str, int]:
+def _declared(information: dict[str, Any]) -> dict[str, int]:
     """Return the messages by topic; the oldest bags call the topic's entry differently."""
     counts: Counter[str] = Counter()
     for entry in information.get("topics_with_message_count") or []:

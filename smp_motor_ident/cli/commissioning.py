@@ -127,7 +127,7 @@ def _begin(arguments: argparse.Namespace, robot: steps.Robot) -> Session:
     if not same:
         if "asked" in made.document:
             _say("wheels, amplitude or duration are others than before: all of it is done anew")
-        for name in (plan.FITTED, plan.UNSEEN):
+        for name in (plan.FITTED, plan.HELD_OUT):
             shutil.rmtree(robot.folder / name, ignore_errors=True)
         made.begin(robot.wheels, asked)
         made.write()
@@ -206,10 +206,10 @@ def _design(session: Session) -> verifying.Designed:
     """Identify and tune; what they write appears as a whole, and is written anew."""
     arguments, robot, made = session.arguments, session.robot, session.protocol
     folder, results = robot.folder, robot.folder / "identification"
-    fitted, unseen = folder / plan.FITTED, folder / plan.UNSEEN
+    fitted, held_out = folder / plan.FITTED, folder / plan.HELD_OUT
     again = ["--force"]
     again += ["--accept-unreliable"] if UNRELIABLE in arguments.accept else []
-    options = [*again, *(["--tuning"] if arguments.tuning else []), "--validate", str(unseen)]
+    options = [*again, *(["--tuning"] if arguments.tuning else []), "--validate", str(held_out)]
     options += [part for wheel in robot.wheels for part in ("--wheel", wheel)]
 
     def identify(part: str) -> dict[str, Estimate]:
@@ -227,7 +227,7 @@ def _design(session: Session) -> verifying.Designed:
         session.schedule.add_further(more, len(robot.wheels))
         _record(session, more)
         estimates = identify(plan.AGAIN)
-    made.stop(made.add("validation", validated(estimates, fitted, unseen)))
+    made.stop(made.add("validation", validated(estimates, fitted, held_out)))
     session.begin(plan.TUNING)
     gains = steps.tune_wheels(results, folder / "gains.yaml", *again[:1])
     document = json.loads((folder / "gains.json").read_text("utf-8"))["wheels"]
@@ -292,10 +292,10 @@ def unreliable(results: Path) -> list[Finding]:
     ]
 
 
-def validated(estimates: Mapping[str, Estimate], fitted: Path, unseen: Path) -> list[Finding]:
+def validated(estimates: Mapping[str, Estimate], fitted: Path, held_out: Path) -> list[Finding]:
     """Judge every motor by a run that its fit has not seen."""
     found = []
-    read = {path: bag.read_experiments([str(path)]) for path in (fitted, unseen)}
+    read = {path: bag.read_experiments([str(path)]) for path in (fitted, held_out)}
     for wheel, one in estimates.items():
         parts = {
             path: [
@@ -304,7 +304,7 @@ def validated(estimates: Mapping[str, Estimate], fitted: Path, unseen: Path) -> 
             ]
             for path, records in read.items()
         }
-        found.append(validation_run.judge(wheel, parts[fitted], parts[unseen]))
+        found.append(validation_run.judge(wheel, parts[fitted], parts[held_out]))
     return found
 
 

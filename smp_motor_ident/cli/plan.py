@@ -15,14 +15,14 @@ from smp_motor_ident.diagnosis.identifiability import what_next
 from smp_motor_ident.diagnosis.wheel_limits import WANTED_ACCURACY
 from smp_motor_ident.result import Estimate
 
-FITTED, UNSEEN = "excitation", "validation"
+FITTED, HELD_OUT = "excitation", "validation"
 """Folders of the recordings that motors are identified from, and that they are judged by."""
 
 SIGNALS = (
     ("sine", 0.75, 1.0, FITTED),
     ("square", 0.75, 1.0, FITTED),
     ("fourier", 1.0, 1.0, FITTED),
-    ("steps", 1.0, 0.5, UNSEEN),
+    ("steps", 1.0, 0.5, HELD_OUT),
 )
 """What moves the wheels: signal, shares of amplitude and duration, and whose recording."""
 
@@ -52,7 +52,7 @@ DRAWN, COLUMNS, BLOCKS = 4.0, 72, "▁▂▃▄▅▆▇█"
 class Recording:
     """One signal and where it is kept."""
 
-    folder: str  # :data:`FITTED` or :data:`UNSEEN`
+    folder: str  # :data:`FITTED` or :data:`HELD_OUT`
     name: str
     excitation: Excitation
 

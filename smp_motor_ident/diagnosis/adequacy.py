@@ -38,7 +38,7 @@ from smp_motor_ident.diagnosis.model_error import Regression
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.quantities import Answer
 from smp_motor_ident.finding import Finding
-from smp_motor_ident.model import structures as models
+from smp_motor_ident.model.physical import physical_gradients
 from smp_motor_ident.result import Quantity, ResidualTests
 
 Array = NDArray[np.float64]
@@ -207,9 +207,9 @@ def _farthest(shown: Evidence, numbers: Sequence[Stated], step: float) -> tuple[
 
 def stated(fit: Fit, result: Answer) -> list[Stated]:
     """Return the numbers that are stated, with their gradients by the free coordinates."""
-    matrix = fit.structure.matrix()
-    _, rows = models.combinations(fit.z, fit.structure.order)
+    matrix = fit.structure.matrix
+    known = fit.structure.combinations(fit.z)
     if fit.structure.current:
-        rows = {**rows, **models.physical(fit.z)[1]}
+        known |= physical_gradients(fit.z)
     quantities = {**result.combinations, **result.parameters}
-    return [(n, q, rows[n] @ matrix) for n, q in quantities.items() if n in rows]
+    return [(n, q, known[n][1] @ matrix) for n, q in quantities.items() if n in known]

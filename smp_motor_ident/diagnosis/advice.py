@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from smp_motor_control.motor.parameters import PHYSICAL
 from smp_motor_ident.diagnosis.limits import (
     FIT_EXPLAINS,
     FIT_HOLDS,
@@ -20,18 +21,18 @@ from smp_motor_ident.diagnosis.limits import (
     UNEXPLAINED,
     WINDING_LAG,
 )
+from smp_motor_ident.diagnosis.residuals import coloured
 from smp_motor_ident.diagnosis.sensors import sensors
 from smp_motor_ident.diagnosis.validation import within_resolution
 from smp_motor_ident.estimation import prediction, shape_constraint
-from smp_motor_ident.estimation.choice import FittedCandidate, preferred_but_for_descent
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.quantities import Answer, answer
+from smp_motor_ident.estimation.selection import POLICY, FittedCandidate
 from smp_motor_ident.finding import Finding
-from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.passes import evaluate
-from smp_motor_ident.model import structures as models
-from smp_motor_ident.model.structures import PHYSICAL
+from smp_motor_ident.model.coordinates import Coordinates, direction
+from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.result import FitPercent, ResidualTests
 
 Array = NDArray[np.float64]
@@ -45,6 +46,7 @@ def assess(data: Experiments, fit: Fit, percent: FitPercent, tests: ResidualTest
     return [
         *_descent(data, fit),
         *_fit(percent, tests, within_resolution(data, fit)),
+        *_fit_of_current(data, fit),
         *_resolution(data, fit, tests),
         *sensors(fit),
         *_second_lag(data, fit),
@@ -61,7 +63,11 @@ def unsettled_rival(
     """
     chosen = candidates[-1]
     for other in candidates[:-1]:
-        if other.fit.converged or not other.whole or not preferred_but_for_descent(chosen, other):
+        if (
+            other.fit.converged
+            or not other.whole
+            or not POLICY.preferred_but_for_descent(chosen, other)
+        ):
             continue
         values = answer(other.fit, known).combinations
         moved = [
@@ -134,11 +140,32 @@ def _fit(percent: FitPercent, tests: ResidualTests, closely: bool) -> list[Findi
     return out
 
 
+def _fit_of_current(data: Experiments, fit: Fit) -> list[Finding]:
+    """Say that a current was given up for the speed: each has a noise of its own, as large as it
+    takes.
+    """
+    if not data.current.size:
+        return []
+    error = data.current - prediction.simulate(data, fit, gain=True)[:, 2]
+    explained = 100 * (1 - float(np.nanstd(error)) / max(float(np.nanstd(data.current)), 1e-300))
+    if explained >= FIT_EXPLAINS.value or not coloured(error):
+        return []
+    return [
+        Finding(
+            "poor_fit_of_current",
+            "unreliable",
+            f"the model explains only {explained:.0f} % of the current, and the rest is no noise",
+            {"fit_percent": explained, "limit": FIT_EXPLAINS.value},
+            "check that speed and current are of this motor, and that neither is filtered",
+        )
+    ]
+
+
 def _resolution(data: Experiments, fit: Fit, tests: ResidualTests) -> list[Finding]:
     out = []
     own = data.quantum**2 / 12
     beyond = own > 0 and fit.noise_ratio == 0 and not within_resolution(data, fit)
-    if data.kind == rc.ANGLE and beyond and tests.white is False:
+    if data.kind == ANGLE and beyond and tests.white is False:
         times = float(np.sqrt(fit.noise[0, 0] / own))
         out.append(
             Finding(
@@ -171,12 +198,11 @@ def _second_lag(data: Experiments, fit: Fit) -> list[Finding]:
     With time constants T and cT, ``a2 a0 / a1^2 = c / (1 + c)^2``, and the sensor's lag is
     ``c / (1 + c)`` of what is stated as the motor's.
     """
-    if fit.structure.order != 2 or fit.structure.current or data.kind == rc.ANGLE:
+    if fit.structure.order != 2 or fit.structure.current or data.kind == ANGLE:
         return []
-    row = np.zeros(fit.z.size)
-    row[[models.A0, models.A1, models.A2]] = 1.0, -2.0, 1.0
-    free = row @ fit.structure.matrix()
-    ratio, spread = float(row @ fit.z), float(np.sqrt(free @ fit.covariance() @ free))
+    row = direction(ln_a0=1.0, ln_a1=-2.0, ln_a2=1.0)
+    free = row @ fit.structure.matrix
+    ratio, spread = float(row @ fit.z.array), float(np.sqrt(free @ fit.covariance() @ free))
     if ratio - HALF_WIDTH.value * spread > np.log(0.25):  # it rings, which no lag does
         return []
     share, least = (_lag_share(ratio - k * spread) for k in (0.0, HALF_WIDTH.value))
@@ -208,7 +234,7 @@ def _lag_share(log_ratio: float) -> float:
 
 
 def _torque_noise(data: Experiments, fit: Fit) -> list[Finding]:
-    if fit.noise_ratio <= 0 or data.kind != rc.ANGLE:
+    if fit.noise_ratio <= 0 or data.kind != ANGLE:
         return []
     out = []
     if not fit.structure.current and _plain_square(data, fit):
@@ -246,11 +272,10 @@ def _plain_square(data: Experiments, fit: Fit) -> bool:
         return False
     level = np.where(driven > 0, np.median(there), np.median(back))
     turns = data.hold_end[:-1][np.diff(np.sign(value)) != 0]
-    lag = float(np.exp(fit.z[models.A1] - fit.z[models.A0]))
     return bool(
         np.mean(np.abs(np.abs(driven) - level) < SQUARE_LEVEL.value * level) > 0.95
         and turns.size > 1
-        and np.median(np.diff(turns)) > STEADY.value * lag
+        and np.median(np.diff(turns)) > STEADY.value * fit.z.time_constant
     )
 
 
@@ -258,8 +283,8 @@ def _ring(fit: Fit) -> float:
     """Return the frequency at which an underdamped motor rings [rad/s], else 0."""
     if fit.structure.order != 2:
         return 0.0
-    a0, a1, a2 = np.exp(fit.z[: models.A2 + 1])
-    return float(np.sqrt(a0 / a2)) if a1 * a1 < a0 * a2 else 0.0
+    z = fit.z
+    return float(np.sqrt(z.a0 / z.a2)) if z.a1 * z.a1 < z.a0 * z.a2 else 0.0
 
 
 def _unsettled(data: Experiments, fit: Fit) -> bool:
@@ -270,25 +295,22 @@ def _unsettled(data: Experiments, fit: Fit) -> bool:
     by as much as such a move is worth counts.
     """
     _, step, _ = prediction.predicted_decrease(data, fit, fit.structure)
-    free = np.array(fit.structure.free())
-    reported = (free != models.TE) | fit.structure.current
+    reported = [n != "ln_te" or fit.structure.current for n in fit.structure.free]
     deviation = np.sqrt(np.diag(fit.covariance()))
     if not np.any(np.abs(step) > HALF_WIDTH.value * deviation, where=reported):
         return False
     here = _least_squares(data, fit, fit.z)
     return any(
-        _least_squares(data, fit, fit.z + share * fit.structure.matrix() @ step)
+        _least_squares(data, fit, fit.z.moved(share * fit.structure.matrix @ step))
         < here - HALF_WIDTH.value**2
         for share in (1.0, 0.3, 0.1)
     )
 
 
-def _least_squares(data: Experiments, fit: Fit, z: Array) -> float:
+def _least_squares(data: Experiments, fit: Fit, z: Coordinates) -> float:
     """Return the weighted sum of squares at coordinates, under the best initial states."""
-    z = z.copy()
-    volts = [models.VC_PLUS, models.VC_MINUS, models.DELAY]
-    z[volts] = np.maximum(z[volts], 0.0)
-    z = fit.structure.complete(z)
+    volts = {n: max(z.value(n), 0.0) for n in ("vc_plus", "vc_minus", "delay")}
+    z = fit.structure.complete(z.with_(**volts))
     if shape_constraint.applies(fit.structure):
         z = shape_constraint.within(z)
     there = evaluate(data, fit.structure, z, fit.initial, fit.initial, fit.noise_model())
@@ -338,12 +360,12 @@ def advise(fit: Fit, result: Answer, known: Mapping[str, float]) -> list[Finding
 
 
 def _friction(fit: Fit) -> list[Finding]:
-    free = fit.structure.free()
-    if models.VC_PLUS not in free or fit.structure.friction == "none":
+    free = fit.structure.free
+    if "vc_plus" not in free or fit.structure.friction == "none":
         return []
-    i = free.index(models.VC_PLUS)
+    i = free.index("vc_plus")
     std = float(np.sqrt(fit.covariance()[i, i]))
-    if std <= FRICTION_SHOWN.value * abs(fit.z[models.VC_PLUS]) or std <= 0.05:
+    if std <= FRICTION_SHOWN.value * abs(fit.z.vc_plus) or std <= 0.05:
         return []
     return [
         _note(

@@ -40,7 +40,7 @@ MOST = 4.0  # deviations at which a residual is cut off: outliers are no scatter
 
 def jittered(data: Experiments, fit: Fit) -> tuple[Fit, list[Finding]]:
     """Return the fit with its covariance widened by instants that scatter, and say so."""
-    scatter = _scatter(data, fit) if fit.structure.free() else 0.0
+    scatter = _scatter(data, fit) if fit.structure.free else 0.0
     if scatter <= 0.0:
         return fit, []
     late = math.sqrt(3.0 * scatter)

@@ -27,7 +27,6 @@ from smp_motor_ident.diagnosis.model_error import Regression
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.prediction import inverse
 from smp_motor_ident.finding import Finding
-from smp_motor_ident.model import structures as models
 
 Array = NDArray[np.float64]
 
@@ -38,7 +37,6 @@ def dependent(fit: Fit, errors: Regression | None) -> tuple[Fit, list[Finding]]:
         return fit, []
     size = errors.n_free
     level = CONDITION_LEVEL.value / max(2 * size * len(errors.conditions), 1)
-    names = [models.Z_NAMES[i] for i in fit.structure.free()]
     unweighted = inverse(errors.own.T @ errors.own, 1e-12)
     added, said = np.zeros((size, size)), {}
     for name, condition in errors.conditions.items():
@@ -50,7 +48,7 @@ def dependent(fit: Fit, errors: Regression | None) -> tuple[Fit, list[Finding]]:
         far = max(moves, key=lambda d: float(np.abs(d).max()))
         if far.any():
             added += np.outer(far, far)
-            said[name] = ", ".join(n for n, d in zip(names, far, strict=True) if d)
+            said[name] = ", ".join(n for n, d in zip(fit.structure.free, far, strict=True) if d)
     if not said:
         return fit, []
     message = "the numbers hang on the part of the motion that one looks at (" + "; ".join(said)

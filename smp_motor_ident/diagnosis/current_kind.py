@@ -12,8 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from smp_motor_ident.diagnosis.data_quality import averaged_runs, measured_speed
 from smp_motor_ident.diagnosis.limits import CURRENT_KIND, FEWEST, METER, REST
-from smp_motor_ident.diagnosis.screening import averaged_runs, measured_speed
 from smp_motor_ident.record import Record
 
 Array = NDArray[np.float64]

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from smp_motor_ident.likelihood import recursion as rc
+from smp_motor_ident.model.measurement import ANGLE, Measurement
 
 Array = NDArray[np.float64]
 Place = Literal["voltage", "torque", "output", "current"]
@@ -38,7 +38,7 @@ class Motion:
     top: float
     fastest: float
     gear: float  # motor revolutions a wheel revolution
-    kind: int  # of the output
+    kind: Measurement  # what the output shows
     # resistance [ohm] and L/R [s], where the current is measured
     resistance: float = 0.0
     electric_lag: float = 0.0
@@ -81,7 +81,7 @@ def _current_late(m: Motion) -> list[Array]:
 
 
 def _angles(m: Motion) -> list[Array]:
-    if m.kind != rc.ANGLE:
+    if m.kind != ANGLE:
         return []
     out = [np.sin(m.angle), np.cos(m.angle)]
     if m.gear > 1.5:
@@ -90,15 +90,15 @@ def _angles(m: Motion) -> list[Array]:
 
 
 def _encoder(m: Motion) -> list[Array]:
-    return [np.sin(m.angle), np.cos(m.angle)] if m.kind == rc.ANGLE else []
+    return [np.sin(m.angle), np.cos(m.angle)] if m.kind == ANGLE else []
 
 
 def _play(m: Motion) -> list[Array]:
-    return [np.tanh(50 * m.speed / m.fastest)] if m.kind == rc.ANGLE else []
+    return [np.tanh(50 * m.speed / m.fastest)] if m.kind == ANGLE else []
 
 
 def _missed(m: Motion) -> list[Array]:
-    if m.kind != rc.ANGLE:
+    if m.kind != ANGLE:
         return []
     fast = m.speed * np.maximum(np.abs(m.speed) / m.fastest - 0.5, 0)
     return [np.cumsum(m.speed * np.abs(m.speed) * m.step), np.cumsum(fast * m.step)]

@@ -13,14 +13,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from smp_motor_control.motor.parameters import PHYSICAL
 from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.fit import Fit
-from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.likelihood.noise import NO_GAIN
-from smp_motor_ident.model import structures as models
-from smp_motor_ident.model.structures import PHYSICAL, Structure
+from smp_motor_ident.model.coordinates import Coordinates
+from smp_motor_ident.model.measurement import ANGLE
+from smp_motor_ident.model.physical import physical_gradients
+from smp_motor_ident.model.structures import Electromechanical
 from smp_motor_ident.record import Hardware, Record
 from smp_motor_ident.result import Estimate
 
@@ -95,44 +97,37 @@ def _family(estimate: Estimate, current_noise: float) -> tuple[list[Fit], bool]:
     known = {n: q.value for n, q in estimate.parameters.items() if n in PHYSICAL}
     given = known.get("resistance") or estimate.hardware.resistance
     r = given or LARGEST_RESISTANCE
-    z = np.zeros(len(models.Z_NAMES))
     gain, tau = estimate.value("dc_gain"), estimate.value("time_constant")
     product = estimate.value("time_constant_product") or 0.02 * tau**2
-    z[models.A0] = -np.log(gain)
-    z[models.A1] = np.log(tau / gain)
-    z[models.A2] = np.log(product / gain)
-    z[models.LN_R] = np.log(r)
-    z[models.VC_PLUS] = z[models.VC_MINUS] = estimate.value("static_voltage")
-    friction = "symmetric" if z[models.VC_PLUS] > 0 else "none"
-    structure = Structure("electromechanical", 2, friction, current=True)
+    a0, a1, a2 = 1 / gain, tau / gain, product / gain
+    z = Coordinates(np.log(a0), np.log(a1), np.log(a2), ln_r=np.log(r))
+    z = z.with_friction(estimate.value("static_voltage"))
+    structure = Electromechanical("symmetric" if z.vc_plus > 0 else "none")
     turn = estimate.hardware.counts_per_revolution
     noise = np.diag([(2 * np.pi / turn) ** 2 / 12 if turn else 1e-4, current_noise**2])
-    f = len(structure.free())
+    f = len(structure.free)
     fits = []
     for te in _electric(estimate, z):
-        z = z.copy()
-        z[models.TE] = np.log(te)
         fits.append(
-            Fit(z, np.zeros((1, 4)), noise, structure=structure, gain=NO_GAIN, objective=0.0,
+            Fit(z.with_(ln_te=np.log(te)), np.zeros((1, 5)), noise, structure=structure,
+                gain=NO_GAIN, objective=0.0,
                 deviance=0.0, information=np.eye(f), scores=np.zeros((0, f)), passes=0,
-                converged=True, samples=0, kind=rc.ANGLE)
+                converged=True, samples=0, kind=ANGLE)
         )  # fmt: skip
     return fits, not estimate.model.startswith("electromechanical")
 
 
-def _electric(estimate: Estimate, z: Array) -> list[float]:
+def _electric(estimate: Estimate, z: Coordinates) -> list[float]:
     """Return L/R, or the values of it that the response leaves open: be = a1/te - a2/te^2."""
     inductance, r = estimate.value("inductance"), estimate.value("resistance")
     if inductance > 0 and r > 0:
         return [inductance / r]
-    a0, a1, a2 = np.exp(z[:3])
     out = []
     for share in SHARES:
-        be = (1 - share) * a0
-        roots = np.roots([be, -a1, a2])
+        roots = np.roots([(1 - share) * z.a0, -z.a1, z.a2])
         real = roots[np.abs(roots.imag) < 1e-9 * np.abs(roots)].real
         out += [float(te) for te in real if te > 0]
-    return out or [float(1.1 * a2 / a1)]
+    return out or [1.1 * z.second_lag]
 
 
 def _trial(amplitude: float, band: tuple[float, float], step: float, hardware: Hardware) -> Record:
@@ -151,19 +146,19 @@ def _least_certain(record: Record, family: Sequence[Fit]) -> dict[str, float]:
 
 
 def _relative_std(record: Record, fit: Fit) -> dict[str, float]:
-    data = replace(prepare([record], True), kind=rc.ANGLE)
+    data = replace(prepare([record], True), kind=ANGLE)
     information = prediction.information(data, fit)
     cov = replace(fit, information=information).covariance()
-    values, gradients = models.physical(fit.z)
-    matrix = fit.structure.matrix()
+    known = physical_gradients(fit.z)
+    matrix = fit.structure.matrix
     out = {}
     for name in PHYSICAL:
         if name == "coulomb_friction" and fit.structure.friction == "none":
             continue
-        row = gradients[name] @ matrix
-        scale = abs(values[name]) or 1.0
+        value, gradient = known[name]
+        row, scale = gradient @ matrix, abs(value) or 1.0
         if name == "viscous_friction":  # often next to nothing: against what turns the motor
-            scale = max(scale, 0.05 * values["motor_constant"] ** 2 / values["resistance"])
+            scale = max(scale, 0.05 * known["motor_constant"][0] ** 2 / known["resistance"][0])
         out[name] = float(np.sqrt(row @ cov @ row) / scale)
     return out
 

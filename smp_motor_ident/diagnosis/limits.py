@@ -108,7 +108,7 @@ WORST_FIT = Limit(
     30.0,
     "% of the speed",
     "below it half of the motion's variance comes from elsewhere: what is fitted is not the motor",
-    "test_screening.py",
+    "test_data_quality.py",
 )
 LEAST_FIT = Limit(
     -100.0,
@@ -117,10 +117,7 @@ LEAST_FIT = Limit(
     "test_estimate.py: a candidate that left the motor behind has no fit",
 )
 PROFILED = Limit(
-    20_000,
-    "samples",
-    "cost: ends of an interval are found on as few samples as tell the same, each a descent",
-    "test_intervals.py",
+    20_000, "samples", "cost: each end of an interval is found by a descent", "test_intervals.py"
 )
 
 # Choice of a candidate structure.
@@ -130,11 +127,20 @@ PRIOR_ODDS = Limit(
     "significance: prior odds of e^2 to 1 against any addition, because many are tried",
     "test_structure_choice.py",
 )
+COLOURED = Limit(
+    4.0, "ratio of variances", "significance: 1e-22 for 60 white runs", "test_structure_choice.py"
+)
 SURE_GAIN = Limit(
     3.0,
     "prices",
     "significance: 5e-14 for a parameter of 500 samples, whatever the richer one leaves loose",
     "test_structure_choice.py",
+)
+LOOSE_ADDITION = Limit(
+    0.4,
+    "of its value, or e-folds",
+    "significance: 2.5 deviations from nothing, one addition in eighty that is not there",
+    "test_structure_choice.py: what is not known to two fifths",
 )
 SUBSET_HOPELESS = Limit(
     40.0,
@@ -221,13 +227,13 @@ FRICTION_SHOWN = Limit(
     0.5, "relative standard deviation", "beyond it the 95 % interval holds zero", "test_findings.py"
 )
 FEWEST = Limit(
-    40, "samples", "ten for each of gain, lag, friction and initial state", "test_screening.py"
+    40, "samples", "ten for each of gain, lag, friction and initial state", "test_data_quality.py"
 )
 MOST_LOST = Limit(
-    0.3, "share of the samples", "beyond it the sensor is at fault", "test_screening.py"
+    0.3, "share of the samples", "beyond it the sensor is at fault", "test_data_quality.py"
 )
 METER = Limit(
-    0.01, "share of the supply or of a level", "what a voltmeter scatters", "test_screening.py"
+    0.01, "share of the supply or of a level", "what a voltmeter scatters", "test_data_quality.py"
 )
 SILENT_SWING = Limit(
     2.0,
@@ -248,10 +254,10 @@ OFFSET_SURE = Limit(
     "standard deviations",
     "of an offset of the current, with errors of neighbouring runs that "
     "hang together allowed for; chance exceeds it once in 5e8",
-    "test_screening.py",
+    "test_data_quality.py",
 )
 LARGEST_OFFSET = Limit(
-    0.2, "share of the largest current", "beyond it a sensor is not calibrated", "test_screening.py"
+    0.2, "share of the largest current", "no calibrated sensor has more", "test_data_quality.py"
 )
 SIGN_SURE = Limit(
     4.0,
@@ -286,7 +292,6 @@ RESIDUAL_LEVEL = Limit(
 )
 
 # Adequacy of the model.
-
 EFFECT_LEVEL = Limit(
     0.001,
     "probability",
@@ -300,10 +305,7 @@ EFFECT_COVERED = Limit(
     "test_adequacy.py",
 )
 CONDITION_LEVEL = Limit(
-    0.01,
-    "probability",
-    "that a clean record's numbers seem to hang on any condition (Bonferroni)",
-    "test_adequacy.py",
+    0.01, "probability", "that clean numbers seem to hang on a condition", "test_adequacy.py"
 )
 CONDITION_WEIGHT = Limit(
     0.8,
@@ -329,6 +331,9 @@ BUNCHED = Limit(
     "cost: the start puts the samples on a grid of their median interval, of 20 times as many "
     "points as there are samples at this share, and without end where stamps are equal",
     "test_bunched.py",
+)
+ROWS_LOST = Limit(
+    2, "samples", "physical: over more of them a command is no straight line", "test_lost_rows.py"
 )
 HALF_WIDTH = Limit(
     1.96, "standard deviations", "half-width of the stated 95 % interval", "test_adequacy.py"
@@ -382,12 +387,7 @@ BEAT_FLOOR = Limit(
 BEAT_JITTER = Limit(
     0.02, "sample", "cost: instants off by less matter less than their rounding", "test_beat.py"
 )
-BEAT_LOST = Limit(
-    0.02,
-    "1",
-    "cost: with more samples lost the number of a sample, and with it its instant, is a guess",
-    "test_beat.py",
-)
+BEAT_LOST = Limit(0.02, "1", "cost: with more lost a sample's number is a guess", "test_beat.py")
 SMOOTHER = Limit(
     3.1,
     "standard deviations",

@@ -18,11 +18,10 @@ from smp_motor_ident.diagnosis.limits import EFFECT_OWN
 from smp_motor_ident.diagnosis.residuals import voltage_at_samples
 from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.fit import Fit
-from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.passes import answers, own_columns, row_starts
 from smp_motor_ident.likelihood.sensitivities import LANES
-from smp_motor_ident.model.structures import LN_R, TE, to_internal
+from smp_motor_ident.model.measurement import ANGLE
 
 Array = NDArray[np.float64]
 
@@ -51,7 +50,7 @@ class Regression:
 
 def regression(data: Experiments, fit: Fit, gear: float) -> Regression | None:
     """Return residuals and responses, whitened, the model's coordinates projected out."""
-    if not fit.structure.free() or data.size < 4 * BLOCKS:
+    if not fit.structure.free or data.size < 4 * BLOCKS:
         return None
     sections, samples = motions(data, fit, gear)
     members: list[tuple[Effect, tuple[int, ...]]] = []
@@ -71,7 +70,7 @@ def regression(data: Experiments, fit: Fit, gear: float) -> Regression | None:
     table = np.array(columns).T  # columns stay together in memory
     if np.count_nonzero(columns[0]) < 4 * BLOCKS or not np.isfinite(table).all():
         return None
-    whole = _projected(table, len(own), _blocks(data), members, len(fit.structure.free()))
+    whole = _projected(table, len(own), _blocks(data), members, len(fit.structure.free))
     return replace(whole, conditions=_conditions(data, samples))
 
 
@@ -175,9 +174,9 @@ def own_responses(data: Experiments, fit: Fit, together: int = 1) -> Array:
     # motor for other physics within their joint deviations.
     deviation = 1 / np.sqrt(np.maximum(np.diag(fit.information), 1e-300))
     out = []
-    for j in range(len(structure.free())):
+    for j in range(len(structure.free)):
         step = 0.3 * float(np.clip(deviation[j], 1e-9, 0.05))
-        z = fit.z + step * structure.matrix()[:, j]
+        z = fit.z.moved(step * structure.matrix[:, j])
         moved = prediction.once(data, replace(fit, z=z), gain=True)[:, 1:]
         out.append(_summed(data, (moved - base) / step, together))
     begins, segments = row_starts(data, together), len(data.starts) - 1
@@ -318,8 +317,8 @@ def motions(data: Experiments, fit: Fit, gear: float) -> tuple[Motion, Motion]:
     """Return the free run at the sections' middles and at the samples."""
     run = prediction.simulate(data, fit)
     speed = run[:, 0]
-    back = to_internal(fit.z, fit.structure.order)[0][2]
-    angle = data.output if data.kind == rc.ANGLE else np.zeros(data.size)
+    back = float(fit.structure.internal(fit.z)[0][2])
+    angle = data.output if data.kind == ANGLE else np.zeros(data.size)
     if np.isnan(angle).any():
         known = np.flatnonzero(np.isfinite(angle))
         angle = np.interp(np.arange(data.size), known, angle[known])
@@ -329,8 +328,8 @@ def motions(data: Experiments, fit: Fit, gear: float) -> tuple[Motion, Motion]:
         at_samples,
         output=run[:, 1],
         current=run[:, 2] if data.current.size else np.zeros(0),
-        resistance=float(np.exp(fit.z[LN_R])),
-        electric_lag=float(np.exp(fit.z[TE])),
+        resistance=float(np.exp(fit.z.ln_r)),
+        electric_lag=fit.z.electrical_time_constant,
     )
     middle, w, theta = (np.empty(data.hold_end.size) for _ in range(3))
     bounds = [*map(int, data.hold_start[: len(data.starts) - 1]), data.hold_end.size]

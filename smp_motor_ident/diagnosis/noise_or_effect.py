@@ -38,11 +38,11 @@ from smp_motor_ident.diagnosis.model_error import (
     whitened,
 )
 from smp_motor_ident.estimation import data_window
-from smp_motor_ident.estimation.choice import sandwich_factor
 from smp_motor_ident.estimation.fit import Fit, Options
+from smp_motor_ident.estimation.selection import sandwich_factor
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import Experiments
-from smp_motor_ident.model import structures as models
+from smp_motor_ident.model.coordinates import LOGARITHMS
 
 Array = NDArray[np.float64]
 
@@ -73,7 +73,7 @@ def in_place_of_noise(
     chance = len(EFFECTS) * float(np.exp(min(-0.5 * gain, 0.0)))
     if chance > EFFECT_LEVEL.value:
         return []
-    moved = np.linalg.lstsq(fit.structure.matrix(), again.z - fit.z, rcond=None)[0]
+    moved = np.linalg.lstsq(fit.structure.matrix, again.z.array - fit.z.array, rcond=None)[0]
     shown = Evidence(effect, chance, gain, np.asarray(-moved, dtype=np.float64), ())
     found = as_finding(shown, [shown], numbers, data.step)
     return [found] if found.severity == "unreliable" else []
@@ -106,7 +106,7 @@ class _Point:
     @cached_property
     def deviance(self) -> float:
         """Minus twice the log-likelihood, the initial states fitted."""
-        free = len(self.fit.structure.free())
+        free = len(self.fit.structure.free)
         return self.fitted(list(range(free, self.own)))[1]
 
     def fitted(self, columns: list[int], damping: float = 0.0) -> tuple[Array, float]:
@@ -144,11 +144,10 @@ class _Point:
         """Return the free run after a Levenberg-Marquardt step; None where it leaves all bounds."""
         step = self.fitted(list(range(self.length.size)), damping)[0]
         structure = self.fit.structure
-        z = self.fit.z + structure.matrix() @ step[: len(structure.free())]
-        if np.abs((z - self.fit.z)[list(models.LOGARITHMS)]).max() > FOLDS:
+        z = self.fit.z.moved(structure.matrix @ step[: len(structure.free)])
+        if max(abs(z.value(n) - self.fit.z.value(n)) for n in LOGARITHMS) > FOLDS:
             return None
-        friction = [models.VC_PLUS, models.VC_MINUS]
-        z[friction] = np.maximum(z[friction], 0.0)
+        z = z.with_(vc_plus=max(z.vc_plus, 0.0), vc_minus=max(z.vc_minus, 0.0))
         data = self.data
         for (_, signal), size in zip(self.signals, step[self.own :], strict=True):
             data = signal.within(data, float(size))

@@ -34,8 +34,6 @@ from smp_motor_ident.estimation.prediction import inverse
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.noise import gain_for, transition, whitening
-from smp_motor_ident.model import structures as models
-from smp_motor_ident.model.structures import LN_R, TE
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -52,8 +50,7 @@ def slower(data: Experiments, fit: Fit) -> tuple[Fit, list[Finding]]:
     move = moved_by_slower(data, fit)
     if not move.any():
         return fit, []
-    names = [models.Z_NAMES[i] for i in fit.structure.free()]
-    said = ", ".join(n for n, d in zip(names, move, strict=True) if d)
+    said = ", ".join(n for n, d in zip(fit.structure.free, move, strict=True) if d)
     return fit.along(move), [
         Finding(
             "torque_noise_frequency",
@@ -69,7 +66,7 @@ def slower(data: Experiments, fit: Fit) -> tuple[Fit, list[Finding]]:
 def moved_by_slower(data: Experiments, fit: Fit) -> Array:
     """Return how far slower observers move the free coordinates beyond chance, shape (f,)."""
     structure = fit.structure
-    farthest: Array = np.zeros(len(structure.free()))
+    farthest: Array = np.zeros(len(structure.free))
     ways = _ways(fit)
     size = ways.shape[1]
     if not size or not np.any(fit.gain != 0.0):
@@ -81,7 +78,7 @@ def moved_by_slower(data: Experiments, fit: Fit) -> Array:
     own_deviation = np.sqrt(np.square(here).sum(axis=(0, 1)))
     for share in SLOWER:
         gain = gain_for(
-            fit.z, structure.order, data.kind, data.step, fit.noise_ratio * share**4, fit.noise,
+            structure, fit.z, data.kind, data.step, fit.noise_ratio * share**4, fit.noise,
             bool(data.current.size),
         )  # fmt: skip
         errors, responses = _linearised(data, replace(fit, gain=gain), ways)
@@ -101,12 +98,12 @@ def _ways(fit: Fit) -> Array:
     An L/R that friction alone shows follows the others along the edge at which it ended, or stays.
     """
     structure = fit.structure
-    every = np.eye(len(structure.free()))
+    every = np.eye(len(structure.free))
     if not shape_constraint.applies(structure):
         return every
     share = shape_constraint.at_edge(fit.z)
     along = None if share is None else shape_constraint.tied(structure, fit.z, share)
-    return np.delete(every, structure.free().index(TE), axis=1) if along is None else along[0]
+    return np.delete(every, structure.free.index("ln_te"), axis=1) if along is None else along[0]
 
 
 def _linearised(data: Experiments, fit: Fit, ways: Array) -> tuple[Array, Array]:
@@ -134,8 +131,8 @@ def _on_innovations(data: Experiments, fit: Fit, gain: Array, weights: Array) ->
     output = np.zeros((outputs, 3))
     output[0, 2] = 1.0
     if outputs == 2:
-        output[1, 0] = np.exp(-fit.z[LN_R])
-    step = transition(fit.z, fit.structure.order, data.step)
+        output[1, 0] = np.exp(-fit.z.ln_r)
+    step = transition(fit.structure, fit.z, data.step)
     difference = step @ (gain - fit.gain)[:, :outputs]
     closed = step @ (np.eye(3) - gain[:, :outputs] @ output)
     white = whitening(fit.noise)[:outputs, :outputs]

@@ -13,7 +13,6 @@ from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.prediction import simulate
 from smp_motor_ident.estimation.quantities import Answer
 from smp_motor_ident.likelihood.experiments import Experiments
-from smp_motor_ident.model import structures as models
 from smp_motor_ident.record import Record
 
 
@@ -74,9 +73,7 @@ def _follows(group: Sequence[Record], data: Experiments, fit: Fit) -> bool:
 def _refuse_integral(group: Sequence[Record], fit: Fit) -> None:
     """Name a speed that never becomes steady: an angle, or a record that ends too soon."""
     longest = max(r.duration for r in group)
-    if fit.z[models.A1] - fit.z[models.A0] < np.log(longest) or any(
-        r.velocity is None for r in group
-    ):
+    if fit.z.time_constant < longest or any(r.velocity is None for r in group):
         return
     raise SignalError(
         f"{where(group)}: velocity changes for as long as there is a voltage and is never steady "
@@ -86,12 +83,12 @@ def _refuse_integral(group: Sequence[Record], fit: Fit) -> None:
 
 
 def _refuse_offset(group: Sequence[Record], fit: Fit) -> None:
-    offset = abs(fit.z[models.OFFSET])
-    if not fit.structure.offset or not fit.structure.current:
+    offset = abs(fit.z.current_offset)
+    if offset == 0.0:
         return
     largest = max(float(np.nanmax(np.abs(r.current))) for r in group if r.current is not None)
     if offset > LARGEST_OFFSET.value * max(largest - offset, 1e-12):
         raise CurrentError(
-            f"{where(group)}: current has an offset of {fit.z[models.OFFSET]:.3g} A where it "
+            f"{where(group)}: current has an offset of {fit.z.current_offset:.3g} A where it "
             f"reaches {largest:.3g} A; zero the current sensor at rest and record again"
         )

@@ -56,6 +56,18 @@ def residual_tests(data: Experiments, fit: Fit, lags: int = 25) -> ResidualTests
     )
 
 
+def coloured(error: Array, lags: int = 25) -> bool:
+    """Tell whether neighbouring errors hang together, by the same band; errors may be NaN."""
+    ok = np.isfinite(error)
+    e = np.where(ok, error - error[ok].mean(), 0.0)[:MOST] if ok.any() else np.zeros(0)
+    n = int(ok[:MOST].sum())
+    if n < 4 * lags or e.std() == 0:
+        return False
+    auto = _lagged(e, e, lags)
+    band = float(ndtri(1 - RESIDUAL_LEVEL.value / 2 / lags) / np.sqrt(n))
+    return bool(np.abs(auto[1:]).max() >= band * auto[0])
+
+
 def voltage_at_samples(data: Experiments) -> Array:
     """Return the voltage at the samples' instants, segment by segment."""
     if data.plain:

@@ -33,7 +33,7 @@ def scope(
     """Return what a reader must know of the values' meaning."""
     size = _one_size(data)
     top = size or _one_swing(data)
-    out = [] if result.level else [*_one_size_of_voltage(top), *_one_direction(data, result)]
+    out = [*_one_size_of_voltage(top), *([] if result.level else _one_direction(data, result))]
     if alike:
         out.append(_alike(alike))
     if result.level:

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.finding import Finding
-from smp_motor_ident.model import structures as models
+from smp_motor_ident.model.structures import Electromechanical
 
 
 def sensors(fit: Fit) -> list[Finding]:
     """Return what was found of the sensors."""
     out = []
     s = fit.structure
-    if s.offset and s.current:
-        offset = float(fit.z[models.OFFSET])
+    if isinstance(s, Electromechanical) and s.offset:
+        offset = fit.z.current_offset
         out.append(
             Finding(
                 "current_offset",
@@ -22,10 +22,10 @@ def sensors(fit: Fit) -> list[Finding]:
                 "zero the current sensor at rest",
             )
         )
-    if s.lags:
-        out.append(_current_lag(s.current_sensor, float(fit.z[models.CURRENT_LAG])))
+    if isinstance(s, Electromechanical) and s.lags:
+        out.append(_current_lag(s.current_sensor, fit.z.current_lag))
     if s.window or "window" in s.fixed:
-        window = float(fit.z[models.WINDOW])
+        window = fit.z.window
         out.append(
             Finding(
                 "averaged_speed",

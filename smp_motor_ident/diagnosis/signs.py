@@ -46,7 +46,7 @@ def likeness(records: Sequence[Record], signals: Sequence[Array], lags: bool) ->
     best, worst, reverse = 0.0, 0.0, [(v, y) for _, v, y in pairs]
     for lag in times:
         for half in (1, 2):  # a mean of two comes half a sample later
-            late = [(_means(_lagged(v, lag / step), half), y) for step, v, y in pairs]
+            late = [(_means(lagged(v, lag / step), half), y) for step, v, y in pairs]
             size = float(np.sqrt(sum(float(x @ x) for x, _ in late) * power)) or 1.0
             for k in range(int(SIGN_LATE.value) + 2 - half):
                 alike = sum(float(x[: x.size - k] @ y[k:]) for x, y in late) / size
@@ -81,7 +81,7 @@ def _means(values: Array, k: int) -> Array:
     return sums / k
 
 
-def _lagged(values: Array, samples: float) -> Array:
+def lagged(values: Array, samples: float) -> Array:
     """Return a signal through a lag of the first order."""
     if samples == 0.0:
         return values

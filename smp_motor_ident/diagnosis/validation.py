@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from smp_motor_ident.diagnosis.limits import UNEXPLAINED
 from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.fit import Fit
-from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments, prepare
+from smp_motor_ident.model.measurement import ANGLE, MEAN_SPEED, SPEED
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import Estimate
 
@@ -41,8 +41,8 @@ def speed_fit(
 ) -> float:
     """Return the fit percent of the freely simulated speed, of its own scatter or a given one."""
     predicted = prediction.simulate(data, fit)
-    at_once = predicted[:, 1] if data.kind != rc.ANGLE else predicted[:, 0]
-    if data.kind != rc.ANGLE:
+    at_once = predicted[:, 1] if data.kind != ANGLE else predicted[:, 0]
+    if data.kind != ANGLE:
         return percent(data.output, at_once, scatter)
     lag = _lag(data, predicted[:, 1])
     best = percent(_means(data, _filled(data), lag), _means(data, predicted[:, 1], lag), scatter)
@@ -60,7 +60,7 @@ def within_resolution(data: Experiments, fit: Fit) -> bool:
 
     That is a counter's rounding, or the scatter of an angle whose motion is smooth beside it.
     """
-    if data.kind != rc.ANGLE or fit.noise_ratio > 0:
+    if data.kind != ANGLE or fit.noise_ratio > 0:
         return False
     moved = _roughness(prediction.simulate(data, fit)[:, 1])
     scatter = _roughness(data.output)
@@ -70,7 +70,7 @@ def within_resolution(data: Experiments, fit: Fit) -> bool:
 
 def stands(data: Experiments, fit: Fit) -> bool:
     """Tell whether the free run of an angle stays within what its sensor scatters."""
-    if data.kind != rc.ANGLE or fit.noise_ratio > 0:
+    if data.kind != ANGLE or fit.noise_ratio > 0:
         return False
     angle = prediction.simulate(data, fit)[:, 1]
     parts = (angle[a:b] for a, b in pairwise(data.starts))
@@ -119,9 +119,9 @@ def held_out(records: Sequence[Record], fit: Fit, hold: str, scatter: float) -> 
     followed as closely as the sensor lets anything: what is left then is the sensor's, not the
     motor's, and differences of few counts make a large speed of it.
     """
-    kind = "speed" if fit.kind != rc.ANGLE else "auto"
+    kind = "speed" if fit.kind != ANGLE else "auto"
     data = prepare(records, False, kind, hold)
-    if fit.kind == rc.MEAN_SPEED and data.kind == rc.SPEED:
+    if fit.kind == MEAN_SPEED and data.kind == SPEED:
         data = data.as_mean_speed()
     data = data.held(fit.structure.held)
     settled = prediction.settle(data, fit)

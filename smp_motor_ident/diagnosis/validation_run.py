@@ -37,15 +37,15 @@ class Simulated:
         return np.asarray(total[count > 0] / count[count > 0])
 
 
-def judge(wheel: str, fitted: Sequence[Simulated], unseen: Sequence[Simulated]) -> Finding:
-    """Compare the errors on unseen data with those on the data that were fitted.
+def judge(wheel: str, fitted: Sequence[Simulated], held_out: Sequence[Simulated]) -> Finding:
+    """Compare the errors on held-out data with those on the data that were fitted.
 
     The finding is a note that states the fit; it is refused where the error is larger than the
     fitted data's, beyond chance, and larger than what costs nothing.
     """
     before = np.concatenate([one.powers() for one in fitted])
-    after = np.concatenate([one.powers() for one in unseen])
-    speed = np.concatenate([one.measured for one in unseen])
+    after = np.concatenate([one.powers() for one in held_out])
+    speed = np.concatenate([one.measured for one in held_out])
     scatter = float(np.nanstd(speed))
     share = math.sqrt(after.mean()) / scatter if scatter > 0 else math.inf
     expected = math.sqrt(before.mean()) / scatter if scatter > 0 else math.inf

@@ -18,13 +18,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident.diagnosis.limits import CANDIDATE_WEIGHT, PRIOR_ODDS
+from smp_motor_ident.diagnosis.limits import CANDIDATE_WEIGHT
 from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.candidate_starts import of_kind
-from smp_motor_ident.estimation.choice import FittedCandidate, size
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.fitted import NORMAL_95
 from smp_motor_ident.estimation.quantities import Answer, answer
+from smp_motor_ident.estimation.selection import POLICY, FittedCandidate
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.result import Quantity
 
@@ -57,7 +57,7 @@ def weights(data: Callable[[Fit], Experiments], fits: Sequence[Fit], seed: int =
     runs = np.array(rows)
     rng = np.random.default_rng(seed)
     shares = rng.dirichlet(np.ones(BLOCKS), DRAWS) * BLOCKS
-    price = np.array([size(f.structure) * (np.log(f.samples) + PRIOR_ODDS.value) for f in fits])
+    price = np.array([POLICY.price(f.structure.size, f.samples) for f in fits])
     total = shares @ runs.T + price
     each = np.exp(-0.5 * (total - total.min(axis=1, keepdims=True)))
     return np.asarray((each / each.sum(axis=1, keepdims=True)).mean(axis=0))
@@ -73,7 +73,7 @@ def averaged(result: Answer, weight: Array, others: Sequence[Answer]) -> Answer:
     own = np.array([_value(result, n, 0.0) for n in result.names])
     values = np.array([own] + [[_value(others[k], n, v) for n, v in zip(result.names, own)]
                                for k in keep])  # fmt: skip
-    mean = share @ values
+    mean = own + share @ (values - own)  # what is the same in all stays so
     between = (values - mean).T @ (share[:, None] * (values - mean))
     shift = dict(zip(result.names, zip(mean, np.diag(between))))
     return replace(
@@ -85,9 +85,13 @@ def averaged(result: Answer, weight: Array, others: Sequence[Answer]) -> Answer:
 
 
 def candidate_weights(data: Experiments, candidates: Sequence[FittedCandidate]) -> dict[int, float]:
-    """Return the weights of the structures that explain the data as well, by their places."""
+    """Return the weights of the structures that explain the data as well, by their places.
+
+    One that has not settled explains them at least as well as that.
+    """
     last = len(candidates) - 1
-    places = [n for n, r in enumerate(candidates) if n < last and r.whole and r.fit.converged]
+    whole = [r.whole and bool(np.isfinite(r.fit.deviance)) for r in candidates[:last]]
+    places = [n for n, there in enumerate(whole) if there]
     if data.quantum > 0:  # a speed in coarse steps is a difference of counts, by its making
         places = [n for n in places if candidates[n].fit.kind == candidates[last].fit.kind]
     if not places:

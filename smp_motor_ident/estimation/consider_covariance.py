@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.current_lag import LITTLE, with_lag
 from smp_motor_ident.estimation.fit import Fit
-from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments
-from smp_motor_ident.model import structures as models
-from smp_motor_ident.model.structures import Structure
+from smp_motor_ident.model.coordinates import direction
+from smp_motor_ident.model.structures import Electromechanical, Structure
 
 Array = NDArray[np.float64]
 
@@ -32,19 +31,19 @@ SEEN = 1e-6
 def consider_timing(data: Experiments, fit: Fit, instant: float) -> Fit:
     """Return the fit with its covariance widened by what the input's instants leave open."""
     structure = fit.structure
-    if instant <= 0 or structure.delay or "delay" in structure.fixed or not structure.free():
+    if instant <= 0 or structure.delay or "delay" in structure.fixed or not structure.free:
         return fit
-    beside = _beside(data, fit, structure.with_(delay=True), models.DELAY)
+    beside = _beside(data, fit, structure.with_(delay=True), "delay")
     return fit.wider(beside.covariance(instant**2))
 
 
 def consider_late(data: Experiments, fit: Fit, late: float) -> Fit:
     """Return the fit with its covariance widened by a delay [s] beside that which was fitted."""
     structure = fit.structure
-    if models.DELAY not in structure.free():
+    if "delay" not in structure.free:
         return consider_timing(data, fit, late)
-    answer = _beside(data, fit, structure, models.DELAY).answer
-    row = np.insert(answer, structure.free().index(models.DELAY), 1.0)
+    answer = _beside(data, fit, structure, "delay").answer
+    row = np.insert(answer, structure.free.index("delay"), 1.0)
     return fit.along(late * row)
 
 
@@ -53,15 +52,14 @@ def consider_clock(data: Experiments, fit: Fit, share: float) -> Fit:
 
     Under another interval an angle's speed, and every time, is another; voltages are not.
     """
-    if share <= 0 or not fit.structure.free():
+    if share <= 0 or not fit.structure.free:
         return fit
-    angle = float(data.kind == rc.ANGLE)
-    powers: Array = np.zeros(fit.z.size)
-    powers[[models.A0, models.A1, models.A2, models.TE]] = angle, 1 + angle, 2 + angle, 1.0
-    times = [models.DELAY, models.WINDOW, models.CURRENT_LAG]
-    powers[times] = fit.z[times]
-    row = share * powers[list(fit.structure.free())]
-    return fit.along(row)
+    n = data.kind.integrals
+    powers = direction(
+        ln_a0=n, ln_a1=1 + n, ln_a2=2 + n, ln_te=1.0,
+        delay=fit.z.delay, window=fit.z.window, current_lag=fit.z.current_lag,
+    )  # fmt: skip
+    return fit.along(share * fit.structure.of_free(powers))
 
 
 def consider_drop(data: Experiments, fit: Fit) -> Fit:
@@ -70,22 +68,20 @@ def consider_drop(data: Experiments, fit: Fit) -> Fit:
     Where the motor turns one way only, a driver's drop of ``R offset`` looks the same, and
     friction is then that much more or less.
     """
-    free = fit.structure.free()
+    s = fit.structure
     one_way = not data.hold_value.min() < 0 < data.hold_value.max()
-    if not (one_way and fit.structure.offset and models.VC_PLUS in free):
+    if not (one_way and isinstance(s, Electromechanical) and s.offset and "vc_plus" in s.free):
         return fit
-    row: Array = np.zeros(len(free))
-    drop = float(np.exp(fit.z[models.LN_R]) * fit.z[models.OFFSET])
-    row[[free.index(i) for i in (models.VC_PLUS, models.VC_MINUS) if i in free]] = drop
-    return fit.along(row)
+    drop = float(np.exp(fit.z.ln_r) * fit.z.current_offset)
+    return fit.along(s.of_free(direction(vc_plus=drop, vc_minus=drop)))
 
 
 def consider_friction(data: Experiments, fit: Fit) -> tuple[Fit, float]:
     """Return the fit with its covariance widened by a friction that was left out."""
     structure = fit.structure
-    if structure.friction != "none" or not structure.free():
+    if structure.friction != "none" or not structure.free:
         return fit, 0.0
-    beside = _beside(data, fit, structure.with_(friction="symmetric"), models.VC_PLUS)
+    beside = _beside(data, fit, structure.with_(friction="symmetric"), "vc_plus")
     variance = float(np.max(fit.sandwich_factors())) * beside.variance
     return fit.wider(beside.covariance(variance)), float(np.sqrt(variance))
 
@@ -96,17 +92,17 @@ def consider_left_out(data: Experiments, fit: Fit) -> Fit:
     That is a delay, a load, or a lag of the current's sensor.
     """
     s = fit.structure
-    additions = []
+    additions: list[tuple[Structure, str]] = []
     if not s.delay and "delay" not in s.fixed:
-        additions.append((s.with_(delay=True), models.DELAY))
+        additions.append((s.with_(delay=True), "delay"))
     if not s.load and not s.own_load and "load" not in s.fixed:
-        additions.append((s.with_(load=True), models.LOAD))
-    if s.current and not s.lags:
-        additions.append((s.with_(current_sensor="averaged"), models.CURRENT_LAG))
-    factor = float(np.median(fit.sandwich_factors())) if s.free() else 1.0
+        additions.append((s.with_(load=True), "load"))
+    if isinstance(s, Electromechanical) and not s.lags:
+        additions.append((s.with_(current_sensor="averaged"), "current_lag"))
+    factor = float(np.median(fit.sandwich_factors())) if s.free else 1.0
     wider = fit
-    for richer, coordinate in additions if s.free() else []:
-        little = LITTLE * data.step * (coordinate == models.CURRENT_LAG)
+    for richer, coordinate in additions if s.free else []:
+        little = LITTLE * data.step * (coordinate == "current_lag")
         beside = _beside(data, with_lag(fit, little) if little else fit, richer, coordinate)
         own, found = factor * beside.variance, beside.size + little
         early = little > 0 and found < 0  # which no sensor is
@@ -130,11 +126,11 @@ class _Beside:
         return np.asarray(variance * np.outer(self.answer, self.answer))
 
 
-def _beside(data: Experiments, fit: Fit, richer: Structure, coordinate: int) -> _Beside:
+def _beside(data: Experiments, fit: Fit, richer: Structure, coordinate: str) -> _Beside:
     """Return how the fit answers to one more coordinate."""
     here = prediction.again(data, richer, fit)
-    keep = [i for i, c in enumerate(richer.free()) if c != coordinate]
-    late = richer.free().index(coordinate)
+    keep = [i for i, c in enumerate(richer.free) if c != coordinate]
+    late = richer.free.index(coordinate)
     answer = prediction.inverse(here.normal[np.ix_(keep, keep)], 1e-12) @ here.normal[keep, late]
     left = max(float(here.normal[late, late] - here.normal[late, keep] @ answer), 1e-12)
     score = float(here.gradient[late] - here.gradient[keep] @ answer)

@@ -12,19 +12,12 @@ from dataclasses import replace
 import numpy as np
 
 from smp_motor_ident.estimation import data_window, descent, prediction
-from smp_motor_ident.estimation.choice import (
-    FittedCandidate,
-    label,
-    preferred,
-    sandwich_factor,
-)
 from smp_motor_ident.estimation.fit import Fit, Options, solve
-from smp_motor_ident.estimation.ridge import slower_winding
+from smp_motor_ident.estimation.selection import POLICY, FittedCandidate, sandwich_factor
+from smp_motor_ident.estimation.trials import slower_winding
 from smp_motor_ident.likelihood.experiments import Experiments
-from smp_motor_ident.model import structures as models
-from smp_motor_ident.model.structures import SENSORS, Structure
-
-Array = models.Array
+from smp_motor_ident.model.coordinates import Coordinates
+from smp_motor_ident.model.structures import SENSORS, Electromechanical, Structure
 
 LITTLE = 0.01  # of a sample: a lag that is as good as none, for the score
 BEYOND = 0.6  # of a sample: the mean lag of a window that reaches beyond the last change of voltage
@@ -42,22 +35,23 @@ def with_current_lag(
 ) -> Fit:
     """Return the fit, or one with the lag of the current's sensor where the data ask for it."""
     direct = best
-    if not direct.structure.current or direct.structure.lags or not _asked_for(data, direct):
+    own = direct.structure
+    if not isinstance(own, Electromechanical) or own.lags or not _asked_for(data, direct):
         return best
     for sensor in SENSORS[1:]:
-        richer = direct.structure.with_(current_sensor=sensor)
+        richer = own.with_(current_sensor=sensor)
         if any(r.fit.structure == richer for r in candidates):
             continue
-        say(f"trying {label(richer)}")
-        starts = _promising(data, direct, richer, options) + [best.z] * best.structure.lags
+        say(f"trying {richer.label}")
+        starts = _leading(data, direct, richer, options) + [best.z] * best.structure.lags
         # What looks like torque noise may be this.
         near = [best] if best.noise_ratio == 0 else [best, replace(best, noise_ratio=0.0)]
         tried = [descent.refine(data, richer, n, z, options) for z in starts for n in near]
         other = min(tried, key=lambda f: f.deviance)
-        if other.z[models.CURRENT_LAG] < LITTLE * data.step:  # another minimum, of no lag
+        if other.z.current_lag < LITTLE * data.step:  # another minimum, of no lag
             candidates.append(FittedCandidate(other, "no lag of the current shows", whole=False))
             continue
-        verdict, reason = preferred(best, other)
+        verdict, reason = POLICY.preferred(best, other)
         if verdict and other.noise_ratio > 0:
             other = data_window.grow(data, richer, other, options)
         candidates.append(FittedCandidate(other, reason))
@@ -67,9 +61,7 @@ def with_current_lag(
 
 def with_lag(fit: Fit, lag: float) -> Fit:
     """Return a fit at another lag of the current's sensor [s]."""
-    z = fit.z.copy()
-    z[models.CURRENT_LAG] = lag
-    return replace(fit, z=z)
+    return replace(fit, z=fit.z.with_(current_lag=lag))
 
 
 def _asked_for(data: Experiments, direct: Fit) -> bool:
@@ -93,27 +85,28 @@ def _predicted(data: Experiments, fit: Fit, structure: Structure) -> float:
     """Return the sum of squares that a step from here would leave; infinite for no lag."""
     here = prediction.again(data, structure, fit)
     step = prediction.inverse(here.normal) @ here.gradient
-    if structure.lags and fit.z[models.CURRENT_LAG] + step[-1] <= 0:
+    if structure.lags and fit.z.current_lag + step[-1] <= 0:
         return np.inf
     return here.objective - here.local_decrease - float(here.gradient @ step)
 
 
-def _promising(data: Experiments, direct: Fit, richer: Structure, options: Options) -> list[Array]:
+def _leading(
+    data: Experiments, direct: Fit, richer: Structure, options: Options
+) -> list[Coordinates]:
     """Return the starts that are ahead after a few passes: the others cost as much and lose."""
 
-    def soon(z: Array) -> float:
+    def soon(z: Coordinates) -> float:
         return solve(data, richer, direct.at(z), options, FEW).deviance
 
     return sorted(_starts(data, direct, richer), key=soon)[:KEPT]
 
 
-def _starts(data: Experiments, direct: Fit, richer: Structure) -> list[Array]:
+def _starts(data: Experiments, direct: Fit, richer: Structure) -> list[Coordinates]:
     """Return starts: lags of so many samples, and those that L/R has taken up."""
-    te = float(np.exp(direct.z[models.TE]))
+    te = direct.z.electrical_time_constant
     lags = [(samples * data.step, te) for samples in SAMPLES]
     out = []
     for lag, left in lags + [(share * te, (1 - share) * te) for share in SHARES]:
         z = slower_winding(direct.z, float(np.log(left)))
-        z[models.CURRENT_LAG] = lag
-        out.append(richer.complete(z))
+        out.append(richer.complete(z.with_(current_lag=lag)))
     return out

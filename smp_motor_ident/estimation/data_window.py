@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident.diagnosis.limits import SUBSET_HOPELESS, TORQUE_NOISE
+from smp_motor_ident.diagnosis.limits import TORQUE_NOISE
 from smp_motor_ident.estimation.descent import (
     SCREENING_SAMPLES,
     at_rest,
@@ -19,9 +19,11 @@ from smp_motor_ident.estimation.descent import (
     noise_ratio_of,
 )
 from smp_motor_ident.estimation.fit import Fit, Options, solve
-from smp_motor_ident.estimation.ridge import along_friction
-from smp_motor_ident.likelihood import recursion as rc
+from smp_motor_ident.estimation.multistart import tried
+from smp_motor_ident.estimation.selection import POLICY
+from smp_motor_ident.estimation.trials import RIDGE
 from smp_motor_ident.likelihood.experiments import Experiments
+from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.model.structures import Structure
 
 Array = NDArray[np.float64]
@@ -47,12 +49,11 @@ def grow(
     """
     part = data.data_window(min(SCREENING_SAMPLES * data.step, 60.0))
     best = _find_noise_ratio(part, structure, first, options, near)
-    if rival is not None and rival.samples == part.size:
-        price = SUBSET_HOPELESS.value * max(1.0, float(np.median(best.sandwich_factors())))
-        if best.deviance > rival.deviance + price:
-            whole = best.samples == data.size
-            return best if whole else extend(data, structure, best, options, rival)
-    found = along_friction(part, structure, best, options)
+    least = rival.deviance if rival is not None and rival.samples == part.size else np.inf
+    if POLICY.rejects_on_subset(best, least):
+        whole = best.samples == data.size
+        return best if whole else extend(data, structure, best, options, rival)
+    found = tried(part, best, RIDGE, options)
     if found.noise_ratio > 0 and found.deviance < best.deviance - TORQUE_NOISE.value:
         again = _find_noise_ratio(part, structure, found, options, found)
         found = min(found, again, key=lambda f: f.deviance)
@@ -65,7 +66,7 @@ def grow(
             free_run.noise[0, 0] < FLOOR * part.quantum**2 / 12
             or free_run.deviance < found.deviance + TORQUE_NOISE.value
         ):
-            found = along_friction(part, structure, free_run, options)
+            found = tried(part, free_run, RIDGE, options)
     best = found
     return extend(data, structure, best, options)
 
@@ -100,7 +101,7 @@ def _find_noise_ratio(
     # A speed output survives torque noise in free run, and free run has no bias where the
     # model is not the motor; the innovations form is for angles, which drift.
     free_run = fitted(first, 0.0, 30)
-    if part.kind != rc.ANGLE:
+    if part.kind != ANGLE:
         return free_run
     # Residuals no larger than the counter's own resolution leave nothing for torque noise.
     quiet = free_run.noise[0, 0] < FLOOR * part.quantum**2 / 12

@@ -7,14 +7,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-
 from smp_motor_ident.estimation import data_window, descent, start
-from smp_motor_ident.estimation.choice import preferred
 from smp_motor_ident.estimation.fit import Fit, Options
 from smp_motor_ident.estimation.initialisation import first_fit
+from smp_motor_ident.estimation.selection import POLICY
 from smp_motor_ident.likelihood.experiments import Experiments
-from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import Structure
 
 DELAYS = (0.3, 1.5, 3.5)  # samples at which a delay is begun that torque noise may have hidden
@@ -43,14 +40,11 @@ def first_with_delay(
     structure = delayed.with_(delay=False)
     starts = []
     if plain is not None:
-        z = plain.z.copy()
-        z[models.DELAY] = 0.2 * data.step
-        starts.append(z)
+        starts.append(plain.z.with_(delay=0.2 * data.step))
     for lag in (0, 1, 2, 4, 8, 16, 32):
         # The regressions of a lagged input are those of a delayed motor.
-        for z in start.lagged_candidates(data, structure, lag):
-            z[models.DELAY] = max(lag - 0.5, 0.1) * data.step
-            starts.append(z)
+        late = max(lag - 0.5, 0.1) * data.step
+        starts += [z.with_(delay=late) for z in start.speed_candidates(data, structure.order, lag)]
     return first_fit(data, delayed, options, starts, keep=4, own=False)
 
 
@@ -61,7 +55,7 @@ def _snap(data: Experiments, fit: Fit, options: Options) -> Fit:
     jump; a descent that comes near such a point stays short of it.
     """
     best = fit
-    for n in {int(fit.z[models.DELAY] / data.step), int(fit.z[models.DELAY] / data.step) + 1}:
+    for n in {int(fit.z.delay / data.step), int(fit.z.delay / data.step) + 1}:
         whole = fit.structure.with_(fixed={**fit.structure.fixed, "delay": n * data.step})
         other = descent.refine(data, whole, fit, fit.z, options, known=best)
         if other.deviance < best.deviance - 1:
@@ -75,23 +69,14 @@ def first_with_averaging(
     """Fit a speed averaged over a window, started from what looked like a delay."""
     if twin is None:
         return None
-    lag = max(twin.z[models.DELAY] + 0.5 * twin.z[models.WINDOW], 0.5 * data.step)
-    starts = []
-    if twin.structure.window:
-        z = twin.z.copy()
-        z[models.A2] = z[models.A1] + np.log(0.1 * lag)
-        z[models.TE] = z[models.A2] - z[models.A1]
-        starts.append(z)
+    lag = max(twin.z.delay + 0.5 * twin.z.window, 0.5 * data.step)
+    starts = [twin.z.with_second_lag(0.1 * lag)] if twin.structure.window else []
     for width in (0.5, 1.0, 1.6) if structure.delay else (1.0, 2.0, 3.0):
-        z = twin.z.copy()
-        z[models.WINDOW] = max(width * lag, 1.01 * data.step)
-        z[models.DELAY] = max(lag - 0.5 * z[models.WINDOW], 0.1 * data.step)
-        if not structure.delay:
-            z[models.DELAY] = 0.0
-        if structure.order == 2 and twin.structure.order == 1:
-            z[models.A2] = z[models.A1] + np.log(0.3 * lag)
-            z[models.TE] = z[models.A2] - z[models.A1]
-        starts.append(z)
+        window = max(width * lag, 1.01 * data.step)
+        delay = max(lag - 0.5 * window, 0.1 * data.step) if structure.delay else 0.0
+        z = twin.z.with_(window=window, delay=delay)
+        further = structure.order == 2 and twin.structure.order == 1
+        starts.append(z.with_second_lag(0.3 * lag) if further else z)
     own = structure.order == 2 and not structure.delay
     return first_fit(data.as_mean_speed(), structure, options, starts, keep=3, own=own)
 
@@ -107,10 +92,13 @@ def delay_without_noise(data: Experiments, best: Fit, options: Options) -> Fit |
     noiseless = replace(best, noise_ratio=0.0)
     plain = descent.refine(data, best.structure, noiseless, best.z, options)
     richer = best.structure.with_(delay=True)
-    late = []
-    for samples in DELAYS:
-        z = plain.z.copy()
-        z[models.DELAY] = samples * data.step
-        late.append(descent.refine(data, richer, plain, z, options))
+    late = [
+        descent.refine(data, richer, plain, plain.z.with_(delay=samples * data.step), options)
+        for samples in DELAYS
+    ]
     other = min(late, key=lambda f: f.deviance)
-    return data_window.grow(data, richer, other, options) if preferred(plain, other)[0] else None
+    return (
+        data_window.grow(data, richer, other, options)
+        if POLICY.preferred(plain, other)[0]
+        else None
+    )

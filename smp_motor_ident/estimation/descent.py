@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from smp_motor_ident.estimation.fit import Fit, Options, solve
 from smp_motor_ident.estimation.memory import remembered
-from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments
-from smp_motor_ident.model import structures as models
+from smp_motor_ident.model.coordinates import Coordinates
+from smp_motor_ident.model.measurement import Measurement
 from smp_motor_ident.model.structures import Structure
 
 Array = NDArray[np.float64]
@@ -30,14 +30,14 @@ def screening_subset(data: Experiments) -> Experiments:
     return remembered(data, "subset", 1, (), cut)
 
 
-def noise_ratio_of(bandwidth: float, step: float, kind: int) -> float:
+def noise_ratio_of(bandwidth: float, step: float, kind: Measurement) -> float:
     """Return the process-to-measurement noise ratio that gives the innovations a bandwidth."""
-    return bandwidth ** (4 if kind == rc.ANGLE else 2) * step
+    return float(bandwidth ** (2 + 2 * kind.integrals) * step)
 
 
-def bandwidth(z: Array, data: Experiments) -> float:
+def bandwidth(z: Coordinates, data: Experiments) -> float:
     """Return the motor's own bandwidth, as far as the sampling shows it."""
-    return float(min(np.exp(z[models.A0] - z[models.A1]), 0.2 / data.step))
+    return min(float(np.exp(z.ln_a0 - z.ln_a1)), 0.2 / data.step)
 
 
 def first_noise(data: Experiments) -> Array:
@@ -72,7 +72,7 @@ def refine(
     data: Experiments,
     structure: Structure,
     near: Fit,
-    z: Array,
+    z: Coordinates,
     options: Options,
     tolerance: float = 1e-2,
     known: Fit | None = None,
@@ -90,7 +90,7 @@ def at_rest(
     if structure.friction == "none":
         return fit
     first = np.abs(fit.initial[:, 1])
-    slow = (first > 0) & (first < 0.05 * np.exp(-fit.z[models.A0]) * np.abs(data.hold_value).max())
+    slow = (first > 0) & (first < 0.05 * fit.z.dc_gain * np.abs(data.hold_value).max())
     if not slow.any():
         return fit
     initial = fit.initial.copy()

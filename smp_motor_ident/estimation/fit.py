@@ -19,7 +19,8 @@ from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.noise import NoiseModel, deviance, gain_for, proper, renewed
 from smp_motor_ident.likelihood.normal_equations import damped_step
 from smp_motor_ident.likelihood.passes import Pass, evaluate, own_columns
-from smp_motor_ident.model import structures as models
+from smp_motor_ident.model.coordinates import LOGARITHMS, NAMES, Coordinates
+from smp_motor_ident.model.physical import physical_gradients
 from smp_motor_ident.model.structures import Structure
 
 __all__ = ["Fit", "Options", "Prior", "Start", "solve"]
@@ -33,6 +34,7 @@ FREE = 0.1  # damping (relative to the diagonal) below which a step counts as un
 LARGEST = 80.0  # logarithm of a coordinate: 1e35
 CLOSE = 0.3  # of the tolerance, within which a step is not even tried where there are kinks
 FASTEST = 1e-3  # of a sample: L/R below it shows in nothing, and leaves the coordinates stiff
+SHORTEST = 1e-9  # s: a window, or a lag, that is as good as none
 ROUNDS = 12  # most times that the noise is estimated anew
 
 
@@ -45,12 +47,13 @@ class _Descent:
         structure: Structure,
         start: Start,
         options: Options,
-        bounds: tuple[Array, Array],
+        bounds: tuple[Coordinates, Coordinates],
         known: Fit | None,
     ) -> None:
         self.data, self.structure, self.options, self.known = data, structure, options, known
         self.noise_ratio, self.bounds = start.noise_ratio, bounds
-        self.matrix = structure.matrix()
+        self.lower, self.upper = (b.array for b in bounds)
+        self.matrix = structure.matrix
         self.own = own_columns(data, structure)
         self.current = data.current.size > 0
         self.shaped = shape_constraint.applies(structure)
@@ -62,12 +65,13 @@ class _Descent:
         self.trail: list[float] = []
         self.look(proper(start.noise))
 
-    def _allowed(self, z: Array) -> Array:
+    def _allowed(self, z: Coordinates) -> Coordinates:
         """Return coordinates brought within the bounds and to a motor that can be."""
-        z = self.structure.complete(np.minimum(np.maximum(z, self.bounds[0]), self.bounds[1]))
+        bounded = np.minimum(np.maximum(z.array, self.lower), self.upper)
+        z = self.structure.complete(Coordinates.of(bounded))
         return shape_constraint.within(z) if self.shaped else z
 
-    def _pass(self, z: Array, initial: Array) -> Pass:
+    def _pass(self, z: Coordinates, initial: Array) -> Pass:
         self.passes += 1
         return evaluate(
             self.data, self.structure, z, initial, self.start, self.noise,
@@ -76,7 +80,7 @@ class _Descent:
 
     def look(self, covariance: Array) -> None:
         """Pass where it is, with this noise and the gain that goes with it."""
-        gain = gain_for(self.z, self.structure.order, self.data.kind, self.data.step,
+        gain = gain_for(self.structure, self.z, self.data.kind, self.data.step,
                         self.noise_ratio, covariance,
                         self.current and not self.structure.lags)  # fmt: skip
         self.noise = NoiseModel(covariance, gain, self.options.huber)
@@ -90,11 +94,11 @@ class _Descent:
         else:
             self.look(covariance)
 
-    def step(self) -> tuple[Array, Array, float]:
+    def step(self) -> tuple[Coordinates, Array, float]:
         """Return where the damped step leads, and its length in standard deviations."""
         here = self.here
         step, size = self._solved(self.damping)
-        z = self._allowed(self.z + self.matrix @ step)
+        z = self._allowed(self.z.moved(self.matrix @ step))
         moved = self.initial.copy()
         # Initial states alone are a small problem, and shorten their own step where it led up.
         share = 1.0 if self.matrix.shape[1] else min(1.0, math.sqrt(FIRST / self.damping))
@@ -115,7 +119,7 @@ class _Descent:
         known = self.known
         if known is None or not known.converged or known.structure != self.structure:
             return False
-        away = (self.z - known.z)[list(self.structure.free())]
+        away = self.structure.of_free(self.z.array - known.z.array)
         return bool(away @ known.information @ away < 1.0)
 
     def hopeless(self, left: int) -> bool:
@@ -135,18 +139,19 @@ class _Descent:
             turn.T @ gradient,
             damping,
             self.matrix @ turn,
-            self.z,
-            *self.bounds,
+            self.z.array,
+            self.lower,
+            self.upper,
         )
         step = turn @ step
-        share = shape_constraint.passed(self.z + self.matrix @ step) if self.shaped else None
+        share = shape_constraint.passed(self.z.moved(self.matrix @ step)) if self.shaped else None
         ties = None if share is None else shape_constraint.tied(self.structure, self.z, share)
         if ties is None:
             return step, size
         along, first = ties
         short, _ = damped_step(
             along.T @ normal @ along, along.T @ (gradient - normal @ first), damping,
-            self.matrix @ along, self.z, *self.bounds,
+            self.matrix @ along, self.z.array, self.lower, self.upper,
         )  # fmt: skip
         step = along @ short + first
         return step, math.sqrt(max(float(step @ normal @ step), 0.0))
@@ -240,17 +245,7 @@ def solve(
     One that is far above it and does not come nearer in its passes is given up.
     """
     options = options or Options()
-    lower, upper = _bounds(FASTEST * data.step if data.current.size else 0.0)
-    # Friction next to the largest voltage would put off a motor's start as long as one likes.
-    most = MOST_FRICTION.value * float(np.abs(data.hold_value).max(initial=0.0))
-    upper[[models.VC_PLUS, models.VC_MINUS]] = max(most, 1e-9)
-    if data.quantum > 0:  # a speed in coarse steps is a difference of counts, over a sample or more
-        lower[models.WINDOW] = data.step
-    bounds = (
-        lower if options.lower is None else options.lower,
-        upper if options.upper is None else options.upper,
-    )
-    descent = _Descent(data, structure, start, options, bounds, known)
+    descent = _Descent(data, structure, start, options, _bounds(data), known)
     for n in range(ROUNDS):
         if not math.isfinite(descent.here.objective):
             break
@@ -267,41 +262,46 @@ def solve(
     return descent.result()
 
 
-def _physical_steps(z: Array, structure: Structure) -> Array:
+def _physical_steps(z: Coordinates, structure: Structure) -> Array:
     """Return steps of a0, tm, be and te in the free coordinates, shape (f, f).
 
     Where L/R is far below the motor's lag, ``a1 = tm + te be`` and ``a2 = te tm`` must move
     together to a millionth for the motor to stay one; damped each by itself they hold the
     descent.  Damping acts on steps of these instead.
     """
-    free = structure.free()
+    free = structure.free
     turn = np.eye(len(free))
-    if not {models.A0, models.A1, models.A2, models.TE} <= set(free):
+    if not {"ln_a0", "ln_a1", "ln_a2", "ln_te"} <= set(free):
         return turn
-    a0, a1, a2, te = np.exp(z[[models.A0, models.A1, models.A2, models.TE]])
-    i, j, k = (free.index(c) for c in (models.A1, models.A2, models.TE))
-    tm = a2 / te
+    a0, a1, te = z.a0, z.a1, z.electrical_time_constant
+    i, j, k = (free.index(c) for c in ("ln_a1", "ln_a2", "ln_te"))
+    tm = np.float64(z.a2) / te
     turn[i, i], turn[i, j], turn[i, k] = te * a0 / a1, tm / a1, 1 - tm / a1
     turn[j, i], turn[j, j], turn[j, k] = 0.0, 1.0, 1.0
     return turn
 
 
-def _bounds(fastest: float) -> tuple[Array, Array]:
-    """Return bounds of z: what floating point can hold, and no negative volts or seconds."""
-    lower, upper = np.full(len(models.Z_NAMES), -np.inf), np.full(len(models.Z_NAMES), np.inf)
-    logarithms = [models.A0, models.A1, models.A2, models.TE, models.LN_R]
-    lower[logarithms], upper[logarithms] = -LARGEST, LARGEST
-    lower[[models.VC_PLUS, models.VC_MINUS, models.DELAY]] = 0.0
-    lower[[models.WINDOW, models.CURRENT_LAG]] = 1e-9
-    if fastest > 0:
-        lower[models.TE], lower[models.CURRENT_LAG] = math.log(fastest), fastest
+def _bounds(data: Experiments) -> tuple[Coordinates, Coordinates]:
+    """Return bounds: what floating point can hold, and no negative volts or seconds."""
+    free = dict.fromkeys(NAMES, math.inf)
+    logarithms = dict.fromkeys(LOGARITHMS, LARGEST)
+    # Friction next to the largest voltage would put off a motor's start as long as one likes.
+    most = MOST_FRICTION.value * float(np.abs(data.hold_value).max(initial=0.0))
+    upper = Coordinates(**{**free, **logarithms}).with_friction(max(most, 1e-9))
+    lower = Coordinates.of(-upper.array).with_friction(0.0).with_(delay=0.0)
+    lower = lower.with_(window=SHORTEST, current_lag=SHORTEST)
+    if data.quantum > 0:  # a speed in coarse steps is a difference of counts, over a sample or more
+        lower = lower.with_(window=data.step)
+    if data.current.size:
+        fastest = FASTEST * data.step
+        lower = lower.with_(ln_te=math.log(fastest), current_lag=fastest)
     return lower, upper
 
 
-def _linearise(priors: Sequence[Prior], z: Array, matrix: Array) -> list[tuple[Array, float]]:
+def _linearise(priors: Sequence[Prior], z: Coordinates, matrix: Array) -> list[tuple[Array, float]]:
     if not priors:
         return []
-    values, gradients = models.physical(z)
+    known = physical_gradients(z)
     return [
-        (gradients[p.name] @ matrix / p.std, (p.value - values[p.name]) / p.std) for p in priors
+        (known[p.name][1] @ matrix / p.std, (p.value - known[p.name][0]) / p.std) for p in priors
     ]

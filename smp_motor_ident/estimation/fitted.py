@@ -13,16 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident.likelihood.noise import NoiseModel
+from smp_motor_ident.model.coordinates import PLAUSIBLE, Coordinates
+from smp_motor_ident.model.measurement import Measurement
 from smp_motor_ident.model.structures import Structure
 
 Array = NDArray[np.float64]
 
 NORMAL_95 = 1.96
 """Half a 95 % interval of a normal variable, in its standard deviations."""
-
-PLAUSIBLE = np.array([1e-2, 1e-2, 1e-2, 0.25, 1e-4, 1e-4, 1e-4, 1e-2, 1e-4, 1e-2, 1e-2, 1e-2])
-"""Inverse squares of how far each coordinate z could be from any value at all."""
-
 
 ROUNDING = 1e-13
 """Share of the information in which sums over thousands of samples are exact."""
@@ -62,9 +60,9 @@ class Prior:
 class Profile:
     """A coordinate followed to both ends of its 95 % interval, all others fitted again."""
 
-    coordinate: int  # index into z
-    # shape (12,) each: coordinates of the whole motor at the lower and the upper end
-    ends: tuple[Array, Array]
+    coordinate: str
+    # The whole motor at the lower and the upper end
+    ends: tuple[Coordinates, Coordinates]
 
 
 @dataclass(frozen=True)
@@ -74,21 +72,20 @@ class Options:
     # Bound of the robust loss [standard deviations]; infinite for least squares
     huber: float = np.inf
     priors: tuple[Prior, ...] = ()  # physical parameters that are known
-    # lower, upper: shape (12,): bounds of z
-    lower: Array | None = None
-    upper: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Start:
     """Where a descent begins: a motor, how it moved at first, and the noise that is believed."""
 
-    z: Array  # shape (12,): coordinates
+    z: Coordinates
     initial: Array  # shape (g, 5): q, w, angle, load, earlier current of each segment
     noise: Array  # shape (2, 2): covariance of the innovations of (output, current)
     noise_ratio: float = 0.0  # intensity of the torque noise over the output's noise variance
 
-    def at(self, z: Array, initial: Array | None = None, noise_ratio: float | None = None) -> Start:
+    def at(
+        self, z: Coordinates, initial: Array | None = None, noise_ratio: float | None = None
+    ) -> Start:
         """Return the same start at other coordinates."""
         return Start(
             z,
@@ -113,7 +110,7 @@ class Fit(Start):
     converged: bool  # whether the last step was small
     # samples, kind: of the data
     samples: int
-    kind: int
+    kind: Measurement
     # shape (f,): factors on the standard deviations, see `quantisation.widened`
     widen: Array | None = None
     # shape (f, f): covariance of what the likelihood does not see: `consider`, `segments`
@@ -141,10 +138,10 @@ class Fit(Start):
         profile, what that found.
         """
         cov = self.conditional()
-        free = list(self.structure.free())
         for profile in self.profiles:
-            far = max(profile.ends, key=lambda z: float(np.abs(z - self.z).max()))
-            secant = (far - self.z)[free] / NORMAL_95
+            moves = [end.array - self.z.array for end in profile.ends]
+            far = max(moves, key=lambda move: float(np.abs(move).max()))
+            secant = self.structure.of_free(far) / NORMAL_95
             cov = cov + np.outer(secant, secant)
         return cov
 
@@ -160,7 +157,7 @@ class Fit(Start):
         if self.widen is not None:
             cov = cov * np.outer(self.widen, self.widen)
         for profile in self.profiles:
-            i = self.structure.free().index(profile.coordinate)
+            i = self.structure.free.index(profile.coordinate)
             cov = cov - np.outer(cov[:, i], cov[i]) / max(float(cov[i, i]), 1e-300)
         cov = cov if self.added is None else cov + self.added
         cov.flags.writeable = False
@@ -190,12 +187,12 @@ class Fit(Start):
     def _white(self) -> Array:
         # Every coordinate lies within some e-folds or volts of any motor's: without that a
         # direction that the data leave open would count as known.
-        information = self.information + np.diag(PLAUSIBLE[list(self.structure.free())])
+        plausible = np.diag(self.structure.of_free(PLAUSIBLE))
+        information = self.information + plausible
         scale = np.sqrt(np.diag(information))
         values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
         vectors = vectors / scale[:, None]
         # What rounding leaves of a direction's information is no information.
-        plausible = np.diag(PLAUSIBLE[list(self.structure.free())])
         alone = np.einsum("ij,ik,kj->j", vectors, plausible, vectors)
         cov: Array = (vectors / np.where(values > ROUNDING, values, alone)) @ vectors.T
         cov.flags.writeable = False

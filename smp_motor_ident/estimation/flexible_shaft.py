@@ -34,8 +34,8 @@ from smp_motor_ident.diagnosis.limits import LOOSE_QUANTITY
 from smp_motor_ident.errors import InsufficientExcitationError
 from smp_motor_ident.estimation.fitted import NORMAL_95
 from smp_motor_ident.estimation.simulation import simulate
-from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import output_of
+from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import UNITS, Candidate, Estimate, FitPercent, Quantity
 
@@ -110,7 +110,7 @@ def _segments(record: Record, rigid: Estimate) -> list[_Segment]:
         there = np.isfinite(y)
         if there.sum() > 10 * AUTOREGRESSION:
             y = np.interp(time, time[there], y[there])
-            found.append(_Segment(time, record.voltage[a:b], sign[a:b], y, kind == rc.ANGLE))
+            found.append(_Segment(time, record.voltage[a:b], sign[a:b], y, kind == ANGLE))
     return found
 
 

@@ -13,22 +13,21 @@ from smp_motor_ident.diagnosis.limits import (
     HOLD_EVIDENCE,
     HOLD_HOPELESS,
     INSTANT,
-    PRIOR_ODDS,
 )
 from smp_motor_ident.estimation import order_selection
 from smp_motor_ident.estimation.candidate_starts import of_kind
-from smp_motor_ident.estimation.choice import FittedCandidate
 from smp_motor_ident.estimation.data_window import extend, grow
 from smp_motor_ident.estimation.descent import ROUGHLY, refine, restate, screening_subset
 from smp_motor_ident.estimation.fit import Fit, Options
 from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.estimation.request import Request
+from smp_motor_ident.estimation.selection import POLICY, FittedCandidate
 from smp_motor_ident.estimation.thinning import thinned
-from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments, prepare
 from smp_motor_ident.likelihood.hold import between_samples
-from smp_motor_ident.model import structures as models
-from smp_motor_ident.model.structures import Structure
+from smp_motor_ident.model.coordinates import direction
+from smp_motor_ident.model.measurement import ANGLE, MEAN_SPEED
+from smp_motor_ident.model.structures import SecondOrder, Structure
 from smp_motor_ident.record import Record
 
 LOOKS = (1_000, 4_000, np.inf)
@@ -46,7 +45,7 @@ def chosen_hold(
     if base.order != 2 or "window" in base.fixed or samples > HOLD_COST.value:
         return "held", None
     plain = prepare(group, base.current)
-    if plain.kind != rc.ANGLE or thinned(plain) is not plain:
+    if plain.kind != ANGLE or thinned(plain) is not plain:
         return "held", None  # how the command ran within so short an interval does not show
     others = {h: prepare(group, base.current, hold=h) for h in ("switched", "middle")}
     others = {h: d for h, d in others.items() if d.hold_end.size > plain.hold_end.size}
@@ -55,7 +54,9 @@ def chosen_hold(
     if not others:
         return "held", None
     say("how the command was held between samples")
-    best = initial_fit(plain, base if base.current else base.with_(shape=False), options)
+    best = initial_fit(
+        plain, base if base.current else SecondOrder.like(base, shape=False), options
+    )
     if best is None:
         return "held", None
     hold = "held"
@@ -87,7 +88,7 @@ def otherwise(
     for other, fit in _worth_a_search(group, data, hold, candidates[-1].fit, request.options):
         request.say("how the command ran between samples")
         again = data if other == hold else prepare(group, request.use_current, hold=other)
-        again = again.as_mean_speed() if data.kind == rc.MEAN_SPEED else again
+        again = again.as_mean_speed() if data.kind == MEAN_SPEED else again
         again = again.held(fit.structure.held)
         there = base.with_(held=fit.structure.held)
         auto = request.model == "auto"
@@ -122,7 +123,7 @@ def _worth_a_search(
         looks[duration] = best if whole else refine(part, s, best, best.z, options, ROUGHLY)
         if whole:
             break
-    late = float(best.z[models.DELAY]) / data.step
+    late = best.z.delay / data.step
     out = []
     for other, how in [("held", "before")] * (hold != "held") + [(hold, how) for how in EARLIER]:
         there = data if other == hold else prepare(group, s.current, hold=other)
@@ -135,7 +136,7 @@ def _worth_a_search(
             # its residuals are of another size.
             near = part.size * (1.0 + (part.current.size > 0))
             if (duration > min(looks) or len(looks) == 1) and found.converged:
-                near = float(np.log(part.size)) + PRIOR_ODDS.value
+                near = POLICY.price(1, part.size)
             if found.deviance >= least.deviance + near:
                 break
         else:
@@ -153,19 +154,17 @@ def _delayed(
     """
     starts = {max(lag, 0.0): best.z, float(max(round(lag), 0)): best.z}
     if lag < 0 and best.structure.order == 2:
-        te = float(np.exp(best.z[models.A2] - best.z[models.A1]))
-        z = best.z.copy()
-        z[[models.A2, models.TE]] += np.log(max(te + lag * part.step, 0.1 * te) / te)
-        starts[-1.0] = z
+        te = best.z.second_lag
+        shorter = np.log(max(te + lag * part.step, 0.1 * te) / te)
+        starts[-1.0] = best.z.moved(direction(ln_a2=shorter, ln_te=shorter))
     if before is not None:
-        starts = {float(before.z[models.DELAY]) / part.step: before.z}
+        starts = {before.z.delay / part.step: before.z}
     near = [best] if best.noise_ratio == 0 else [best, replace(best, noise_ratio=0.0)]
     fits = []
     for samples, start in starts.items():
         delay = max(samples, 0.0) * part.step
         structure = best.structure.with_(held=how, delay=delay > 0)
-        z = start.copy()
-        z[models.DELAY] = delay
+        z = start.with_(delay=delay)
         fixed = structure.with_(delay=False, fixed={**structure.fixed, "delay": delay})
         whole = [refine(part, fixed, n, fixed.complete(z), options, ROUGHLY) for n in near]
         fits.append((min(whole, key=lambda f: f.deviance), structure))

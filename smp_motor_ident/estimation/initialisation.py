@@ -10,7 +10,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident.estimation import start
 from smp_motor_ident.estimation.data_window import grow
 from smp_motor_ident.estimation.descent import (
     SCREENING_SAMPLES,
@@ -20,11 +19,13 @@ from smp_motor_ident.estimation.descent import (
 )
 from smp_motor_ident.estimation.fit import Fit, Options, Start, solve
 from smp_motor_ident.estimation.memory import remembered
-from smp_motor_ident.estimation.ridge import better, shapes, slower_winding
+from smp_motor_ident.estimation.multistart import better, tried
+from smp_motor_ident.estimation.start import FilteredData, speed_candidates
+from smp_motor_ident.estimation.trials import WINDINGS, shapes
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.noise import NoiseModel, deviance, kalman_gain
 from smp_motor_ident.likelihood.passes import gather
-from smp_motor_ident.model import structures as models
+from smp_motor_ident.model.coordinates import Coordinates, direction
 from smp_motor_ident.model.structures import Structure
 
 Array = NDArray[np.float64]
@@ -32,8 +33,6 @@ Array = NDArray[np.float64]
 ALIKE = 0.05  # e-folds or volts by which starts differ that end alike
 SHAPES = 6  # of the same linear response that are refined
 LAGS, SAMPLES = 20.0, 2_000  # of a motor, and at least, on which starts are compared
-OPEN = 0.02  # standard deviation of ln L/R or ln R above which other starts are tried
-WINDING = 0.2  # of a sample: a shorter L/R has settled to a hundredth when the current is read
 
 
 MOVES = 0.5
@@ -41,26 +40,19 @@ MOVES = 0.5
 descent no way out."""
 
 
-def candidates(data: Experiments, structure: Structure) -> list[Array]:
+def candidates(data: Experiments, structure: Structure) -> list[Coordinates]:
     """Return starting coordinates for a structure, from linear regressions."""
-    found = start.current_candidates(data) if structure.current else []
-    if not found:
-        frictions = (False,) if structure.friction == "none" else (True, False)
-        found = start.speed_candidates(data, structure.order, frictions=frictions)
-    if not found and structure.order == 2:
-        for z in start.speed_candidates(data, 1):
-            z[models.A2] = 2 * z[models.A1] - z[models.A0] - np.log(20)
-            z[models.TE] = z[models.A2] - z[models.A1]
-            found.append(z)
-    if not found and structure.order == 1:
-        found = start.speed_candidates(data, 2)
     most = MOVES * float(np.abs(data.hold_value).max(initial=0.0))
-    for z in found:
-        if structure.window:
-            z[models.WINDOW] = 1.02 * data.step
-        for friction in (models.VC_PLUS, models.VC_MINUS):  # what moves is held by less
-            z[friction] = np.clip(z[friction], -most, most)
+    found = []
+    for z in structure.guesses(FilteredData(data)):
+        z = z.with_friction(float(np.clip(z.vc_plus, -most, most)))  # what moves is held by less
+        found.append(z.with_(window=1.02 * data.step) if structure.window else z)
     return found
+
+
+def ranked_on(data: Experiments) -> Experiments:
+    """Return the part that first fits are of."""
+    return data.data_window(min(8.0, SCREENING_SAMPLES * data.step))
 
 
 def beginning(data: Experiments) -> Experiments:
@@ -69,8 +61,8 @@ def beginning(data: Experiments) -> Experiments:
 
 
 def _beginning(data: Experiments) -> Experiments:
-    whole = data.data_window(min(8.0, SCREENING_SAMPLES * data.step))
-    lags = [np.exp(z[models.A1] - z[models.A0]) for z in start.speed_candidates(whole, 1)]
+    whole = ranked_on(data)
+    lags = [z.time_constant for z in speed_candidates(whole, 1)]
     if not lags:
         return data
     few = data.data_window(max(LAGS * float(np.median(lags)), SAMPLES * data.step))
@@ -82,7 +74,7 @@ def initial_fit(
     data: Experiments,
     structure: Structure,
     options: Options,
-    extra: Sequence[Array] = (),
+    extra: Sequence[Coordinates] = (),
     keep: int = 3,
     own: bool = True,
     near: Fit | None = None,
@@ -96,20 +88,20 @@ def first_fit(
     data: Experiments,
     structure: Structure,
     options: Options,
-    extra: Sequence[Array] = (),
+    extra: Sequence[Coordinates] = (),
     keep: int = 3,
     own: bool = True,
 ) -> Fit | None:
     """Fit a structure to the beginning of the data: the likeliest of several starts."""
-    subset = data.data_window(min(8.0, SCREENING_SAMPLES * data.step))
+    subset = ranked_on(data)
     found = [*extra, *(candidates(data, structure) if own else [])]
-    starts = [z for z in map(structure.complete, found) if np.all(np.isfinite(z))]
+    starts = [z for z in map(structure.complete, found) if np.all(np.isfinite(z.array))]
     if not starts:
         return None
     noise = first_noise(subset)
     ranked = _ranked(subset, structure, starts, noise)
     best: Fit | None = None
-    if models.TE in structure.free() and not structure.current:
+    if "ln_te" in structure.free and not structure.current:
         shaped = [other for z in ranked[:2] for other in shapes(z)]
         ranked, keep = _ranked(subset, structure, shaped, noise), SHAPES
     for z in ranked[:keep]:
@@ -119,56 +111,24 @@ def first_fit(
         again = best is not None and abs(one.deviance - best.deviance) < 0.1
         if best is None or better(one, best):
             best = one
-        agreed = again and models.TE not in structure.free()
+        agreed = again and "ln_te" not in structure.free
         if (agreed or structure.friction == "none") and one.converged:
             break  # two starts agree, or the surface is smooth
     assert best is not None
     if structure.current:
-        best = _elsewhere(subset, structure, best, options)
+        best = tried(subset, best, WINDINGS, options, 25, 0.1)
     return best
 
 
-def _elsewhere(subset: Experiments, structure: Structure, best: Fit, options: Options) -> Fit:
-    """Try other L, and other R at the same L, where the fit leaves them open.
-
-    An L/R of less than a sample, or an R that next to nothing falls off at, leaves a surface so
-    flat that a descent ends where it began.
-    """
-    free = structure.free()
-    std = np.sqrt(np.diag(best.covariance()))
-    open_ones = [i for i in (models.TE, models.LN_R) if i in free and std[free.index(i)] > OPEN]
-    if not open_ones:
-        return best
-    for change in ({models.A2: 1, models.TE: 1}, {models.TE: 1, models.LN_R: -1}):
-        for factor in (0.2, 0.5, 2.0, 5.0):
-            z = best.z.copy()
-            for i, power in change.items():
-                z[i] += power * np.log(factor)
-            best = _likelier(subset, z, best, options)
-    if best.z[models.TE] > np.log(WINDING * subset.step):
-        return best
-    # Below that L/R shows in nothing: what a descent left behind on its way there shows.
-    slow = float(np.exp(best.z[models.A1] - best.z[models.A0]))
-    for te in np.geomspace(WINDING * subset.step, max(WINDING * subset.step, 0.2 * slow), 4):
-        best = _likelier(subset, slower_winding(best.z, float(np.log(te))), best, options)
-    return best
-
-
-def _likelier(subset: Experiments, z: Array, best: Fit, options: Options) -> Fit:
-    """Return the better of a fit and of a descent from other coordinates."""
-    s = best.structure
-    other = solve(subset, s, best.at(s.complete(z)), options, 25, 0.1)
-    return other if other.deviance < best.deviance - 1 else best
-
-
-def _distinct(starts: Sequence[Array], step: float) -> list[Array]:
+def _distinct(starts: Sequence[Coordinates], step: float) -> list[Coordinates]:
     """Return starts without those from which a descent would end as from one before them."""
-    apart = np.full(len(models.Z_NAMES), np.inf)
-    apart[: models.VC_PLUS + 1] = ALIKE
-    apart[[models.DELAY, models.WINDOW]] = 0.5 * step
-    scaled = np.array(starts) / apart
+    per: Array = direction(
+        **dict.fromkeys(("ln_a0", "ln_a1", "ln_a2", "ln_te", "vc_plus"), 1 / ALIKE),
+        **dict.fromkeys(("delay", "window"), 2 / step),
+    )
+    scaled = np.array([z.array for z in starts]) * per
     left = np.arange(len(starts))
-    out: list[Array] = []
+    out: list[Coordinates] = []
     while left.size:
         out.append(starts[left[0]])
         left = left[np.abs(scaled[left] - scaled[left[0]]).max(axis=1) >= 1]
@@ -176,17 +136,17 @@ def _distinct(starts: Sequence[Array], step: float) -> list[Array]:
 
 
 def _ranked(
-    subset: Experiments, structure: Structure, starts: list[Array], noise: Array
-) -> list[Array]:
+    subset: Experiments, structure: Structure, starts: list[Coordinates], noise: Array
+) -> list[Coordinates]:
     """Return starts, the likeliest first; of those that are alike, one."""
     return sorted(_distinct(starts, subset.step), key=lambda z: _score(subset, structure, z, noise))
 
 
-def _score(subset: Experiments, structure: Structure, z: Array, noise: Array) -> float:
+def _score(subset: Experiments, structure: Structure, z: Coordinates, noise: Array) -> float:
     """Return the deviance of a candidate on the innovations (robust against drift)."""
     noise_ratio = noise_ratio_of(bandwidth(z, subset), subset.step, subset.kind)
     relative = noise[1, 1] / noise[0, 0] if subset.current.size else 0.0
-    gain, _ = kalman_gain(z, structure.order, subset.kind, subset.step, noise_ratio, relative)
+    gain, _ = kalman_gain(structure, z, subset.kind, subset.step, noise_ratio, relative)
     sums = gather(
         subset, structure, z, subset.initial, NoiseModel(noise, gain), differentiate=False
     )

@@ -10,12 +10,12 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from smp_motor_control.motor.parameters import PHYSICAL
 from smp_motor_ident.estimation.fit import Fit
-from smp_motor_ident.model import structures as models
-from smp_motor_ident.model.structures import PHYSICAL
+from smp_motor_ident.model.coordinates import direction
 
 Array = NDArray[np.float64]
-RESPONSE = [models.A0, models.A1, models.A2]
+RESPONSE = ("ln_a0", "ln_a1", "ln_a2")
 
 
 def solved_for(
@@ -27,11 +27,11 @@ def solved_for(
     free = [n for n in PHYSICAL[:5] if n not in fixed]
     if len(free) > len(RESPONSE) or not free:
         return {}
-    rows = np.eye(len(models.Z_NAMES))[RESPONSE] @ matrix
+    rows = np.array([direction(**{n: 1.0}) for n in RESPONSE]) @ matrix
     spread = rows @ covariance @ rows.T
     weight = np.asarray(np.linalg.pinv(spread, hermitian=True), dtype=np.float64)
     half = np.linalg.cholesky(weight + 1e-12 * np.trace(weight) * np.eye(len(RESPONSE))).T
-    target = fit.z[RESPONSE]
+    target = np.array([fit.z.value(n) for n in RESPONSE])
     furthest = max(0.02, 5 * float(np.sqrt(np.trace(spread))))
     # The equations are quadratic: with R and b known, say, two motors answer the same.
     found: list[tuple[Array, Array]] = []
@@ -53,8 +53,8 @@ def solved_for(
     if "coulomb_friction" not in fixed:
         every = {**{n: v for n, (v, _) in out.items()}, **fixed}
         per = every["motor_constant"] / every["resistance"]
-        row = np.eye(len(models.Z_NAMES))[models.VC_PLUS] @ matrix * per
-        value = fit.z[models.VC_PLUS] * per
+        row = direction(vc_plus=per) @ matrix
+        value = fit.z.vc_plus * per
         for name, sign in (("motor_constant", 1), ("resistance", -1)):
             if name in out:
                 row = row + sign * value * out[name][1] / out[name][0]
@@ -63,7 +63,7 @@ def solved_for(
 
 
 def _guesses(fit: Fit, fixed: Mapping[str, float], free: list[str]) -> list[Array]:
-    a0, a1, a2 = np.exp(fit.z[:3])
+    a0, a1, a2 = fit.z.a0, fit.z.a1, fit.z.a2
     r = fixed.get("resistance", 1.0)
     out = []
     for share in (0.03, 0.3, 0.7, 0.97):

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from smp_motor_ident.diagnosis.limits import PRIOR_ODDS, SUBSET_HOPELESS
+from smp_motor_ident.diagnosis.limits import COLOURED
 from smp_motor_ident.estimation import data_window, descent
 from smp_motor_ident.estimation.candidate_starts import (
     from_richer,
@@ -16,15 +16,6 @@ from smp_motor_ident.estimation.candidate_starts import (
     of_kind,
     under_load,
 )
-from smp_motor_ident.estimation.choice import (
-    FittedCandidate,
-    label,
-    more_shows,
-    preferred,
-    sandwich_factor,
-    simplest_left,
-    size,
-)
 from smp_motor_ident.estimation.current_lag import with_current_lag
 from smp_motor_ident.estimation.delay_and_averaging import (
     first_with_averaging,
@@ -32,18 +23,21 @@ from smp_motor_ident.estimation.delay_and_averaging import (
     settled,
     with_delay,
 )
-from smp_motor_ident.estimation.fit import Fit, Options
+from smp_motor_ident.estimation.fit import Fit, Options, solve
 from smp_motor_ident.estimation.fitted import NORMAL_95
-from smp_motor_ident.estimation.initialisation import beginning, first_fit, initial_fit
-from smp_motor_ident.estimation.ridge import random_restart, slower_winding
+from smp_motor_ident.estimation.initialisation import beginning, first_fit, initial_fit, ranked_on
+from smp_motor_ident.estimation.multistart import tried as other_starts
+from smp_motor_ident.estimation.selection import POLICY, FittedCandidate, sandwich_factor
 from smp_motor_ident.estimation.thinning import thinned
+from smp_motor_ident.estimation.trials import RANDOM, slower_winding
 from smp_motor_ident.estimation.variations import friction_shows, may_rub, varied
-from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments
-from smp_motor_ident.model import structures as models
-from smp_motor_ident.model.structures import Structure
+from smp_motor_ident.model.measurement import ANGLE, SPEED
+from smp_motor_ident.model.structures import FirstOrder, SecondOrder, Structure
 
 Say = Callable[[str], None]
+
+NOISE = 5  # passes in which a fit shows what it explains under another torque noise
 
 
 def explore(
@@ -68,7 +62,7 @@ def explore(
             FittedCandidate(first, "asked for" if not auto else "current is measured")
         )
         best = with_current_lag(data, first, options, candidates, say)
-        if auto and data.kind == rc.SPEED:
+        if auto and data.kind == SPEED:
             best = _try_average(data, best, options, candidates, say)
     else:
         found = _orders(data, base, options, say, candidates)
@@ -82,7 +76,7 @@ def explore(
 
 
 def _initial_fit(data: Experiments, s: Structure, options: Options, say: Say) -> Fit | None:
-    say(f"fitting {label(s)}")
+    say(f"fitting {s.label}")
     if s.delay:
         return with_delay(data, s, options, None)
     return initial_fit(data, s, options)
@@ -94,14 +88,17 @@ def _frictionless(
     """Climb without friction where the score of a linear motor asks for none.
 
     Where there is none, a descent with friction has no bottom to find: L/R beside the
-    response's own coefficients is identifiable by friction alone.
+    response's own coefficients is identifiable by friction alone.  The score is believed where
+    nothing else is left, which torque noise or coloured residuals are.
     """
     if base.current or base.friction != "symmetric" or options.priors or data.quantum > 0:
         return []
-    plain = base.with_(friction="none", shape=False)
+    plain = base.frictionless()
     subset = descent.screening_subset(data)
     quick = initial_fit(subset, plain, options)
-    if quick is None or not quick.converged or friction_shows(subset, quick, False):
+    if quick is None or not quick.converged or quick.noise_ratio > 0:
+        return []
+    if sandwich_factor(quick) > COLOURED.value or friction_shows(subset, quick, False):
         return []
     candidates = explore(data, plain, options, auto, say, quick if subset is data else None)
     if not candidates or may_rub(of_kind(data, candidates[-1].fit), candidates[-1].fit, options):
@@ -122,11 +119,11 @@ def _orders(
     Candidates that the screening subset rejects by far are not fitted to all of a long record.
     """
     part = descent.screening_subset(thinned(data))
-    structures = _structures(base, data.kind == rc.SPEED, data.quantum > 0)
+    structures = _structures(base, data.kind == SPEED, data.quantum > 0)
     tried = _first_fits(part, structures, options, say)
     # Of a short record torque noise may stand for a load that is not asked for yet.
-    if part is not data or data.kind == rc.SPEED:
-        tried = _left(data, part, tried, candidates)
+    if part is not data or data.kind == SPEED:
+        tried = _left(data, part, _under_one_noise(part, tried, options), candidates)
     alone = _alone(data, part, tried, options, candidates) if part is not data else None
     if alone is not None:
         return alone
@@ -138,17 +135,17 @@ def _orders(
     for there in tried:
         fitted = there
         if part is not data:
-            if best and on_part and not more_shows(data, best, on_part, there):
+            if best and on_part and not POLICY.more_shows(data, best, on_part, there):
                 candidates.append(_no_better(data, part, best, on_part, there))
                 continue
             fitted = _on_all(data, there, [r.fit for r in candidates if r.whole], options)
         if best is None:
             better, reason = True, "the simplest left" if candidates else "the simplest"
         else:
-            better, reason = preferred(best, fitted)
+            better, reason = POLICY.preferred(best, fitted)
         candidates.append(FittedCandidate(fitted, reason))
         best, on_part = (fitted, there) if better else (best, on_part)
-    return best and simplest_left(next(r for r in candidates if r.fit is best), candidates)
+    return best and POLICY.simplest_left(next(r for r in candidates if r.fit is best), candidates)
 
 
 def _alone(
@@ -162,14 +159,14 @@ def _alone(
 
     Of an angle torque noise may stand for what is missing, and tells no score of it.
     """
-    if not firsts or data.kind != rc.SPEED:
+    if not firsts or data.kind != SPEED:
         return None
     simple, *others = firsts
-    price = float(np.log(simple.samples)) + PRIOR_ODDS.value
+    price = POLICY.price(1, simple.samples)
     if any(simple.deviance - r.deviance > price for r in others):
         return None
     fit = _on_all(data, settled(part, simple, options, None), [], options)
-    if not fit.converged or any(more_shows(data, fit, simple, r) for r in others):
+    if not fit.converged or any(POLICY.more_shows(data, fit, simple, r) for r in others):
         return None
     candidates += [_no_better(data, part, fit, simple, r) for r in others]
     candidates.append(FittedCandidate(fit, "the simplest left"))
@@ -180,7 +177,7 @@ def _no_better(
     data: Experiments, part: Experiments, best: Fit, on_part: Fit, rich: Fit
 ) -> FittedCandidate:
     """Return a richer candidate that neither a part of the data nor the score of all asks for."""
-    reason = f"no better than {label(best.structure)} by its score"
+    reason = f"no better than {best.structure.label} by its score"
     return _rejected(data, part, rich, reason, best.deviance - (on_part.deviance - rich.deviance))
 
 
@@ -191,10 +188,28 @@ def _first_fits(
     tried: list[Fit] = []
     part = beginning(part)
     for structure in structures:
-        say(f"fitting {label(structure)}")
+        say(f"fitting {structure.label}")
         fitted = _first(part, structure, options, tried)
         tried += [fitted] if fitted is not None else []
     return tried
+
+
+def _under_one_noise(part: Experiments, tried: list[Fit], options: Options) -> list[Fit]:
+    """Return first fits, those far behind under the torque noise of the likeliest if that is more.
+
+    Each believes in as much as its own motor's bandwidth asks for, and a wrong one's may be any.
+    """
+    out = []
+    for fit in tried:
+        best = min(tried, key=lambda f: f.deviance)
+        less = fit.noise_ratio < best.noise_ratio
+        if part.kind == ANGLE and less and POLICY.rejects_on_subset(fit, best.deviance):
+            start = fit.at(fit.z, noise_ratio=best.noise_ratio)
+            there = ranked_on(of_kind(beginning(part), fit))
+            again = solve(there, fit.structure, start, options, NOISE)
+            fit = min(fit, again, key=lambda f: f.deviance)
+        out.append(fit)
+    return out
 
 
 def _left(
@@ -204,7 +219,7 @@ def _left(
     least = min((f.deviance for f in tried), default=0.0)
     left = []
     for fit in tried:
-        if fit.deviance > least + SUBSET_HOPELESS.value * sandwich_factor(fit):
+        if POLICY.rejects_on_subset(fit, least):
             reason = f"rejected on {fit.samples} samples"
             projected = fit.deviance * data.size / fit.samples
             candidates.append(_rejected(data, part, fit, reason, projected))
@@ -248,18 +263,18 @@ def _on_all(data: Experiments, fit: Fit, known: list[Fit], options: Options) -> 
         other = data_window.extend(every, fit.structure, start, options, best)
         best = min(best, other, key=lambda f: f.deviance)
     fit = best
-    fit = random_restart(every, fit.structure, fit, options)
+    fit = other_starts(every, fit, RANDOM, options)
     return no_worse(every, fit, known, options)
 
 
 def _may_hide(fit: Fit, step: float) -> bool:
     """Tell whether a second lag may be shorter than the intervals at which it was looked at."""
-    free = fit.structure.free()
-    if models.A2 not in free:
+    free = fit.structure.free
+    if "ln_a2" not in free:
         return True
-    i = free.index(models.A2)
-    lag = float(fit.z[models.A2] - fit.z[models.A1])
-    return bool(lag - NORMAL_95 * float(np.sqrt(fit.covariance()[i, i])) < np.log(step))
+    i = free.index("ln_a2")
+    shortest = np.log(fit.z.second_lag) - NORMAL_95 * np.sqrt(fit.covariance()[i, i])
+    return bool(shortest < np.log(step))
 
 
 def _rejected(
@@ -277,9 +292,10 @@ def _structures(base: Structure, speed: bool, coarse: bool) -> list[Structure]:
     A speed that comes in coarse steps is a difference of counts, a mean over a window by its
     making: a second time constant is asked for beside that window, not in its place.
     """
-    first = replace(base, name="first_order", order=1, shape=False)
-    second = replace(base, name="second_order", order=2, shape=True)
+    first = FirstOrder.like(base)
+    second = SecondOrder.like(base, shape=True)
     late, late2 = first.with_(delay=True), second.with_(delay=True)
+    candidates: list[Structure]
     if not speed:
         candidates = [first, late, second, late2]
     elif coarse:
@@ -296,7 +312,7 @@ def _first(
 ) -> Fit | None:
     """Fit one candidate first, started from what the simpler ones found."""
     if structure.window:
-        late = replace(structure, name="first_order", order=1, shape=False, delay=True)
+        late = FirstOrder.like(structure, delay=True)
         twin = _find(known, late) or _find(known, late.with_(window=False))
         if twin is None or structure.order == 1:
             twin = _find(known, structure.with_(window=False, delay=True))
@@ -306,12 +322,9 @@ def _first(
         return first_with_delay(data, structure, options, plain)
     extra = []
     if structure.order == 2 and known:
-        z = min(known, key=lambda f: f.deviance).z.copy()
-        slow = np.exp(z[models.A1] - z[models.A0])
-        z[models.A2] = z[models.A1] + np.log(max(z[models.DELAY] + z[models.WINDOW], 0.05 * slow))
-        z[models.TE] = z[models.A2] - z[models.A1]
-        z[models.DELAY] = 0.0
-        extra = [z]
+        z = min(known, key=lambda f: f.deviance).z
+        late_by = max(z.delay + z.window, 0.05 * z.time_constant)
+        extra = [z.with_second_lag(late_by).with_(delay=0.0)]
     return first_fit(data, structure, options, extra)
 
 
@@ -333,18 +346,14 @@ def _orders_again(
         structure = known.structure.with_(load=True, friction=s.friction)
         if any(r.fit.structure == structure for r in candidates):
             continue
-        say(f"trying {label(structure)}")
+        say(f"trying {structure.label}")
         there = of_kind(data, known)
         start = replace(known, noise=best.noise, noise_ratio=best.noise_ratio)
         fits = [
             descent.refine(there, structure, start, z, options) for z in under_load(known, best)
         ]
         other = no_worse(there, min(fits, key=lambda f: f.deviance), [best], options)
-        if size(structure) < size(s):
-            verdict, reason = preferred(other, best)
-            better = not verdict
-        else:
-            better, reason = preferred(best, other)
+        better, reason = POLICY.replaces(best, other)
         if better and other.noise_ratio > 0:  # what looked like torque noise may have been this
             other = data_window.grow(there, structure, other, options)
         candidates.append(FittedCandidate(other, reason))
@@ -357,15 +366,11 @@ def _try_average(
 ) -> Fit:
     """Try a speed averaged over a window of a sample or more, current being measured."""
     structure = best.structure.with_(window=True)
-    say(f"trying {label(structure)}")
-    starts = []
-    for width in (1.02, 2.0, 4.0):
-        z = best.z.copy()
-        z[models.WINDOW] = width * data.step
-        starts.append(z)
+    say(f"trying {structure.label}")
+    starts = [best.z.with_(window=width * data.step) for width in (1.02, 2.0, 4.0)]
     fitted = initial_fit(data.as_mean_speed(), structure, options, starts, keep=3, own=False)
     if fitted is None:
         return best
-    verdict, reason = preferred(best, fitted)
+    verdict, reason = POLICY.preferred(best, fitted)
     candidates.append(FittedCandidate(fitted, reason))
     return fitted if verdict else best

@@ -17,7 +17,6 @@ from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.noise import NO_GAIN, NoiseModel, whitening
 from smp_motor_ident.likelihood.passes import Pass, answers, evaluate, gather, own_columns
 from smp_motor_ident.likelihood.sensitivities import LANES
-from smp_motor_ident.model import structures as models
 from smp_motor_ident.model.structures import Structure
 
 Array = NDArray[np.float64]
@@ -54,7 +53,7 @@ def again(data: Experiments, structure: Structure, fit: Fit) -> Pass:
     question = (more, fit.z, fit.initial, fit.noise, fit.gain)
     here = remembered(data, "pass", PASSES, question, run)
     # How each of its coordinates moves those of the pass.
-    move = np.linalg.lstsq(more.matrix(), structure.matrix(), rcond=None)[0]
+    move = np.linalg.lstsq(more.matrix, structure.matrix, rcond=None)[0]
     return replace(
         here,
         normal=move.T @ here.normal @ move,
@@ -66,14 +65,14 @@ def again(data: Experiments, structure: Structure, fit: Fit) -> Pass:
 
 def _beside(data: Experiments, structure: Structure) -> Structure:
     """Return a structure with all free that is asked for beside a fit, if a pass has the room."""
-    free = structure.friction == "symmetric" and models.VC_PLUS in structure.free()
+    free = structure.friction == "symmetric" and "vc_plus" in structure.free
     more = structure.with_(
         load=not structure.own_load,
         delay=structure.delay or "delay" not in structure.fixed,
-        offset=structure.current,
         friction="asymmetric" if free else structure.friction,
+        **({"offset": True} if structure.current else {}),
     )
-    room = len(more.free()) + len(own_columns(data, more)) <= LANES
+    room = len(more.free) + len(own_columns(data, more)) <= LANES
     return more if room else structure
 
 
@@ -99,7 +98,7 @@ def influence(data: Experiments, fit: Fit) -> tuple[Array, Array]:
     The motion stays the one that the fit predicts, so the Gauss-Newton step is a sum over the
     samples.
     """
-    here, free = again(data, fit.structure, fit), len(fit.structure.free())
+    here, free = again(data, fit.structure, fit), len(fit.structure.free)
     none = np.zeros((0, 0)), np.zeros((0, 0, 0))
     moved = answers(data, fit.structure, fit.z, fit.initial, fit.noise_model(), none, 1, True)
     weight = whitening(fit.noise)
@@ -124,12 +123,8 @@ def predicted_decrease(
 
 def settle(data: Experiments, fit: Fit, iterations: int = 12) -> Fit:
     """Fit only the initial states and constant loads of other data (free run)."""
-    free = fit.structure.free()
-    fixed = {**fit.structure.fixed, **{models.Z_NAMES[i]: float(fit.z[i]) for i in free}}
-    if models.TE not in free and "ln_te" not in fixed:
-        fixed["ln_te"] = float(fit.z[models.TE])
-    if fit.structure.friction == "symmetric":
-        fixed["vc_minus"] = float(fit.z[models.VC_MINUS])
+    free = fit.structure.free
+    fixed = {**fit.structure.fixed, **{n: fit.z.value(n) for n in (*free, "ln_te", "vc_minus")}}
     structure = fit.structure.with_(fixed=fixed, own_load=True)
     done = solve(data, structure, fit.at(fit.z, data.initial, 0.0), iterations=iterations)
     return replace(done, structure=fit.structure, z=fit.z)

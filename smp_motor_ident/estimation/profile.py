@@ -24,16 +24,16 @@ from smp_motor_ident.estimation.descent import initial_of
 from smp_motor_ident.estimation.fit import Fit, Options, solve
 from smp_motor_ident.estimation.fitted import NORMAL_95, Profile
 from smp_motor_ident.estimation.prediction import simulate
-from smp_motor_ident.estimation.ridge import slower_winding
+from smp_motor_ident.estimation.trials import slower_winding
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.passes import own_columns
-from smp_motor_ident.model import structures as models
-from smp_motor_ident.model.structures import to_internal
+from smp_motor_ident.model.coordinates import Coordinates, direction
+from smp_motor_ident.model.second_order import internal
 
 Array = NDArray[np.float64]
 
 RISE = float(chdtri(1, 0.05))  # of the deviance at the end of a 95 % interval
-NONLINEAR = (models.VC_PLUS, models.A2, models.DELAY, models.WINDOW, models.CURRENT_LAG)
+NONLINEAR = ("vc_plus", "ln_a2", "delay", "window", "current_lag")
 """Coordinates that act other than linearly, in the order in which they are followed."""
 NEAR = 3.0  # standard deviations to a bound within which no parabola is trusted
 STEPS = 8  # points on each side
@@ -44,7 +44,7 @@ def profiled(data: Experiments, fit: Fit, options: Options) -> Fit:
     """Return the fit with the profiles of what is poorly known."""
     if np.isfinite(options.huber):
         return fit
-    free = fit.structure.free()
+    free = fit.structure.free
     std = np.sqrt(np.diag(fit.covariance()))
     white = np.sqrt(np.diag(fit.white()))
     found: list[Profile] = []
@@ -55,7 +55,7 @@ def profiled(data: Experiments, fit: Fit, options: Options) -> Fit:
         i = free.index(coordinate)
         # Coloured residuals and repeating counts scale the deviance as they do variances.
         target = RISE * float((std[i] / white[i]) ** 2)
-        if coordinate == models.VC_PLUS and one_level(data, fit):
+        if coordinate == "vc_plus" and one_level(data, fit):
             ends = _range(data, fit, coordinate)
             # A winding first builds up the torque that breaks loose: from rest that is late,
             # and where its current is measured it tells friction.
@@ -71,12 +71,12 @@ def profiled(data: Experiments, fit: Fit, options: Options) -> Fit:
             alike = replace(fit, profiles=tuple(found))
             std = np.sqrt(np.maximum(np.diag(alike.conditional()), 0.0))
             white = np.minimum(white, np.maximum(std, 1e-12))
-            friction = {**fit.structure.fixed, "vc_plus": float(fit.z[coordinate])}
+            friction = {**fit.structure.fixed, "vc_plus": fit.z.vc_plus}
             held = replace(fit, structure=fit.structure.with_(fixed=friction))
             continue
-        value = float(fit.z[coordinate])
-        loose = std[i] > PROFILE_FROM.value * (1.0 if coordinate == models.A2 else abs(value))
-        if not loose and (coordinate == models.A2 or value > NEAR * std[i]):
+        value = fit.z.value(coordinate)
+        loose = std[i] > PROFILE_FROM.value * (1.0 if coordinate == "ln_a2" else abs(value))
+        if not loose and (coordinate == "ln_a2" or value > NEAR * std[i]):
             continue
         found.append(_followed(data, held, coordinate, float(std[i]), target, options))
     return replace(fit, profiles=tuple(found))
@@ -107,11 +107,11 @@ def one_level(data: Experiments, fit: Fit) -> bool:
 
 
 def _followed(
-    data: Experiments, fit: Fit, coordinate: int, std: float, target: float, options: Options
+    data: Experiments, fit: Fit, coordinate: str, std: float, target: float, options: Options
 ) -> Profile:
     low, high = _range(data, fit, coordinate)
-    value = float(fit.z[coordinate])
-    size = max(value, 0.02 * high) if coordinate != models.A2 else 1.0
+    value = fit.z.value(coordinate)
+    size = max(value, 0.02 * high) if coordinate != "ln_a2" else 1.0
     first = float(np.clip(NORMAL_95 * std, 0.05 * size, size))
     target *= data.size / fit.samples
     here = solve(data, fit.structure, fit.at(fit.z, initial_of(data, fit)), options, 6)
@@ -120,59 +120,56 @@ def _followed(
         shift = _physical(fit.z) - _physical(here.z)
         both = [_coordinates(_physical(end) + shift) for end in ends]
         return Profile(coordinate, (both[0], both[1]))
-    shift = fit.z - here.z
-    return Profile(coordinate, (ends[0] + shift, ends[1] + shift))
+    shift = fit.z.array - here.z.array
+    return Profile(coordinate, (ends[0].moved(shift), ends[1].moved(shift)))
 
 
-def _physical(z: Array) -> Array:
+def _physical(z: Coordinates) -> Array:
     """Return coordinates with be and ln tm for ln a1 and ln a2, which stay a motor's in between.
 
     Where L/R is short, a1 = tm + te be and a2 = te tm hang together to a millionth.
     """
-    _, tm, _, be = to_internal(z, 2)[0][:4]
-    out = z.copy()
-    out[[models.A1, models.A2]] = be, np.log(tm)
-    return out
+    _, tm, _, be = internal(z)[0][:4]
+    return z.with_(ln_a1=be, ln_a2=np.log(tm)).array
 
 
-def _coordinates(physical: Array) -> Array:
+def _coordinates(physical: Array) -> Coordinates:
     """Return what `_physical` was made of."""
-    te, tm, be = np.exp(physical[models.TE]), np.exp(physical[models.A2]), physical[models.A1]
-    z = physical.copy()
-    z[[models.A1, models.A2]] = np.log(max(tm + te * be, 1e-3 * tm)), np.log(te * tm)
-    return z
+    z = Coordinates.of(physical)
+    te, tm, be = z.electrical_time_constant, z.a2, z.ln_a1
+    return z.with_(ln_a1=np.log(max(tm + te * be, 1e-3 * tm)), ln_a2=np.log(te * tm))
 
 
-def _range(data: Experiments, fit: Fit, coordinate: int) -> tuple[float, float]:
-    if coordinate == models.A2:
-        slowest = float(2 * fit.z[models.A1] - fit.z[models.A0])  # a winding as slow as the rotor
-        value = float(fit.z[models.A2])
+def _range(data: Experiments, fit: Fit, coordinate: str) -> tuple[float, float]:
+    value = fit.z.value(coordinate)
+    if coordinate == "ln_a2":
+        slowest = 2 * fit.z.ln_a1 - fit.z.ln_a0  # a winding as slow as the rotor
         return value - FARTHEST, max(value + FARTHEST, slowest)
-    if coordinate == models.VC_PLUS:
+    if coordinate == "vc_plus":
         full = float(np.abs(data.hold_value).max())
         if not fit.structure.current:
             return 0.0, MOST_FRICTION.value * full
         # The current tells the back-EMF: friction is what viscous friction may be, at most.
-        back = _back_emf(fit.z) / float(np.exp(fit.z[models.A0]))
-        value = float(fit.z[coordinate])
+        back = _back_emf(fit.z) / fit.z.a0
         return 0.0, min(MOST_FRICTION.value * full, value + (1 - back) * max(full - value, 0.0))
-    return (0.0 if coordinate == models.DELAY else 1e-9), float(np.ptp(data.time))
+    return (0.0 if coordinate == "delay" else 1e-9), float(np.ptp(data.time))
 
 
 def _end(
     data: Experiments,
     fit: Fit,
-    coordinate: int,
+    coordinate: str,
     bound: float,
     first: float,
     target: float,
     options: Options,
-) -> Array:
+) -> Coordinates:
     """Return the coordinates at which the deviance has risen by ``target``, or at the bound."""
-    side = np.sign(bound - fit.z[coordinate])
+    begin = fit.z.value(coordinate)
+    side = np.sign(bound - begin)
     inner, inner_rise, move, near = fit, 0.0, first, fit
     for _ in range(STEPS if side else 0):
-        value = float(fit.z[coordinate] + side * move)
+        value = float(begin + side * move)
         last = side * (value - bound) >= 0
         value = bound if last else value
         outer = _fixed_at(data, near, coordinate, value, options)
@@ -185,7 +182,7 @@ def _end(
             if fit.structure.current:
                 near_end, far_end = _physical(inner.z), _physical(outer.z)
                 return _coordinates(near_end + share * (far_end - near_end))
-            return np.asarray(inner.z + share * (outer.z - inner.z))
+            return inner.z.moved(share * (outer.z.array - inner.z.array))
         inner, inner_rise, near = outer, rise, outer
         if last:
             break
@@ -193,37 +190,35 @@ def _end(
     return inner.z
 
 
-def _fixed_at(data: Experiments, near: Fit, coordinate: int, value: float, options: Options) -> Fit:
+def _fixed_at(data: Experiments, near: Fit, coordinate: str, value: float, options: Options) -> Fit:
     """Fit all others with a coordinate fixed at a value, its segments moving or at rest at first.
 
     Friction takes its volts from the gain.
     """
-    fixed = {**near.structure.fixed, models.Z_NAMES[coordinate]: value}
+    fixed = {**near.structure.fixed, coordinate: value}
     structure = near.structure.with_(fixed=fixed)
-    if coordinate == models.VC_PLUS:
+    if coordinate == "vc_plus":
         z, initials = rubbing(data, near, value)
     else:
-        z, initials = near.z.copy(), [near.initial]
-        if coordinate == models.A2 and structure.current:
-            z = slower_winding(z, z[models.TE] + value - z[models.A2])
-    z[coordinate] = value
+        z, initials = near.z, [near.initial]
+        if coordinate == "ln_a2" and structure.current:
+            z = slower_winding(z, z.ln_te + value - z.ln_a2)
     starts = [structure.complete(z)]
-    if coordinate == models.VC_PLUS and models.TE in structure.free() and not structure.current:
+    if coordinate == "vc_plus" and "ln_te" in structure.free and not structure.current:
         # Without friction L/R is any; with it, what is late in the response is the winding.
-        z[models.TE] = z[models.A2] - z[models.A1]
-        starts.append(structure.complete(z))
+        starts.append(structure.complete(z.undamped()))
     tried = [
         solve(data, structure, near.at(z, i), options, 10, 0.05) for z in starts for i in initials
     ]
     return min(tried, key=lambda f: f.deviance)
 
 
-def _back_emf(z: Array) -> float:
+def _back_emf(z: Coordinates) -> float:
     """Return K [V s/rad], between none and all of a0."""
-    return float(np.clip(to_internal(z, 2)[0][2], 0.0, np.exp(z[models.A0])))
+    return float(np.clip(internal(z)[0][2], 0.0, z.a0))
 
 
-def rubbing(data: Experiments, near: Fit, value: float) -> tuple[Array, list[Array]]:
+def rubbing(data: Experiments, near: Fit, value: float) -> tuple[Coordinates, list[Array]]:
     """Return coordinates and initial states of other friction that turn the motor as fast.
 
     At one level of voltage these answer exactly alike: all of the response scales.  A segment
@@ -231,19 +226,19 @@ def rubbing(data: Experiments, near: Fit, value: float) -> tuple[Array, list[Arr
     """
     full = float(np.abs(data.hold_value).max())
     least = 1e-9 * full  # friction of all the voltage and more leaves a motor that stands
-    scale = max(full - value, least) / max(full - near.z[models.VC_PLUS], least)
-    z = near.z.copy()
-    z[[models.A0, models.A1, models.A2]] += np.log(scale)
+    before = near.z.vc_plus
+    scale = max(full - value, least) / max(full - before, least)
+    higher = np.log(scale)
+    z = near.z.moved(direction(ln_a0=higher, ln_a1=higher, ln_a2=higher)).with_friction(value)
     if near.structure.current:  # which tells the back-EMF, so that it does not scale
-        te, a1 = np.exp(near.z[[models.TE, models.A1]])
+        te, a1 = near.z.electrical_time_constant, near.z.a1
         more = scale * a1 + te * _back_emf(near.z) * (scale - 1)
-        z[models.A1] = np.log(max(more, 1e-3 * scale * a1))
-    z[[models.VC_PLUS, models.VC_MINUS]] = value
+        z = z.with_(ln_a1=np.log(max(more, 1e-3 * scale * a1)))
     moving = near.initial.copy()
     sign = np.sign(near.initial[:, 1])
-    moving[:, 0] = scale * (moving[:, 0] - sign * near.z[models.VC_PLUS]) + sign * value
-    before = np.abs(data.hold_value[data.hold_start[: len(moving)]])
-    at_rest = before < max(value, near.z[models.VC_PLUS])
+    moving[:, 0] = scale * (moving[:, 0] - sign * before) + sign * value
+    driven = np.abs(data.hold_value[data.hold_start[: len(moving)]])
+    at_rest = driven < max(value, before)
     if not np.any(at_rest & near.initial[:, :2].any(axis=1)):
         return z, [moving]
     still = np.array([0.0, 0.0, 1.0, 1.0, 0.0])

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.fit import Fit
-from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments
+from smp_motor_ident.model.measurement import ANGLE, MEAN_SPEED
 
 Array = NDArray[np.float64]
 
@@ -28,10 +28,10 @@ REACH = 2.0  # standard deviations to which motions near the estimate are replay
 
 def widened(data: Experiments, fit: Fit, seed: int = 0) -> Fit:
     """Return the fit with its covariance widened where quantisation repeats."""
-    if data.kind != rc.ANGLE or data.quantum == 0 or fit.noise_ratio > 0:
+    if data.quantum == 0 or fit.noise_ratio > 0 or not fit.structure.free:
         return fit
     own = data.quantum**2 / 12
-    if fit.noise[0, 0] > 3 * own or not fit.structure.free():
+    if fit.noise[0, 0] > 3 * own or (data.kind != ANGLE and _counted(data, fit)):
         return fit
     cov = fit.covariance()
     counted, metered = (np.diag(share) for share in _shares(data, fit))
@@ -47,6 +47,19 @@ def widened(data: Experiments, fit: Fit, seed: int = 0) -> Fit:
         second = metered + np.square(errors).sum(axis=0) / max(len(errors), 1)
         excess = np.maximum(second / np.maximum(expected, np.diag(cov)), excess)
     return replace(fit, widen=np.sqrt(excess))
+
+
+def _counted(data: Experiments, fit: Fit) -> bool:
+    """Tell whether a speed in steps is a difference of counts, which is right on average.
+
+    Neighbours then share a count: their errors correlate by -1/2, those of a rounded speed by 0 or
+    more.
+    """
+    if data.kind == MEAN_SPEED:
+        return True
+    error = data.output - prediction.simulate(data, fit)[:, 1]
+    error = error[np.isfinite(error)]
+    return bool(error[1:] @ error[:-1] < -0.25 * (error @ error))
 
 
 def _shares(data: Experiments, fit: Fit) -> tuple[Array, Array]:
@@ -69,15 +82,20 @@ def _half(spread: Array) -> Array:
 def _counting_errors(
     data: Experiments, fit: Fit, own: float, moves: Array, rng: np.random.Generator
 ) -> Array:
-    """Return what a counter adds to the angle of motions near the fit's, shape (replays, n)."""
+    """Return what rounding adds to the output of motions near the fit's, shape (replays, n).
+
+    A counter's zero may be anywhere, a speed's is known; an angle's offset is free besides.
+    """
     noise = np.sqrt(max(fit.noise[0, 0] - own, 0.0))
     there = prediction.simulate(data, fit)[:, 1]
     errors = []
     for _ in range(int(np.clip(MOST // data.size, *REPLAYS))):
-        angle = there + moves @ rng.standard_normal(moves.shape[1])
-        if not np.abs(angle).max() < COUNTED * data.quantum:
+        true = there + moves @ rng.standard_normal(moves.shape[1])
+        if not np.abs(true).max() < COUNTED * data.quantum:
             continue  # no motor: a coordinate that the data leave open went out of all bounds
-        shown = angle + rng.uniform(0, data.quantum) + noise * rng.standard_normal(data.size)
-        wrong = np.floor(shown / data.quantum) * data.quantum - angle
-        errors.append(wrong - wrong.mean())
+        counted = data.kind == ANGLE
+        shown = true + noise * rng.standard_normal(data.size)
+        shown += rng.uniform(-0.5, 0.5) * data.quantum * counted
+        wrong = np.rint(shown / data.quantum) * data.quantum - true
+        errors.append(wrong - wrong.mean() * counted)
     return np.array(errors).reshape(-1, data.size)

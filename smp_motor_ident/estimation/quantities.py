@@ -11,13 +11,16 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from smp_motor_control.motor.parameters import PHYSICAL
 from smp_motor_ident.diagnosis.limits import HIDDEN_LAG, LOOSE_QUANTITY, NEGLIGIBLE_FRICTION
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.fitted import NORMAL_95
 from smp_motor_ident.estimation.inversion import solved_for
 from smp_motor_ident.likelihood.experiments import Experiments
-from smp_motor_ident.model import structures as models
-from smp_motor_ident.model.structures import PHYSICAL
+from smp_motor_ident.model.coordinates import Coordinates, direction
+from smp_motor_ident.model.physical import physical, physical_gradients
+from smp_motor_ident.model.structure import Gradients
+from smp_motor_ident.model.structures import Structure
 from smp_motor_ident.result import UNITS, Quantity
 
 Array = NDArray[np.float64]
@@ -76,7 +79,7 @@ def answer(
 ) -> Answer:
     """Turn a fit into quantities."""
     structure, conditional = fit.structure, fit.conditional()
-    reported = _reported(structure)
+    reported = list(structure.separates())
     values = _values(fit, fixed, reported, level)
     joint = values.covariance(conditional)
     if friction_std > 0:
@@ -112,10 +115,10 @@ def answer(
 
 
 def _values(fit: Fit, fixed: Mapping[str, float], reported: list[str], level: float) -> _Values:
-    matrix, free = fit.structure.matrix(), list(fit.structure.free())
-    there, gradients = _at(fit.z, fit.structure, level)
-    value = {n: there[n] for n in reported}
-    row = {n: gradients[n] @ matrix for n in reported}
+    matrix = fit.structure.matrix
+    there = _at(fit.z, fit.structure, level)
+    value = {n: there[n][0] for n in reported}
+    row = {n: there[n][1] @ matrix for n in reported}
     known = _physical_rows(fit, fixed, matrix)
     value |= {n: v for n, (v, _) in known.items()}
     row |= {n: r for n, (_, r) in known.items()}
@@ -123,10 +126,10 @@ def _values(fit: Fit, fixed: Mapping[str, float], reported: list[str], level: fl
     for profile in fit.profiles:
         sides = []
         for z in profile.ends:
-            moved, _ = _at(z, fit.structure, level)
-            if fit.structure.current and fit.structure.order == 2:
-                moved |= models.physical(z)[0]
-            step = (z - fit.z)[free]
+            moved = {n: v for n, (v, _) in _at(z, fit.structure, level).items()}
+            if fit.structure.current:
+                moved |= physical(z)
+            step = fit.structure.of_free(z.array - fit.z.array)
             sides.append({n: moved[n] - value[n] if n in moved else row[n] @ step
                           for n in value})  # fmt: skip
         for n in value:
@@ -134,18 +137,14 @@ def _values(fit: Fit, fixed: Mapping[str, float], reported: list[str], level: fl
     return _Values(value, row, ends)
 
 
-def _at(
-    z: Array, structure: models.Structure, level: float
-) -> tuple[dict[str, float], dict[str, Array]]:
+def _at(z: Coordinates, structure: Structure, level: float) -> Gradients:
     """Return the combinations of coordinates, the steady speed at a level among them."""
-    values, gradients = models.combinations(z, structure.order)
-    friction = "static_voltage" if level >= 0 else "static_voltage_reverse"
-    net = level - np.copysign(values[friction], level) - values["load_voltage"]
-    values["steady_speed"] = values["dc_gain"] * net
-    gradients["steady_speed"] = net * gradients["dc_gain"] - values["dc_gain"] * (
-        np.copysign(1.0, level) * gradients[friction] + gradients["load_voltage"]
-    )
-    return values, gradients
+    found = structure.combinations(z)
+    friction = "vc_plus" if level >= 0 else "vc_minus"
+    sign = float(np.copysign(1.0, level))
+    net = level - sign * z.value(friction) - z.load
+    gradient = net * found["dc_gain"][1] - z.dc_gain * direction(**{friction: sign, "load": 1.0})
+    return {**found, "steady_speed": (z.dc_gain * net, gradient)}
 
 
 def _parameters(
@@ -185,37 +184,15 @@ def _hidden(name: str, value: float, std: float, fit: Fit) -> bool:
     """
     if name != "time_constant_product" or not std > LOOSE_QUANTITY.value * abs(value):
         return False
-    lag = float(np.exp(fit.z[models.A1] - fit.z[models.A0]))
-    return fit.structure.current or value < HIDDEN_LAG.value * lag**2
+    return fit.structure.current or value < HIDDEN_LAG.value * fit.z.time_constant**2
 
 
 def _friction(name: str, fit: Fit) -> float:
     """Return how much of a quantity a volt of Coulomb friction is."""
     if name == "coulomb_friction" and fit.structure.current:
-        values, _ = models.physical(fit.z)
+        values = physical(fit.z)
         return values["motor_constant"] / values["resistance"]
     return float(name == "static_voltage")
-
-
-def _reported(structure: models.Structure) -> list[str]:
-    names = ["dc_gain"]
-    if not structure.name.startswith("static_gain"):
-        names.append("time_constant")
-    if structure.order == 2:
-        names.append("time_constant_product")
-    names.append("static_voltage")
-    if structure.friction == "asymmetric":
-        names.append("static_voltage_reverse")
-    if structure.load:
-        names.append("load_voltage")
-    names.append("steady_speed")
-    if structure.delay or "delay" in structure.fixed:
-        names.append("delay")
-    if structure.window or "window" in structure.fixed:
-        names.append("averaging_window")
-    if structure.lags:
-        names.append("current_lag")
-    return names
 
 
 def _physical_rows(
@@ -227,10 +204,10 @@ def _physical_rows(
     if fit.structure.order != 2:
         return {}
     if fit.structure.current or electric:
-        values, gradients = models.physical(fit.z)
-        if values["motor_constant"] <= 0:
+        known = physical_gradients(fit.z)
+        if known["motor_constant"][0] <= 0:
             return {}
-        return {n: (values[n], gradients[n] @ matrix) for n in values if n not in fixed}
+        return {n: (value, row @ matrix) for n, (value, row) in known.items() if n not in fixed}
     return solved_for(fit, fixed, matrix, fit.covariance())
 
 
@@ -240,12 +217,12 @@ def _too_loose(name: str, value: float, std: float, fit: Fit) -> bool:
         return True
     if std < LOOSE_QUANTITY.value * abs(value):
         return False
-    values, _ = models.physical(fit.z)
+    values = physical(fit.z)
     per = values["motor_constant"] / values["resistance"]
     if name.startswith("coulomb_friction"):
         return std > NEGLIGIBLE_FRICTION.value * per
     if name == "viscous_friction":
-        return std > 0.02 * per * float(np.exp(fit.z[models.A0]))
+        return std > 0.02 * per * fit.z.a0
     return True
 
 

@@ -7,10 +7,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from smp_motor_control.motor.parameters import PHYSICAL
 from smp_motor_ident.diagnosis.limits import CURRENT_THERE
 from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.estimation.fit import Options
-from smp_motor_ident.model.structures import MODELS, PHYSICAL, Structure
+from smp_motor_ident.model.structures import (
+    CANDIDATES,
+    MODELS,
+    Electromechanical,
+    SecondOrder,
+    Structure,
+)
 from smp_motor_ident.record import Record
 
 LOSSES = {"linear": np.inf, "huber": 2.0}
@@ -128,11 +135,9 @@ def base_structure(request: Request, group: Sequence[Record]) -> Structure:
     asymmetric = model.endswith("_asymmetric")
     friction = "asymmetric" if asymmetric else "symmetric"
     if use_current:
-        return Structure(
-            "electromechanical", 2, friction, current=True, load=asymmetric, fixed=fixed
-        )
+        return Electromechanical(friction, asymmetric, fixed=fixed)
     if candidate in ("auto", "electromechanical"):
         candidate = "second_order"
-    order = 2 if candidate == "second_order" else 1
+    structure = CANDIDATES[candidate](friction, asymmetric, fixed=fixed)
     # How friction is felt depends on L/R, which the linear response leaves open.
-    return Structure(candidate, order, friction, shape=order == 2, load=asymmetric, fixed=fixed)
+    return structure.with_(shape=True) if isinstance(structure, SecondOrder) else structure

@@ -21,13 +21,14 @@ from scipy.special import chdtri, fdtri, stdtrit
 
 from smp_motor_ident.diagnosis.limits import HOMOGENEITY, SEGMENT_INFORMATION, SEGMENTS
 from smp_motor_ident.estimation.fit import Fit
-from smp_motor_ident.estimation.fitted import NORMAL_95, PLAUSIBLE
+from smp_motor_ident.estimation.fitted import NORMAL_95
 from smp_motor_ident.estimation.prediction import inverse as inverse_of
 from smp_motor_ident.estimation.prediction import simulate
-from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.passes import gather
-from smp_motor_ident.model import structures as models
+from smp_motor_ident.model.coordinates import LOGARITHMS, PLAUSIBLE
+from smp_motor_ident.model.measurement import ANGLE
+from smp_motor_ident.model.structures import sensor_of
 
 Array = NDArray[np.float64]
 
@@ -35,7 +36,6 @@ FEWEST = 4  # parts of which a scatter can be taken
 ORDERED = 6  # parts of which a drift is distinguishable from scatter
 LOOSE = 0.3  # e-folds, or of the value: a coordinate known worse from a part is left out
 ROUNDING = 1e-12  # of the largest eigenvalue: what the sums of a part are exact to
-COMPARED = [i for i in range(len(models.Z_NAMES)) if i != models.TE]
 
 
 def heterogeneous(data: Experiments, fit: Fit) -> tuple[Fit, dict[str, float]]:
@@ -62,10 +62,10 @@ def heterogeneous(data: Experiments, fit: Fit) -> tuple[Fit, dict[str, float]]:
     ordered = len(data.starts) - 1 < FEWEST and parts >= ORDERED  # records are not a sequence
     between, freedom = _between(middle, step, cov.mean(axis=0), ordered)
     between = between * (stdtrit(freedom, 0.975) / NORMAL_95) ** 2
-    added = np.zeros((len(fit.structure.free()),) * 2)
+    added = np.zeros((len(fit.structure.free),) * 2)
     added[np.ix_(free, free)] = between
     std = np.sqrt(np.diag(between))
-    names = [models.Z_NAMES[fit.structure.free()[i]] for i in free]
+    names = [fit.structure.free[i] for i in free]
     widened = added + (0.0 if fit.added is None else fit.added)
     return replace(fit, added=widened), dict(zip(names, map(float, std), strict=True))
 
@@ -92,12 +92,12 @@ def _positive(matrix: Array, scale: Array) -> Array:
 
 def _steps(data: Experiments, fit: Fit) -> tuple[Array, Array, Array, list[int]] | None:
     """Return time (of the whole, 0 in the middle), step and covariance of each part."""
-    structure, f = fit.structure, len(fit.structure.free())
+    structure, f = fit.structure, len(fit.structure.free)
     cut = _parted(data, fit, int(SEGMENTS.value))
     sums = gather(cut, structure, fit.z, cut.initial, fit.noise_model())
-    common = [i for i, c in enumerate(structure.free()) if c in COMPARED]
+    common = [i for i, c in enumerate(structure.free) if c != "ln_te"]
     factors = np.sqrt(_fast_factors(fit))
-    plausible = np.diag(PLAUSIBLE[list(structure.free())])
+    plausible = np.diag(structure.of_free(PLAUSIBLE))
     middle, steps, covs = [], [], []
     for b, (normal, gradient) in enumerate(zip(sums.normal, sums.gradient, strict=True)):
         own = inverse_of(normal[f:, f:])
@@ -109,9 +109,7 @@ def _steps(data: Experiments, fit: Fit) -> tuple[Array, Array, Array, list[int]]
         covs.append(inverse * np.outer(factors, factors))
     step, cov, when = np.array(steps), np.array(covs), np.array(middle)
     variance = np.einsum("bii->bi", cov)
-    size = np.where(
-        np.isin(structure.free(), models.LOGARITHMS), 1.0, np.abs(fit.z[list(structure.free())])
-    )
+    size = [1.0 if n in LOGARITHMS else abs(fit.z.value(n)) for n in structure.free]
     known = 1 / np.maximum(variance, 1e-300)
     enough = known >= SEGMENT_INFORMATION.value * known.mean(axis=0)
     common = [i for i in common
@@ -155,7 +153,7 @@ def _parted(data: Experiments, fit: Fit, parts: int) -> Experiments:
     initial = np.zeros((starts.size - 1, 5))
     predicted = simulate(data, fit, gain=True)
     current = data.current.copy()
-    reach = 2 * fit.z[models.CURRENT_LAG] * (fit.structure.current_sensor == "averaged")
+    reach = 2 * fit.z.current_lag * (sensor_of(fit.structure) == "averaged")
     for n, (begin, g) in enumerate(zip(starts[:-1], owner, strict=True)):
         a = int(data.hold_start[g])
         last = int(data.hold_start[g + 1]) if g + 2 < data.starts.size else data.hold_end.size
@@ -168,13 +166,13 @@ def _parted(data: Experiments, fit: Fit, parts: int) -> Experiments:
             current[begin : begin + end] = np.nan
         voltage = data.hold_value[min(int(first[n]), last - 1)]
         initial[n] = (
-            voltage - fit.z[models.LOAD],
+            voltage - fit.z.load,
             predicted[begin, 0],
             data.output[begin],
             fit.initial[g, 3],
             0.0,
         )
-        if data.kind != rc.ANGLE or not np.isfinite(data.output[begin]):
-            initial[n, 2] = predicted[begin, 1] if data.kind == rc.ANGLE else 0.0
+        if data.kind != ANGLE or not np.isfinite(data.output[begin]):
+            initial[n, 2] = predicted[begin, 1] if data.kind == ANGLE else 0.0
     return replace(data, starts=starts, hold_start=np.append(first, data.hold_start[-1]),
                    initial=initial, current=current)  # fmt: skip

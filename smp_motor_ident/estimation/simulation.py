@@ -8,10 +8,11 @@ from numpy.typing import NDArray
 from smp_motor_ident.diagnosis.validation import percent
 from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.fit import Fit
-from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import prepare
-from smp_motor_ident.model import structures as models
-from smp_motor_ident.model.structures import Structure
+from smp_motor_ident.model.coordinates import NAMES, Coordinates
+from smp_motor_ident.model.measurement import ANGLE, SPEED
+from smp_motor_ident.model.static_gain import INSTANTLY
+from smp_motor_ident.model.structures import FirstOrder, SecondOrder, StaticGain
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import Estimate
 
@@ -26,11 +27,11 @@ def simulate(estimate: Estimate, record: Record) -> tuple[Array, Array]:
     """
     data = prepare([record], False)
     fit = _motor(estimate)
-    if fit.structure.fixed["window"] > 0 and data.kind == rc.SPEED:
+    if fit.structure.fixed["window"] > 0 and data.kind == SPEED:
         data = data.as_mean_speed()
     settled = prediction.settle(data, fit)
     predicted = prediction.simulate(data, settled)
-    if data.kind != rc.ANGLE:
+    if data.kind != ANGLE:
         return data.output, predicted[:, 1]
     mean = _differences(record, predicted[:, 1])
     measured = record.velocity
@@ -49,10 +50,12 @@ def _differences(record: Record, angle: Array) -> Array:
 
 def _motor(estimate: Estimate) -> Fit:
     """Return the estimate as a fit with nothing free."""
-    z, order = coordinates(estimate)
-    fixed = dict(zip(models.Z_NAMES, map(float, z), strict=True))
-    name = "static_gain" if estimate.model.startswith("static_gain") else "estimated"
-    structure = Structure(name, order, "asymmetric", fixed=fixed)
+    z = coordinates(estimate)
+    fixed = {n: z.value(n) for n in NAMES}
+    instant = estimate.model.startswith("static_gain")
+    second = estimate.value("time_constant_product") > 0
+    kind = SecondOrder if second else StaticGain if instant else FirstOrder
+    structure = kind("asymmetric", fixed=fixed)
     nothing = np.zeros((0, 0))
     return Fit(
         structure=structure,
@@ -68,27 +71,27 @@ def _motor(estimate: Estimate) -> Fit:
         passes=0,
         converged=True,
         samples=estimate.samples,
-        kind=rc.SPEED,
+        kind=SPEED,
     )
 
 
-def coordinates(estimate: Estimate) -> tuple[Array, int]:
-    """Return an estimate in the coordinates of the fit, and its order."""
-    z = np.zeros(len(models.Z_NAMES))
-    z[models.A0] = -np.log(estimate.value("dc_gain"))
+def coordinates(estimate: Estimate) -> Coordinates:
+    """Return an estimate in the coordinates of the fit."""
+    ln_a0 = -float(np.log(estimate.value("dc_gain")))
     lag, product = estimate.value("time_constant"), estimate.value("time_constant_product")
-    z[models.A1] = z[models.A0] + (np.log(lag) if lag > 0 else -30.0)
-    order = 2 if product > 0 else 1
-    if order == 2:
-        z[models.A2] = z[models.A0] + np.log(product)
-        z[models.TE] = z[models.A2] - z[models.A1]
-        inductance, resistance = estimate.value("inductance"), estimate.value("resistance")
-        if inductance > 0 and resistance > 0:
-            z[models.TE] = np.log(inductance / resistance)
     forward = estimate.value("static_voltage")
-    z[models.VC_PLUS] = forward
-    z[models.VC_MINUS] = estimate.value("static_voltage_reverse", forward)
-    z[models.LOAD] = estimate.value("load_voltage")
-    z[models.DELAY] = estimate.value("delay")
-    z[models.WINDOW] = estimate.value("averaging_window")
-    return z, order
+    z = Coordinates(
+        ln_a0=ln_a0,
+        ln_a1=ln_a0 + (float(np.log(lag)) if lag > 0 else INSTANTLY),
+        vc_plus=forward,
+        vc_minus=estimate.value("static_voltage_reverse", forward),
+        load=estimate.value("load_voltage"),
+        delay=estimate.value("delay"),
+        window=estimate.value("averaging_window"),
+    )
+    if not product > 0:
+        return z
+    z = z.with_(ln_a2=ln_a0 + np.log(product)).undamped()
+    inductance, resistance = estimate.value("inductance"), estimate.value("resistance")
+    known = inductance > 0 and resistance > 0
+    return z.with_(ln_te=np.log(inductance / resistance)) if known else z

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident.diagnosis.limits import METER
-from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.regression import (
     filtered,
@@ -21,11 +20,28 @@ from smp_motor_ident.likelihood.regression import (
     search,
     solved,
 )
-from smp_motor_ident.model import structures as models
+from smp_motor_ident.model.coordinates import Coordinates
+from smp_motor_ident.model.measurement import ANGLE
+from smp_motor_ident.model.physical import from_physical
 
 Array = NDArray[np.float64]
 
 GRIDS = 8  # segments that are looked at, those that moved most
+
+
+@dataclass(frozen=True, eq=False)
+class FilteredData:
+    """The regressions on some experiments, as `structure.Structure.guesses` asks for them."""
+
+    data: Experiments
+
+    def speed(self, order: int, frictions: tuple[bool, ...]) -> list[Coordinates]:
+        """Return motors of an order from voltage and speed, with friction or without."""
+        return speed_candidates(self.data, order, frictions=frictions)
+
+    def current(self) -> list[Coordinates]:
+        """Return motors from voltage, speed and current."""
+        return current_candidates(self.data)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,20 +92,15 @@ def cutoffs(data: Experiments, count: int = 7) -> Array:
     return np.asarray(np.geomspace(low, high, count), dtype=np.float64)
 
 
-def lagged_candidates(data: Experiments, structure: models.Structure, lag: int) -> list[Array]:
-    """Return candidates for a motor that answers ``lag`` samples late."""
-    return speed_candidates(data, structure.order, lag)
-
-
 def speed_candidates(
     data: Experiments, order: int, lag: int = 0, frictions: tuple[bool, ...] = (True, False)
-) -> list[Array]:
+) -> list[Coordinates]:
     """Return candidate coordinates from voltage and the mechanical output.
 
     Least squares on ``v = a2 w'' + a1 w' + a0 w + Vc sign(w)`` after filtering, for several
     cut-offs, with and without friction, each refined by one instrumental-variable step.
     """
-    out: list[Array] = []
+    out: list[Coordinates] = []
     for view in _views(data):
         grids = [_late(u, lag) for u in view]
         voltage = np.concatenate([u.voltage for u in grids])
@@ -97,7 +108,7 @@ def speed_candidates(
         bounds = np.cumsum([0, *(len(u.output) for u in grids)])
         steps = np.array([u.step for u in grids])
         bands = cutoffs(data, 7 if lag == 0 else 4)
-        angle = data.kind == rc.ANGLE
+        angle = data.kind == ANGLE
         for friction in frictions:
             for theta in search(voltage, output, bounds, steps, bands, order, angle, friction):
                 out.append(_to_z(theta, order))
@@ -115,7 +126,7 @@ def _views(data: Experiments) -> list[list[Uniform]]:
     grids = sorted(grids, key=lambda u: -float(np.ptp(u.output)))[:GRIDS]
     if any(np.ptp(u.voltage[1:]) > METER.value * np.abs(u.voltage).max() for u in grids):
         return [grids]
-    return [grids, [_from_rest(u, data.kind == rc.ANGLE) for u in grids]]
+    return [grids, [_from_rest(u, data.kind == ANGLE) for u in grids]]
 
 
 def _from_rest(u: Uniform, angle: bool) -> Uniform:
@@ -134,28 +145,25 @@ def _late(u: Uniform, lag: int) -> Uniform:
     return Uniform(u.step, voltage, u.output, u.current)
 
 
-def _to_z(theta: Array, order: int) -> Array:
+def _to_z(theta: Array, order: int) -> Coordinates:
     """Return the coordinates of a0, a1 (, a2) and the volts of friction."""
-    z = np.zeros(len(models.Z_NAMES))
-    z[: order + 1] = np.log(theta[: order + 1])
-    if order == 2:
-        z[models.TE] = z[models.A2] - z[models.A1]
-    z[models.VC_PLUS] = z[models.VC_MINUS] = theta[-1]
-    return z
+    names = ("ln_a0", "ln_a1", "ln_a2")[: order + 1]
+    z = Coordinates(**dict(zip(names, map(float, np.log(theta[: order + 1])), strict=True)))
+    return (z.undamped() if order == 2 else z).with_friction(float(theta[-1]))
 
 
-def current_candidates(data: Experiments) -> list[Array]:
+def current_candidates(data: Experiments) -> list[Coordinates]:
     """Return candidate coordinates from voltage, current and the mechanical output.
 
     The electric equation ``v = L i' + R i + K w`` and the mechanical
     ``K i = J w' + b w + Tc sign(w)`` are two linear regressions, filtered.
     """
-    out: list[Array] = []
+    out: list[Coordinates] = []
     for view, cutoff in product(_views(data), cutoffs(data)):
         electric, mechanic = np.zeros((4, 7)), np.zeros((4, 7))
         for u in view:
             if u.current is not None:
-                _both_equations(u, cutoff, data.kind == rc.ANGLE, electric, mechanic)
+                _both_equations(u, cutoff, data.kind == ANGLE, electric, mechanic)
         inductance, r, k = solved(electric)[:3]
         if not (r > 0 and k > 0):
             continue
@@ -165,9 +173,7 @@ def current_candidates(data: Experiments) -> list[Array]:
         for slope, damping, drag in (solved(mechanic)[:3], (*solved(bare)[:2], 0.0)):
             if slope > 0:
                 b, tc = k * max(damping, 0.0), k * max(drag, 0.0)
-                z = models.from_physical(r, inductance, k, k * slope, b, tc)
-                z[models.OFFSET] = 0.0
-                out.append(z)
+                out.append(from_physical(r, inductance, k, k * slope, b, tc))
     return out
 
 

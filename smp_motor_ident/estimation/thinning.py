@@ -10,8 +10,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import Experiments
+from smp_motor_ident.model.measurement import ANGLE
 
 Array = NDArray[np.float64]
 
@@ -27,7 +27,7 @@ def thinned(data: Experiments) -> Experiments:
 
     The input keeps its jumps where they are; between them it is averaged.
     """
-    if data.kind != rc.ANGLE or data.current.size:
+    if data.kind != ANGLE or data.current.size:
         return data
     k = min(_idle(data) // FINER, data.size // (LEAST * (len(data.starts) - 1)))
     return _every(data, k) if k >= FEWEST else data

@@ -6,24 +6,17 @@ from collections.abc import Callable
 
 import numpy as np
 
-from smp_motor_ident.diagnosis.limits import LITTLE_FRICTION, SUBSET_HOPELESS
+from smp_motor_ident.diagnosis.limits import LITTLE_FRICTION
 from smp_motor_ident.estimation import data_window, descent, prediction
 from smp_motor_ident.estimation.candidate_starts import of_kind
-from smp_motor_ident.estimation.choice import (
-    FittedCandidate,
-    label,
-    preferred,
-    sandwich_factor,
-    worth_a_fit,
-)
 from smp_motor_ident.estimation.current_lag import with_current_lag
 from smp_motor_ident.estimation.delay_and_averaging import delay_without_noise
 from smp_motor_ident.estimation.fit import Fit, Options, solve
 from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.estimation.profile import RISE, one_level, rubbing
-from smp_motor_ident.likelihood import recursion as rc
+from smp_motor_ident.estimation.selection import POLICY, FittedCandidate, sandwich_factor
 from smp_motor_ident.likelihood.experiments import Experiments
-from smp_motor_ident.model import structures as models
+from smp_motor_ident.model.measurement import MEAN_SPEED
 from smp_motor_ident.model.structures import Structure
 
 Say = Callable[[str], None]
@@ -35,7 +28,7 @@ def varied(
     data: Experiments, best: Fit, options: Options, candidates: list[FittedCandidate], say: Say
 ) -> Fit:
     """Add what the data ask for, take away what they do not show."""
-    if best.kind == rc.MEAN_SPEED:
+    if best.kind == MEAN_SPEED:
         data = data.as_mean_speed()
     before = None
     while before != best.structure:  # what was added may have hidden that the rest is there, too
@@ -60,16 +53,14 @@ def _with_addition(
     if richer == best.structure or any(r.fit.structure == richer for r in candidates):
         return best
     hidden = delay_without_noise(data, best, options) if "delay" in change else None
-    if hidden is None and not worth_a_fit(data, best, richer):
+    if hidden is None and not POLICY.worth_a_fit(data, best, richer):
         return best
-    say(f"trying {label(richer)}")
-    z = best.z.copy()
-    if "delay" in change:
-        z[models.DELAY] = 0.3 * data.step
+    say(f"trying {richer.label}")
+    z = best.z.with_(delay=0.3 * data.step) if "delay" in change else best.z
     other = descent.refine(data, richer, best, z, options)
     other = min(other, hidden or other, key=lambda f: f.deviance)
-    verdict, reason = preferred(best, other)
-    if verdict and "delay" in change and other.z[models.DELAY] < 0.03 * data.step:
+    verdict, reason = POLICY.preferred(best, other)
+    if verdict and "delay" in change and other.z.delay < 0.03 * data.step:
         verdict, reason = False, "a delay of hundredths of a sample is how the input was held"
     if verdict and other.noise_ratio > 0:  # what looked like torque noise may have been this
         other = data_window.grow(data, richer, other, options)
@@ -100,17 +91,16 @@ def _without_friction(
     s = best.structure
     if s.friction != "symmetric" or "vc_plus" in s.fixed:
         return best
-    smooth = s.with_(friction="none", shape=False)
+    smooth = s.frictionless()
     subset = of_kind(descent.screening_subset(data), best)
     if subset.size < data.size:
         with_it = descent.refine(subset, s, best, best.z, options)
         without = descent.refine(subset, smooth, with_it, best.z, options, known=with_it)
-        if without.deviance > with_it.deviance + SUBSET_HOPELESS.value * sandwich_factor(with_it):
+        if without.deviance > with_it.deviance + POLICY.hopeless * sandwich_factor(with_it):
             return best
     plain = descent.refine(data, smooth, best, best.z, options)
     if plain.deviance < best.deviance:  # then friction has led astray
-        z = plain.z.copy()
-        z[models.VC_PLUS] = 1e-3 * np.abs(data.hold_value).max()
+        z = plain.z.with_(vc_plus=1e-3 * np.abs(data.hold_value).max())
         others = [descent.refine(data, s, plain, s.complete(z), options)]
         if s.current and one_level(data, plain):  # the same motion, with the friction of another
             others += _rubbing_more(data, plain, s, options)
@@ -142,7 +132,7 @@ def friction_shows(data: Experiments, fit: Fit, surely_small: bool) -> bool:
     """Tell by the score whether Coulomb friction is there, or may be and is not little."""
     structure = fit.structure.with_(friction="symmetric")
     _, step, cov = prediction.predicted_decrease(data, fit, structure)
-    i = structure.free().index(models.VC_PLUS)
+    i = structure.free.index("vc_plus")
     std = float(np.sqrt(max(cov[i, i], 1e-300)) * np.sqrt(sandwich_factor(fit)))
     found = max(float(step[i]), 0.0)
     if not np.isfinite(found) or (found / std) ** 2 > 0.5 * np.log(fit.samples):
@@ -166,7 +156,7 @@ def may_rub(data: Experiments, fit: Fit, options: Options) -> bool:
     subset = of_kind(descent.screening_subset(data), fit)
     if subset.size < data.size:
         there = descent.refine(subset, fit.structure, fit, fit.z, options)
-        if _lost_by_rubbing(subset, there, options) > SUBSET_HOPELESS.value:
+        if _lost_by_rubbing(subset, there, options) > POLICY.hopeless:
             return False
     return _lost_by_rubbing(data, fit, options) < RISE
 

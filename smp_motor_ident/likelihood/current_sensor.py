@@ -28,7 +28,7 @@ from smp_motor_ident.likelihood.sensitivities import (
     ST,
     SW,
 )
-from smp_motor_ident.model.structures import CURRENT_LAG, LN_R, OFFSET
+from smp_motor_ident.model.columns import CURRENT_LAG, LN_R, OFFSET
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -29,7 +29,7 @@ from smp_motor_ident.likelihood.sensitivities import (
     stay,
     turn,
 )
-from smp_motor_ident.model.structures import VC_MINUS, VC_PLUS
+from smp_motor_ident.model.columns import VC_MINUS, VC_PLUS
 
 Array = NDArray[np.float64]
 

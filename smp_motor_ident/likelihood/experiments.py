@@ -9,9 +9,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.hold import held_intervals, rerun
 from smp_motor_ident.likelihood.standstill import stands
+from smp_motor_ident.model.measurement import ANGLE, MEAN_SPEED, SPEED, Measurement
 from smp_motor_ident.record import Record
 
 Array = NDArray[np.float64]
@@ -44,7 +44,7 @@ class Experiments:
     hold_end: Array
     hold_value: Array
     hold_start: Integers
-    kind: int  # SPEED, ANGLE or MEAN_SPEED
+    kind: Measurement  # what the output shows
     step: float  # median sampling interval [s]
     quantum: float  # resolution of the output [rad or rad/s]; 0 where it has none
     # shape (g, 5), of each segment: first guess of q (0), speed, angle, load, and of what the
@@ -97,7 +97,7 @@ class Experiments:
 
     def as_mean_speed(self) -> Experiments:
         """Return the same experiments, the speed taken for a mean over a trailing window."""
-        return replace(self, kind=rc.MEAN_SPEED)
+        return replace(self, kind=MEAN_SPEED)
 
     def held(self, how: str) -> Experiments:
         """Return the same experiments, a row's command taken to run before it (as they are), after
@@ -161,7 +161,7 @@ class Experiments:
         )
 
 
-def output_of(record: Record, kind: str = "auto") -> tuple[Array, int, float]:
+def output_of(record: Record, kind: str = "auto") -> tuple[Array, Measurement, float]:
     """Choose the mechanical output of a record: counts before angle before speed."""
     per_turn = record.hardware.counts_per_revolution
     if kind != "speed":
@@ -169,17 +169,17 @@ def output_of(record: Record, kind: str = "auto") -> tuple[Array, int, float]:
             quantum = 2 * np.pi / per_turn
             angle = (record.count - record.count[0]) * quantum
             angle[_repeats(record.count, record.starts)] = np.nan
-            return angle, rc.ANGLE, quantum
+            return angle, ANGLE, quantum
         if record.position is not None and np.isfinite(record.position).sum() > 2:
             angle = record.position - record.position[np.isfinite(record.position)][0]
             quantum = angle_quantum(angle)
             if quantum > 0 and np.all(np.isfinite(angle)):
                 count = np.rint(angle / quantum).astype(np.int64)
                 angle[_repeats(count, record.starts)] = np.nan
-            return angle, rc.ANGLE, quantum
+            return angle, ANGLE, quantum
     if record.velocity is None:
         raise ValueError("record has no velocity")
-    mean = rc.MEAN_SPEED if record.velocity_window > 0 else rc.SPEED
+    mean = MEAN_SPEED if record.velocity_window > 0 else SPEED
     return record.velocity, mean, speed_quantum(record.velocity)
 
 
@@ -308,7 +308,7 @@ def prepare(
     )
 
 
-def dithered(values: Array, kind: int | None, rng: np.random.Generator) -> Array:
+def dithered(values: Array, kind: Measurement | None, rng: np.random.Generator) -> Array:
     """Return an angle, a speed or a current as the finest sensor of it reads.
 
     A signal without any noise, as simulators write it, would weigh without bound beside another,
@@ -316,7 +316,7 @@ def dithered(values: Array, kind: int | None, rng: np.random.Generator) -> Array
     """
     known = values[np.isfinite(values)]
     range_ = float(np.ptp(known)) if known.size else 0.0
-    step = FINEST_ENCODER if kind == rc.ANGLE else FINEST_SENSOR * range_
+    step = FINEST_ENCODER if kind == ANGLE else FINEST_SENSOR * range_
     return np.asarray(values + step * rng.uniform(-0.5, 0.5, values.size))
 
 
@@ -324,7 +324,7 @@ def _join(arrays: Sequence[Array]) -> Array:
     return np.ascontiguousarray(arrays[0]) if len(arrays) == 1 else np.concatenate(arrays)
 
 
-def _initial(time: Array, output: Array, starts: Integers, kind: int) -> Array:
+def _initial(time: Array, output: Array, starts: Integers, kind: Measurement) -> Array:
     initial = np.zeros((len(starts) - 1, 5))
     for g in range(len(starts) - 1):
         a, b = int(starts[g]), int(min(starts[g + 1], starts[g] + 6))
@@ -333,7 +333,7 @@ def _initial(time: Array, output: Array, starts: Integers, kind: int) -> Array:
         if not ok.any():
             continue
         y, t = y[ok], t[ok]
-        if kind == rc.ANGLE:
+        if kind == ANGLE:
             initial[g, 2] = y[0]
             moved = int(np.argmax(y != y[0]))  # one that is taken to stand may be held by friction
             if moved:

@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident._compile import compiled
-from smp_motor_ident.likelihood import recursion
 from smp_motor_ident.likelihood.propagator import BE, TE, TM, WIDTH, K, first_order, second_order
-from smp_motor_ident.model.structures import LN_R, to_internal
+from smp_motor_ident.model.coordinates import Coordinates
+from smp_motor_ident.model.measurement import ANGLE, Measurement
+from smp_motor_ident.model.structure import Structure
 
 Array = NDArray[np.float64]
 
@@ -71,9 +72,9 @@ def _row(h: float, te: float, tm: float, k: float, be: float) -> Array:
     return row
 
 
-def transition(z: Array, order: int, step: float) -> Array:
+def transition(structure: Structure, z: Coordinates, step: float) -> Array:
     """Return how voltage over the resistance, speed and angle follow from those a step before."""
-    par, _ = to_internal(z, order)
+    par, _ = structure.internal(z)
     row = _row(step, par[TE], par[TM], par[K], par[BE])
     return np.array([[row[0], row[1], 0.0], [row[2], row[3], 0.0], [row[4], row[5], 1.0]])
 
@@ -146,16 +147,22 @@ CLOSEST = 0.95  # correlation of two outputs' residuals
 
 
 def kalman_gain(
-    z: Array, order: int, kind: int, step: float, noise_ratio: float, current_noise: float
+    structure: Structure,
+    z: Coordinates,
+    kind: Measurement,
+    step: float,
+    noise_ratio: float,
+    current_noise: float,
 ) -> tuple[Array, Array]:
     """Return the steady innovation gain of the sliding motor under torque noise."""
     gain = np.zeros((3, 2))
     innovation = np.diag([1.0, current_noise if current_noise > 0 else 1.0])
-    if noise_ratio <= 0 or kind != recursion.ANGLE:
+    if noise_ratio <= 0 or kind != ANGLE:
         return gain, innovation
-    par, _ = to_internal(z, order)
+    par, _ = structure.internal(z)
+    resistance = float(np.exp(z.ln_r))
     found, spread = steady_gain(
-        par[TE], par[TM], par[K], par[BE], par[LN_R], step, noise_ratio, current_noise
+        par[TE], par[TM], par[K], par[BE], resistance, step, noise_ratio, current_noise
     )
     if not np.all(np.isfinite(found)):
         return gain, innovation
@@ -163,20 +170,26 @@ def kalman_gain(
 
 
 def gain_for(
-    z: Array, order: int, kind: int, step: float, noise_ratio: float, noise: Array, current: bool
+    structure: Structure,
+    z: Coordinates,
+    kind: Measurement,
+    step: float,
+    noise_ratio: float,
+    noise: Array,
+    current: bool,
 ) -> Array:
     """Return the innovation gain that goes with a covariance of the innovations."""
     if noise_ratio <= 0:
         return NO_GAIN
     relative = float(noise[1, 1] / noise[0, 0]) if current else 0.0
-    gain, innovation = kalman_gain(z, order, kind, step, noise_ratio, relative)
+    gain, innovation = kalman_gain(structure, z, kind, step, noise_ratio, relative)
     for _ in range(3):  # noise holds innovations; the ratio of the sensors' own is wanted
         if not current:
             break
         relative = float(
             (noise[1, 1] / innovation[1, 1] * relative) / (noise[0, 0] / innovation[0, 0])
         )
-        gain, innovation = kalman_gain(z, order, kind, step, noise_ratio, relative)
+        gain, innovation = kalman_gain(structure, z, kind, step, noise_ratio, relative)
     return gain
 
 

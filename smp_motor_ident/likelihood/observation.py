@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from smp_motor_ident._compile import compiled, inlined
 from smp_motor_ident.likelihood.sensitivities import D0, D1, LANES, SLOPE, SQ, ST, SW
-from smp_motor_ident.model.structures import LN_R, OFFSET, WINDOW
+from smp_motor_ident.model import measurement
+from smp_motor_ident.model.columns import LN_R, OFFSET, WINDOW
 
 Array = NDArray[np.float64]
 
@@ -56,8 +57,7 @@ def recall(ring: Array, k: int, first: int, t: float, p: int, past: Array) -> fl
     return float(d * (b[1] - a[1]) + (1 - u) * (1 - 3 * u) * a[2] + u * (3 * u - 2) * b[2])
 
 
-SPEED, ANGLE, MEAN_SPEED = range(3)  # what the mechanical output is
-
+ANGLE, MEAN_SPEED = measurement.ANGLE.code, measurement.MEAN_SPEED.code
 ON_OFFSET, ON_R = SLOPE + OFFSET * LANES, SLOPE + LN_R * LANES
 ON_WINDOW = SLOPE + WINDOW * LANES
 

@@ -19,8 +19,10 @@ from smp_motor_ident.likelihood.linear_pass import run_sliding, squares_sliding
 from smp_motor_ident.likelihood.noise import NoiseModel, whitening
 from smp_motor_ident.likelihood.normal_equations import eliminate
 from smp_motor_ident.likelihood.sensitivities import LANES
-from smp_motor_ident.model import structures as models
-from smp_motor_ident.model.structures import Structure, to_internal
+from smp_motor_ident.model.columns import CURRENT_LAG, WINDOW
+from smp_motor_ident.model.coordinates import Coordinates
+from smp_motor_ident.model.measurement import ANGLE, MEAN_SPEED
+from smp_motor_ident.model.structures import SENSORS, Structure, sensor_of
 
 Array = NDArray[np.float64]
 
@@ -99,7 +101,7 @@ def row_starts(data: Experiments, together: int) -> NDArray[np.int64]:
 def answers(
     data: Experiments,
     structure: Structure,
-    z: Array,
+    z: Coordinates,
     initial: Array,
     noise: NoiseModel,
     signals: tuple[Array, Array],
@@ -107,7 +109,7 @@ def answers(
     own: bool,
 ) -> Array:
     """Return what own columns and signals (`Beside`) change in the predictions, summed by rows."""
-    count = own * (structure.matrix().shape[1] + len(own_columns(data, structure)))
+    count = own * (structure.matrix.shape[1] + len(own_columns(data, structure)))
     width = count + max(signals[0].shape[-1], signals[1].shape[-1])
     sums = np.zeros((row_starts(data, together).size, 1 + (data.current.size > 0), width))
     beside = Beside(*signals, sums, together)
@@ -117,7 +119,7 @@ def answers(
 
 def own_columns(data: Experiments, structure: Structure) -> tuple[int, ...]:
     """Return which of (q, w, angle, load, earlier current) each segment has to itself."""
-    angle = (2,) if data.kind == recursion.ANGLE else ()
+    angle = (2,) if data.kind == ANGLE else ()
     own = (1,) if structure.order == 1 else (0, 1)
     earlier = (4,) if structure.lags else ()
     return own + angle + ((3,) if structure.own_load else ()) + earlier
@@ -126,7 +128,7 @@ def own_columns(data: Experiments, structure: Structure) -> tuple[int, ...]:
 def gather(
     data: Experiments,
     structure: Structure,
-    z: Array,
+    z: Coordinates,
     initial: Array,
     noise: NoiseModel | None = None,
     predicted: Array | None = None,
@@ -136,12 +138,10 @@ def gather(
 ) -> Sums:
     """Run over the data once; scores are summed over about so many runs of samples."""
     noise = NoiseModel() if noise is None else noise
-    par, internal = to_internal(z, structure.order)
+    par, internal = structure.internal(z)
     # A motor drawn at random near another may have any lag: no sensor is early.
-    par[models.CURRENT_LAG] = max(par[models.CURRENT_LAG], LEAST_LAG * data.step)
-    slope = (
-        np.ascontiguousarray(internal @ structure.matrix()) if differentiate else internal[:, :0]
-    )
+    par[CURRENT_LAG] = max(par[CURRENT_LAG], LEAST_LAG * data.step)
+    slope = np.ascontiguousarray(internal @ structure.matrix) if differentiate else internal[:, :0]
     own = np.array(own_columns(data, structure) if differentiate else (), dtype=np.int64)
     p, segments = slope.shape[1] + own.size, len(data.starts) - 1
     length = max(1, -(-data.size // blocks))
@@ -149,7 +149,7 @@ def gather(
     scores, owner = np.empty((rows, p)), np.empty(rows, dtype=np.int64)
     normal, gradient, cost = np.empty((segments, p, p)), np.empty((segments, p)), np.zeros(segments)
     spread = np.zeros(6)
-    angle = data.kind == recursion.ANGLE
+    angle = data.kind == ANGLE
     if predicted is None and beside is NOTHING and _slides(data, structure, z, noise):
         if p == 0:
             spread[0], spread[3] = squares_sliding(
@@ -166,10 +166,10 @@ def gather(
     else:
         used = recursion.run(
             data.time, data.starts, data.hold_end, data.hold_value, data.hold_start,
-            data.output, data.current, data.kind, structure.friction != "none", par, slope,
+            data.output, data.current, data.kind.code, structure.friction != "none", par, slope,
             initial, own, noise.gain, whitening(noise.covariance), noise.huber, normal, gradient,
             cost, spread, length, scores, owner, _ring(data, par, max(p, beside.answers.shape[-1])),
-            models.SENSORS.index(structure.current_sensor) if structure.current else 0,
+            SENSORS.index(sensor_of(structure)),
             _trail(data, structure, par), np.zeros((0, 3)) if predicted is None else predicted,
             data.jittered, beside.voltage, beside.added, beside.answers, beside.together,
         )  # fmt: skip
@@ -178,16 +178,16 @@ def gather(
 
 def _ring(data: Experiments, par: Array, p: int) -> Array:
     """Return the memory for the window of a mean speed."""
-    if data.kind != recursion.MEAN_SPEED:
+    if data.kind != MEAN_SPEED:
         return np.zeros((0, 0))
-    return np.zeros((_depth(data, par[recursion.WINDOW]), 3 + 2 * p))
+    return np.zeros((_depth(data, par[WINDOW]), 3 + 2 * p))
 
 
 def _trail(data: Experiments, structure: Structure, par: Array) -> Array:
     """Return the memory for the window of a mean current."""
-    if not structure.lags or structure.current_sensor != "averaged":
+    if sensor_of(structure) != "averaged":
         return np.zeros((0, 0))
-    return np.zeros((_depth(data, 2 * par[models.CURRENT_LAG]), 2 + LANES))
+    return np.zeros((_depth(data, 2 * par[CURRENT_LAG]), 2 + LANES))
 
 
 def _depth(data: Experiments, width: float) -> int:
@@ -198,13 +198,13 @@ def _depth(data: Experiments, width: float) -> int:
     return min(4 + math.ceil(width / float(steps[steps > 0].min())), data.size + 1)
 
 
-def _slides(data: Experiments, structure: Structure, z: Array, noise: NoiseModel) -> bool:
+def _slides(data: Experiments, structure: Structure, z: Coordinates, noise: NoiseModel) -> bool:
     """Tell whether `cascade.run_sliding` does: nothing happens between the samples."""
     return bool(
         structure.friction == "none"
         and not structure.delay
-        and z[models.DELAY] == 0.0
-        and data.kind != recursion.MEAN_SPEED
+        and z.delay == 0.0
+        and data.kind != MEAN_SPEED
         and not data.current.size
         and noise.huber == math.inf
         and not noise.gain.any()
@@ -215,7 +215,7 @@ def _slides(data: Experiments, structure: Structure, z: Array, noise: NoiseModel
 def evaluate(
     data: Experiments,
     structure: Structure,
-    z: Array,
+    z: Coordinates,
     initial: Array,
     start: Array,
     noise: NoiseModel,
@@ -223,13 +223,13 @@ def evaluate(
 ) -> Pass:
     """Run, add what is known beforehand, and eliminate the initial states."""
     own = own_columns(data, structure)
-    segments, f, o = len(data.starts) - 1, structure.matrix().shape[1], len(own)
+    segments, f, o = len(data.starts) - 1, structure.matrix.shape[1], len(own)
     common, score = np.zeros((f, f)), np.zeros(f)
     step, local_gain = np.zeros((segments, o)), np.zeros((segments, o, f))
     nowhere = Pass(math.inf, np.zeros((f, f)), np.zeros(f), np.zeros_like(step),
                    np.zeros_like(local_gain), 0.0, np.full(6, np.nan),
                    np.zeros((0, f)))  # fmt: skip
-    if not np.isfinite(z).all():  # what predicts no number misses no measurement
+    if not np.isfinite(z.array).all():  # what predicts no number misses no measurement
         return nowhere
     sums = gather(data, structure, z, initial, noise)
     total = float(sums.cost.sum())
@@ -238,9 +238,9 @@ def evaluate(
         score += row * miss
         total += miss * miss
     known = data.known_initial
-    unseen = own[0] == 0 and not structure.current  # a measured current tells how it began
+    uncurbed = own[0] == 0 and not structure.current  # a measured current tells how it began
     both = np.stack([known[:, 0], known[:, 0] + sums.normal[:, f, f]])
-    occam = float(np.diff(np.log(both), axis=0).sum()) if unseen else 0.0
+    occam = float(np.diff(np.log(both), axis=0).sum()) if uncurbed else 0.0
     value, away = initial[:, list(own)], (initial - start)[:, list(own)]
     prior, decrease = eliminate(
         sums.normal, sums.gradient, away, value, known[:, list(own)], data.size,

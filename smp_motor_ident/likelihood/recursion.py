@@ -25,14 +25,7 @@ from smp_motor_ident.likelihood.current_sensor import (
 )
 from smp_motor_ident.likelihood.events import STUCK, advance, keeps_turning
 from smp_motor_ident.likelihood.normal_equations import ROOM, TILE, robust, sum_up
-from smp_motor_ident.likelihood.observation import (
-    ANGLE,
-    MEAN_SPEED,
-    SPEED,
-    note,
-    observe,
-    observe_current,
-)
+from smp_motor_ident.likelihood.observation import note, observe, observe_current
 from smp_motor_ident.likelihood.propagator import TE, TM
 from smp_motor_ident.likelihood.sensitivities import (
     ACTIVE,
@@ -58,9 +51,7 @@ from smp_motor_ident.likelihood.sensitivities import (
     tabulate,
     turn,
 )
-from smp_motor_ident.model.structures import CURRENT_LAG, DELAY, LOAD, VC_MINUS, VC_PLUS, WINDOW
-
-__all__ = ["ANGLE", "MEAN_SPEED", "SPEED", "WINDOW", "run"]
+from smp_motor_ident.model.columns import CURRENT_LAG, DELAY, LOAD, VC_MINUS, VC_PLUS
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]

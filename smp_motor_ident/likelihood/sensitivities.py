@@ -29,7 +29,7 @@ from smp_motor_ident.likelihood.propagator import (
     half_range,
     second_order,
 )
-from smp_motor_ident.model.structures import LOAD, VC_MINUS, VC_PLUS
+from smp_motor_ident.model.columns import LOAD, VC_MINUS, VC_PLUS
 
 Array = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident.likelihood import recursion as rc
+from smp_motor_ident.model.measurement import ANGLE, Measurement
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -26,7 +26,7 @@ ON = 0.05  # of the largest voltage
 
 
 def stands(
-    time: Array, output: Array, voltage: Array, starts: Integers, kind: int, quantum: float
+    time: Array, output: Array, voltage: Array, starts: Integers, kind: Measurement, quantum: float
 ) -> Flags:
     """Tell of each segment whether the motor still stands while it is driven, shape (g,)."""
     out = np.zeros(len(starts) - 1, dtype=np.bool_)
@@ -39,13 +39,13 @@ def stands(
     return out
 
 
-def _stands(t: Array, y: Array, kind: int, quantum: float) -> bool:
+def _stands(t: Array, y: Array, kind: Measurement, quantum: float) -> bool:
     """Tell whether one segment begins with a standstill.
 
     What starts or turns around at a constant acceleration takes twice as long from one speed to
     its treble, or from one angle to nine times it, as it took to get there.
     """
-    if kind == rc.ANGLE:
+    if kind == ANGLE:
         away = np.abs(y - y[0])
         near = max(1.5 * quantum, SLIGHT * float(np.ptp(y)))
         far = 9 * near

@@ -14,13 +14,12 @@ import msgspec
 import numpy as np
 import yaml
 
+from smp_motor_control.motor.parameters import COMBINATIONS, PHYSICAL
 from smp_motor_ident.errors import BagError, ParameterError
 from smp_motor_ident.result import Estimate, Quantity
 
 SCHEMA = 1
-PHYSICAL = ("resistance", "inductance", "motor_constant", "inertia", "viscous_friction")
 POSITIVE = ("resistance", "inductance", "motor_constant", "inertia", "dc_gain")
-COMBINATIONS = ("dc_gain", "time_constant", "time_constant_product", "static_voltage")
 
 
 def identification_document(estimates: Mapping[str, Estimate]) -> dict[str, Any]:
@@ -111,8 +110,8 @@ def motor_entry(estimate: Estimate) -> dict[str, float | int]:
     of the same response from voltage to speed.
     """
     parameters = estimate.parameters
-    physical = all(_known(parameters.get(name)) for name in PHYSICAL)
-    names = (*PHYSICAL, "coulomb_friction") if physical else COMBINATIONS
+    physical = all(_known(parameters.get(name)) for name in PHYSICAL[:5])
+    names = PHYSICAL if physical else COMBINATIONS
     held = parameters if physical else estimate.combinations
     entry: dict[str, float | int] = {
         name: float(estimate.value(name)) for name in names if _known(held.get(name))

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
+from smp_motor_control.motor.parameters import COMBINATIONS, PHYSICAL
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.result import Estimate, Quantity
@@ -18,8 +19,6 @@ from smp_motor_ident.tune.limits import (
     UNRELIABLE_SPREAD,
 )
 
-PHYSICAL = ("resistance", "inductance", "motor_constant", "inertia", "viscous_friction")
-COMBINATIONS = ("dc_gain", "time_constant", "time_constant_product")
 SENSOR = ("delay", "averaging_window", "sensor_lag")
 """What stands between the motor's speed and the one that is reported: [s] each."""
 
@@ -225,9 +224,9 @@ def unreliable_spread(estimate: Estimate) -> float:
 
 def _names(estimate: Estimate) -> tuple[str, ...]:
     if estimate.value("dc_gain") and estimate.value("time_constant"):
-        return (*COMBINATIONS, "static_voltage", *SENSOR)
+        return (*COMBINATIONS, *SENSOR)
     if all(estimate.value(n) for n in ("resistance", "motor_constant", "inertia")):
-        return (*PHYSICAL, "coulomb_friction", *SENSOR)
+        return (*PHYSICAL, *SENSOR)
     advice = "; ".join(f.advice for f in estimate.findings if f.advice)
     raise DesignError(
         f"{estimate.wheel}: the estimate holds neither dc_gain and time_constant nor all physical "
@@ -243,7 +242,7 @@ def _motors(estimate: Estimate, value: dict[str, Array]) -> Motors:
         a2 = value["time_constant_product"] * a0
         static = value["static_voltage"]
     else:
-        R, L, K, J, b = (value[name] for name in PHYSICAL)
+        R, L, K, J, b = (value[name] for name in PHYSICAL[:5])
         a0, a1, a2 = (R * b + K * K) / K, (R * J + L * b) / K, L * J / K
         static = R * value["coulomb_friction"] / K
     if not (np.all(a0 > 0) and np.all(a1 > 0) and np.all(a2 >= 0) and np.all(np.isfinite(a0))):

@@ -112,25 +112,22 @@ def top_speed(plant: Plant, supply: float) -> float:
     return float((HEADROOM * supply - m.static_voltage[0]) / m.a0[0])
 
 
-def plan_reference(
-    plant: Plant,
-    loop: Loop,
-    controller: Controller,
-    *,
-    least: float = 0.0,
-    max_velocity: float | None = None,
-    max_acceleration: float | None = None,
-    transition_time: float | None = None,
-    together: bool = False,
-    bearable: float = math.inf,
-) -> Reference:
-    """Return the fastest reference that the motor can follow without overshoot.
+@dataclass(frozen=True)
+class Wanted:
+    """What a user asks of the reference, at the motor shaft; None: as fast as can be."""
 
-    Of a delay that may be longer than usual it takes no more than is ``bearable`` [s].
-    """
+    max_velocity: float | None = None  # [rad/s]
+    max_acceleration: float | None = None  # [rad/s^2]
+    transition_time: float | None = None  # [s]
+    together: bool = False  # whether all wheels change their speed in one time
+
+
+def plan_reference(
+    plant: Plant, loop: Loop, controller: Controller, wanted: Wanted, least: float = 0.0
+) -> Reference:
+    """Return the fastest reference, of ``least`` seconds, that is followed without overshoot."""
     ratio = loop.gear_ratio
-    loop = replace(loop, delay_doubt=min(loop.delay_doubt, bearable))
-    speed = _reachable(plant, loop, max_velocity)
+    speed = _reachable(plant, loop, wanted.max_velocity)
     m = plant.motors
     drive = Drive(
         top_speed=(PEAK * loop.supply_voltage - float(m.static_voltage[0])) / float(m.a0[0]),
@@ -142,28 +139,28 @@ def plan_reference(
         max_acceleration=math.inf,
         transition_time=0.0,
         lag=measured_lag(plant, loop.expected_delay),
-        doubt=0.0 if together else loop.delay_doubt,
+        doubt=0.0 if wanted.together else loop.delay_doubt,
         drive=drive,
     )
     plan = _quickest(plant, loop, controller, plan, least)
     quickest = plan.transition_time
-    if max_acceleration is not None:
+    if (rate := wanted.max_acceleration) is not None:
         steepest = _steepest(plant, loop, speed, quickest)
-        if max_acceleration > steepest:
+        if rate > steepest:
             raise DesignError(
-                f"max_acceleration {max_acceleration / ratio:.4g} rad/s^2 is beyond the motor: a "
+                f"max_acceleration {rate / ratio:.4g} rad/s^2 is beyond the motor: a "
                 f"change by {speed / ratio:.3g} rad/s within {PEAK:.0%} of "
                 f"{loop.supply_voltage:g} V reaches {steepest / ratio:.4g} rad/s^2; ask for that "
                 "or less"
             )
-        plan = replace(plan, max_acceleration=max_acceleration)
-    if transition_time is not None:
-        if transition_time < quickest - 1e-9:
+        plan = replace(plan, max_acceleration=rate)
+    if (duration := wanted.transition_time) is not None:
+        if duration < quickest - 1e-9:
             raise DesignError(
-                f"transition_time {transition_time:.4g} s is too short for the loop: without "
+                f"transition_time {duration:.4g} s is too short for the loop: without "
                 f"overshoot a change takes at least {quickest:.3g} s; ask for that or more"
             )
-        plan = replace(plan, transition_time=transition_time)
+        plan = replace(plan, transition_time=duration)
     return plan
 
 

@@ -57,7 +57,8 @@ def choose_source(estimate: Estimate, loop: Loop, **targets: Any) -> tuple[Loop,
         for w in WINDOWS
         if noisy and w > loop.difference_window
     ]
-    watched = _trial(estimate, replace(loop, speed_source="observer"), targets)
+    lacks = _lacking(estimate)
+    watched = None if lacks else _trial(estimate, replace(loop, speed_source="observer"), targets)
     best = usual
     longer = max((t for t in windows if t is not None), key=lambda t: t.integral, default=None)
     for trial, worth in ((longer, WORTH_WINDOW), (watched, WORTH_OBSERVER)):
@@ -71,7 +72,16 @@ def choose_source(estimate: Estimate, loop: Loop, **targets: Any) -> tuple[Loop,
         for t in (usual, longer, watched)
         if t is not None
     )
-    return best.loop, f"{best.name}: {compared}"
+    return best.loop, f"{best.name}: {compared}{lacks}"
+
+
+def _lacking(estimate: Estimate) -> str:
+    """Return in words why the model is not to be leaned on: its error shows what it lacks.
+
+    That may move no number, and still be what rings between motor and encoder.
+    """
+    shown = (f for f in estimate.findings if "explained_deviance" in f.evidence)
+    return next((f"; not the observer, which leans on the model: {f.message}" for f in shown), "")
 
 
 def _trial(estimate: Estimate, loop: Loop, targets: dict[str, Any]) -> Trial | None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import independent
 import numpy as np
 
-from smp_motor_ident.model import structures as models
+from smp_motor_ident.model.physical import from_physical, physical
+from smp_motor_ident.model.structures import SecondOrder
 from smp_motor_ident.record import Hardware, Record
 
 QUANTUM = 2 * np.pi / 500
@@ -16,8 +17,9 @@ def truth(wheel: str, static_voltage: float) -> dict[str, float]:
     """Return parameters and combinations of a motor of Table 1 with Coulomb friction."""
     p = independent.TABLE_1[wheel]
     coulomb = static_voltage * p[2] / p[0]
-    z = models.from_physical(*p, coulomb)
-    return {**models.physical(z)[0], **models.combinations(z, 2)[0]}
+    z = from_physical(*p, coulomb)
+    seen = SecondOrder().combinations(z)
+    return {**physical(z), **{n: value for n, (value, _) in seen.items()}}
 
 
 def record(

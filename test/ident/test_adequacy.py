@@ -14,7 +14,7 @@ from smp_motor_ident.estimate import estimate
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import prepare
-from smp_motor_ident.model.structures import Structure
+from smp_motor_ident.model.structures import StaticGain
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import Quantity, ResidualTests
 
@@ -129,7 +129,7 @@ def test_intervals_of_clean_errors_are_widened_as_seldom_as_stated():
 
 def estimation_fit() -> Fit:
     """A fit of one free coordinate, of which only that matters here."""
-    structure = Structure("static_gain", order=1, friction="none")
+    structure = StaticGain(friction="none")
     return Fit(
         np.zeros(12), np.zeros((1, 5)), np.eye(2), structure=structure, gain=np.zeros((3, 2)),
         objective=1.0, deviance=0.0, information=np.eye(1), scores=np.zeros((0, 1)), passes=1,

@@ -5,12 +5,13 @@ from dataclasses import replace
 import motors
 import numpy as np
 
-from smp_motor_ident.estimation.averaging import averaged, weights
+from smp_motor_ident.estimation.averaging import averaged, candidate_weights, covering, weights
 from smp_motor_ident.estimation.fitted import Options
 from smp_motor_ident.estimation.initialisation import initial_fit
-from smp_motor_ident.estimation.quantities import Answer
+from smp_motor_ident.estimation.quantities import Answer, answer
+from smp_motor_ident.estimation.selection import FittedCandidate
 from smp_motor_ident.likelihood.experiments import prepare
-from smp_motor_ident.model.structures import LN_R, Structure
+from smp_motor_ident.model.structures import Electromechanical
 from smp_motor_ident.result import Quantity
 
 
@@ -41,8 +42,24 @@ def test_a_candidate_that_is_rejected_changes_nothing():
 
 def test_a_candidate_that_only_the_current_rejects_has_no_weight():
     data = prepare([motors.record("rear_left", seconds=2.0)], True)
-    fit = initial_fit(data, Structure("electromechanical", current=True), Options())
+    fit = initial_fit(data, Electromechanical(), Options())
     # Of another resistance, and all torques with it, the motor turns just alike.
-    other = replace(fit, z=fit.z + 0.02 * np.eye(fit.z.size)[LN_R])
+    other = replace(fit, z=fit.z.with_(ln_r=fit.z.ln_r + 0.02))
     assert weights(lambda _: data, [fit, other])[1] < 1e-6
     assert np.ptp(weights(lambda _: data, [fit, fit])) < 1e-9
+
+
+def test_a_candidate_that_did_not_settle_is_covered_as_far_as_it_explains_the_data():
+    data = prepare([motors.record("rear_left", seconds=2.0)], True)
+    fit = initial_fit(data, Electromechanical(), Options())
+    # Another lag by two deviations: in likelihood a fit that is hardly worse.
+    near = fit.z.with_(ln_a1=fit.z.ln_a1 + 2 * np.sqrt(fit.covariance()[1, 1]))
+    unsettled = FittedCandidate(replace(fit, z=near, converged=False))
+    lost = FittedCandidate(replace(fit, deviance=np.inf, converged=False))
+    own = answer(fit, {})
+    candidates = [lost, unsettled, FittedCandidate(fit)]
+    found, _ = covering(candidate_weights(data, candidates), candidates, own, {})
+    before, after = own.combinations["time_constant"], found.combinations["time_constant"]
+    other = answer(unsettled.fit, {}).combinations["time_constant"].value
+    assert after.std > before.std
+    assert min(before.value, other) < after.value < max(before.value, other)

@@ -16,12 +16,13 @@ from scipy.signal import lfilter
 from test_recursion import exact, predict
 
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.likelihood.noise import NO_GAIN, NoiseModel, kalman_gain
 from smp_motor_ident.likelihood.passes import gather
-from smp_motor_ident.model import structures as models
-from smp_motor_ident.model.structures import SENSORS, Structure
+from smp_motor_ident.model.coordinates import LOGARITHMS
+from smp_motor_ident.model.measurement import ANGLE
+from smp_motor_ident.model.physical import from_physical
+from smp_motor_ident.model.structures import SENSORS, Electromechanical
 from smp_motor_ident.record import Record
 
 WHEEL = "rear_left"
@@ -76,10 +77,10 @@ def test_a_sensor_shows_the_current_of_a_locked_rotor_as_the_formula_says(sensor
     else:
         both = te * np.exp(-time / te) - lag * np.exp(-time / lag)
         expected = 1 - both / (te - lag)
-    z = models.from_physical(R, L, K, J, B, 10.0 * K / R)  # friction that 5 V do not break
-    z[models.CURRENT_LAG] = lag
+    z = from_physical(R, L, K, J, B, 10.0 * K / R)  # friction that 5 V do not break
+    z = z.with_(current_lag=lag)
     data = replace(prepare([record], True), initial=np.zeros((1, 5)))
-    out = predict(data, Structure("electromechanical", current=True, current_sensor=sensor), z)
+    out = predict(data, Electromechanical(current_sensor=sensor), z)
     # The low-pass is kept 2e-5 apart from the winding's own pole.
     np.testing.assert_allclose(out[:, 2], 5.0 / R * expected, atol=5.0 / R * 2e-5)
 
@@ -92,8 +93,7 @@ def test_a_sensor_shows_the_current_of_a_motor_that_turns_and_sticks(sensor, lag
     step = data.step / FINE
     time = step * np.arange(fine.size)
     motion = independent.simulate(time, fine, R, L, K, J, B, 0.5 * K / R, 0.0 * time, 4)
-    z[models.CURRENT_LAG] = lag
-    out = predict(data, Structure("electromechanical", current=True, current_sensor=sensor), z)
+    out = predict(data, Electromechanical(current_sensor=sensor), z.with_(current_lag=lag))
     # Trapezoids of 25 us on a winding of 20 ms: (h/te)^2/12 = 1.3e-7 of 3.5 A, and four of these.
     expected = shown(motion[:, 0], step, sensor, lag, FINE)
     np.testing.assert_allclose(out[:, 2], expected, atol=3e-6)
@@ -104,14 +104,13 @@ def test_a_sensor_shows_the_current_of_a_motor_that_turns_and_sticks(sensor, lag
 @pytest.mark.parametrize("with_gain", [False, True])
 def test_gradient_by_the_lag_is_that_of_finite_differences(sensor, delay, with_gain):
     _, data, z = exact(seconds=2.0, kind="square")
-    structure = Structure(
-        "electromechanical", current=True, delay=delay > 0, offset=True, load=True,
-        current_sensor=sensor,
-    )  # fmt: skip
-    matrix = structure.matrix()
-    z = structure.complete(z) + matrix @ np.full(matrix.shape[1], 1e-3)
-    z[models.DELAY], z[models.CURRENT_LAG] = delay, 3.1e-3
-    gain = kalman_gain(z, 2, rc.ANGLE, data.step, 1e7, 0.0)[0] if with_gain else NO_GAIN
+    structure = Electromechanical(delay=delay > 0, offset=True, load=True, current_sensor=sensor)
+    matrix = structure.matrix
+    z = structure.complete(z).moved(matrix @ np.full(matrix.shape[1], 1e-3))
+    z = z.with_(delay=delay, current_lag=3.1e-3)
+    gain = NO_GAIN
+    if with_gain:
+        gain, _ = kalman_gain(structure, z, ANGLE, data.step, 1e7, 0.0)
     begun = np.array([[0.3, 2.0, 0.0, 0.0, 0.2]])
 
     def run(at):
@@ -119,8 +118,8 @@ def test_gradient_by_the_lag_is_that_of_finite_differences(sensor, delay, with_g
 
     gradient = run(z).gradient[0]
     for j in range(matrix.shape[1]):
-        step = 1e-6 if structure.free()[j] < models.VC_PLUS else 1e-7
-        up, down = run(z + step * matrix[:, j]).cost, run(z - step * matrix[:, j]).cost
+        step = 1e-6 if structure.free[j] in LOGARITHMS[:4] else 1e-7
+        up, down = (run(z.moved(way * step * matrix[:, j])).cost for way in (1, -1))
         numeric = -0.5 * (up[0] - down[0]) / (2 * step)
         scale = np.abs(gradient).max()
         # As without a sensor in test_recursion.py.
@@ -181,8 +180,7 @@ def test_a_record_may_begin_while_the_current_flows():
 def test_a_sensor_that_would_be_early_shows_the_current_at_once(sensor):
     # Motors are drawn at random around an estimate; a window of less than nothing has no end.
     _, data, z = exact(WHEEL, seconds=1.0)
-    z[models.CURRENT_LAG] = -1e-3
-    early = predict(data, Structure("electromechanical", current=True, current_sensor=sensor), z)
-    direct = predict(data, Structure("electromechanical", current=True), z)
+    early = predict(data, Electromechanical(current_sensor=sensor), z.with_(current_lag=-1e-3))
+    direct = predict(data, Electromechanical(), z)
     # A thousandth of a sample late: 5 us of what 12 V change in L.
     np.testing.assert_allclose(early[:, 2], direct[:, 2], atol=5e-6 * 2 * 12 / L)

@@ -7,11 +7,11 @@ import motors
 import numpy as np
 import pytest
 
+from smp_motor_control.motor.parameters import PHYSICAL
 from smp_motor_ident.diagnosis import validation
 from smp_motor_ident.diagnosis.identifiability import what_next
 from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.model.structures import PHYSICAL
 
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 # Of some fifty quantities tested one in 2000 passes four standard deviations by chance.

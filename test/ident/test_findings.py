@@ -10,6 +10,7 @@ from pathlib import Path
 import motors
 import numpy as np
 import pytest
+from independent import simulate
 from scipy.signal import lfilter
 
 from smp_motor_ident.bag import limits as recordings
@@ -133,3 +134,25 @@ def test_a_current_of_the_supply_looks_like_a_scale_under_one_size(kind: str, se
     about = next(f for f in found.findings if f.code == "current_scale")
     assert about.severity == severity
     assert ("supply" in about.message) is (severity == "warning")
+
+
+def test_a_current_that_was_given_up_for_a_filtered_speed_makes_the_answer_unreliable():
+    """One step at 50 Hz whose speed comes through a filter as slow as the motor: L/R takes it."""
+    r, el, k, j, b, tc, rate, n = 4.66, 0.0105, 0.104, 3.0e-4, 4.0e-4, 8.0e-3, 50.0, 150
+    t, rng = np.arange(n) / rate, np.random.default_rng(1)
+    volts = np.where(np.arange(n) < 9, 0.0, -10.0)
+    out = simulate(t, volts, r, el, k, j, b, tc, np.zeros(n), 400)
+    slow = np.zeros(n)
+    for m in range(1, n):  # 0.11 s, in one step a sample
+        slow[m] = slow[m - 1] + (out[m, 1] - slow[m - 1]) * (1 - np.exp(-1 / rate / 0.11))
+    amps = out[:, 0] + 0.014 * rng.standard_normal(n)
+    shown = Record("motor", t, volts, amps, slow + 0.24 * rng.standard_normal(n))
+    found = estimate(shown)
+    assert "poor_fit_of_current" in [f.code for f in found.findings if f.severity == "unreliable"]
+
+
+def test_a_current_that_is_mostly_noise_is_no_poor_fit():
+    good = motors.record("rear_left", seconds=3.0)
+    noise = 3.0 * np.std(good.current) * np.random.default_rng(0).standard_normal(len(good))
+    found = estimate(replace(good, current=good.current + noise))
+    assert "poor_fit_of_current" not in [f.code for f in found.findings]

@@ -15,7 +15,7 @@ from smp_motor_ident.estimate import estimate
 from smp_motor_ident.estimation.fit import Options
 from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.likelihood.experiments import prepare
-from smp_motor_ident.model.structures import Structure
+from smp_motor_ident.model.structures import SecondOrder
 from smp_motor_ident.record import Hardware, Record
 from smp_motor_ident.result import Estimate
 
@@ -95,7 +95,7 @@ def test_a_current_offset_is_found_beside_an_offset_of_the_driver() -> None:
 
 def test_a_step_out_of_all_bounds_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
     data = prepare([motors.record("rear_left", current=False, seconds=2.0)], False)
-    fit = initial_fit(data, Structure("second_order"), Options())
+    fit = initial_fit(data, SecondOrder(), Options())
     assert fit is not None
     here = noise_or_effect._linearised(data, fit, EFFECTS[:1], 1.0)
     assert here is not None

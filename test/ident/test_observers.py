@@ -13,7 +13,7 @@ from smp_motor_ident.diagnosis.observers import moved_by_slower
 from smp_motor_ident.estimation.fit import Fit, Options
 from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.likelihood.experiments import Experiments, prepare
-from smp_motor_ident.model.structures import Structure
+from smp_motor_ident.model.structures import SecondOrder
 
 
 def fitted(share: float, seed: int) -> tuple[Experiments, Fit]:
@@ -25,7 +25,7 @@ def fitted(share: float, seed: int) -> tuple[Experiments, Fit]:
     slow = lfilter([1 - a], [1.0, -a], made.voltage)
     record = replace(made, voltage=made.voltage - share * slow, velocity=None)
     data = prepare([record], False)
-    fit = initial_fit(data, Structure("second_order", friction="none"), Options())
+    fit = initial_fit(data, SecondOrder(friction="none"), Options())
     assert fit is not None and fit.noise_ratio > 0
     return data, fit
 

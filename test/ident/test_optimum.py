@@ -18,8 +18,9 @@ from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.likelihood.noise import NoiseModel, proper, renewed, whitening
 from smp_motor_ident.likelihood.normal_equations import cholesky_solve, damped_step, eliminate
 from smp_motor_ident.likelihood.passes import gather
-from smp_motor_ident.model import structures as models
-from smp_motor_ident.model.structures import Structure
+from smp_motor_ident.model.coordinates import Coordinates
+from smp_motor_ident.model.physical import from_physical
+from smp_motor_ident.model.structures import FirstOrder, SecondOrder
 from smp_motor_ident.record import Record
 
 STEP = 2e-3
@@ -54,7 +55,7 @@ def random_record(seed, n=3000, noise=0.5):
 def test_initial_fit_is_the_least_squares_optimum_that_scipy_finds_from_the_truth(seed):
     record, truth = random_record(seed)
     data = prepare([record], False)
-    fit = initial_fit(data, Structure("linear", friction="none"), Options())
+    fit = initial_fit(data, SecondOrder(friction="none"), Options())
 
     weight = np.sqrt(data.known_initial[0, 0] * fit.noise[0, 0])  # of the winding at first
 
@@ -64,21 +65,21 @@ def test_initial_fit_is_the_least_squares_optimum_that_scipy_finds_from_the_trut
 
     start = np.concatenate([truth, [0.0, record.velocity[0]]])
     found = least_squares(residual, start, x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15)
-    ours = np.concatenate([fit.z[:3], fit.initial[0, :2]])
+    ours = np.concatenate([fit.z.array[:3], fit.initial[0, :2]])
     cost = (residual(ours) ** 2).sum()
     # A wide prior on the initial states and the last step cost less than 1e-12, measured.
     assert cost == pytest.approx(2 * found.cost, rel=1e-9)
     deviation = np.sqrt(np.diag(fit.covariance()))
-    np.testing.assert_array_less(np.abs(fit.z[:3] - found.x[:3]), 1e-4 * deviation)
+    np.testing.assert_array_less(np.abs(fit.z.array[:3] - found.x[:3]), 1e-4 * deviation)
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_without_noise_the_initial_fit_returns_the_motor_itself(seed):
     record, truth = random_record(seed, noise=0.0)
     data = replace(prepare([record], False), output=record.velocity)  # not as a sensor reads it
-    fit = initial_fit(data, Structure("linear", friction="none"), Options())
+    fit = initial_fit(data, SecondOrder(friction="none"), Options())
     # Rounding of speeds of 1e2 rad/s, summed over the record.
-    np.testing.assert_allclose(fit.z[:3], truth, atol=1e-8)
+    np.testing.assert_allclose(fit.z.array[:3], truth, atol=1e-8)
 
 
 @pytest.mark.parametrize("kind", ["speed", "angle"])
@@ -91,10 +92,9 @@ def test_one_copy_of_the_motor_gives_the_sums_of_the_general_recursion(kind, ext
     lost[40:47] = np.nan
     record = replace(record, velocity=lost)
     data = prepare([record, record.slice(90, 400)], False, kind=kind)
-    structure = Structure("x", order, "none", **(extra if order == 2 else {}))
-    z = models.from_physical(3.3, 0.064, 0.03, 1.4e-5, 5.5e-5)
-    z[models.A1] += 0.1
-    z[models.LOAD] = 0.2
+    structure = SecondOrder("none", **extra) if order == 2 else FirstOrder("none")
+    z = from_physical(3.3, 0.064, 0.03, 1.4e-5, 5.5e-5)
+    z = z.with_(ln_a1=z.ln_a1 + 0.1, load=0.2)
     initial = data.initial[:, :4] + rng.uniform(-1, 1, (2, 4))
     noise = np.diag([0.3, 1.0])
     z = structure.complete(z)
@@ -170,12 +170,11 @@ def test_current_lost_at_every_other_sample_still_gives_the_motor():
 def test_a_start_outside_the_bounds_is_taken_to_them():
     record, _ = random_record(1)
     data = prepare([record], False).as_mean_speed()
-    structure = Structure("x", friction="none", window=True)
-    z = np.log([0.03, 1e-3, 1e-5, 1e-2, 1, 1, 1, 1, 1, 1, 1, 1])
-    z[models.WINDOW], z[models.TE] = -0.1, 1e4
+    structure = SecondOrder(friction="none", window=True)
+    z = Coordinates(*np.log([0.03, 1e-3, 1e-5])).with_(window=-0.1, ln_te=1e4)
     fit = solve(data, structure, Start(z, data.initial, first_noise(data)), iterations=3)
-    assert fit.z[models.WINDOW] > 0
-    assert np.all(np.isfinite(fit.z))
+    assert fit.z.window > 0
+    assert np.all(np.isfinite(fit.z.array))
 
 
 @pytest.mark.parametrize("broken", [np.nan, np.inf, -1.0, 0.0])
@@ -199,9 +198,9 @@ def test_information_of_a_motor_that_never_moves_is_finite():
     n = 400
     record = Record("motor", 0.01 * np.arange(n), np.zeros(n), velocity=np.zeros(n))
     data = prepare([record], False)
-    structure = Structure("x", friction="none", load=True)
+    structure = SecondOrder(friction="none", load=True)
     fit = initial_fit(
-        prepare([random_record(0)[0]], False), Structure("x", friction="none"), Options()
+        prepare([random_record(0)[0]], False), SecondOrder(friction="none"), Options()
     )
     gain, step, covariance = prediction.predicted_decrease(
         data, replace(fit, initial=data.initial), structure
@@ -220,8 +219,8 @@ def test_tabulated_propagators_of_jittered_stamps_are_the_exact_ones(order, fric
     assert data.jittered > 0
     exact = replace(data)
     exact.__dict__["jittered"] = 0.0
-    structure = Structure("x", order, friction)
-    z = structure.complete(models.from_physical(3.3, 0.064, 0.03, 1.4e-5, 5.5e-5, 2e-3))
+    structure = (FirstOrder, SecondOrder)[order - 1](friction)
+    z = structure.complete(from_physical(3.3, 0.064, 0.03, 1.4e-5, 5.5e-5, 2e-3))
     a, b = (gather(d, structure, z, data.initial) for d in (data, exact))
     # The polynomial is exact to 1e-13; sums cancel by some orders more.
     np.testing.assert_allclose(a.cost, b.cost, rtol=1e-9)

@@ -7,12 +7,13 @@ import motors
 import numpy as np
 import pytest
 
-from smp_motor_ident.likelihood import recursion as rc
 from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.likelihood.noise import NO_GAIN, NoiseModel, kalman_gain
 from smp_motor_ident.likelihood.passes import answers, evaluate, gather
-from smp_motor_ident.model import structures as models
-from smp_motor_ident.model.structures import Structure
+from smp_motor_ident.model.coordinates import LOGARITHMS, NAMES, Coordinates
+from smp_motor_ident.model.measurement import ANGLE, MEAN_SPEED
+from smp_motor_ident.model.physical import from_physical
+from smp_motor_ident.model.structures import Electromechanical, FirstOrder, SecondOrder
 
 
 def predict(data, structure, z, gain=NO_GAIN):
@@ -26,14 +27,14 @@ def exact(wheel="front_left", static_voltage=0.5, kind="fourier", seconds=4.0):
     data = prepare([recording], True)
     data = replace(data, initial=np.zeros((1, 5)))
     p = independent.TABLE_1[wheel]
-    z = models.from_physical(*p, static_voltage * p[2] / p[0])
+    z = from_physical(*p, static_voltage * p[2] / p[0])
     return recording, data, z
 
 
 @pytest.mark.parametrize("kind", ["sine", "square", "fourier"])
 def test_sticking_and_reversal_inside_the_step_match_a_simulation_in_small_steps(kind):
     recording, data, z = exact(kind=kind)
-    structure = Structure("electromechanical", current=True)
+    structure = Electromechanical()
     r, el, k, j, b = independent.TABLE_1["front_left"]
     small = independent.simulate(
         recording.time, recording.voltage, r, el, k, j, b, 0.5 * k / r,
@@ -49,24 +50,21 @@ def test_sticking_and_reversal_inside_the_step_match_a_simulation_in_small_steps
 @pytest.mark.parametrize("with_gain", [False, True])
 def test_gradient_is_that_of_finite_differences_through_all_events(delay, with_gain):
     _, data, z = exact(seconds=3.0)
-    structure = Structure(
-        "electromechanical", current=True, delay=delay > 0, offset=True, load=True
-    )
-    z = structure.complete(z) + 0.0
-    z[models.DELAY] = delay
-    matrix = structure.matrix()
-    z = z + matrix @ np.full(matrix.shape[1], 1e-3)
+    structure = Electromechanical(delay=delay > 0, offset=True, load=True)
+    matrix = structure.matrix
+    z = structure.complete(z).with_(delay=delay)
+    z = z.moved(matrix @ np.full(matrix.shape[1], 1e-3))
     gain = NO_GAIN.copy()
     if with_gain:
-        gain, _ = kalman_gain(z, 2, rc.ANGLE, data.step, 1e7, 0.5)
+        gain, _ = kalman_gain(structure, z, ANGLE, data.step, 1e7, 0.5)
 
     def run(at):
         return gather(data, structure, at, data.initial, NoiseModel(np.diag([1e-4, 1e-4]), gain))
 
     gradient = run(z).gradient
     for j in range(matrix.shape[1]):
-        step = 1e-6 if structure.free()[j] < models.VC_PLUS else 1e-7
-        up, down = run(z + step * matrix[:, j]).cost, run(z - step * matrix[:, j]).cost
+        step = 1e-6 if structure.free[j] in LOGARITHMS[:4] else 1e-7
+        up, down = (run(z.moved(way * step * matrix[:, j])).cost for way in (1, -1))
         numeric = -0.5 * (up[0] - down[0]) / (2 * step)
         scale = np.abs(gradient[0]).max()
         # A whole delay of samples and the sticking have kinks; elsewhere 1e-3 is rounding.
@@ -75,10 +73,9 @@ def test_gradient_is_that_of_finite_differences_through_all_events(delay, with_g
 
 def test_delay_of_whole_samples_equals_a_shifted_input():
     recording, data, z = exact(static_voltage=0.3)
-    structure = Structure("second_order", delay=True)
+    structure = SecondOrder(delay=True)
     z = structure.complete(z)
-    late = z.copy()
-    late[models.DELAY] = 2 * data.step
+    late = z.with_(delay=2 * data.step)
     v = recording.voltage
     shifted = replace(recording, voltage=np.concatenate([[v[0], v[0]], v[:-2]]), current=None)
     plain = replace(prepare([shifted], False), initial=np.zeros((1, 5)))
@@ -89,12 +86,11 @@ def test_delay_of_whole_samples_equals_a_shifted_input():
 
 def test_mean_speed_over_a_window_is_the_difference_of_angles():
     _, data, z = exact(static_voltage=0.0)
-    structure = Structure("second_order", friction="none", window=True)
-    z = structure.complete(z)
-    z[models.WINDOW] = 4 * data.step
+    structure = SecondOrder(friction="none", window=True)
+    z = structure.complete(z).with_(window=4 * data.step)
     data = replace(data, current=np.zeros(0))
-    angle = predict(replace(data, kind=rc.ANGLE), structure, z)[:, 1]
-    mean = predict(replace(data, kind=rc.MEAN_SPEED), structure, z)[:, 1]
+    angle = predict(replace(data, kind=ANGLE), structure, z)[:, 1]
+    mean = predict(replace(data, kind=MEAN_SPEED), structure, z)[:, 1]
     np.testing.assert_allclose(mean[4:], (angle[4:] - angle[:-4]) / (4 * data.step), rtol=1e-9)
 
 
@@ -108,16 +104,16 @@ def test_irregular_stamps_are_taken_as_they_are():
                         current=small[:, 0], count=np.zeros(800, dtype=np.int64))  # fmt: skip
     recording = replace(recording, count=(small[:, 2] / motors.QUANTUM).astype(np.int64))
     data = replace(prepare([recording], True), initial=np.zeros((1, 5)))
-    z = models.from_physical(*p, 0.2 * p[2] / p[0])
-    out = predict(data, Structure("electromechanical", current=True), z)
+    z = from_physical(*p, 0.2 * p[2] / p[0])
+    out = predict(data, Electromechanical(), z)
     np.testing.assert_allclose(out[:, 0], small[:, 1], atol=0.05)  # as above
 
 
 def test_coordinates_that_are_no_numbers_are_no_motor_and_no_crash():
     data = prepare([motors.record("rear_left", current=False, seconds=1.0)], False, "speed")
     data = data.as_mean_speed()
-    structure = Structure("first_order", order=1, window=True)
-    z = np.full(len(models.Z_NAMES), np.nan)  # as a descent's overflow leaves it
+    structure = FirstOrder(window=True)
+    z = Coordinates.of(np.full(len(NAMES), np.nan))  # as a descent's overflow leaves it
     found = evaluate(data, structure, z, data.initial, data.initial, NoiseModel())
     assert found.objective == np.inf
 
@@ -125,8 +121,8 @@ def test_coordinates_that_are_no_numbers_are_no_motor_and_no_crash():
 def test_a_beginning_that_has_faded_is_nothing_and_costs_nothing():
     recording = motors.record("rear_right", current=False, kinds=("sine",), seconds=60.0)
     data = prepare([recording], False, "speed")
-    structure = Structure("second_order")
-    z = models.from_physical(*independent.TABLE_1["rear_right"])
+    structure = SecondOrder()
+    z = from_physical(*independent.TABLE_1["rear_right"])
     sums = gather(data, structure, z, data.initial)
     own = np.abs(sums.scores[-1, -2:])
     # After a thousand time constants; a number that is not normal would take ten times as long.
@@ -137,9 +133,9 @@ def test_a_beginning_that_has_faded_is_nothing_and_costs_nothing():
 @pytest.mark.parametrize("with_gain", [False, True])
 def test_answer_to_a_signal_is_what_little_of_it_changes(sensor, with_gain):
     _, data, z = exact(static_voltage=0.3, kind="sine", seconds=3.0)
-    structure = Structure("electromechanical", current=True, current_sensor=sensor, delay=True)
-    z[[models.DELAY, models.CURRENT_LAG]] = 0.3 * data.step, 0.7 * data.step
-    gain = kalman_gain(z, 2, rc.ANGLE, data.step, 1e7, 0.5)[0] if with_gain else NO_GAIN
+    structure = Electromechanical(current_sensor=sensor, delay=True)
+    z = z.with_(delay=0.3 * data.step, current_lag=0.7 * data.step)
+    gain = kalman_gain(structure, z, ANGLE, data.step, 1e7, 0.5)[0] if with_gain else NO_GAIN
     signal = np.cos(3 * data.hold_end)
     shown = 1e-2 * np.sin(5 * data.time)
     found = answers(

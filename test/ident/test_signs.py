@@ -6,7 +6,7 @@ import motors
 import numpy as np
 import pytest
 
-from smp_motor_ident.diagnosis.screening import _signs
+from smp_motor_ident.diagnosis.data_quality import _signs
 from smp_motor_ident.diagnosis.signs import likeness
 from smp_motor_ident.errors import InsufficientExcitationError, SignalError
 

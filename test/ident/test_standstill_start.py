@@ -10,7 +10,8 @@ from smp_motor_ident.estimate import estimate
 from smp_motor_ident.likelihood.experiments import angle_quantum, prepare
 from smp_motor_ident.likelihood.noise import NoiseModel
 from smp_motor_ident.likelihood.passes import evaluate
-from smp_motor_ident.model.structures import Structure
+from smp_motor_ident.model.coordinates import Coordinates
+from smp_motor_ident.model.structures import FirstOrder, SecondOrder
 from smp_motor_ident.record import Record
 
 RATE = 500.0
@@ -70,10 +71,9 @@ def test_a_winding_begins_with_no_more_than_what_drives_it() -> None:
 
 def test_a_winding_that_may_begin_as_it_likes_has_its_price() -> None:
     data = prepare([stepped()], False)
-    z = np.zeros(12)
-    z[:4] = np.log([0.05, 0.05 * LAG, 0.05 * LAG * 1e-3, 1e-3])
-    second = Structure("second_order", order=2, friction="none")
-    first = Structure("first_order", order=1, friction="none")
+    z = Coordinates(*np.log([0.05, 0.05 * LAG, 0.05 * LAG * 1e-3, 1e-3]))
+    second = SecondOrder(friction="none")
+    first = FirstOrder(friction="none")
     noise = NoiseModel(np.diag([0.05**2, 1.0]))
     here = evaluate(data, second, z, data.initial, data.initial, noise)
     # A volt over the winding for a millisecond, and the speed falls off with the motor's lag.

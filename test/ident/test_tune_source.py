@@ -15,6 +15,7 @@ from smp_motor_control.motor.model import MotorModel
 from smp_motor_control.wheel.loop import LoopSettings
 from smp_motor_ident.cli.tune import main
 from smp_motor_ident.cli.tuning import read_estimates
+from smp_motor_ident.finding import Finding
 from smp_motor_ident.tune import Loop, design
 from smp_motor_ident.tune.feedback import spectral_radius
 from smp_motor_ident.tune.motors import Motors, motors_of
@@ -108,6 +109,19 @@ def test_at_1_khz_the_observer_is_taken_and_said_why(estimates):
     better = design(estimates["rear_left"], replace(loop, noise_voltage=0.48))
     assert better.gains.i > 1.5 * plain.gains.i
     assert better.performance.control_noise <= 1.01 * 0.48
+
+
+def test_a_model_whose_error_shows_what_it_lacks_is_not_leaned_on(estimates):
+    shown = Finding("backlash", "note", "the model's error shows backlash between motor and "
+                    "encoder", {"explained_deviance": 200.0})  # fmt: skip
+    told = replace(estimates["rear_left"], findings=(shown,))
+    loop, why = choose_source(told, Loop(sample_time=0.001))
+    assert loop.speed_source != "observer"
+    assert "not the observer, which leans on the model: the model's error shows backlash" in why
+    # What is neither shown nor excluded is no reason.
+    doubt = replace(shown, evidence={"p_value": 0.01})
+    unsure = replace(told, findings=(doubt,))
+    assert choose_source(unsure, Loop(sample_time=0.001))[0].speed_source == "observer"
 
 
 def test_at_200_hz_the_reported_speed_does(estimates):

@@ -44,7 +44,7 @@ class Messages(Source):
                 pass
         return [self._channels[key] for key in sorted(self._channels)]
 
-    def promised(self) -> dict[str, int] | None:
+    def declared(self) -> dict[str, int] | None:
         """Return the number of messages by topic where the file itself tells it."""
         return None
 

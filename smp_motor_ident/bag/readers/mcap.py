@@ -76,7 +76,7 @@ class _McapFile(Messages):
             self._add_channel(channel)
         return summary
 
-    def promised(self) -> dict[str, int] | None:
+    def declared(self) -> dict[str, int] | None:
         """Return what the summary counts."""
         if self._summary is None or self._summary.statistics is None:
             return None

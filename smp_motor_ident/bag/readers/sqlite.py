@@ -120,7 +120,7 @@ class _SqliteFile(Messages):
         """Return the topics of the file."""
         return self._topics
 
-    def promised(self) -> dict[str, int] | None:
+    def declared(self) -> dict[str, int] | None:
         """Return None: the file holds no count besides its messages."""
         return None
 

@@ -95,7 +95,7 @@ def test_bare_files_of_different_names_in_a_folder_are_experiments(
     ]
 
 
-def test_fewer_messages_than_the_metadata_promise_are_told(
+def test_fewer_messages_than_the_metadata_count_are_named(
     tmp_path: Path, corpus: SimpleNamespace
 ) -> None:
     truth = corpus.motion()

@@ -109,7 +109,7 @@ def test_a_compressed_file_cut_at_every_kilobyte(
     assert_every_cut_is_sound(pack(plain.read_bytes()), path, 400, 400)
 
 
-def test_a_cut_bag_tells_how_much_of_what_the_metadata_promise(
+def test_a_cut_bag_tells_how_much_of_what_the_metadata_count(
     tmp_path: Path, corpus: SimpleNamespace
 ) -> None:
     truth = corpus.motion(n=400)

@@ -6,6 +6,7 @@ import motors
 import numpy as np
 import pytest
 
+from smp_motor_ident.diagnosis.data_quality import screen
 from smp_motor_ident.diagnosis.identifiability import what_next
 from smp_motor_ident.errors import InsufficientExcitationError, SignalError
 from smp_motor_ident.estimate import estimate
@@ -102,6 +103,29 @@ def test_a_small_offset_of_the_current_is_removed_and_said():
     result = estimate(replace(GOOD, current=GOOD.current + 0.05))
     assert any(f.code == "current_offset" for f in result.findings)
     assert result.value("resistance") == pytest.approx(3.2843, rel=2e-3)  # 5 of its std
+
+
+def test_a_speed_that_a_filter_makes_late_and_small_has_the_gear_ratio_of_its_angle():
+    """The lag is 30 ms, of a motor that takes 50 ms: what is left is 0.8 of the speed or so."""
+    slow = np.zeros(N)
+    for n in range(1, N):
+        slow[n] = slow[n - 1] + (GOOD.velocity[n] - slow[n - 1]) * 0.005 / 0.035
+    screen([replace(GOOD, current=None, velocity=slow)])
+
+
+@pytest.mark.parametrize("offset", [0.0, 1.2])
+def test_a_noisy_speed_makes_no_offset_of_the_current(offset):
+    """Its noise takes a share of its coefficient, which driven one way looks like an offset."""
+    rng = np.random.default_rng(1)
+    volts = np.repeat(rng.uniform(2.0, 10.0, 400), 20)
+    true = motors.record("rear_left", voltage=volts, seconds=20.0)
+    noise = 2.0 * true.velocity.std() * rng.standard_normal(volts.size)
+    noisy = replace(true, count=None, velocity=true.velocity + noise, current=true.current + offset)
+    if offset:  # the winding, which the regression leaves out, takes a fifth of an ampere of it
+        with pytest.raises(SignalError, match=r"current has an offset of (0.9|1)"):
+            screen([noisy])
+    else:
+        screen([noisy])
 
 
 def test_gaps_of_nan_are_left_out_and_said():
