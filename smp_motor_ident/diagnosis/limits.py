@@ -21,6 +21,13 @@ class Limit:
 
 
 # Estimation: what is stated, and how surely.
+NEIGHBOURS = Limit(
+    -0.25,
+    "correlation",
+    "significance: half-way between counts over one sample (-1/2) and several (0), 5 deviations "
+    "of 400 samples from either",
+    "test_differenced.py: a speed over several samples is no difference of neighbouring counts",
+)
 LOOSE_QUANTITY = Limit(
     0.5,
     "of its value",
