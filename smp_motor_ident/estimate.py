@@ -18,6 +18,7 @@ from smp_motor_ident.diagnosis.bunched import merge_bunches
 from smp_motor_ident.diagnosis.conditions import dependent
 from smp_motor_ident.diagnosis.current_kind import ARMATURE, current_kind
 from smp_motor_ident.diagnosis.data_quality import screen
+from smp_motor_ident.diagnosis.differenced import counts_again, rounding
 from smp_motor_ident.diagnosis.limits import LEAST_FIT, PROFILED
 from smp_motor_ident.diagnosis.lost_rows import bridged
 from smp_motor_ident.diagnosis.misfit import widened_by_misfit
@@ -117,7 +118,7 @@ def estimate(
         rigid = estimate(group, "second_order", fixed=fixed, loss=loss, progress=progress)
         return flexible_shaft.flexible_shaft(group, rigid)
     request = checked(group, model, fixed, bounds, loss, validation, progress)
-    group = [bridged(merge_bunches(on_beat(r))) for r in group]
+    group = [counts_again(bridged(merge_bunches(on_beat(r)))) for r in group]
     kind = current_kind(group) if request.may_leave_current else ARMATURE
     if kind != ARMATURE:
         group, request = request.without_current(group)
@@ -257,7 +258,7 @@ def _stated(
         findings=tuple(findings),
         samples=data.size,
         sample_time=data.step,
-        speed_noise=0.0 if data.kind == ANGLE else float(np.sqrt(chosen.noise[0, 0])),
+        speed_noise=_speed_noise(group, data, chosen),
         **_provenance(group),
     )
 
@@ -268,8 +269,15 @@ def _prepared(
     """Return the data, how the command was held in them, and the fit that showed that."""
     hold, first = chosen_hold(group, base, request.options, request.say)
     data = prepare(group, request.use_current, hold=hold)
-    averaged_speed = base.window or "window" in base.fixed
+    averaged_speed = data.kind != ANGLE and (base.window or "window" in base.fixed)
     return data.as_mean_speed() if averaged_speed else data, hold, first
+
+
+def _speed_noise(group: Sequence[Record], data: Experiments, fit: Fit) -> float:
+    """Return the noise of the speed that was recorded [rad/s], 0 where only an angle was."""
+    if data.kind == ANGLE:
+        return max(map(rounding, group))
+    return float(np.sqrt(fit.noise[0, 0]))
 
 
 def _provenance(group: Sequence[Record]) -> dict[str, Any]:

@@ -32,6 +32,7 @@ from smp_motor_ident.diagnosis.limits import (
     EFFECT_LEVEL,
     EFFECT_OWN,
     HALF_WIDTH,
+    NEGLIGIBLE_FRICTION,
     RELEVANT_BIAS,
 )
 from smp_motor_ident.diagnosis.model_error import Regression
@@ -193,8 +194,10 @@ def _farthest(shown: Evidence, numbers: Sequence[Stated], step: float) -> tuple[
     worst, times, share = "", 0.0, 0.0
     friction = {n: abs(q.value or 0.0) for n, q, _ in numbers}.get("static_voltage", 0.0)
     # Beside what a number that may be nothing matters: times of the interface beside the sampling
-    # interval, however small they are, and a load beside the friction that it adds to.
+    # interval, however small they are, a load beside the friction that it adds to, and a friction
+    # beside one that is next to none.
     least = {**dict.fromkeys(INTERFACE, step), "load_voltage": friction}
+    least["static_voltage"] = NEGLIGIBLE_FRICTION.value
     for name, quantity, row in numbers:
         if quantity.value is None or not quantity.std:
             continue

@@ -14,6 +14,8 @@ from smp_motor_ident.diagnosis.limits import (
     FIT_INDEPENDENT,
     FRICTION_SHOWN,
     HALF_WIDTH,
+    HIGHEST_GAIN,
+    LONGEST_LAG,
     RELEVANT_BIAS,
     RINGING,
     SQUARE_LEVEL,
@@ -50,6 +52,7 @@ def assess(data: Experiments, fit: Fit, percent: FitPercent, tests: ResidualTest
         *_resolution(data, fit, tests),
         *sensors(fit),
         *_second_lag(data, fit),
+        *_implausible(fit),
         *_torque_noise(data, fit),
     ]
 
@@ -223,6 +226,26 @@ def _second_lag(data: Experiments, fit: Fit) -> list[Finding]:
                 "shift_share": share / (1 + share),
             },
             "switch the filter of the firmware off, or record encoder counts or the current",
+        )
+    ]
+
+
+def _implausible(fit: Fit) -> list[Finding]:
+    """Say of a motor that cannot be that a unit may be another."""
+    lag, gain = fit.z.time_constant, fit.z.dc_gain
+    odd = {
+        f"a time constant of {lag:.3g} s": lag > LONGEST_LAG.value,
+        f"a gain of {gain:.3g} rad/s per volt": gain > HIGHEST_GAIN.value,
+    }
+    if not any(odd.values()):
+        return []
+    return [
+        Finding(
+            "implausible_motor",
+            "warning",
+            f"no motor has {' and '.join(word for word, there in odd.items() if there)}",
+            {"time_constant": lag, "dc_gain": gain},
+            "check the units of time (ms taken for s?), speed and voltage (PWM taken for volts?)",
         )
     ]
 

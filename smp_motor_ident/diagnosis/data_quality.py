@@ -13,6 +13,7 @@ from smp_motor_ident.diagnosis.limits import (
     METER,
     MOST_LOST,
     OFFSET_SURE,
+    REST,
     SIGN_ALIKE,
     SIGN_SURE,
     SIGN_TOLD,
@@ -27,6 +28,8 @@ Array = NDArray[np.float64]
 
 RUNS = 2_000  # runs of samples in which signals are averaged before they are compared
 INSTRUMENTS = 8  # lags of the voltage, of which what the motor makes of it is a sum
+LATE = 3  # samples by which a speed commonly comes late
+FEWEST_AT_LIMIT = 5  # samples at a limit while the voltage moves
 RUN_CORRELATION = 20.0  # by which neighbouring runs' errors hang together, at most
 
 
@@ -220,11 +223,11 @@ def _saturation(record: Record) -> None:
             continue
         ok = np.isfinite(values)
         x, v = values[ok], record.voltage[ok]
-        if x.size < 50 or np.unique(x).size < 20:
+        if x.size < 50 or np.unique(x).size < 20 or _one_level(v):
             continue
         for limit in (x.max(), x.min()):
             at = x == limit
-            if limit == 0.0:
+            if abs(limit) < 0.5 * np.abs(x).max():  # the slowest that it turned, one way
                 continue
             share = float(at.mean())
             levels, times = np.unique(x, return_counts=True)
@@ -233,7 +236,11 @@ def _saturation(record: Record) -> None:
             # A resting sensor shows its limit far more often than the level beside it.
             if share < 0.01 or at.sum() < 5 * next_times or runs.sum() < 0.5 * at.sum():
                 continue
-            low, high = np.percentile(v[at], [5, 95])
+            # The last samples of a rest may be late, of a voltage that has moved since.
+            early = at & np.append(at[LATE:], [False] * LATE)
+            if early.sum() < FEWEST_AT_LIMIT:
+                continue
+            low, high = np.percentile(v[early], [5, 95])
             if high - low < 10 * METER.value * np.ptp(v) and not _abrupt(x, at):
                 continue
             raise SignalError(
@@ -241,6 +248,12 @@ def _saturation(record: Record) -> None:
                 f"{share:.1%} of the samples while the voltage moves; widen its range or "
                 "lower the excitation"
             )
+
+
+def _one_level(v: Array) -> bool:
+    """Tell whether the motor is driven by one level of voltage, at which it may come to rest."""
+    driven = v[np.abs(v) > REST.value * np.abs(v).max()]
+    return not driven.size or bool(np.ptp(driven) < 10 * METER.value * np.abs(driven).max())
 
 
 def _abrupt(x: Array, at: NDArray[np.bool_]) -> bool:

@@ -80,17 +80,15 @@ def _current_late(m: Motion) -> list[Array]:
     return [first, slope(first, m.step)]
 
 
-def _angles(m: Motion) -> list[Array]:
-    if m.kind != ANGLE:
+def _once_a_turn(m: Motion, gear: float = 1.0) -> list[Array]:
+    """Return what repeats with every turn of a shaft that has turned once at least."""
+    if m.kind != ANGLE or np.ptp(m.angle) < 2 * np.pi * gear:
         return []
-    out = [np.sin(m.angle), np.cos(m.angle)]
-    if m.gear > 1.5:
-        out += [np.sin(m.angle / m.gear), np.cos(m.angle / m.gear)]
-    return out
+    return [np.sin(m.angle / gear), np.cos(m.angle / gear)]
 
 
-def _encoder(m: Motion) -> list[Array]:
-    return [np.sin(m.angle), np.cos(m.angle)] if m.kind == ANGLE else []
+def _angles(m: Motion) -> list[Array]:
+    return _once_a_turn(m) + (_once_a_turn(m, m.gear) if m.gear > 1.5 else [])
 
 
 def _play(m: Motion) -> list[Array]:
@@ -196,7 +194,7 @@ EFFECTS = (
     ),
     Effect(
         "encoder_error", "output", "an encoder that is off once a turn",
-        "centre the encoder's disc, or average over whole turns", _encoder,
+        "centre the encoder's disc, or average over whole turns", _once_a_turn,
     ),
     Effect(
         "backlash", "output", "backlash between motor and encoder",

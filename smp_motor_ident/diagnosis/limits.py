@@ -21,6 +21,13 @@ class Limit:
 
 
 # Estimation: what is stated, and how surely.
+NEIGHBOURS = Limit(
+    -0.25,
+    "correlation",
+    "significance: half-way between counts over one sample (-1/2) and several (0), 5 deviations "
+    "of 400 samples from either",
+    "test_differenced.py: a speed over several samples is no difference of neighbouring counts",
+)
 LOOSE_QUANTITY = Limit(
     0.5,
     "of its value",
@@ -337,6 +344,18 @@ ROWS_LOST = Limit(
 )
 HALF_WIDTH = Limit(
     1.96, "standard deviations", "half-width of the stated 95 % interval", "test_adequacy.py"
+)
+LONGEST_LAG = Limit(
+    10.0,
+    "s",
+    "physical: a flywheel of hundreds of times its motor's inertia runs up within a few seconds",
+    "test_poor_records.py: a motor that cannot be is said to be none",
+)
+HIGHEST_GAIN = Limit(
+    2000.0,
+    "rad/s/V",
+    "physical: 19,000 rpm per volt; the fastest motors of models turn half as fast",
+    "test_poor_records.py: a motor that cannot be is said to be none",
 )
 RELEVANT_BIAS = Limit(
     0.02,

@@ -117,8 +117,10 @@ def _one_size_of_voltage(top: float) -> list[Finding]:
 
 def _one_direction(data: Experiments, result: Answer) -> list[Finding]:
     """Say that friction and a constant load are one voltage where the motor turns one way only."""
-    if data.hold_value.min() < 0 < data.hold_value.max() or "load_voltage" in result.combinations:
+    if data.hold_value.min() < 0 < data.hold_value.max():
         return []
+    if "load_voltage" in result.combinations:
+        return _driving_load(data, result)
     return [
         Finding(
             "one_direction",
@@ -127,6 +129,31 @@ def _one_direction(data: Experiments, result: Answer) -> list[Finding]:
             "together, and the other way may have its own",
             {"voltage": float(data.hold_value[np.argmax(np.abs(data.hold_value))])},
             "drive both directions",
+        )
+    ]
+
+
+def _driving_load(data: Experiments, result: Answer) -> list[Finding]:
+    """Say it where, turning one way only, a motor seems to be driven by its load.
+
+    Under ``v = K w + friction + load`` the gain is then more than speed over voltage: what says
+    so is the shape of the answer alone, and hills that pull a robot are rare.
+    """
+    names = ("static_voltage", "load_voltage")
+    sign = float(np.copysign(1.0, data.hold_value[np.argmax(np.abs(data.hold_value))]))
+    value = sum(s * (result.combinations[n].value or 0.0) for n, s in zip(names, (1.0, sign)))
+    row = np.array([{names[0]: 1.0, names[1]: sign}.get(n, 0.0) for n in result.names])
+    std = float(np.sqrt(row @ result.covariance @ row))
+    if value + HALF_WIDTH.value * std >= 0.0:
+        return []
+    return [
+        Finding(
+            "driving_load",
+            "unreliable",
+            f"the motor would be driven by its load, by {-value:.3g} V more than friction takes, "
+            "one way only: the steady speeds and the changes of speed ask for different gains",
+            {"voltage": value, "std": std},
+            "drive both directions, at several steady levels of voltage",
         )
     ]
 

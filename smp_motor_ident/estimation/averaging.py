@@ -75,12 +75,19 @@ def averaged(result: Answer, weight: Array, others: Sequence[Answer]) -> Answer:
                                for k in keep])  # fmt: skip
     mean = own + share @ (values - own)  # what is the same in all stays so
     between = (values - mean).T @ (share[:, None] * (values - mean))
-    shift = dict(zip(result.names, zip(mean, np.diag(between))))
+    # One that explains the data better than the choice, and knows less, speaks for what it knows.
+    variance = np.maximum(np.diag(result.covariance), 1e-300)
+    each = np.array([variance] + [
+        _variances(others[k], result.names, variance) if w >= share[0] else variance
+        for k, w in zip(keep, share[1:])
+    ])  # fmt: skip
+    factor = np.sqrt(np.maximum(share @ each / variance, 1.0))
+    shift = dict(zip(result.names, zip(mean, np.diag(between), factor)))
     return replace(
         result,
         combinations=_shifted(result.combinations, shift),
         parameters=_shifted(result.parameters, shift),
-        covariance=result.covariance + between,
+        covariance=result.covariance * np.outer(factor, factor) + between,
     )
 
 
@@ -116,6 +123,12 @@ def covering(
     return found, likely if len(likely) > 1 else {}
 
 
+def _variances(answer: Answer, names: Sequence[str], own: Array) -> Array:
+    """Return a candidate's variances; the chosen one's where it has none."""
+    known = dict(zip(answer.names, np.diag(answer.covariance)))
+    return np.array([known.get(n, v) for n, v in zip(names, own)])
+
+
 def _value(answer: Answer, name: str, own: float) -> float:
     """Return a candidate's value; the chosen one's where it has none."""
     quantity = answer.combinations.get(name) or answer.parameters.get(name)
@@ -125,21 +138,21 @@ def _value(answer: Answer, name: str, own: float) -> float:
 
 
 def _shifted(
-    quantities: Mapping[str, Quantity], shift: Mapping[str, tuple[float, float]]
+    quantities: Mapping[str, Quantity], shift: Mapping[str, tuple[float, float, float]]
 ) -> dict[str, Quantity]:
     out = dict(quantities)
     for name, quantity in quantities.items():
         if name not in shift or quantity.value is None or quantity.std is None:
             continue
-        mean, between = float(shift[name][0]), float(shift[name][1])
+        mean, between, factor = map(float, shift[name])
         low, high = quantity.ci95 or (quantity.value, quantity.value)
         reach = NORMAL_95**2 * between
-        down = mean - float(np.sqrt((quantity.value - low) ** 2 + reach))
+        down = mean - float(np.sqrt((factor * (quantity.value - low)) ** 2 + reach))
         out[name] = replace(
             quantity,
             value=mean,
-            std=float(np.hypot(quantity.std, np.sqrt(between))),
+            std=float(np.hypot(factor * quantity.std, np.sqrt(between))),
             ci95=(max(down, 0.0) if low >= 0 else down,
-                  mean + float(np.sqrt((high - quantity.value) ** 2 + reach))),
+                  mean + float(np.sqrt((factor * (high - quantity.value)) ** 2 + reach))),
         )  # fmt: skip
     return out

@@ -246,7 +246,7 @@ def speed_quantum(velocity: Array) -> float:
     levels = np.unique(x)
     steps = np.diff(levels)
     steps = steps[steps > 1e-6 * max(span, 1e-300)]
-    if steps.size < 4:
+    if steps.size == 0:
         return 0.0
     # Published logs round: a twentieth of a step is allowed, and what a single step is out by
     # must not add up over many: a line through all levels tells the step.
@@ -257,7 +257,7 @@ def speed_quantum(velocity: Array) -> float:
     quantum, first = (float(x) for x in np.polyfit(count, levels, 1))
     whole = (levels - first) / quantum
     regular = np.mean(np.abs(whole - np.round(whole)) < 0.05)
-    return quantum if regular > 0.95 and 2e-3 * span < quantum < 0.2 * span else 0.0
+    return quantum if regular > 0.95 and quantum > 2e-3 * span else 0.0
 
 
 def prepare(

@@ -69,6 +69,22 @@ def test_a_load_that_is_nothing_is_no_number_that_an_effect_moves():
     assert finding(0.02).evidence["quantity"] == "load_voltage"
 
 
+def test_a_friction_that_is_nothing_is_moved_by_no_multiple_of_it():
+    shown = adequacy.Evidence(EFFECTS[0], 1e-6, 200.0, np.array([2e-4]), (0,))
+    numbers = [("static_voltage", Quantity(0.0, 1e-5, (0.0, 2e-5), "V"), np.array([1.0]))]
+    assert adequacy.as_finding(shown, [shown], numbers, 0.005).severity == "note"  # 0.2 mV
+
+
+def test_what_repeats_with_every_turn_is_asked_for_where_there_was_one():
+    data = prepare([motors.record("rear_left", current=False, seconds=2.0)], False)
+    signals = (data.time, data.voltage, np.ones(data.size), np.linspace(0.0, 7.0, data.size))
+    turned = model_error._motion(data, 3.0, signals, 0.1, np.array([data.size]))
+    once = {e.code: e for e in EFFECTS if e.code in ("position", "encoder_error")}
+    assert [len(e.regressors(turned)) for e in once.values()] == [2, 2]  # not of the wheel
+    still = replace(turned, angle=0.8 * turned.angle)  # 5.6 rad
+    assert not any(e.regressors(still) for e in once.values())
+
+
 def test_numbers_that_hang_on_the_size_of_the_voltage_cover_both_sizes():
     """A motor whose gain falls from 10 to 9 at the larger voltages, by regression alone."""
     rng = np.random.default_rng(4)

@@ -35,6 +35,15 @@ def test_a_lag_that_may_be_a_delay_is_stated_with_both():
     np.testing.assert_allclose(both.covariance[0, 1], -0.6 * 0.4 * 0.01 * 0.01)
 
 
+def test_what_is_likelier_than_the_choice_and_knows_less_counts_with_what_it_knows():
+    vague = replace(_answer(0.06, None), covariance=25e-6 * np.eye(1))
+    for weight in (0.2, 0.8):
+        both = averaged(_answer(0.05, 0.01), np.array([1 - weight, weight]), [vague])
+        within = 0.2 * 0.001**2 + 0.8 * 0.005**2 if weight > 0.5 else 0.001**2
+        lag = both.combinations["time_constant"]
+        np.testing.assert_allclose(lag.std**2, within + 0.2 * 0.8 * 0.01**2)
+
+
 def test_a_candidate_that_is_rejected_changes_nothing():
     alone = _answer(0.05, 0.01)
     assert averaged(alone, np.array([0.999, 0.001]), [_answer(0.06, None)]) is alone

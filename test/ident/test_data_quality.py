@@ -5,11 +5,13 @@ from dataclasses import replace
 import motors
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from smp_motor_ident.diagnosis.data_quality import screen
 from smp_motor_ident.diagnosis.identifiability import what_next
 from smp_motor_ident.errors import InsufficientExcitationError, SignalError
 from smp_motor_ident.estimate import estimate
+from smp_motor_ident.record import Record
 
 GOOD = motors.record("rear_left", seconds=4.0)
 N = len(GOOD)
@@ -91,6 +93,20 @@ def test_a_current_clipped_by_a_two_level_command_is_saturated():
     good = motors.record("rear_left", voltage=random, seconds=4.0)
     with pytest.raises(SignalError, match="saturated sensor, current"):
         estimate(replace(good, current=np.clip(good.current, -0.6, 0.6)))
+
+
+@pytest.mark.parametrize("late", [0, 2])
+def test_a_speed_that_settles_on_its_resolution_is_not_saturated(late):
+    """To a tenth of a rad/s it rests within 40 samples of each step, and late until the next."""
+    level = np.repeat([3.0, 8.0, 5.0, 8.0, 2.0, 8.0, 0.0, 6.0], 40)
+    speed = lfilter([0.5], [1.0, -0.5], np.roll(level, late) * 25.0)
+    screen([Record("motor", np.arange(320) / 50.0, level, velocity=np.round(speed, 1))])
+
+
+def test_one_level_of_voltage_saturates_no_sensor():
+    speed = np.round(8.0 * 25.0 * (1 - np.exp(-np.arange(300) / 30)), 1)
+    level = np.r_[np.zeros(20), np.full(280, 8.0)]
+    screen([Record("motor", np.arange(300) / 100.0, level, velocity=speed)])
 
 
 def test_a_voltmeter_that_scatters_around_a_level_is_a_constant_input():

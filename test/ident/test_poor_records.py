@@ -124,6 +124,26 @@ def test_two_levels_know_gain_and_friction_apart():
     assert "one_direction" in [f.code for f in found.findings if f.severity == "warning"]
 
 
+def test_a_motor_that_its_load_would_drive_one_way_is_unreliable():
+    """It follows the voltage less than its steady speed asks for: 8 rad/s/V of 15, here."""
+    level = 4.0 + np.where(np.arange(2000) // 100 % 2, 0.5, -0.5)
+    t = np.arange(level.size) / 500.0
+    changes = lfilter([1 - np.exp(-1 / 60)], [1, -np.exp(-1 / 60)], level - 4.0)
+    noise = 0.5 * np.random.default_rng(5).standard_normal(t.size)
+    found = estimate(Record("motor", t, level, velocity=15.0 * 4.0 + 8.0 * changes + noise))
+    assert found.combinations["load_voltage"].value < 0.0
+    assert "driving_load" in [f.code for f in found.findings if f.severity == "unreliable"]
+
+
+def test_a_motor_that_cannot_be_is_said_to_be_none():
+    good = motors.record("rear_left", current=False, seconds=3.0)
+    codes = {}
+    for scale in (1.0, 1000.0):
+        found = estimate(replace(good, time=scale * good.time, velocity=None))
+        codes[scale] = [f.code for f in found.findings]
+    assert "implausible_motor" in codes[1000.0] and "implausible_motor" not in codes[1.0]
+
+
 def test_rest_before_the_excitation_changes_nothing():
     driven = motors.record("rear_left", current=False, seconds=3.0)
     n = 4000

@@ -121,7 +121,7 @@ def _separator(lines: list[str]) -> str:
     """Return what most lines are divided by; a comma may be a decimal one."""
     usual = lines[len(lines) // 2 :]
     for candidate in ";\t|,":
-        if sum(candidate in line for line in usual) >= 0.9 * len(usual):
+        if sum(candidate in line for line in usual) > 2 / 3 * len(usual):
             return candidate
     return " " if any(" " in line.strip() for line in usual) else ","
 

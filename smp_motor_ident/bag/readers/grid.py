@@ -166,8 +166,10 @@ def columns(
             sound_rows.append(row)
         except (ValueError, OverflowError):
             stray.append((k, _culprit(row, use, names)))
-    if stray and len(stray) > STRAY_ROWS.value * (len(kept) + len(stray)):
-        k, what = stray[0]
+    # Notes that follow the table are no part of it.
+    inside = [one for one in stray if 2 * len(rows[one[0]]) > len(sound_rows[0])] if kept else stray
+    if len(inside) > STRAY_ROWS.value * (len(kept) + len(inside)):
+        k, what = inside[0]
         raise BagError(f"{where}: line {lines[k]}, {what}")
     findings = []
     if stray:

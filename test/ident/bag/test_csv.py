@@ -96,6 +96,14 @@ def test_a_comment_right_above_the_numbers_may_name_the_columns(
     np.testing.assert_allclose(record["motor"].velocity, np.deg2rad(Y))
 
 
+def test_notes_below_a_short_table_are_no_part_of_it(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text(table(", ", head="t, u, y") + "Acceleration: 9.46\n")
+    (record,) = read_records(path, MAP).values()
+    np.testing.assert_allclose(record.velocity, np.deg2rad(Y))
+    assert "stray_rows" in [f.code for f in record.findings]
+
+
 def test_units_in_a_comment_below_the_names_are_understood(tmp_path: Path) -> None:
     (tmp_path / "log.csv").write_text("# t,u,y\n# s,mV,deg/s\n" + table().partition("\n")[2])
     record = read_records(tmp_path / "log.csv", ["voltage=u velocity=y time=t"])["motor"]
