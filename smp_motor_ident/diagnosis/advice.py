@@ -23,7 +23,6 @@ from smp_motor_ident.diagnosis.limits import (
     UNEXPLAINED,
     WINDING_LAG,
 )
-from smp_motor_ident.diagnosis.residuals import coloured
 from smp_motor_ident.diagnosis.sensors import sensors
 from smp_motor_ident.diagnosis.validation import within_resolution
 from smp_motor_ident.estimation import prediction, shape_constraint
@@ -48,9 +47,8 @@ def assess(data: Experiments, fit: Fit, percent: FitPercent, tests: ResidualTest
     return [
         *_descent(data, fit),
         *_fit(percent, tests, within_resolution(data, fit)),
-        *_fit_of_current(data, fit),
         *_resolution(data, fit, tests),
-        *sensors(fit),
+        *sensors(data, fit),
         *_second_lag(data, fit),
         *_implausible(fit),
         *_torque_noise(data, fit),
@@ -141,27 +139,6 @@ def _fit(percent: FitPercent, tests: ResidualTests, closely: bool) -> list[Findi
             )
         )
     return out
-
-
-def _fit_of_current(data: Experiments, fit: Fit) -> list[Finding]:
-    """Say that a current was given up for the speed: each has a noise of its own, as large as it
-    takes.
-    """
-    if not data.current.size:
-        return []
-    error = data.current - prediction.simulate(data, fit, gain=True)[:, 2]
-    explained = 100 * (1 - float(np.nanstd(error)) / max(float(np.nanstd(data.current)), 1e-300))
-    if explained >= FIT_EXPLAINS.value or not coloured(error):
-        return []
-    return [
-        Finding(
-            "poor_fit_of_current",
-            "unreliable",
-            f"the model explains only {explained:.0f} % of the current, and the rest is no noise",
-            {"fit_percent": explained, "limit": FIT_EXPLAINS.value},
-            "check that speed and current are of this motor, and that neither is filtered",
-        )
-    ]
 
 
 def _resolution(data: Experiments, fit: Fit, tests: ResidualTests) -> list[Finding]:

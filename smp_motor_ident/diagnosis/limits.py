@@ -97,19 +97,13 @@ INSTANT = Limit(
     "test_intervals.py",
 )
 HOLD_COST = Limit(
-    400_000,
-    "samples",
-    "cost: a second fit of a longer record takes seconds, and the instants average out",
-    "test_mirror.py",
+    400_000, "samples", "cost: a second fit of a longer record takes seconds", "test_mirror.py"
 )
 HOLD_HOPELESS = Limit(
     100.0, "deviance", "cost: nothing makes up for odds of e^50 to 1 on a subset", "test_mirror.py"
 )
 HOLD_EVIDENCE = Limit(
-    30.0,
-    "deviance",
-    "significance: odds of e^15 to 1 against the command as it was recorded, as most drivers hold",
-    "test_mirror.py",
+    30.0, "deviance", "significance: odds of e^15 to 1 against what was recorded", "test_mirror.py"
 )
 WORST_FIT = Limit(
     30.0,
@@ -138,10 +132,7 @@ COLOURED = Limit(
     4.0, "ratio of variances", "significance: 1e-22 for 60 white runs", "test_structure_choice.py"
 )
 SURE_GAIN = Limit(
-    3.0,
-    "prices",
-    "significance: 5e-14 for a parameter of 500 samples, whatever the richer one leaves loose",
-    "test_structure_choice.py",
+    3.0, "prices", "significance: 5e-14 for a parameter of 500 samples", "test_structure_choice.py"
 )
 LOOSE_ADDITION = Limit(
     0.4,
@@ -321,10 +312,7 @@ CONDITION_WEIGHT = Limit(
     "test_adequacy.py",
 )
 EFFECT_BLOCKS = Limit(
-    6,
-    "degrees of freedom",
-    "with fewer stretches of data that show an effect the level of its test is not known",
-    "test_adequacy.py",
+    6, "degrees of freedom", "with fewer the level of a test is unknown", "test_adequacy.py"
 )
 EFFECT_OWN = Limit(
     1e-2,
@@ -398,18 +386,12 @@ LEFT_BAND = Limit(
 
 # Stamps of arrival, put back on the beat of their sender.
 BEAT_FLOOR = Limit(
-    0.5,
-    "sample",
-    "physical: a later beat than half a sample is the next one; the least latency stays below it",
-    "test_beat.py",
+    0.5, "sample", "physical: a later beat than half a sample is the next one", "test_beat.py"
 )
 BEAT_JITTER = Limit(
     0.02, "sample", "cost: instants off by less matter less than their rounding", "test_beat.py"
 )
 BEAT_LOST = Limit(0.02, "1", "cost: with more lost a sample's number is a guess", "test_beat.py")
 SMOOTHER = Limit(
-    3.1,
-    "standard deviations",
-    "sign test of size 1e-3: stamps are kept unless the motion is evidently that of their beat",
-    "test_beat.py",
+    3.1, "standard deviations", "sign test of size 1e-3, else stamps are kept", "test_beat.py"
 )

@@ -1,15 +1,21 @@
-"""What a fit says of the sensors: an offset of the current, and over how long they average."""
+"""What a fit says of the sensors: the current's offset and misfit, how long they average."""
 
 from __future__ import annotations
 
+import numpy as np
+
+from smp_motor_ident.diagnosis.limits import FIT_EXPLAINS
+from smp_motor_ident.diagnosis.residuals import coloured
+from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.finding import Finding
+from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.structures import Electromechanical
 
 
-def sensors(fit: Fit) -> list[Finding]:
+def sensors(data: Experiments, fit: Fit) -> list[Finding]:
     """Return what was found of the sensors."""
-    out = []
+    out = _fit_of_current(data, fit)
     s = fit.structure
     if isinstance(s, Electromechanical) and s.offset:
         offset = fit.z.current_offset
@@ -36,6 +42,27 @@ def sensors(fit: Fit) -> list[Finding]:
             )
         )
     return out
+
+
+def _fit_of_current(data: Experiments, fit: Fit) -> list[Finding]:
+    """Say that a current was given up for the speed: each has a noise of its own, as large as it
+    takes.
+    """
+    if not data.current.size:
+        return []
+    error = data.current - prediction.simulate(data, fit, gain=True)[:, 2]
+    explained = 100 * (1 - float(np.nanstd(error)) / max(float(np.nanstd(data.current)), 1e-300))
+    if explained >= FIT_EXPLAINS.value or not coloured(error):
+        return []
+    return [
+        Finding(
+            "poor_fit_of_current",
+            "unreliable",
+            f"the model explains only {explained:.0f} % of the current, and the rest is no noise",
+            {"fit_percent": explained, "limit": FIT_EXPLAINS.value},
+            "check that speed and current are of this motor, and that neither is filtered",
+        )
+    ]
 
 
 def _current_lag(sensor: str, lag: float) -> Finding:
