@@ -118,7 +118,7 @@ def estimate(
         rigid = estimate(group, "second_order", fixed=fixed, loss=loss, progress=progress)
         return flexible_shaft.flexible_shaft(group, rigid)
     request = checked(group, model, fixed, bounds, loss, validation, progress)
-    group = [counts_again(bridged(merge_bunches(on_beat(r)))) for r in group]
+    group = counts_again([bridged(merge_bunches(on_beat(r))) for r in group])
     kind = current_kind(group) if request.may_leave_current else ARMATURE
     if kind != ARMATURE:
         group, request = request.without_current(group)

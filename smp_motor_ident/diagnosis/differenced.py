@@ -3,7 +3,8 @@
 The rounding error of a count comes twice in such a speed, once each way, so that the errors of
 neighbouring speeds go against each other (correlation -1/2) and sum up to that of one count.  As
 independent errors of a speed they would be far larger than what the data hold, and a loop that
-answers to them would bias the fit.  Over several samples the neighbours share no count.
+answers to them would bias the fit.  Differences over m samples sum up to m counts in a row, whose
+errors are m times as large: a motor that leaves no more than one count's rounding says which.
 
 References
 ----------
@@ -12,14 +13,18 @@ L. Ljung, System Identification, 2nd ed. (1999), section 13.4 (noise that a loop
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident.diagnosis.limits import NEIGHBOURS
+from smp_motor_ident.diagnosis.limits import NEIGHBOURS, ONE_COUNT
+from smp_motor_ident.estimation.fit import Options
+from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.finding import Finding
-from smp_motor_ident.likelihood.experiments import speed_quantum
+from smp_motor_ident.likelihood.experiments import prepare, speed_quantum
+from smp_motor_ident.model.structures import SecondOrder
 from smp_motor_ident.record import Record
 
 Array = NDArray[np.float64]
@@ -28,8 +33,13 @@ SMOOTH = 9  # samples of which a mean leaves the motion and hardly the rounding
 EVEN = 0.5  # of the usual interval: stamps that are off by more may hide a lost sample
 
 
-def counts_again(record: Record) -> Record:
-    """Return a record with the angle that its speed is the difference of, if it is one."""
+def counts_again(group: Sequence[Record]) -> list[Record]:
+    """Return records with the angles that their speeds are the differences of, if all are."""
+    summed = [_summed(r) for r in group]
+    return list(group) if any(s is r for s, r in zip(summed, group, strict=True)) else summed
+
+
+def _summed(record: Record) -> Record:
     velocity = record.velocity
     if velocity is None or record.count is not None or record.position is not None:
         return record
@@ -39,6 +49,9 @@ def counts_again(record: Record) -> Record:
     intervals = np.delete(np.diff(record.time), [s - 1 for s in record.starts if s > 0])
     moved = np.rint(velocity / quantum)
     if np.abs(intervals - step).max() > EVEN * step or not _against_each_other(moved):
+        return record
+    angle = np.cumsum(moved) * quantum * step
+    if not _rounds_once(replace(record, position=angle, current=None), quantum * step):
         return record
     found = Finding(
         "speed_summed",
@@ -50,7 +63,7 @@ def counts_again(record: Record) -> Record:
     )
     return replace(
         record,
-        position=np.cumsum(moved) * quantum * step,
+        position=angle,
         velocity_window=step,
         findings=(*record.findings, found),
     )
@@ -60,6 +73,15 @@ def rounding(record: Record) -> float:
     """Return the noise [rad/s] of a recorded speed whose counts are used, 0 where it is another."""
     found = next((f for f in record.findings if f.code == "speed_summed"), None)
     return 0.0 if found is None else float(found.evidence["quantum"] or 0.0) / 6**0.5
+
+
+def _rounds_once(record: Record, count: float) -> bool:
+    """Tell whether a motor in free run leaves no more of an angle than one count's rounding."""
+    data = prepare([record], False)
+    fit = initial_fit(data, SecondOrder(), Options())
+    if fit is None or fit.noise_ratio > 0:
+        return False
+    return bool(fit.noise[0, 0] < ONE_COUNT.value * count**2 / 12)
 
 
 def _against_each_other(moved: Array) -> bool:

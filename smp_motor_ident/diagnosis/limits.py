@@ -24,8 +24,13 @@ class Limit:
 NEIGHBOURS = Limit(
     -0.25,
     "correlation",
-    "significance: half-way between counts over one sample (-1/2) and several (0), 5 deviations "
-    "of 400 samples from either",
+    "cost: half-way between counts over one sample (-1/2) and several (0); others are not tried",
+    "test_differenced.py: a speed over several samples is no difference of neighbouring counts",
+)
+ONE_COUNT = Limit(
+    1.5,
+    "variances of a count's rounding",
+    "physical: one count leaves one, the sum of two neighbours two",
     "test_differenced.py: a speed over several samples is no difference of neighbouring counts",
 )
 LOOSE_QUANTITY = Limit(
@@ -334,17 +339,13 @@ HALF_WIDTH = Limit(
     1.96, "standard deviations", "half-width of the stated 95 % interval", "test_adequacy.py"
 )
 LONGEST_LAG = Limit(
-    10.0,
-    "s",
-    "physical: a flywheel of hundreds of times its motor's inertia runs up within a few seconds",
+    10.0, "s", "physical: a flywheel of a hundred rotors runs up within seconds",
     "test_poor_records.py: a motor that cannot be is said to be none",
-)
+)  # fmt: skip
 HIGHEST_GAIN = Limit(
-    2000.0,
-    "rad/s/V",
-    "physical: 19,000 rpm per volt; the fastest motors of models turn half as fast",
+    2000.0, "rad/s/V", "physical: 19,000 rpm per volt, twice that of the fastest models' motors",
     "test_poor_records.py: a motor that cannot be is said to be none",
-)
+)  # fmt: skip
 RELEVANT_BIAS = Limit(
     0.02,
     "of a number, or of a sampling interval for a delay",

@@ -158,16 +158,18 @@ def columns(
     kept: list[list[float]] = []
     stray: list[tuple[int, str]] = []
     sound_rows: list[Row] = []
+    last = 0  # that is one of numbers
     for k, row in enumerate(rows):
         if all(_empty(cell) for cell in row):
             continue
         try:
             kept.append([number(row[j]) if j < len(row) else np.nan for j in use])
             sound_rows.append(row)
+            last = k
         except (ValueError, OverflowError):
             stray.append((k, _culprit(row, use, names)))
     # Notes that follow the table are no part of it.
-    inside = [one for one in stray if 2 * len(rows[one[0]]) > len(sound_rows[0])] if kept else stray
+    inside = [one for one in stray if one[0] < last or 2 * len(rows[one[0]]) > len(rows[last])]
     if len(inside) > STRAY_ROWS.value * (len(kept) + len(inside)):
         k, what = inside[0]
         raise BagError(f"{where}: line {lines[k]}, {what}")
