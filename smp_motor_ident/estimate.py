@@ -26,8 +26,19 @@ from smp_motor_ident.diagnosis.model_error import regression
 from smp_motor_ident.diagnosis.noise_or_effect import in_place_of_noise
 from smp_motor_ident.diagnosis.refusal import no_candidate, refuse
 from smp_motor_ident.diagnosis.residuals import residual_tests
-from smp_motor_ident.diagnosis.scope import blames_current, contradicted, current_left_out, scope
-from smp_motor_ident.errors import InsufficientExcitationError, SignalError, SmpError
+from smp_motor_ident.diagnosis.scope import (
+    UNDECIDED,
+    blames_current,
+    contradicted,
+    current_left_out,
+    scope,
+)
+from smp_motor_ident.errors import (
+    CurrentError,
+    InsufficientExcitationError,
+    SignalError,
+    SmpError,
+)
 from smp_motor_ident.estimation import flexible_shaft, order_selection, prediction
 from smp_motor_ident.estimation.averaging import candidate_weights, covering
 from smp_motor_ident.estimation.candidate_starts import of_kind
@@ -142,8 +153,10 @@ def _answered(group: list[Record], request: Request, found: Sequence[Finding]) -
         if blamed is None:
             return first
         reason = blamed.code
-    except (SignalError, InsufficientExcitationError) as error:
+    except CurrentError as error:
         refusal, reason = error, "refused"
+    except (SignalError, InsufficientExcitationError) as error:
+        refusal, reason = error, UNDECIDED
     bare, other = request.without_current(group)
     try:
         second: Estimate | None = _estimated(bare, other, [*found, current_left_out(reason)])

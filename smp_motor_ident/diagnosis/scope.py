@@ -220,13 +220,21 @@ def blames_current(finding: Finding) -> bool:
     return finding.severity == "unreliable" and finding.code in OF_CURRENT
 
 
+UNDECIDED = "undecided"
+"""Why a current was left out that shows no fault of its own: with it nothing could be stated."""
+
+
 def current_left_out(reason: str) -> Finding:
-    """Return why the answer is one without the current, and what would make it useful."""
+    """Return why the answer is one without the current, and what would make it useful.
+
+    Where that shows no fault of its own, voltage or motion may be what is wrong: data that tell
+    more do not tell less.
+    """
     effect = OF_CURRENT.get(reason)
     what = f"shows {effect.cause}" if effect else "does not fit voltage and motion"
     return Finding(
         "current_left_out",
-        "warning",
+        "unreliable" if reason == UNDECIDED else "warning",
         f"the current {what}: this is the answer without it, and what only the current tells "
         "(resistance, inductance, motor constant, inertia, friction torques) is not stated",
         {"reason": reason},

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from dataclasses import replace
 
 import motors
@@ -9,8 +10,10 @@ import numpy as np
 import pytest
 
 from smp_motor_ident.diagnosis.current_kind import ARMATURE, SUPPLY, UNSIGNED, current_kind
+from smp_motor_ident.errors import InsufficientExcitationError
 from smp_motor_ident.estimate import estimate
 
+estimate_module = importlib.import_module("smp_motor_ident.estimate")
 GOOD = motors.record("rear_left", seconds=3.0)
 DUTY = GOOD.voltage / 12.0
 CURRENTS = {
@@ -54,3 +57,16 @@ def test_the_size_of_a_current_is_left_out_where_the_motor_is_driven_back_only(s
 def test_a_coarse_encoder_does_not_hide_that_a_current_has_no_sign():
     coarse = replace(GOOD, velocity=None, count=GOOD.count // 20 * 20, current=np.abs(GOOD.current))
     assert current_kind([coarse]) == UNSIGNED
+
+
+def test_data_that_tell_nothing_with_their_current_are_not_believed_without_it(monkeypatch):
+    inner = estimate_module._estimated
+
+    def refused(group, request, found):
+        if request.use_current:
+            raise InsufficientExcitationError("the data do not tell time_constant")
+        return inner(group, request, found)
+
+    monkeypatch.setattr(estimate_module, "_estimated", refused)
+    result = estimate(GOOD)
+    assert "current_left_out" in [f.code for f in result.findings if f.severity == "unreliable"]
