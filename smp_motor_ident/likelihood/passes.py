@@ -133,10 +133,9 @@ def gather(
     noise: NoiseModel | None = None,
     predicted: Array | None = None,
     differentiate: bool = True,
-    blocks: int = BLOCKS,
     beside: Beside = NOTHING,
 ) -> Sums:
-    """Run over the data once; scores are summed over about so many runs of samples."""
+    """Run over the data once; scores are summed over `BLOCKS` runs of samples or so."""
     noise = NoiseModel() if noise is None else noise
     par, internal = structure.internal(z)
     # A motor drawn at random near another may have any lag: no sensor is early.
@@ -144,7 +143,7 @@ def gather(
     slope = np.ascontiguousarray(internal @ structure.matrix) if differentiate else internal[:, :0]
     own = np.array(own_columns(data, structure) if differentiate else (), dtype=np.int64)
     p, segments = slope.shape[1] + own.size, len(data.starts) - 1
-    length = max(1, -(-data.size // blocks))
+    length = max(1, -(-data.size // BLOCKS))
     rows = data.size // length + 2 * segments + 2
     scores, owner = np.empty((rows, p)), np.empty(rows, dtype=np.int64)
     normal, gradient, cost = np.empty((segments, p, p)), np.empty((segments, p)), np.zeros(segments)
