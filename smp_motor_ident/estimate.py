@@ -181,28 +181,31 @@ def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) 
         raise no_candidate(group)
     data, hold, candidates = otherwise(group, base, request, data, hold, candidates)
     refused: SmpError | None = None
-    for fits in _in_turn(candidates):
+    left = list(candidates)
+    for one in _in_turn(candidates):
+        left = [r for r in left if r.fit is not one.fit]
         try:
-            words = [*found, *_fallen_back(refused, fits)]
-            return _stated(group, request, words, data, hold, fits)
+            words = [*found, *_fallen_back(refused, one)]
+            return _stated(group, request, words, data, hold, [*left, one])
         except (SignalError, InsufficientExcitationError) as refusal:
             refused = refused or refusal
+            # What was refused, and what is richer, is no rival that another's answer must cover.
+            most = one.fit.structure.size
+            left = [replace(r, whole=r.whole and r.fit.structure.size <= most) for r in left]
+            left.append(replace(one, reason=f"refused: {refusal}", whole=False))
     assert refused is not None
     raise refused
 
 
-def _in_turn(candidates: list[FittedCandidate]) -> list[list[FittedCandidate]]:
-    """Return the candidates with the choice last, then with each that is no richer in its place.
-
-    Those whose descent did not settle come last.
-    """
+def _in_turn(candidates: list[FittedCandidate]) -> list[FittedCandidate]:
+    """Return the choice, then those that are no richer; whose descent did not settle come last."""
     most = candidates[-1].fit.structure.size
     others = [r for r in candidates[:-1] if r.whole and r.fit.structure.size <= most]
     others.sort(key=lambda r: (not r.fit.converged, r.bic))
-    return [candidates, *([*(o for o in candidates if o is not r), r] for r in others)]
+    return [candidates[-1], *others]
 
 
-def _fallen_back(refusal: SmpError | None, candidates: list[FittedCandidate]) -> list[Finding]:
+def _fallen_back(refusal: SmpError | None, other: FittedCandidate) -> list[Finding]:
     if refusal is None:
         return []
     return [
@@ -210,7 +213,7 @@ def _fallen_back(refusal: SmpError | None, candidates: list[FittedCandidate]) ->
             "choice_refused",
             "unreliable",
             f"the structure that fits the samples best was refused ({refusal}); this is "
-            f"the answer of {candidates[-1].label}",
+            f"the answer of {other.label}",
             advice="record longer, with sharper and larger steps",
         )
     ]

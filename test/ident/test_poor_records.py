@@ -110,6 +110,10 @@ def test_a_refusal_is_tried_again_with_the_simpler_structure(monkeypatch):
     monkeypatch.setattr("smp_motor_ident.estimate.refuse", strict)
     found = estimate(motors.record("rear_left", current=False, seconds=3.0))
     assert found.model == "first_order"
+    reasons = {c.model: c.reason for c in found.candidates if c.reason.startswith("refused: ")}
+    assert reasons and all(m.startswith("second_order") for m in reasons)
+    assert [c.model.split(" ")[0] for c in found.candidates if c.chosen] == ["first_order"]
+    assert "structures_alike" not in [f.code for f in found.findings]  # none of the refused
     assert "choice_refused" in [f.code for f in found.findings if f.severity == "unreliable"]
 
 
