@@ -80,7 +80,7 @@ def initial_fit(
     near: Fit | None = None,
 ) -> Fit | None:
     """Fit a structure without any guess."""
-    first = first_fit(beginning(data), structure, options, extra, keep, own)
+    first = first_fit(data, structure, options, extra, keep, own)
     return first and grow(data, structure, first, options, near)
 
 
