@@ -372,8 +372,10 @@ def _winding(v: Array, w: Array, i: Array) -> tuple[Array, float]:
     """
     ones = np.ones(len(v))
     slow = [lagged(v, samples) for samples in np.geomspace(1.0, len(v) / 4, INSTRUMENTS)]
-    told = np.column_stack([v, *slow, ones])
-    columns = np.column_stack([v, told @ np.linalg.lstsq(told, w, rcond=1e-8)[0], ones])
+    instruments = np.column_stack([v, *slow, ones])
+    columns = np.column_stack(
+        [v, instruments @ np.linalg.lstsq(instruments, w, rcond=1e-8)[0], ones]
+    )
     answer, _, rank, _ = np.linalg.lstsq(columns, i, rcond=1e-8)
     if rank < 3:
         return answer, np.inf

@@ -32,9 +32,10 @@ class SecondOrder(Structure):
     def _response(self) -> tuple[str, ...]:
         return ("ln_a0", "ln_a1", "ln_a2", *(("ln_te",) if self.shape else ()))
 
-    def _tie_steps(self, matrix: Array) -> None:
+    def _tied_steps(self, matrix: Array) -> Array:
         if not self.has("ln_te"):
             matrix[place("ln_te")] = matrix[place("ln_a2")] - matrix[place("ln_a1")]
+        return matrix
 
     def _tied(self, z: Coordinates) -> Coordinates:
         return z if self.has("ln_te") else z.undamped()

@@ -6,6 +6,7 @@ parameters that the compiled pass runs with, what it separates, and where a fit 
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
@@ -33,7 +34,7 @@ class Regressions(Protocol):
 
 
 @dataclass(frozen=True)
-class Structure:
+class Structure(ABC):
     """A candidate structure of the motor, and what is added to it."""
 
     name: ClassVar[str]
@@ -76,9 +77,9 @@ class Structure:
         wanted = {*self._response(), *self._added()}
         return tuple(n for n in NAMES if n in wanted and n not in self.fixed)
 
+    @abstractmethod
     def _response(self) -> tuple[str, ...]:
         """Return the coordinates of the response."""
-        raise NotImplementedError
 
     def _added(self) -> Iterator[str]:
         """Return the coordinates of what is added."""
@@ -90,17 +91,18 @@ class Structure:
     @cached_property
     def matrix(self) -> Array:
         """Derivative of all coordinates by the free ones, shape (12, free), read-only."""
-        m = np.zeros((len(NAMES), len(self.free)))
+        m: Array = np.zeros((len(NAMES), len(self.free)))
         for j, name in enumerate(self.free):
             m[place(name), j] = 1.0
         if self.friction == "symmetric":
             m[place("vc_minus")] = m[place("vc_plus")]
-        self._tie_steps(m)
+        m = self._tied_steps(m)
         m.flags.writeable = False
         return m
 
-    def _tie_steps(self, matrix: Array) -> None:
-        """Put the ties of this structure into the matrix."""
+    def _tied_steps(self, matrix: Array) -> Array:
+        """Return the matrix with the ties of this structure."""
+        return matrix
 
     def of_free(self, vector: Array) -> Array:
         """Return the part of a vector over all coordinates that is of the free ones, shape (f,)."""
@@ -119,13 +121,13 @@ class Structure:
         """Return coordinates with the ties of this structure held."""
         return z
 
+    @abstractmethod
     def internal(self, z: Coordinates) -> tuple[Array, Array]:
         """Return the parameters of the compiled pass and their derivative by the coordinates.
 
         The first four are te, tm, K, be, then follow the coordinates, R itself; shapes (12,) and
         (12, 12).
         """
-        raise NotImplementedError
 
     @property
     def size(self) -> int:
@@ -202,9 +204,9 @@ class Structure:
     def _reported_lags(self) -> tuple[str, ...]:
         return "dc_gain", "time_constant"
 
+    @abstractmethod
     def guesses(self, regressions: Regressions) -> list[Coordinates]:
         """Return motors at which a fit may begin."""
-        raise NotImplementedError
 
     @property
     def _frictions(self) -> tuple[bool, ...]:
