@@ -8,8 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident.diagnosis.limits import (
+    AT_LIMIT,
     FEWEST,
     LARGEST_OFFSET,
+    LATE_ROWS,
     METER,
     MOST_LOST,
     OFFSET_SURE,
@@ -28,8 +30,6 @@ Array = NDArray[np.float64]
 
 RUNS = 2_000  # runs of samples in which signals are averaged before they are compared
 INSTRUMENTS = 8  # lags of the voltage, of which what the motor makes of it is a sum
-LATE = 3  # samples by which a speed commonly comes late
-FEWEST_AT_LIMIT = 5  # samples at a limit while the voltage moves
 RUN_CORRELATION = 20.0  # by which neighbouring runs' errors hang together, at most
 
 
@@ -237,8 +237,9 @@ def _saturation(record: Record) -> None:
             if share < 0.01 or at.sum() < 5 * next_times or runs.sum() < 0.5 * at.sum():
                 continue
             # The last samples of a rest may be late, of a voltage that has moved since.
-            early = at & np.append(at[LATE:], [False] * LATE)
-            if early.sum() < FEWEST_AT_LIMIT:
+            late = int(LATE_ROWS.value)
+            early = at & np.append(at[late:], [False] * late)
+            if early.sum() < AT_LIMIT.value:
                 continue
             low, high = np.percentile(v[early], [5, 95])
             if high - low < 10 * METER.value * np.ptp(v) and not _abrupt(x, at):

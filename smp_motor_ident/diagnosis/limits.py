@@ -22,53 +22,45 @@ class Limit:
 
 # Estimation: what is stated, and how surely.
 NEIGHBOURS = Limit(
-    -0.25,
-    "correlation",
+    -0.25, "correlation",
     "cost: half-way between counts over one sample (-1/2) and several (0); others are not tried",
     "test_differenced.py: a speed over several samples is no difference of neighbouring counts",
-)
+)  # fmt: skip
 ONE_COUNT = Limit(
-    1.5,
-    "variances of a count's rounding",
+    1.5, "variances of a count's rounding",
     "physical: one count leaves one, the sum of two neighbours two",
     "test_differenced.py: a speed over several samples is no difference of neighbouring counts",
-)
+)  # fmt: skip
 LOOSE_QUANTITY = Limit(
-    0.5,
-    "of its value",
+    0.5, "of its value",
     "a quantity known no better than to a factor of two (95 %) decides nothing",
     "test_poor_records.py: a single level of voltage gives one combination",
-)
+)  # fmt: skip
 HIDDEN_LAG = Limit(
-    1e-3,
-    "of the first lag",
+    1e-3, "of the first lag",
     "physical: at ten times the motor's bandwidth that lag turns the phase by 0.6 degrees",
     "test_poor_records.py: a second lag of next to nothing that is not known is not stated",
-)
+)  # fmt: skip
 NEGLIGIBLE_FRICTION = Limit(
-    0.05,
-    "V",
+    0.05, "V",
     "Coulomb friction certain to that much may be nothing: half a percent of 10 V",
     "test_estimate.py: a linear motor is recovered without friction",
-)
+)  # fmt: skip
 HOMOGENEITY = Limit(
-    0.01,
-    "significance level",
+    0.01, "significance level",
     "one record in a hundred of a motor that does not change may be called one that does",
     "test_segments.py: a motor that does not change is rarely said to",
-)
+)  # fmt: skip
 SEGMENTS = Limit(
-    8,
-    "parts of a record",
+    8, "parts of a record",
     "enough for a scatter (a factor of 1.2 by Student's t), few enough for each to know the motor",
     "test_segments.py: a motor that warms up",
-)
+)  # fmt: skip
 SEGMENT_INFORMATION = Limit(
-    0.25,
-    "of the average part's",
+    0.25, "of the average part's",
     "a part whose interval is more than twice the others' adds its noise, not the motor's change",
     "test_segments.py: parts without excitation do not count",
-)
+)  # fmt: skip
 REST = Limit(
     0.05,
     "of the largest voltage",
@@ -338,6 +330,14 @@ ROWS_LOST = Limit(
 HALF_WIDTH = Limit(
     1.96, "standard deviations", "half-width of the stated 95 % interval", "test_adequacy.py"
 )
+LATE_ROWS = Limit(
+    3, "rows", "physical: a firmware's speed commonly comes up to two periods late, and is held",
+    "test_data_quality.py: a speed that settles on its resolution is not saturated",
+)  # fmt: skip
+AT_LIMIT = Limit(
+    5, "rows", "cost: of fewer at a limit neither their voltages nor their run say anything",
+    "test_data_quality.py: a peak that is held for some rows is not saturated",
+)  # fmt: skip
 LONGEST_LAG = Limit(
     10.0, "s", "physical: a flywheel of a hundred rotors runs up within seconds",
     "test_poor_records.py: a motor that cannot be is said to be none",

@@ -103,6 +103,14 @@ def test_a_speed_that_settles_on_its_resolution_is_not_saturated(late):
     screen([Record("motor", np.arange(320) / 50.0, level, velocity=np.round(speed, 1))])
 
 
+def test_a_peak_that_is_held_for_some_rows_is_not_saturated():
+    """A board that reports its speed late says a peak of noise six times."""
+    level = np.repeat([3.0, 8.0, 5.0, 2.0, 6.0], 60) + np.linspace(0.0, 1.0, 300)
+    speed = 25.0 * level + np.random.default_rng(4).normal(0.0, 2.0, 300)
+    speed[100:106] = speed.max() + 20.0
+    screen([Record("motor", np.arange(300) / 100.0, level, velocity=speed)])
+
+
 def test_one_level_of_voltage_saturates_no_sensor():
     speed = np.round(8.0 * 25.0 * (1 - np.exp(-np.arange(300) / 30)), 1)
     level = np.r_[np.zeros(20), np.full(280, 8.0)]
