@@ -285,8 +285,7 @@ def _prepared(
     """Return the data, how the command was held in them, and the fit that showed that."""
     hold, first = chosen_hold(group, base, request.options, request.say)
     data = prepare(group, request.use_current, hold=hold)
-    averaged_speed = data.kind != ANGLE and (base.window or "window" in base.fixed)
-    return data.as_mean_speed() if averaged_speed else data, hold, first
+    return data.measured_as(base.speed), hold, first
 
 
 def _speed_noise(group: Sequence[Record], data: Experiments, fit: Fit) -> float:

@@ -36,6 +36,7 @@ UNITS: Mapping[str, str] = {
     "load_voltage": "V",
     "steady_speed": "rad/s",
     "averaging_window": "s",
+    "sensor_lag": "s",
     "current_lag": "s",
     "resonance_frequency": "rad/s",
     "resonance_damping": "1",

@@ -30,18 +30,25 @@ def sensors(data: Experiments, fit: Fit) -> list[Finding]:
         )
     if isinstance(s, Electromechanical) and s.lags:
         out.append(_current_lag(s.current_sensor, fit.z.current_lag))
-    if s.window or "window" in s.fixed:
-        window = fit.z.window
-        out.append(
-            Finding(
-                "averaged_speed",
-                "warning",
-                f"the speed is averaged over {1e3 * window:.3g} ms: {1e3 * window / 2:.3g} ms of "
-                "what looks like a delay is that filter, not the motor",
-                {"window": window},
-            )
-        )
-    return out
+    return out + ([_filtered_speed(fit)] if s.has("window") else [])
+
+
+def _filtered_speed(fit: Fit) -> Finding:
+    """Say over what the speed's sensor averages, or how it low-passes."""
+    window, lag = fit.z.window, 0.5 * fit.z.window
+    low = fit.structure.low_pass
+    how = (
+        f"low-passed with a time constant of {1e3 * lag:.3g} ms"
+        if low
+        else f"averaged over {1e3 * window:.3g} ms"
+    )
+    return Finding(
+        "low_passed_speed" if low else "averaged_speed",
+        "warning",
+        f"the speed is {how}: {1e3 * lag:.3g} ms of what looks like a delay is that filter, not "
+        "the motor",
+        {"lag": lag} if low else {"window": window},
+    )
 
 
 def _fit_of_current(data: Experiments, fit: Fit) -> list[Finding]:

@@ -13,7 +13,7 @@ from smp_motor_ident.diagnosis.limits import UNEXPLAINED
 from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.likelihood.experiments import Experiments, prepare
-from smp_motor_ident.model.measurement import ANGLE, MEAN_SPEED, SPEED
+from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import Estimate
 
@@ -120,10 +120,7 @@ def held_out(records: Sequence[Record], fit: Fit, hold: str, scatter: float) -> 
     motor's, and differences of few counts make a large speed of it.
     """
     kind = "speed" if fit.kind != ANGLE else "auto"
-    data = prepare(records, False, kind, hold)
-    if fit.kind == MEAN_SPEED and data.kind == SPEED:
-        data = data.as_mean_speed()
-    data = data.held(fit.structure.held)
+    data = prepare(records, False, kind, hold).measured_as(fit.kind).held(fit.structure.held)
     settled = prediction.settle(data, fit)
     own = speed_fit(records, data, settled)
     if within_resolution(data, settled):

@@ -33,7 +33,8 @@ Array = NDArray[np.float64]
 BLOCKS = 60
 DRAWS = 400
 ABSENT = (
-    "delay", "averaging_window", "time_constant_product", "load_voltage", "current_lag",
+    "delay", "averaging_window", "sensor_lag", "time_constant_product", "load_voltage",
+    "current_lag",
 )  # fmt: skip
 """Quantities that are nothing in a structure that does not have them."""
 

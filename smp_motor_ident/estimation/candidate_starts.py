@@ -12,7 +12,6 @@ from smp_motor_ident.estimation import descent
 from smp_motor_ident.estimation.fit import Fit, Options
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.coordinates import Coordinates
-from smp_motor_ident.model.measurement import MEAN_SPEED
 from smp_motor_ident.model.structures import Structure
 
 Array = NDArray[np.float64]
@@ -20,8 +19,7 @@ Array = NDArray[np.float64]
 
 def of_kind(data: Experiments, fit: Fit) -> Experiments:
     """Return the experiments with output and command taken as a fit's structure takes them."""
-    data = data.held(fit.structure.held)
-    return data.as_mean_speed() if fit.kind == MEAN_SPEED else data
+    return data.held(fit.structure.held).measured_as(fit.kind)
 
 
 def no_worse(data: Experiments, fit: Fit, known: list[Fit], options: Options) -> Fit:

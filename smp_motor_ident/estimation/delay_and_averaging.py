@@ -5,15 +5,19 @@ Derivation: docs/derivations.md, section 10.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 from smp_motor_ident.estimation import data_window, descent, start
 from smp_motor_ident.estimation.fit import Fit, Options
 from smp_motor_ident.estimation.initialisation import first_fit
-from smp_motor_ident.estimation.selection import POLICY
+from smp_motor_ident.estimation.selection import POLICY, FittedCandidate
 from smp_motor_ident.likelihood.experiments import Experiments
+from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.model.structures import Structure
 
+HARDLY = 0.01  # of a sample: a window that is as good as none, for the score
+WINDOWS = (1.0, 4.0)  # samples at which a low-pass is begun
 DELAYS = (0.3, 1.5, 3.5)  # samples at which a delay is begun that torque noise may have hidden
 
 
@@ -78,7 +82,42 @@ def first_with_averaging(
         further = structure.order == 2 and twin.structure.order == 1
         starts.append(z.with_second_lag(0.3 * lag) if further else z)
     own = structure.order == 2 and not structure.delay
-    return first_fit(data.as_mean_speed(), structure, options, starts, keep=3, own=own)
+    return first_fit(data.measured_as(structure.speed), structure, options, starts, keep=3, own=own)
+
+
+def with_low_pass(
+    data: Experiments,
+    best: Fit,
+    options: Options,
+    candidates: list[FittedCandidate],
+    say: Callable[[str], None],
+) -> Fit:
+    """Return the fit, or one whose speed is low-passed where the data ask for that.
+
+    Where nothing rubs and no current is measured, a low-pass is a second lag like any.
+    """
+    s = best.structure
+    apart = s.current or (s.order == 2 and s.friction != "none")
+    if data.kind == ANGLE or data.quantum > 0 or s.has("window") > s.window or s.low_pass:
+        return best
+    richer = s.with_(window=True, low_pass=True)
+    low = data.measured_as(richer.speed)
+    if not s.window:
+        hardly = replace(best, z=best.z.with_(window=HARDLY * data.step))
+        if not apart or not POLICY.worth_a_fit(low, hardly, richer):
+            return best
+    say(f"trying {richer.label}")
+    starts = [best.z] if s.window else [best.z.with_(window=n * data.step) for n in WINDOWS]
+    if s.order == 2 and not s.window:
+        lag = best.z.second_lag
+        starts.append(best.z.with_second_lag(0.2 * lag).with_(window=1.6 * lag))
+    tried = [descent.refine(low, richer, best, richer.complete(z), options) for z in starts]
+    other = min(tried, key=lambda f: f.deviance)
+    verdict, reason = POLICY.preferred(best, other)
+    if verdict and other.noise_ratio > 0:  # what looked like torque noise may have been this
+        other = data_window.grow(low, richer, other, options)
+    candidates.append(FittedCandidate(other, reason))
+    return other if verdict else best
 
 
 def delay_without_noise(data: Experiments, best: Fit, options: Options) -> Fit | None:

@@ -26,7 +26,7 @@ from smp_motor_ident.estimation.thinning import thinned
 from smp_motor_ident.likelihood.experiments import Experiments, prepare
 from smp_motor_ident.likelihood.hold import between_samples
 from smp_motor_ident.model.coordinates import direction
-from smp_motor_ident.model.measurement import ANGLE, MEAN_SPEED
+from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.model.structures import SecondOrder, Structure
 from smp_motor_ident.record import Record
 
@@ -88,8 +88,7 @@ def otherwise(
     for other, fit in _worth_a_search(group, data, hold, candidates[-1].fit, request.options):
         request.say("how the command ran between samples")
         again = data if other == hold else prepare(group, request.use_current, hold=other)
-        again = again.as_mean_speed() if data.kind == MEAN_SPEED else again
-        again = again.held(fit.structure.held)
+        again = again.measured_as(data.kind).held(fit.structure.held)
         there = base.with_(held=fit.structure.held)
         auto = request.model == "auto"
         rivals = order_selection.explore(again, there, request.options, auto, request.say)

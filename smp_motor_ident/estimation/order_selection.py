@@ -368,7 +368,7 @@ def _try_average(
     structure = best.structure.with_(window=True)
     say(f"trying {structure.label}")
     starts = [best.z.with_(window=width * data.step) for width in (1.02, 2.0, 4.0)]
-    fitted = initial_fit(data.as_mean_speed(), structure, options, starts, keep=3, own=False)
+    fitted = initial_fit(data.measured_as(structure.speed), structure, options, starts, keep=3, own=False)
     if fitted is None:
         return best
     verdict, reason = POLICY.preferred(best, fitted)

@@ -21,7 +21,7 @@ from smp_motor_ident.model.structures import (
 from smp_motor_ident.record import Record
 
 LOSSES = {"linear": np.inf, "huber": 2.0}
-FIXABLE = (*PHYSICAL, "delay", "averaging_window")
+FIXABLE = (*PHYSICAL, "delay", "averaging_window", "sensor_lag")
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ def checked(
     for name, value in known.items():
         if name not in FIXABLE:
             raise ParameterError(f"fixed {name!r} is not one of {', '.join(FIXABLE)}")
-        positive = name in PHYSICAL[:4] or name == "averaging_window"
+        positive = name in PHYSICAL[:4] or name in FIXABLE[-2:]
         if not np.isfinite(value) or value < 0 or (positive and value == 0):
             raise ParameterError(f"fixed {name} = {value} is not a motor's")
     wheels = {r.wheel for r in group}
@@ -128,16 +128,18 @@ def base_structure(request: Request, group: Sequence[Record]) -> Structure:
         fixed["ln_te"] = float(np.log(known["inductance"] / known["resistance"]))
     if "delay" in known:
         fixed["delay"] = known["delay"]
+    low_pass = "sensor_lag" in known
     window = known.get("averaging_window", max(r.velocity_window for r in group))
+    window = 2 * known["sensor_lag"] if low_pass else window
     if window > 0:
         fixed["window"] = window
     candidate = model.removesuffix("_asymmetric")
     asymmetric = model.endswith("_asymmetric")
     friction = "asymmetric" if asymmetric else "symmetric"
     if use_current:
-        return Electromechanical(friction, asymmetric, fixed=fixed)
+        return Electromechanical(friction, asymmetric, low_pass=low_pass, fixed=fixed)
     if candidate in ("auto", "electromechanical"):
         candidate = "second_order"
-    structure = CANDIDATES[candidate](friction, asymmetric, fixed=fixed)
+    structure = CANDIDATES[candidate](friction, asymmetric, low_pass=low_pass, fixed=fixed)
     # How friction is felt depends on L/R, which the linear response leaves open.
     return structure.with_(shape=True) if isinstance(structure, SecondOrder) else structure

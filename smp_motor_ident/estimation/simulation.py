@@ -25,10 +25,8 @@ def simulate(estimate: Estimate, record: Record) -> tuple[Array, Array]:
     Only the state at the beginning of each segment is fitted; from there on the motor sees
     nothing but the voltage.
     """
-    data = prepare([record], False)
     fit = _motor(estimate)
-    if fit.structure.fixed["window"] > 0 and data.kind == SPEED:
-        data = data.as_mean_speed()
+    data = prepare([record], False).measured_as(fit.kind)
     settled = prediction.settle(data, fit)
     predicted = prediction.simulate(data, settled)
     if data.kind != ANGLE:
@@ -55,7 +53,8 @@ def _motor(estimate: Estimate) -> Fit:
     instant = estimate.model.startswith("static_gain")
     second = estimate.value("time_constant_product") > 0
     kind = SecondOrder if second else StaticGain if instant else FirstOrder
-    structure = kind("asymmetric", fixed=fixed)
+    filtered = estimate.value("sensor_lag") > 0
+    structure = kind("asymmetric", low_pass=filtered, fixed=fixed)
     nothing = np.zeros((0, 0))
     return Fit(
         structure=structure,
@@ -71,7 +70,7 @@ def _motor(estimate: Estimate) -> Fit:
         passes=0,
         converged=True,
         samples=estimate.samples,
-        kind=SPEED,
+        kind=structure.speed if z.window > 0 else SPEED,
     )
 
 
@@ -87,7 +86,7 @@ def coordinates(estimate: Estimate) -> Coordinates:
         vc_minus=estimate.value("static_voltage_reverse", forward),
         load=estimate.value("load_voltage"),
         delay=estimate.value("delay"),
-        window=estimate.value("averaging_window"),
+        window=estimate.value("averaging_window") or 2 * estimate.value("sensor_lag"),
     )
     if not product > 0:
         return z

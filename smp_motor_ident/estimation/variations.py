@@ -10,13 +10,12 @@ from smp_motor_ident.diagnosis.limits import LITTLE_FRICTION
 from smp_motor_ident.estimation import data_window, descent, prediction
 from smp_motor_ident.estimation.candidate_starts import of_kind
 from smp_motor_ident.estimation.current_lag import with_current_lag
-from smp_motor_ident.estimation.delay_and_averaging import delay_without_noise
+from smp_motor_ident.estimation.delay_and_averaging import delay_without_noise, with_low_pass
 from smp_motor_ident.estimation.fit import Fit, Options, solve
 from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.estimation.profile import RISE, one_level, rubbing
 from smp_motor_ident.estimation.selection import POLICY, FittedCandidate, sandwich_factor
 from smp_motor_ident.likelihood.experiments import Experiments
-from smp_motor_ident.model.measurement import MEAN_SPEED
 from smp_motor_ident.model.structures import Structure
 
 Say = Callable[[str], None]
@@ -28,8 +27,8 @@ def varied(
     data: Experiments, best: Fit, options: Options, candidates: list[FittedCandidate], say: Say
 ) -> Fit:
     """Add what the data ask for, take away what they do not show."""
-    if best.kind == MEAN_SPEED:
-        data = data.as_mean_speed()
+    best = with_low_pass(data, best, options, candidates, say)
+    data = data.measured_as(best.kind)
     before = None
     while before != best.structure:  # what was added may have hidden that the rest is there, too
         before = best.structure

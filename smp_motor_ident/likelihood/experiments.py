@@ -95,9 +95,9 @@ class Experiments:
             self.hold_value, other.hold_value
         )
 
-    def as_mean_speed(self) -> Experiments:
-        """Return the same experiments, the speed taken for a mean over a trailing window."""
-        return replace(self, kind=MEAN_SPEED)
+    def measured_as(self, speed: Measurement) -> Experiments:
+        """Return the same experiments, a recorded speed taken for what a sensor shows of it."""
+        return self if self.kind in (ANGLE, speed) else replace(self, kind=speed)
 
     def held(self, how: str) -> Experiments:
         """Return the same experiments, a row's command taken to run before it (as they are), after

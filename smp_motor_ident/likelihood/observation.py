@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident._compile import compiled, inlined
+from smp_motor_ident.likelihood.low_pass import low_passed
 from smp_motor_ident.likelihood.sensitivities import D0, D1, LANES, SLOPE, SQ, ST, SW
 from smp_motor_ident.model import measurement
 from smp_motor_ident.model.columns import LN_R, OFFSET, WINDOW
@@ -58,6 +59,7 @@ def recall(ring: Array, k: int, first: int, t: float, p: int, past: Array) -> fl
 
 
 ANGLE, MEAN_SPEED = measurement.ANGLE.code, measurement.MEAN_SPEED.code
+LOW_PASSED = measurement.LOW_PASSED.code
 ON_OFFSET, ON_R = SLOPE + OFFSET * LANES, SLOPE + LN_R * LANES
 ON_WINDOW = SLOPE + WINDOW * LANES
 
@@ -77,6 +79,8 @@ def observe(
         for j in range(p):
             m[D0 + j] = (m[ST + j] - past[1 + j] + (speed - y) * m[ON_WINDOW + j]) / width
         return y
+    if kind == LOW_PASSED:
+        return low_passed(k == first, t, 0.5 * par[WINDOW], x, m, ring, past.shape[0] - 1)
     if columns:
         if kind == ANGLE:
             for j in range(LANES):

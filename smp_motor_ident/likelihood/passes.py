@@ -17,11 +17,12 @@ from smp_motor_ident.likelihood import recursion
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.linear_pass import run_sliding, squares_sliding
 from smp_motor_ident.likelihood.noise import NoiseModel, whitening
+from smp_motor_ident.likelihood.low_pass import LOW_PASS_WEIGHTS
 from smp_motor_ident.likelihood.normal_equations import eliminate
 from smp_motor_ident.likelihood.sensitivities import LANES
 from smp_motor_ident.model.columns import CURRENT_LAG, WINDOW
 from smp_motor_ident.model.coordinates import Coordinates
-from smp_motor_ident.model.measurement import ANGLE, MEAN_SPEED
+from smp_motor_ident.model.measurement import ANGLE, LOW_PASSED, MEAN_SPEED, SPEED
 from smp_motor_ident.model.structures import SENSORS, Structure, sensor_of
 
 Array = NDArray[np.float64]
@@ -176,7 +177,9 @@ def gather(
 
 
 def _ring(data: Experiments, par: Array, p: int) -> Array:
-    """Return the memory for the window of a mean speed."""
+    """Return the memory for the filter of a speed."""
+    if data.kind == LOW_PASSED:
+        return np.zeros((2, max(4 + 3 * p, LOW_PASS_WEIGHTS)))
     if data.kind != MEAN_SPEED:
         return np.zeros((0, 0))
     return np.zeros((_depth(data, par[WINDOW]), 3 + 2 * p))
@@ -203,7 +206,7 @@ def _slides(data: Experiments, structure: Structure, z: Coordinates, noise: Nois
         structure.friction == "none"
         and not structure.delay
         and z.delay == 0.0
-        and data.kind != MEAN_SPEED
+        and data.kind in (SPEED, ANGLE)
         and not data.current.size
         and noise.huber == math.inf
         and not noise.gain.any()

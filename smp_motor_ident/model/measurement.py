@@ -20,3 +20,5 @@ ANGLE = Measurement("angle", 1, 1)
 """The angle, or counts times their resolution [rad]."""
 MEAN_SPEED = Measurement("mean speed", 2)
 """The mean of the speed over a trailing window [rad/s]."""
+LOW_PASSED = Measurement("low-passed speed", 3)
+"""A first-order low-pass of the speed that is as late as the mean over a window [rad/s]."""

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident.model.coordinates import NAMES, Coordinates, direction, place
+from smp_motor_ident.model.measurement import LOW_PASSED, MEAN_SPEED, SPEED, Measurement
 
 Array = NDArray[np.float64]
 S = TypeVar("S", bound="Structure")
@@ -46,6 +47,7 @@ class Structure(ABC):
     load: bool = False
     delay: bool = False
     window: bool = False
+    low_pass: bool = False  # whether a low-pass of half the window's lag stands in its place
     # How the command ran: a row's value before it, after it, or interpolated from row to row
     held: str = "before"
     own_load: bool = False  # whether every segment has a constant load of its own
@@ -65,6 +67,13 @@ class Structure(ABC):
     def frictionless(self: S) -> S:
         """Return the same without Coulomb friction."""
         return self.with_(friction="none")
+
+    @property
+    def speed(self) -> Measurement:
+        """What the sensor shows of the speed."""
+        if not self.has("window"):
+            return SPEED
+        return LOW_PASSED if self.low_pass else MEAN_SPEED
 
     @property
     def lags(self) -> bool:
@@ -154,7 +163,8 @@ class Structure(ABC):
         yield self.friction == "asymmetric", "asymmetric friction"
         yield self.load, "load"
         yield self.delay, "delay"
-        yield self.window, "averaged speed"
+        yield self.window and not self.low_pass, "averaged speed"
+        yield self.window and self.low_pass, "low-passed speed"
         yield self.held == "after", "command held after its row"
         yield self.held == "interpolated", "command interpolated"
 
@@ -173,7 +183,8 @@ class Structure(ABC):
             "averaging_window": "window",
             "current_lag": "current_lag",
         }
-        return found | {n: (z.value(c), direction(**{c: 1.0})) for n, c in reported.items()}
+        found |= {n: (z.value(c), direction(**{c: 1.0})) for n, c in reported.items()}
+        return found | {"sensor_lag": (0.5 * z.window, direction(window=0.5))}
 
     def _lags_of(self, z: Coordinates) -> Gradients:
         """Return the gain and the lags of the response."""
@@ -196,8 +207,8 @@ class Structure(ABC):
         yield "steady_speed"
         if self.delay or "delay" in self.fixed:
             yield "delay"
-        if self.window or "window" in self.fixed:
-            yield "averaging_window"
+        if self.has("window"):
+            yield "sensor_lag" if self.low_pass else "averaging_window"
         if self.lags:
             yield "current_lag"
 

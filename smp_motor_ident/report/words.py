@@ -25,6 +25,7 @@ EXPLAINED: Mapping[str, tuple[str, str, str]] = {
     "static_voltage_reverse": ("v0−", "Static voltage, reverse", "turning backwards"),
     "load_voltage": ("vl", "Load voltage", "offset that a constant load or sensor makes"),
     "averaging_window": ("w", "Averaging window", "over which the sensor averages the speed"),
+    "sensor_lag": ("τs", "Sensor lag", "time constant of the speed's low-pass"),
     "current_lag": ("τi", "Current lag", "by which the current's sensor is late on average"),
 }
 """Symbol, name and meaning of every quantity."""

@@ -19,6 +19,7 @@ from smp_motor_ident.likelihood.noise import NoiseModel, proper, renewed, whiten
 from smp_motor_ident.likelihood.normal_equations import cholesky_solve, damped_step, eliminate
 from smp_motor_ident.likelihood.passes import gather
 from smp_motor_ident.model.coordinates import Coordinates
+from smp_motor_ident.model.measurement import MEAN_SPEED
 from smp_motor_ident.model.physical import from_physical
 from smp_motor_ident.model.structures import FirstOrder, SecondOrder
 from smp_motor_ident.record import Record
@@ -169,7 +170,7 @@ def test_current_lost_at_every_other_sample_still_gives_the_motor():
 
 def test_a_start_outside_the_bounds_is_taken_to_them():
     record, _ = random_record(1)
-    data = prepare([record], False).as_mean_speed()
+    data = prepare([record], False).measured_as(MEAN_SPEED)
     structure = SecondOrder(friction="none", window=True)
     z = Coordinates(*np.log([0.03, 1e-3, 1e-5])).with_(window=-0.1, ln_te=1e4)
     fit = solve(data, structure, Start(z, data.initial, first_noise(data)), iterations=3)

@@ -111,7 +111,7 @@ def test_irregular_stamps_are_taken_as_they_are():
 
 def test_coordinates_that_are_no_numbers_are_no_motor_and_no_crash():
     data = prepare([motors.record("rear_left", current=False, seconds=1.0)], False, "speed")
-    data = data.as_mean_speed()
+    data = data.measured_as(MEAN_SPEED)
     structure = FirstOrder(window=True)
     z = Coordinates.of(np.full(len(NAMES), np.nan))  # as a descent's overflow leaves it
     found = evaluate(data, structure, z, data.initial, data.initial, NoiseModel())

@@ -1,0 +1,95 @@
+"""A speed behind a first-order low-pass, ``lag y' = w - y``, from sample to sample.
+
+Between two samples the speed is taken for the parabola that has its values at both and the angle
+between them for its integral: the low-pass answers that exactly.
+Derivation: docs/derivations.md, section 4.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smp_motor_ident._compile import compiled
+from smp_motor_ident.likelihood.sensitivities import D0, LANES, SLOPE, ST, SW
+from smp_motor_ident.model.columns import WINDOW
+
+Array = NDArray[np.float64]
+
+# Interval [s]; weights of the output before, of the speed before and now and of the mean speed
+# between, and the derivatives of these four by the lag [1/s].
+LOW_PASS_WEIGHTS = 9
+SHORT = 0.5  # of an interval, in lags: below it the moments are summed as series
+TERMS = 9
+
+
+@compiled
+def _moments(x: float, moment: Array, slope: Array) -> None:
+    """Put ``int_0^1 x exp(-x (1 - u)) u^n du``, n = 0, 1, 2, and its derivative by x."""
+    if x < SHORT:
+        for n in range(3):
+            term = x / (n + 1)
+            moment[n] = slope[n] = 0.0
+            for k in range(TERMS):
+                moment[n] += term
+                slope[n] += (k + 1) * term / x
+                term *= -x / (n + k + 2)
+        return
+    gone = math.exp(-x)
+    moment[0], slope[0] = 1 - gone, gone
+    for n in range(1, 3):
+        moment[n] = 1 - n * moment[n - 1] / x
+        slope[n] = n * (moment[n - 1] / x - slope[n - 1]) / x
+
+
+@compiled
+def weigh(h: float, lag: float, weights: Array) -> None:
+    """Put the weights of a step of the low-pass, and their derivatives by the lag."""
+    moment, slope = np.empty(3), np.empty(3)
+    x = h / lag
+    _moments(x, moment, slope)
+    weights[0] = h
+    for at, m, share in ((1, moment, 1.0), (5, slope, -x / lag)):
+        weights[at] = share * ((1.0 if at == 1 else 0.0) - m[0])
+        weights[at + 1] = share * (m[0] - 4 * m[1] + 3 * m[2])
+        weights[at + 2] = share * (3 * m[2] - 2 * m[1])
+        weights[at + 3] = share * 6 * (m[1] - m[2])
+
+
+@compiled
+def low_passed(
+    first: bool, t: float, lag: float, x: Array, m: Array, kept: Array, p: int
+) -> float:
+    """Return the low-passed speed at a sample; put its derivative into D0.
+
+    It begins where the speed does.  Kept are, in rows, the sample before (time, angle, speed,
+    output and the sensitivities of the last three) and the weights of the interval.
+    """
+    before, c = kept[0], kept[1]
+    speed, angle = x[1], x[2]
+    if first:
+        y = speed
+        for j in range(p):
+            m[D0 + j] = m[SW + j]
+    else:
+        h = t - before[0]
+        if c[0] != h:
+            weigh(h, lag, c)
+        mean = (angle - before[1]) / h
+        y = c[1] * before[3] + c[2] * before[2] + c[3] * speed + c[4] * mean
+        by_lag = c[5] * before[3] + c[6] * before[2] + c[7] * speed + c[8] * mean
+        for j in range(p):
+            m[D0 + j] = (
+                c[1] * before[4 + 2 * p + j]
+                + c[2] * before[4 + p + j]
+                + c[3] * m[SW + j]
+                + c[4] * (m[ST + j] - before[4 + j]) / h
+                + 0.5 * by_lag * m[SLOPE + WINDOW * LANES + j]
+            )
+    before[0], before[1], before[2], before[3] = t, angle, speed, y
+    for j in range(p):
+        before[4 + j], before[4 + p + j] = m[ST + j], m[SW + j]
+        before[4 + 2 * p + j] = m[D0 + j]
+    return float(y)

@@ -1,0 +1,97 @@
+"""A speed that firmware low-passes: the compiled filter, and motors found behind one."""
+
+from dataclasses import replace
+
+import independent
+import motors
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from smp_motor_ident.estimate import estimate
+from smp_motor_ident.likelihood.experiments import prepare
+from smp_motor_ident.likelihood.noise import NoiseModel
+from smp_motor_ident.likelihood.passes import gather
+from smp_motor_ident.model.measurement import LOW_PASSED
+from smp_motor_ident.model.physical import from_physical
+from smp_motor_ident.model.structures import Electromechanical, SecondOrder
+from smp_motor_ident.record import Record
+from smp_motor_ident.tune import motors as tuned
+
+STEP = 5e-3
+FINE = 50  # parts of a sample in which the tests' own motor and filter run
+
+
+def filtered(lag, static_voltage, seconds=10.0, noise=0.0, kind="fourier", wheel="rear_left"):
+    """Return a record of a motor of Table 1 whose speed went through a low-pass."""
+    n = int(seconds / STEP)
+    t = np.arange(n * FINE) * STEP / FINE
+    voltage = independent.excitation(np.arange(n) * STEP, kind, 10.0)
+    # A row's voltage ran before it: sample k is the end of the k-th interval.
+    held = np.concatenate([[voltage[0]], np.repeat(voltage[1:], FINE)])
+    t = np.arange(held.size) * STEP / FINE
+    r, el, k, j, b = independent.TABLE_1[wheel]
+    out = independent.simulate(
+        t, held, r, el, k, j, b, static_voltage * k / r, np.zeros(t.size), 4
+    )  # fmt: skip
+    gone = np.exp(-STEP / FINE / lag)
+    mean = 0.5 * (out[1:, 1] + out[:-1, 1])
+    speed = np.concatenate([[0.0], lfilter([1 - gone], [1, -gone], mean)])[::FINE]
+    rng = np.random.default_rng(2)
+    speed = speed + noise * rng.standard_normal(n)
+    amps = out[::FINE, 0] + 0.01 * rng.standard_normal(n)
+    return Record("motor", np.arange(n) * STEP, voltage, amps, speed, source="bag")
+
+
+@pytest.mark.parametrize("lag", [0.1 * STEP, STEP, 30 * STEP])
+def test_prediction_is_that_of_a_filter_in_small_steps(lag):
+    record = filtered(lag, 0.3)
+    data = replace(prepare([record], True), initial=np.zeros((1, 5))).measured_as(LOW_PASSED)
+    p = independent.TABLE_1["rear_left"]
+    structure = Electromechanical(window=True, low_pass=True)
+    z = structure.complete(from_physical(*p, 0.3 * p[2] / p[0])).with_(window=2 * lag)
+    out = np.zeros((data.size, 3))
+    gather(data, structure, z, data.initial, NoiseModel(), out, differentiate=False)
+    # Where friction bends the speed between two samples, a parabola is off by that much.
+    assert np.abs(out[:, 1] - record.velocity).max() < 2e-3 * np.ptp(record.velocity)
+    assert np.median(np.abs(out[:, 1] - record.velocity)) < 2e-5 * np.ptp(record.velocity)
+
+
+@pytest.mark.parametrize("lag", [0.1 * STEP, STEP, 30 * STEP])
+def test_gradient_is_that_of_finite_differences(lag):
+    record = filtered(STEP, 0.0, 3.0, noise=1.0)
+    data = prepare([record], False).measured_as(LOW_PASSED)
+    structure = SecondOrder(friction="none", window=True, low_pass=True)
+    z = structure.complete(from_physical(*independent.TABLE_1["rear_left"])).with_(window=2 * lag)
+    matrix = structure.matrix
+    gradient = gather(data, structure, z, data.initial).gradient[0]
+    for j in range(matrix.shape[1]):
+        step = 1e-6 * (lag if structure.free[j] == "window" else 1.0)
+        up, down = (
+            gather(data, structure, z.moved(way * step * matrix[:, j]), data.initial).cost[0]
+            for way in (1, -1)
+        )
+        scale = np.abs(gradient[j])
+        assert gradient[j] == pytest.approx(-0.5 * (up - down) / (2 * step), abs=1e-4 * scale)
+
+
+@pytest.mark.parametrize("lag", [0.4 * STEP, 3 * STEP])
+def test_a_motor_with_current_is_found_behind_its_speed_s_low_pass(lag):
+    found = estimate(filtered(lag, 0.3, 20.0, noise=0.1))
+    assert "low_passed_speed" in [f.code for f in found.findings]
+    truth = motors.truth("rear_left", 0.3) | {"sensor_lag": lag}
+    for name in ("sensor_lag", "dc_gain", "time_constant", "resistance", "inductance"):
+        q = (found.parameters | found.combinations)[name]
+        assert abs(q.value - truth[name]) < max(4 * q.std, 5e-3 * truth[name]), name
+    # What gains are computed for is that motor behind that filter.
+    assert tuned.motors_of(found).sensor_lag[0] == pytest.approx(lag, rel=0.05)
+
+
+def test_a_low_pass_that_is_known_is_taken_as_given():
+    lag = 2 * STEP
+    record = replace(filtered(lag, 0.3, noise=0.1), current=None)
+    found = estimate(record, fixed={"sensor_lag": lag})
+    truth = motors.truth("rear_left", 0.3)
+    q = found.combinations["time_constant_product"]
+    assert abs(q.value - truth["time_constant_product"]) < 4 * q.std
+    assert found.value("sensor_lag") == pytest.approx(lag)
