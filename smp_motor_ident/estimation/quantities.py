@@ -27,6 +27,8 @@ Array = NDArray[np.float64]
 
 TRADED = ("dc_gain", "static_voltage", "static_voltage_reverse", "load_voltage")
 """Of a steady speed at one level of voltage only ``dc_gain (level - static_voltage)`` is known."""
+FILTERS = ("averaging_window", "sensor_lag")
+"""What the record or the user may give of a speed's filter."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +90,9 @@ def answer(
     one_level = spread["dc_gain"] > LOOSE_QUANTITY.value * values.value["dc_gain"]
     combinations = {}
     for name in reported:
+        if name in FILTERS and "window" in structure.fixed:
+            combinations[name] = Quantity(values.value[name], unit=UNITS[name], status="fixed")
+            continue
         interval = values.interval(name, conditional)
         if friction_std > 0:
             reach = NORMAL_95 * spread[name]

@@ -95,3 +95,4 @@ def test_a_low_pass_that_is_known_is_taken_as_given():
     q = found.combinations["time_constant_product"]
     assert abs(q.value - truth["time_constant_product"]) < 4 * q.std
     assert found.value("sensor_lag") == pytest.approx(lag)
+    assert found.combinations["sensor_lag"].status == "fixed"
