@@ -20,6 +20,7 @@ from smp_motor_ident.record import Record
 Array = NDArray[np.float64]
 
 LAGS = 16  # between a sampling interval and a quarter of the record: each 1.5 to 2 times the last
+FINE = 16  # samples that are enough of a lag
 RUNS = 2_000  # stretches over which signals are averaged: in them a counter's noise is small
 
 
@@ -35,8 +36,7 @@ class Likeness:
 def likeness(records: Sequence[Record], signals: Sequence[Array], lags: bool) -> Likeness | None:
     """Hold signals against the voltage, as late as they may be; None where they are nothing."""
     pairs = [pair for r, y in zip(records, signals, strict=True) if (pair := _smooth(r, y))]
-    power = sum(float(y @ y) for _, _, y in pairs)
-    if power == 0.0:
+    if not any(y.any() for _, _, y in pairs):
         return None
     times = [0.0]
     if lags:
@@ -45,10 +45,13 @@ def likeness(records: Sequence[Record], signals: Sequence[Array], lags: bool) ->
         times = [0.0, *np.geomspace(shortest, max(longest, 2 * shortest), LAGS)]
     best, worst, reverse = 0.0, 0.0, [(v, y) for _, v, y in pairs]
     for lag in times:
+        every = max(1, int(lag / (FINE * max(step for step, _, _ in pairs))))
+        fewer = [(every * step, _every(v, every), _every(y, every)) for step, v, y in pairs]
+        power = sum(float(y @ y) for _, _, y in fewer)
         for half in (1, 2):  # a mean of two comes half a sample later
-            late = [(_means(lagged(v, lag / step), half), y) for step, v, y in pairs]
+            late = [(_means(lagged(v, lag / step), half), y) for step, v, y in fewer]
             size = float(np.sqrt(sum(float(x @ x) for x, _ in late) * power)) or 1.0
-            for k in range(int(SIGN_LATE.value) + 2 - half):
+            for k in range(int(SIGN_LATE.value / every) + 2 - half):
                 alike = sum(float(x[: x.size - k] @ y[k:]) for x, y in late) / size
                 best = max(best, alike)
                 if alike < worst:
@@ -70,6 +73,12 @@ def _smooth(record: Record, signal: Array) -> tuple[float, Array, Array] | None:
     while k > 1 and 2 * np.square(_means(volts, k)).sum() < np.square(volts).sum():
         k //= 2
     return step, _means(volts, k), _means(y, k) / np.maximum(_means(there, k), 1e-9 + 0.5 / k)
+
+
+def _every(values: Array, k: int) -> Array:
+    """Return the means of k neighbours, one of each k."""
+    n = values.size // k * k
+    return np.asarray(values[:n].reshape(-1, k).mean(axis=1)) if 1 < k <= n else values
 
 
 def _means(values: Array, k: int) -> Array:

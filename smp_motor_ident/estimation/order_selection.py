@@ -116,11 +116,44 @@ def _orders(
 ) -> Fit | None:
     """Climb, by the number of parameters, as far as the data ask.
 
-    Candidates that the screening subset rejects by far are not fitted to all of a long record.
+    Candidates richer than a second lag are not fitted to a long record that asks for no more.
     """
     part = descent.screening_subset(thinned(data))
     structures = _structures(base, data.kind == SPEED, data.quantum > 0)
-    tried = _first_fits(part, structures, options, say)
+    least = [s for s in structures if s.size <= SecondOrder.like(base, shape=True).size]
+    firsts = _first_fits(part, least, options, say, [])
+    if part is not data and data.kind == SPEED and data.quantum == 0:
+        likeliest = min(firsts, key=lambda f: f.deviance, default=None)
+        if likeliest and _enough(part, settled(part, likeliest, options, None)):
+            found: list[FittedCandidate] = []
+            fit = _climbed(data, part, firsts, options, found)
+            if fit and _enough(data, fit):
+                candidates += found
+                return fit
+    firsts = _first_fits(part, structures[len(least) :], options, say, firsts)
+    return _climbed(data, part, firsts, options, candidates)
+
+
+def _enough(data: Experiments, fit: Fit) -> bool:
+    """Tell whether residuals are white and the score of a delay, which any lag has, is none."""
+    s = fit.structure
+    if s.delay or s.window or "delay" in s.fixed or not fit.converged or fit.noise_ratio > 0:
+        return False
+    white = sandwich_factor(fit) <= COLOURED.value
+    return white and not POLICY.worth_a_fit(data, fit, s.with_(delay=True))
+
+
+def _climbed(
+    data: Experiments,
+    part: Experiments,
+    tried: list[Fit],
+    options: Options,
+    candidates: list[FittedCandidate],
+) -> Fit | None:
+    """Climb from first fits.
+
+    Candidates that the screening subset rejects by far are not fitted to all of a long record.
+    """
     # Of a short record torque noise may stand for a load that is not asked for yet.
     if part is not data or data.kind == SPEED:
         tried = _left(data, part, _under_one_noise(part, tried, options), candidates)
@@ -182,10 +215,10 @@ def _no_better(
 
 
 def _first_fits(
-    part: Experiments, structures: list[Structure], options: Options, say: Say
+    part: Experiments, structures: list[Structure], options: Options, say: Say, known: list[Fit]
 ) -> list[Fit]:
-    """Fit all candidates to the beginning of the screening subset."""
-    tried: list[Fit] = []
+    """Fit candidates beside those that are known to the beginning of the screening subset."""
+    tried = list(known)
     part = beginning(part)
     for structure in structures:
         say(f"fitting {structure.label}")
