@@ -70,7 +70,7 @@ def _scatter(data: Experiments, fit: Fit) -> float:
     x = np.zeros_like(base)
     several = carried(data, PATTERNS)
     for n in range(0, PATTERNS, several):
-        signs = rng.choice([-1.0, 1.0], (voltage.size, min(several, PATTERNS - n)))
+        signs = 2.0 * rng.integers(0, 2, (voltage.size, min(several, PATTERNS - n))) - 1.0
         made = signs * moved[:, None], np.zeros((0, 0, 0))
         x += np.square(answered(data, fit, made, 1)).sum(axis=2) / PATTERNS
     x /= np.square(deviation)

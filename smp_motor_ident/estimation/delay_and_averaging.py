@@ -10,7 +10,7 @@ from dataclasses import replace
 
 from smp_motor_ident.estimation import data_window, descent, start
 from smp_motor_ident.estimation.fit import Fit, Options
-from smp_motor_ident.estimation.initialisation import first_fit
+from smp_motor_ident.estimation.initialisation import first_fit, initial_fit
 from smp_motor_ident.estimation.selection import POLICY, FittedCandidate
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.measurement import ANGLE
@@ -83,6 +83,27 @@ def first_with_averaging(
         starts.append(z.with_second_lag(0.3 * lag) if further else z)
     own = structure.order == 2 and not structure.delay
     return first_fit(data.measured_as(structure.speed), structure, options, starts, keep=3, own=own)
+
+
+def with_average(
+    data: Experiments,
+    best: Fit,
+    options: Options,
+    candidates: list[FittedCandidate],
+    say: Callable[[str], None],
+) -> Fit:
+    """Try a speed averaged over a window of a sample or more, current being measured."""
+    structure = best.structure.with_(window=True)
+    say(f"trying {structure.label}")
+    starts = [best.z.with_(window=width * data.step) for width in (1.02, 2.0, 4.0)]
+    fitted = initial_fit(
+        data.measured_as(structure.speed), structure, options, starts, keep=3, own=False
+    )
+    if fitted is None:
+        return best
+    verdict, reason = POLICY.preferred(best, fitted)
+    candidates.append(FittedCandidate(fitted, reason))
+    return fitted if verdict else best
 
 
 def with_low_pass(

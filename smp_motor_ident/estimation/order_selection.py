@@ -21,6 +21,7 @@ from smp_motor_ident.estimation.delay_and_averaging import (
     first_with_averaging,
     first_with_delay,
     settled,
+    with_average,
     with_delay,
 )
 from smp_motor_ident.estimation.fit import Fit, Options, solve
@@ -63,7 +64,7 @@ def explore(
         )
         best = with_current_lag(data, first, options, candidates, say)
         if auto and data.kind == SPEED:
-            best = _try_average(data, best, options, candidates, say)
+            best = with_average(data, best, options, candidates, say)
     else:
         found = _orders(data, base, options, say, candidates)
         if found is None:
@@ -392,18 +393,3 @@ def _orders_again(
         candidates.append(FittedCandidate(other, reason))
         best, s = (other, structure) if better else (best, s)
     return best
-
-
-def _try_average(
-    data: Experiments, best: Fit, options: Options, candidates: list[FittedCandidate], say: Say
-) -> Fit:
-    """Try a speed averaged over a window of a sample or more, current being measured."""
-    structure = best.structure.with_(window=True)
-    say(f"trying {structure.label}")
-    starts = [best.z.with_(window=width * data.step) for width in (1.02, 2.0, 4.0)]
-    fitted = initial_fit(data.measured_as(structure.speed), structure, options, starts, keep=3, own=False)
-    if fitted is None:
-        return best
-    verdict, reason = POLICY.preferred(best, fitted)
-    candidates.append(FittedCandidate(fitted, reason))
-    return fitted if verdict else best

@@ -59,9 +59,7 @@ def weigh(h: float, lag: float, weights: Array) -> None:
 
 
 @compiled
-def low_passed(
-    first: bool, t: float, lag: float, x: Array, m: Array, kept: Array, p: int
-) -> float:
+def low_passed(first: bool, t: float, lag: float, x: Array, m: Array, kept: Array, p: int) -> float:
     """Return the low-passed speed at a sample; put its derivative into D0.
 
     It begins where the speed does.  Kept are, in rows, the sample before (time, angle, speed,

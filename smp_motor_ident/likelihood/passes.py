@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from smp_motor_ident.likelihood import recursion
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.linear_pass import run_sliding, squares_sliding
-from smp_motor_ident.likelihood.noise import NoiseModel, whitening
 from smp_motor_ident.likelihood.low_pass import LOW_PASS_WEIGHTS
+from smp_motor_ident.likelihood.noise import NoiseModel, whitening
 from smp_motor_ident.likelihood.normal_equations import eliminate
 from smp_motor_ident.likelihood.sensitivities import LANES
 from smp_motor_ident.model.columns import CURRENT_LAG, WINDOW
