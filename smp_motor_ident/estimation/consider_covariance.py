@@ -10,6 +10,7 @@ Derivation: docs/derivations.md, section 9; Leeb and Poetscher, Econometric Theo
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,6 +25,7 @@ from smp_motor_ident.model.structures import Electromechanical, Structure
 
 Array = NDArray[np.float64]
 
+POINTS = 64  # of a sample, at which a delay may be
 SEEN = 1e-6
 """Share of a coordinate's information below which rounding and kinks decide what is left."""
 
@@ -106,10 +108,32 @@ def consider_left_out(data: Experiments, fit: Fit) -> Fit:
         beside = _beside(data, with_lag(fit, little) if little else fit, richer, coordinate)
         own, found = factor * beside.variance, beside.size + little
         early = little > 0 and found < 0  # which no sensor is
+        left = 0.0
+        if coordinate == "delay":
+            left = within_a_sample(found, own, data.step)
         # Akaike: with it the motor is predicted better.
         if beside.seen and found**2 > 2 * own and not early:
-            wider = wider.wider(beside.covariance(found**2 - own))
+            left = max(left, found**2 - own)
+        wider = wider.wider(beside.covariance(left)) if left > 0 else wider
     return wider
+
+
+def within_a_sample(found: float, variance: float, step: float) -> float:
+    """Return the mean square [s^2] of a delay that as likely is none as any part of a sample.
+
+    ``found`` and ``variance`` are what the data say of it (a normal likelihood).  Nobody who logs
+    a command knows when in its interval the driver takes it up; the logarithm of the samples, by
+    which an addition must gain, is the price of one that could be anything.
+
+    References
+    ----------
+    Mitchell and Beauchamp, J. Am. Stat. Assoc. 83 (1988), 1023 (spike and slab).
+    """
+    deviation = math.sqrt(variance)
+    delays = (np.arange(POINTS) + 0.5) * step / POINTS
+    likely = np.exp(-0.5 * np.square((delays - found) / deviation))
+    none = math.exp(-0.5 * (found / deviation) ** 2)
+    return float(np.mean(likely * np.square(delays)) / (np.mean(likely) + none + 1e-300))
 
 
 @dataclass(frozen=True, eq=False)

@@ -168,7 +168,10 @@ def _delayed(
         whole = [refine(part, fixed, n, fixed.complete(z), options, ROUGHLY) for n in near]
         fits.append((min(whole, key=lambda f: f.deviance), structure))
     fit, structure = min(fits, key=lambda f: f[0].deviance)
-    return restate(part, structure, fit, options)
+    found = restate(part, structure, fit, options)
+    # Another hold may be another part of a sample late.
+    freed = refine(part, structure, found, found.z, options, ROUGHLY) if structure.delay else found
+    return min(found, freed, key=lambda f: f.deviance)
 
 
 def instant_deviation(group: Sequence[Record], hold: str) -> float:

@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
-from independent import excitation, simulate
+from independent import TABLE_1, excitation, simulate
+from motors import truth
 from scipy.signal import lsim
+from scipy.stats import chi2
 
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.likelihood.hold import rerun
@@ -51,6 +53,42 @@ def test_a_command_that_runs_straight_from_row_to_row_is_no_longer_winding(seed)
     speed = speed + 0.05 * rng.standard_normal(t.size)
     truth = {"dc_gain": motor[0][0], "time_constant": slow[0], "time_constant_product": slow[1]}
     right(Record("motor", t, v, velocity=speed), truth)
+
+
+def late_record(seed, tones, rate, samples, per_turn, late=None):
+    """Return counts of a motor that takes each command up none or some tenths of a sample late."""
+    rng = np.random.default_rng(seed)
+    drawn = int(rng.integers(0, 10)) if rng.random() < 0.5 else 0
+    late = drawn if late is None else late
+    t = np.arange(samples) / rate
+    v = sum(rng.uniform(1, 3) * np.sin(2 * np.pi * f * t + rng.uniform(0, 6)) for f in tones)
+    ran = np.concatenate([np.full(1 + late, v[0]), np.repeat(v[1:], 10)])[: 10 * (samples - 1) + 1]
+    r, el, k, j, b = TABLE_1["rear_left"]
+    fine = np.arange(ran.size) / (10 * rate)
+    out = simulate(fine, ran, r, el, k, j, b, 0.3 * k / r, np.zeros(ran.size), 4)[::10]
+    count = np.floor(out[:, 2] * per_turn / (2 * np.pi) + rng.uniform()).astype(np.int64)
+    return Record("motor", t, v, count=count, hardware=Hardware(1.0, per_turn))
+
+
+@pytest.mark.parametrize("late", [3, 4])
+def test_a_part_of_a_sample_that_a_command_comes_late_is_no_switch_in_its_middle(late):
+    tones = (0.5, 1.1, 2.3, 5.3, 11.0, 19.0)
+    record = late_record(1, tones, 200, 1000, 500.0, late)
+    known = truth("rear_left", 0.3)
+    right(record, {name: known[name] for name in TRUTH})
+    assert estimate(record).value("delay") == pytest.approx(late / 10 / 200, abs=0.02 / 200)
+
+
+def test_lags_bear_a_part_of_a_sample_that_slow_commands_do_not_show():
+    """Coarse counts of slow tones tell a delay and a second lag apart by a fraction of a sample."""
+    known, errors = truth("rear_left", 0.3), []
+    for seed in range(20):
+        found = estimate(late_record(seed, (0.2, 0.5, 1.1, 2.3), 500, 5000, 28.0)).combinations
+        lag = found["time_constant"]
+        errors.append((lag.value - known["time_constant"]) / lag.std)
+    # Of 20 draws of unit variance; half as large intervals, or twice, are beyond it.
+    low, high = np.sqrt(chi2.ppf([1e-3, 1 - 1e-3], 20) / 20)
+    assert low < np.sqrt(np.mean(np.square(errors))) < high
 
 
 def test_the_quarters_of_a_rise_have_the_moments_of_the_straight_line():
