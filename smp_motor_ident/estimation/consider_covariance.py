@@ -25,7 +25,7 @@ from smp_motor_ident.model.structures import Electromechanical, Structure
 
 Array = NDArray[np.float64]
 
-POINTS = 64  # of a sample, at which a delay may be
+POINTS = 64  # at which a lag may be
 SEEN = 1e-6
 """Share of a coordinate's information below which rounding and kinks decide what is left."""
 
@@ -94,23 +94,23 @@ def consider_left_out(data: Experiments, fit: Fit) -> Fit:
     That is a delay, a load, or a lag of the current's sensor.
     """
     s = fit.structure
-    additions: list[tuple[Structure, str]] = []
+    # With the most that nobody would know of it: a driver takes up a command within a sample, and
+    # a sensor that averages over one is late by half.
+    additions: list[tuple[Structure, str, float]] = []
     if not s.delay and "delay" not in s.fixed:
-        additions.append((s.with_(delay=True), "delay"))
+        additions.append((s.with_(delay=True), "delay", data.step))
     if not s.load and not s.own_load and "load" not in s.fixed:
-        additions.append((s.with_(load=True), "load"))
+        additions.append((s.with_(load=True), "load", 0.0))
     if isinstance(s, Electromechanical) and not s.lags:
-        additions.append((s.with_(current_sensor="averaged"), "current_lag"))
+        additions.append((s.with_(current_sensor="averaged"), "current_lag", 0.5 * data.step))
     factor = float(np.median(fit.sandwich_factors())) if s.free else 1.0
     wider = fit
-    for richer, coordinate in additions if s.free else []:
+    for richer, coordinate, most in additions if s.free else []:
         little = LITTLE * data.step * (coordinate == "current_lag")
         beside = _beside(data, with_lag(fit, little) if little else fit, richer, coordinate)
         own, found = factor * beside.variance, beside.size + little
         early = little > 0 and found < 0  # which no sensor is
-        left = 0.0
-        if coordinate == "delay":
-            left = within_a_sample(found, own, data.step)
+        left = mean_square(found, own, most) if beside.seen else most**2 / 6
         # Akaike: with it the motor is predicted better.
         if beside.seen and found**2 > 2 * own and not early:
             left = max(left, found**2 - own)
@@ -118,22 +118,21 @@ def consider_left_out(data: Experiments, fit: Fit) -> Fit:
     return wider
 
 
-def within_a_sample(found: float, variance: float, step: float) -> float:
-    """Return the mean square [s^2] of a delay that as likely is none as any part of a sample.
+def mean_square(found: float, variance: float, most: float) -> float:
+    """Return the mean square [s^2] of a lag that as likely is none as any part of ``most``.
 
-    ``found`` and ``variance`` are what the data say of it (a normal likelihood).  Nobody who logs
-    a command knows when in its interval the driver takes it up; the logarithm of the samples, by
-    which an addition must gain, is the price of one that could be anything.
+    ``found`` and ``variance`` are what the data say of it (a normal likelihood).  The logarithm of
+    the samples, by which an addition must gain, is the price of one that could be anything.
 
     References
     ----------
     Mitchell and Beauchamp, J. Am. Stat. Assoc. 83 (1988), 1023 (spike and slab).
     """
     deviation = math.sqrt(variance)
-    delays = (np.arange(POINTS) + 0.5) * step / POINTS
-    likely = np.exp(-0.5 * np.square((delays - found) / deviation))
+    lags = (np.arange(POINTS) + 0.5) * most / POINTS
+    likely = np.exp(-0.5 * np.square((lags - found) / deviation))
     none = math.exp(-0.5 * (found / deviation) ** 2)
-    return float(np.mean(likely * np.square(delays)) / (np.mean(likely) + none + 1e-300))
+    return float(np.mean(likely * np.square(lags)) / (np.mean(likely) + none + 1e-300))
 
 
 @dataclass(frozen=True, eq=False)

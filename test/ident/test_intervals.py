@@ -12,7 +12,7 @@ from smp_motor_control.excitation import Fourier
 from smp_motor_control.motor.parameters import PHYSICAL
 from smp_motor_ident.diagnosis.identifiability import what_next
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.estimation.consider_covariance import consider_left_out, within_a_sample
+from smp_motor_ident.estimation.consider_covariance import consider_left_out, mean_square
 from smp_motor_ident.estimation.fitted import Options, long_run
 from smp_motor_ident.estimation.hold_choice import instant_deviation
 from smp_motor_ident.estimation.initialisation import initial_fit
@@ -174,7 +174,7 @@ def test_a_delay_within_a_sample_is_none_or_any_part_of_it(found, deviation):
     none, some = likely(0.0), quad(likely, 0.0, 1.0, points=[found])[0]
     square = quad(lambda d: d * d * likely(d), 0.0, 1.0, points=[found])[0]
     step = 3e-3
-    open_left = within_a_sample(found * step, (deviation * step) ** 2, step)
+    open_left = mean_square(found * step, (deviation * step) ** 2, step)
     assert open_left == pytest.approx(square / (none + some) * step**2, rel=0.01)
 
 
