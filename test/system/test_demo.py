@@ -48,6 +48,7 @@ def mark() -> Iterator[str]:
         os.kill(pid, signal.SIGKILL)
 
 
+@pytest.mark.alone
 @pytest.mark.slow
 def test_the_demo_shows_everything_and_leaves_nothing_running(
     process: Callable[..., Any], mark: str, tmp_path: Path
