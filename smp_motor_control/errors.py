@@ -5,6 +5,8 @@ Every message names the value (and the file where there is one) and says what to
 
 from __future__ import annotations
 
+import math
+
 LONGEST_MESSAGE = 1000
 """Characters of a message: of a value that is quoted from a spoilt file head and tail are shown."""
 
@@ -32,3 +34,10 @@ def check_range(name: str, value: float, low: float, high: float, unit: str = ""
         return float(value)
     given = f"{value!r} {unit}".rstrip()
     raise ParameterError(f"{name} is {given}; it must be a number from {low:g} to {high:g}")
+
+
+def check_positive(name: str, value: float, unit: str = "", *, or_zero: bool = False) -> None:
+    """Refuse what is not finite and positive; zero only where it is none of what may be."""
+    if not (0.0 < value < math.inf or (or_zero and value == 0.0)):
+        given = f"{value!r} {unit}".rstrip()
+        raise ParameterError(f"{name} is {given}; it must be {'zero or ' * or_zero}positive")

@@ -16,7 +16,7 @@ from typing import overload
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_control.errors import ParameterError
+from smp_motor_control.errors import ParameterError, check_positive
 
 Array = NDArray[np.float64]
 
@@ -41,8 +41,8 @@ class Excitation(ABC):
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if name not in ("seed", "duration") and not (math.isfinite(value) and value > 0):
-                raise ParameterError(f"{name} is {value!r}; it must be positive")
+            if name not in ("seed", "duration"):
+                check_positive(name, value)
 
     @overload
     def __call__(self, time: float) -> float: ...
@@ -227,8 +227,7 @@ class Bounded(Excitation):
     fade: float = 0.0  # time over which it grows and shrinks [s]
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.duration) and self.duration > 0):
-            raise ParameterError(f"duration is {self.duration!r} s; it must be positive")
+        check_positive("duration", self.duration, "s")
         if not 0.0 <= self.fade <= self.duration / 2:
             raise ParameterError(
                 f"fade is {self.fade!r} s; it must be between 0 and half of the duration"

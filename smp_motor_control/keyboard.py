@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from smp_motor_control import WHEELS
-from smp_motor_control.errors import ParameterError
+from smp_motor_control.errors import check_positive
 
 ARROWS: Mapping[str, str] = {"A": "up", "B": "down", "C": "right", "D": "left"}
 
@@ -73,9 +73,7 @@ class Speeds:
 
     def __post_init__(self) -> None:
         for name in ("linear", "angular", "wheel", "step", "timeout"):
-            value = getattr(self, name)
-            if not 0.0 < value < math.inf:
-                raise ParameterError(f"{name} of the keyboard is {value}: must be positive")
+            check_positive(f"{name} of the keyboard", getattr(self, name))
 
 
 class Keyboard:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from enum import Enum
 
-from smp_motor_control.errors import ParameterError
+from smp_motor_control.errors import check_positive
 
 
 class Verdict(Enum):
@@ -39,8 +39,7 @@ class BodyCommand:
 
     def configure(self, timeout: float) -> None:
         """Change the time-out."""
-        if not 0.0 <= timeout < math.inf:
-            raise ParameterError(f"timeout is {timeout} s: must be finite and not negative")
+        check_positive("timeout", timeout, "s", or_zero=True)
         self.timeout = timeout
 
     def reset(self) -> None:

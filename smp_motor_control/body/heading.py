@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from smp_motor_control.errors import ParameterError
+from smp_motor_control.errors import check_positive
 
 
 def wrapped(angle: float) -> float:
@@ -44,12 +44,10 @@ class HeadingHold:
     def __init__(
         self, p: float = 2.0, i: float = 0.5, max_correction: float = 0.5, max_error: float = 0.7
     ) -> None:
-        for name, value in {"p": p, "i": i}.items():
-            if not 0.0 <= value < math.inf:
-                raise ParameterError(f"heading {name} is {value}: must not be negative")
-        for name, value in {"max_correction": max_correction, "max_error": max_error}.items():
-            if not 0.0 < value < math.inf:
-                raise ParameterError(f"heading {name} is {value}: must be positive")
+        check_positive("heading p", p, "1/s", or_zero=True)
+        check_positive("heading i", i, "1/s^2", or_zero=True)
+        check_positive("heading max_correction", max_correction, "rad/s")
+        check_positive("heading max_error", max_error, "rad")
         self._p, self._i = p, i
         self._max_correction, self._max_error = max_correction, max_error
         self.reset()

@@ -6,7 +6,7 @@ import math
 from collections import deque
 from typing import NamedTuple
 
-from smp_motor_control.errors import ParameterError
+from smp_motor_control.errors import ParameterError, check_positive
 
 LEAST_STEP = 1e-6
 """Time steps [s] below this one are not integrated."""
@@ -101,17 +101,11 @@ class Odometry:
         turn_noise: float,
     ) -> None:
         """Change the geometry or the noise from the next step on; the pose stays."""
-        lengths = {
-            "wheel_separation": wheel_separation,
-            "left_radius": left_radius,
-            "right_radius": right_radius,
-        }
-        for name, value in lengths.items():
-            if not 0.0 < value < math.inf:
-                raise ParameterError(f"{name} is {value} m: must be positive")
-        for name, value in {"travel_noise": travel_noise, "turn_noise": turn_noise}.items():
-            if not 0.0 <= value < math.inf:
-                raise ParameterError(f"{name} is {value}: must not be negative")
+        check_positive("wheel_separation", wheel_separation, "m")
+        check_positive("left_radius", left_radius, "m")
+        check_positive("right_radius", right_radius, "m")
+        check_positive("travel_noise", travel_noise, "m^2/m", or_zero=True)
+        check_positive("turn_noise", turn_noise, "rad^2/rad", or_zero=True)
         self._separation, self._left, self._right = wheel_separation, left_radius, right_radius
         self._travel_noise, self._turn_noise = travel_noise, turn_noise
 

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from smp_motor_control.encoder import Encoder
-from smp_motor_control.errors import ParameterError
+from smp_motor_control.errors import ParameterError, check_positive
 from smp_motor_control.motor.friction import Gearbox, MotorParameters
 from smp_motor_control.motor.parameters import COMBINATIONS, PHYSICAL
 from smp_motor_control.parameter_file import read_yaml
@@ -58,10 +58,7 @@ class Wiring:
                     f"{name} is {getattr(self, name)!r}; it must be 1, or -1 where swapped"
                 )
         for name in ("dead_zone", "described_gear_ratio"):
-            if not getattr(self, name) >= 0:
-                raise ParameterError(
-                    f"{name} is {getattr(self, name)!r}; it must be zero or positive"
-                )
+            check_positive(name, getattr(self, name), or_zero=True)
 
 
 @dataclass(frozen=True)
@@ -171,12 +168,8 @@ def _entry(values: Any, where: str) -> MotorEntry:
 def _with_hardware(
     parameters: MotorParameters, resistance: float, hardware: Mapping[str, float]
 ) -> MotorEntry:
-    if not hardware["supply_voltage"] > 0:
-        raise ParameterError(
-            f"supply_voltage is {hardware['supply_voltage']!r} V; it must be positive"
-        )
-    if not hardware["delay"] >= 0:
-        raise ParameterError(f"delay is {hardware['delay']!r} s; it must be zero or positive")
+    check_positive("supply_voltage", hardware["supply_voltage"], "V")
+    check_positive("delay", hardware["delay"], "s", or_zero=True)
     bits = hardware["encoder_bits"]
     return MotorEntry(
         parameters=parameters,

@@ -27,8 +27,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from smp_motor_control.errors import ParameterError, check_range
-
 Array = NDArray[np.float64]
 
 NEGLIGIBLE = 1e-14
@@ -200,62 +198,3 @@ def _coefficients(tau: Array, tp: Array, t: Array) -> tuple[Array, Array, Array,
         np.where(first_order, 0.0, h_rate),
         np.where(first_order, 0.0, tp),
     )
-
-
-def flexible_shaft(
-    motor: tuple[float, float, float, float, float],
-    load_inertia: float,
-    stiffness: float,
-    damping: float = 0.0,
-) -> tuple[Array, Array]:
-    """Return the state space of a motor that drives its encoder through a flexible shaft.
-
-    State ``(i, w_motor, w_load, twist)`` with ``twist = angle_motor - angle_load``:
-
-        L i' = v - R i - K w_m
-        J w_m' = K i - b w_m - s,   J_load w_l' = s,   s = stiffness twist + damping (w_m - w_l)
-
-    The encoder shows ``w_l``.  The antiresonance is at ``sqrt(stiffness / J_load)`` and the
-    free resonance at ``sqrt(stiffness (1/J + 1/J_load))``.
-
-    Parameters
-    ----------
-    motor : tuple of float
-        R [ohm], L [H], K [N m/A], J [kg m^2] and b [N m s/rad] at the motor shaft.
-    load_inertia : float
-        [kg m^2], positive.
-    stiffness : float
-        [N m/rad], positive.
-    damping : float
-        [N m s/rad].
-
-    Returns
-    -------
-    A : ndarray, shape (4, 4) or (3, 3)
-        Without inductance the current is no state.
-    B : ndarray, shape (4,) or (3,)
-        From the voltage.
-
-    Raises
-    ------
-    ParameterError
-        When a number is not finite or not of its sign.
-    """
-    R, L, K, J, b = motor
-    for name, value in (("load_inertia", load_inertia), ("stiffness", stiffness)):
-        check_range(name, value, 1e-18, 1e12)
-    check_range("damping", damping, 0.0, 1e12)
-    if not (R > 0.0 and L >= 0.0 and J > 0.0):
-        raise ParameterError(f"motor has R = {R}, L = {L}, J = {J}: R and J must be positive")
-    A = np.zeros((4, 4))
-    A[0] = (-R, -K, 0.0, 0.0)
-    A[1] = (K / J, -(b + damping) / J, damping / J, -stiffness / J)
-    A[2] = (0.0, damping / load_inertia, -damping / load_inertia, stiffness / load_inertia)
-    A[3, 1:3] = 1.0, -1.0
-    B = np.array([1.0, 0.0, 0.0, 0.0])
-    if L > 0.0:
-        A[0] /= L
-        return A, B / L
-    # Without inductance i = (v - K w) / R.
-    A[1] += A[1, 0] * np.array([0.0, -K / R, 0.0, 0.0])
-    return A[1:, 1:], np.array([K / (J * R), 0.0, 0.0])

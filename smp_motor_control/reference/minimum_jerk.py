@@ -22,7 +22,7 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from smp_motor_control.errors import ParameterError, check_range
+from smp_motor_control.errors import check_positive, check_range
 
 PEAK_ACCELERATION = 15.0 / 8.0
 """Peak acceleration of the minimum-jerk transition from rest, in units of ``|D|/T``."""
@@ -93,8 +93,7 @@ class MinimumJerk:
     __slots__ = ("_c", "duration", "start", "target")
 
     def __init__(self, start: Reference, target: float, duration: float) -> None:
-        if not (duration > 0.0 and math.isfinite(duration)):
-            raise ParameterError(f"duration of a transition is {duration} s: must be positive")
+        check_positive("duration of a transition", duration, "s")
         self.start, self.target, self.duration = start, target, duration
         step = target - start.velocity
         slope = start.acceleration * duration

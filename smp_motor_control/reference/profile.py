@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from smp_motor_control.errors import ParameterError
+from smp_motor_control.errors import ParameterError, check_positive
 from smp_motor_control.reference.minimum_jerk import (
     Limited,
     MinimumJerk,
@@ -70,10 +70,7 @@ class Profile:
         self, limits: ProfileLimits, transition_time: float, drive: Drive | None = None
     ) -> None:
         """Change limits and duration from the next change of the target on."""
-        if not 0.0 <= transition_time < math.inf:
-            raise ParameterError(
-                f"transition_time is {transition_time} s: must be finite and not negative"
-            )
+        check_positive("transition_time", transition_time, "s", or_zero=True)
         self.limits, self.drive = limits, drive
         self.transition_time = transition_time if transition_time >= _SHORTEST else 0.0
 

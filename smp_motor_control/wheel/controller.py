@@ -13,7 +13,7 @@ from statistics import median
 from typing import Protocol
 
 from smp_motor_control.encoder import Encoder
-from smp_motor_control.errors import ParameterError
+from smp_motor_control.errors import ParameterError, check_positive
 from smp_motor_control.motor.parameters import Gearbox
 from smp_motor_control.pid import PidOutput
 from smp_motor_control.wheel.acceptance import Circumstances, check
@@ -136,8 +136,7 @@ class WheelController:
         self, gearbox: Gearbox, encoder: Encoder, supply: float, resistance: float = math.nan
     ) -> None:
         """Learn what is between motor and wheel."""
-        if not 0.0 < supply < math.inf:
-            raise ParameterError(f"supply_voltage is {supply!r} V; it must be positive")
+        check_positive("supply_voltage", supply, "V")
         self.settings.loop.within(supply)
         self.supply = supply
         self.loop.set_hardware(gearbox, encoder, 1.5 * supply)

@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass
 from enum import Enum
 
-from smp_motor_control.errors import ParameterError
+from smp_motor_control.errors import check_positive
 
 MOST_TRIES = 3
 """How often a wheel at fault is tried again before only a person may reset it."""
@@ -71,8 +71,7 @@ class FaultLimits:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if not 0.0 <= value < math.inf:
-                raise ParameterError(f"{name} is {value!r}; it must be zero or positive")
+            check_positive(name, value, or_zero=True)
 
 
 class FaultDetector:

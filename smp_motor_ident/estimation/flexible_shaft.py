@@ -2,10 +2,10 @@ r"""A motor that shows its encoder through a flexible shaft: one file, one candi
 
     w / v = K / ((tp s^2 + tau s + 1) (s^2 / w_r^2 + 2 zeta s / w_r + 1))
 
-is what two inertias with a spring and a damper between them answer at the far one (see
-:func:`smp_motor_control.motor.response.flexible_shaft`), whatever their shares: from voltage and
-speed the resonance is known, the two inertias and the stiffness are not.  The zero of a damped
-shaft at ``-stiffness/damping`` is beyond the resonance; it shows as a little less delay or L/R.
+is what two inertias with a spring and a damper between them answer at the far one, whatever their
+shares: from voltage and speed the resonance is known, the two inertias and the stiffness are not.
+The zero of a damped shaft at ``-stiffness/damping`` is beyond the resonance; it shows as a little
+less delay or L/R.
 
 The response is exact for a voltage held over intervals of any length.  Gain, static voltage and
 the state at the beginning of each segment enter linearly and are eliminated (variable

@@ -6,12 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from smp_motor_control.errors import ParameterError
-from smp_motor_control.motor.response import (
-    FreeResponse,
-    flexible_shaft,
-    zero_order_hold,
-)
+from smp_motor_control.motor.response import FreeResponse, zero_order_hold
 
 GAIN, TAU = 20.0, 0.05
 # tp / tau^2: oscillating, a double root, real roots, and L/R of 50 us and 50 ns.
@@ -62,25 +57,3 @@ def test_a_decayed_pole_leaves_the_motor_of_first_order() -> None:
     assert second.angle_forced == pytest.approx(first.angle_forced, rel=1e-7)
     for values in second:
         assert np.all(np.isfinite(values))
-
-
-def test_a_flexible_shaft_resonates_where_its_two_inertias_say() -> None:
-    motor, load, stiffness = (2.0, 1e-3, 0.03, 1e-5, 1e-6), 4e-5, 2.0
-    A, _ = flexible_shaft(motor, load, stiffness)
-    ringing = np.abs(np.linalg.eigvals(A).imag).max()
-    # Back-EMF and friction shift it by the square of their damping, a few percent.
-    assert ringing == pytest.approx(np.sqrt(stiffness * (1 / 1e-5 + 1 / load)), rel=0.02)
-
-
-@pytest.mark.parametrize("inductance", [0.0, 1e-3])
-def test_a_stiff_shaft_is_one_inertia(inductance: float) -> None:
-    motor, load = (2.0, inductance, 0.03, 1e-5, 1e-6), 4e-5
-    A, B = flexible_shaft(motor, load, 1e9, 1.0)
-    speed = -2 if inductance == 0.0 else 2
-    gain = -np.linalg.solve(A, B)[1 if inductance == 0.0 else speed]
-    assert gain == pytest.approx(0.03 / (0.03**2 + 2.0 * 1e-6), rel=1e-6)
-
-
-def test_a_shaft_without_stiffness_is_refused() -> None:
-    with pytest.raises(ParameterError, match="stiffness"):
-        flexible_shaft((2.0, 1e-3, 0.03, 1e-5, 1e-6), 4e-5, 0.0)
