@@ -14,6 +14,7 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
@@ -79,6 +80,16 @@ class MotorEntry:
     def knows_current(self) -> bool:
         """Whether the current follows from the parameters."""
         return not math.isnan(self.resistance)
+
+
+def paper_motors() -> Path:
+    """Return the file of the paper's motors, from the installation or from the sources."""
+    prefixes = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
+    shares = [Path(prefix, "share", "smp_motor_control") for prefix in prefixes if prefix]
+    for place in (*shares, Path(__file__).resolve().parents[2]):
+        if (path := place / "config" / "motors_paper.yaml").is_file():
+            return path
+    raise ParameterError("config/motors_paper.yaml is not installed; build smp_motor_control again")
 
 
 def load_motors(path: str | Path, wheels: Iterable[str] | None = None) -> dict[str, MotorEntry]:

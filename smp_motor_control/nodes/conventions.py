@@ -1,14 +1,11 @@
-"""What all nodes do alike: QoS, timers that nothing stops, names, stamps, files."""
+"""What all nodes do alike: QoS, timers that nothing stops, names, stamps."""
 
 from __future__ import annotations
 
-import contextlib
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
-from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
@@ -21,8 +18,6 @@ from rclpy.qos import (
     ReliabilityPolicy,
 )
 from rclpy.timer import Timer
-
-from smp_motor_control.errors import SmpError
 
 # REP-2003: streams are published reliably and taken best effort, so that both a stock
 # reliable subscriber and a stock best-effort publisher find a partner in our nodes.
@@ -54,17 +49,6 @@ def send_last(publisher: Publisher, message: Any, timeout: float = 0.3) -> None:
 def steady_timer(node: Node, period: float, callback: Callable[[], None]) -> Timer:
     """Return a timer that neither simulated nor corrected time can stop."""
     return node.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
-
-
-def share(path: str) -> Path:
-    """Return a file of this package, installed or in its source tree."""
-    places = [Path(__file__).resolve().parents[2]]
-    with contextlib.suppress(PackageNotFoundError):
-        places.insert(0, Path(get_package_share_directory("smp_motor_control")))
-    for place in places:
-        if (place / path).exists():
-            return place / path
-    raise SmpError(f"{path} of smp_motor_control is not installed; build the package again")
 
 
 def nanoseconds(stamp: Any) -> int:

@@ -16,7 +16,6 @@ import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from rcl_interfaces.msg import ParameterDescriptor
@@ -26,7 +25,13 @@ from std_msgs.msg import Float64
 from smp_interfaces.msg import MotorDescription, MotorState
 from smp_motor_control import joint_of
 from smp_motor_control.errors import ParameterError
-from smp_motor_control.motor.file import MotorEntry, load_motors, nest, parse_motors
+from smp_motor_control.motor.file import (
+    MotorEntry,
+    load_motors,
+    nest,
+    paper_motors,
+    parse_motors,
+)
 from smp_motor_control.motor.hardware import DrivenMotor, DriveSettings, Supply
 from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.motor_writer import MotorReader
@@ -175,8 +180,7 @@ class MotorPlant(Node):
             for key, value in motors.items():
                 self.declare_parameter(f"motors.{key}", value, _FIXED, ignore_override=True)
             return parse_motors(nest(motors), "parameters")
-        path = settings.motors_file or str(runtime.share("config/motors_paper.yaml"))
-        return load_motors(Path(path))
+        return load_motors(settings.motors_file or paper_motors())
 
     def _change(self, settings: Settings) -> None:
         self._supply.resistance = settings.supply_resistance

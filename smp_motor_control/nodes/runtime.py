@@ -32,7 +32,6 @@ from smp_motor_control.nodes.conventions import (  # noqa: F401  (offered by thi
     nanoseconds,
     seconds,
     send_last,
-    share,
     steady_timer,
 )
 from smp_motor_control.nodes.diagnostics import ERROR, OK, WARN, Diagnostics  # noqa: F401

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import chain
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident.bag.layout import Decoder
-from smp_motor_ident.bag.source import Recording
+from smp_motor_ident.bag.source import Recording, recordings
 from smp_motor_ident.bag.storage import Batch, Channel, Integers, Table, damaged
 from smp_motor_ident.bag.types import Definitions, Types
 from smp_motor_ident.bag.unpack import Budget, decompress_messages
@@ -140,3 +142,27 @@ def collect(
         if progress is not None:
             progress(fraction, recording.name)
     return {topic: collector.table() for topic, collector in collectors.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """Fields of one topic, where no record of a motor is wanted."""
+
+    # shape (n,), [s]: header stamps where the messages have them, else when they were recorded;
+    # since 1970
+    time: NDArray[np.float64]
+    fields: Mapping[str, NDArray[Any]]  # shape (n,): by field path
+
+
+def read_columns(path: Path, wanted: Mapping[str, Sequence[str]]) -> dict[str, Columns]:
+    """Read fields of topics of one bag; a topic without a message is an error."""
+    asked = {topic: list(fields) for topic, fields in wanted.items()}
+    found = {}
+    for recording in recordings([path]):
+        for topic, table in collect(recording, asked, Types(()), None).items():
+            assert table.log is not None
+            clock = table.log if table.stamp is None else table.stamp
+            if clock.size == 0:
+                raise BagError(f"{recording.name}: has no message on {topic}")
+            found[topic] = Columns(1e-9 * clock.astype(np.float64), table.columns)
+    return found

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from smp_motor_control import LEFT, RIGHT, WHEELS
-from smp_motor_control.motor.file import load_motors
+from smp_motor_control.motor.file import load_motors, paper_motors
 from smp_motor_ident.cli import steps
 from smp_motor_ident.cli.demo import NAME
 from smp_motor_ident.cli.driving import Drive, answers_of, drive_figure, longest_stall, read_drive
@@ -56,7 +56,7 @@ def work(arguments: argparse.Namespace) -> int:
     def say(text: str) -> None:
         print(f"[{time.monotonic() - begun:5.1f} s] {text}", flush=True)
 
-    motors = Path(arguments.motors) if arguments.motors else steps.config("motors_paper.yaml")
+    motors = Path(arguments.motors) if arguments.motors else paper_motors()
     truth = load_motors(motors, WHEELS)
     folder = _fresh(Path(arguments.output), arguments.keep)
     domain = free_domain() if arguments.domain is None else arguments.domain

@@ -12,7 +12,7 @@ from scipy.signal import savgol_filter
 
 from smp_motor_control.encoder import unwrap
 from smp_motor_control.motor.friction import Gearbox
-from smp_motor_ident.bag.columns import Columns, read_columns
+from smp_motor_ident.bag.decode import Columns, read_columns
 from smp_motor_ident.record import Hardware
 from smp_motor_ident.report.chart import Chart, Curve
 from smp_motor_ident.report.drawing import document

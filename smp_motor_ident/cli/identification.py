@@ -41,7 +41,7 @@ from smp_motor_ident.report.document import (
     motors_yaml,
     write_together,
 )
-from smp_motor_ident.report.series import Comparison, Role
+from smp_motor_ident.report.figures import Comparison, Role
 from smp_motor_ident.result import UNITS, Estimate
 
 if TYPE_CHECKING:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,7 +9,6 @@ from typing import Any
 
 from smp_motor_ident.cli import applying, identify, tune
 from smp_motor_ident.cli.processes import ProcessError, Processes
-from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.report.document import read_identification
 from smp_motor_ident.result import Estimate
 
@@ -96,14 +94,3 @@ def _succeed(tool: str, code: int) -> None:
         raise KeyboardInterrupt
     if code != 0:
         raise ProcessError(f"{tool} ended with exit code {code}, see above")
-
-
-def config(name: str) -> Path:
-    """Return a file of ``config/``, from the installation or from the sources."""
-    prefixes = [Path(p) for p in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if p]
-    places = [prefix / "share" / "smp_motor_control" / "config" for prefix in prefixes]
-    places.append(Path(__file__).resolve().parents[2] / "config")
-    for place in places:
-        if (place / name).is_file():
-            return place / name
-    raise ParameterError(f"config/{name}: not found; run 'make setup', or source the workspace")

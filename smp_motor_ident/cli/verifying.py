@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from smp_motor_control.motor.file import nest
-from smp_motor_ident.bag.columns import Columns, read_columns
+from smp_motor_ident.bag.decode import Columns, read_columns
 from smp_motor_ident.cli import steps
 from smp_motor_ident.cli.driving import wheel_angle
 from smp_motor_ident.cli.processes import ProcessError

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from smp_motor_ident.report.chart import Array, Chart, Curve, thin
-from smp_motor_ident.report.series import Comparison
 from smp_motor_ident.report.words import label
 from smp_motor_ident.result import ResidualTests
 
@@ -16,6 +17,22 @@ POINTS = 8000
 
 COHERENT = 0.6
 """Below this coherence most of what a frequency shows is not the answer to the voltage."""
+
+Role = Literal["estimation", "validation"]
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Measured against simulated motor speed over one stretch of data."""
+
+    role: Role  # whether the model was fitted to this stretch or only judged by it
+    source: str  # name of the bag
+    time: Array  # shape (n,), [s]: from the stretch's start
+    # voltage, measured, simulated: shape (n,), [V, rad/s, rad/s]: at the motor shaft; NaN where
+    # nothing was measured
+    voltage: Array
+    measured: Array
+    simulated: Array
 
 
 def fit_charts(wheel: str, parts: Sequence[Comparison]) -> list[Chart]:

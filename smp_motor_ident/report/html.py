@@ -12,7 +12,7 @@ import numpy as np
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.report import figures, templates, words
 from smp_motor_ident.report.chart import Chart
-from smp_motor_ident.report.series import Comparison
+from smp_motor_ident.report.figures import Comparison
 from smp_motor_ident.result import Estimate, Quantity
 
 if TYPE_CHECKING:

@@ -14,8 +14,8 @@ from results import estimate
 
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.report import commissioning, fleet, tuning_page
+from smp_motor_ident.report.figures import Comparison
 from smp_motor_ident.report.html import Report, render
-from smp_motor_ident.report.series import Comparison
 from smp_motor_ident.tune import Loop
 from smp_motor_ident.tune.verification import Bands, Change, Reading
 

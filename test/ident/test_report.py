@@ -17,9 +17,8 @@ from scipy.signal import lfilter
 from smp_motor_ident.report import tuning_page
 from smp_motor_ident.report.chart import thin
 from smp_motor_ident.report.drawing import ticks
-from smp_motor_ident.report.figures import frequency_charts, residual_charts
+from smp_motor_ident.report.figures import Comparison, frequency_charts, residual_charts
 from smp_motor_ident.report.html import Report, render
-from smp_motor_ident.report.series import Comparison
 from smp_motor_ident.report.tuning_figures import tuning_charts
 from smp_motor_ident.result import (
     ResidualTests,

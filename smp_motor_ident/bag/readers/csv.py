@@ -47,9 +47,7 @@ class _CsvFile(Tables):
     def table(self, topic: str, fields: Sequence[str]) -> Table:
         """Return columns; cells that are empty are NaN."""
         names = self._grid.names
-        for name in fields:
-            if name not in names:
-                raise BagError(f"{self.path}: has no column {name!r}; it has {', '.join(names)}")
+        self._check(fields, names)
         use = [names.index(name) for name in fields]
         body = self._lines[self._first :]
         fast = self._fast(body, use)

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from smp_motor_ident.bag.storage import Batch, Channel, Table, damaged
+import numpy as np
+from numpy.typing import NDArray
+
+from smp_motor_ident.bag.storage import TABLE, Batch, Channel, Table, damaged
 from smp_motor_ident.bag.unpack import Budget
+from smp_motor_ident.errors import BagError
 from smp_motor_ident.finding import Finding
 
 
@@ -59,6 +64,47 @@ class Tables(Source):
     @abstractmethod
     def table(self, topic: str, fields: Sequence[str]) -> Table:
         """Return columns of a topic; ``log`` is None where the time is a column, too."""
+
+    def _check(self, fields: Sequence[str], there: Collection[str]) -> None:
+        for name in fields:
+            if name not in there:
+                raise BagError(f"{self.path}: has no column {name!r}; it has {', '.join(there)}")
+
+
+class ColumnFile(Tables):
+    """A file of columns, one table of the topic ``""``; ``dates`` are columns of nanoseconds."""
+
+    def __init__(
+        self,
+        path: Path,
+        name: str,
+        columns: Mapping[str, NDArray[Any]],
+        units: Mapping[str, str] | None = None,
+        dates: Collection[str] = (),
+        problems: Sequence[Finding] = (),
+    ) -> None:
+        super().__init__(path, name)
+        self.problems += problems
+        if not columns:
+            raise BagError(f"{name}: holds no column of numbers")
+        self._columns = columns
+        self._units = units or {}
+        self._dates = dates
+
+    def channels(self) -> list[Channel]:
+        """Return the one table."""
+        return [Channel(0, "", "", TABLE, fields=tuple(self._columns), units=self._units)]
+
+    def table(self, topic: str, fields: Sequence[str]) -> Table:
+        """Return columns; all must have the same length."""
+        self._check(fields, self._columns)
+        columns = {name: self._columns[name] for name in fields}
+        sizes = {name: column.size for name, column in columns.items()}
+        if len(set(sizes.values())) > 1:
+            lengths = ", ".join(f"{name} {size}" for name, size in sizes.items())
+            raise BagError(f"{self.path}: its columns differ in length: {lengths}")
+        exact = frozenset(n for n in fields if n in self._dates)
+        return Table(None, None, {n: np.asarray(c) for n, c in columns.items()}, exact=exact)
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from smp_motor_ident.bag.limits import STRAY_ROWS
 from smp_motor_ident.bag.readers import grid
-from smp_motor_ident.bag.readers.columns import ColumnFile
-from smp_motor_ident.bag.readers.format import Format
+from smp_motor_ident.bag.readers.format import ColumnFile, Format
 from smp_motor_ident.bag.storage import damaged
 from smp_motor_ident.bag.unpack import Budget
 from smp_motor_ident.errors import BagError

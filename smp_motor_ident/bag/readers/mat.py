@@ -19,8 +19,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from smp_motor_ident.bag.readers.columns import ColumnFile
-from smp_motor_ident.bag.readers.format import Format
+from smp_motor_ident.bag.readers.format import ColumnFile, Format
 from smp_motor_ident.bag.storage import first_line, found
 from smp_motor_ident.bag.unpack import Budget
 from smp_motor_ident.errors import BagError

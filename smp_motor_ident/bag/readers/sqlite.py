@@ -120,10 +120,6 @@ class _SqliteFile(Messages):
         """Return the topics of the file."""
         return self._topics
 
-    def declared(self) -> dict[str, int] | None:
-        """Return None: the file holds no count besides its messages."""
-        return None
-
     def batches(self, wanted: Callable[[Channel], bool]) -> Iterator[tuple[float, Batch]]:
         """Read the messages in the order in which they were written."""
         asked = {channel.id: channel for channel in self._topics if wanted(channel)}

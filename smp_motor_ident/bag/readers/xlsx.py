@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from smp_motor_ident.bag.readers import grid
-from smp_motor_ident.bag.readers.columns import ColumnFile
-from smp_motor_ident.bag.readers.format import Format
+from smp_motor_ident.bag.readers.format import ColumnFile, Format
 from smp_motor_ident.bag.storage import first_line
 from smp_motor_ident.bag.unpack import Budget
 from smp_motor_ident.errors import BagError
