@@ -144,7 +144,7 @@ def read(instants: np.ndarray, speed: np.ndarray, change: float) -> tuple[float,
 def judge(job: tuple[int, int, int, bool]) -> tuple[int, str, str]:
     """Record, identify, tune and run one case; return effect, outcome and words."""
     number, level, seed, rich = job
-    from smp_motor_ident.cli import tune_arguments
+    from smp_motor_ident.cli import tune, tuning
     from smp_motor_ident.errors import SmpError
     from smp_motor_ident.estimate import estimate
     from smp_motor_ident.tune import design
@@ -163,8 +163,8 @@ def judge(job: tuple[int, int, int, bool]) -> tuple[int, str, str]:
     )
     try:
         found = estimate(recorded(c, rng))
-        usual = tune_arguments.parser().parse_args(["identification", "--rate", str(c.rate)])
-        loop, _ = choose_source(found, tune_arguments.loop_for(found, usual))
+        usual = tune.parser().parse_args(["identification", "--rate", str(c.rate)])
+        loop, _ = choose_source(found, tuning.loop_for(found, usual))
         made_for = design(found, loop)
         spec = made_for.specification
         over, settled, rings = read(*changed_speed(c, made_for, rng), spec.change)

@@ -28,7 +28,7 @@ from smp_motor_control.motor import Motor
 from smp_motor_control.motor.file import load_motors
 from smp_motor_control.ros_arguments import split_arguments
 from smp_motor_ident.bag.writer import BagWriter
-from smp_motor_ident.cli import commission, demo, identify, tune, tune_arguments
+from smp_motor_ident.cli import commission, demo, identify, tune
 from smp_motor_ident.nodes import play, record
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -39,7 +39,7 @@ PAGES = [
 TOOLS = {"identify": identify.main, "tune": tune.main}
 PARSERS = {
     "identify": identify.parser,
-    "tune": tune_arguments.parser,
+    "tune": tune.parser,
     "commission": commission.parser,
     "demo": demo.parser,
     "record": record.parser,

@@ -185,14 +185,14 @@ def _compare(found: Estimate, record: Record, role: Role) -> Comparison:
 
 def _tunings(outcomes: Mapping[str, Outcome], say: Callable[..., None]) -> dict[str, Tuning]:
     """Design controllers for the tuning page, as `tune` does without arguments."""
-    from smp_motor_ident.cli import tune_arguments
+    from smp_motor_ident.cli import tune, tuning
     from smp_motor_ident.report import tuning_page
 
-    usual = tune_arguments.parser().parse_args(["identification"])
+    usual = tune.parser().parse_args(["identification"])
 
     def one(found: Estimate, _: Callable[[str], None]) -> Tuning:
         try:
-            return tuning_page.tuning_of(found, tune_arguments.loop_for(found, usual))
+            return tuning_page.tuning_of(found, tuning.loop_for(found, usual))
         except ParameterError as error:  # of a motor whose supply is not known
             return tuning_page.Tuning(found.wheel, reason=str(error))
 

@@ -1,4 +1,4 @@
-"""What tune does once its arguments are read."""
+"""What ``tune`` does: loops as the arguments describe them, designs, and what it tells of them."""
 
 from __future__ import annotations
 
@@ -9,21 +9,23 @@ from pathlib import Path
 from typing import Any
 
 from smp_motor_control.parameter_file import flat
-from smp_motor_ident.bag.transport import measure_delay
+from smp_motor_ident.bag.transport import TransportDelay, measure_delay
 from smp_motor_ident.cli import applying, frame, relaying
-from smp_motor_ident.cli.tune_arguments import TARGETS, loop_for
-from smp_motor_ident.cli.tune_words import HEAD, provenance, row, show, tell_delays
-from smp_motor_ident.errors import ParameterError
+from smp_motor_ident.cli.tune import TARGETS
+from smp_motor_ident.errors import DesignError, ParameterError
 from smp_motor_ident.report.document import check_free, read_identification, write_together
 from smp_motor_ident.report.tuning_figures import tuning_svg
 from smp_motor_ident.result import Estimate, Quantity
-from smp_motor_ident.tune import METHODS, Loop, compare, design_wheels, recommend
+from smp_motor_ident.tune import METHODS, Design, Loop, compare, design_wheels, recommend
 from smp_motor_ident.tune.case import COMMON
 from smp_motor_ident.tune.curves import curves
 from smp_motor_ident.tune.exports import FORMATS, export
 from smp_motor_ident.tune.source import choose_source
 from smp_motor_ident.tune.wheels import WheelSet
 from smp_motor_ident.tune.writing import gains_document, gains_yaml, parameters, to_json
+
+DEFAULT_RATE = 200.0
+"""Steps per second where neither the user nor the identification says [Hz]."""
 
 
 def work(arguments: argparse.Namespace) -> int:
@@ -51,6 +53,48 @@ def work(arguments: argparse.Namespace) -> int:
         gains = {wheel: flat(parameters(design)) for wheel, design in wheels.designs.items()}
         return applying.apply(gains, arguments)
     return 0
+
+
+def loop_for(
+    estimate: Estimate, arguments: argparse.Namespace, measured: TransportDelay | None = None
+) -> Loop:
+    """Return the loop of one wheel: what the user says, else what the bag knew."""
+    hardware = estimate.hardware
+    supply = _first(arguments.supply, hardware.supply_voltage)
+    if supply is None:
+        raise ParameterError(
+            f"{arguments.source}: {estimate.wheel}: the supply voltage is not known; give --supply"
+        )
+    if arguments.rate is not None and not arguments.rate > 0:
+        raise ParameterError(f"--rate is {arguments.rate}; it must be positive")
+    if arguments.rate is not None:
+        sample_time = 1.0 / arguments.rate
+    else:
+        sample_time = estimate.sample_time or 1.0 / DEFAULT_RATE
+    window = arguments.difference_window
+    # Of a speed that was recorded what averaging there is was identified.
+    usual_window = int(arguments.speed_source == "difference" or not estimate.speed_noise)
+    usual, longest = (None, None) if measured is None else measured.until_applied(sample_time)
+    if arguments.delay is not None:
+        usual = None  # it is the longest, which nothing measured may pass
+    return Loop(
+        sample_time=sample_time,
+        delay=_first(arguments.delay, longest),
+        usual_delay=_first(arguments.usual_delay, usual),
+        gear_ratio=_first(arguments.gear_ratio, hardware.gear_ratio) or 0.0,
+        counts_per_revolution=_first(
+            arguments.counts_per_revolution, hardware.counts_per_revolution
+        ),
+        supply_voltage=supply,
+        speed_source="measured" if arguments.speed_source == "auto" else arguments.speed_source,
+        difference_window=usual_window if window is None else window,
+        speed_noise=_first(arguments.speed_noise, estimate.speed_noise) or 0.0,
+        averaging_given=window is not None,
+    )
+
+
+def _first(given: float | None, identified: float | None) -> float | None:
+    return identified if given is None else given
 
 
 def _targets(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -210,3 +254,72 @@ def _compare(
     chosen = max(votes, key=lambda n: votes[n])
     print(f"\n* recommended: {chosen}. {reason[chosen]}\n")
     return chosen
+
+
+def tell_delays(
+    loops: Mapping[str, Loop],
+    measured: Mapping[str, TransportDelay],
+    arguments: argparse.Namespace,
+) -> list[str]:
+    """Return where the delays come from, in a line for each wheel, if a bag was to tell them."""
+    lines = []
+    for wheel, loop in loops.items() if arguments.bag is not None else ():
+        if wheel not in measured:
+            lines.append(f"{wheel}: {arguments.bag} tells no delay: taken as one sample")
+            continue
+        one = measured[wheel]
+        lines.append(
+            f"{wheel}: delay usually {1e3 * loop.expected_delay:.3g} ms, at most "
+            f"{1e3 * loop.loop_delay:.3g} ms, from {one.answers} commands of {arguments.bag} that "
+            f"arrived after {1e3 * one.usual:.3g} ms, 95 % within {1e3 * one.longest:.3g} ms"
+            + (", and wait for the driver's next sample" if one.latched else "")
+        )
+    return lines
+
+
+HEAD = (
+    f"  {'method':16s} {'p':>7} {'i':>7} {'d':>7} {'PM':>4} {'GM':>5} {'Ms':>5} {'settle':>7} "
+    f"{'over':>5} {'load':>6} {'volts':>6} {'noise':>6}"
+)
+"""Of a table of designs."""
+
+
+def row(result: Design | DesignError) -> str:
+    """Return a design as a row under :data:`HEAD`."""
+    if isinstance(result, DesignError):
+        return str(result)
+    g, m, f = result.gains, result.margins, result.performance
+    return (
+        f"{g.p:7.3f} {g.i:7.2f} {g.d:7.4f} {m.phase:4.0f} {m.gain:5.2f} {m.sensitivity:5.2f} "
+        f"{1e3 * f.settling:5.0f}ms {f.overshoot:4.1f}% {f.load_integral:6.3f} "
+        f"{f.peak_voltage:5.2f}V {1e3 * f.control_noise:4.0f}mV"
+    )
+
+
+def show(wheels: WheelSet) -> None:
+    """Print the designs of all wheels, and why they are as they are."""
+    print(f"  {'wheel':16s}{HEAD[18:]}")
+    for wheel, design in wheels.designs.items():
+        print(f"  {wheel:16s} {row(design)}")
+    print(wheels.reason)
+    for wheel, design in wheels.designs.items():
+        print(f"{wheel}: {design.reason}")
+        for warning in design.warnings:
+            print(f"{wheel}: warning: {warning}")
+
+
+def provenance(
+    wheels: WheelSet, arguments: argparse.Namespace, estimates: Mapping[str, Estimate], now: str
+) -> list[str]:
+    """Return where gains come from, as lines for the head of their file."""
+    lines = [
+        f"Gains of the wheel nodes, designed {now} by tune from {arguments.source}.",
+        "Units: wheel rad/s, volts, seconds; model.* at the motor shaft.",
+        wheels.reason,
+    ]
+    for wheel, design in wheels.designs.items():
+        sources = ", ".join(estimates[wheel].sources) or "unknown"
+        lines.append(f"{wheel}: {estimates[wheel].model} model from {sources}")
+        lines.append(f"  {design.reason}")
+        lines.extend(f"  warning: {warning}" for warning in design.warnings)
+    return lines

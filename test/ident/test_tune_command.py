@@ -143,7 +143,7 @@ def test_unknown_supply_is_asked_for(identified, capsys):
 
 
 def test_names_in_the_arguments_are_those_that_there_are():
-    from smp_motor_ident.cli import tune_arguments as arguments
+    from smp_motor_ident.cli import tune as arguments
     from smp_motor_ident.tune import METHODS
     from smp_motor_ident.tune.exports import FORMATS
     from smp_motor_ident.tune.loop import SPEED_SOURCES

@@ -9,8 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from smp_motor_ident.cli import tune_arguments
+from smp_motor_ident.cli import tuning
 from smp_motor_ident.cli.tune import main as tune
+from smp_motor_ident.cli.tune import parser
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.estimate import estimate as identify
 from smp_motor_ident.finding import Finding
@@ -282,8 +283,8 @@ def test_noise_of_a_recorded_speed_limits_the_gains():
     record = Record("m", T * np.arange(n), voltage, None, shown, None, None)
     found = identify(replace(record, hardware=Hardware(1.0, None, 0, 12.0)))
     assert found.speed_noise == pytest.approx(noise, rel=0.05)
-    usual = tune_arguments.parser().parse_args(["identification"])
-    loop = tune_arguments.loop_for(found, usual)
+    usual = parser().parse_args(["identification"])
+    loop = tuning.loop_for(found, usual)
     assert loop.speed_noise == found.speed_noise
     # It was recorded as it is at each instant: an average would have been identified.
     assert loop.difference_window == 0
