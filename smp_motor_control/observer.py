@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 
 from smp_motor_control.encoder import DifferencedSpeed, Encoder, Unwrapper
 from smp_motor_control.errors import ParameterError, check_range
+from smp_motor_control.fields import described
 from smp_motor_control.motor.model import MotorModel
 from smp_motor_control.motor.response import FreeResponse, zero_order_hold
 
@@ -53,13 +54,13 @@ class ObserverNoise:
         When a value is not positive, or beyond what the arithmetic can hold.
     """
 
-    # How much the load, as an armature voltage, wanders in one second [V/sqrt(s)]. Raises the
-    # bandwidth with which changes of the load are seen.
-    load: float = 1.0
-    # White noise of the voltage and of what the model leaves out [V sqrt(s)]
-    voltage: float = 0.005
-    # Standard deviation of the encoder's error [counts]; ``1/sqrt(12)`` is quantisation alone
-    count: float = 1.0 / math.sqrt(12.0)
+    # More of the first raises the bandwidth with which changes of the load are seen; the second
+    # stands for what the model leaves out, too; the third's default is quantisation alone.
+    load: float = described(1.0, "Wander of the load in one second, as a voltage [V/sqrt(s)].")
+    voltage: float = described(0.005, "White noise of the voltage [V sqrt(s)].")
+    count: float = described(
+        1.0 / math.sqrt(12.0), "Standard deviation of the encoder's error [counts]."
+    )
 
     def __post_init__(self) -> None:
         for name, unit in (("load", "V/sqrt(s)"), ("voltage", "V sqrt(s)"), ("count", "counts")):

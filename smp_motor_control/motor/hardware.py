@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 from smp_motor_control.encoder import DifferencedSpeed
 from smp_motor_control.errors import ParameterError
+from smp_motor_control.fields import described
 from smp_motor_control.motor.file import MotorEntry
 from smp_motor_control.motor.friction import Motor
 
@@ -41,19 +42,25 @@ class DriveSettings:
         When a value is negative or not finite.
     """
 
-    pwm_steps: int = 0  # steps of the duty cycle from 0 to 1; 0 for a continuous one
-    # Time [s] after the last command at which the voltage goes to zero
-    command_timeout: float = 0.2
-    current_sensor: bool = True  # whether the current is measured at all
-    current_noise: float = 0.0  # standard deviation of the measured current [A]
-    # Intensity of a random load at the motor shaft [N m sqrt(s)]: over an interval of dt its mean
-    # has the standard deviation ``torque_noise / sqrt(dt)``
-    torque_noise: float = 0.0
-    # Samples over which the reported speed is averaged; 0 reports the true one
-    velocity_window: int = 1
-    # Whether a command waits for the next sampling instant, as in firmware whose loop has a fixed
-    # rate: every reported voltage was then constant over its interval
-    latch: bool = False
+    pwm_steps: int = described(0, "Steps of the duty cycle from 0 to 1; 0 for a continuous one.")
+    command_timeout: float = described(
+        0.2, "Time after the last command at which the voltage goes to zero [s]."
+    )
+    current_sensor: bool = described(
+        True, "Whether the current is measured; reported as NaN where not."
+    )
+    current_noise: float = described(0.0, "Standard deviation of the measured current [A].")
+    # Over an interval of dt its mean has the standard deviation ``torque_noise / sqrt(dt)``.
+    torque_noise: float = described(
+        0.0, "Intensity of a random load at the motor shaft [N m sqrt(s)]."
+    )
+    # Every reported voltage is then constant over its interval.
+    latch: bool = described(
+        False, "Whether commands wait for the next sample, as in firmware with a fixed rate."
+    )
+    velocity_window: int = described(
+        1, "Samples that the reported speed is differenced over; 0 for the true one."
+    )
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():

@@ -38,10 +38,10 @@ LATCHED = QoSProfile(
 """Descriptions: the last one is kept for whoever comes late."""
 
 
-def send_last(publisher: Publisher, message: Any, timeout: float = 0.3) -> None:
+def send_last(publisher: Publisher, message: Any) -> None:
     """Publish a last message and wait until those who take it reliably have it."""
     publisher.publish(message)
-    publisher.wait_for_all_acked(Duration(seconds=timeout))
+    publisher.wait_for_all_acked(Duration(seconds=0.3))
     # Best-effort readers acknowledge nothing: give the datagram time to leave the process.
     time.sleep(0.02)
 

@@ -73,13 +73,6 @@ class Settings:
             )
         self.signal_of(0)
 
-    def bounds(self) -> Bounds:
-        """Return what a wheel may reach."""
-        return Bounds(
-            speed=self.max_speed or math.inf,
-            current=self.max_current or math.inf,
-        )
-
     def chosen(self) -> tuple[str, ...]:
         """Return the wheels to excite."""
         return self.wheel_names if "all" in self.wheels else tuple(dict.fromkeys(self.wheels))
@@ -105,11 +98,12 @@ class Excite(Node):
         self._outputs: list[tuple[MotorWriter, Excitation]] = []
         self._watched: dict[str, Protection] = {}
         self._unheard: dict[str, float] = {}
+        bounds = Bounds(speed=settings.max_speed, current=settings.max_current)
         for k, wheel in enumerate(settings.chosen()):
             signal = settings.signal_of(k)
             signal(0.0)  # Prepared now, not in the first period.
             self._outputs.append((MotorWriter(self, f"{wheel}/"), signal))
-            self._watched[wheel] = Protection(settings.bounds())
+            self._watched[wheel] = Protection(bounds)
             self.create_subscription(
                 MotorState,
                 f"{wheel}/motor_state",

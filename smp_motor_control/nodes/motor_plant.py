@@ -38,17 +38,6 @@ from smp_motor_control.nodes.motor_writer import MotorReader
 from smp_motor_control.nodes.settings import Parameters, described, fixed, given_parameters, nested
 
 _FIXED = ParameterDescriptor(description="As in a motor file.", read_only=True)
-_DRIVE = {
-    "pwm_steps": "Steps of the duty cycle from 0 to 1; 0 for a continuous one.",
-    "command_timeout": "Time after the last command at which the voltage goes to zero [s].",
-    "current_sensor": "Whether the current is measured; reported as NaN where not.",
-    "current_noise": "Standard deviation of the measured current [A].",
-    "torque_noise": "Intensity of a random load at the motor shaft [N m sqrt(s)].",
-    "latch": "Whether commands wait for the next sample, as in firmware with a fixed rate.",
-    "velocity_window": "Samples that the reported speed is differenced over; 0 for the true one.",
-}
-
-
 _DRIVE_DEFAULTS = DriveSettings(pwm_steps=1000, current_noise=0.01, latch=True)
 
 
@@ -60,7 +49,7 @@ class Settings:
     rate: float = fixed(
         200.0, "Samples per second of every motor [Hz].", minimum=1.0, maximum=2000.0
     )
-    drive: DriveSettings = nested(_DRIVE_DEFAULTS, _DRIVE)  # noqa: RUF009
+    drive: DriveSettings = nested(_DRIVE_DEFAULTS)  # noqa: RUF009
     supply_resistance: float = described(
         0.0, "Inner resistance of the battery that all motors share [ohm].", minimum=0.0
     )

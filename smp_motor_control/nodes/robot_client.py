@@ -292,10 +292,10 @@ class RobotClient:
         if self._guard is not None:
             self._guard.note(owed)
 
-    def give_back(self, owed: Mapping[str, Any], patience: float = PATIENCE) -> None:
+    def give_back(self, owed: Mapping[str, Any]) -> None:
         """Set gains as they were and activate the controllers that were active."""
         if owed.get("gains"):
-            self.set_parameters(owed["gains"], patience)
+            self.set_parameters(owed["gains"])
         if owed.get("active"):
             wheels = [node.partition("/")[0] for node in owed["active"]]
             # Who excites them ends too: never two that command one wheel.

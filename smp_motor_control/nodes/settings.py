@@ -33,6 +33,7 @@ from rcl_interfaces.msg import (
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from smp_motor_control import fields
 from smp_motor_control.errors import ParameterError
 
 S = TypeVar("S")
@@ -51,8 +52,7 @@ def described(
 ) -> Any:
     """Return a dataclass field that becomes a ROS parameter."""
     limits = {"minimum": minimum, "maximum": maximum}
-    metadata = {"description": description, "read_only": read_only, "name": name, **limits}
-    return dataclasses.field(default=default, metadata=metadata)
+    return fields.described(default, description, read_only=read_only, name=name, **limits)
 
 
 def fixed(default: Any, description: str, **limits: float) -> Any:

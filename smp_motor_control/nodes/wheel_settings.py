@@ -33,21 +33,6 @@ _GAINS = {
     "feedforward_velocity": "Voltage per speed [V s/rad].",
     "feedforward_acceleration": "Voltage per acceleration [V s^2/rad].",
 }
-_FAULTS = {
-    "current_limit": "Current above which the motor is switched off [A]; 0 for none.",
-    "current_time": "Time above the limit before that [s].",
-    "stall_voltage": "Least voltage at which the wheel must turn [V].",
-    "stall_velocity": "Least speed that counts as turning [rad/s, wheel].",
-    "stall_time": "Time without turning before the motor is switched off [s]; 0: never.",
-    "runaway_time": "Time of turning against the voltage before that [s]; 0: never.",
-    "tracking_tolerance": "Share of the reference by which the speed may be off for long.",
-    "tracking_time": "Time of being off by more before the motor is switched off [s]; 0: never.",
-}
-_NOISE = {
-    "load": "Wander of the load in one second, as a voltage [V/sqrt(s)].",
-    "voltage": "White noise of the voltage [V sqrt(s)].",
-    "count": "Standard deviation of the encoder's error [counts].",
-}
 _NO_NOISE_GIVEN, _NO_GAINS_GIVEN, _NO_FAULTS_GIVEN = ObserverNoise(), PidGains(), FaultLimits()
 
 
@@ -106,8 +91,8 @@ class Settings:
     )
     model_static_voltage: float = _of("model", "static_voltage", "What dry friction takes [V].")
     model_delay: float = _of("model", "delay", "From voltage to effect [s].")
-    observer: ObserverNoise = nested(_NO_NOISE_GIVEN, _NOISE, prefix="observer.")  # noqa: RUF009
-    faults: FaultLimits = nested(_NO_FAULTS_GIVEN, _FAULTS)  # noqa: RUF009
+    observer: ObserverNoise = nested(_NO_NOISE_GIVEN, prefix="observer.")  # noqa: RUF009
+    faults: FaultLimits = nested(_NO_FAULTS_GIVEN)  # noqa: RUF009
     fault_retry: float = described(
         2.0, "Pause before a wheel at fault is tried again under a set-point that is not zero "
         "[s], doubled every time, three times at most; 0: only after a zero set-point.",

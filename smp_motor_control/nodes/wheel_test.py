@@ -126,11 +126,11 @@ def descriptions(
     return found
 
 
-def battery(client: RobotClient, patience: float = 1.0) -> float:
+def battery(client: RobotClient) -> float:
     """Return what ``battery_state`` says [V]; NaN where nobody publishes it."""
     if not client.node.count_publishers("battery_state"):
         return math.nan
     heard: list[float] = []
     with client.listen(BatteryState, {"battery_state": lambda m: heard.append(m.voltage)}):
-        client.until(lambda: bool(heard), patience)
+        client.until(lambda: bool(heard), 1.0)
     return heard[-1] if heard else math.nan

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from smp_motor_control.errors import check_positive
+from smp_motor_control.fields import described
 
 MOST_TRIES = 3
 """How often a wheel at fault is tried again before only a person may reset it."""
@@ -57,17 +58,24 @@ class Fault(Enum):
 class FaultLimits:
     """When a motor misbehaves."""
 
-    current_limit: float = 0.0  # [A]; 0 for none
-    current_time: float = 0.1  # time [s] above the limit before it counts
-    stall_voltage: float = 4.0  # least voltage [V] at which the wheel must turn
-    stall_velocity: float = 0.02  # least speed [rad/s, wheel] that counts as turning
-    # Time [s] without turning before it counts; 0 switches the detection off
-    stall_time: float = 0.5
-    # Time [s] of turning the wrong way, without slowing down, before it counts; 0: off
-    runaway_time: float = 0.2
-    tracking_tolerance: float = 0.5  # share of the reference by which the speed may be off for long
-    # Time [s] of being off by more, without coming nearer, before it counts; 0: off
-    tracking_time: float = 0.45
+    current_limit: float = described(
+        0.0, "Current above which the motor is switched off [A]; 0 for none."
+    )
+    current_time: float = described(0.1, "Time above the limit before that [s].")
+    stall_voltage: float = described(4.0, "Least voltage at which the wheel must turn [V].")
+    stall_velocity: float = described(0.02, "Least speed that counts as turning [rad/s, wheel].")
+    stall_time: float = described(
+        0.5, "Time without turning before the motor is switched off [s]; 0: never."
+    )
+    runaway_time: float = described(
+        0.2, "Time of turning against the voltage before that [s]; 0: never."
+    )
+    tracking_tolerance: float = described(
+        0.5, "Share of the reference by which the speed may be off for long."
+    )
+    tracking_time: float = described(
+        0.45, "Time of being off by more before the motor is switched off [s]; 0: never."
+    )
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 PERSISTENCE = 0.05
@@ -11,10 +10,10 @@ PERSISTENCE = 0.05
 
 @dataclass(frozen=True, kw_only=True)
 class Bounds:
-    """What a wheel under test may reach."""
+    """What a wheel under test may reach; 0 for anything."""
 
-    speed: float = math.inf  # of the wheel, either way [rad/s]
-    current: float = math.inf  # either way [A]
+    speed: float = 0.0  # of the wheel, either way [rad/s]
+    current: float = 0.0  # either way [A]
 
 
 class Protection:
@@ -34,9 +33,9 @@ class Protection:
     def add(self, time: float, current: float, speed: float) -> str:
         """Take a sample, as in ``MotorState``; return why the test must end, or nothing."""
         bounds = self._bounds
-        if self._exceeds("speed", time, abs(speed) > bounds.speed):
+        if self._exceeds("speed", time, abs(speed) > bounds.speed > 0.0):
             return f"it turns at {abs(speed):.3g} rad/s, the limit is {bounds.speed:.3g} rad/s"
-        if self._exceeds("current", time, abs(current) > bounds.current):
+        if self._exceeds("current", time, abs(current) > bounds.current > 0.0):
             return f"its current is {abs(current):.3g} A, the limit is {bounds.current:.3g} A"
         return ""
 

@@ -138,10 +138,6 @@ def parse(items: Iterable[str], msg_files: Iterable[str] = ()) -> SignalMap:
         if name in target:
             raise BagError(f"mapping {item!r}: {key.strip()} is given twice")
         target[name] = value.strip()
-    if not motors and any(name in SIGNALS for name in document):
-        motors[DEFAULT_MOTOR] = {
-            name: document.pop(name) for name in list(document) if name in SIGNALS
-        }
     document["motors"] = motors
     document["types"] = list(msg_files)
     return from_document(document, "mapping")

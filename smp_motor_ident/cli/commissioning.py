@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import shutil
 import sys
 from collections.abc import Mapping, Sequence
@@ -157,10 +156,7 @@ def _move(session: Session, known: Mapping[str, Any]) -> None:
 def _check(session: Session, known: Mapping[str, Any]) -> None:
     """Check the wheels one by one; stop where another hand must mend something."""
     arguments, robot, made = session.arguments, session.robot, session.protocol
-    bounds = Bounds(
-        speed=arguments.max_speed or math.inf,
-        current=arguments.max_current or math.inf,
-    )
+    bounds = Bounds(speed=arguments.max_speed or 0.0, current=arguments.max_current)
     checked = checking.check_wheels(
         robot.client, robot.wheels, arguments.amplitude, bounds, known,
         lambda wheel: session.begin(f"checking {wheel}"),

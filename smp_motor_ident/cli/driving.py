@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.signal import savgol_filter
 
 from smp_motor_control.encoder import unwrap
 from smp_motor_control.motor.friction import Gearbox
@@ -16,12 +14,9 @@ from smp_motor_ident.bag.decode import Columns, read_columns
 from smp_motor_ident.record import Hardware
 from smp_motor_ident.report.chart import Chart, Curve
 from smp_motor_ident.report.drawing import document
+from smp_motor_ident.tune.arrays import Array
 from smp_motor_ident.tune.simulation import step_figures
-
-Array = NDArray[np.float64]
-
-SMOOTHING = 0.05
-"""Length [s] of the parabola whose slope is taken as the speed."""
+from smp_motor_ident.tune.verification import smoothed
 
 LEAST_CHANGE = 0.8
 """A smaller change of the set-point [rad/s, wheel] is no step to judge."""
@@ -112,12 +107,7 @@ def wheel_angle(state: Columns, hardware: Hardware) -> Array:
 def wheel_speed(state: Columns, hardware: Hardware) -> tuple[Array, Array]:
     """Return the wheel's speed as its encoder saw it."""
     angle = wheel_angle(state, hardware)
-    step = float(np.median(np.diff(state.time)))
-    time = np.arange(state.time[0], state.time[-1], step)
-    even = np.interp(time, state.time, angle - angle[0])
-    window = max(2 * round(SMOOTHING / step / 2) + 1, 5)
-    speed = np.asarray(savgol_filter(even, window, 2, deriv=1, delta=step), dtype=np.float64)
-    return time, speed
+    return smoothed(state.time, angle - angle[0], float(np.median(np.diff(state.time))))
 
 
 def _answer(

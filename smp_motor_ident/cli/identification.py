@@ -7,7 +7,6 @@ import json
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import datetime, timezone
 from functools import partial
 from importlib import metadata
 from pathlib import Path
@@ -39,6 +38,7 @@ from smp_motor_ident.report.document import (
     check_free,
     identification_document,
     motors_yaml,
+    now,
     write_together,
 )
 from smp_motor_ident.report.figures import Comparison, Role
@@ -208,13 +208,13 @@ def _contents(
     """Return the three files' texts, in the order of :data:`OUTPUTS`."""
     from smp_motor_ident.report.html import Report, render
 
-    now = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
+    date = now()
     provenance = {
         "Recordings": ", ".join(Path(path).name for path in arguments.bags),
         "Judged by": ", ".join(Path(path).name for path in arguments.validate)
         or "parts of the same recordings that were held out",
         "Command": arguments.command,
-        "Date": now,
+        "Date": date,
         "Versions": ", ".join(
             f"{name} {metadata.version(name)}" for name in ("smp_motor_control", "numpy", "numba")
         ),
@@ -230,7 +230,7 @@ def _contents(
         {wheel: history.history_charts(wheel, entries) for wheel, entries in since.items()},
     )
     document = identification_document(estimates)
-    head = [f"Identified {now} by {NAME} from {provenance['Recordings']}.", "SI, motor shaft."]
+    head = [f"Identified {date} by {NAME} from {provenance['Recordings']}.", "SI, motor shaft."]
     return [
         json.dumps(document, indent=2, allow_nan=False) + "\n",
         motors_yaml(estimates, head),

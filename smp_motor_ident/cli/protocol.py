@@ -7,7 +7,6 @@ import dataclasses
 import json
 import math
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
-from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from smp_motor_ident.cli.processes import ProcessError
 from smp_motor_ident.diagnosis.wheel_test import Figures
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.report import commissioning as page
-from smp_motor_ident.report.document import write_together
+from smp_motor_ident.report.document import now, write_together
 from smp_motor_ident.tune.verification import Change
 
 SCHEMA = 1
@@ -109,8 +108,7 @@ class Protocol:
 
     def write(self) -> None:
         """Write both files, or none."""
-        now = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
-        self.document["date"] = now
+        self.document["date"] = now()
         files: dict[Path, str | bytes] = {
             self._folder / NAME: json.dumps(self.document, indent=2, allow_nan=False) + "\n",
             self._folder / REPORT: page.render(self.document, self._changes),

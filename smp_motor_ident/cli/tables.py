@@ -45,15 +45,11 @@ def estimate_table(estimate: Estimate) -> Table:
     made = table(", ".join(title), "quantity", "value", "std", "95 % interval", "unit", "status")
     made.columns[4].justify = made.columns[5].justify = "left"
     for name, quantity in {**estimate.combinations, **estimate.parameters}.items():
-        interval = "—"
-        if quantity.ci95 is not None:
-            low, high = (words.number(bound, quantity.std) for bound in quantity.ci95)
-            interval = f"{low} … {high}"
         made.add_row(
             name,
             words.number(quantity.value, quantity.std),
             words.spread(quantity.std),
-            interval,
+            words.interval(quantity),
             quantity.unit,
             Text(words.status(quantity), style=_COLOR[quantity.status]),
         )

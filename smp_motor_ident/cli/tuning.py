@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import argparse
-import datetime
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from smp_motor_control.motor.file import load_motors
+from smp_motor_control.motor.parameters import COMBINATIONS
 from smp_motor_control.parameter_file import flat
 from smp_motor_ident.bag.transport import TransportDelay, measure_delay
 from smp_motor_ident.cli import applying, frame, relaying
 from smp_motor_ident.cli.tune import TARGETS
 from smp_motor_ident.errors import DesignError, ParameterError
-from smp_motor_ident.report.document import check_free, read_identification, write_together
+from smp_motor_ident.record import Hardware
+from smp_motor_ident.report.document import (
+    check_free,
+    now,
+    read_identification,
+    write_together,
+)
 from smp_motor_ident.report.tuning_figures import tuning_svg
 from smp_motor_ident.result import Estimate, Quantity
 from smp_motor_ident.tune import METHODS, Design, Loop, compare, design_wheels, recommend
@@ -136,11 +143,11 @@ def _write(
     reasons: Mapping[str, list[str]],
 ) -> None:
     """Write parameters, document and figure, all or none."""
-    now = datetime.datetime.now(datetime.timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
-    heading = provenance(wheels, arguments, estimates, now)
+    date = now()
+    heading = provenance(wheels, arguments, estimates, date)
     heading += [line for lines in reasons.values() for line in lines]
     sources = sorted({s for e in estimates.values() for s in e.sources})
-    origin = {"date": now, "input": str(arguments.source), "sources": sources, **reasons}
+    origin = {"date": date, "input": str(arguments.source), "sources": sources, **reasons}
     text = gains_yaml(wheels.designs, heading)
     document = to_json(gains_document(wheels.designs, origin, wheels.reason))
     drawn = {w: curves(estimates[w], one) for w, one in wheels.designs.items()}
@@ -207,19 +214,10 @@ def read_estimates(source: Path) -> dict[str, Estimate]:
     """Read what is to be tuned."""
     if source.suffix not in (".yaml", ".yml"):
         return read_identification(source)
-    from smp_motor_control.motor.file import load_motors
-    from smp_motor_ident.record import Hardware
-
     estimates = {}
     for wheel, entry in load_motors(source).items():
-        m = entry.parameters
-        held = {
-            "dc_gain": m.dc_gain,
-            "time_constant": m.time_constant,
-            "time_constant_product": m.time_constant_product,
-            "static_voltage": m.static_voltage,
-            "delay": entry.delay,
-        }
+        held = {name: float(getattr(entry.parameters, name)) for name in COMBINATIONS}
+        held["delay"] = entry.delay
         estimates[wheel] = Estimate(
             wheel=wheel,
             model="motor file",
@@ -309,11 +307,11 @@ def show(wheels: WheelSet) -> None:
 
 
 def provenance(
-    wheels: WheelSet, arguments: argparse.Namespace, estimates: Mapping[str, Estimate], now: str
+    wheels: WheelSet, arguments: argparse.Namespace, estimates: Mapping[str, Estimate], date: str
 ) -> list[str]:
     """Return where gains come from, as lines for the head of their file."""
     lines = [
-        f"Gains of the wheel nodes, designed {now} by tune from {arguments.source}.",
+        f"Gains of the wheel nodes, designed {date} by tune from {arguments.source}.",
         "Units: wheel rad/s, volts, seconds; model.* at the motor shaft.",
         wheels.reason,
     ]

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from smp_motor_control.motor.file import MotorEntry
+from smp_motor_control.motor.parameters import COMBINATIONS, PHYSICAL
 from smp_motor_ident.cli.driving import Answer
 from smp_motor_ident.cli.tables import console, table
 from smp_motor_ident.report import words
@@ -45,10 +46,7 @@ class Check:
 def _compared(entry: MotorEntry, estimate: Estimate) -> list[tuple[str, float, Quantity]]:
     """Return name, truth and estimate of every quantity that the estimate claims to know."""
     held = {**estimate.combinations, **estimate.parameters}
-    names = ["dc_gain", "time_constant", "time_constant_product", "static_voltage"]
-    if entry.knows_current:
-        names += ["resistance", "inductance", "motor_constant", "inertia"]
-        names += ["viscous_friction", "coulomb_friction"]
+    names = (*COMBINATIONS, *PHYSICAL) if entry.knows_current else COMBINATIONS
     truth = {name: float(getattr(entry.parameters, name)) for name in names}
     return [(n, t, held[n]) for n, t in truth.items() if n in held and held[n].value is not None]
 

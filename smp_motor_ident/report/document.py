@@ -7,6 +7,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterable, Mapping
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,11 @@ from smp_motor_ident.result import Estimate, Quantity
 
 SCHEMA = 1
 POSITIVE = ("resistance", "inductance", "motor_constant", "inertia", "dc_gain")
+
+
+def now() -> str:
+    """Return the present time as files bear it."""
+    return datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
 
 
 def identification_document(estimates: Mapping[str, Estimate]) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from smp_motor_ident.errors import BagError
@@ -63,12 +64,8 @@ def read(path: Path) -> dict[str, list[Entry]]:
     lines = path.read_text("utf-8").splitlines()
     for number, line in enumerate(lines, 1):
         try:
-            raw = json.loads(line)
-            values = {str(k): (float(v), float(s)) for k, (v, s) in raw["values"].items()}
-            one = Entry(float(raw["stamp"]), str(raw["wheel"]), values, tuple(raw["findings"]))
-            if not all(map(math.isfinite, (one.stamp, *(x for p in values.values() for x in p)))):
-                raise ValueError("a number is not finite")
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            one = msgspec.json.decode(line, type=Entry)
+        except msgspec.DecodeError as error:
             if number == len(lines):
                 break  # the power went while it was written
             raise BagError(f"{path}: line {number} is no entry of a history ({error})") from None

@@ -144,18 +144,13 @@ def _cell(q: Quantity, low: float, high: float) -> tuple[str, tuple[float, float
 def _row(name: str, quantity: Quantity) -> dict[str, str]:
     """Return one line of a table of quantities, in words."""
     symbol, title, meaning = words.EXPLAINED.get(name, ("", words.label(name), ""))
-    std = quantity.std
-    interval = "—"
-    if quantity.ci95 is not None:
-        low, high = (words.number(bound, std) for bound in quantity.ci95)
-        interval = f"{low} … {high}"
     return dict(
         symbol=symbol,
         name=title,
         meaning=meaning,
-        value=words.number(quantity.value, std),
-        std=words.spread(std),
-        interval=interval,
+        value=words.number(quantity.value, quantity.std),
+        std=words.spread(quantity.std),
+        interval=words.interval(quantity),
         unit=words.typeset(quantity.unit),
         status=words.status(quantity),
         kind=quantity.status,

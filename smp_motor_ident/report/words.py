@@ -83,6 +83,14 @@ def spread(std: float | None) -> str:
     return f"{std:.1e}"
 
 
+def interval(quantity: Quantity) -> str:
+    """Return the 95 % interval of a number."""
+    if quantity.ci95 is None:
+        return "—"
+    low, high = (number(bound, quantity.std) for bound in quantity.ci95)
+    return f"{low} … {high}"
+
+
 def typeset(unit: str) -> str:
     """Return a unit as one prints it."""
     return unit.replace("^2", "²").replace("ohm", "Ω")
