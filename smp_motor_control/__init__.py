@@ -12,3 +12,8 @@ LEFT, RIGHT = WHEELS[::2], WHEELS[1::2]
 def joint_of(wheel: str) -> str:
     """Return the joint of a wheel, as set-points and joint states name it."""
     return f"{wheel}_wheel_joint"
+
+
+def controller_of(wheel: str) -> str:
+    """Return the node that controls a wheel, below the robot's namespace."""
+    return f"{wheel}/wheel_pid"

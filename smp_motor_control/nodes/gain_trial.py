@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import time
 from collections import deque
@@ -10,16 +9,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from smp_interfaces.msg import PidState
+from smp_motor_control import controller_of
 from smp_motor_control.errors import SmpError
 from smp_motor_control.nodes.conventions import seconds
-from smp_motor_control.nodes.robot_client import (
-    LOOK,
-    PATIENCE,
-    RobotClient,
-    RobotError,
-    controller,
-)
+from smp_motor_control.nodes.robot_client import LOOK, PATIENCE, RobotClient, RobotError
 
 BASELINE = 0.5
 """How long the old gains are watched first [s]."""
@@ -106,13 +102,12 @@ def _span(states: list[PidState]) -> float:
 
 
 def _rms(values: list[float]) -> float:
-    return math.sqrt(sum(v * v for v in values) / len(values)) if values else 0.0
+    return float(np.sqrt(np.mean(np.square(values)))) if values else 0.0
 
 
 def _swing(values: list[float]) -> float:
     """Return the mean change from a step to the next [V]."""
-    steps = [abs(b - a) for a, b in itertools.pairwise(values)]
-    return sum(steps) / len(steps) if steps else 0.0
+    return float(np.mean(np.abs(np.diff(values)))) if len(values) > 1 else 0.0
 
 
 @dataclass(frozen=True)
@@ -135,7 +130,7 @@ def try_gains(
     """Set parameters in all wheels, watch the loops, and take all back when one misbehaves."""
     watches = {wheel: Watch(supply) for wheel in values}
     with client.listen(PidState, {f"{w}/pid_state": one.take for w, one in watches.items()}):
-        old = client.get_parameters({controller(w): list(new) for w, new in values.items()})
+        old = client.get_parameters({controller_of(w): list(new) for w, new in values.items()})
         client.set_parameters(old)  # what could not be taken back is not tried
         client.until(lambda: all(w.seen for w in watches.values()), PATIENCE)
         silent = [wheel for wheel, one in watches.items() if not one.seen]
@@ -150,7 +145,7 @@ def try_gains(
         begun = time.monotonic()
         client.owe(gains=old)
         try:
-            client.set_parameters({controller(w): new for w, new in values.items()})
+            client.set_parameters({controller_of(w): new for w, new in values.items()})
             reason = _watch(client, watches, trial)
         except RobotError as trouble:
             reason = str(trouble)

@@ -22,8 +22,7 @@ from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 from std_msgs.msg import Float64
 
-from smp_interfaces.msg import MotorDescription, MotorState
-from smp_motor_control import joint_of
+from smp_interfaces.msg import MotorDescription
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.motor.file import (
     MotorEntry,
@@ -73,36 +72,23 @@ by 20 V, shift a motor's angle by half a count of the paper's encoder, for good.
 class Wheel:
     """One motor and its topics."""
 
-    def __init__(self, node: MotorPlant, name: str, motor: DrivenMotor) -> None:
+    def __init__(self, node: MotorPlant, name: str, motor: DrivenMotor, ohmmeter: bool) -> None:
         self.name = name
         self.motor = motor
         self.rejected = self.late = 0
-        self._commands = MotorReader(node, name, motor.settings.command_timeout, self._command)
-        self.lease = self._commands.lease
-        self.state = MotorState()
-        self.state.header.frame_id = joint_of(name)
-        self.publisher = node.create_publisher(
-            MotorState, f"{name}/motor_state", runtime.STREAM_PUBLISHER
+        entry = motor.entry
+        description = MotorDescription(
+            gear_ratio=entry.wiring.described_gear_ratio or entry.gearbox.ratio,
+            counts_per_revolution=entry.encoder.counts_per_revolution,
+            encoder_bits=entry.encoder.bits,
+            supply_voltage=entry.supply_voltage,
+            resistance=entry.resistance if ohmmeter else math.nan,
         )
-        self._description = node.create_publisher(
-            MotorDescription, f"{name}/motor_description", runtime.LATCHED
-        )
+        timeout = motor.settings.command_timeout
+        self._driver = MotorReader(node, name, timeout, self._command, description)
+        self.lease = self._driver.lease
         node.create_subscription(
             Float64, f"{name}/load_torque", self._load, runtime.STREAM_SUBSCRIBER
-        )
-
-    def describe(self, ohmmeter: bool) -> None:
-        """Publish what a bag needs to describe itself."""
-        entry = self.motor.entry
-        self._description.publish(
-            MotorDescription(
-                joint_name=self.state.header.frame_id,
-                gear_ratio=entry.wiring.described_gear_ratio or entry.gearbox.ratio,
-                counts_per_revolution=entry.encoder.counts_per_revolution,
-                encoder_bits=entry.encoder.bits,
-                supply_voltage=entry.supply_voltage,
-                resistance=entry.resistance if ohmmeter else math.nan,
-            )
         )
 
     def _command(self, now: float, voltage: float) -> None:
@@ -115,16 +101,15 @@ class Wheel:
 
     def publish(self, now: float, stamp: Any) -> None:
         """Sample at an instant of the steady clock and publish it with its ROS time."""
-        state, sample = self.state, self.motor.sample(now)
-        state.header.stamp = stamp
+        state, sample = self._driver.state, self.motor.sample(now)
         state.voltage = sample.voltage
         state.current = sample.current
         state.velocity = sample.velocity
         state.position = sample.position
         state.encoder_count = sample.encoder_count
         state.duty_cycle = sample.duty
-        self.publisher.publish(state)
-        self._commands.tell_owner(now)
+        self._driver.report(stamp)
+        self._driver.tell_owner(now)
 
 
 class MotorPlant(Node):
@@ -144,11 +129,10 @@ class MotorPlant(Node):
                 self,
                 name,
                 DrivenMotor(entry, settings.drive, self._supply, start, 97 * settings.seed + k),
+                settings.ohmmeter,
             )
             for k, (name, entry) in enumerate(entries.items())
         ]
-        for wheel in self._wheels:
-            wheel.describe(settings.ohmmeter)
         self._samples = self._late = 0
         self._period = 1.0 / settings.rate
         self._last = start

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections.abc import Callable
@@ -10,7 +11,8 @@ from typing import Any
 from rclpy.node import Node
 from std_msgs.msg import String
 
-from smp_interfaces.msg import MotorCommand
+from smp_interfaces.msg import MotorCommand, MotorDescription, MotorState
+from smp_motor_control import joint_of
 from smp_motor_control.nodes.conventions import (
     LATCHED,
     STREAM_PUBLISHER,
@@ -73,18 +75,32 @@ class MotorWriter:
 
 
 class MotorReader:
-    """The driver's end: obeys the owner of the wheel's lease, and says who that is.
+    """The driver's end: obeys the owner of the wheel's lease, says who that is, and reports.
 
-    ``obey`` gets the instant [s] on a steady clock and the voltage [V].
+    ``obey`` gets the instant [s] on a steady clock and the voltage [V]; ``state`` is the message
+    that :meth:`report` publishes, its stamp and frame filled in.
     """
 
     def __init__(
-        self, node: Node, wheel: str, timeout: float, obey: Callable[[float, float], Any]
+        self,
+        node: Node,
+        wheel: str,
+        timeout: float,
+        obey: Callable[[float, float], Any],
+        description: MotorDescription,
     ) -> None:
         self._clock, self._obey = node.get_clock(), obey
         self.lease = Lease(timeout)
+        self.state = MotorState(current=math.nan)
+        self.state.header.frame_id = description.joint_name = joint_of(wheel)
         self._owner = "?"
         self._owners = node.create_publisher(String, f"{wheel}/motor_owner", LATCHED)
+        self._states = node.create_publisher(MotorState, f"{wheel}/motor_state", STREAM_PUBLISHER)
+        # A publisher that nothing holds would be destroyed, and what it latched with it.
+        self._descriptions = node.create_publisher(
+            MotorDescription, f"{wheel}/motor_description", LATCHED
+        )
+        self._descriptions.publish(description)
         node.create_subscription(
             MotorCommand, f"{wheel}/motor_command", self._heard, STREAM_SUBSCRIBER
         )
@@ -94,6 +110,11 @@ class MotorReader:
         stamps = nanoseconds(message.header.stamp), self._clock.now().nanoseconds
         if self.lease.take(message.header.frame_id, message.voltage, now, *stamps):
             self._obey(now, message.voltage)
+
+    def report(self, stamp: Any) -> None:
+        """Publish the state as it is filled in now."""
+        self.state.header.stamp = stamp
+        self._states.publish(self.state)
 
     def tell_owner(self, now: float) -> None:
         """Publish who owns the wheel, where that is another than before."""

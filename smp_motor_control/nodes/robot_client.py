@@ -25,6 +25,7 @@ from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import String
 
 from smp_interfaces.msg import MotorState
+from smp_motor_control import controller_of
 from smp_motor_control.errors import SmpError
 from smp_motor_control.nodes.conventions import LATCHED, STREAM_SUBSCRIBER, seconds, steady_timer
 from smp_motor_control.nodes.executor import LeanExecutor
@@ -55,11 +56,6 @@ class RobotError(SmpError):
     """What the robot did not answer or refused, in a line for the user."""
 
     exit_code = 1
-
-
-def controller(wheel: str) -> str:
-    """Return the name of a wheel's controller."""
-    return f"{wheel}/wheel_pid"
 
 
 class RobotClient:
@@ -330,7 +326,7 @@ class RobotClient:
                         f"{self._full(wheel)}/motor_command: {', '.join(rival)} commands the "
                         "wheel, and is no wheel_pid that can be paused; end it first"
                     )
-            nodes = [controller(w) for w in wheels if self._controlled(w, owners.get(w, ""))]
+            nodes = [controller_of(w) for w in wheels if self._controlled(w, owners.get(w, ""))]
             active = [node for node, state in self.get_states(nodes).items() if state == "active"]
             self.owe(active=active)
             self.change_states(active, "deactivate")

@@ -18,8 +18,8 @@ from typing import Any
 
 from rclpy.node import Node
 
-from smp_interfaces.msg import MotorDescription, MotorState
-from smp_motor_control import WHEELS, joint_of
+from smp_interfaces.msg import MotorDescription
+from smp_motor_control import WHEELS
 from smp_motor_control.encoder import Encoder, wrap
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.motor.parameters import Gearbox
@@ -79,31 +79,21 @@ class Wheel:
 
     def __init__(self, node: Node, name: str, settings: Settings) -> None:
         self.settings, self.voltage, self.commanded = settings, 0.0, -math.inf
-        self._commands = MotorReader(node, name, settings.command_timeout, self._command)
-        self.lease = self._commands.lease
+        description = MotorDescription(
+            gear_ratio=settings.gear_ratio,
+            counts_per_revolution=settings.counts_per_revolution,
+            encoder_bits=settings.encoder_bits,
+            supply_voltage=settings.supply_voltage,
+            resistance=settings.resistance,
+        )
+        timeout = settings.command_timeout
+        self._driver = MotorReader(node, name, timeout, self._command, description)
+        self.lease = self._driver.lease
         self._gearbox = Gearbox(settings.gear_ratio)
         self._encoder = Encoder(settings.counts_per_revolution, settings.encoder_bits)
-        self._state = MotorState(current=math.nan)
-        self._state.header.frame_id = joint_of(name)
         self._angle = 0.0
         self._count: int | None = None
         self._applied = 0.0
-        self._publisher = node.create_publisher(
-            MotorState, f"{name}/motor_state", runtime.STREAM_PUBLISHER
-        )
-        self._description = node.create_publisher(
-            MotorDescription, f"{name}/motor_description", runtime.LATCHED
-        )
-        self._description.publish(
-            MotorDescription(
-                joint_name=joint_of(name),
-                gear_ratio=settings.gear_ratio,
-                counts_per_revolution=settings.counts_per_revolution,
-                encoder_bits=settings.encoder_bits,
-                supply_voltage=settings.supply_voltage,
-                resistance=settings.resistance,
-            )
-        )
 
     def _command(self, now: float, voltage: float) -> None:
         if math.isfinite(voltage):
@@ -111,7 +101,7 @@ class Wheel:
 
     def wanted(self, now: float, battery: float) -> float:
         """Return the voltage to command now [V]."""
-        self._commands.tell_owner(now)
+        self._driver.tell_owner(now)
         if now - self.commanded > self.settings.command_timeout:
             return 0.0
         return min(max(self.voltage, -battery), battery)
@@ -128,13 +118,12 @@ class Wheel:
         turned = wrap(count - before, self._encoder.bits) * self._encoder.angle_per_count
         step = self._gearbox.to_wheel(turned)
         self._angle += step
-        state = self._state
-        state.header.stamp = stamp
+        state = self._driver.state
         state.voltage, state.current = self._applied, current
         state.velocity, state.position = step / dt, self._angle
         state.encoder_count = count
         state.duty_cycle = min(max(self._applied / battery, -1.0), 1.0) if battery > 0 else 0.0
-        self._publisher.publish(state)
+        self._driver.report(stamp)
 
     def sent(self, voltage: float) -> None:
         """Note what acts from now on."""

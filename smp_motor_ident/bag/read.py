@@ -181,7 +181,7 @@ def _records(
         plan = replace(plan, hardware={**description, **plan.hardware})
         try:
             mine = timed(recording, plan, channels, tables) if recording.is_table else tables
-            record = assemble(wheel, plan, _hardware(plan.hardware), mine, recording.name)
+            record = assemble(wheel, plan, hardware_of(plan.hardware), mine, recording.name)
             records.append(replace(record, findings=(*findings, *record.findings)))
         except BagError as error:
             if not plan.own:
@@ -266,8 +266,13 @@ def _description(
     return {}, []
 
 
-def _hardware(known: Mapping[str, float]) -> Hardware:
-    """Return what is known of the hardware."""
+def described(message: Any) -> Hardware:
+    """Return what a ``motor_description`` tells of the hardware."""
+    return hardware_of({name: float(getattr(message, name)) for name in mappings.HARDWARE})
+
+
+def hardware_of(known: Mapping[str, float]) -> Hardware:
+    """Return what is known of the hardware; what no hardware can have is not known."""
 
     def positive(name: str) -> float | None:
         value = known.get(name)

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from smp_motor_control import controller_of
 from smp_motor_control.parameter_file import read_parameters
 from smp_motor_ident.cli.processes import connect
 from smp_motor_ident.errors import ParameterError
@@ -19,10 +20,9 @@ def apply(wanted: Mapping[str, Mapping[str, Any]], arguments: argparse.Namespace
     supply = max((limit for limit in limits if math.isfinite(limit)), default=12.0)
     with connect("tune", arguments.ros_arguments) as robot:
         from smp_motor_control.nodes.gain_trial import try_gains
-        from smp_motor_control.nodes.robot_client import controller
 
-        found = robot.get_parameters({controller(w): list(new) for w, new in wanted.items()})
-        new = _changes({wheel: found[controller(wheel)] for wheel in wanted}, wanted)
+        found = robot.get_parameters({controller_of(w): list(new) for w, new in wanted.items()})
+        new = _changes({wheel: found[controller_of(wheel)] for wheel in wanted}, wanted)
         if not any(new.values()):
             print("the running gains are these already: nothing to set")
             return 0

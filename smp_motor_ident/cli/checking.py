@@ -9,6 +9,7 @@ from typing import Any
 
 from smp_motor_control.motor.file import MotorEntry
 from smp_motor_control.wheel.protection import Bounds
+from smp_motor_ident.bag.read import described
 from smp_motor_ident.diagnosis.wheel_checks import Robot, judge
 from smp_motor_ident.diagnosis.wheel_test import (
     Figures,
@@ -110,7 +111,8 @@ def check_wheels(
     """Test the wheels one after the other, at most at ``limit`` volts, and judge what they did."""
     from smp_motor_control.nodes import wheel_test
 
-    hardware = _described(wheel_test.descriptions(client, wheels, PATIENCE), wheels)
+    said = wheel_test.descriptions(client, wheels, PATIENCE)
+    hardware = {wheel: described(said[wheel]) if wheel in said else Hardware() for wheel in wheels}
     phases: list[Phase] = []
     counters = {
         wheel: wheel_test.counter(
@@ -144,21 +146,6 @@ def check_wheels(
     speeds = [abs(found[w].gain) * amplitude / hardware[w].gear_ratio for w in wheels]
     fastest = max(filter(math.isfinite, speeds), default=math.nan)
     return Checked(tuple(judge(robot)), found, amplitude, fastest)
-
-
-def _described(found: Mapping[str, Any], wheels: Sequence[str]) -> dict[str, Hardware]:
-    """Return what each wheel's hardware says of itself, or the defaults."""
-    return {
-        wheel: Hardware(
-            gear_ratio=found[wheel].gear_ratio or 1.0,
-            counts_per_revolution=found[wheel].counts_per_revolution or None,
-            encoder_bits=found[wheel].encoder_bits,
-            supply_voltage=found[wheel].supply_voltage or None,
-        )
-        if wheel in found
-        else Hardware()
-        for wheel in wheels
-    }
 
 
 def _constant(voltage: float) -> Callable[[float], float]:

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from smp_motor_control import WHEELS
+from smp_motor_control import WHEELS, controller_of
 from smp_motor_control.motor.file import load_motors
 from smp_motor_control.wheel.protection import Bounds
 from smp_motor_ident import bag
@@ -273,7 +273,8 @@ def _found(client: Any) -> tuple[str, ...]:
 
 def _controlled(robot: steps.Robot, wheel: str) -> bool:
     node = robot.client.node
-    return bool(node.count_services(node.resolve_service_name(f"{wheel}/wheel_pid/change_state")))
+    service = node.resolve_service_name(f"{controller_of(wheel)}/change_state")
+    return bool(node.count_services(service))
 
 
 def unreliable(results: Path) -> list[Finding]:

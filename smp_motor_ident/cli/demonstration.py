@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from smp_motor_control import LEFT, RIGHT, WHEELS
+from smp_motor_control import LEFT, RIGHT, WHEELS, controller_of
 from smp_motor_control.motor.file import load_motors, paper_motors
 from smp_motor_ident.cli import steps
 from smp_motor_ident.cli.demo import NAME
@@ -130,7 +130,7 @@ def drive(
     """Drive through :data:`DRIVE` with the gains; return recording, segments and stall [s]."""
     from smp_motor_control.nodes.driving import drive_body
 
-    robot.client.set_parameters({f"{wheel}/wheel_pid": new for wheel, new in gains.items()})
+    robot.client.set_parameters({controller_of(w): new for w, new in gains.items()})
     robot.switch("activate")
     say("gains set in the running controllers; driving")
     drives = []

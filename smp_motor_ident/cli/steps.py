@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from smp_motor_control import controller_of
 from smp_motor_ident.cli import applying, identify, tune
 from smp_motor_ident.cli.processes import ProcessError, Processes
 from smp_motor_ident.report.document import read_identification
@@ -36,7 +37,7 @@ class Robot:
 
     def wheel_nodes(self) -> list[str]:
         """Return the names of the wheels' controllers."""
-        return [f"{wheel}/wheel_pid" for wheel in self.wheels]
+        return [controller_of(wheel) for wheel in self.wheels]
 
     def switch(self, transition: str) -> None:
         """Let every wheel's controller go through a lifecycle transition."""

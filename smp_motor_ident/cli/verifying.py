@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from smp_motor_control import controller_of
 from smp_motor_control.motor.file import nest
 from smp_motor_ident.bag.decode import Columns, read_columns
 from smp_motor_ident.cli import steps
@@ -45,7 +46,7 @@ class Trial:
 @contextlib.contextmanager
 def on_trial(client: Any, gains: Mapping[str, Mapping[str, Any]]) -> Iterator[Trial]:
     """Set gains in the running controllers; set the former ones again unless they are kept."""
-    new = {f"{wheel}/wheel_pid": dict(values) for wheel, values in gains.items()}
+    new = {controller_of(wheel): dict(values) for wheel, values in gains.items()}
     old = client.get_parameters({node: list(values) for node, values in new.items()})
     owed, trial = dict(client.owed), Trial()
     client.owe(**owed, gains=old)

@@ -33,11 +33,12 @@ from smp_motor_control.errors import ParameterError, SmpError
 from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.executor import Untouched
 from smp_motor_control.nodes.settings import Parameters, described, fixed, nested
+from smp_motor_ident.bag import read
 from smp_motor_ident.bag.window import Window
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.estimation.live import Demands, missing
 from smp_motor_ident.estimation.monitor import Monitor, commissioned_of
-from smp_motor_ident.record import Hardware, Record
+from smp_motor_ident.record import Record
 from smp_motor_ident.report import history
 from smp_motor_ident.report.document import read_identification
 from smp_motor_ident.result import Estimate
@@ -144,13 +145,7 @@ class Wheel:
 
     def _on_description(self, message: MotorDescription) -> None:
         self.joint_name = message.joint_name or self.joint_name
-        self.window.hardware = Hardware(
-            gear_ratio=message.gear_ratio if message.gear_ratio > 0 else 1.0,
-            counts_per_revolution=_positive(message.counts_per_revolution),
-            encoder_bits=message.encoder_bits,
-            supply_voltage=_positive(message.supply_voltage),
-            resistance=_positive(message.resistance),
-        )
+        self.window.hardware = read.described(message)
 
     def tell(self, status: str, found: Estimate | None = None) -> None:
         """Publish an answer."""
@@ -282,10 +277,6 @@ def _monitors(settings: Settings) -> dict[str, Monitor]:
         return {}
     found = read_identification(Path(settings.commissioned))
     return {n: Monitor(commissioned_of(found[n])) for n in settings.wheels if n in found}
-
-
-def _positive(value: float) -> float | None:
-    return value if value > 0 else None
 
 
 def _identify(record: Record, model: str) -> tuple[Estimate | Exception, float]:
