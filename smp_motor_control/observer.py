@@ -64,7 +64,7 @@ class ObserverNoise:
 
     def __post_init__(self) -> None:
         for name, unit in (("load", "V/sqrt(s)"), ("voltage", "V sqrt(s)"), ("count", "counts")):
-            check_range(f"observer noise of {name}", getattr(self, name), 1e-6, 1e6, unit)
+            check_range(name, getattr(self, name), 1e-6, 1e6, unit)
 
 
 class SteadyGain(NamedTuple):

@@ -4,23 +4,13 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from typing import NamedTuple
+
+import numpy as np
 
 from smp_motor_control.errors import ParameterError, check_positive
 
 LEAST_STEP = 1e-6
 """Time steps [s] below this one are not integrated."""
-
-
-class PoseCovariance(NamedTuple):
-    """Upper triangle of the covariance of (x, y, heading) in [m^2], [m rad], [rad^2]."""
-
-    xx: float
-    xy: float
-    xh: float
-    yy: float
-    yh: float
-    hh: float
 
 
 class Odometry:
@@ -51,7 +41,7 @@ class Odometry:
         Pose [m], [m], [rad]; the heading is not wrapped.
     linear, angular : float
         Velocity [m/s], [rad/s].
-    covariance : PoseCovariance
+    covariance : ndarray, shape (3, 3)
         Of the pose, since the last :meth:`set_odometry`.
 
     Raises
@@ -119,7 +109,7 @@ class Odometry:
     def set_odometry(self, x: float, y: float, heading: float) -> None:
         """Declare where the body is, without doubt."""
         self.x, self.y, self.heading = x, y, heading
-        self.covariance = PoseCovariance(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        self.covariance = np.zeros((3, 3))
 
     def forget_positions(self) -> None:
         """Take the next wheel positions as where the wheels have been all along."""
@@ -245,26 +235,13 @@ class Odometry:
 
     def _spread(self, left: float, right: float, travel: float, turn: float) -> None:
         """Advance the covariance: ``P = F P F' + G Q G'`` with inputs (travel, turn)."""
-        p, k, b = self.covariance, self._travel_noise, self._separation
-        q_tt = k * (abs(left) + abs(right)) / 4.0
-        q_th = k * (abs(right) - abs(left)) / (2.0 * b)
-        q_hh = k * (abs(left) + abs(right)) / (b * b) + self._turn_noise * abs(turn)
+        k, b = self._travel_noise, self._separation
+        rolled, uneven = k * (abs(left) + abs(right)), k * (abs(right) - abs(left))
+        skidded = self._turn_noise * abs(turn)
+        Q = [[rolled / 4.0, uneven / (2.0 * b)], [uneven / (2.0 * b), rolled / (b * b) + skidded]]
         middle = self.heading + turn / 2.0
         cos, sin = math.cos(middle), math.sin(middle)
-        # Columns of F (heading) and of G (turn, half of it), both perpendicular to the travel.
-        fx, fy = -travel * sin, travel * cos
-        gx, gy = fx / 2.0, fy / 2.0
-        xh, yh = p.xh + fx * p.hh, p.yh + fy * p.hh
-        self.covariance = PoseCovariance(
-            p.xx + fx * (p.xh + xh) + cos * cos * q_tt + 2.0 * cos * gx * q_th + gx * gx * q_hh,
-            p.xy
-            + fy * p.xh
-            + fx * yh
-            + cos * sin * q_tt
-            + (cos * gy + sin * gx) * q_th
-            + gx * gy * q_hh,
-            xh + cos * q_th + gx * q_hh,
-            p.yy + fy * (p.yh + yh) + sin * sin * q_tt + 2.0 * sin * gy * q_th + gy * gy * q_hh,
-            yh + sin * q_th + gy * q_hh,
-            p.hh + q_hh,
-        )
+        across = np.array([-travel * sin, travel * cos])
+        F, G = np.eye(3), np.array([[cos, 0.0], [sin, 0.0], [0.0, 1.0]])
+        F[:2, 2], G[:2, 1] = across, across / 2.0
+        self.covariance = F @ self.covariance @ F.T + G @ Q @ G.T

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 import sys
+from dataclasses import dataclass
 from typing import NamedTuple
 
 from smp_motor_control.errors import ParameterError
+from smp_motor_control.fields import described
 
 
 class Limited(NamedTuple):
@@ -123,21 +125,16 @@ class RateLimiter:
         return _share(v0 + before + _clamp(change - before, lower, upper), v)
 
 
+@dataclass(eq=False)
 class SpeedLimiter(RateLimiter):
-    """A :class:`RateLimiter` with the parameters of a diff_drive_controller.
+    """A :class:`RateLimiter` with the parameters of a diff_drive_controller; NaN is None.
 
     Accelerations in reverse and decelerations forward are negative there, as they are here.
 
-    Parameters
-    ----------
-    min_velocity, max_velocity : float or None
-        [m/s] or [rad/s].
-    max_acceleration_reverse, max_acceleration : float or None
-        Speeding up in reverse (not positive) and forward [m/s^2] or [rad/s^2].
-    max_deceleration, max_deceleration_reverse : float or None
-        Slowing down from forward (not positive) and from reverse.
-    min_jerk, max_jerk : float or None
-        [m/s^3] or [rad/s^3].
+    Raises
+    ------
+    ParameterError
+        When a minimum is above its maximum.
 
     Examples
     --------
@@ -145,27 +142,31 @@ class SpeedLimiter(RateLimiter):
     0.2
     """
 
-    def __init__(
-        self,
-        min_velocity: float | None = None,
-        max_velocity: float | None = None,
-        max_acceleration_reverse: float | None = None,
-        max_acceleration: float | None = None,
-        max_deceleration: float | None = None,
-        max_deceleration_reverse: float | None = None,
-        min_jerk: float | None = None,
-        max_jerk: float | None = None,
-    ) -> None:
-        super().__init__(
-            min_velocity,
-            max_velocity,
-            max_acceleration_reverse,
-            max_acceleration,
-            max_deceleration,
-            max_deceleration_reverse,
-            min_jerk,
-            max_jerk,
-        )
+    min_velocity: float | None = described(
+        math.nan, "Lowest velocity; NaN takes the negative of max_velocity."
+    )
+    max_velocity: float | None = described(
+        math.nan, "Highest velocity [m/s] or [rad/s]; NaN for no limit."
+    )
+    max_acceleration_reverse: float | None = described(
+        math.nan, "Speeding up in reverse, not positive; NaN as forward."
+    )
+    max_acceleration: float | None = described(
+        math.nan, "Speeding up forward [m/s^2] or [rad/s^2]; NaN for no limit."
+    )
+    max_deceleration: float | None = described(
+        math.nan, "Slowing down from forward, not positive; NaN as speeding up."
+    )
+    max_deceleration_reverse: float | None = described(
+        math.nan, "Slowing down from reverse, not negative; NaN as speeding up."
+    )
+    min_jerk: float | None = described(math.nan, "Lowest jerk; NaN takes the negative of max_jerk.")
+    max_jerk: float | None = described(
+        math.nan, "Highest jerk [m/s^3] or [rad/s^3]; NaN for no limit."
+    )
+
+    def __post_init__(self) -> None:
+        super().__init__(*vars(self).values())
 
 
 def _absent(limit: float | None) -> bool:

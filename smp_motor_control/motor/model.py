@@ -43,18 +43,3 @@ class MotorModel:
         )
         for name, most, unit in limits:
             check_range(f"{name} of the model", getattr(self, name), 0.0, most, unit)
-
-    @property
-    def a0(self) -> float:
-        """Voltage per speed [V s/rad]."""
-        return 1.0 / self.dc_gain
-
-    @property
-    def a1(self) -> float:
-        """Voltage per acceleration [V s^2/rad]."""
-        return self.time_constant / self.dc_gain
-
-    @property
-    def a2(self) -> float:
-        """Voltage per jerk [V s^3/rad]."""
-        return self.time_constant_product / self.dc_gain

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
+import numpy as np
 from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import Odometry as OdometryMessage
 from rclpy.node import Node
@@ -68,11 +69,10 @@ class OdometryOutput:
         pose.pose.position.x, pose.pose.position.y = odometry.x, odometry.y
         half = math.remainder(odometry.heading, 2.0 * math.pi) / 2.0
         pose.pose.orientation.z, pose.pose.orientation.w = math.sin(half), math.cos(half)
-        p = odometry.covariance
-        pose.covariance = _spread(p.xx, p.xy, p.xh, p.yy, p.yh, p.hh)
+        pose.covariance = _spread(odometry.covariance)
         twist.twist.linear.x, twist.twist.angular.z = odometry.linear, odometry.angular
         linear, angular = odometry.twist_variances(self._span)
-        twist.covariance = _spread(linear + STILL, 0.0, 0.0, SIDEWAYS, 0.0, angular + STILL)
+        twist.covariance = _spread(np.diag([linear + STILL, SIDEWAYS, angular + STILL]))
         self._publisher.publish(message)
         if self._tf is not None:
             self._transform.header = message.header
@@ -95,11 +95,8 @@ class OdometryOutput:
         self._joints.publish(message)
 
 
-def _spread(xx: float, xy: float, xh: float, yy: float, yh: float, hh: float) -> list[float]:
+def _spread(planar: np.ndarray) -> np.ndarray:
     """Return the 6 x 6 covariance of (x, y, z, roll, pitch, yaw), row by row."""
-    matrix = [0.0] * 36
-    matrix[0], matrix[1], matrix[5] = xx, xy, xh
-    matrix[6], matrix[7], matrix[11] = xy, yy, yh
-    matrix[30], matrix[31], matrix[35] = xh, yh, hh
-    matrix[14] = matrix[21] = matrix[28] = UNKNOWN
-    return matrix
+    matrix = np.diag([0.0, 0.0, UNKNOWN, UNKNOWN, UNKNOWN, 0.0])
+    matrix[np.ix_((0, 1, 5), (0, 1, 5))] = planar
+    return matrix.ravel()

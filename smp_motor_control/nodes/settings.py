@@ -188,10 +188,9 @@ class Parameters(Generic[S]):
                 top[entry.path[0]] = values[name]
             else:
                 inner.setdefault(entry.path[0], {})[entry.path[1]] = values[name]
-        defaults = {field.name: field.default for field in dataclasses.fields(self._type)}  # type: ignore[arg-type]
         try:
-            for name, parts in inner.items():
-                top[name] = dataclasses.replace(defaults[name], **parts)
+            for field in (f for f in dataclasses.fields(self._type) if f.name in inner):  # type: ignore[arg-type]
+                top[field.name] = _replaced(field, inner[field.name])
             return self._type(**top)
         except ArithmeticError as error:
             raise ParameterError(f"the values cannot be computed with: {error}") from error
@@ -216,6 +215,15 @@ class Parameters(Generic[S]):
         self.settings = self._build(values)
         if self._changed is not None:
             self._changed(self.settings)
+
+
+def _replaced(field: dataclasses.Field[Any], parts: Mapping[str, Any]) -> Any:
+    """Return nested settings with new values; what is refused is named as the parameters are."""
+    try:
+        return dataclasses.replace(field.default, **parts)
+    except ParameterError as error:
+        place = field.metadata["prefix"].rstrip(".")
+        raise ParameterError(f"{place}: {error}" if place else str(error)) from None
 
 
 def given_parameters(node: Node) -> dict[str, Any]:

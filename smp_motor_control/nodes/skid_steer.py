@@ -105,7 +105,7 @@ class SkidSteerNode(Node):
     def _configure(self, settings: Settings) -> None:
         robot = settings.robot()
         self._robot = robot
-        self._linear, self._angular = settings.limiters()
+        self._linear, self._angular = settings.linear, settings.angular
         self._command.configure(settings.cmd_vel_timeout)
         self._feedback.max_speed = IMPLAUSIBLE * min(robot.max_wheel_speed, FASTEST)
         self._hold = settings.hold()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, make_dataclass
+from dataclasses import dataclass
 
 from smp_motor_control import LEFT, RIGHT
 from smp_motor_control.body.heading import HeadingHold
@@ -13,19 +13,6 @@ from smp_motor_control.body.kinematics import SkidSteer
 from smp_motor_control.body.speed_limiter import SpeedLimiter
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.nodes.settings import described, fields_for, fixed, nested
-
-_LIMITS = {
-    "min_velocity": "Lowest velocity; NaN takes the negative of max_velocity.",
-    "max_velocity": "Highest velocity [m/s] or [rad/s]; NaN for no limit.",
-    "max_acceleration_reverse": "Speeding up in reverse, not positive; NaN as forward.",
-    "max_acceleration": "Speeding up forward [m/s^2] or [rad/s^2]; NaN for no limit.",
-    "max_deceleration": "Slowing down from forward, not positive; NaN as speeding up.",
-    "max_deceleration_reverse": "Slowing down from reverse, not negative; NaN as speeding up.",
-    "min_jerk": "Lowest jerk; NaN takes the negative of max_jerk.",
-    "max_jerk": "Highest jerk [m/s^3] or [rad/s^3]; NaN for no limit.",
-}
-AxisLimits = make_dataclass("AxisLimits", [(n, float, math.nan) for n in _LIMITS], frozen=True)
-"""Limits of one component of the body's velocity; NaN for none."""
 
 
 def check_wheels(left: Sequence[str], right: Sequence[str]) -> None:
@@ -94,29 +81,18 @@ class Settings:
         0.7, "Beyond this the present heading is taken for the wanted one [rad]."
     )
     imu_timeout: float = described(0.2, "Age at which a yaw is not used [s].", minimum=0.01)
-    linear: AxisLimits = nested(AxisLimits(), _LIMITS, prefix="linear.x.")  # noqa: RUF009
-    angular: AxisLimits = nested(AxisLimits(), _LIMITS, prefix="angular.z.")  # noqa: RUF009
+    linear: SpeedLimiter = nested(SpeedLimiter(), prefix="linear.x.")  # noqa: RUF009
+    angular: SpeedLimiter = nested(SpeedLimiter(), prefix="angular.z.")  # noqa: RUF009
 
     def __post_init__(self) -> None:
         check_wheels(self.left_wheel_names, self.right_wheel_names)
         self.robot()
         self.hold()
-        self.limiters()
 
     def robot(self) -> SkidSteer:
         """Return the geometry."""
         most = self.max_wheel_velocity or math.inf
         return SkidSteer(**fields_for(SkidSteer, self), max_wheel_speed=most)
-
-    def limiters(self) -> list[SpeedLimiter]:
-        """Return the limiters of linear and angular velocity."""
-        made = []
-        for name, axis in (("linear.x", self.linear), ("angular.z", self.angular)):
-            try:
-                made.append(SpeedLimiter(**asdict(axis)))
-            except ParameterError as error:
-                raise ParameterError(f"{name}: {error}") from None
-        return made
 
     def hold(self) -> HeadingHold:
         """Return a heading controller."""

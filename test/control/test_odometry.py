@@ -44,11 +44,6 @@ def state(odometry: Odometry) -> np.ndarray:
     return np.array([odometry.x, odometry.y, odometry.heading])
 
 
-def matrix(odometry: Odometry) -> np.ndarray:
-    p = odometry.covariance
-    return np.array([[p.xx, p.xy, p.xh], [p.xy, p.yy, p.yh], [p.xh, p.yh, p.hh]])
-
-
 @pytest.mark.parametrize("way", ["velocity", "position", "travel", "open loop"])
 def test_pose_and_covariance_follow_arcs_forth_and_back(way: str) -> None:
     draw, odometry = random.Random(way), make()
@@ -73,7 +68,7 @@ def test_pose_and_covariance_follow_arcs_forth_and_back(way: str) -> None:
         p = spread(p, pose[2], left, right)
         pose = arc(pose, left, right)
         assert state(odometry) == pytest.approx(pose, rel=ROUNDING, abs=ROUNDING)
-        assert matrix(odometry) == pytest.approx(p, rel=ROUNDING, abs=1e-12)
+        assert odometry.covariance == pytest.approx(p, rel=ROUNDING, abs=1e-12)
 
 
 @pytest.mark.parametrize("turn", [0.0, 1e-9, 0.9e-6, 1.1e-6, 1e-5, -1e-5, 3.0])
@@ -119,10 +114,10 @@ def test_a_pose_that_is_set_is_without_doubt_and_a_reset_forgets_all() -> None:
     odometry.update_from_position(0.0, 0.0, 0.1)
     odometry.update_from_position(1.0, 2.0, 0.1)
     odometry.set_odometry(3.0, -2.0, 7.0)
-    assert state(odometry).tolist() == [3.0, -2.0, 7.0] and not matrix(odometry).any()
+    assert state(odometry).tolist() == [3.0, -2.0, 7.0] and not odometry.covariance.any()
     odometry.update_from_position(2.0, 3.0, 0.1)
     odometry.reset()
-    assert not state(odometry).any() and not matrix(odometry).any()
+    assert not state(odometry).any() and not odometry.covariance.any()
     assert (odometry.linear, odometry.angular) == (0.0, 0.0)
     assert not odometry.update_from_position(50.0, 50.0, 0.1), "the first position is no motion"
     assert not state(odometry).any()
@@ -205,9 +200,9 @@ def test_a_new_geometry_counts_from_the_next_step_on() -> None:
     odometry = make()
     odometry.update_from_travel(1.0, 0.8, 0.0, 0.0)
     odometry.configure(1.0, 0.2, 0.3, 0.0, 0.0)
-    before = matrix(odometry)
+    before = odometry.covariance
     odometry.update_from_travel(1.0, 2.0 / 3.0, 0.0, 0.0)
     assert odometry.x == pytest.approx(0.1 + 0.2)
     # Noise of zero: what is known is only carried along.
     carried = np.array([[1, 0, 0], [0, 1, 0.2], [0, 0, 1]])
-    assert matrix(odometry) == pytest.approx(carried @ before @ carried.T, abs=1e-15)
+    assert odometry.covariance == pytest.approx(carried @ before @ carried.T, abs=1e-15)

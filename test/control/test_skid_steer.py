@@ -117,8 +117,7 @@ def test_covariance_agrees_with_a_thousand_noisy_drives() -> None:
     odometry = make_odometry(travel_noise=travel_noise, turn_noise=turn_noise)
     for _ in range(steps):
         odometry.update_from_velocity(left / 0.1, right / 0.1, 1.0)
-    p = odometry.covariance
-    predicted = np.array([[p.xx, p.xy, p.xh], [p.xy, p.yy, p.yh], [p.xh, p.yh, p.hh]])
+    predicted = odometry.covariance
     # The sampled deviation of 1000 drives is known to 1/sqrt(2000) = 2.2 %; correlations to
     # 0.03. Four of those, and 5 % for what linearisation leaves out.
     std = np.sqrt(np.diag(sampled))
