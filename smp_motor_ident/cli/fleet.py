@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
-import math
 import multiprocessing
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -19,6 +18,8 @@ from concurrent.futures.process import BrokenProcessPool
 from importlib import metadata
 from pathlib import Path
 from typing import Any, cast
+
+import msgspec
 
 from smp_motor_ident import bag
 from smp_motor_ident.cli.workers import end_with_parent
@@ -29,6 +30,9 @@ from smp_motor_ident.report.document import check_free, write_together
 
 TRIES = 2
 """How often a recording is begun that takes its worker with it."""
+
+Results = Iterator[tuple[str, list[fleet.Row]]]
+"""Paths of recordings, each with its rows."""
 
 
 def work(
@@ -45,15 +49,15 @@ def work(
     left = [path for path, file in files.items() if not file.exists()]
     if not arguments.quiet:
         print(f"{len(files) - len(left)} of {len(files)} recordings are known already")
-    results = {p: json.loads(f.read_text()) for p, f in files.items() if f.exists()}
+    results = {p: _known(f) for p, f in files.items() if f.exists()}
     settings = (mapping, arguments.model, dict(fixed))
-    for path, result in _results(left, settings, arguments.scheduler):
-        results[path] = result
-        if not result.get("lost"):  # what was not its fault is tried again by the next run
-            write_together({files[path]: json.dumps(result, allow_nan=False)}, force=True)
+    for path, found in _results(left, settings, arguments.scheduler):
+        results[path] = found
+        if not any(row.lost for row in found):
+            write_together({files[path]: msgspec.json.encode(found)}, force=True)
         if not arguments.quiet:
-            print(f"{path}: {result['failure'] or ', '.join(result['motors'])}", flush=True)
-    rows = [row for path in files for row in _rows(path, results[path])]
+            print(f"{path}: {', '.join(row.wheel or row.failure for row in found)}", flush=True)
+    rows = [row for path in files for row in results[path]]
     marks = [*fleet.drifts(rows), *fleet.outliers(rows)]
     name, content = fleet.table(rows)
     pages: dict[Path, str | bytes] = {
@@ -74,42 +78,54 @@ def _key(path: Path, options: str) -> str:
         raise BagError(f"{path}: no such file or folder")
     parts = sorted(path.rglob("*")) if path.is_dir() else [path]
     seen = [(str(p), p.stat().st_size, p.stat().st_mtime_ns) for p in parts if p.is_file()]
-    text = json.dumps([str(path.resolve()), seen, options, metadata.version("smp_motor_control")])
+    text = json.dumps(
+        ["rows", str(path.resolve()), seen, options, metadata.version("smp_motor_control")]
+    )
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
-def identify_one(path: str, settings: tuple[Any, ...]) -> dict[str, Any]:
-    """Return what came out for one recording, as a document; a failure is one too."""
+def _known(file: Path) -> list[fleet.Row]:
+    return msgspec.json.decode(file.read_bytes(), type=list[fleet.Row])
+
+
+def identify_one(path: str, settings: tuple[Any, ...]) -> list[fleet.Row]:
+    """Return what came out for one recording, a row a wheel; a failure is a row too."""
     mapping, model, fixed = settings
-    motors: dict[str, Any] = {}
+    rows = []
     try:
         for wheel, records in bag.read_experiments([path], mapping).items():
             try:
                 found = estimate(records, model, fixed=fixed)
             except SmpError as error:
-                motors[wheel] = {"failure": str(error)}
+                rows.append(_row(path, wheel=wheel, failure=str(error)))
                 continue
             held = {**found.combinations, **found.parameters}
-            fit = found.fit_percent.validation
-            motors[wheel] = {
-                "values": {
-                    name: [q.value, q.std or 0.0]
-                    for name, q in held.items()
-                    if name in fleet.QUANTITIES and q.value is not None
-                },
-                "fit_percent": fit,
-                "unreliable": found.unreliable,
+            values = {
+                name: (float(q.value), float(q.std or 0.0))
+                for name, q in held.items()
+                if name in fleet.QUANTITIES and q.value is not None
             }
+            fit, unreliable = found.fit_percent.validation, found.unreliable
+            rows.append(
+                _row(path, wheel=wheel, values=values, fit_percent=fit, unreliable=unreliable)
+            )
     except SmpError as error:
-        return {"failure": str(error), "motors": {}}
+        return [_row(path, failure=str(error))]
     except Exception as error:  # whatever is wrong with one recording, the others go on
-        return {"failure": f"{path}: {type(error).__name__}: {error}", "motors": {}}
-    return {"failure": "", "motors": motors}
+        return [_row(path, failure=f"{path}: {type(error).__name__}: {error}")]
+    return rows
 
 
-def _results(
-    paths: Sequence[str], settings: tuple[Any, ...], scheduler: str | None
-) -> Iterator[tuple[str, dict[str, Any]]]:
+def _row(path: str, **what: Any) -> fleet.Row:
+    """Return a row of a recording; the robot is the folder that it lies in."""
+    where = Path(path).resolve()
+    about = {"wheel": "", "values": {}, **what}
+    return fleet.Row(
+        robot=where.parent.name, source=where.name, date=where.stat().st_mtime, **about
+    )
+
+
+def _results(paths: Sequence[str], settings: tuple[Any, ...], scheduler: str | None) -> Results:
     """Yield results as they come; a worker that dies takes nothing with it but its own try."""
     if scheduler:
         yield from on_cluster(paths, settings, scheduler)
@@ -129,23 +145,21 @@ def _results(
                     tries[path] += 1
         for path in [p for p, n in tries.items() if n >= TRIES]:
             del tries[path]
-            yield path, {"failure": f"{path}: its worker was ended, perhaps for its memory",
-                         "motors": {}, "lost": True}  # fmt: skip
+            why = f"{path}: its worker was ended, perhaps for its memory"
+            yield path, [_row(path, failure=why, lost=True)]
 
 
 def _gathered(
     pool: Executor, paths: Sequence[str] | dict[str, int], settings: tuple[Any, ...]
-) -> Iterator[tuple[str, dict[str, Any]]]:
-    futures: dict[Future[dict[str, Any]], str] = {
+) -> Results:
+    futures: dict[Future[list[fleet.Row]], str] = {
         pool.submit(identify_one, path, settings): path for path in paths
     }
     for future in as_completed(futures):
         yield futures[future], future.result()
 
 
-def on_cluster(
-    paths: Sequence[str], settings: tuple[Any, ...], address: str
-) -> Iterator[tuple[str, dict[str, Any]]]:
+def on_cluster(paths: Sequence[str], settings: tuple[Any, ...], address: str) -> Results:
     """Yield results as workers of a Dask cluster give them; it repeats what a dead one had."""
     try:
         from dask import distributed
@@ -163,30 +177,5 @@ def on_cluster(
         for future in call(futures):
             path = futures[future]
             lost = future.exception()
-            yield path, future.result() if lost is None else {
-                "failure": f"{path}: {lost}", "motors": {}, "lost": True
-            }  # fmt: skip
-
-
-def _rows(path: str, result: dict[str, Any]) -> list[fleet.Row]:
-    """Return the rows of one recording; the robot is the folder that it lies in."""
-    where = Path(path).resolve()
-    robot, date = where.parent.name, where.stat().st_mtime
-    if result["failure"]:
-        return [fleet.Row(robot, "", where.name, date, {}, failure=result["failure"])]
-    rows = []
-    for wheel, one in result["motors"].items():
-        fit = one.get("fit_percent")
-        rows.append(
-            fleet.Row(
-                robot,
-                wheel,
-                where.name,
-                date,
-                {name: (v, s) for name, (v, s) in one.get("values", {}).items()},
-                math.nan if fit is None else fit,
-                one.get("unreliable", False),
-                one.get("failure", ""),
-            )
-        )
-    return rows
+            failed = [_row(path, failure=f"{path}: {lost}", lost=True)]
+            yield path, future.result() if lost is None else failed

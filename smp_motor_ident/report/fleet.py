@@ -30,9 +30,10 @@ class Row:
     source: str
     date: float  # when it was recorded [s since 1970]
     values: Mapping[str, tuple[float, float]]  # value and standard deviation by name
-    fit_percent: float = math.nan  # of the speed in held-out data; NaN where there is none
+    fit_percent: float | None = None  # of the speed in held-out data; None where there is none
     unreliable: bool = False  # whether the identification calls itself so
     failure: str = ""  # why there are no values
+    lost: bool = False  # whether that was not the recording's fault: the next run tries it again
 
 
 @dataclass(frozen=True)
@@ -117,7 +118,7 @@ def columns(rows: Sequence[Row]) -> dict[str, list[object]]:
         pairs = [r.values.get(name) for r in rows]
         out[name] = [p[0] if p else None for p in pairs]
         out[f"{name}_std"] = [p[1] if p else None for p in pairs]
-    out["fit_percent"] = [None if math.isnan(r.fit_percent) else r.fit_percent for r in rows]
+    out["fit_percent"] = [r.fit_percent for r in rows]
     out["unreliable"] = [r.unreliable for r in rows]
     out["failure"] = [r.failure for r in rows]
     return out

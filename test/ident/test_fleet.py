@@ -42,19 +42,18 @@ def test_a_motor_unlike_the_others_stands_out_and_a_few_robots_are_not_compared(
     assert "other" in page([*same, *other], outliers([*same, *other]))
 
 
-def fake(path: str, settings: tuple[Any, ...]) -> dict[str, Any]:
+def fake(path: str, settings: tuple[Any, ...]) -> list[Row]:
     """A recording as its file says: broken, deadly once, or a motor."""
     with (Path(path).parent / "log").open("a") as log:
         log.write(Path(path).name + "\n")
     text = Path(path).read_text()
     if text == "broken":
-        return {"failure": f"{path}: is no recording", "motors": {}}
+        return [command._row(path, failure=f"{path}: is no recording")]
     killed = Path(path + ".killed")
     if text == "deadly" and not killed.exists():
         killed.touch()
         os.kill(os.getpid(), signal.SIGKILL)
-    return {"failure": "", "motors": {"left": {"values": {"dc_gain": [25.0, 0.1]},
-            "fit_percent": 97.0, "unreliable": False}}}  # fmt: skip
+    return [command._row(path, wheel="left", values={"dc_gain": (25.0, 0.1)}, fit_percent=97.0)]
 
 
 def test_a_broken_bag_fails_alone_a_killed_worker_loses_nothing_and_no_work_is_done_twice(
