@@ -101,14 +101,14 @@ def main() -> int:
         whole, quick = by_two(paths, settings, kill=False)
         print(f"two workers: {quick:.1f} s, {took / quick:.2f} times as fast", flush=True)
         cut, slow = by_two(paths, settings, kill=True)
-        lost = sum(bool(one["failure"]) for one in cut.values())
+        lost = sum(any(row.failure for row in rows) for rows in cut.values())
         print(f"one of two killed half-way: {slow:.1f} s, {lost} lost")
     same = whole == alone and cut == alone
     for path, one in alone.items():
         for other in (whole[path], cut[path]):
             if other != one:
                 print(f"{path}:\n  {one}\n  {other}")
-    known = sum(bool(one["motors"]) and not one["failure"] for one in alone.values())
+    known = sum(not any(row.failure for row in rows) for rows in alone.values())
     load = os.getloadavg()[0]
     print(f"numbers {'are' if same else 'are NOT'} the same; {known} of {given.bags} identified; "
           f"load {load:.1f}")  # fmt: skip
