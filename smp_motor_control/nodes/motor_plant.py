@@ -33,7 +33,7 @@ from smp_motor_control.motor.file import (
 )
 from smp_motor_control.motor.hardware import DrivenMotor, DriveSettings, Supply
 from smp_motor_control.nodes import runtime
-from smp_motor_control.nodes.motor_writer import MotorReader
+from smp_motor_control.nodes.motor_writer import MotorDriver
 from smp_motor_control.nodes.settings import Parameters, described, fixed, given_parameters, nested
 
 _FIXED = ParameterDescriptor(description="As in a motor file.", read_only=True)
@@ -85,7 +85,7 @@ class Wheel:
             resistance=entry.resistance if ohmmeter else math.nan,
         )
         timeout = motor.settings.command_timeout
-        self._driver = MotorReader(node, name, timeout, self._command, description)
+        self._driver = MotorDriver(node, name, timeout, self._command, description)
         self.lease = self._driver.lease
         node.create_subscription(
             Float64, f"{name}/load_torque", self._load, runtime.STREAM_SUBSCRIBER

@@ -74,7 +74,7 @@ class MotorWriter:
         self._node.destroy_subscription(self._owners)
 
 
-class MotorReader:
+class MotorDriver:
     """The driver's end: obeys the owner of the wheel's lease, says who that is, and reports.
 
     ``obey`` gets the instant [s] on a steady clock and the voltage [V]; ``state`` is the message

@@ -24,7 +24,7 @@ from smp_motor_control.encoder import Encoder, wrap
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.motor.parameters import Gearbox
 from smp_motor_control.nodes import runtime
-from smp_motor_control.nodes.motor_writer import MotorReader
+from smp_motor_control.nodes.motor_writer import MotorDriver
 from smp_motor_control.nodes.settings import Parameters, described, fixed
 from smp_motor_control.serial_protocol import (
     CLOCK,
@@ -87,7 +87,7 @@ class Wheel:
             resistance=settings.resistance,
         )
         timeout = settings.command_timeout
-        self._driver = MotorReader(node, name, timeout, self._command, description)
+        self._driver = MotorDriver(node, name, timeout, self._command, description)
         self.lease = self._driver.lease
         self._gearbox = Gearbox(settings.gear_ratio)
         self._encoder = Encoder(settings.counts_per_revolution, settings.encoder_bits)

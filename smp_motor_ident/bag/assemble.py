@@ -43,7 +43,7 @@ def assemble(
     motor = Motor(wheel, plan, hardware, tables, source)
     for topic in dict.fromkeys(s.topic for s in plan.signals.values()):
         motor.findings += tables[topic].findings
-        if not _log(tables[topic]).size:
+        if not tables[topic].logged.size:
             raise BagError(f"{motor.where}: {topic or 'it'} has no messages")
     axis_name = next((name for name in _OUTPUTS if name in plan.signals), None)
     if axis_name is None or "voltage" not in plan.signals:
@@ -132,21 +132,21 @@ def _clock(motor: Motor) -> dict[str, Integers]:
     topics = list(dict.fromkeys(signal.topic for signal in motor.plan.signals.values()))
     tables = {topic: motor.tables[topic] for topic in topics}
     if all(table.clocked for table in tables.values()):
-        return {topic: _log(table) for topic, table in tables.items()}
+        return {topic: table.logged for topic, table in tables.items()}
     stamps = {topic: _stamp(motor, tables[topic]) for topic in topics}
     if motor.plan.clock == "log":
         motor.tell("time_base", "time: log times, as asked")
-        return {topic: _log(table) for topic, table in tables.items()}
+        return {topic: table.logged for topic, table in tables.items()}
     poor = {
         topic: reason
         for topic, table in tables.items()
-        if (reason := judge_stamps(stamps[topic], _log(table)))
+        if (reason := judge_stamps(stamps[topic], table.logged))
     }
     if motor.plan.clock == "header" and poor:
         topic, reason = next(iter(poor.items()))
         raise BagError(f"{motor.where}: {topic} has no usable header time: {reason}")
     fits = {
-        t: fit_clock(stamp, _log(tables[t]))
+        t: fit_clock(stamp, tables[t].logged)
         for t, stamp in stamps.items()
         if t not in poor and stamp is not None
     }
@@ -160,7 +160,7 @@ def _clock(motor: Motor) -> dict[str, Integers]:
         return {topic: stamp for topic, stamp in stamps.items() if stamp is not None}
     if not fits:
         motor.tell("time_base", f"time: log times ({next(iter(poor.values()))})")
-        return {topic: _log(table) for topic, table in tables.items()}
+        return {topic: table.logged for topic, table in tables.items()}
     because = "; ".join(f"{topic}: {why}" for topic, why in poor.items())
     text = "time: header stamps moved to the recorder's clock by their offset and drift, because "
     motor.tell("time_base", text + (because or "the topics' clocks differ"))
@@ -172,14 +172,9 @@ def _to_log(
 ) -> Integers:
     """Return a topic's stamps on the recorder's clock; its log times where it has none."""
     if topic not in fits or stamp is None:
-        return _log(motor.tables[topic])
+        return motor.tables[topic].logged
     _tell_offset(motor, topic, fits, always=True)
     return fits[topic].to_log(stamp)
-
-
-def _log(table: Table) -> Integers:
-    assert table.log is not None
-    return table.log
 
 
 def _set_back(
@@ -190,11 +185,11 @@ def _set_back(
         motor.findings.pop()
         text = "time: log times (the clock of the header stamps was set back meanwhile)"
         motor.tell("time_base", text)
-        return {topic: _log(table) for topic, table in tables.items()}
+        return {topic: table.logged for topic, table in tables.items()}
     topic, table = next(iter(tables.items()))
     stamp = stamps[topic]
     assert stamp is not None
-    parts, log = epochs(stamp), _log(table)
+    parts, log = epochs(stamp), table.logged
     least = pause_between(stamp, parts, motor.plan.gap)
     pauses = [max(int(log[begin] - log[begin - 1]), least) for begin, _ in parts[1:]]
     time = one_after_another([stamp], [parts], pauses)[0]

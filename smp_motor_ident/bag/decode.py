@@ -160,8 +160,7 @@ def read_columns(path: Path, wanted: Mapping[str, Sequence[str]]) -> dict[str, C
     found = {}
     for recording in recordings([path]):
         for topic, table in collect(recording, asked, Types(()), None).items():
-            assert table.log is not None
-            clock = table.log if table.stamp is None else table.stamp
+            clock = table.logged if table.stamp is None else table.stamp
             if clock.size == 0:
                 raise BagError(f"{recording.name}: has no message on {topic}")
             found[topic] = Columns(1e-9 * clock.astype(np.float64), table.columns)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any
@@ -119,7 +119,7 @@ def pause_between(time: Integers, parts: Parts, gap: float) -> int:
 
 def laid_out(tables: Mapping[str, Table], gap: float, where: str) -> dict[str, Table]:
     """Return tables of one clock with their runs one after another; BagError where they differ."""
-    every = {topic: runs(log, table.columns) for topic, table, log in _clocked(tables)}
+    every = {topic: runs(table.logged, table.columns) for topic, table in tables.items()}
     numbers = {topic: len(parts) - 1 for topic, parts in every.items()}
     if not any(numbers.values()):
         return dict(tables)
@@ -129,7 +129,7 @@ def laid_out(tables: Mapping[str, Table], gap: float, where: str) -> dict[str, T
             f"{where}: the time goes back {times_in}, and which run belongs to which is not known; "
             "give each run files of its own"
         )
-    times = [log for _, _, log in _clocked(tables)]
+    times = [table.logged for table in tables.values()]
     pause = max(pause_between(t, parts, gap) for t, parts in zip(times, every.values()))
     count = next(iter(numbers.values()))
     moved = one_after_another(times, list(every.values()), [pause] * count)
@@ -137,11 +137,5 @@ def laid_out(tables: Mapping[str, Table], gap: float, where: str) -> dict[str, T
     warning = found("clock_set_back", f"{text}; a new segment each", "warning", times=count)
     return {
         topic: replace(table, log=time, findings=[*table.findings, warning])
-        for (topic, table, _), time in zip(_clocked(tables), moved)
+        for (topic, table), time in zip(tables.items(), moved)
     }
-
-
-def _clocked(tables: Mapping[str, Table]) -> Iterator[tuple[str, Table, Integers]]:
-    for topic, table in tables.items():
-        assert table.log is not None
-        yield topic, table, table.log

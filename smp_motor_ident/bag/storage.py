@@ -103,6 +103,12 @@ class Table:
     # Columns of whole nanoseconds, whatever unit is mapped: they were written as dates
     exact: frozenset[str] = frozenset()
 
+    @property
+    def logged(self) -> Integers:
+        """When the recorder got them, once that is known."""
+        assert self.log is not None
+        return self.log
+
 
 def gather(data: Bytes, at: Integers, dtype: str) -> NDArray[Any]:
     """Return the numbers that begin at the given bytes, aligned or not; all must fit."""

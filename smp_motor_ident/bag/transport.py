@@ -17,12 +17,13 @@ from numpy.typing import NDArray
 
 from smp_motor_ident.bag.clock import SAME_CLOCK, fit_clock, mean_held
 from smp_motor_ident.bag.decode import collect
+from smp_motor_ident.bag.read import STATE
 from smp_motor_ident.bag.source import Recording, recordings
 from smp_motor_ident.bag.storage import Table
 from smp_motor_ident.bag.types import Types
 from smp_motor_ident.errors import BagError
 
-STATE, COMMAND = "smp_interfaces/msg/MotorState", "smp_interfaces/msg/MotorCommand"
+COMMAND = "smp_interfaces/msg/MotorCommand"
 
 LEAST_ANSWERS = 50
 """Commands below which quantiles of their delay mean nothing."""
@@ -94,9 +95,8 @@ def _delay(state: Table, command: Table) -> TransportDelay | None:
     answers = np.isin(command.stamp, state.stamp)
     if np.count_nonzero(answers) < LEAST_ANSWERS:
         return None
-    assert state.log is not None and command.log is not None
-    stamp, log = command.stamp[answers], command.log[answers]
-    offset = fit_clock(state.stamp, state.log)
+    stamp, log = command.stamp[answers], command.logged[answers]
+    offset = fit_clock(state.stamp, state.logged)
     # On another clock the fastest state stands for no latency at all.
     one_clock = abs(offset.offset) < SAME_CLOCK
     arrival = 1e-9 * (log - (stamp if one_clock else offset.to_log(stamp)))
