@@ -6,12 +6,14 @@ import sys
 
 from smp_motor_ident.bag import limits as recordings
 from smp_motor_ident.diagnosis import limits as estimates
+from smp_motor_ident.diagnosis import response_limits as responses
 from smp_motor_ident.diagnosis import wheel_limits as wheels
 from smp_motor_ident.tune import limits as gains
 
 TABLES = {
     "Recordings": recordings,
     "Estimates": estimates,
+    "Response over frequency": responses,
     "Wheels on blocks": wheels,
     "Gains and loops": gains,
 }

@@ -103,16 +103,27 @@ class Correlation:
 
 
 @dataclass(frozen=True)
-class ResidualTests:
-    """Whiteness of the residuals and their independence from the input (95 % bands).
+class ModelError:
+    """Error of the model's response relative to that response, band by band."""
 
-    The curves are what the verdicts are of; they are for the report and stay out of the JSON.
+    frequency: tuple[float, ...]  # middles of the bands [rad/s], rising
+    # shown, bound: magnitude as estimated, and what it does not exceed with 95 % [-]
+    shown: tuple[float, ...]
+    bound: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class ResidualTests:
+    """Whiteness of the residuals, independence from the input (95 % bands), error by frequency.
+
+    The correlations are what the verdicts are of; they are for the report and stay out of the JSON.
     """
 
     white: bool | None = None
     independent_of_input: bool | None = None
     autocorrelation: Correlation | None = field(default=None, compare=False, repr=False)
     cross_correlation: Correlation | None = field(default=None, compare=False, repr=False)
+    model_error: ModelError | None = None
 
 
 @dataclass(frozen=True)
@@ -244,6 +255,7 @@ class Estimate:
         dict
             Of plain types; numbers that do not exist are None.
         """
+        error = self.residuals.model_error
         return {
             "model": self.model,
             "parameters": {n: _quantity_to_document(q) for n, q in self.parameters.items()},
@@ -259,6 +271,7 @@ class Estimate:
             "residuals": {
                 "white": self.residuals.white,
                 "independent_of_input": self.residuals.independent_of_input,
+                "model_error": error and {n: list(x) for n, x in asdict(error).items()},
             },
             "findings": [f.to_document() for f in self.findings],
             "warnings": list(self.warnings),

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from smp_motor_ident.diagnosis.limits import RESIDUAL_LEVEL
+from smp_motor_ident.diagnosis.unmodelled import unmodelled_dynamics
 from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.likelihood.experiments import Experiments
@@ -38,7 +39,7 @@ def residual_tests(data: Experiments, fit: Fit, lags: int = 25) -> ResidualTests
     u = (voltage - voltage.mean())[:MOST]
     n = int(ok[:MOST].sum())
     if n < 4 * lags or e.std() == 0 or u.std() == 0:
-        return ResidualTests()
+        return ResidualTests(model_error=unmodelled_dynamics(data, fit))
     band = float(ndtri(1 - RESIDUAL_LEVEL.value / 2 / lags) / np.sqrt(n))
     auto = _lagged(e, e, lags)
     own = _lagged(u, u, lags)
@@ -53,6 +54,7 @@ def residual_tests(data: Experiments, fit: Fit, lags: int = 25) -> ResidualTests
         independent_of_input=bool(np.abs(cross).max() < wide),
         autocorrelation=Correlation(lag, auto, band),
         cross_correlation=Correlation(lag, cross, wide),
+        model_error=unmodelled_dynamics(data, fit),
     )
 
 

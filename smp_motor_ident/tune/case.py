@@ -26,6 +26,7 @@ from smp_motor_ident.tune.motors import (
 )
 from smp_motor_ident.tune.plant import sample
 from smp_motor_ident.tune.problem import Method, Problem, RequiredMargins, checked, control_noise
+from smp_motor_ident.tune.unmodelled import unmodelled_dynamics, words
 
 CLAMPED = 1 / 6
 """Largest control noise [share of the supply, rms] of any gains: three times it is half of the
@@ -66,7 +67,7 @@ def prepare(estimate: Estimate, loop: Loop, method: str, targets: dict[str, Any]
     findings += [one for one in (friction.finding, lag, level) if one is not None]
     planned = np.array([friction.planned])
     plant = sample(replace(motors_of(estimate), static_voltage=planned), loop)
-    problem = Problem(plant, loop, targets)
+    problem = Problem(plant, loop, targets, unmodelled_dynamics(estimate))
     required = _required(chosen, problem)
     n = int(checked(targets, "samples") or 1000)
     seed = int(checked(targets, "seed", least=-1) or 0)
@@ -77,7 +78,7 @@ def prepare(estimate: Estimate, loop: Loop, method: str, targets: dict[str, Any]
     if motors is not None and lag is not None:
         motors = with_lag_of_sensor(motors)
     draws = plant if motors is None else sample(motors, loop, believed=plant.motors)
-    ensemble = UncertaintyEnsemble(draws, required)
+    ensemble = UncertaintyEnsemble(draws, required, problem)
     if motors is None:
         words = "the estimate has no uncertainty: the margins are those of one motor"
         findings.append(Finding("no_uncertainty", "warning", words))
@@ -117,8 +118,8 @@ def solve(case: Case) -> tuple[Feedback, float, Robustness]:
         raise DesignError(
             f"{case.wheel}: no gains of this kind keep a phase margin of "
             f"{case.required.phase:g} deg and Ms {case.required.sensitivity:g} over the motors "
-            f"that the data allow (only {robustness.holds:.0%} do); record more, or ask for "
-            "smaller margins"
+            f"that the data allow (only {robustness.holds:.0%} do)"
+            f"{words(case.problem.unmodelled)}; record more, or ask for smaller margins"
         )
     return feedback, factor, robustness
 

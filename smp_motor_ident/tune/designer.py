@@ -16,7 +16,7 @@ from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune.case import Case, prepare, solve
 from smp_motor_ident.tune.ensemble import Robustness
 from smp_motor_ident.tune.feedback import Feedback
-from smp_motor_ident.tune.limits import DELAY_BORNE
+from smp_motor_ident.tune.limits import DELAY_BORNE, HELD_BACK
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.margins import Margins, loop_margins
 from smp_motor_ident.tune.plant import Plant, sample
@@ -24,6 +24,8 @@ from smp_motor_ident.tune.problem import checked, control_noise
 from smp_motor_ident.tune.reference import Reference, Wanted, controller_for, plan_reference
 from smp_motor_ident.tune.simulation import Controller
 from smp_motor_ident.tune.specification import Performance, Specification, figures_of
+from smp_motor_ident.tune.unmodelled import UnmodelledDynamics
+from smp_motor_ident.tune.unmodelled import words as known_words
 
 
 @dataclass(frozen=True)
@@ -229,6 +231,14 @@ def _explain(
             f"gains backed off to {factor:.0%} of the rule's so that 99 % hold and the control "
             "noise from the encoder stays within the clamp"
         )
+    unmodelled = case.problem.unmodelled
+    if unmodelled is not None:
+        words.append(
+            f"what the model may lack reaches {robustness.unmodelled:.0%} of what the loop bears"
+            + known_words(unmodelled, ": ")
+        )
+        if robustness.unmodelled > HELD_BACK.value:
+            findings.append(_held_back(unmodelled))
     if figures.control_noise > 1.05 * loop.noise_limit:
         noisy = (
             f"encoder quantisation makes {figures.control_noise:.2g} V of control noise, above "
@@ -236,6 +246,17 @@ def _explain(
         )
         findings.append(Finding("control_noise", "warning", noisy))
     return "; ".join(words), tuple(findings)
+
+
+def _held_back(unmodelled: UnmodelledDynamics) -> Finding:
+    return Finding(
+        "unmodelled_dynamics",
+        "warning",
+        "the gains are as large as a motor bears whose response is known only up to "
+        f"{unmodelled.known:.3g} rad/s",
+        {"known_frequency": unmodelled.known},
+        "for larger gains record a voltage that changes faster, such as a pseudo-random binary one",
+    )
 
 
 def _sensor(case: Case) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 from smp_motor_ident.tune.feedback import Feedback, spectral_radius
 from smp_motor_ident.tune.margins import BatchMargins, batch_margins, grid_for
 from smp_motor_ident.tune.plant import Plant
-from smp_motor_ident.tune.problem import RequiredMargins
+from smp_motor_ident.tune.problem import Problem, RequiredMargins
 
 SHARE = 0.99
 """Share of the distribution for which the required margins must hold."""
@@ -27,14 +27,18 @@ class Robustness:
     phase: float
     gain: float
     sensitivity: float
+    unmodelled: float = 0.0  # largest |T| W, of what the model may lack [-]; stable below 1
 
 
 class UncertaintyEnsemble:
     """Assesses gains over a batch of motors, whose response is computed once."""
 
-    def __init__(self, plant: Plant, required: RequiredMargins) -> None:
+    def __init__(
+        self, plant: Plant, required: RequiredMargins, nominal: Problem | None = None
+    ) -> None:
         self.plant = plant
         self.required = required
+        self.nominal = nominal  # whose unmodelled dynamics the gains must bear
         self.omega = grid_for(plant, 200)
         self.response = plant.response(self.omega)
 
@@ -51,6 +55,8 @@ class UncertaintyEnsemble:
         # A hundredth of slack: the grid's resolution.
         holds = stable & (m.phase >= 0.99 * p.phase) & (m.gain >= 0.99 * p.gain)
         holds &= m.sensitivity <= 1.01 * p.sensitivity
+        unmodelled = 0.0 if self.nominal is None else self.nominal.unmodelled_gain(feedback)
+        holds &= unmodelled <= 1.01
         low, high = 1 - SHARE, SHARE
         return Robustness(
             samples=len(self.plant),
@@ -59,6 +65,7 @@ class UncertaintyEnsemble:
             phase=float(np.quantile(m.phase, low, method="lower")),
             gain=float(np.quantile(m.gain, low, method="lower")),
             sensitivity=float(np.quantile(m.sensitivity, high, method="higher")),
+            unmodelled=unmodelled,
         )
 
 

@@ -94,14 +94,24 @@ class Plant:
             return state[:, self.sensor]
         angle = np.einsum("ns,nsf->nf", self.phi_angle, state) + self.taps_angle @ delays
         if self.observer is not None:
-            from_angle, from_voltage = self.observer.transfer(z)
-            m = self.observer.taps.size
-            shifted = self.observer.taps @ z[None, :] ** -np.arange(m)[:, None]
-            observed: Complex = from_angle * angle + from_voltage * shifted
+            observed: Complex = self.observer.transfer(z)[0] * angle + self._predicted(z)
             return observed
         steps = z[None, :] ** -(1.0 + np.arange(self.window))[:, None]
         averaged: Complex = angle * (self.average @ steps)
         return averaged
+
+    def through_motor(self, omega: Array) -> Complex:
+        """Return the response without what an observer predicts from the voltage itself."""
+        z = np.exp(1j * np.asarray(omega) * self.sample_time)
+        return self.transfer(z) - self._predicted(z)
+
+    def _predicted(self, z: Complex) -> Complex:
+        """Return the transfer from controller output to what the observer adds, shape (f,)."""
+        if self.observer is None:
+            return np.zeros(z.size, dtype=np.complex128)
+        delays = z[None, :] ** -np.arange(self.observer.taps.size)[:, None]
+        predicted: Complex = self.observer.transfer(z)[1] * (self.observer.taps @ delays)
+        return predicted
 
     def angle_noise(self, omega: Array) -> Array:
         """Return how an error of the counted angle shows in the speed of the first motor."""

@@ -16,6 +16,7 @@ from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.margins import grid_for
 from smp_motor_ident.tune.plant import Plant
+from smp_motor_ident.tune.unmodelled import UnmodelledDynamics
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,7 @@ class Problem:
     plant: Plant  # the sampled motor, a batch of one
     loop: Loop  # the loop that will run
     targets: Mapping[str, Any] = field(default_factory=dict)  # what the caller asks of the method
+    unmodelled: UnmodelledDynamics | None = None  # what the motor may do beside its model
 
     @cached_property
     def omega(self) -> Array:
@@ -61,6 +63,19 @@ class Problem:
         """Response to the true speed, not the measured one, on the grid, shape (f,)."""
         response: Complex = self.plant.response(self.omega, true_speed=True)[0]
         return response
+
+    @cached_property
+    def uncertain(self) -> Complex:
+        """Response through the motor times the bound of its relative error, shape (f,)."""
+        if self.unmodelled is None:
+            return np.zeros(self.omega.size, dtype=np.complex128)
+        through: Complex = self.plant.through_motor(self.omega)[0]
+        return through * self.unmodelled.weight(self.omega)
+
+    def unmodelled_gain(self, feedback: Feedback) -> float:
+        """Return the largest ``|T| W``: below 1 what the model may lack cannot destabilise."""
+        control = feedback.response(self.omega, self.loop.sample_time)
+        return float(np.abs(control * self.uncertain / (1 + control * self.response)).max())
 
     @cached_property
     def noise(self) -> Array:

@@ -24,6 +24,7 @@ from smp_motor_ident.tune.limits import SPEED_NOISE
 from smp_motor_ident.tune.margins import loop_margins
 from smp_motor_ident.tune.methods.simc import SIMC
 from smp_motor_ident.tune.problem import Method, Problem, RequiredMargins
+from smp_motor_ident.tune.unmodelled import words
 
 FOCUS = ("balanced", "tracking", "load")
 MORE_NOISE, ENOUGH = 8, 1.2
@@ -64,7 +65,8 @@ def _solve(problem: Problem) -> Feedback:
     if found is None:
         raise DesignError(
             f"no controller keeps a phase margin of {margin:g} deg, Ms {peak:g} and a control "
-            f"noise of {problem.loop.noise_limit:.3g} V; {_nearest(problem, margin, peak, focus)}"
+            f"noise of {problem.loop.noise_limit:.3g} V{words(problem.unmodelled, ', where ')}; "
+            f"{_nearest(problem, margin, peak, focus)}"
         )
     return found[0]
 
@@ -201,7 +203,7 @@ def _candidates(problem: Problem, crossovers: Array, margins: Array, shares: Arr
 
 
 def _hold(problem: Problem, c: _Candidates, margin: float, peak: float, hump: float) -> Array:
-    """Return which candidates keep Ms, the hump of T, phase and gain margin, and control noise."""
+    """Return which candidates keep margins, the hump of T, unmodelled dynamics, control noise."""
     omega, T = problem.omega, problem.loop.sample_time
     integral, derivative = terms(omega, T, c.filter_time[:, None])
     control = c.p[:, None] + c.i[:, None] * integral + c.d[:, None] * derivative
@@ -210,6 +212,7 @@ def _hold(problem: Problem, c: _Candidates, margin: float, peak: float, hump: fl
     sensitivity = np.abs(back)
     good = sensitivity.max(axis=1) <= peak
     good &= np.abs(loop * back).max(axis=1) <= hump
+    good &= np.abs(control * problem.uncertain * back).max(axis=1) <= 1
     # Nyquist: 1 + L comes from -90 deg and must end at 0 without having gone around.
     turned = np.angle(1 / back[:, 0]) + np.sum(np.angle(back[:, :-1] / back[:, 1:]), axis=1)
     good &= np.abs(turned) < 0.5
@@ -237,7 +240,8 @@ def _at_bandwidth(problem: Problem, wished: float, margin: float, peak: float) -
     raise DesignError(
         f"bandwidth {wished:.4g} rad/s cannot keep a phase margin of {margin:g} deg, Ms {peak:g} "
         f"and a control noise of {problem.loop.noise_limit:.3g} V with {delay:.3g} ms of delay at "
-        f"{problem.loop.rate:.4g} Hz (Nyquist {nyquist:.4g} rad/s); {hint} rad/s"
+        f"{problem.loop.rate:.4g} Hz (Nyquist {nyquist:.4g} rad/s)"
+        f"{words(problem.unmodelled, ', where ')}; {hint} rad/s"
     )
 
 

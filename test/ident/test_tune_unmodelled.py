@@ -1,0 +1,137 @@
+"""Gains bear what a recording leaves open of the motor's response."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import control
+import numpy as np
+import pytest
+
+from smp_motor_ident.errors import DesignError
+from smp_motor_ident.result import Estimate, ModelError, Quantity, ResidualTests
+from smp_motor_ident.tune import METHODS, Loop, design
+from smp_motor_ident.tune.feedback import Feedback
+from smp_motor_ident.tune.motors import motors_of
+from smp_motor_ident.tune.plant import sample
+from smp_motor_ident.tune.problem import Problem
+from smp_motor_ident.tune.unmodelled import unmodelled_dynamics
+from smp_motor_ident.tune.writing import gains_document
+
+LOOP = Loop(sample_time=0.005, delay=0.005, gear_ratio=1.0, counts_per_revolution=None)
+FREQUENCY = (0.5, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 600.0)
+
+
+def estimate(shown, bound) -> Estimate:
+    values = {"dc_gain": 25.0, "time_constant": 0.05, "time_constant_product": 1e-4}
+    values["static_voltage"] = 0.2
+    deviations = [0.002 * v for v in values.values()]
+    one = Estimate(
+        "motor", "second_order", {},
+        {n: Quantity(v, s) for (n, v), s in zip(values.items(), deviations, strict=True)},
+        tuple(values), np.diag(np.square(deviations)),
+    )  # fmt: skip
+    return replace(one, residuals=ResidualTests(model_error=ModelError(FREQUENCY, shown, bound)))
+
+
+def known_up_to(frequency: float) -> Estimate:
+    bound = tuple(0.05 if f <= frequency else 50.0 for f in FREQUENCY)
+    return estimate(tuple(0.01 if b < 1 else 5.0 for b in bound), bound)
+
+
+def sensitivity(one, omega):
+    """The complementary sensitivity, by python-control from the sampled transfer functions."""
+    T = one.loop.sample_time
+    gain, tau, tp = (one.motor[n] for n in ("dc_gain", "time_constant", "time_constant_product"))
+    z = control.tf([1, 0], [1], T)
+    plant = control.sample_system(control.tf([gain], [tp, tau, 1]), T, "zoh") / z
+    keep = one.gains.derivative_filter_time_constant
+    keep /= keep + T
+    pid = (
+        one.gains.p
+        + one.gains.i * T / (z - 1)
+        + one.gains.d * (1 - keep) * (z - 1) / T / (z - keep)
+    )
+    loop = control.frequency_response(plant * pid, omega).frdata[0, 0]
+    return np.abs(loop / (1 + loop))
+
+
+def test_loop_does_not_reach_beyond_what_the_recording_shows():
+    loop = replace(LOOP, difference_window=0)
+    free, held = (design(known_up_to(f), loop) for f in (600.0, 5.0))
+    omega = np.geomspace(10.0, 600.0, 100)
+    assert sensitivity(free, omega).max() > 0.6
+    # Nothing is known from 10 rad/s on, where 2 is taken for the relative error.
+    assert sensitivity(held, omega).max() < 0.51
+    assert held.robustness.unmodelled == pytest.approx(1.0, abs=0.03)
+    assert "unmodelled_dynamics" in [f.code for f in held.findings]
+    assert "unmodelled_dynamics" not in [f.code for f in free.findings]
+    assert "10 rad/s" in held.reason
+
+
+@pytest.mark.parametrize("method", sorted(METHODS))
+def test_every_method_keeps_within_what_the_recording_shows(method):
+    held = design(known_up_to(20.0), replace(LOOP, difference_window=0), method)
+    assert sensitivity(held, np.geomspace(50.0, 600.0, 100)).max() < 0.51
+
+
+def test_error_that_is_shown_counts_for_a_resonance():
+    # Of ten times the response, at one frequency: stable with every phase of it.
+    bound = tuple(3.0 if f == 50.0 else 0.05 for f in FREQUENCY)
+    shown = tuple(2.5 if b > 1 else 0.01 for b in bound)
+    one = design(estimate(shown, bound), replace(LOOP, difference_window=0))
+    assert sensitivity(one, np.array([50.0]))[0] < 0.101
+
+
+def test_error_that_is_not_shown_does_not_count_in_full():
+    bound = tuple(30.0 if f > 20 else 0.05 for f in FREQUENCY)
+    weight = unmodelled_dynamics(estimate((0.01,) * len(FREQUENCY), bound)).weight
+    assert weight(np.array([100.0])) == pytest.approx(2.0)
+    assert weight(np.array([5.0])) == pytest.approx(0.05)
+    assert weight(np.array([5000.0])) == pytest.approx(2.0)
+
+
+def test_recording_that_shows_nothing_is_refused_with_the_reason():
+    nothing = estimate((0.5,) * len(FREQUENCY), (5.0,) * len(FREQUENCY))
+    with pytest.raises(DesignError, match=r"shows the motor's response up to 0\.5 rad/s"):
+        design(nothing, LOOP)
+
+
+def test_observer_bears_more_of_what_it_does_not_feed_back():
+    # What the observer predicts from the voltage is the model's, whatever the motor does.
+    loop = replace(LOOP, counts_per_revolution=500.0, speed_source="observer")
+    motors = motors_of(known_up_to(20.0))
+    plant = sample(motors, loop)
+    omega = np.array([20.0, 300.0])
+    z = np.exp(1j * omega * loop.sample_time)
+    observer = plant.observer
+    size = observer.by_angle.size
+    predicted = [
+        np.linalg.solve(x * np.eye(size) - observer.advance, observer.by_voltage)[1]
+        * sum(share * x**-k for k, share in enumerate(observer.taps))
+        for x in z
+    ]
+    through = plant.through_motor(omega)[0]
+    assert through == pytest.approx(plant.response(omega)[0] - np.array(predicted))
+    assert np.abs(through)[1] < 0.5 * np.abs(plant.response(omega)[0])[1]
+
+
+def test_gain_of_unmodelled_dynamics_is_that_of_the_formula():
+    one, loop = known_up_to(20.0), replace(LOOP, difference_window=0)
+    plant = sample(motors_of(one), loop)
+    problem = Problem(plant, loop, {}, unmodelled_dynamics(one))
+    feedback = Feedback(0.05, 0.5)
+    C = feedback.response(problem.omega, loop.sample_time)
+    L = plant.response(problem.omega)[0] * C
+    weight = np.interp(np.log(problem.omega), np.log(FREQUENCY), [0.05] * 5 + [2.0] * 4, right=2.0)
+    expected = np.max(np.abs(L / (1 + L)) * weight)
+    assert problem.unmodelled_gain(feedback) == pytest.approx(expected)
+
+
+def test_gains_file_says_what_the_loop_bears():
+    held = design(known_up_to(5.0), LOOP)
+    entry = gains_document({"motor": held}, {}, "")["wheels"]["motor"]
+    assert entry["robustness"]["unmodelled"] == held.robustness.unmodelled
+    (found,) = (f for f in entry["findings"] if f["code"] == "unmodelled_dynamics")
+    assert found["evidence"]["known_frequency"] == 10.0
+    assert "pseudo-random" in found["advice"]
