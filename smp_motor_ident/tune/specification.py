@@ -22,6 +22,7 @@ from smp_motor_ident.tune.simulation import (
     simulate,
     step_figures,
 )
+from smp_motor_ident.tune.unmodelled import resonance_beyond
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,8 @@ class Specification:
     """What the loop does to a change of set-point from rest, and its margins, in bands.
 
     Simulated with counts, dry friction and the usual delay, over draws of all that the estimate
-    leaves open; the margins bear the longest delay.
+    leaves open, and with what a resonance adds where the recording does not show the response; the
+    margins bear the longest delay.
     """
 
     samples: int  # motors that the bands are over; 0 where the estimate has no uncertainty
@@ -112,11 +114,14 @@ def figures_of(
         for speed, volts in zip(run.speed, run.voltage, strict=True)
     ]
     found = case.ensemble.margins(controller.feedback)
+    left, longer = resonance_beyond(problem.unmodelled, plan.reference, problem.loop.sample_time)
+    overshoot = [one.overshoot for one in each] + [figures.overshoot + 100 * left]
+    settling = [one.settling for one in each] + [figures.settling + longer]
     return figures, Specification(
         samples=len(each) if case.drawn else 0,
         change=change,
-        overshoot=_band(figures.overshoot, [one.overshoot for one in each]),
-        settling=_band(figures.settling, [one.settling for one in each]),
+        overshoot=_band(figures.overshoot, overshoot),
+        settling=_band(figures.settling, settling),
         phase_margin=_band(margins.phase, found.phase),
         gain_margin=_band(margins.gain, found.gain),
         sensitivity=_band(margins.sensitivity, found.sensitivity),

@@ -15,7 +15,11 @@ from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.motors import motors_of
 from smp_motor_ident.tune.plant import sample
 from smp_motor_ident.tune.problem import Problem
-from smp_motor_ident.tune.unmodelled import unmodelled_dynamics
+from smp_motor_ident.tune.unmodelled import (
+    UnmodelledDynamics,
+    resonance_beyond,
+    unmodelled_dynamics,
+)
 from smp_motor_ident.tune.writing import gains_document
 
 LOOP = Loop(sample_time=0.005, delay=0.005, gear_ratio=1.0, counts_per_revolution=None)
@@ -135,3 +139,46 @@ def test_gains_file_says_what_the_loop_bears():
     (found,) = (f for f in entry["findings"] if f["code"] == "unmodelled_dynamics")
     assert found["evidence"]["known_frequency"] == 10.0
     assert "pseudo-random" in found["advice"]
+
+
+def resonant(reference, omega, T, damping=0.0):
+    """A resonance that follows a reference, in small steps of semi-implicit Euler."""
+    y = rate = 0.0
+    out, sub = [], 200
+    for r in reference:
+        for _ in range(sub):
+            rate += T / sub * (omega**2 * (r - y) - 2 * damping * omega * rate)
+            y += T / sub * rate
+        out.append(y)
+    return np.array(out)
+
+
+def test_what_a_resonance_is_left_with_is_that_of_a_simulated_one():
+    T, omega = 0.002, 40.0
+    s = np.clip(np.arange(1500) * T / 0.2, 0, 1)
+    reference = 3.0 * (10 * s**3 - 15 * s**4 + 6 * s**5)
+    frequency = np.array([1.0, 20.0, 40.0, 1000.0])
+    only = UnmodelledDynamics(frequency, np.array([0.0, 0.0, 1.0, 0.0]))
+    left, _ = resonance_beyond(only, reference, T)
+    ringing = resonant(reference, omega, T)[300:]
+    assert left == pytest.approx(np.ptp(ringing) / 2 / 3.0, rel=0.05)
+    beyond = UnmodelledDynamics(frequency, np.array([0.0, 0.0, 2.0, 2.0]))
+    left, longer = resonance_beyond(beyond, reference, T)
+    known = beyond.known
+    damped = np.abs(resonant(reference, known, T, 0.05) / 3.0 - 1)
+    last = T * (np.flatnonzero(damped > 0.02)[-1] + 1)
+    assert 0.2 + longer >= last
+    assert 0.2 + longer < 2 * last
+
+
+def test_nothing_is_left_where_all_is_known():
+    assert resonance_beyond(None, np.linspace(0, 1, 50), 0.01) == (0.0, 0.0)
+    known = UnmodelledDynamics(np.array([1.0, 400.0]), np.array([0.01, 0.1]))
+    assert resonance_beyond(known, np.minimum(np.linspace(0, 5, 500), 1), 0.01)[0] < 0.01
+
+
+def test_bands_hold_a_resonance_that_the_recording_does_not_show():
+    loop = replace(LOOP, difference_window=0)
+    free, held = (design(known_up_to(f), loop).specification for f in (600.0, 20.0))
+    assert held.overshoot.high > free.overshoot.high + 2
+    assert held.settling.high > free.settling.high
