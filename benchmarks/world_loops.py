@@ -7,7 +7,8 @@ Each case of ``world`` is recorded, identified and tuned as the tools do it with
 wheel's own loop then changes its speed on the simulated drive, with the same effects in driver,
 motor and sensor, by what ``gains.json`` speaks of, from a set-point of zero.  ``kept``: overshoot
 and settling within the stated bands, with what is tolerated of each (`OVER`, `LATE`); ``declined``:
-no estimate, one that ``tune`` refuses, or a recording of which a refusal alone is right.
+no estimate, one that ``tune`` refuses, or a recording of which a refusal alone is right;
+``unstated``: the gains state no largest settling time, and keep the rest.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from world import recorded, table  # noqa: E402
 from world_effects import EFFECTS, Case  # noqa: E402
 from world_record import at_bridge, case, fine_steps, floor_torque, plant  # noqa: E402
 
-OUTCOMES = ("kept", "declined", "overshoot", "settling", "unstable", "crash")
+OUTCOMES = ("kept", "declined", "unstated", "overshoot", "settling", "unstable", "crash")
 OVER = 2.0  # percentage points: the width of the band of settling
 LATE = 1.15  # times the stated settling, and two samples
 BAND = 0.03  # that it settles in; stated is 2 %, at whose very edge noise would decide
@@ -182,7 +183,7 @@ def judge(job: tuple[int, int, int, bool]) -> tuple[int, str, str]:
         return number, "overshoot", words
     if settled > LATE * spec.settling.high + 2 * c.step:
         return number, "settling", words
-    return number, "kept", words
+    return number, "kept" if np.isfinite(spec.settling.high) else "unstated", words
 
 
 if __name__ == "__main__":

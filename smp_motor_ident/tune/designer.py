@@ -125,7 +125,7 @@ def finish(case: Case, feedback: Feedback, factor: float, robustness: Robustness
     reference = _plan(usual, loop, controller, margins, problem.targets)
     noise = control_noise(problem, feedback)
     figures, bands = figures_of(case, usual, controller, reference, margins, noise)
-    reason, findings = _explain(case, margins, factor, robustness, figures)
+    reason, findings = _explain(case, margins, factor, robustness, (figures, bands))
     m = plant.motors
     return Design(
         gains=wheel_gains(case, controller),
@@ -212,9 +212,10 @@ def _plan(
 
 
 def _explain(
-    case: Case, margins: Margins, factor: float, robustness: Robustness, figures: Performance
-) -> tuple[str, tuple[Finding, ...]]:
-    loop = case.problem.loop
+    case: Case, margins: Margins, factor: float, robustness: Robustness,
+    simulated: tuple[Performance, Specification],
+) -> tuple[str, tuple[Finding, ...]]:  # fmt: skip
+    loop, (figures, bands) = case.problem.loop, simulated
     words = [
         f"{case.method.title} at {loop.rate:g} Hz with {1e3 * loop.loop_delay:.3g} ms of delay"
         f"{_sensor(case)}: phase margin {margins.phase:.0f} deg, Ms {margins.sensitivity:.2f}, "
@@ -245,6 +246,12 @@ def _explain(
             f"{loop.noise_limit:.2g} V"
         )
         findings.append(Finding("control_noise", "warning", noisy))
+    if math.isnan(bands.settling.high):
+        open_end = (
+            "some of the motors that the data allow do not settle within 2 % of a change of "
+            "set-point: no largest settling time is stated"
+        )
+        findings.append(Finding("settling_unknown", "warning", open_end))
     return "; ".join(words), tuple(findings)
 
 

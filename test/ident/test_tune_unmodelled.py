@@ -182,3 +182,13 @@ def test_bands_hold_a_resonance_that_the_recording_does_not_show():
     free, held = (design(known_up_to(f), loop).specification for f in (600.0, 20.0))
     assert held.overshoot.high > free.overshoot.high + 2
     assert held.settling.high > free.settling.high
+
+
+def test_settling_that_is_not_stated_is_said():
+    noisy = replace(LOOP, speed_noise=30.0)
+    one = design(known_up_to(600.0), noisy, "ziegler_nichols")
+    assert np.isnan(one.specification.settling.high)
+    assert "settling_unknown" in [f.code for f in one.findings]
+    calm = design(known_up_to(600.0), LOOP)
+    assert np.isfinite(calm.specification.settling.high)
+    assert "settling_unknown" not in [f.code for f in calm.findings]
