@@ -9,19 +9,19 @@ BAND_LEVEL = Limit(
     "probability",
     "that the error of the response in a band lies outside of its circle, the level of the "
     "intervals of all stated numbers",
-    "test_unmodelled.py: the circle holds the error as often as it says",
+    "test_unmodelled.py: circle holds the error as often as it says",
 )
 BAND_WIDTH = Limit(
     10 ** (1 / 6),
     "last over first frequency of a band",
     "the damping of a shaft of 0.05 to 0.5 makes a resonance 0.1 to 1 of its frequency wide: it "
     "fills a quarter of a band or more",
-    "test_unmodelled.py: a resonance that the voltage excites is shown",
+    "test_unmodelled.py: resonance that the voltage excites is shown",
 )
 BAND_LINES = Limit(
     8,
     "lines of the spectrum",
     "some four independent ones: with fewer the circle is wider than what it is around for chance "
     "alone",
-    "test_unmodelled.py: the circle holds the error as often as it says",
+    "test_unmodelled.py: circle holds the error as often as it says",
 )

@@ -49,20 +49,20 @@ UNKNOWN_RESPONSE = Limit(
     "relative error that is taken where the recording does not show the response: the least that "
     "Skogestad and Postlethwaite (2005), section 7.4.2, take at high frequencies, where phase and "
     "size of the response are unknown",
-    "test_tune_unmodelled.py: a loop does not reach beyond what the recording shows",
+    "test_tune_unmodelled.py: loop does not reach beyond what the recording shows",
 )
 RESONANCE = Limit(
     10.0,
     "of the model's response",
     "physical: 1/(2 zeta) of a shaft with the damping ratio 0.05 of steel in its bearings",
-    "test_tune_unmodelled.py: an error that is shown counts for a resonance",
+    "test_tune_unmodelled.py: error that is shown counts for a resonance",
 )
 HELD_BACK = Limit(
     0.97,
     "of what a loop bears",
     "the step of gains that are scaled back: with less of unmodelled dynamics something else held "
     "them, and a richer recording is not advised",
-    "test_tune_unmodelled.py: a loop does not reach beyond what the recording shows",
+    "test_tune_unmodelled.py: loop does not reach beyond what the recording shows",
 )
 DELAY_BORNE = Limit(
     0.5,

@@ -115,8 +115,10 @@ def figures_of(
     ]
     found = case.ensemble.margins(controller.feedback)
     left, longer = resonance_beyond(problem.unmodelled, plan.reference, problem.loop.sample_time)
-    overshoot = [one.overshoot for one in each] + [figures.overshoot + 100 * left]
-    settling = [one.settling for one in each] + [figures.settling + longer]
+    overshoot = np.array([one.overshoot for one in each] + [figures.overshoot])
+    settling = np.array([one.settling for one in each] + [figures.settling])
+    overshoot = np.append(overshoot, overshoot.max() + 100 * left)
+    settling = np.append(settling, settling.max() + longer)
     return figures, Specification(
         samples=len(each) if case.drawn else 0,
         change=change,
