@@ -26,8 +26,8 @@ from smp_motor_ident.model.structures import Electromechanical, Structure
 Array = NDArray[np.float64]
 
 POINTS = 64  # at which a lag may be
-SEEN = 1e-6
-"""Share of a coordinate's information below which rounding and kinks decide what is left."""
+SEEN, ROUNDING = 1e-6, 1e-11
+"""Shares of a coordinate's information below which kinks, or rounding, decide what is left."""
 
 
 def consider_timing(data: Experiments, fit: Fit, instant: float) -> Fit:
@@ -85,6 +85,7 @@ def consider_friction(data: Experiments, fit: Fit) -> tuple[Fit, float]:
         return fit, 0.0
     beside = _beside(data, fit, structure.with_(friction="symmetric"), "vc_plus")
     variance = float(np.max(fit.sandwich_factors())) * beside.variance
+    variance = min(variance, float(np.abs(data.hold_value).max()) ** 2)  # or it would not turn
     return fit.wider(beside.covariance(variance)), float(np.sqrt(variance))
 
 
@@ -110,7 +111,7 @@ def consider_left_out(data: Experiments, fit: Fit) -> Fit:
         beside = _beside(data, with_lag(fit, little) if little else fit, richer, coordinate)
         own, found = factor * beside.variance, beside.size + little
         early = little > 0 and found < 0  # which no sensor is
-        left = mean_square(found, own, most) if beside.seen else most**2 / 6
+        left = mean_square(found, own, most)
         # Akaike: with it the motor is predicted better.
         if beside.seen and found**2 > 2 * own and not early:
             left = max(left, found**2 - own)
@@ -130,6 +131,8 @@ def mean_square(found: float, variance: float, most: float) -> float:
     """
     deviation = math.sqrt(variance)
     lags = (np.arange(POINTS) + 0.5) * most / POINTS
+    if not math.isfinite(variance):
+        return most**2 / 6
     likely = np.exp(-0.5 * np.square((lags - found) / deviation))
     none = math.exp(-0.5 * (found / deviation) ** 2)
     return float(np.mean(likely * np.square(lags)) / (np.mean(likely) + none + 1e-300))
@@ -155,6 +158,9 @@ def _beside(data: Experiments, fit: Fit, richer: Structure, coordinate: str) -> 
     keep = [i for i, c in enumerate(richer.free) if c != coordinate]
     late = richer.free.index(coordinate)
     answer = prediction.inverse(here.normal[np.ix_(keep, keep)], 1e-12) @ here.normal[keep, late]
-    left = max(float(here.normal[late, late] - here.normal[late, keep] @ answer), 1e-12)
+    whole = float(here.normal[late, late])
+    left = float(here.normal[late, late] - here.normal[late, keep] @ answer)
+    if not left > ROUNDING * whole:  # the data say nothing of it
+        return _Beside(answer, 0.0, math.inf, False)
     score = float(here.gradient[late] - here.gradient[keep] @ answer)
-    return _Beside(answer, score / left, 1 / left, left > SEEN * here.normal[late, late])
+    return _Beside(answer, score / left, 1 / left, left > SEEN * whole)

@@ -21,7 +21,7 @@ Flags = NDArray[np.bool_]
 SLOW = 0.02  # of the fastest speed: what stands
 SLIGHT = 1e-3  # of all that it turned: the same of an angle
 LONGER = 3.0  # than a motor takes to turn around
-ROWS = 3  # at least
+ROWS = 2  # at least
 ON = 0.05  # of the largest voltage
 
 
@@ -46,14 +46,16 @@ def _stands(t: Array, y: Array, kind: Measurement, quantum: float) -> bool:
     its treble, or from one angle to nine times it, as it took to get there.
     """
     if kind == ANGLE:
-        away = np.abs(y - y[0])
-        near = max(1.5 * quantum, SLIGHT * float(np.ptp(y)))
-        far = 9 * near
+        away, treble = np.abs(y - y[0]), 9.0
+        slight = SLIGHT * float(np.ptp(y))
+        # A fine counter shows a standstill of which a thousandth of the way would show nothing.
+        nears = [1.5 * quantum, max(1.5 * quantum, slight)]
     else:
-        away = np.abs(y)
-        near = SLOW * float(np.quantile(away, 0.98))
-        far = 3 * near
-    left, gone = int(np.argmax(away > near)), int(np.argmax(away > far))
-    if not (near > 0 and gone >= left >= ROWS):
-        return False
-    return float(t[left] - t[0]) > LONGER * 0.5 * float(t[gone] - t[left])
+        away, treble = np.abs(y), 3.0
+        nears = [SLOW * float(np.quantile(away, 0.98))]
+    for near in nears:
+        left, gone = int(np.argmax(away > near)), int(np.argmax(away > treble * near))
+        waits = float(t[left] - t[0]) > LONGER * 0.5 * float(t[gone] - t[left])
+        if near > 0 and gone >= left >= ROWS and waits:
+            return True
+    return False

@@ -120,7 +120,8 @@ def test_the_motor_is_identified_through_the_loop(laws, name, tmp_path):
         found = motor["combinations"][key]
         # Four standard deviations: 1 in 16,000 by chance, and the seed is fixed.
         assert abs(found["value"] - truth) < 4 * found["std"]
-        assert found["std"] < 0.02 * truth
+        # What part of a period of 20 ms passes before the driver acts is not known.
+        assert found["std"] < 0.02 * truth + (0.1 * 0.02 if key == "time_constant" else 0.0)
     # Its speeds are whole ticks: a gain from 20 s of counts, not from speeds rounded one by one.
     assert motor["combinations"]["dc_gain"]["std"] < 1e-4 * GAIN
     assert "reconstructed_voltage" in [f["code"] for f in motor["findings"]]

@@ -12,7 +12,7 @@ from smp_motor_ident.likelihood.noise import NoiseModel
 from smp_motor_ident.likelihood.passes import evaluate
 from smp_motor_ident.model.coordinates import Coordinates
 from smp_motor_ident.model.structures import FirstOrder, SecondOrder
-from smp_motor_ident.record import Record
+from smp_motor_ident.record import Hardware, Record
 
 RATE = 500.0
 DEAD = 0.06  # s
@@ -87,3 +87,21 @@ def test_the_steps_of_an_angle_show_though_few_rows_move() -> None:
     slow = 0.0245 * np.floor(np.linspace(0.0, 90.3, 40_000) ** 1.01)
     late = np.concatenate([np.zeros(30_000), slow])
     assert angle_quantum(late) == pytest.approx(0.0245)
+
+
+def test_a_first_command_that_a_fine_counter_shows_to_come_late_was_none_before() -> None:
+    """From rest, every row another voltage, each a sample late: what ran before the first is none."""
+    n, rate, per_turn = 1500, 200.0, 20_000.0
+    t = np.arange(n) / rate
+    tones = (0.5, 1.1, 2.7, 5.1, 11.0, 23.0)
+    volts = sum(1.5 * np.cos(2 * np.pi * f * t) for f in tones)
+    ran = np.concatenate([[0.0, 0.0], volts[1:-1]])  # over the interval that ends at each row
+    r, el, k, j, b = MOTOR
+    out = independent.simulate(t, ran, r, el, k, j, b, STATIC * k / r, np.zeros(n), 100)
+    count = np.floor(out[:, 2] * per_turn / (2 * np.pi)).astype(np.int64)
+    record = Record("wheel", t, volts, count=count, hardware=Hardware(1.0, per_turn))
+    assert prepare([record], False).stood.all()
+    found = estimate(record).combinations
+    assert found["delay"].value == pytest.approx(1 / rate, rel=1e-2)
+    for name, true in (("time_constant", LAG), ("static_voltage", STATIC)):
+        assert abs(found[name].value - true) < max(5 * found[name].std, 2e-3 * true), name
