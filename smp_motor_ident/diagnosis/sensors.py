@@ -1,4 +1,4 @@
-"""What a fit says of the sensors: the current's offset and misfit, how long they average."""
+"""What a fit says of command and sensors: when they are, offset and misfit, how they average."""
 
 from __future__ import annotations
 
@@ -30,7 +30,21 @@ def sensors(data: Experiments, fit: Fit) -> list[Finding]:
         )
     if isinstance(s, Electromechanical) and s.lags:
         out.append(_current_lag(s.current_sensor, fit.z.current_lag))
-    return out + ([_filtered_speed(fit)] if s.has("window") else [])
+    out += [_filtered_speed(fit)] * s.has("window") + [_late_command(s.shift)] * (s.shift > 0)
+    return out
+
+
+def _late_command(shift: float) -> Finding:
+    """Say that a row's command ran an interval later than its row has it."""
+    return Finding(
+        "late_command",
+        "note",
+        f"the command acts an interval of {1e3 * shift:.3g} ms later than recorded: that is in the "
+        "delay",
+        {"shift": shift},
+        "where a row has the command of the interval that follows it, that is no delay but how it "
+        "was logged: map it with held=after",
+    )
 
 
 def _filtered_speed(fit: Fit) -> Finding:

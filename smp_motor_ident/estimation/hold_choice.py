@@ -89,7 +89,7 @@ def otherwise(
         request.say("how the command ran between samples")
         again = data if other == hold else prepare(group, request.use_current, hold=other)
         again = again.measured_as(data.kind).held(fit.structure.held)
-        there = base.with_(held=fit.structure.held)
+        there = base.with_(held=fit.structure.held, shift=fit.structure.shift)
         auto = request.model == "auto"
         rivals = order_selection.explore(again, there, request.options, auto, request.say)
         whole = extend(of_kind(again, fit), fit.structure, fit, request.options)
@@ -162,7 +162,8 @@ def _delayed(
     fits = []
     for samples, start in starts.items():
         delay = max(samples, 0.0) * part.step
-        structure = best.structure.with_(held=how, delay=delay > 0)
+        shift = part.step if how == "after" else 0.0
+        structure = best.structure.with_(held=how, delay=delay > 0, shift=shift)
         z = start.with_(delay=delay)
         fixed = structure.with_(delay=False, fixed={**structure.fixed, "delay": delay})
         whole = [refine(part, fixed, n, fixed.complete(z), options, ROUGHLY) for n in near]

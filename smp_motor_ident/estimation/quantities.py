@@ -12,7 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_control.motor.parameters import PHYSICAL
-from smp_motor_ident.diagnosis.limits import HIDDEN_LAG, LOOSE_QUANTITY, NEGLIGIBLE_FRICTION
+from smp_motor_ident.diagnosis.limits import (
+    HIDDEN_LAG,
+    INSTANT,
+    LOOSE_QUANTITY,
+    NEGLIGIBLE_FRICTION,
+)
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.fitted import NORMAL_95
 from smp_motor_ident.estimation.inversion import solved_for
@@ -86,6 +91,9 @@ def answer(
     joint = values.covariance(conditional)
     if friction_std > 0:
         joint += np.diag(np.square([_friction(n, fit) * friction_std for n in values.value]))
+    if "delay" in values.value:  # whole intervals are known no better than instants are
+        at = list(values.value).index("delay")
+        joint[at, at] += (INSTANT.value * structure.shift) ** 2
     spread = dict(zip(values.value, np.sqrt(np.maximum(np.diag(joint), 0.0)), strict=True))
     one_level = spread["dc_gain"] > LOOSE_QUANTITY.value * values.value["dc_gain"]
     combinations = {}
@@ -94,7 +102,7 @@ def answer(
             combinations[name] = Quantity(values.value[name], unit=UNITS[name], status="fixed")
             continue
         interval = values.interval(name, conditional)
-        if friction_std > 0:
+        if friction_std > 0 or (name == "delay" and structure.shift > 0):
             reach = NORMAL_95 * spread[name]
             interval = values.value[name] - reach, values.value[name] + reach
         if (one_level and name in TRADED) or _hidden(name, values.value[name], spread[name], fit):

@@ -50,6 +50,7 @@ class Structure(ABC):
     low_pass: bool = False  # whether a low-pass of half the window's lag stands in its place
     # How the command ran: a row's value before it, after it, or interpolated from row to row
     held: str = "before"
+    shift: float = 0.0  # by how much later than recorded such a command ran as a whole [s]
     own_load: bool = False  # whether every segment has a constant load of its own
     # Coordinates fixed at a value, by name
     fixed: Mapping[str, float] = field(default_factory=dict)
@@ -179,11 +180,11 @@ class Structure(ABC):
             "static_voltage": "vc_plus",
             "static_voltage_reverse": "vc_minus",
             "load_voltage": "load",
-            "delay": "delay",
             "averaging_window": "window",
             "current_lag": "current_lag",
         }
         found |= {n: (z.value(c), direction(**{c: 1.0})) for n, c in reported.items()}
+        found["delay"] = self.shift + z.delay, direction(delay=1.0)
         return found | {"sensor_lag": (0.5 * z.window, direction(window=0.5))}
 
     def _lags_of(self, z: Coordinates) -> Gradients:
@@ -205,7 +206,7 @@ class Structure(ABC):
         if self.load:
             yield "load_voltage"
         yield "steady_speed"
-        if self.delay or "delay" in self.fixed:
+        if self.has("delay") or self.shift > 0:
             yield "delay"
         if self.has("window"):
             yield "sensor_lag" if self.low_pass else "averaging_window"

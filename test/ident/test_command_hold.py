@@ -38,7 +38,13 @@ def test_a_command_that_is_logged_before_it_runs_is_no_slower_motor(kind):
     ran = np.concatenate([v[:1], v[:-1]])  # over the interval that ends at each row
     out = simulate(t, ran, R, L, K, J, B, TC, np.zeros(t.size), 100)
     count = np.floor(out[:, 2] * 500 / (2 * np.pi)).astype(np.int64)
-    right(Record("motor", t, v, count=count, hardware=Hardware(1.0, 500.0)), TRUTH)
+    record = Record("motor", t, v, count=count, hardware=Hardware(1.0, 500.0))
+    right(record, TRUTH)
+    # A loop through this log would be late by that, unless it only logs it so: both are said.
+    found = estimate(record)
+    low, high = found.combinations["delay"].ci95
+    assert low < 1 / 200 < high < 1.1 / 200
+    assert "late_command" in [f.code for f in found.findings]
 
 
 @pytest.mark.parametrize("seed", range(3))
