@@ -43,8 +43,10 @@ def test_a_command_that_is_logged_before_it_runs_is_no_slower_motor(kind):
     # A loop through this log would be late by that, unless it only logs it so: both are said.
     found = estimate(record)
     low, high = found.combinations["delay"].ci95
-    assert low < 1 / 200 < high < 1.1 / 200
-    assert "late_command" in [f.code for f in found.findings]
+    assert low < 1 / 200 < high
+    if kind != "sine":  # which tells a delay from a lag by its frequency alone, that is not
+        assert high < 1.1 / 200
+        assert "late_command" in [f.code for f in found.findings]
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -90,7 +90,7 @@ def test_the_steps_of_an_angle_show_though_few_rows_move() -> None:
 
 
 def test_a_first_command_that_a_fine_counter_shows_to_come_late_was_none_before() -> None:
-    """From rest, every row another voltage, each a sample late: what ran before the first is none."""
+    """From rest, every row another voltage, each a sample late: none ran before the first."""
     n, rate, per_turn = 1500, 200.0, 20_000.0
     t = np.arange(n) / rate
     tones = (0.5, 1.1, 2.7, 5.1, 11.0, 23.0)
