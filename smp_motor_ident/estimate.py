@@ -60,6 +60,7 @@ from smp_motor_ident.estimation.segments import heterogeneous
 from smp_motor_ident.estimation.selection import FittedCandidate
 from smp_motor_ident.estimation.subset import excited
 from smp_motor_ident.estimation.thinning import thinned
+from smp_motor_ident.estimation.transients import widened_by_pieces
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import Experiments, prepare
 from smp_motor_ident.model.measurement import ANGLE
@@ -313,7 +314,7 @@ def _certain(
     final = of_kind(data, fit)
     chosen = _constrain(final, fit, request)
     few = thinned(final) if final.size > PROFILED.value else final
-    chosen = profiled(few, widened(final, chosen), request.options)
+    chosen = profiled(few, widened_by_pieces(final, widened(final, chosen)), request.options)
     timed = consider_timing(final, chosen, instant_deviation(group, hold))
     timed = consider_drop(final, consider_clock(final, timed, clock_share(group)))
     chosen, friction_std = consider_friction(final, consider_left_out(final, timed))

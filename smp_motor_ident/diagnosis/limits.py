@@ -61,6 +61,10 @@ SEGMENT_INFORMATION = Limit(
     "a part whose interval is more than twice the others' adds its noise, not the motor's change",
     "test_segments.py: parts without excitation do not count",
 )  # fmt: skip
+FEW_TRANSIENTS = Limit(
+    8.0, "runs of samples", "a variance of fewer sums is known to no better than its half",
+    "test_transients.py: a step alone scatters as it says",
+)  # fmt: skip
 REST = Limit(
     0.05,
     "of the largest voltage",

@@ -1,0 +1,101 @@
+"""How well a few transients tell what they alone tell: a sandwich over their pieces.
+
+Where all that is known of a coordinate comes from few runs of samples, the scores of these runs are
+nothing at the optimum, whatever the model lacks, and so is a sandwich of them.  It is taken over
+pieces of equal leverage, however short, instead, and their errors count by that leverage more.
+Derivation: docs/derivations.md, section 9.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtri
+
+from smp_motor_ident.diagnosis.limits import CONDITION_LEVEL, FEW_TRANSIENTS
+from smp_motor_ident.estimation import prediction
+from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.estimation.fitted import long_run
+from smp_motor_ident.likelihood.experiments import Experiments
+from smp_motor_ident.likelihood.noise import whitening
+from smp_motor_ident.likelihood.passes import answers, own_columns
+
+Array = NDArray[np.float64]
+
+PIECES = 24
+
+
+def widened_by_pieces(data: Experiments, fit: Fit) -> Fit:
+    """Return the fit with its covariance widened to that of errors of pieces, if few runs tell it.
+
+    References
+    ----------
+    Bell and McCaffrey, Survey Methodology 28 (2002), 169 (errors of clusters, by their leverage).
+    """
+    if data.current.size or fit.gain.any() or not fit.structure.free:
+        return fit
+    if not np.any(_runs(fit) < FEW_TRANSIENTS.value):
+        return fit
+    moves = _moves(data, fit)
+    pieces = len(moves)
+    if pieces <= 2 * moves.shape[1]:
+        return fit
+    # In standard deviations, along directions that are independent of each other.
+    deviation = np.sqrt(np.diag(fit.conditional()))
+    values, vectors = np.linalg.eigh(fit.conditional() / np.outer(deviation, deviation))
+    half = deviation[:, None] * vectors * np.sqrt(np.maximum(values, 1e-12))
+    scaled = moves @ np.linalg.inv(half).T
+    along = np.linalg.eigh(scaled.T @ scaled)[1]
+    ratio = long_run(scaled @ along) * (pieces - 1) / pieces
+    ratio[ratio < chdtri(pieces - 1, CONDITION_LEVEL.value) / (pieces - 1)] = 1.0
+    more = half @ along * np.sqrt(np.maximum(ratio - 1.0, 0.0))
+    return fit.wider(more @ more.T)
+
+
+def _runs(fit: Fit) -> Array:
+    """Return over how many runs of samples the score of each coordinate is spread, shape (f,)."""
+    square = np.square(fit.scores)
+    spread = np.square(square.sum(axis=0))
+    return np.asarray(spread / np.maximum(np.square(square).sum(axis=0), 1e-300))
+
+
+def _moves(data: Experiments, fit: Fit) -> Array:
+    """Return how the errors of each piece move the free coordinates, shape (pieces, f).
+
+    Of errors that were as large everywhere, what a piece leaves of its own is less by its leverage:
+    they count by the root of that more.
+    """
+    none = np.zeros((0, 0)), np.zeros((0, 0, 0))
+    moved = answers(data, fit.structure, fit.z, fit.initial, fit.noise_model(), none, 1, True)
+    rows = whitening(fit.noise)[0, 0] * moved[:, 0]
+    error = whitening(fit.noise)[0, 0] * (data.output - prediction.simulate(data, fit)[:, 1])
+    error, size = np.nan_to_num(error), len(fit.structure.free)
+    own = list(own_columns(data, fit.structure))
+    parts, seen = [], []
+    for g, (a, b) in enumerate(pairwise(data.starts)):
+        parts.append(rows[a:b].T @ rows[a:b])
+        parts[-1][size:, size:] += np.diag(data.known_initial[g, own])
+        inner = parts[-1][:size, size:] @ prediction.inverse(parts[-1][size:, size:])
+        seen.append(parts[-1][:size, :size] - inner @ parts[-1][size:, :size])
+    whole = np.sum(seen, axis=0)
+    share = np.einsum("nf,fg,ng->n", rows[:, :size], prediction.inverse(whole), rows[:, :size])
+    leverage = np.cumsum(share)
+    shares = np.linspace(0.0, leverage[-1], PIECES + 1)[:-1]
+    cuts = np.union1d(np.searchsorted(leverage, shares), data.starts)
+    moves = []
+    for a, b in pairwise(cuts):
+        g = int(np.searchsorted(data.starts, a, side="right")) - 1
+        normal = parts[g].copy()
+        normal[:size, :size] += whole - seen[g]
+        inverse, piece = prediction.inverse(normal), rows[a:b].T @ rows[a:b]
+        values, vectors = np.linalg.eigh(inverse)
+        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        taken, along = np.linalg.eigh(root.T @ piece @ root)
+        taken = np.clip(taken, 1e-12, 1 - 1e-6)
+        more = root @ along * ((1 / np.sqrt(1 - taken) - 1) / taken)
+        gradient = rows[a:b].T @ error[a:b]
+        gradient = gradient + piece @ more @ (root @ along).T @ gradient
+        moves.append((inverse @ gradient)[:size])
+    return np.array(moves)
