@@ -14,7 +14,7 @@ from smp_motor_ident.estimation.initialisation import first_fit, initial_fit
 from smp_motor_ident.estimation.selection import POLICY, FittedCandidate
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.measurement import ANGLE
-from smp_motor_ident.model.structures import Structure
+from smp_motor_ident.model.structures import FirstOrder, Structure
 
 HARDLY = 0.01  # of a sample: a window that is as good as none, for the score
 WINDOWS = (1.0, 4.0)  # samples at which a low-pass is begun
@@ -138,7 +138,20 @@ def with_low_pass(
     if verdict and other.noise_ratio > 0:  # what looked like torque noise may have been this
         other = data_window.grow(low, richer, other, options)
     candidates.append(FittedCandidate(other, reason))
-    return other if verdict else best
+    if not verdict:
+        return best
+    simple = _without_second_lag(low, other, options) if s.order == 2 and not s.current else None
+    if simple is None or POLICY.needed(simple, other)[0]:
+        return other
+    candidates.append(FittedCandidate(simple, f"as good as {other.structure.label}"))
+    return simple
+
+
+def _without_second_lag(data: Experiments, fit: Fit, options: Options) -> Fit:
+    """Return a fit of one lag less: what the sensor has may have been the motor's second."""
+    simple = FirstOrder.like(fit.structure)
+    z = fit.z.with_(delay=(fit.z.delay + fit.z.second_lag) * simple.delay)
+    return descent.refine(data, simple, fit, simple.complete(z), options)
 
 
 def delay_without_noise(data: Experiments, best: Fit, options: Options) -> Fit | None:
