@@ -20,6 +20,7 @@ from smp_motor_ident.diagnosis.limits import (
     SIGN_SURE,
     SIGN_TOLD,
 )
+from smp_motor_ident.diagnosis.lost_sign import lost_sign
 from smp_motor_ident.diagnosis.signs import lagged, likeness
 from smp_motor_ident.diagnosis.silence import silent
 from smp_motor_ident.errors import InsufficientExcitationError, SignalError
@@ -40,6 +41,8 @@ def screen(records: Sequence[Record]) -> list[Finding]:
     _length(records, where)
     for record in records:
         warnings += _lost(record)
+    _resolution(records, where)
+    lost_sign(records, [measured_speed(r) for r in records], where)
     _excitation(records, where)
     for record in records:
         _saturation(record)
@@ -53,6 +56,15 @@ def screen(records: Sequence[Record]) -> list[Finding]:
         _offset(record)
     read = [finding for record in records for finding in record.findings]
     return [*warnings, *(f for k, f in enumerate(read) if f not in read[:k])]
+
+
+def _resolution(records: Sequence[Record], where: str) -> None:
+    if any(np.isfinite(measured_speed(r)).any() for r in records):
+        return
+    if any(r.count is not None and not r.hardware.counts_per_revolution for r in records):
+        raise SignalError(
+            f"{where}: encoder counts without their number a turn; map counts_per_revolution=N"
+        )
 
 
 def _where(records: Sequence[Record]) -> str:

@@ -1,0 +1,50 @@
+"""Sizes where a sign decides are named for what they are."""
+
+from dataclasses import replace
+
+import motors
+import numpy as np
+import pytest
+
+from smp_motor_ident.errors import SignalError
+from smp_motor_ident.estimate import estimate
+
+
+def driven(kinds=("square", "fourier")):
+    return motors.record("rear_left", current=False, kinds=kinds)
+
+
+@pytest.mark.parametrize("kind", ["sine", "square", "fourier"])
+def test_a_command_without_its_sign_is_refused_and_says_so(kind):
+    record = driven((kind,))
+    with pytest.raises(SignalError, match="no sign; map its direction"):
+        estimate(replace(record, voltage=np.abs(record.voltage)))
+
+
+@pytest.mark.parametrize("kind", ["sine", "square", "fourier"])
+def test_a_speed_without_its_sign_is_refused_and_says_so(kind):
+    record = driven((kind,))
+    size = replace(record, velocity=np.abs(record.velocity), count=None)
+    with pytest.raises(SignalError, match="velocity is never negative"):
+        estimate(size)
+
+
+def test_one_direction_with_pulses_that_brake_is_no_lost_sign():
+    """A speed that is never negative because the motor never turns back has its sign."""
+    rng = np.random.default_rng(1)
+    runs = [(volts, n) for n in rng.integers(20, 60, 40) for volts, n in ((8.0, n), (-2.0, 8))]
+    volts = np.concatenate([np.full(n, v) for v, n in runs])
+    record = motors.record("rear_left", current=False, kinds=("square",), voltage=volts,
+                           seconds=(volts.size + 0.5) / 200)  # fmt: skip
+    assert record.velocity.min() >= 0
+    found = estimate(replace(record, count=None))
+    truth = motors.truth("rear_left", 0.3)
+    assert found.value("dc_gain") == pytest.approx(truth["dc_gain"], rel=0.05)
+
+
+def test_counts_without_their_number_a_turn_ask_for_it():
+    record = driven()
+    bare = replace(record, velocity=None, hardware=replace(record.hardware,
+                                                           counts_per_revolution=None))  # fmt: skip
+    with pytest.raises(SignalError, match="map counts_per_revolution"):
+        estimate(bare)
