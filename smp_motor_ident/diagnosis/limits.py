@@ -66,37 +66,32 @@ FEW_TRANSIENTS = Limit(
     "test_transients.py: a step alone scatters as it says",
 )  # fmt: skip
 REST = Limit(
-    0.05,
-    "of the largest voltage",
+    0.05, "of the largest voltage",
     "a motor that does not move at a twentieth of the voltage shows what it shows at none",
     "test_poor_records.py: rest before the excitation changes nothing",
-)
+)  # fmt: skip
 SAME_LEVEL = Limit(
-    0.02,
-    "of a voltage",
+    0.02, "of a voltage",
     "levels closer than a voltmeter and a battery under load hold them are one level",
     "test_poor_records.py: a single level of voltage gives one combination",
-)
+)  # fmt: skip
 CURRENT_THERE = Limit(
-    0.3,
-    "share of the samples",
+    0.3, "share of the samples",
     "cost: with less of the current its noise decides more than the motor does",
     "test_estimate.py: a current that is rarely there is not used",
-)
+)  # fmt: skip
 CURRENT_KIND = Limit(
-    0.5,
-    "of what the armature's equation leaves",
+    0.5, "of what the armature's equation leaves",
     "cost: a current is taken for what it is called unless another equation of as many "
     "coefficients leaves half of the squares; noise leaves as much of either",
     "test_current_kind.py",
-)
+)  # fmt: skip
 INSTANT = Limit(
-    0.01,
-    "sample",
+    0.01, "sample",
     "physical: a command on a clock of its own, or stamps that jitter, are known to a hundredth of "
     "an interval at best",
     "test_intervals.py",
-)
+)  # fmt: skip
 HOLD_COST = Limit(
     400_000, "samples", "cost: a second fit of a longer record takes seconds", "test_mirror.py"
 )
@@ -107,28 +102,25 @@ HOLD_EVIDENCE = Limit(
     30.0, "deviance", "significance: odds of e^15 to 1 against what was recorded", "test_mirror.py"
 )
 WORST_FIT = Limit(
-    30.0,
-    "% of the speed",
+    30.0, "% of the speed",
     "below it half of the motion's variance comes from elsewhere: what is fitted is not the motor",
     "test_data_quality.py",
-)
+)  # fmt: skip
 LEAST_FIT = Limit(
-    -100.0,
-    "% of the speed",
+    -100.0, "% of the speed",
     "an error twice the motion is no fit to compare: a descent that left the motor behind",
     "test_estimate.py: a candidate that left the motor behind has no fit",
-)
+)  # fmt: skip
 PROFILED = Limit(
     20_000, "samples", "cost: each end of an interval is found by a descent", "test_intervals.py"
 )
 
 # Choice of a candidate structure.
 PRIOR_ODDS = Limit(
-    4.0,
-    "deviance per parameter",
+    4.0, "deviance per parameter",
     "significance: prior odds of e^2 to 1 against any addition, because many are tried",
     "test_structure_choice.py",
-)
+)  # fmt: skip
 COLOURED = Limit(
     4.0, "ratio of variances", "significance: 1e-22 for 60 white runs", "test_structure_choice.py"
 )
@@ -136,44 +128,38 @@ SURE_GAIN = Limit(
     3.0, "prices", "significance: 5e-14 for a parameter of 500 samples", "test_structure_choice.py"
 )
 LOOSE_ADDITION = Limit(
-    0.4,
-    "of its value, or e-folds",
+    0.4, "of its value, or e-folds",
     "significance: 2.5 deviations from nothing, one addition in eighty that is not there",
     "test_structure_choice.py: what is not known to two fifths",
-)
+)  # fmt: skip
 SUBSET_HOPELESS = Limit(
-    40.0,
-    "deviance",
+    40.0, "deviance",
     "cost: odds of e^20 to 1 on the screening subset are not made up for by more data",
     "test_estimate.py: a candidate that left the motor behind has no fit",
-)
+)  # fmt: skip
 SECOND_LAG = Limit(
-    20.0,
-    "deviance",
+    20.0, "deviance",
     "physical: every motor has a second lag, few a delay: up to odds of e^10 to 1 it is the lag",
     "test_averaging.py: a lag that may be a delay",
-)
+)  # fmt: skip
 LITTLE_FRICTION = Limit(
-    0.02,
-    "of the largest voltage",
+    0.02, "of the largest voltage",
     "physical: friction below a fiftieth of what drives changes a gain by less than that",
     "test_estimate.py: a linear motor is recovered without friction",
-)
+)  # fmt: skip
 TORQUE_NOISE = Limit(
     12.0, "deviance", "significance: odds of e^6 to 1 for an unrecorded load", "test_intervals.py"
 )
 MOST_FRICTION = Limit(
-    0.98,
-    "of what drives",
+    0.98, "of what drives",
     "physical: beyond it, of a0 (viscous) or of the voltage (Coulomb), no motor would have turned",
     "test_shape_constraint.py",
-)
+)  # fmt: skip
 PROFILE_FROM = Limit(
-    0.1,
-    "relative standard deviation",
+    0.1, "relative standard deviation",
     "physical: a coordinate that acts as its exponential is a tenth off its parabola there",
     "test_intervals.py",
-)
+)  # fmt: skip
 
 # Assessment of a fit.
 FIT_EXPLAINS = Limit(
