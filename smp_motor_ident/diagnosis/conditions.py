@@ -27,6 +27,7 @@ from smp_motor_ident.diagnosis.model_error import Regression
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.prediction import inverse
 from smp_motor_ident.finding import Finding
+from smp_motor_ident.model.coordinates import STANDS_FOR
 
 Array = NDArray[np.float64]
 
@@ -48,7 +49,8 @@ def dependent(fit: Fit, errors: Regression | None) -> tuple[Fit, list[Finding]]:
         far = max(moves, key=lambda d: float(np.abs(d).max()))
         if far.any():
             added += np.outer(far, far)
-            said[name] = ", ".join(n for n, d in zip(fit.structure.free, far, strict=True) if d)
+            names = (n for n, d in zip(fit.structure.free, far, strict=True) if d)
+            said[name] = ", ".join(STANDS_FOR.get(n, n) for n in names)
     if not said:
         return fit, []
     message = "the numbers hang on the part of the motion that one looks at (" + "; ".join(said)

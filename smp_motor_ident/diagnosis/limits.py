@@ -254,11 +254,11 @@ SIGN_SURE = Limit(
 BACKWARD = Limit(
     0.1, "of the way",
     "physical: a load turns a motor back against a voltage of one sign, but not for long",
-    "test_lost_sign.py: a command without its sign is refused, and says so",
+    "test_lost_sign.py: a command without its sign is refused and says so",
 )  # fmt: skip
 HALF_EXPLAINED = Limit(
     0.5, "of the variance", "most of what there is",
-    "test_lost_sign.py: a speed without its sign is refused, and says so",
+    "test_lost_sign.py: a speed without its sign is refused and says so",
 )  # fmt: skip
 SIGN_ALIKE = Limit(
     0.5,

@@ -34,6 +34,7 @@ from smp_motor_ident.estimation.prediction import inverse
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.noise import gain_for, transition, whitening
+from smp_motor_ident.model.coordinates import STANDS_FOR
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -50,14 +51,15 @@ def slower(data: Experiments, fit: Fit) -> tuple[Fit, list[Finding]]:
     move = moved_by_slower(data, fit)
     if not move.any():
         return fit, []
-    said = ", ".join(n for n, d in zip(fit.structure.free, move, strict=True) if d)
+    names = (n for n, d in zip(fit.structure.free, move, strict=True) if d)
+    said = ", ".join(STANDS_FOR.get(n, n) for n in names)
     return fit.along(move), [
         Finding(
             "torque_noise_frequency",
             "note",
             "what looks like a load that fluctuates leads to other numbers where one follows the "
             f"motor more slowly ({said}): the intervals cover them",
-            {"coordinates": said},
+            {"quantities": said},
             "record at the motor's terminals, without load, and sample faster: it may be no load",
         )
     ]

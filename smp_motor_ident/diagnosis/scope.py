@@ -18,6 +18,7 @@ from smp_motor_ident.diagnosis.limits import (
 from smp_motor_ident.estimation.quantities import Answer
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import Experiments
+from smp_motor_ident.model.coordinates import STANDS_FOR
 from smp_motor_ident.result import Estimate
 
 FEWEST_SWINGS = 6  # of which it can be said that they are alike
@@ -46,7 +47,7 @@ def scope(
                 "note",
                 "parts of the recordings differ by more than their noise (temperature, friction): "
                 "the intervals are those of another recording of this motor",
-                dict(change),
+                {STANDS_FOR.get(n, n): deviation for n, deviation in change.items()},
                 "let the motor warm up, or record on several days, to know how much it changes",
             )
         )
@@ -172,7 +173,7 @@ def _current_scale(result: Answer, ohmmeter: float | None, one_size: bool) -> li
     known = {n: q for n in OF_SCALE if (q := result.parameters[n]).status == "estimated"}
     if not known:
         return []
-    words = f"{', '.join(known)} hold to the scale of the current's sensor, which no record shows"
+    words = f"the scale of the current's sensor, which no record shows, is in {', '.join(known)}"
     found = known.get("resistance")
     if found is None or found.value is None or not ohmmeter:
         advice = "state the resistance by ohmmeter (`resistance`), which shows the scale"

@@ -138,6 +138,20 @@ PLAUSIBLE = 1 / np.square([float(f.metadata["far"]) for f in fields(Coordinates)
 """Inverse squares of how far each coordinate could be from any value at all, shape (12,)."""
 
 
+STANDS_FOR = {
+    "ln_a0": "dc_gain",
+    "ln_a1": "time_constant",
+    "ln_a2": "time_constant_product",
+    "ln_te": "inductance",
+    "vc_plus": "static_voltage",
+    "vc_minus": "static_voltage_reverse",
+    "load": "load_voltage",
+    "ln_r": "resistance",
+    "window": "averaging_window",
+}
+"""The reported quantity that a coordinate moves most, where it has another name."""
+
+
 def place(name: str) -> int:
     """Return where a coordinate stands in arrays over all of them."""
     return NAMES.index(name)
