@@ -172,7 +172,8 @@ def identify_wheel(
                 "record a longer excitation with several frequencies, in both directions"
             )
         )
-    fitted, held_out = (records, kept) if kept else split(records)
+    judged = found.fit_percent.validation is not None
+    fitted, held_out = (records, kept) if kept or not judged else split(records)
     curves: list[tuple[Record, Role]] = [(record, "estimation") for record in fitted]
     curves += [(record, "validation") for record in held_out]
     return Outcome(found, tuple(_compare(found, *curve) for curve in curves))

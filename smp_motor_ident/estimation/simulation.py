@@ -76,7 +76,7 @@ def _motor(estimate: Estimate) -> Fit:
 
 def coordinates(estimate: Estimate) -> Coordinates:
     """Return an estimate in the coordinates of the fit."""
-    ln_a0 = -float(np.log(estimate.value("dc_gain")))
+    ln_a0 = -float(np.log(estimate.value("dc_gain") or _gain_without_friction(estimate)))
     lag, product = estimate.value("time_constant"), estimate.value("time_constant_product")
     forward = estimate.value("static_voltage")
     z = Coordinates(
@@ -94,3 +94,9 @@ def coordinates(estimate: Estimate) -> Coordinates:
     inductance, resistance = estimate.value("inductance"), estimate.value("resistance")
     known = inductance > 0 and resistance > 0
     return z.with_(ln_te=np.log(inductance / resistance)) if known else z
+
+
+def _gain_without_friction(estimate: Estimate) -> float:
+    """Return the gain that moves the motor alike at the one level of which it is known."""
+    level = next((f for f in estimate.findings if f.code == "one_level"), None)
+    return estimate.value("steady_speed") / float(level.evidence["voltage"]) if level else 0.0

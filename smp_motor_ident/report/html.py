@@ -93,7 +93,9 @@ def _motor(
         ],
         "alike": _alike(estimate),
         # By their information criterion, those without one last
-        "candidates": sorted(estimate.candidates, key=lambda c: (c.bic is None, c.bic or 0.0)),
+        "candidates": sorted(
+            estimate.candidates, key=lambda c: (not c.chosen, c.bic is None, c.bic or 0.0)
+        ),
         "correlations": _correlations(estimate),
         "charts": [*fit, *residuals, *frequency, *since],
         "history": since,

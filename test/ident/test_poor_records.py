@@ -10,10 +10,12 @@ from independent import simulate
 from scipy.signal import lfilter
 
 from smp_motor_ident.diagnosis import refusal, scope
+from smp_motor_ident.diagnosis.validation import percent
 from smp_motor_ident.errors import DesignError, SignalError
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.estimation import quantities
 from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.estimation.simulation import simulate as free_run
 from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.model.coordinates import Coordinates
 from smp_motor_ident.model.measurement import SPEED
@@ -71,6 +73,8 @@ def test_a_single_level_of_voltage_gives_one_combination(rest):
         assert [f.evidence["voltage"] for f in found.findings if f.code == code] == [8.0]
     with pytest.raises(DesignError, match="combination"):
         design(found, Loop())
+    measured, simulated = free_run(found, record)
+    assert percent(measured, simulated) > 90
 
 
 def test_friction_that_delays_the_first_motion_is_in_the_lags_of_one_step():
