@@ -163,40 +163,35 @@ PROFILE_FROM = Limit(
 
 # Assessment of a fit.
 FIT_EXPLAINS = Limit(
-    70.0,
-    "% of the speed",
+    70.0, "% of the speed",
     "below it a third of the motion comes from elsewhere; no interval of a "
     "model that lacks a third of what happens means anything",
     "test_findings.py",
-)
+)  # fmt: skip
 FIT_HOLDS = Limit(
-    15.0,
-    "% of the speed",
+    15.0, "% of the speed",
     "held-out data that are fitted so much worse are of another motor or "
     "load; chance alone changes a fit by parts of a percent",
     "test_findings.py",
-)
+)  # fmt: skip
 FIT_INDEPENDENT = Limit(
-    95.0,
-    "% of the speed",
+    95.0, "% of the speed",
     "what follows the voltage in the last twentieth of the motion changes "
     "the gain by less than that",
     "test_findings.py",
-)
+)  # fmt: skip
 UNEXPLAINED = Limit(
-    9.0,
-    "ratio of variances",
+    9.0, "ratio of variances",
     "an encoder's rounding has a variance of a twelfth of a count; three "
     "times its deviation is beyond any counter",
     "test_findings.py",
-)
+)  # fmt: skip
 RINGING = Limit(
-    1.5,
-    "rad per sample",
+    1.5, "rad per sample",
     "at pi a ringing cannot be distinguished from a slower one; at half of that "
     "sampling between two swings still shows both",
     "test_findings.py",
-)
+)  # fmt: skip
 STEADY = Limit(4.0, "time constants", "98 % of a step are over", "test_estimate.py")
 WINDING_LAG = Limit(
     0.25,
@@ -340,6 +335,10 @@ AT_LIMIT = Limit(
 LONGEST_LAG = Limit(
     10.0, "s", "physical: a flywheel of a hundred rotors runs up within seconds",
     "test_poor_records.py: a motor that cannot be is said to be none",
+)  # fmt: skip
+LOW_VOLTAGE = Limit(
+    60.0, "V", "physical: extra-low voltage ends there, and with it what robots are built with",
+    "test_lost_sign.py: a duty in counts that is called a voltage is questioned",
 )  # fmt: skip
 HIGHEST_GAIN = Limit(
     2000.0, "rad/s/V", "physical: 19,000 rpm per volt, twice that of the fastest models' motors",

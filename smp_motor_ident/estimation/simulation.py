@@ -98,5 +98,6 @@ def coordinates(estimate: Estimate) -> Coordinates:
 
 def _gain_without_friction(estimate: Estimate) -> float:
     """Return the gain that moves the motor alike at the one level of which it is known."""
-    level = next((f for f in estimate.findings if f.code == "one_level"), None)
-    return estimate.value("steady_speed") / float(level.evidence["voltage"]) if level else 0.0
+    levels = (f.evidence["voltage"] for f in estimate.findings if f.code == "one_level")
+    level = next(levels, None)
+    return estimate.value("steady_speed") / level if isinstance(level, float) else 0.0

@@ -42,6 +42,16 @@ def test_one_direction_with_pulses_that_brake_is_no_lost_sign():
     assert found.value("dc_gain") == pytest.approx(truth["dc_gain"], rel=0.05)
 
 
+@pytest.mark.parametrize("full", [100, 255, 1023])
+def test_a_duty_in_counts_that_is_called_a_voltage_is_questioned(full):
+    record = driven()
+    counts = np.rint(record.voltage / 10.0 * full)
+    codes = [f.code for f in estimate(replace(record, voltage=counts)).findings]
+    assert "whole_volts" in codes
+    volts = [f.code for f in estimate(replace(record, voltage=np.rint(record.voltage))).findings]
+    assert "whole_volts" not in volts
+
+
 def test_counts_without_their_number_a_turn_ask_for_it():
     record = driven()
     bare = replace(record, velocity=None, hardware=replace(record.hardware,
