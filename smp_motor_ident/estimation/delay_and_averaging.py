@@ -92,13 +92,15 @@ def with_average(
     candidates: list[FittedCandidate],
     say: Callable[[str], None],
 ) -> Fit:
-    """Try a speed averaged over a window of a sample or more, current being measured."""
+    """Try a speed averaged over a window of a sample or more, current being measured.
+
+    A speed that was taken for what it is at its stamp may have made the fit give the current up:
+    the regressions begin anew.
+    """
     structure = best.structure.with_(window=True)
     say(f"trying {structure.label}")
     starts = [best.z.with_(window=width * data.step) for width in (1.02, 2.0, 4.0)]
-    fitted = initial_fit(
-        data.measured_as(structure.speed), structure, options, starts, keep=3, own=False
-    )
+    fitted = initial_fit(data.measured_as(structure.speed), structure, options, starts)
     if fitted is None:
         return best
     verdict, reason = POLICY.preferred(best, fitted)

@@ -184,3 +184,20 @@ def test_a_sensor_that_would_be_early_shows_the_current_at_once(sensor):
     direct = predict(data, Electromechanical(), z)
     # A thousandth of a sample late: 5 us of what 12 V change in L.
     np.testing.assert_allclose(early[:, 2], direct[:, 2], atol=5e-6 * 2 * 12 / L)
+
+
+def test_a_current_is_not_given_up_for_a_speed_that_is_a_mean():
+    """A quick motor's speed over a sample is off by far more than its encoder, its current not."""
+    r, el, k, j, b = 0.41, 8e-4, 0.0184, 2.26e-5, 9.1e-5
+    rng = np.random.default_rng(8)
+    volts = 2.6 * np.repeat(rng.choice([-1.0, 1.0], 600), 6)
+    t = np.arange(volts.size) / 200
+    out = independent.simulate(t, volts, r, el, k, j, b, 4.7e-3, np.zeros(t.size), 200)
+    count = np.floor(out[:, 2] * 4096 / (2 * np.pi))
+    speed = np.diff(count, prepend=0.0) * 2 * np.pi / 4096 * 200
+    amps = out[:, 0] + 0.02 * rng.standard_normal(t.size)
+    found = estimate(Record("motor", t, volts, amps, speed))
+    for name, true in (("resistance", r), ("inductance", el), ("dc_gain", k / (k * k + r * b))):
+        q = (found.parameters | found.combinations)[name]
+        assert abs(q.value - true) < max(5 * q.std, 5e-3 * true), name
+    assert not found.unreliable
