@@ -194,12 +194,11 @@ RINGING = Limit(
 )  # fmt: skip
 STEADY = Limit(4.0, "time constants", "98 % of a step are over", "test_estimate.py")
 WINDING_LAG = Limit(
-    0.25,
-    "of the first lag",
+    0.25, "of the first lag",
     "physical: that is an L/R of a sixth of R J/K^2; catalogues of brushed motors have less than a "
     "tenth, and a wheel's inertia makes that smaller",
     "test_findings.py: a speed that is filtered as slowly as the motor turns",
-)
+)  # fmt: skip
 SQUARE_LEVEL = Limit(
     0.03, "share of the level", "what a voltmeter scatters around a level", "test_estimate.py"
 )
@@ -216,36 +215,32 @@ METER = Limit(
     0.01, "share of the supply or of a level", "what a voltmeter scatters", "test_data_quality.py"
 )
 SILENT_SWING = Limit(
-    2.0,
-    "smallest steps of the sensor",
+    2.0, "smallest steps of the sensor",
     "physical: rounding hides a swing of up to one; the other is for what the rest of a record "
     "does not tell of the lag, the winding and the friction that make the swing small",
     "test_silence.py",
-)
+)  # fmt: skip
 FLICKER = Limit(
-    3.0,
-    "ratio of changes of level",
+    3.0, "ratio of changes of level",
     "physical: counts differenced faster than they come change level at most samples, a rounded "
     "speed once a crossing; what is expected of the motion is known to a factor of two",
     "test_silence.py",
-)
+)  # fmt: skip
 OFFSET_SURE = Limit(
-    6.0,
-    "standard deviations",
+    6.0, "standard deviations",
     "of an offset of the current, with errors of neighbouring runs that "
     "hang together allowed for; chance exceeds it once in 5e8",
     "test_data_quality.py",
-)
+)  # fmt: skip
 LARGEST_OFFSET = Limit(
     0.2, "share of the largest current", "no calibrated sensor has more", "test_data_quality.py"
 )
 SIGN_SURE = Limit(
-    4.0,
-    "standard deviations",
+    4.0, "standard deviations",
     "of the correlation of two signals that have no part in each other; the largest of its lags "
     "exceeds it by chance once in 2000 records of a standing motor",
     "test_signs.py",
-)
+)  # fmt: skip
 BACKWARD = Limit(
     0.1, "of the way",
     "physical: a load turns a motor back against a voltage of one sign, but not for long",
@@ -256,68 +251,60 @@ HALF_EXPLAINED = Limit(
     "test_lost_sign.py: a speed without its sign is refused and says so",
 )  # fmt: skip
 SIGN_ALIKE = Limit(
-    0.5,
-    "correlation, or share of one",
+    0.5, "correlation, or share of one",
     "a quarter of the motion follows the voltage: it turns, however slowly the voltage changes; "
     "the cosine of 60 degrees, twice what delays between those tried may miss (SIGN_TOLD)",
     "test_signs.py",
-)
+)  # fmt: skip
 SIGN_TOLD = Limit(
-    0.87,
-    "share of a correlation",
+    0.87, "share of a correlation",
     "physical: cosine of 30 degrees; at three samples to a period, delays that are tried in halves "
     "of a sample come so near to any phase, and the sign of what is nearer tells nothing",
     "test_signs.py",
-)
+)  # fmt: skip
 SIGN_LATE = Limit(
-    2.0,
-    "samples",
+    2.0, "samples",
     "physical: a driver and an encoder of one clock each are half a sample late on average and one "
     "at most; a longer transport is long beside a sample, not beside a motor",
     "test_signs.py",
-)
+)  # fmt: skip
 RESIDUAL_LEVEL = Limit(
     0.05, "probability", "that any lag of clean residuals leaves its band", "test_findings.py"
 )
 
 # Adequacy of the model.
 EFFECT_LEVEL = Limit(
-    0.001,
-    "probability",
+    0.001, "probability",
     "that a clean record shows any effect (Bonferroni): 0.01 would stop one commissioning in 25",
     "test_adequacy.py",
-)
+)  # fmt: skip
 EFFECT_COVERED = Limit(
-    0.05,
-    "probability",
+    0.05, "probability",
     "that a clean record's 95 % intervals are wider by an effect that is not there (Bonferroni)",
     "test_adequacy.py",
-)
+)  # fmt: skip
 CONDITION_LEVEL = Limit(
     0.01, "probability", "that clean numbers seem to hang on a condition", "test_adequacy.py"
 )
 CONDITION_WEIGHT = Limit(
-    0.8,
-    "share of the weight",
+    0.8, "share of the weight",
     "nine to one: nearly half of the data alone, and yet no number is lost that one half lacks",
     "test_adequacy.py",
-)
+)  # fmt: skip
 EFFECT_BLOCKS = Limit(
     6, "degrees of freedom", "with fewer the level of a test is unknown", "test_adequacy.py"
 )
 EFFECT_OWN = Limit(
-    1e-2,
-    "share of the sum of squares",
+    1e-2, "share of the sum of squares",
     "an effect's shape is known to a tenth at best: what the model imitates so far shows nothing",
     "test_adequacy.py",
-)
+)  # fmt: skip
 BUNCHED = Limit(
-    0.05,
-    "share of the mean interval",
+    0.05, "share of the mean interval",
     "cost: the start puts the samples on a grid of their median interval, of 20 times as many "
     "points as there are samples at this share, and without end where stamps are equal",
     "test_bunched.py",
-)
+)  # fmt: skip
 ROWS_LOST = Limit(
     2, "samples", "physical: over more of them a command is no straight line", "test_lost_rows.py"
 )
@@ -340,16 +327,23 @@ LOW_VOLTAGE = Limit(
     60.0, "V", "physical: extra-low voltage ends there, and with it what robots are built with",
     "test_lost_sign.py: a duty in counts that is called a voltage is questioned",
 )  # fmt: skip
+LONG_DELAY = Limit(
+    3.0, "time constants", "physical: a motor is over its transient before it would begin",
+    "test_poor_records.py: a ramp that overcomes friction late is no delay",
+)  # fmt: skip
+SHARP = Limit(
+    0.25, "of the command's range", "physical: a step of that overcomes any friction at once",
+    "test_poor_records.py: a ramp that overcomes friction late is no delay",
+)  # fmt: skip
 HIGHEST_GAIN = Limit(
     2000.0, "rad/s/V", "physical: 19,000 rpm per volt, twice that of the fastest models' motors",
     "test_poor_records.py: a motor that cannot be is said to be none",
 )  # fmt: skip
 RELEVANT_BIAS = Limit(
-    0.02,
-    "of a number, or of a sampling interval for a delay",
+    0.02, "of a number, or of a sampling interval for a delay",
     "costs a loop a fiftieth of its bandwidth or of its sampling interval: less than any margin",
     "test_adequacy.py",
-)
+)  # fmt: skip
 CANDIDATE_WEIGHT = Limit(
     0.05,
     "probability",

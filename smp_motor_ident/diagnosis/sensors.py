@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from smp_motor_ident.diagnosis.limits import FIT_EXPLAINS
+from smp_motor_ident.diagnosis.limits import FIT_EXPLAINS, LONG_DELAY, SHARP
 from smp_motor_ident.diagnosis.residuals import coloured
 from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.fit import Fit
@@ -31,7 +31,27 @@ def sensors(data: Experiments, fit: Fit) -> list[Finding]:
     if isinstance(s, Electromechanical) and s.lags:
         out.append(_current_lag(s.current_sensor, fit.z.current_lag))
     out += [_filtered_speed(fit)] * s.has("window") + [_late_command(s.shift)] * (s.shift > 0)
-    return out
+    return out + _long_delay(data, fit)
+
+
+def _long_delay(data: Experiments, fit: Fit) -> list[Finding]:
+    """Question a delay far beyond the motor's lag, which friction makes of a slow command."""
+    delay, lag = fit.z.delay, fit.z.time_constant
+    if delay <= LONG_DELAY.value * lag or "delay" not in fit.structure.free:
+        return []
+    change = np.abs(np.diff(data.hold_value))
+    seen = data.hold_end[:-1] + delay + lag < data.time[-1]
+    sharp = bool(np.any(change[seen] > SHARP.value * np.ptp(data.hold_value)))
+    return [
+        Finding(
+            "long_delay",
+            "warning" if sharp else "unreliable",
+            f"the delay of {delay:.3g} s is {delay / lag:.2g} times the time constant"
+            + ("" if sharp else ": a slow command that overcomes static friction late looks so"),
+            {"delay": delay, "time_constant": lag},
+            "" if sharp else "record steps: what is late after a step is delay",
+        )
+    ]
 
 
 def _late_command(shift: float) -> Finding:

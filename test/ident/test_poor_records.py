@@ -282,3 +282,26 @@ def test_a_second_lag_of_next_to_nothing_that_is_not_known_is_not_stated():
     assert hidden(0.9e-3, 0.6, False) and not hidden(1.1e-3, 0.6, False)
     assert not hidden(0.9e-3, 0.4, False) and not hidden(0.1, 0.4, True)
     assert hidden(0.1, 0.6, True)  # then the current would tell it
+
+
+@pytest.mark.parametrize("sharp", [False, True])
+def test_a_ramp_that_overcomes_friction_late_is_no_delay(sharp):
+    """Rest holds by 1.5 V, motion by 0.5 V: late by 0.3 s of a ramp; a step's delay is one."""
+    rng = np.random.default_rng(0)
+    t = np.arange(4000) / 1000
+    volts = 3.2 * t if not sharp else np.where(t % 1.0 > 0.5, 9.0, 0.0)
+    late = 200 if sharp else 0
+    heard = np.concatenate([np.zeros(late), volts[: t.size - late]])
+    w = np.zeros(t.size)
+    for k in range(1, t.size):
+        holds = 1.5 if w[k - 1] == 0 and not sharp else 0.5
+        driven = heard[k] > holds or w[k - 1] > 0
+        keep = np.exp(-1e-3 / 0.012)
+        w[k] = max(keep * w[k - 1] + (1 - keep) * 20.0 * (heard[k] - 0.5), 0.0) if driven else 0.0
+    found = estimate(Record("motor", t, volts, velocity=w + 0.3 * rng.standard_normal(t.size)))
+    said = {f.code: f.severity for f in found.findings}
+    if sharp:
+        assert said["long_delay"] == "warning"
+        assert found.value("delay") == pytest.approx(0.2, abs=2e-3)
+    else:
+        assert said.get("long_delay") == "unreliable" or found.value("delay") < 0.036, said
