@@ -119,22 +119,23 @@ def with_low_pass(
 
     Where nothing rubs and no current is measured, a low-pass is a second lag like any.
     """
-    s = best.structure
+    near = _likelier_mean(best, candidates)
+    s = near.structure
     apart = s.current or (s.order == 2 and s.friction != "none")
     if data.kind == ANGLE or data.quantum > 0 or s.has("window") > s.window or s.low_pass:
         return best
     richer = s.with_(window=True, low_pass=True)
     low = data.measured_as(richer.speed)
     if not s.window:
-        hardly = replace(best, z=best.z.with_(window=HARDLY * data.step))
+        hardly = replace(near, z=near.z.with_(window=HARDLY * data.step))
         if not apart or not POLICY.worth_a_fit(low, hardly, richer):
             return best
     say(f"trying {richer.label}")
-    starts = [best.z] if s.window else [best.z.with_(window=n * data.step) for n in WINDOWS]
+    starts = [near.z] if s.window else [near.z.with_(window=n * data.step) for n in WINDOWS]
     if s.order == 2 and not s.window:
-        lag = best.z.second_lag
-        starts.append(best.z.with_second_lag(0.2 * lag).with_(window=1.6 * lag))
-    tried = [descent.refine(low, richer, best, richer.complete(z), options) for z in starts]
+        lag = near.z.second_lag
+        starts.append(near.z.with_second_lag(0.2 * lag).with_(window=1.6 * lag))
+    tried = [descent.refine(low, richer, near, richer.complete(z), options) for z in starts]
     other = min(tried, key=lambda f: f.deviance)
     verdict, reason = POLICY.preferred(best, other)
     if verdict and other.noise_ratio > 0:  # what looked like torque noise may have been this
@@ -147,6 +148,18 @@ def with_low_pass(
         return other
     candidates.append(FittedCandidate(simple, f"as good as {other.structure.label}"))
     return simple
+
+
+def _likelier_mean(best: Fit, candidates: list[FittedCandidate]) -> Fit:
+    """Return a fit of a mean speed that is likelier than the choice by far, or the choice.
+
+    Where the filter is no mean, errors hang together, and what else is there seems not needed.
+    """
+    means = [r.fit for r in candidates if r.whole and r.fit.structure.window]
+    likeliest = min(means, key=lambda f: f.deviance, default=best)
+    more = likeliest.structure.size - best.structure.size
+    gained = best.deviance - likeliest.deviance
+    return likeliest if gained > POLICY.price(max(more, 1), best.samples) else best
 
 
 def _without_second_lag(data: Experiments, fit: Fit, options: Options) -> Fit:
