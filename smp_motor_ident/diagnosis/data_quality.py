@@ -285,7 +285,7 @@ def _standing(records: Sequence[Record], where: str) -> None:
     speeds = [s for s in speeds if s.size]
     if not speeds or (max(map(np.ptp, speeds)) == 0 and np.ptp([s[0] for s in speeds]) == 0):
         largest = max(float(np.abs(r.voltage).max()) for r in records)
-        level = float(speeds[0][0]) if speeds else 0.0
+        level = float(speeds[0][0]) + 0.0 if speeds else 0.0  # no -0
         raise SignalError(
             f"{where}: a standing motor or a dead encoder: the speed stays at {level:.3g} rad/s "
             f"while the voltage reaches {largest:.3g} V, no excitation above friction; drive "

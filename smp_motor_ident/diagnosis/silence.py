@@ -39,7 +39,7 @@ def silent(record: Record, where: str) -> None:
             continue
         if _swing(record, name, a, b) > SILENT_SWING.value:
             raise SignalError(
-                f"{where}: dead encoder, the {name} stays at {values[a + 1]:.6g} from "
+                f"{where}: dead encoder, the {name} stays at {values[a + 1] + 0.0:.6g} from "
                 f"t = {record.time[a]:.4g} s to {record.time[b]:.4g} s while the voltage reaches "
                 f"{np.abs(still).max():.3g} V; check the encoder's cable, or that nothing "
                 "blocks the motor"
