@@ -129,10 +129,10 @@ def mean_square(found: float, variance: float, most: float) -> float:
     ----------
     Mitchell and Beauchamp, J. Am. Stat. Assoc. 83 (1988), 1023 (spike and slab).
     """
-    deviation = math.sqrt(variance)
-    lags = (np.arange(POINTS) + 0.5) * most / POINTS
     if not math.isfinite(variance):
         return most**2 / 6
+    deviation = math.sqrt(variance)
+    lags = (np.arange(POINTS) + 0.5) * most / POINTS
     likely = np.exp(-0.5 * np.square((lags - found) / deviation))
     none = math.exp(-0.5 * (found / deviation) ** 2)
     return float(np.mean(likely * np.square(lags)) / (np.mean(likely) + none + 1e-300))

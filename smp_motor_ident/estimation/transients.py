@@ -25,6 +25,7 @@ from smp_motor_ident.likelihood.passes import answers, own_columns
 Array = NDArray[np.float64]
 
 PIECES = 24
+MOST = 1_000_000  # samples whose sensitivities are held in memory at once
 
 
 def widened_by_pieces(data: Experiments, fit: Fit) -> Fit:
@@ -34,7 +35,7 @@ def widened_by_pieces(data: Experiments, fit: Fit) -> Fit:
     ----------
     Bell and McCaffrey, Survey Methodology 28 (2002), 169 (errors of clusters, by their leverage).
     """
-    if data.current.size or fit.gain.any() or not fit.structure.free:
+    if data.current.size or fit.gain.any() or not fit.structure.free or data.size > MOST:
         return fit
     if not np.any(_runs(fit) < FEW_TRANSIENTS.value):
         return fit
