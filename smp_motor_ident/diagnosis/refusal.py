@@ -43,7 +43,8 @@ def refuse(
     if not explained and not within_resolution(data, fit) and not _follows(group, data, fit):
         raise SignalError(
             f"{where(group)}: the voltage does not explain the motion (fit {fitted:.0f} %); check "
-            "that voltage and encoder belong to the same motor, and that nothing else drives it"
+            "that voltage and encoder belong to the same motor, that the driver puts out what is "
+            "commanded (no clip at the supply, no coasting), and that nothing else drives it"
         )
     loose = [
         n
