@@ -70,9 +70,10 @@ def _scatter(data: Experiments, fit: Fit) -> float:
     x = np.zeros_like(base)
     several = carried(data, PATTERNS)
     for n in range(0, PATTERNS, several):
-        signs = 2.0 * rng.integers(0, 2, (voltage.size, min(several, PATTERNS - n))) - 1.0
-        made = signs * moved[:, None], np.zeros((0, 0, 0))
-        x += np.square(answered(data, fit, made, 1)).sum(axis=2) / PATTERNS
+        shape = voltage.size, min(several, PATTERNS - n)
+        made = (2.0 * rng.integers(0, 2, shape, np.int8) - 1.0) * moved[:, None]
+        moves = answered(data, fit, (made, np.zeros((0, 0, 0))), 1)
+        x += np.einsum("noc,noc->no", moves, moves) / PATTERNS
     x /= np.square(deviation)
     known = np.isfinite(values)
     square = np.minimum(np.square((values - base) / deviation)[known], MOST**2)

@@ -17,8 +17,9 @@ from smp_motor_ident.diagnosis.limits import (
     OFFSET_SURE,
     REST,
     SIGN_ALIKE,
+    SIGN_LEAST,
+    SIGN_NEARER,
     SIGN_SURE,
-    SIGN_TOLD,
 )
 from smp_motor_ident.diagnosis.lost_sign import lost_sign
 from smp_motor_ident.diagnosis.signs import lagged, likeness
@@ -315,14 +316,14 @@ def _signs(records: Sequence[Record], where: str) -> None:
         found = likeness(kept, [s for s in signals if s is not None], lags=what == "speed")
         if found is None:
             continue
-        sure = SIGN_SURE.value * found.chance
-        if found.wrong - found.right > max(0.2, min(sure, SIGN_ALIKE.value * found.wrong)):
+        sure, least = SIGN_SURE.value * found.chance, SIGN_LEAST.value
+        if found.wrong - found.right > max(least, min(sure, SIGN_ALIKE.value * found.wrong)):
             raise SignalError(
                 f"{where}: swapped sign, {what} runs against the voltage "
                 f"(correlation {-found.wrong:.2f}); {remedy}"
             )
-        follows = found.wrong > max(0.2, min(sure, SIGN_ALIKE.value))
-        if what == "speed" and follows and found.wrong > SIGN_TOLD.value * found.right:
+        follows = found.wrong > max(least, min(sure, SIGN_ALIKE.value))
+        if what == "speed" and follows and found.wrong > SIGN_NEARER.value * found.right:
             raise InsufficientExcitationError(
                 f"{where}: the voltage changes too fast for its sampling, {_period(records):.2g} "
                 "samples a period: a speed that comes late looks like one of the other sign; "

@@ -241,6 +241,10 @@ SIGN_SURE = Limit(
     "exceeds it by chance once in 2000 records of a standing motor",
     "test_signs.py",
 )  # fmt: skip
+SIGN_LEAST = Limit(
+    0.2, "correlation", "what explains less than a twentieth of a signal shows no sign of it",
+    "test_signs.py",
+)  # fmt: skip
 BACKWARD = Limit(
     0.1, "of the way",
     "physical: a load turns a motor back against a voltage of one sign, but not for long",
@@ -253,10 +257,10 @@ HALF_EXPLAINED = Limit(
 SIGN_ALIKE = Limit(
     0.5, "correlation, or share of one",
     "a quarter of the motion follows the voltage: it turns, however slowly the voltage changes; "
-    "the cosine of 60 degrees, twice what delays between those tried may miss (SIGN_TOLD)",
+    "the cosine of 60 degrees, twice what delays between those tried may miss (SIGN_NEARER)",
     "test_signs.py",
 )  # fmt: skip
-SIGN_TOLD = Limit(
+SIGN_NEARER = Limit(
     0.87, "share of a correlation",
     "physical: cosine of 30 degrees; at three samples to a period, delays that are tried in halves "
     "of a sample come so near to any phase, and the sign of what is nearer tells nothing",

@@ -28,6 +28,7 @@ Array = NDArray[np.float64]
 BLOCKS = 40  # whose sums of scores give the covariance
 ROWS = 6_000  # of each output that the regression has at most
 ROOM = 16_000_000  # numbers in a table of signals
+TILE = 2_000  # rows of it that are filled at once
 SEGMENTS = 20  # beyond which only the angle's offset of each is projected out
 
 
@@ -293,17 +294,21 @@ def _tables(data: Experiments, made: Sequence[Signal]) -> tuple[Array, Array]:
     """Return the signals as `Beside` takes them."""
     volts, added = np.zeros((0, 0)), np.zeros((0, 0, 0))
     if any(s.voltage is not None for s in made):
-        volts = np.zeros((data.hold_end.size, len(made)))
+        volts = _beside([s.voltage for s in made], data.hold_end.size)
     if any(s.output is not None or s.current is not None for s in made):
-        added = np.zeros((2, data.size, len(made)))
-    for n, signal in enumerate(made):
-        if signal.voltage is not None:
-            volts[:, n] = signal.voltage
-        if signal.output is not None:
-            added[0, :, n] = signal.output
-        if signal.current is not None:
-            added[1, :, n] = signal.current
+        both = [s.output for s in made], [s.current for s in made]
+        added = np.stack([_beside(columns, data.size) for columns in both])
     return volts, added
+
+
+def _beside(columns: Sequence[Array | None], rows: int) -> Array:
+    """Return columns beside each other, zero where there is none; by tiles that a cache holds."""
+    out = np.zeros((rows, len(columns)))
+    for a in range(0, rows, TILE):
+        for n, column in enumerate(columns):
+            if column is not None:
+                out[a : a + TILE, n] = column[a : a + TILE]
+    return out
 
 
 def _as_it_is(data: Experiments, signal: Signal) -> Array:

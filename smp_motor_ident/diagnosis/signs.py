@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
 from scipy.signal import lfilter
 
-from smp_motor_ident.diagnosis.limits import SIGN_LATE
+from smp_motor_ident.diagnosis.limits import SIGN_LATE, SIGN_LEAST
 from smp_motor_ident.record import Record
 
 Array = NDArray[np.float64]
@@ -56,6 +56,8 @@ def likeness(records: Sequence[Record], signals: Sequence[Array], lags: bool) ->
                 best = max(best, alike)
                 if alike < worst:
                     worst, reverse = alike, late
+    if -worst <= SIGN_LEAST.value:  # then nobody asks what chance would make of it
+        return Likeness(best, -worst, np.inf)
     sizes = [float(np.sqrt((x @ x) * (y @ y))) for x, y in reverse]
     spread = [size * _chance(x, y) for size, (x, y) in zip(sizes, reverse, strict=True)]
     chance = float(np.linalg.norm(spread)) / (sum(sizes) or 1.0)

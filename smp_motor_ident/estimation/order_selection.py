@@ -27,6 +27,7 @@ from smp_motor_ident.estimation.delay_and_averaging import (
 from smp_motor_ident.estimation.fit import Fit, Options, solve
 from smp_motor_ident.estimation.fitted import NORMAL_95
 from smp_motor_ident.estimation.initialisation import beginning, first_fit, initial_fit, ranked_on
+from smp_motor_ident.estimation.memory import remembered
 from smp_motor_ident.estimation.multistart import tried as other_starts
 from smp_motor_ident.estimation.selection import POLICY, FittedCandidate, sandwich_factor
 from smp_motor_ident.estimation.thinning import thinned
@@ -66,8 +67,7 @@ def explore(
         if auto and data.kind == SPEED:
             best = with_average(data, best, options, candidates, say)
     else:
-        found = _orders(data, base, options, say, candidates)
-        if found is None:
+        if (found := _orders(data, base, options, say, candidates)) is None:
             return []
         best = found
     best = varied(data, best, options, candidates, say)
@@ -117,22 +117,27 @@ def _orders(
 ) -> Fit | None:
     """Climb, by the number of parameters, as far as the data ask.
 
-    Candidates richer than a second lag are not fitted to a long record that asks for no more.
+    Candidates that come late are not fitted to a long record that shows no lag beside the motor's.
     """
     part = descent.screening_subset(thinned(data))
     structures = _structures(base, data.kind == SPEED, data.quantum > 0)
-    least = [s for s in structures if s.size <= SecondOrder.like(base, shape=True).size]
-    firsts = _first_fits(part, least, options, say, [])
     if part is not data and data.kind == SPEED and data.quantum == 0:
+        plain = [s for s in structures if not (s.delay or s.window)]
+        firsts = _first_fits(part, plain, options, say)
         likeliest = min(firsts, key=lambda f: f.deviance, default=None)
-        if likeliest and _enough(part, settled(part, likeliest, options, None)):
+        if likeliest and _enough(part, _settled(part, likeliest, options)):
             found: list[FittedCandidate] = []
             fit = _climbed(data, part, firsts, options, found)
             if fit and _enough(data, fit):
                 candidates += found
                 return fit
-    firsts = _first_fits(part, structures[len(least) :], options, say, firsts)
-    return _climbed(data, part, firsts, options, candidates)
+    return _climbed(data, part, _first_fits(part, structures, options, say), options, candidates)
+
+
+def _settled(part: Experiments, first: Fit, options: Options) -> Fit:
+    """Return a first fit carried on to the screening subset."""
+    question = (first, options)
+    return remembered(part, "settled", 1, question, lambda: settled(part, first, options, None))
 
 
 def _enough(data: Experiments, fit: Fit) -> bool:
@@ -199,7 +204,7 @@ def _alone(
     price = POLICY.price(1, simple.samples)
     if any(simple.deviance - r.deviance > price for r in others):
         return None
-    fit = _on_all(data, settled(part, simple, options, None), [], options)
+    fit = _on_all(data, _settled(part, simple, options), [], options)
     if not fit.converged or any(POLICY.more_shows(data, fit, simple, r) for r in others):
         return None
     candidates += [_no_better(data, part, fit, simple, r) for r in others]
@@ -216,10 +221,10 @@ def _no_better(
 
 
 def _first_fits(
-    part: Experiments, structures: list[Structure], options: Options, say: Say, known: list[Fit]
+    part: Experiments, structures: list[Structure], options: Options, say: Say
 ) -> list[Fit]:
-    """Fit candidates beside those that are known to the beginning of the screening subset."""
-    tried = list(known)
+    """Fit candidates to the beginning of the screening subset."""
+    tried: list[Fit] = []
     part = beginning(part)
     for structure in structures:
         say(f"fitting {structure.label}")

@@ -81,7 +81,8 @@ def _moves(data: Experiments, fit: Fit) -> Array:
         inner = parts[-1][:size, size:] @ prediction.inverse(parts[-1][size:, size:])
         seen.append(parts[-1][:size, :size] - inner @ parts[-1][size:, :size])
     whole = np.sum(seen, axis=0)
-    share = np.einsum("nf,fg,ng->n", rows[:, :size], prediction.inverse(whole), rows[:, :size])
+    free = rows[:, :size]
+    share = np.einsum("nf,nf->n", free @ prediction.inverse(whole), free)
     leverage = np.cumsum(share)
     shares = np.linspace(0.0, leverage[-1], PIECES + 1)[:-1]
     cuts = np.union1d(np.searchsorted(leverage, shares), data.starts)

@@ -12,7 +12,7 @@ from smp_motor_ident.estimation.candidate_starts import of_kind
 from smp_motor_ident.estimation.current_lag import with_current_lag
 from smp_motor_ident.estimation.delay_and_averaging import delay_without_noise, with_low_pass
 from smp_motor_ident.estimation.fit import Fit, Options, solve
-from smp_motor_ident.estimation.initialisation import initial_fit
+from smp_motor_ident.estimation.initialisation import beginning, initial_fit
 from smp_motor_ident.estimation.profile import RISE, one_level, rubbing
 from smp_motor_ident.estimation.selection import POLICY, FittedCandidate, sandwich_factor
 from smp_motor_ident.likelihood.experiments import Experiments
@@ -153,10 +153,11 @@ def may_rub(data: Experiments, fit: Fit, options: Options) -> bool:
     if one_level(data, fit) or friction_shows(data, fit, True):
         return True
     subset = of_kind(descent.screening_subset(data), fit)
-    if subset.size < data.size:
-        there = descent.refine(subset, fit.structure, fit, fit.z, options)
-        if _lost_by_rubbing(subset, there, options) > POLICY.hopeless:
-            return False
+    for few in (beginning(subset), subset):
+        if few.size < data.size:
+            there = descent.refine(few, fit.structure, fit, fit.z, options)
+            if _lost_by_rubbing(few, there, options) > POLICY.hopeless:
+                return False
     return _lost_by_rubbing(data, fit, options) < RISE
 
 
