@@ -292,7 +292,8 @@ def _put_answers(
 
 def _tables(data: Experiments, made: Sequence[Signal]) -> tuple[Array, Array]:
     """Return the signals as `Beside` takes them."""
-    volts, added = np.zeros((0, 0)), np.zeros((0, 0, 0))
+    volts: Array = np.zeros((0, 0))
+    added: Array = np.zeros((0, 0, 0))
     if any(s.voltage is not None for s in made):
         volts = _beside([s.voltage for s in made], data.hold_end.size)
     if any(s.output is not None or s.current is not None for s in made):
