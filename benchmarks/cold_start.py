@@ -120,19 +120,19 @@ def main() -> None:
         here = [x for x in lines if x["case"] == name]
         right = sum(x["right"] for x in here)
         rest = [x for x in here if not x["right"]]
-        told = sum(x["says"] != "sure" for x in rest)
+        warned = sum(x["says"] != "sure" for x in rest)
         fine = sum(x["says"] == "sure" and x["sigmas"] <= FAR for x in rest)
         asked = [x for x in here if "says" in x]
         wrong = [x for x in asked if x["says"] == "sure" and x["sigmas"] > FAR]
         rows.append(
-            (name, f"{right} of {len(here)} ({100 * right / len(here):.1f} %)", told,
-             fine, len(rest) - told - fine,
+            (name, f"{right} of {len(here)} ({100 * right / len(here):.1f} %)", warned,
+             fine, len(rest) - warned - fine,
              f"{sum(x['says'] == 'sure' for x in asked)} of {len(asked)}",
              sum(x["says"] == "unreliable" for x in asked),
              sum(x["says"] == "refused" for x in asked), len(wrong),
              f"{1e3 * np.median([x['seconds'] for x in here]):.0f} ms")
         )  # fmt: skip
-    head = ("case", "right minimum", "else told", "else the tool is right", "else silent",
+    head = ("case", "right minimum", "else warned", "else the tool is right", "else silent",
             "tool: sure", "unreliable",
             "refused", f"sure, yet off by > {FAR:g} std", "median time")  # fmt: skip
     print("\n" + table(head, rows))

@@ -219,7 +219,7 @@ FAULTS = [
 ]  # fmt: skip
 
 
-def unseen(commands: list[Any]) -> float:
+def unsampled(commands: list[Any]) -> float:
     """Return the time of which no sample reached the controller [s].
 
     Of a gap between samples it takes 0.1 s for evidence and no more, so that on a processor which
@@ -245,7 +245,7 @@ def trial(campaign: Campaign, faults: list[Fault], duration: float) -> str:
 
     def look() -> bool:
         # By the stamps of the plant: this process may be behind on a busy machine.
-        late = campaign.stamp() - begun > deadline - begin + (unseen(commands) if tried else 0.0)
+        late = campaign.stamp() - begun > deadline - begin + (unsampled(commands) if tried else 0.0)
         most = TRY_VOLTAGE if tried else 0.05
         if late and abs(campaign.voltage()) > most:
             wrong.append(f"{campaign.voltage():+.2f} V")

@@ -120,21 +120,21 @@ def _one(what: str, kind: str, friction: float, n: int) -> tuple[tuple[object, .
         del made, arrays
         flags = (counts, friction > 0, what != "fit")
         command = [sys.executable, __file__, folder, *(str(int(flag)) for flag in flags)]
-        told = json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
+        used = json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
     row = (
         what,
         kind,
         f"{friction} V",
         n,
-        f"{told['wall']:.3f}",
-        f"{told['processor']:.3f}",
-        f"{1e9 * told['processor'] / n:.0f} ns",
+        f"{used['wall']:.3f}",
+        f"{used['processor']:.3f}",
+        f"{1e9 * used['processor'] / n:.0f} ns",
         f"{size:.1f} MiB",
-        f"{told['more']:.1f} MiB",
-        f"{told['more'] / size:.1f}",
-        f"{np.abs(np.array(told['z']) - z.array[:3]).max():.1e}",
+        f"{used['more']:.1f} MiB",
+        f"{used['more'] / size:.1f}",
+        f"{np.abs(np.array(used['z']) - z.array[:3]).max():.1e}",
     )
-    return row, told["processor"]
+    return row, used["processor"]
 
 
 if __name__ == "__main__":

@@ -121,12 +121,12 @@ def identification_table(found):
         for name in ("dc_gain", "time_constant", "time_constant_product"):
             q = e.combinations.get(name)
             if q is None or q.value is None:
-                cells.append("not told")
+                cells.append("not identifiable")
                 continue
             true = getattr(truth, name)
             cells.append(f"{100 * (q.value / true - 1):+.3f} ± {100 * (q.std or 0) / true:.3f} %")
         refused = [n for n in e.unidentifiable if n != "coulomb_friction"]
-        cells.append(f"refused: {len(refused)}" if refused else "told")
+        cells.append(f"refused: {len(refused)}" if refused else "identifiable")
         lines.append(f"| {NUMBER[wheel]} | {wave} | " + " | ".join(cells) + " |")
     return lines
 

@@ -107,8 +107,8 @@ class Driver:
         """Count everything that is worse than all right."""
         for status in array.status if self.counting else ():
             if status.level != b"\x00":
-                told = f"{status.name}: {status.message}"
-                self.trouble[told] = self.trouble.get(told, 0) + 1
+                report = f"{status.name}: {status.message}"
+                self.trouble[report] = self.trouble.get(report, 0) + 1
 
     def spin(self, seconds: float) -> None:
         """Drive for some time."""
@@ -147,8 +147,8 @@ def soak(minutes: float, processes: dict[str, subprocess.Popen[bytes]]) -> bool:
     ages = 1e3 * np.array(driver.ages)
     p50, p99 = np.percentile(ages, [50, 99])
     print(f"age of feedback: p50 {p50:.2f} ms, p99 {p99:.2f} ms")
-    for told, count in driver.trouble.items():
-        print(f"{count} x {told}")
+    for report, count in driver.trouble.items():
+        print(f"{count} x {report}")
     if not driver.trouble:
         print("no watchdog has bitten, nothing was worse than all right")
     return held and not driver.trouble

@@ -8,7 +8,7 @@ speed, which the loop does not use, is what the plant reports (velocity_window 0
     python benchmarks/together_live.py [--rates 100 200 1000] [--steps 6]
 
 A step during which a sample or the answer to it came late by more than 0.7 of the period, or
-not at all, is told as disturbed: the machine ran something else then.
+not at all, is noted as disturbed: the machine ran something else then.
 """
 
 from __future__ import annotations
@@ -127,15 +127,15 @@ class Probe:
         self.catch_up()
         settling, instants, overshoot, longest = {}, [], 0.0, 0.0
         for wheel, seen in self.states.items():
-            told = [deserialize_message(data, PidState) for data in self.asked[wheel]]
-            told = [m for m in told if m.setpoint == target]
-            begin = runtime.seconds(told[0].header.stamp)
-            answered = np.array([runtime.seconds(m.header.stamp) for m in told])
+            states = [deserialize_message(data, PidState) for data in self.asked[wheel]]
+            states = [m for m in states if m.setpoint == target]
+            begin = runtime.seconds(states[0].header.stamp)
+            answered = np.array([runtime.seconds(m.header.stamp) for m in states])
             states = [deserialize_message(data, MotorState) for data in seen]
             stamps = np.array([runtime.seconds(m.header.stamp) for m in states])
             speed = np.array([m.velocity for m in states])[stamps > begin - 2 * period]
             stamps = stamps[stamps > begin - 2 * period]
-            late = max(float(np.diff(answered).max()), period + max(m.age for m in told))
+            late = max(float(np.diff(answered).max()), period + max(m.age for m in states))
             at = settling_time(stamps, speed / target)
             settling[wheel] = at - begin
             instants.append(at)
@@ -215,12 +215,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         steps, transition = measure(rate, arguments.steps, arguments.seed, arguments.priority)
         for one in steps:
             times = "  ".join(f"{1e3 * t:6.1f}" for t in one.settling.values())
-            told = (
+            words = (
                 "" if one.interval < LATE else f"  disturbed: a sample {one.interval:.1f} periods"
             )
             print(
                 f"{rate:9g}  {1e3 * transition:15.0f}  {times}  {1e3 * one.spread:11.1f}  "
-                f"{one.overshoot:13.2f}{told}",
+                f"{one.overshoot:13.2f}{words}",
                 flush=True,
             )
     return 0

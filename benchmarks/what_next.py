@@ -1,4 +1,4 @@
-"""Whether the proposed excitation brings what it promises: recorded, identified, compared.
+"""Whether the proposed excitation brings what it predicts: recorded, identified, compared.
 
 Each motor of Table 1 is recorded without current, identified, and asked what to record next; the
 proposal is simulated with the `excite` node's own Fourier voltage and identified from cold.
@@ -60,14 +60,14 @@ def main() -> None:
                 known = q.value is not None
                 stated.setdefault(name, []).append(q.std / truth[name] if known else np.inf)
                 errors.setdefault(name, []).append((q.value / truth[name] - 1) if known else np.inf)
-        for name, promised in proposal.relative_std.items():
+        for name, predicted in proposal.relative_std.items():
             rows.append(
                 (wheel, f"{proposal.amplitude:.3g} V, {proposal.band[0]:.2g} to "
                  f"{proposal.band[1]:.2g} Hz, {proposal.duration:.0f} s", name,
-                 f"{promised:.3%}", f"{np.median(stated[name]):.3%}",
+                 f"{predicted:.3%}", f"{np.median(stated[name]):.3%}",
                  f"{np.sqrt(np.mean(np.square(errors[name]))):.3%}")
             )  # fmt: skip
-    head = ("motor", "proposal", "parameter", "promised std", "std then stated", "rms error then")
+    head = ("motor", "proposal", "parameter", "predicted std", "std then stated", "rms error then")
     print(table(head, rows))
 
 

@@ -86,17 +86,17 @@ def test_counts_are_differenced_over_the_window_in_the_time_that_passed() -> Non
 
 
 def test_the_observer_takes_over_once_it_knows_the_usual_interval(monkeypatch) -> None:
-    told: list[tuple[object, ...]] = []
+    calls: list[tuple[object, ...]] = []
     real = loops.SpeedObserver
-    monkeypatch.setattr(loops, "SpeedObserver", lambda *given: told.append(given) or real(*given))
+    monkeypatch.setattr(loops, "SpeedObserver", lambda *given: calls.append(given) or real(*given))
     loop = make("observer")
     for k in range(LEARNT):  # nine of them shorter: the median is the longer
         loop.speed(DT if k < 9 else 2 * DT, 9.0, 0, 0.0)
         assert loop.source == "difference"
-    assert told == [(MODEL, 2 * DT, ENCODER, ObserverNoise(), 2, 1.0)]
+    assert calls == [(MODEL, 2 * DT, ENCODER, ObserverNoise(), 2, 1.0)]
     assert rest(loop, 3) == ["observer"] * 3
     loop.reset_speed()
-    assert math.isnan(loop.speed(DT, 9.0, 500, 0.0)) and len(told) == 1
+    assert math.isnan(loop.speed(DT, 9.0, 500, 0.0)) and len(calls) == 1
     assert loop.speed(DT, 9.0, 500, 0.0) == 0.0 and loop.source == "observer"
 
 

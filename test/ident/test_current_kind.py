@@ -1,4 +1,4 @@
-"""A current that is not the armature's is told by the winding's equation, and left out."""
+"""A current that is not the armature's is shown by the winding's equation, and left out."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A current that its sensor averages or low-passes: shown exactly, told from the winding.
+"""A current that its sensor averages or low-passes: shown exactly, apart from the winding.
 
 What a sensor shows of a locked rotor's current is a formula; of a turning motor it is taken of a
 simulation in steps 200 times as small.

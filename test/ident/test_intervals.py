@@ -140,11 +140,11 @@ def test_what_outlasts_a_run_of_samples_counts(share: float):
     sums[0] = rng.standard_normal(500) / np.sqrt(1 - share**2)
     for k in range(1, 60):
         sums[k] = share * sums[k - 1] + rng.standard_normal(500)
-    told = np.median(long_run(sums)) * (1 - share) ** 2 / 60
+    spread = np.median(long_run(sums)) * (1 - share) ** 2 / 60
     alone = np.median(np.square(sums).sum(axis=0)) * (1 - share) ** 2 / 60
     # Bartlett's weights leave some of a long memory out; chance adds a little where there is none.
-    assert told < 1.1
-    assert told - alone > 0.4 * (1 - alone), (told, alone)
+    assert spread < 1.1
+    assert spread - alone > 0.4 * (1 - alone), (spread, alone)
 
 
 def test_a_delay_not_worth_its_price_is_in_the_interval():

@@ -55,8 +55,8 @@ def test_the_mean_of_a_straight_line_is_that_of_its_held_samples():
 def test_what_lost_nothing_or_was_bridged_before_is_left_as_it_is():
     whole = ramps(0.0)
     assert bridged(whole) is whole
-    told = replace(ramps(0.1), findings=(Finding("samples_missing", "note", "by the reader"),))
-    assert bridged(told) is told
+    noted = replace(ramps(0.1), findings=(Finding("samples_missing", "note", "by the reader"),))
+    assert bridged(noted) is noted
     jittered = replace(whole, time=whole.time + 0.3 / RATE * np.sin(np.arange(len(whole))))
     assert bridged(jittered) is jittered
     long = replace(whole, time=whole.time + 4.0 / RATE * (np.arange(len(whole)) > 900))

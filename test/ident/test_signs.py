@@ -1,4 +1,4 @@
-"""A reversed answer is told from a late one, and said to be neither where nothing tells them."""
+"""A reversed answer is separated from a late one; where nothing separates them, it says so."""
 
 from dataclasses import replace
 

@@ -18,29 +18,29 @@ def counted(counts: list[int], starts: tuple[int, ...] = (0,)) -> Record:
     return Record("w", time, np.ones(count.size), count=count, starts=starts, hardware=hardware)
 
 
-def told(record: Record) -> list[int]:
+def kept(record: Record) -> list[int]:
     """Indices at which the angle is an output."""
     return [int(k) for k in np.flatnonzero(np.isfinite(prepare([record], False).output))]
 
 
 def test_of_a_standstill_the_middle_stays() -> None:
     moving, still = list(range(20)), [20] * 31
-    assert told(counted([*moving, *still, *range(21, 30)])) == [*range(20), 35, *range(51, 60)]
+    assert kept(counted([*moving, *still, *range(21, 30)])) == [*range(20), 35, *range(51, 60)]
 
 
 def test_a_segment_that_begins_at_rest_keeps_its_first_sample() -> None:
     counts = [0] * 30 + list(range(1, 11)) + [7] * 30 + list(range(8, 12))
-    assert told(counted(counts, (0, 40))) == [0, *range(30, 40), 40, *range(70, 74)]
+    assert kept(counted(counts, (0, 40))) == [0, *range(30, 40), 40, *range(70, 74)]
 
 
 def test_slow_motion_is_left_as_it_is() -> None:
     slow = [k // (REST - 1) for k in range(90)]
-    assert told(counted(slow)) == list(range(90))
+    assert kept(counted(slow)) == list(range(90))
 
 
 @pytest.mark.parametrize("rest", [REST, 10 * REST])
 def test_how_long_it_stands_adds_nothing(rest: int) -> None:
-    assert len(told(counted([0, 1, 2, *[3] * rest, 4, 5]))) == 6
+    assert len(kept(counted([0, 1, 2, *[3] * rest, 4, 5]))) == 6
 
 
 def test_a_motor_that_stands_under_a_noisy_angle_is_refused_whatever_its_current_tells() -> None:

@@ -78,8 +78,8 @@ def test_a_winding_that_may_begin_as_it_likes_has_its_price() -> None:
     here = evaluate(data, second, z, data.initial, data.initial, noise)
     # A volt over the winding for a millisecond, and the speed falls off with the motor's lag.
     answer = 1e-3 / (0.05 * LAG) * np.exp(-data.time / LAG)
-    told = np.square(answer / 0.05).sum() * 0.8**2
-    assert here.occam == pytest.approx(np.log1p(told), rel=0.1)
+    information = np.square(answer / 0.05).sum() * 0.8**2
+    assert here.occam == pytest.approx(np.log1p(information), rel=0.1)
     assert evaluate(data, first, z, data.initial, data.initial, noise).occam == 0.0
 
 

@@ -62,8 +62,8 @@ def test_a_step_alone_scatters_as_it_says(seed):
     known = np.linalg.inv(x.T @ x)
     left = data.output - x[:, 0] * (1 + 0 * since)
     left -= x @ (known @ x.T @ left)
-    told = x[:, :2] - np.outer(first, first @ x[:, :2]) / (first @ first)
-    weight = np.cumsum(np.einsum("ni,ij,nj->n", told, np.linalg.inv(told.T @ told), told))
+    rest = x[:, :2] - np.outer(first, first @ x[:, :2]) / (first @ first)
+    weight = np.cumsum(np.einsum("ni,ij,nj->n", rest, np.linalg.inv(rest.T @ rest), rest))
     cuts = [*np.searchsorted(weight, np.linspace(0, 2, 25)[:-1]), data.size]
     moves = []
     for a, b in pairwise(cuts):

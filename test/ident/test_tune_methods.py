@@ -1,4 +1,4 @@
-"""Every tuning method: its published numbers, and what it promises on the sampled loop."""
+"""Every tuning method: its published numbers, and what it specifies on the sampled loop."""
 
 from __future__ import annotations
 

@@ -114,13 +114,13 @@ def test_at_1_khz_the_observer_is_taken_and_said_why(estimates):
 def test_a_model_whose_error_shows_what_it_lacks_is_not_leaned_on(estimates):
     shown = Finding("backlash", "note", "the model's error shows backlash between motor and "
                     "encoder", {"explained_deviance": 200.0})  # fmt: skip
-    told = replace(estimates["rear_left"], findings=(shown,))
-    loop, why = choose_source(told, Loop(sample_time=0.001))
+    given = replace(estimates["rear_left"], findings=(shown,))
+    loop, why = choose_source(given, Loop(sample_time=0.001))
     assert loop.speed_source != "observer"
     assert "not the observer, which leans on the model: the model's error shows backlash" in why
     # What is neither shown nor excluded is no reason.
     doubt = replace(shown, evidence={"p_value": 0.01})
-    unsure = replace(told, findings=(doubt,))
+    unsure = replace(given, findings=(doubt,))
     assert choose_source(unsure, Loop(sample_time=0.001))[0].speed_source == "observer"
 
 

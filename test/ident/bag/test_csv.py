@@ -90,8 +90,8 @@ def test_a_comment_right_above_the_numbers_may_name_the_columns(
     path.write_text(above + "\n" + table(separator).partition("\n")[2])
     listing = list_topics(path)[0]
     assert listing.offers[0].fields == names
-    told = "no_column_names" in [finding.code for finding in listing.findings]
-    assert told is (names[0] == "c1")
+    unnamed = "no_column_names" in [finding.code for finding in listing.findings]
+    assert unnamed is (names[0] == "c1")
     record = read_records(path, [f"voltage={names[1]}:V velocity={names[2]}:deg/s sample_time=1"])
     np.testing.assert_allclose(record["motor"].velocity, np.deg2rad(Y))
 

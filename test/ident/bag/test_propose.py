@@ -110,7 +110,7 @@ def test_nothing_is_proposed_where_nothing_explains_the_speed(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize(
-    ("begin", "end", "told"),
+    ("begin", "end", "remark"),
     [
         pytest.param(0, N, "is constant", id="constant"),
         pytest.param(0, N - 1, "changes 1 time only", id="switched off at the last sample"),
@@ -118,7 +118,7 @@ def test_nothing_is_proposed_where_nothing_explains_the_speed(tmp_path: Path) ->
     ],
 )
 def test_a_step_that_no_test_can_confirm_is_proposed_by_names(
-    tmp_path: Path, begin: int, end: int, told: str
+    tmp_path: Path, begin: int, end: int, remark: str
 ) -> None:
     voltage = np.where((np.arange(N) >= begin) & (np.arange(N) < end), 12.0, 0.0)
     speed = 240 * (1 - np.exp(-np.maximum(T - T[begin], 0) / 0.1))
@@ -126,7 +126,7 @@ def test_a_step_that_no_test_can_confirm_is_proposed_by_names(
     path = write(tmp_path / "log.csv", Time_sec=T, Voltage_V=voltage, Speed_rad_s=speed)
     listing = list_topics(path)[0]
     assert listing.suggestion == ["voltage=Voltage_V", "velocity=Speed_rad_s", "time=Time_sec"]
-    assert listing.remark.startswith(f"Voltage_V {told}, so that the data cannot confirm")
+    assert listing.remark.startswith(f"Voltage_V {remark}, so that the data cannot confirm")
     assert len(read_records(path, listing.suggestion)["motor"]) == N
 
 

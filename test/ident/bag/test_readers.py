@@ -90,9 +90,9 @@ def test_objects_of_matlab_are_named_and_the_other_variables_read(
     path.write_bytes(whole[:128] + one + whole[128:] + two)
     record = read_records(path, MAP)["motor"]
     assert_motor(record)
-    told = [f.message for f in record.findings if f.code == "matlab_object"]
-    assert len(told) == 1
-    assert "speedSeries (timeseries), out (Simulink.Data)" in told[0]
+    said = [f.message for f in record.findings if f.code == "matlab_object"]
+    assert len(said) == 1
+    assert "speedSeries (timeseries), out (Simulink.Data)" in said[0]
     path.write_bytes(whole[:128] + one)
     with pytest.raises(BagError, match=r"speedSeries \(timeseries\); save its Time and Data as"):
         list_topics(path)
