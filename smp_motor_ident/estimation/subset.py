@@ -3,12 +3,23 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from smp_motor_ident.diagnosis.limits import REST
 from smp_motor_ident.record import Record
 
+Array = NDArray[np.float64]
+
 LONG = 2_000  # samples of rest: a quarter of what the start looks at (`start.resample`)
 MARGIN = 10  # samples of rest kept on either side
+SCATTER = 6.0  # deviations of the sensor's noise that are no motion
+
+
+def _scatter(values: Array) -> float:
+    """Return the deviation of what is white, by the usual size of fourth differences: 1 4 6 4 1."""
+    if values.size < 8:
+        return 0.0
+    return float(np.median(np.abs(np.diff(values, n=4)))) / 0.6745 / np.sqrt(70)
 
 
 def excited(record: Record) -> Record:
@@ -19,8 +30,9 @@ def excited(record: Record) -> Record:
         if values is None:
             continue
         y = np.where(np.isfinite(values), values, 0.0)
-        y = np.abs(y) if name == "velocity" else np.abs(np.diff(y, prepend=y[0]))
-        moves |= y > REST.value * float(np.max(y))
+        y = y if name == "velocity" else np.diff(y, prepend=y[0])
+        noise = 0.0 if name == "count" else _scatter(y)
+        moves |= np.abs(y) > max(REST.value * float(np.abs(y).max()), SCATTER * noise)
         break
     busy = np.flatnonzero(moves)
     # A rest shorter than the excitation does not hide it, and shows the sensor's noise.

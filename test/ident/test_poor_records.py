@@ -13,6 +13,7 @@ from smp_motor_ident.diagnosis import refusal, scope
 from smp_motor_ident.diagnosis.validation import percent
 from smp_motor_ident.errors import DesignError, SignalError
 from smp_motor_ident.estimate import estimate
+from smp_motor_ident.estimation.subset import excited
 from smp_motor_ident.estimation import quantities
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.simulation import simulate as free_run
@@ -168,6 +169,26 @@ def test_rest_before_the_excitation_changes_nothing():
     for name in ("dc_gain", "time_constant", "static_voltage"):
         a, b = with_it.combinations[name], without.combinations[name]
         assert abs(a.value - b.value) < b.std, name
+
+
+def test_the_scatter_of_an_angle_at_rest_is_no_motion():
+    driven = motors.record("rear_left", current=False, seconds=3.0)
+    n, rng = 9000, np.random.default_rng(3)
+    turn = 2 * np.pi / driven.hardware.counts_per_revolution
+    moved = np.r_[np.zeros(n), (driven.count - driven.count[0]) * turn]
+    scatter = 0.1 * np.abs(np.diff(moved)).max()
+    rested = replace(
+        driven,
+        time=np.arange(moved.size) / 200.0,
+        voltage=np.r_[np.zeros(n), driven.voltage],
+        velocity=None,
+        count=None,
+        position=moved + scatter * rng.standard_normal(moved.size),
+    )
+    assert len(excited(rested)) < 1.1 * len(driven)
+    found = estimate(rested).combinations["dc_gain"]
+    truth = estimate(driven).combinations["dc_gain"]
+    assert abs(found.value - truth.value) < 3 * found.std
 
 
 def test_an_angle_that_is_given_as_a_speed_is_recognised():
