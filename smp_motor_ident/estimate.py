@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_control.motor.parameters import PHYSICAL
 from smp_motor_ident.diagnosis import validation as validate
-from smp_motor_ident.diagnosis.adequacy import adequacy, stated
+from smp_motor_ident.diagnosis.adequacy import adequacy, lacks_something, stated
 from smp_motor_ident.diagnosis.advice import advise, assess, unsettled_rival
 from smp_motor_ident.diagnosis.beat import clock_share, on_beat
 from smp_motor_ident.diagnosis.bunched import merge_bunches
@@ -19,7 +18,7 @@ from smp_motor_ident.diagnosis.conditions import dependent
 from smp_motor_ident.diagnosis.current_kind import ARMATURE, current_kind
 from smp_motor_ident.diagnosis.data_quality import screen
 from smp_motor_ident.diagnosis.differenced import counts_again, rounding
-from smp_motor_ident.diagnosis.limits import LEAST_FIT, PROFILED
+from smp_motor_ident.diagnosis.limits import PROFILED
 from smp_motor_ident.diagnosis.lost_rows import bridged
 from smp_motor_ident.diagnosis.misfit import widened_by_misfit
 from smp_motor_ident.diagnosis.model_error import regression
@@ -31,15 +30,17 @@ from smp_motor_ident.diagnosis.scope import (
     blames_current,
     contradicted,
     current_left_out,
+    one_size_or_swing,
     scope,
 )
+from smp_motor_ident.diagnosis.unmodelled import unmodelled_dynamics
 from smp_motor_ident.errors import (
     CurrentError,
     InsufficientExcitationError,
     SignalError,
     SmpError,
 )
-from smp_motor_ident.estimation import flexible_shaft, order_selection, prediction
+from smp_motor_ident.estimation import flexible_shaft, order_selection
 from smp_motor_ident.estimation.averaging import candidate_weights, covering
 from smp_motor_ident.estimation.candidate_starts import of_kind
 from smp_motor_ident.estimation.consider_covariance import (
@@ -49,8 +50,9 @@ from smp_motor_ident.estimation.consider_covariance import (
     consider_left_out,
     consider_timing,
 )
-from smp_motor_ident.estimation.descent import ROUGHLY, refine
-from smp_motor_ident.estimation.fit import Fit, Prior, solve
+from smp_motor_ident.estimation.constraint import constrained
+from smp_motor_ident.estimation.driver_effect import declared, likeliest, through
+from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.hold_choice import chosen_hold, instant_deviation, otherwise
 from smp_motor_ident.estimation.profile import profiled
 from smp_motor_ident.estimation.quantisation import widened
@@ -64,10 +66,9 @@ from smp_motor_ident.estimation.transients import widened_by_pieces
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import Experiments, prepare
 from smp_motor_ident.model.measurement import ANGLE
-from smp_motor_ident.model.physical import physical
 from smp_motor_ident.model.structures import Structure
 from smp_motor_ident.record import Record
-from smp_motor_ident.result import Candidate, Estimate, FitPercent
+from smp_motor_ident.result import Estimate, FitPercent
 
 Array = NDArray[np.float64]
 
@@ -95,8 +96,9 @@ def estimate(
         ``auto``, or a candidate structure: ``static_gain``, ``first_order``,
         ``second_order``, ``electromechanical``.
     fixed : mapping of str to float, optional
-        Parameters that the user knows, by the names of `model.physical.PHYSICAL` or ``delay``,
-        ``averaging_window``; SI, at the motor shaft.
+        What the user knows, by the names of `model.physical.PHYSICAL` or ``delay``,
+        ``averaging_window``, ``sensor_lag``, and of the driver ``dead_zone``, ``clip_voltage``,
+        ``slew_rate``; SI, at the motor shaft.
     bounds : mapping of str to (float, float), optional
         Limits of physical parameters, where current is measured.
     loss : {'linear', 'huber'}
@@ -131,6 +133,15 @@ def estimate(
         return flexible_shaft.flexible_shaft(group, rigid)
     request = checked(group, model, fixed, bounds, loss, validation, progress)
     group = counts_again([bridged(merge_bunches(on_beat(r))) for r in group])
+
+    def behind(records: list[Record], kept: Sequence[Record] | None) -> Estimate:
+        return _checked(records, replace(request, validation=kept))
+
+    return declared(behind, group, request.validation, request.known)
+
+
+def _checked(group: list[Record], request: Request) -> Estimate:
+    """Estimate from records whose data are looked at first."""
     kind = current_kind(group) if request.may_leave_current else ARMATURE
     if kind != ARMATURE:
         group, request = request.without_current(group)
@@ -187,7 +198,10 @@ def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) 
         left = [r for r in left if r.fit is not one.fit]
         try:
             words = [*found, *_fallen_back(refused, one)]
-            return _stated(group, request, words, data, hold, [*left, one])
+            plain = _stated(group, request, words, data, hold, [*left, one])
+            if not lacks_something(plain):
+                return plain
+            return _through_driver(group, request, found, data, hold, one.fit) or plain
         except (SignalError, InsufficientExcitationError) as refusal:
             refused = refused or refusal
             # What was refused, and what is richer, is no rival that another's answer must cover.
@@ -195,7 +209,34 @@ def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) 
             left = [replace(r, whole=r.whole and r.fit.structure.size <= most) for r in left]
             left.append(replace(one, reason=f"refused: {refusal}", whole=False))
     assert refused is not None
+    again = _through_driver(group, request, found, data, hold, candidates[-1].fit)
+    if again:
+        return again
     raise refused
+
+
+def _through_driver(
+    group: list[Record],
+    request: Request,
+    found: Sequence[Finding],
+    data: Experiments,
+    hold: str,
+    fit: Fit,
+) -> Estimate | None:
+    """Return the estimate of a motor behind the driver that explains the records, if one does."""
+    if request.driver is not None or one_size_or_swing(data):
+        return None
+    request.say("what the driver makes of its command")
+    driver = likeliest(group, fit, hold, request.options)
+    if driver is None:
+        return None
+    known = request.validation
+    kept = None if known is None else driver.applied(known, fit, hold)
+    try:
+        e = _estimated(driver.records, replace(request, driver=driver, validation=kept), found)
+    except (SignalError, InsufficientExcitationError):
+        return None
+    return None if e.unreliable else through(e, driver)
 
 
 def _in_turn(candidates: list[FittedCandidate]) -> list[FittedCandidate]:
@@ -245,9 +286,12 @@ def _stated(
     fitted = validate.speed_fit(group, final, chosen)
     refuse(group, final, chosen, result, fitted)
     request.say("validating")
-    own, common = _validation(group, request, final, chosen, hold)
+    own, common = validate.validated(group, request, final, chosen, hold)
     percent = FitPercent(fitted, own)
     tests = residual_tests(final, chosen)
+    if request.driver is not None:  # what a controller that knows nothing of it meets
+        there = of_kind(prepare(request.driver.before, request.use_current, hold=hold), chosen)
+        tests = replace(tests, model_error=unmodelled_dynamics(there, chosen))
     numbers = stated(chosen, result)
     lacks, possible = adequacy(errors, data.step, numbers, tests)
     if not any(f.severity == "unreliable" for f in lacks):
@@ -270,7 +314,7 @@ def _stated(
         names=result.names,
         covariance=result.covariance,
         fit_percent=percent,
-        candidates=_candidates(candidates, chosen, group, data),
+        candidates=validate.candidates_of(candidates, chosen, group, data),
         residuals=tests,
         findings=tuple(findings),
         samples=data.size,
@@ -312,88 +356,13 @@ def _certain(
 ) -> tuple[Fit, float, dict[str, float]]:
     """Return the chosen fit with all of its uncertainty, and how the motor changes."""
     final = of_kind(data, fit)
-    chosen = _constrain(final, fit, request)
+    chosen = constrained(final, fit, request)
     few = thinned(final) if final.size > PROFILED.value else final
     chosen = profiled(few, widened_by_pieces(final, widened(final, chosen)), request.options)
     timed = consider_timing(final, chosen, instant_deviation(group, hold))
     timed = consider_drop(final, consider_clock(final, timed, clock_share(group)))
     chosen, friction_std = consider_friction(final, consider_left_out(final, timed))
+    if request.driver is not None:
+        chosen = request.driver.widened(chosen, hold, request.options)
     chosen, change = heterogeneous(final, chosen)
     return chosen, friction_std, change
-
-
-def _constrain(data: Experiments, fit: Fit, request: Request) -> Fit:
-    """Refit under what the user holds fixed or bounded, and what physics forbids."""
-    if not fit.structure.current:
-        return fit
-    known = request.known
-    values = physical(fit.z)
-    scale = {n: abs(values[n]) for n in PHYSICAL}
-    scale["viscous_friction"] = values["motor_constant"] ** 2 / values["resistance"]
-    priors = [
-        Prior(n, known[n], 1e-4 * max(abs(known[n]), 1e-2 * scale[n]))
-        for n in PHYSICAL
-        if n in known
-        and not (n == "resistance" or (n == "inductance" and "ln_te" in fit.structure.fixed))
-    ]
-    for name, (low, high) in request.bounds.items():
-        if not low <= values[name] <= high:
-            priors.append(Prior(name, float(np.clip(values[name], low, high)), 1e-4 * scale[name]))
-    if values["viscous_friction"] < 0 and "viscous_friction" not in known:
-        priors.append(
-            Prior(
-                "viscous_friction",
-                1e-9 * scale["viscous_friction"],
-                1e-4 * scale["viscous_friction"],
-            )
-        )
-    if not priors:
-        return fit
-    bound = replace(request.options, priors=tuple(priors))
-    return refine(data, fit.structure, fit, fit.z, bound)
-
-
-def _validation(
-    group: Sequence[Record], request: Request, data: Experiments, fit: Fit, hold: str
-) -> tuple[float | None, float | None]:
-    """Return the fit percent of held-out data: of their own motion, and of the records'."""
-    validation, options = request.validation, request.options
-    scatter = float(prediction.simulate(data, fit)[:, 0].std())
-    if validation is not None:
-        found = validate.held_out(list(validation), fit, hold, scatter)
-    else:
-        fitted, kept = validate.split(group)
-        if not kept:
-            return None, None
-        part = of_kind(prepare(fitted, fit.structure.current, hold=hold), fit)
-        if np.ptp(part.hold_value) == 0 or all(np.ptp(r.voltage) == 0 for r in kept):
-            return None, None
-        start = replace(fit, initial=part.initial)
-        refined = solve(part, fit.structure, start, options, 30, ROUGHLY)
-        found = validate.held_out(kept, refined, hold, scatter)
-    own, common = (x if np.isfinite(x) else None for x in found)
-    return own, common
-
-
-def _candidates(
-    candidates: Sequence[FittedCandidate], chosen: Fit, group: Sequence[Record], data: Experiments
-) -> tuple[Candidate, ...]:
-    out = []
-    for n, candidate in enumerate(candidates):
-        last = n == len(candidates) - 1
-        fit = chosen if last else candidate.fit
-        part = candidate.on
-        seen = (group, data) if part is None else ([], part)
-        value = validate.speed_fit(seen[0], of_kind(seen[1], fit), fit)
-        if value < LEAST_FIT.value and not last:
-            value = float("nan")  # a descent that left the motor behind has no fit to speak of
-        out.append(
-            Candidate(
-                candidate.label,
-                value if np.isfinite(value) else None,
-                candidate.bic,
-                last,
-                candidate.reason,
-            )
-        )
-    return tuple(out)

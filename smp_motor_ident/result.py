@@ -38,6 +38,12 @@ UNITS: Mapping[str, str] = {
     "averaging_window": "s",
     "sensor_lag": "s",
     "current_lag": "s",
+    "dead_zone": "V",
+    "clip_voltage": "V",
+    "slew_rate": "V/s",
+    "source_resistance_ratio": "1",
+    "brush_drop": "V",
+    "coasting_share": "1",
     "resonance_frequency": "rad/s",
     "resonance_damping": "1",
 }

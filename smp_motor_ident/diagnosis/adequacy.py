@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import fdtrc
 
-from smp_motor_ident.diagnosis.effects import Effect
+from smp_motor_ident.diagnosis.effects import EFFECTS, Effect
 from smp_motor_ident.diagnosis.limits import (
     EFFECT_BLOCKS,
     EFFECT_COVERED,
@@ -40,7 +40,7 @@ from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.quantities import Answer
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.model.physical import physical_gradients
-from smp_motor_ident.result import Quantity, ResidualTests
+from smp_motor_ident.result import Estimate, Quantity, ResidualTests
 
 Array = NDArray[np.float64]
 Stated = tuple[str, Quantity, Array]
@@ -206,6 +206,12 @@ def _farthest(shown: Evidence, numbers: Sequence[Stated], step: float) -> tuple[
         if shift > RELEVANT_BIAS.value * size and shift / quantity.std > times:
             worst, times, share = name, shift / quantity.std, shift / size
     return worst, times, share
+
+
+def lacks_something(estimate: Estimate) -> bool:
+    """Tell whether an estimate's findings leave room for what the model lacks."""
+    misfits = {effect.code for effect in EFFECTS} | {"conditions", "command_jitter"}
+    return estimate.unreliable or any(f.code in misfits for f in estimate.findings)
 
 
 def stated(fit: Fit, result: Answer) -> list[Stated]:

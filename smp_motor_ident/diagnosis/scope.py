@@ -33,7 +33,7 @@ def scope(
 ) -> list[Finding]:
     """Return what a reader must know of the values' meaning."""
     size = _one_size(data)
-    top = size or _one_swing(data)
+    top = one_size_or_swing(data)
     out = [*_one_size_of_voltage(top), *([] if result.level else _one_direction(data, result))]
     if alike:
         out.append(_alike(alike))
@@ -64,6 +64,11 @@ def _alike(weights: Mapping[str, float]) -> Finding:
         "sample faster, and excite with sharp steps of several sizes: a delay, an averaged "
         "speed and a second lag differ in the first samples after a step",
     )
+
+
+def one_size_or_swing(data: Experiments) -> float:
+    """Return the voltage's only size, or that of its only swing; 0 where there are more."""
+    return _one_size(data) or _one_swing(data)
 
 
 def _one_size(data: Experiments) -> float:

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident.diagnosis.limits import UNEXPLAINED
+from smp_motor_ident.diagnosis.limits import LEAST_FIT, UNEXPLAINED
 from smp_motor_ident.estimation import prediction
-from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.estimation.candidate_starts import of_kind
+from smp_motor_ident.estimation.descent import ROUGHLY
+from smp_motor_ident.estimation.fit import Fit, solve
+from smp_motor_ident.estimation.request import Request
+from smp_motor_ident.estimation.selection import FittedCandidate
 from smp_motor_ident.likelihood.experiments import Experiments, prepare
 from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.record import Record
-from smp_motor_ident.result import Estimate
+from smp_motor_ident.result import Candidate, Estimate
 
 Array = NDArray[np.float64]
 
@@ -146,6 +150,53 @@ def split(records: Sequence[Record], share: float = 0.7) -> tuple[list[Record], 
         fitted.append(record.slice(0, cut))
         kept_records.append(record.slice(cut, len(record)))
     return fitted, kept_records
+
+
+def validated(
+    group: Sequence[Record], request: Request, data: Experiments, fit: Fit, hold: str
+) -> tuple[float | None, float | None]:
+    """Return the fit percent of held-out data: of their own motion, and of the records'."""
+    validation, options = request.validation, request.options
+    scatter = float(prediction.simulate(data, fit)[:, 0].std())
+    if validation is not None:
+        found = held_out(list(validation), fit, hold, scatter)
+    else:
+        fitted, kept = split(group)
+        if not kept:
+            return None, None
+        part = of_kind(prepare(fitted, fit.structure.current, hold=hold), fit)
+        if np.ptp(part.hold_value) == 0 or all(np.ptp(r.voltage) == 0 for r in kept):
+            return None, None
+        start = replace(fit, initial=part.initial)
+        refined = solve(part, fit.structure, start, options, 30, ROUGHLY)
+        found = held_out(kept, refined, hold, scatter)
+    own, common = (x if np.isfinite(x) else None for x in found)
+    return own, common
+
+
+def candidates_of(
+    candidates: Sequence[FittedCandidate], chosen: Fit, group: Sequence[Record], data: Experiments
+) -> tuple[Candidate, ...]:
+    """Return the candidates as the result lists them, each with its fit percent."""
+    out = []
+    for n, candidate in enumerate(candidates):
+        last = n == len(candidates) - 1
+        fit = chosen if last else candidate.fit
+        part = candidate.on
+        seen = (group, data) if part is None else ([], part)
+        value = speed_fit(seen[0], of_kind(seen[1], fit), fit)
+        if value < LEAST_FIT.value and not last:
+            value = float("nan")  # a descent that left the motor behind has no fit to speak of
+        out.append(
+            Candidate(
+                candidate.label,
+                value if np.isfinite(value) else None,
+                candidate.bic,
+                last,
+                candidate.reason,
+            )
+        )
+    return tuple(out)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,9 @@ import numpy as np
 from smp_motor_control.motor.parameters import PHYSICAL
 from smp_motor_ident.diagnosis.limits import CURRENT_THERE
 from smp_motor_ident.errors import ParameterError
+from smp_motor_ident.estimation.driver_effect import DriverFit
 from smp_motor_ident.estimation.fit import Options
+from smp_motor_ident.model.driver import DECLARABLE
 from smp_motor_ident.model.structures import (
     CANDIDATES,
     MODELS,
@@ -21,7 +23,8 @@ from smp_motor_ident.model.structures import (
 from smp_motor_ident.record import Record
 
 LOSSES = {"linear": np.inf, "huber": 2.0}
-FIXABLE = (*PHYSICAL, "delay", "averaging_window", "sensor_lag")
+SENSOR = ("averaging_window", "sensor_lag")
+FIXABLE = (*PHYSICAL, "delay", *SENSOR, *DECLARABLE)
 
 
 @dataclass(frozen=True)
@@ -36,6 +39,7 @@ class Request:
     validation: Sequence[Record] | None  # Held-out records
     say: Callable[[str], None]  # receives in words what is being done
     use_current: bool  # whether the current is an output of the model
+    driver: DriverFit | None = None  # what the driver is taken to make of its command
 
     @property
     def options(self) -> Options:
@@ -74,7 +78,7 @@ def checked(
     for name, value in known.items():
         if name not in FIXABLE:
             raise ParameterError(f"fixed {name!r} is not one of {', '.join(FIXABLE)}")
-        positive = name in PHYSICAL[:4] or name in FIXABLE[-2:]
+        positive = name in (*PHYSICAL[:4], *SENSOR, *DECLARABLE)
         if not np.isfinite(value) or value < 0 or (positive and value == 0):
             raise ParameterError(f"fixed {name} = {value} is not a motor's")
     wheels = {r.wheel for r in group}

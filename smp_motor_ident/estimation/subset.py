@@ -19,7 +19,7 @@ def _scatter(values: Array) -> float:
     """Return the deviation of what is white, by the usual size of fourth differences: 1 4 6 4 1."""
     if values.size < 8:
         return 0.0
-    return float(np.median(np.abs(np.diff(values, n=4)))) / 0.6745 / np.sqrt(70)
+    return float(np.median(np.abs(np.diff(values, n=4))) / 0.6745 / np.sqrt(70))
 
 
 def excited(record: Record) -> Record:

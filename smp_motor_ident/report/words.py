@@ -26,6 +26,12 @@ EXPLAINED: Mapping[str, tuple[str, str, str]] = {
     "load_voltage": ("vl", "Load voltage", "offset that a constant load or sensor makes"),
     "averaging_window": ("w", "Averaging window", "over which the sensor averages the speed"),
     "sensor_lag": ("τs", "Sensor lag", "time constant of the speed's low-pass"),
+    "dead_zone": ("vd", "Dead zone", "command for which the driver puts out nothing"),
+    "clip_voltage": ("vc", "Clip voltage", "the most that the driver puts out"),
+    "slew_rate": ("dv/dt", "Slew rate", "how fast the driver's voltage rises"),
+    "source_resistance_ratio": ("ρ", "Source resistance", "of the supply, over the armature's"),
+    "brush_drop": ("vb", "Brush drop", "over brushes or transistors, whatever the current"),
+    "coasting_share": ("γ", "Coasting share", "of each PWM pause in which the motor runs free"),
     "current_lag": ("τi", "Current lag", "by which the current's sensor is late on average"),
 }
 """Symbol, name and meaning of every quantity."""

@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 
 from smp_motor_ident.errors import DesignError
+from smp_motor_ident.estimation.driver_effect import driver_of
 from smp_motor_ident.finding import Finding
+from smp_motor_ident.model.driver import Driver
 from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune.ensemble import Robustness, UncertaintyEnsemble, back_off, softer
 from smp_motor_ident.tune.feedback import Feedback
@@ -54,18 +56,26 @@ class Case:
     ensemble: UncertaintyEnsemble  # the motors that the data allow
     drawn: bool  # whether these were drawn; else the ensemble is the nominal motor alone
     friction: Friction  # what is known of it
+    driver: Driver  # what its driver makes of a command
     findings: tuple[Finding, ...]  # what is to be said of the estimate
+
+    @property
+    def swallowed(self) -> float:
+        """Voltage [V] that is surely lost before the motor turns, which feed-forward adds."""
+        return self.friction.known + self.driver.threshold
 
 
 def prepare(estimate: Estimate, loop: Loop, method: str, targets: dict[str, Any]) -> Case:
     """Sample the motor and the draws of its distribution; see :func:`design`."""
     chosen = _method(method, targets)
     findings = list(_reliability(estimate, bool(targets.get("accept_unreliable"))))
+    driver = driver_of(estimate)
+    loop = _behind(driver, loop)
     friction = friction_of(estimate, loop.supply_voltage)
     lag = lag_of_sensor(estimate) if loop.reports_speed else None
     level = one_size_of_voltage(estimate)
     findings += [one for one in (friction.finding, lag, level) if one is not None]
-    planned = np.array([friction.planned])
+    planned = np.array([friction.planned + driver.threshold])
     plant = sample(replace(motors_of(estimate), static_voltage=planned), loop)
     problem = Problem(plant, loop, targets, unmodelled_dynamics(estimate))
     required = _required(chosen, problem)
@@ -84,8 +94,24 @@ def prepare(estimate: Estimate, loop: Loop, method: str, targets: dict[str, Any]
         findings.append(Finding("no_uncertainty", "warning", words))
     drawn = motors is not None
     return Case(
-        estimate.wheel, chosen, problem, required, ensemble, drawn, friction, tuple(findings)
+        estimate.wheel,
+        chosen,
+        problem,
+        required,
+        ensemble,
+        drawn,
+        friction,
+        driver,
+        tuple(findings),
     )
+
+
+def _behind(driver: Driver, loop: Loop) -> Loop:
+    """Return a loop with what a driver takes of it: a ramp is late by half of its length."""
+    supply = min(loop.supply_voltage, driver.limit)
+    ramp = 0.5 * driver.ramp(supply)
+    usual, longest = loop.expected_delay + ramp, loop.loop_delay + ramp
+    return replace(loop, supply_voltage=supply, delay=longest, usual_delay=usual)
 
 
 def _reliability(estimate: Estimate, accepted: bool) -> tuple[Finding, ...]:

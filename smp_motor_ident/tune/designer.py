@@ -188,7 +188,7 @@ def wheel_gains(case: Case, controller: Controller) -> PidGains:
         setpoint_weight_p=controller.weight,
         setpoint_weight_d=controller.weight_d,
         derivative_filter_time_constant=fb.filter_time,
-        feedforward_static=case.friction.known,
+        feedforward_static=case.swallowed,
         feedforward_velocity=float(m.a0[0]) * ratio,
         feedforward_acceleration=float(m.a1[0]) * ratio,
     )

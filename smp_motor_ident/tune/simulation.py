@@ -13,10 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from smp_motor_ident._compile import compiled
+from smp_motor_ident.model.driver import Driver, terminal_voltage
 from smp_motor_ident.tune.arrays import Array
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.observer_model import NO_OBSERVER, SPEED
 from smp_motor_ident.tune.plant import Plant
+
+NO_EFFECT = Driver()
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,8 +63,12 @@ def simulate(
     count_angle: float = 0.0,
     friction: Array | None = None,
     modelled: float = 0.0,
+    driver: Driver = NO_EFFECT,
 ) -> Response:
-    """Run the closed loop from rest; ``modelled`` is the friction [V] that the observer knows."""
+    """Run the closed loop from rest; ``modelled`` is the friction [V] that the observer knows.
+
+    The driver stands between what the controller puts out, which the observer knows, and the motor.
+    """
     n, steps, fb = len(plant), inputs.low.size, controller.feedback
     back = 1.0 / np.asarray(controller.tracking)
     numbers = (fb.p, fb.i, fb.d, fb.filter_time, controller.weight, controller.weight_d,
@@ -77,7 +84,7 @@ def simulate(
         none if inputs.forward is None else inputs.forward,
         none if inputs.load is None else inputs.load,
         np.zeros(n) if friction is None else np.ascontiguousarray(friction),
-        modelled, count_angle, noise,
+        modelled, count_angle, noise, driver, np.broadcast_to(plant.motors.a0, n),
     )  # fmt: skip
     return Response(speed, voltage)
 
@@ -154,16 +161,18 @@ def _run(
     modelled: float,
     count_angle: float,
     noise: Array,
+    driver: Driver,
+    back_emf: Array,
 ) -> tuple[Array, Array]:
     n, m, s = taps.shape
     steps, window = low.size, average.shape[1]
     speed, voltage = np.empty((n, steps)), np.empty((n, steps))
     for j in range(n):
         p, i, d, filter_time, weight, weight_d, limit, back = controllers[j]
-        x, following, past = np.zeros(s), np.zeros(s), np.zeros(m)
+        x, following, past, put_out = np.zeros(s), np.zeros(s), np.zeros(m), np.zeros(m)
         angle = np.full(window + 1, count_angle * ((0.5 + 0.618034 * j) % 1.0))
         observer = np.zeros(by_angle.size)
-        integral = previous = rate = 0.0
+        integral = previous = rate = last = 0.0
         for k in range(steps):
             measured = observer[SPEED] if observer.size else x[sensor]
             if window > 0:
@@ -179,9 +188,10 @@ def _run(
             integral += T * (i * (reference - measured) + (given - wanted) * back)
             speed[j, k], voltage[j, k] = x[0], given
             for q in range(m - 1, 0, -1):
-                past[q] = past[q - 1]
+                past[q], put_out[q] = past[q - 1], put_out[q - 1]
             past[0] = given
-            drag = _drag(x[0], friction[j], past, taps_angle[j], load[k])
+            put_out[0], last = terminal_voltage(driver, given, back_emf[j] * x[0], last, T)
+            drag = _drag(x[0], friction[j], put_out, taps_angle[j], load[k])
             swept = 0.0
             following[:] = 0.0
             for a in range(s):
@@ -190,7 +200,7 @@ def _run(
                     following[a] += phi[j, a, b] * x[b]
             # Load and friction act at once, the controller's voltage after its delay.
             for q in range(m):
-                volts = past[q] - load[k] - drag
+                volts = put_out[q] - load[k] - drag
                 swept += taps_angle[j, q] * volts
                 for a in range(s):
                     following[a] += taps[j, q, a] * volts

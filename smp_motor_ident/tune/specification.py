@@ -100,14 +100,15 @@ def figures_of(
     if loop.reported_noise > 0:
         shape = (len(plant), time.size)
         noise = loop.reported_noise * np.random.default_rng(0).standard_normal(shape)
-    forward = plan.forward + known * np.sign(plan.reference + plan.forward)
+    forward = plan.forward + case.swallowed * np.sign(plan.reference + plan.forward)
     run = simulate(
         plant,
         controller,
         replace(plan.inputs, forward=forward, noise=noise),
         count_angle=0.0 if np.any(plant.motors.sensor_lag > 0) else loop.count_angle,
         friction=drawn.static_voltage if case.drawn else np.array([known]),
-        modelled=known,
+        modelled=case.swallowed,
+        driver=case.driver,
     )
     each = [
         step_figures(time, speed, volts, change)

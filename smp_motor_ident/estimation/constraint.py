@@ -1,0 +1,45 @@
+"""Refits under what the user holds fixed or bounded, and what physics forbids."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from smp_motor_control.motor.parameters import PHYSICAL
+from smp_motor_ident.estimation.descent import refine
+from smp_motor_ident.estimation.fit import Fit, Prior
+from smp_motor_ident.estimation.request import Request
+from smp_motor_ident.likelihood.experiments import Experiments
+from smp_motor_ident.model.physical import physical
+
+
+def constrained(data: Experiments, fit: Fit, request: Request) -> Fit:
+    """Return a fit that keeps to what is known, and to friction that takes power."""
+    if not fit.structure.current:
+        return fit
+    known = request.known
+    values = physical(fit.z)
+    scale = {n: abs(values[n]) for n in PHYSICAL}
+    scale["viscous_friction"] = values["motor_constant"] ** 2 / values["resistance"]
+    priors = [
+        Prior(n, known[n], 1e-4 * max(abs(known[n]), 1e-2 * scale[n]))
+        for n in PHYSICAL
+        if n in known
+        and not (n == "resistance" or (n == "inductance" and "ln_te" in fit.structure.fixed))
+    ]
+    for name, (low, high) in request.bounds.items():
+        if not low <= values[name] <= high:
+            priors.append(Prior(name, float(np.clip(values[name], low, high)), 1e-4 * scale[name]))
+    if values["viscous_friction"] < 0 and "viscous_friction" not in known:
+        priors.append(
+            Prior(
+                "viscous_friction",
+                1e-9 * scale["viscous_friction"],
+                1e-4 * scale["viscous_friction"],
+            )
+        )
+    if not priors:
+        return fit
+    bound = replace(request.options, priors=tuple(priors))
+    return refine(data, fit.structure, fit, fit.z, bound)

@@ -1,0 +1,283 @@
+"""A driver's effect on its command, estimated beside the motor: the likeliest of a table.
+
+The size is sought along the profile of the likelihood, all of the motor fitted again for each.
+What follows then sees the voltage at the terminals in place of the command.
+Derivation: docs/derivations.md, section 13.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import fminbound
+
+from smp_motor_ident.estimation import prediction
+from smp_motor_ident.estimation.candidate_starts import of_kind
+from smp_motor_ident.estimation.descent import ROUGHLY, initial_of, refine
+from smp_motor_ident.estimation.fit import Fit, Options, solve
+from smp_motor_ident.estimation.fitted import NORMAL_95
+from smp_motor_ident.estimation.selection import POLICY, sandwich_factor
+from smp_motor_ident.finding import Finding
+from smp_motor_ident.likelihood.experiments import Experiments, prepare
+from smp_motor_ident.model.driver import DECLARABLE, EFFECTS, SLEW, Driver, DriverEffect, Rows
+from smp_motor_ident.model.structures import FirstOrder
+from smp_motor_ident.record import Record
+from smp_motor_ident.result import UNITS, Estimate, Quantity
+
+Array = NDArray[np.float64]
+
+TURNS = 3  # of a motion that the effect asks for, and that follows from it
+NEAR = 0.02  # e-folds of the size at which its deviance is first looked at beside the best
+RISE = 2.0  # of the deviance on both sides together, from which its curvature is read
+PARABOLAS = 5  # that are laid through it at most
+CLOSE = 0.2  # standard deviations within which a size is the likeliest
+MOST = 25  # sizes that are tried between those of the table
+FEW = 8  # passes of a descent while the size is sought
+
+
+@dataclass(frozen=True, eq=False)
+class DriverFit:
+    """An effect of known size, and the records with the voltage at the terminals."""
+
+    effect: DriverEffect
+    driver: Driver
+    std: float  # of its size
+    before: list[Record]  # as they were
+    records: list[Record]
+    beside: list[Record]  # the same for a size one standard deviation greater
+    fit: Fit  # the motor behind it, roughly
+    # the same of other effects that explain the records as well
+    rivals: tuple[Fit, ...] = ()
+
+    def widened(self, fit: Fit, hold: str, options: Options) -> Fit:
+        """Return a fit with its covariance widened by what is not known of the driver."""
+        other = refine(_prepared(self.beside, hold, fit), fit.structure, fit, fit.z, options)
+        moves = [other.z.array - fit.z.array]
+        moves += [rival.z.array - self.fit.z.array for rival in self.rivals]
+        for move in moves:
+            fit = fit.along(fit.structure.of_free(move))
+        return fit
+
+    def applied(self, records: Sequence[Record], fit: Fit, hold: str) -> list[Record]:
+        """Return other records of the same motor with the voltage at the terminals."""
+        data = of_kind(prepare(records, False, hold=hold), fit)
+        rows = rows_of(data, records, prediction.settle(data, fit))
+        return with_voltages(records, rows.through(self.driver))
+
+
+def through(estimate: Estimate, found: DriverFit) -> Estimate:
+    """Return the estimate of a motor behind a driver, with what is known of the driver."""
+    size, std = found.driver.size, found.std
+    interval = max(size - NORMAL_95 * std, 0.0), size + NORMAL_95 * std
+    unit = UNITS[found.effect.quantity]
+    words = f"the records show {found.effect.cause}: {size:.3g} ± {std:.2g} {unit}"
+    return _behind(estimate, found.effect, Quantity(size, std, interval, unit), words, found.driver)
+
+
+def declared(
+    estimate: Callable[[list[Record], Sequence[Record] | None], Estimate],
+    group: list[Record],
+    validation: Sequence[Record] | None,
+    known: Mapping[str, float],
+) -> Estimate:
+    """Return the estimate of a motor behind a driver of which the user says what it does."""
+    there = [(effect, known[name]) for name, effect in DECLARABLE.items() if name in known]
+    drivers = []
+    for effect, size in there:
+        driver = Driver(effect.kind, size, max(float(np.abs(r.voltage).max()) for r in group))
+        drivers.append(driver)
+        group = [_driven(r, driver) for r in group]
+        validation = validation and [_driven(r, driver) for r in validation]
+    found = estimate(group, validation)
+    for (effect, size), driver in zip(there, drivers, strict=True):
+        unit = UNITS[effect.quantity]
+        words = f"as declared, there is {effect.cause}: {size:.3g} {unit}"
+        quantity = Quantity(size, unit=unit, status="fixed")
+        found = _behind(found, effect, quantity, words, driver)
+    return found
+
+
+def _driven(record: Record, driver: Driver) -> Record:
+    """Return a record with the voltage that a driver makes of its command."""
+    first = np.zeros(len(record), dtype=np.bool_)
+    first[list(record.starts)] = True
+    interval = np.diff(record.time, prepend=record.time[0])
+    rows = Rows(record.voltage, np.zeros(len(record)), interval, first, 0.0)
+    return replace(record, voltage=rows.through(driver))
+
+
+def _behind(
+    estimate: Estimate, effect: DriverEffect, quantity: Quantity, words: str, driver: Driver
+) -> Estimate:
+    finding = Finding(
+        effect.code,
+        "warning" if quantity.status == "estimated" else "note",
+        f"{words}; the motor is estimated behind it, and a controller meets both",
+        {"quantity": effect.quantity, "size": driver.size, "std": quantity.std,
+         "largest_command": driver.top},
+        "" if quantity.status == "fixed" else "record the voltage at the motor's terminals to see "
+        f"it, or declare it with --fix {effect.quantity}=",
+    )  # fmt: skip
+    combinations = {**estimate.combinations, effect.quantity: quantity}
+    return replace(estimate, combinations=combinations, findings=(finding, *estimate.findings))
+
+
+def driver_of(estimate: Estimate) -> Driver:
+    """Return the driver behind which a motor was estimated."""
+    for effect in EFFECTS:
+        for finding in estimate.findings:
+            size, top = (finding.evidence.get(n) for n in ("size", "largest_command"))
+            if finding.code == effect.code and isinstance(size, float) and isinstance(top, float):
+                return Driver(effect.kind, size, top)
+    return Driver()
+
+
+def with_voltages(group: Sequence[Record], voltage: Array) -> list[Record]:
+    """Return records with other voltages, one after the other."""
+    ends = np.cumsum([0, *map(len, group)])
+    return [replace(r, voltage=voltage[a:b]) for r, (a, b) in zip(group, pairwise(ends))]
+
+
+def rows_of(data: Experiments, group: Sequence[Record], fit: Fit) -> Rows:
+    """Return the commands of records and how the fitted motor runs."""
+    speed = prediction.simulate(data, fit)[:, 0]
+    first = np.zeros(data.size, dtype=np.bool_)
+    first[data.starts[:-1]] = True
+    middle, interval = speed.copy(), np.full(data.size, data.step)
+    middle[1:] = np.where(first[1:], speed[1:], 0.5 * (speed[1:] + speed[:-1]))
+    interval[1:] = np.where(first[1:], data.step, np.diff(data.time))
+    back = float(fit.structure.internal(fit.z)[0][2])
+    command = np.concatenate([r.voltage for r in group])
+    return Rows(command, back * middle, interval, first, fit.z.time_constant)
+
+
+def likeliest(group: Sequence[Record], fit: Fit, hold: str, options: Options) -> DriverFit | None:
+    """Return the effect that explains the records best; None where none is worth its number."""
+    found = [
+        driver
+        for effect in EFFECTS
+        for start, how in _starts(group, fit, hold, options, effect)
+        if (driver := _Search(list(group), how, start, options, effect).best()) is not None
+    ]
+    price, factor = POLICY.price(1, fit.samples), sandwich_factor(fit)
+
+    def cost(one: Fit) -> float:
+        return (one.deviance - fit.deviance) / factor + price * (
+            one.structure.size - fit.structure.size
+        )
+
+    found = sorted((d for d in found if cost(d.fit) < -price), key=lambda d: cost(d.fit))
+    if not found:
+        return None
+    best, *others = found
+    near = [d.fit for d in others if cost(d.fit) < cost(best.fit) + price]
+    return replace(best, rivals=tuple(near))
+
+
+def _starts(
+    group: Sequence[Record], fit: Fit, hold: str, options: Options, effect: DriverEffect
+) -> list[tuple[Fit, str]]:
+    """Return the motors with which an effect's size is sought, and how the command was held.
+
+    All that may stand for the effect is put back: torque noise, a command that ran otherwise or
+    comes late, of a limited rate a second lag; and friction, for which the effect may stand.
+    """
+    s = fit.structure
+    if s.friction == "none" and "vc_plus" not in s.fixed:
+        s = s.with_(friction="symmetric")
+    ways = [(s, hold)]
+    plain = s.with_(held="before", shift=0.0, delay=s.delay and "delay" in s.fixed)
+    if plain != s or hold != "held":
+        ways.append((plain, "held"))
+    if effect.kind == SLEW and s.order == 2 and not s.current:
+        ways.append((FirstOrder.like(plain), "held"))
+    out = []
+    for structure, how in ways:
+        near = replace(fit, structure=structure, noise_ratio=0.0)
+        data = _prepared(group, how, near)
+        out.append((refine(data, structure, near, structure.complete(fit.z), options), how))
+    return out
+
+
+def _prepared(group: Sequence[Record], hold: str, fit: Fit) -> Experiments:
+    return of_kind(prepare(group, fit.structure.current, hold=hold), fit)
+
+
+class _Search:
+    """The profile of the likelihood along one effect's size."""
+
+    def __init__(
+        self,
+        group: list[Record],
+        hold: str,
+        fit: Fit,
+        options: Options,
+        effect: DriverEffect,
+    ) -> None:
+        self.group, self.hold, self.options, self.effect = group, hold, options, effect
+        self.data, self.near = _prepared(group, hold, fit), fit
+        self.turns = TURNS if effect.follows_motion else 1
+
+    def at(self, size: float, passes: int = 30) -> tuple[Fit, Experiments, list[Record]]:
+        """Return the motor fitted for a size, and what it was fitted to."""
+        data, fit, records = self.data, self.near, self.group
+        for _ in range(self.turns):
+            rows = rows_of(data, self.group, fit)
+            voltage = rows.through(Driver(self.effect.kind, size, rows.top))
+            records = with_voltages(self.group, voltage)
+            data = _prepared(records, self.hold, self.near)
+            start = fit.at(fit.z, initial_of(data, fit))
+            fit = solve(data, fit.structure, start, self.options, passes, ROUGHLY)
+        return fit, data, records
+
+    def deviance(self, logarithm: float) -> float:
+        """Return the deviance at a size's logarithm; the next fit begins from the best so far."""
+        fit, data, _ = self.at(float(np.exp(logarithm)), FEW)
+        if fit.deviance < self.near.deviance:
+            self.near, self.data = fit, data
+        return fit.deviance if np.isfinite(fit.deviance) else 1e300
+
+    def best(self) -> DriverFit | None:
+        """Return the likeliest size with its deviation; None where none is likelier than none."""
+        none = self.near.deviance
+        rows = rows_of(self.data, self.group, self.near)
+        grid = np.log(self.effect.scale(rows) * np.array(self.effect.shares))
+        values = [self.deviance(x) for x in grid]
+        k = int(np.argmin(values))
+        if not values[k] < none:
+            return None
+        low = float(grid[k - 1] if k else 2 * grid[0] - grid[1])
+        high = float(grid[k + 1] if k + 1 < grid.size else 2 * grid[-1] - grid[-2])
+        x = float(fminbound(self.deviance, low, high, xtol=1e-2, maxfun=MOST, disp=0))
+        return self._polished(x, rows.top)
+
+    def _polished(self, x: float, top: float) -> DriverFit:
+        """Go on to the bottom by parabolas through three deviances, whose curvature is its std."""
+        away = NEAR
+        for _ in range(PARABOLAS):
+            fit, data, records = self.at(float(np.exp(x)))
+            self.near, self.data = fit, data
+            low, high = self._beside(x, away)
+            while low + high - 2 * fit.deviance < RISE and away < 1.0:
+                away *= 2
+                low, high = self._beside(x, away)
+            curved = max(low + high - 2 * fit.deviance, 0.1 * RISE)
+            std = away * float(np.sqrt(2 * sandwich_factor(fit) / curved))
+            move = 0.5 * away * (low - high) / curved
+            if abs(move) < CLOSE * std:
+                break
+            x += float(np.clip(move, -2 * away, 2 * away))
+            away = min(max(std, 0.1 * NEAR), 1.0)
+        size = float(np.exp(x))
+        driver = Driver(self.effect.kind, size, top)
+        more = self.at(size * float(np.exp(std)))[2]
+        return DriverFit(self.effect, driver, size * std, self.group, records, more, fit)
+
+    def _beside(self, x: float, away: float) -> tuple[float, float]:
+        """Return the deviances so many e-folds of the size below and above."""
+        low, high = (self.at(float(np.exp(x + s * away)))[0].deviance for s in (-1, 1))
+        return low, high

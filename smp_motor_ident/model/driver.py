@@ -1,0 +1,167 @@
+"""What a driver puts out for a command, each effect by one number: a Hammerstein model's input.
+
+Derivation: docs/derivations.md, section 13.
+
+References
+----------
+E. Bai, Identification of linear systems with hard input nonlinearities of known structure,
+Automatica 38 (2002), 853-860 (one number beside a linear system: separable least squares).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smp_motor_ident._compile import compiled, inlined
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+NOTHING, DEAD_ZONE, CLIP, SLEW, SAG, DROP, COAST = range(7)
+
+
+class Driver(NamedTuple):
+    """One effect and its size."""
+
+    kind: int = NOTHING
+    size: float = 0.0
+    top: float = 1.0  # command [V] at which it is always on: what duty refers to
+
+    @property
+    def threshold(self) -> float:
+        """Command [V] that it swallows before anything moves."""
+        return self.size if self.kind == DEAD_ZONE else 0.0
+
+    @property
+    def limit(self) -> float:
+        """Largest voltage [V] that it puts out."""
+        return self.size if self.kind == CLIP else float("inf")
+
+    def ramp(self, voltage: float) -> float:
+        """Return how long [s] it takes to a voltage [V]."""
+        return voltage / self.size if self.kind == SLEW else 0.0
+
+
+@inlined
+def _beyond(voltage: float, threshold: float) -> float:
+    return voltage - min(max(voltage, -threshold), threshold)
+
+
+@compiled
+def terminal_voltage(
+    driver: Driver, command: float, back_emf: float, before: float, interval: float
+) -> tuple[float, float]:
+    """Return the mean voltage at the motor's terminals over an interval, and that at its end [V].
+
+    ``before`` is the voltage at its beginning; only a slew limit remembers it.
+    """
+    kind, size, top = driver
+    out = command
+    if kind == DEAD_ZONE:
+        out = _beyond(command, size)
+    elif kind == CLIP:
+        out = min(max(command, -size), size)
+    elif kind == SLEW:
+        step, most = command - before, size * interval
+        end = before + min(max(step, -most), most)
+        ramp = min(abs(step) / most, 1.0) if most > 0.0 else 1.0
+        return end - 0.5 * (end - before) * ramp, end
+    elif kind == SAG:  # a source's own resistance, which sees duty times the current
+        duty = command / top
+        out = back_emf + (command - back_emf) / (1 + size * duty * duty)
+    elif kind == DROP:
+        out = back_emf + _beyond(command - back_emf, size)
+    elif kind == COAST:  # free for the rest of each period
+        out = command + size * (1 - abs(command) / top) * back_emf
+    return out, out
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """A command, row by row, and how the motor runs meanwhile."""
+
+    command: Array  # [V]
+    back_emf: Array  # mean over each row's interval [V]
+    interval: Array  # its length [s]
+    first: Flags  # where a segment begins
+    time_constant: float  # of the motor [s]
+
+    @property
+    def top(self) -> float:
+        """Largest command [V]."""
+        return float(np.abs(self.command).max(initial=0.0)) or 1.0
+
+    def through(self, driver: Driver) -> Array:
+        """Return the mean voltage at the terminals over each row's interval [V]."""
+        return _through(driver, self.command, self.back_emf, self.interval, self.first)
+
+
+@compiled
+def _through(
+    driver: Driver, command: Array, back_emf: Array, interval: Array, first: Flags
+) -> Array:
+    out = np.empty(command.shape[0])
+    now = 0.0
+    for k in range(command.shape[0]):
+        if first[k]:
+            now = command[k]
+        out[k], now = terminal_voltage(driver, command[k], back_emf[k], now, interval[k])
+    return out
+
+
+@dataclass(frozen=True)
+class DriverEffect:
+    """One way in which the voltage at the terminals is not the command."""
+
+    kind: int
+    code: str  # of its finding
+    quantity: str  # name of the number that it is described by
+    cause: str
+    # Sizes between which its own is looked for: in the unit, or as shares of `scale`
+    shares: tuple[float, ...]
+
+    def scale(self, rows: Rows) -> float:
+        """Return what the shares are of."""
+        if self.kind == SLEW:
+            return rows.top / rows.time_constant
+        return 1.0 if self.kind in (SAG, COAST) else rows.top
+
+    @property
+    def follows_motion(self) -> bool:
+        """Whether it depends on how the motor runs."""
+        return self.kind in (SAG, DROP, COAST)
+
+
+EFFECTS = (
+    DriverEffect(
+        DEAD_ZONE, "dead_zone", "dead_zone", "a dead zone of the driver", (0.01, 0.03, 0.1, 0.3)
+    ),
+    DriverEffect(
+        CLIP, "clip", "clip_voltage", "a command that is clipped at the supply",
+        (0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0),
+    ),
+    DriverEffect(
+        SLEW, "slew", "slew_rate", "a driver that limits how fast the voltage rises",
+        (0.1, 0.3, 1.0, 3.0, 10.0, 30.0),
+    ),
+    DriverEffect(
+        SAG, "supply_sag", "source_resistance_ratio", "a supply that sags under load",
+        (0.03, 0.1, 0.3, 1.0),
+    ),
+    DriverEffect(
+        DROP, "brush_drop", "brush_drop", "a voltage drop over brushes or transistors",
+        (0.01, 0.03, 0.1, 0.3),
+    ),
+    DriverEffect(
+        COAST, "coast", "coasting_share", "a driver that lets the motor coast (fast decay)",
+        (0.1, 0.3, 0.6, 1.0),
+    ),
+)  # fmt: skip
+
+DECLARABLE: Mapping[str, DriverEffect] = {e.quantity: e for e in EFFECTS if not e.follows_motion}
+"""What a user may know of a driver: the command alone tells its voltage."""

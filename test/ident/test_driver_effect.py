@@ -1,0 +1,145 @@
+"""What a driver makes of its command is estimated beside the motor, declared, and designed for."""
+
+import numpy as np
+import pytest
+
+from smp_motor_ident.errors import ParameterError
+from smp_motor_ident.estimate import estimate
+from smp_motor_ident.estimation.driver_effect import driver_of
+from smp_motor_ident.model import driver
+from smp_motor_ident.model.driver import Driver, terminal_voltage
+from smp_motor_ident.record import Record
+from smp_motor_ident.tune.designer import design
+from smp_motor_ident.tune.loop import Loop
+
+GAIN, TAU, STATIC, STEP = 20.0, 0.08, 0.4, 0.005
+NOISE = 0.3  # rad/s
+
+
+def commands(seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return np.repeat(rng.uniform(-12.0, 12.0, 60), rng.integers(20, 40, 60))
+
+
+def run(voltage: np.ndarray, seed: int) -> np.ndarray:
+    """Return the speed of a motor of first order with friction, exactly but for its stops."""
+    fine, w, out = 100, 0.0, np.zeros(voltage.size)
+    keep = np.exp(-STEP / fine / TAU)
+    for k in range(1, voltage.size):
+        for _ in range(fine):
+            if w == 0.0 and abs(voltage[k]) <= STATIC:
+                continue
+            direction = np.sign(w) if w != 0.0 else np.sign(voltage[k])
+            after = keep * w + (1 - keep) * GAIN * (voltage[k] - STATIC * direction)
+            w = 0.0 if after * direction < 0.0 else after
+        out[k] = w
+    return out + NOISE * np.random.default_rng(1000 + seed).standard_normal(out.size)
+
+
+def dead(u: np.ndarray) -> np.ndarray:
+    return np.where(np.abs(u) > 1.0, u - np.sign(u), 0.0)
+
+
+def clipped(u: np.ndarray) -> np.ndarray:
+    return np.clip(u, -9.0, 9.0)
+
+
+def slewed(u: np.ndarray) -> np.ndarray:
+    """Return the means of a voltage that rises by 200 V/s, by a fine grid."""
+    fine, now, out = 200, u[0], np.empty(u.size)
+    for k, target in enumerate(u):
+        total = 0.0
+        for _ in range(fine):
+            before = now
+            now += np.clip(target - now, -200 * STEP / fine, 200 * STEP / fine)
+            total += 0.5 * (before + now)
+        out[k] = total / fine
+    return out
+
+
+DRIVERS = {"dead_zone": (dead, 1.0), "clip_voltage": (clipped, 9.0), "slew_rate": (slewed, 200.0)}
+
+
+def recorded(name: str, seed: int) -> Record:
+    command = commands(seed)
+    time = np.arange(command.size) * STEP
+    return Record("motor", time, command, velocity=run(DRIVERS[name][0](command), seed))
+
+
+@pytest.mark.parametrize("name", DRIVERS)
+def test_motor_and_driver_are_both_found(name):
+    truth = {"dc_gain": GAIN, "time_constant": TAU, "static_voltage": STATIC}
+    truth[name] = DRIVERS[name][1]
+    errors = []
+    for seed in range(4):
+        found = estimate(recorded(name, seed))
+        assert not found.unreliable
+        errors.append(
+            [(found.combinations[n].value - v) / found.combinations[n].std
+             for n, v in truth.items()]
+        )  # fmt: skip
+    errors = np.array(errors)
+    assert np.abs(errors).max() < 4.0
+    assert 0.4 < np.sqrt(np.square(errors).mean()) < 1.6  # neither too narrow nor too wide
+
+
+def test_a_plain_driver_has_no_effect():
+    command = commands(5)
+    time = np.arange(command.size) * STEP
+    found = estimate(Record("motor", time, command, velocity=run(command, 5)))
+    assert driver_of(found).kind == driver.NOTHING
+    assert not set(DRIVERS) & set(found.combinations)
+
+
+def test_a_declared_driver_is_taken_for_known():
+    found = estimate(recorded("dead_zone", 0), fixed={"dead_zone": 1.0})
+    zone = found.combinations["dead_zone"]
+    assert (zone.value, zone.std, zone.status) == (1.0, None, "fixed")
+    gain = found.combinations["dc_gain"]
+    assert abs(gain.value - GAIN) < 4 * gain.std
+    assert driver_of(found) == Driver(driver.DEAD_ZONE, 1.0, np.abs(commands(0)).max())
+    with pytest.raises(ParameterError, match="dead_zone = -1"):
+        estimate(recorded("dead_zone", 0), fixed={"dead_zone": -1.0})
+
+
+def test_a_declared_clip_holds_for_held_out_records():
+    records = [recorded("clip_voltage", seed) for seed in (0, 1)]
+    found = estimate(records[:1], fixed={"clip_voltage": 9.0}, validation=records[1:])
+    assert found.fit_percent.validation > 98.5
+    assert estimate(records[:1], validation=records[1:]).fit_percent.validation > 98.5
+
+
+def test_gains_are_for_motor_and_driver():
+    loop = Loop(sample_time=STEP, gear_ratio=1.0, counts_per_revolution=None, supply_voltage=12.0)
+    zone = design(estimate(recorded("dead_zone", 0)), loop)
+    assert zone.gains.feedforward_static == pytest.approx(STATIC + 1.0, abs=0.05)
+    clip = design(estimate(recorded("clip_voltage", 0)), loop)
+    assert clip.gains.u_clamp_max == pytest.approx(9.0, abs=0.05)
+    slew = design(estimate(recorded("slew_rate", 0)), loop)
+    assert slew.loop.loop_delay == pytest.approx(STEP + 0.5 * 12.0 / 200.0, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("kind", "size", "command", "back_emf", "expected"),
+    [
+        (driver.NOTHING, 0.0, 3.0, 1.0, 3.0),
+        (driver.DEAD_ZONE, 0.5, -3.0, 1.0, -2.5),
+        (driver.DEAD_ZONE, 0.5, 0.4, 1.0, 0.0),
+        (driver.CLIP, 2.0, -3.0, 1.0, -2.0),
+        (driver.SAG, 1.0, 5.0, 1.0, 1.0 + 4.0 / 1.25),  # half duty: a quarter of the resistance
+        (driver.DROP, 0.5, 3.0, 1.0, 2.5),
+        (driver.DROP, 0.5, 1.2, 1.0, 1.0),  # no current flows
+        (driver.COAST, 1.0, 0.0, 4.0, 4.0),  # a motor that runs free
+        (driver.COAST, 1.0, 10.0, 4.0, 10.0),
+    ],
+)
+def test_voltage_at_the_terminals(kind, size, command, back_emf, expected):
+    mean, end = terminal_voltage(Driver(kind, size, 10.0), command, back_emf, 0.0, STEP)
+    assert mean == pytest.approx(expected)
+    assert end == mean
+
+
+def test_a_slew_limit_remembers_where_it_was():
+    limited = Driver(driver.SLEW, 100.0, 10.0)
+    assert terminal_voltage(limited, 3.0, 0.0, 1.0, 0.01) == pytest.approx((1.5, 2.0))
+    assert terminal_voltage(limited, 1.5, 0.0, 1.0, 0.01) == pytest.approx((1.375, 1.5))
