@@ -24,7 +24,7 @@ from smp_motor_ident.diagnosis.limits import (
 from smp_motor_ident.diagnosis.lost_sign import lost_sign
 from smp_motor_ident.diagnosis.signs import lagged, likeness
 from smp_motor_ident.diagnosis.silence import silent
-from smp_motor_ident.diagnosis.units import whole_volts
+from smp_motor_ident.diagnosis.units import implausible_voltage
 from smp_motor_ident.errors import InsufficientExcitationError, SignalError
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.record import Record
@@ -38,7 +38,7 @@ RUN_CORRELATION = 20.0  # by which neighbouring runs' errors hang together, at m
 
 def screen(records: Sequence[Record]) -> list[Finding]:
     """Refuse records that cannot lead to a right answer; name the reason and the remedy."""
-    warnings = whole_volts(records)
+    warnings = implausible_voltage(records)
     where = _where(records)
     _length(records, where)
     for record in records:

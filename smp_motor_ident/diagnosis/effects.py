@@ -112,12 +112,12 @@ def _held_back(m: Motion) -> list[Array]:
 EFFECTS = (
     Effect(
         "dead_zone", "voltage", "a dead zone of the driver",
-        "declare the driver's dead zone, or record the voltage at the motor's terminals",
+        "record the voltage at the motor's terminals, or declare the dead zone with --fix dead_zone=",
         lambda m: [_sign(m.voltage)],
     ),
     Effect(
         "clip", "voltage", "a command that is clipped at the supply",
-        "record the voltage at the motor's terminals, or stay below the supply's voltage",
+        "stay below the supply's voltage, or declare it with --fix clip_voltage=",
         lambda m: [_sign(m.voltage) * np.maximum(np.abs(m.voltage) - c * m.top, 0.0)
                    for c in (0.65, 0.85)],
     ),
@@ -185,7 +185,7 @@ EFFECTS = (
     ),
     Effect(
         "slew", "voltage", "a driver that limits how fast the voltage rises",
-        "switch the driver's ramp off, or declare it",
+        "switch the driver's ramp off, or declare it with --fix slew_rate=",
         lambda m: [_change(m) * np.abs(_change(m)), np.roll(_change(m), 1) * np.abs(_change(m))],
     ),
     Effect(

@@ -327,9 +327,13 @@ LONGEST_LAG = Limit(
     10.0, "s", "physical: a flywheel of a hundred rotors runs up within seconds",
     "test_poor_records.py: a motor that cannot be is said to be none",
 )  # fmt: skip
-LOW_VOLTAGE = Limit(
+EXTRA_LOW_VOLTAGE = Limit(
     60.0, "V", "physical: extra-low voltage ends there, and with it what robots are built with",
     "test_lost_sign.py: a duty in counts that is called a voltage is questioned",
+)  # fmt: skip
+LOW_VOLTAGE = Limit(
+    1500.0, "V", "physical: the end of low direct voltage (IEC 60038), and with it of motors",
+    "test_lost_sign.py: thousands of volts are questioned whatever they are",
 )  # fmt: skip
 LONG_DELAY = Limit(
     3.0, "time constants", "physical: a motor is over its transient before it would begin",

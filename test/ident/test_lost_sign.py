@@ -52,6 +52,16 @@ def test_a_duty_in_counts_that_is_called_a_voltage_is_questioned(full):
     assert "whole_volts" not in volts
 
 
+@pytest.mark.parametrize(
+    ("scale", "severity"), [(1.0, None), (20.3, "warning"), (300.7, "unreliable")]
+)
+def test_thousands_of_volts_are_questioned_whatever_they_are(scale, severity):
+    record = driven()
+    found = estimate(replace(record, voltage=scale * record.voltage)).findings
+    said = [f.severity for f in found if f.code == "high_voltage"]
+    assert said == ([severity] if severity else [])
+
+
 def test_counts_without_their_number_a_turn_ask_for_it():
     record = driven()
     bare = replace(record, velocity=None, hardware=replace(record.hardware,
