@@ -112,7 +112,7 @@ def _held_back(m: Motion) -> list[Array]:
 EFFECTS = (
     Effect(
         "dead_zone", "voltage", "a dead zone of the driver",
-        "record the voltage at the motor's terminals, or declare the dead zone with --fix dead_zone=",
+        "record the voltage at the motor's terminals, or declare it with --fix dead_zone=",
         lambda m: [_sign(m.voltage)],
     ),
     Effect(
