@@ -7,6 +7,7 @@ Derivation: docs/derivations.md, section 13.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -36,7 +37,10 @@ RISE = 2.0  # of the deviance on both sides together, from which its curvature i
 PARABOLAS = 5  # that are laid through it at most
 CLOSE = 0.2  # standard deviations within which a size is the likeliest
 MOST = 25  # sizes that are tried between those of the table
-FEW = 8  # passes of a descent while the size is sought
+SUBSET, PIECES, LAGS = 5_000, 5, 10  # rows on which effects are ranked, in pieces of so many lags
+AROUND = 0.3  # e-folds of the size that these may be off by
+FINALISTS = 3  # that are held against each other on all of them
+FEW = 12  # passes of a descent while the size is sought
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +53,7 @@ class DriverFit:
     before: list[Record]  # as they were
     records: list[Record]
     beside: list[Record]  # the same for a size one standard deviation greater
+    search: _Search  # what found it
     fit: Fit  # the motor behind it, roughly
     # the same of other effects that explain the records as well
     rivals: tuple[Fit, ...] = ()
@@ -157,25 +162,42 @@ def rows_of(data: Experiments, group: Sequence[Record], fit: Fit) -> Rows:
 
 def likeliest(group: Sequence[Record], fit: Fit, hold: str, options: Options) -> DriverFit | None:
     """Return the effect that explains the records best; None where none is worth its number."""
-    found = [
-        driver
-        for effect in EFFECTS
-        for start, how in _starts(group, fit, hold, options, effect)
-        if (driver := _Search(list(group), how, start, options, effect).best()) is not None
-    ]
-    price, factor = POLICY.price(1, fit.samples), sandwich_factor(fit)
+    step = float(np.median(np.diff(group[0].time)))
+    few = _pieces(group, step, fit.z.time_constant)
+    price = POLICY.price(1, fit.samples)
 
     def cost(one: Fit) -> float:
-        return (one.deviance - fit.deviance) / factor + price * (
-            one.structure.size - fit.structure.size
-        )
+        return one.deviance / sandwich_factor(fit) + price * one.structure.size
 
-    found = sorted((d for d in found if cost(d.fit) < -price), key=lambda d: cost(d.fit))
+    searches = [
+        _Search(few, how, start, options, effect)
+        for effect in EFFECTS
+        for start, how in _starts(few, fit, hold, options, effect)
+    ]
+    found = [driver for s in searches if (driver := s.best()) is not None]
+    found.sort(key=lambda d: cost(d.fit))
+    if sum(map(len, few)) < sum(map(len, group)):
+        found = [d.search.on(list(group)) for d in found[:FINALISTS]]
+    found = sorted((d for d in found if cost(d.fit) + price < cost(fit)), key=lambda d: cost(d.fit))
     if not found:
         return None
     best, *others = found
     near = [d.fit for d in others if cost(d.fit) < cost(best.fit) + price]
     return replace(best, rivals=tuple(near))
+
+
+def _pieces(group: Sequence[Record], step: float, lag: float) -> list[Record]:
+    """Return pieces of long records, all over them, that outlive a motor's lag."""
+    rows = sum(map(len, group))
+    length = int(np.clip(LAGS * lag / step, SUBSET / PIECES, SUBSET))
+    every = rows * length / SUBSET
+    if every < 2 * length:
+        return list(group)
+    return [
+        record.slice(a, a + length)
+        for record in group
+        for a in np.arange(0, len(record) - length + 1, every).astype(int)
+    ] or list(group)
 
 
 def _starts(
@@ -221,6 +243,7 @@ class _Search:
         self.group, self.hold, self.options, self.effect = group, hold, options, effect
         self.data, self.near = _prepared(group, hold, fit), fit
         self.turns = TURNS if effect.follows_motion else 1
+        self.size = math.nan  # logarithm of the likeliest
 
     def at(self, size: float, passes: int = 30) -> tuple[Fit, Experiments, list[Record]]:
         """Return the motor fitted for a size, and what it was fitted to."""
@@ -252,10 +275,19 @@ class _Search:
             return None
         low = float(grid[k - 1] if k else 2 * grid[0] - grid[1])
         high = float(grid[k + 1] if k + 1 < grid.size else 2 * grid[-1] - grid[-2])
-        x = float(fminbound(self.deviance, low, high, xtol=1e-2, maxfun=MOST, disp=0))
-        return self._polished(x, rows.top)
+        return self._between(low, high)
 
-    def _polished(self, x: float, top: float) -> DriverFit:
+    def on(self, group: list[Record]) -> DriverFit:
+        """Go on from the size that was found, with more records."""
+        near = replace(self.near, initial=_prepared(group, self.hold, self.near).initial)
+        more = _Search(group, self.hold, near, self.options, self.effect)
+        return more._between(self.size - AROUND, self.size + AROUND)
+
+    def _between(self, low: float, high: float) -> DriverFit:
+        x = fminbound(self.deviance, low, high, xtol=1e-2, maxfun=MOST, disp=0)
+        return self._polished(float(x))
+
+    def _polished(self, x: float) -> DriverFit:
         """Go on to the bottom by parabolas through three deviances, whose curvature is its std."""
         away = NEAR
         for _ in range(PARABOLAS):
@@ -272,10 +304,10 @@ class _Search:
                 break
             x += float(np.clip(move, -2 * away, 2 * away))
             away = min(max(std, 0.1 * NEAR), 1.0)
-        size = float(np.exp(x))
-        driver = Driver(self.effect.kind, size, top)
+        self.size, size = x, float(np.exp(x))
+        driver = Driver(self.effect.kind, size, rows_of(self.data, self.group, fit).top)
         more = self.at(size * float(np.exp(std)))[2]
-        return DriverFit(self.effect, driver, size * std, self.group, records, more, fit)
+        return DriverFit(self.effect, driver, size * std, self.group, records, more, self, fit)
 
     def _beside(self, x: float, away: float) -> tuple[float, float]:
         """Return the deviances so many e-folds of the size below and above."""
