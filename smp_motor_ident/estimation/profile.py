@@ -38,6 +38,7 @@ NONLINEAR = ("vc_plus", "ln_a2", "delay", "window", "current_lag")
 NEAR = 3.0  # standard deviations to a bound within which no parabola is trusted
 STEPS = 8  # points on each side
 FARTHEST = 4.0  # e-folds
+SLOWEST = 10.0  # time constants of the motor, for a delay and for a sensor
 
 
 def profiled(data: Experiments, fit: Fit, options: Options) -> Fit:
@@ -152,7 +153,8 @@ def _range(data: Experiments, fit: Fit, coordinate: str) -> tuple[float, float]:
         # The current tells the back-EMF: friction is what viscous friction may be, at most.
         back = _back_emf(fit.z) / fit.z.a0
         return 0.0, min(MOST_FRICTION.value * full, value + (1 - back) * max(full - value, 0.0))
-    return (0.0 if coordinate == "delay" else 1e-9), float(np.ptp(data.time))
+    longest = max(value, SLOWEST * fit.z.time_constant)  # after which nothing is left of a motion
+    return (0.0 if coordinate == "delay" else 1e-9), min(longest, float(np.ptp(data.time)))
 
 
 def _end(
