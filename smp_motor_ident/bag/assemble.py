@@ -96,13 +96,7 @@ def _on_beat(motor: Motor, topic: str, time: Integers) -> Integers:
 def _check(motor: Motor, series: dict[str, Series]) -> None:
     """Leave out values that cannot be, and a current without sign; give a size its direction."""
     if "direction" in series:
-        direction = series.pop("direction")
-        series["voltage"] = signed(series["voltage"], direction, motor.where)
-        speed = series.get("velocity")
-        backward = np.any(series["voltage"].value < 0)
-        if speed is not None and backward and not np.any(speed.value < 0):
-            text = "velocity: never negative although the voltage is; it has no sign"
-            motor.tell("unsigned_velocity", text, "unreliable")
+        series["voltage"] = signed(series["voltage"], series.pop("direction"), motor.where)
     for name in sorted(series, key=lambda name: name != "count"):
         value = series[name].value
         if name == "count":  # which wraps, and that is no jump

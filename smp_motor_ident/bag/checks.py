@@ -78,6 +78,13 @@ def signed(size: Series, direction: Series, where: str) -> Series:
         raise BagError(
             f"{where}: direction has {levels.size} values; two, such as 0 and 1, are signs"
         )
+    if levels.min() >= 0 and (levels > 0).sum() > 1:
+        codes = ", ".join(f"{level:g}" for level in levels)
+        raise BagError(
+            f"{where}: direction has the values {codes}: which of them is backwards? Scale it so "
+            "that backwards is negative, such as direction=COLUMN*-1+1.5 where 1 is forwards and "
+            "2 backwards"
+        )
     sign = np.sign(direction.value)
     if levels.min() >= 0:  # 0 and 1
         sign = np.where(direction.value > 0, 1.0, -1.0)

@@ -19,8 +19,11 @@ from smp_motor_ident.finding import Finding
 
 Row = Sequence[Any]
 _MISSING = ("", "nan", "na", "n/a", "null", "none", "-", "inf", "-inf", "#n/a")
-_WORDS = {"true": 1, "false": 0, "on": 1, "off": 0, "fwd": 1, "forward": 1, "cw": 1}
-_WORDS.update({"rev": -1, "reverse": -1, "backward": -1, "ccw": -1})
+_WORDS = {
+    **dict.fromkeys(("true", "on", "fwd", "forward", "forwards", "f", "cw"), 1),
+    **dict.fromkeys(("false", "off", "stop", "stopped", "neutral", "n"), 0),
+    **dict.fromkeys(("rev", "reverse", "backward", "backwards", "bwd", "r", "b", "ccw"), -1),
+}
 _ISO = re.compile(
     r"(?:(\d{4}-\d\d-\d\d)[T ])?(\d\d?:\d\d:\d\d(?:[.,]\d{1,9})?) ?(Z|[+-]\d\d:?\d\d)?"
 )

@@ -121,6 +121,27 @@ def test_the_sign_comes_from_a_direction_column(tmp_path: Path, levels: tuple[in
         read_records(path, [mapping])
 
 
+@pytest.mark.parametrize("codes_of", [("F", "R"), ("fwd", "rev"), ("forwards", "backwards")])
+def test_a_direction_may_be_written_in_words(tmp_path: Path, codes_of: tuple[str, str]) -> None:
+    ways = [codes_of[0] if u > 0 else codes_of[1] for u in U]
+    rows = [f"{t},{abs(u)},{way},{y}" for t, u, way, y in zip(T, U, ways, motion())]
+    (tmp_path / "log.csv").write_text("\n".join(["t,u,dir,y", *rows]))
+    record = read_records(tmp_path / "log.csv", ["voltage=u direction=dir velocity=y time=t"])
+    np.testing.assert_allclose(record["motor"].voltage[1:], U[:-1], rtol=1e-12)
+
+
+@pytest.mark.parametrize("still", [0, 1])  # a code for standing still beside the two ways
+def test_codes_of_a_direction_that_are_no_signs_are_questioned(tmp_path: Path, still: int) -> None:
+    volts = U * (np.arange(N) % 40 >= 20 * still)
+    direction = np.select([volts > 0, volts < 0], [1, 2], 0)
+    path = write(tmp_path / "log.csv", t=T, u=np.abs(volts), dir=direction, y=motion())
+    mapping = "voltage=u velocity=y time=t direction=dir"
+    with pytest.raises(BagError, match="1, 2: which of them is backwards"):
+        read_records(path, [mapping])
+    record = read_records(path, [f"{mapping}*-1+1.5"])["motor"]
+    np.testing.assert_allclose(record.voltage[1:], volts[:-1], rtol=1e-12)
+
+
 def test_a_speed_of_the_rim_needs_the_wheels_radius(tmp_path: Path) -> None:
     path = write(tmp_path / "log.csv", t=T, u=U, y=0.03 * motion())
     record = read_records(path, ["voltage=u velocity=y:m/s time=t wheel_radius=0.03"])["motor"]
