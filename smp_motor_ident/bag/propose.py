@@ -23,9 +23,9 @@ from smp_motor_ident.bag.read import STATE, one_line, read_recording
 from smp_motor_ident.bag.runs import runs
 from smp_motor_ident.bag.source import Recording, recordings
 from smp_motor_ident.bag.storage import Array, found
-from smp_motor_ident.bag.tables import TIME_NAMES, self_described, time_unit
+from smp_motor_ident.bag.tables import TIME_NAMES, self_described
 from smp_motor_ident.bag.types import Types
-from smp_motor_ident.bag.units import check_unit, of_the_rim
+from smp_motor_ident.bag.units import of_the_rim, written_or_named
 from smp_motor_ident.errors import BagError
 
 _ROLES = {
@@ -48,8 +48,6 @@ _HINTS = (
     ("position", r"deg", ":deg"),
     ("voltage", r"duty", ":duty"),
     ("voltage", r"pwm|throttle", ":pwm"),
-    ("voltage", r"(?:^|_)m(?:illi)?v", ":mV"),
-    ("current", r"(?:^|_)m(?:illi)?a(?:mp|$|_)", ":mA"),
 )
 _SIDES = ("front", "rear", "back", "left", "right", "fl", "fr", "rl", "rr", "bl", "br")
 _RADIUS = "in metres: what is measured is the way of the rim"
@@ -81,18 +79,15 @@ class _Candidate:
     def unit(self) -> str:
         """What follows the source: a unit by name, never a scale."""
         text = f"{self.offer.topic}.{self.path}"
-        if written := self.offer.units.get(self.path):
-            try:
-                return f":{check_unit(self.role, written)}"
-            except BagError:
-                pass
-        if self.role == "time":
-            return f":{unit}" if (unit := time_unit(self.path)) else ""
+        if unit := written_or_named(self.role, self.offer.units.get(self.path, ""), text):
+            return f":{unit}"
         hint = _hint(self.role, text)
         whole = self.value[np.isfinite(self.value)]
         if self.role == "voltage" and not hint and whole.size:
             steps = np.array_equal(whole, np.rint(whole)) and np.abs(whole).max() > 48
             hint = ":pwm" if steps and not re.search(_WORDS_OF_VOLTS, text, re.IGNORECASE) else ""
+        if hint == ":duty" and np.abs(whole).max(initial=0.0) > 1:
+            hint = ":pwm"  # of a scale that is asked for
         return hint
 
 

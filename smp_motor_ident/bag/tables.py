@@ -10,14 +10,16 @@ from itertools import product
 import numpy as np
 
 from smp_motor_ident.bag.mapping import DEFAULT_MOTOR, MotorMap, Signal, SignalMap
+from smp_motor_ident.bag.readers.grid import without_unit
 from smp_motor_ident.bag.runs import laid_out
 from smp_motor_ident.bag.source import Recording
 from smp_motor_ident.bag.storage import TABLE, Channel, Integers, Table, found
-from smp_motor_ident.bag.units import FACTORS, check_unit
+from smp_motor_ident.bag.units import FACTORS, written_or_named
 from smp_motor_ident.errors import BagError
 
 TIME_NAMES = (
-    r"time|stamp|^t$|zeit|temps|tiempo|tempo|(?:^|\W|_)tid(?:$|\W|_)|czas|čas|время|时间|時間"
+    r"time|stamp|^t(?:[\W_]*(?:s|sec|ms|us|µs|ns))?[\W_]*$|^(?:ms|us|sec(?:onds)?)$|millis|micros|zeit"
+    r"|temps|tiempo|tempo|(?:^|\W|_)tid(?:$|\W|_)|czas|čas|время|时间|時間"
 )
 """What a column of time is called, in the languages of those who log motors."""
 
@@ -26,14 +28,6 @@ _EPOCHS = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
 
 _MOTIONS = ("velocity", "position", "count")
 _WHEELS = ((DEFAULT_MOTOR, ""), ("left", "left_"), ("right", "right_"))
-
-
-def time_unit(name: str) -> str:
-    """Return the unit that the name of a column of time ends in, such as ``t_ms``."""
-    for unit, pattern in (("ms", r"ms|milli"), ("us", r"us|micro"), ("ns", r"ns|nano")):
-        if re.search(rf"(?:^|[^a-z])(?:{pattern})(?:[^a-z]|$)|millis|micros", name.lower()):
-            return "us" if "micros" in name.lower() else unit
-    return ""
 
 
 def resolved(plan: MotorMap, channels: list[Channel]) -> MotorMap:
@@ -52,7 +46,8 @@ def _resolved(name: str, signal: Signal, tables: list[Channel]) -> Signal:
     choices = [(signal.topic, signal.field), ("", whole)]
     choices += [(entry[1], "value" + entry[2])] if entry else []
     every = choices + [(c.topic, signal.field) for c in tables if not signal.topic]
-    for topic, field in every:
+    bare = [(c.topic, n) for c in tables for n in c.fields if without_unit(n) == signal.field]
+    for topic, field in every + (bare if len(bare) == 1 and not signal.topic else []):
         for channel in tables:
             if channel.topic == topic and field in channel.fields:
                 return replace(
@@ -65,13 +60,9 @@ def _resolved(name: str, signal: Signal, tables: list[Channel]) -> Signal:
 
 def _unit(name: str, signal: Signal, channel: Channel, field: str) -> str:
     """Return a signal's unit: as mapped, else as the file writes it."""
-    written = channel.units.get(field, "")
-    if signal.unit or not written or (signal.scale, signal.offset) != (1.0, 0.0):
+    if signal.unit or (signal.scale, signal.offset) != (1.0, 0.0):
         return signal.unit
-    try:
-        return check_unit(name, written)
-    except BagError:
-        return ""
+    return written_or_named(name, channel.units.get(field, ""), field)
 
 
 def self_described(
@@ -131,8 +122,7 @@ def _time_signal(
     likely = [name for name in channel.fields if re.search(TIME_NAMES, name, re.IGNORECASE)]
     if mapped is not None and likely:
         signal = Signal(topic, likely[0])
-        unit = _unit("time", signal, channel, likely[0]) or time_unit(likely[0])
-        return replace(signal, unit=unit)
+        return replace(signal, unit=_unit("time", signal, channel, likely[0]))
     hint = f"time={likely[0]}" if likely else "time=COLUMN"
     raise BagError(
         f"{recording.files[0]}: which column is the time? map {hint} or sample_time=SECONDS"

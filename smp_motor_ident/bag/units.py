@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 from smp_motor_ident.errors import BagError
 
@@ -48,6 +49,7 @@ _ALIASES = {
     "amperes": "A",
     "amps": "A",
     "percent": "%",
+    "pct": "%",
     "rps": "rev/s",
     "rev/min": "rpm",
     "u/min": "rpm",
@@ -63,7 +65,11 @@ _ALIASES = {
     "sec": "s",
     "seconds": "s",
     "msec": "ms",
+    "millis": "ms",
+    "milliseconds": "ms",
     "usec": "us",
+    "micros": "us",
+    "microseconds": "us",
     "kph": "km/h",
     "mps": "m/s",
 }
@@ -103,6 +109,36 @@ def written_unit(text: str) -> str | None:
         except BagError:
             continue
     return None
+
+
+def written_or_named(signal: str, written: str, name: str) -> str:
+    """Return the unit that a file writes of a signal, or that its name tells; empty for none."""
+    try:
+        return check_unit(signal, written) if written else unit_in_name(signal, name)
+    except BagError:
+        return ""
+
+
+def unit_in_name(signal: str, name: str) -> str:
+    """Return the unit of a signal that is a word of a name; empty where there is no other than SI.
+
+    A single letter is none: the angle ``theta_m`` is the motor's.
+
+    Examples
+    --------
+    >>> unit_in_name("velocity", "speed_deg_s"), unit_in_name("time", "t_ms")
+    ('deg/s', 'ms')
+    """
+    words = re.split(r"[\W_]+(?:per[\W_]+)?|(?<=[a-z]{2})(?=[A-Z])", name)
+    for k in reversed(range(len(words))):
+        for text in ("/".join(words[k : k + 2]), words[k]):
+            try:
+                unit = check_unit(signal, text) if len(text) > 1 else ""
+            except BagError:
+                continue
+            if unit not in ("", _known(signal)[0], "duty", _PWM):  # the last are signals' names too
+                return unit
+    return ""
 
 
 def factor(

@@ -83,6 +83,11 @@ def head(rows: Sequence[Row], where: str) -> Grid:
     return Grid(names, units, first)
 
 
+def without_unit(name: str) -> str:
+    """Return a column's name without the unit in brackets behind it."""
+    return _BRACKETS.sub("", name)
+
+
 def _empty(cell: Any) -> bool:
     return cell is None or not str(cell).strip()
 

@@ -145,6 +145,31 @@ def test_several_files_are_several_experiments_of_several_motors(tmp_path: Path)
     assert {wheel: len(records) for wheel, records in found.items()} == {"left": 2, "right": 2}
 
 
+@pytest.mark.parametrize("names", ["t_us,u_mV,y_rpm", "micros,u mV,rpm", "t [us],u [mV],y [rpm]"])
+def test_a_unit_in_a_columns_name_is_its_unit(tmp_path: Path, names: str) -> None:
+    (tmp_path / "log.csv").write_text(table(head=names))
+    t, u, y = (f'"{name}"' for name in names.split(","))
+    record = read_records(tmp_path / "log.csv", [f"voltage={u} velocity={y} time={t}"])["motor"]
+    np.testing.assert_allclose(np.diff(record.time), 0.02e-6)
+    np.testing.assert_allclose(record.voltage[1:], 1e-3 * U[:-1])
+    np.testing.assert_allclose(record.velocity, Y * np.pi / 30)
+    plain = read_records(tmp_path / "log.csv", [f"voltage={u}*1e-3 velocity={y}:deg/s time={t}"])
+    np.testing.assert_allclose(plain["motor"].voltage[1:], 1e-3 * U[:-1])
+    np.testing.assert_allclose(plain["motor"].velocity, np.deg2rad(Y))
+
+
+def test_a_column_goes_by_its_name_without_the_unit(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text(table(";", ",", "Zeit [ms],Spannung [V],Drehzahl [rpm]"))
+    mapping = "voltage=Spannung velocity=Drehzahl time=Zeit"
+    record = read_records(path, [mapping])["motor"]
+    np.testing.assert_allclose(np.diff(record.time), 0.02e-3)
+    np.testing.assert_allclose(record.velocity, Y * np.pi / 30)
+    path.write_text(table(head="t,y [V],y [rpm]"))
+    with pytest.raises(BagError, match="no column 'y'"):
+        read_records(path, ["voltage=y velocity=y time=t"])
+
+
 @pytest.mark.parametrize(
     ("text", "mapping", "reason"),
     [
