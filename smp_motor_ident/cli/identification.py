@@ -274,8 +274,8 @@ def _print(found: Estimate, arguments: argparse.Namespace) -> None:
 
 
 def _what_is_unreliable(found: Estimate) -> str:
-    """Return the gravest findings and what to record next, in one line."""
+    """Return the codes of the gravest findings, which the report tells, and what to record next."""
     grave = [f for f in found.findings if f.severity in ("unreliable", "refused")]
-    advice = dict.fromkeys(f.advice for f in grave if f.advice)
-    parts = [*(f.message.rstrip(".") for f in grave), *(text.rstrip(".") for text in advice)]
-    return f"unreliable: {'; '.join(parts)}. --accept-unreliable takes it as it is"
+    codes = ", ".join(dict.fromkeys(f.code for f in grave))
+    advice = dict.fromkeys(f.advice.rstrip(".") for f in grave if f.advice)
+    return "; ".join([f"unreliable: {codes}", *advice, "--accept-unreliable takes it as it is"])

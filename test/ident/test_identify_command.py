@@ -203,6 +203,7 @@ def test_an_unreliable_answer_is_written_and_ends_with_one_unless_accepted(
     assert main([str(recording), *MAP, "--output", str(output), "--quiet", *options]) == code
     said = capsys.readouterr().err
     assert ("record a slow ramp" in said) == (code == 1)
+    assert "a dead zone of 1 V" not in said  # which the report and the table above it tell
     (motor,) = json.loads((output / "identification.json").read_text())["motors"].values()
     assert motor["findings"][0]["severity"] == severity
     page = (output / "report.html").read_text()
