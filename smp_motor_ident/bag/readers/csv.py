@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,8 @@ from smp_motor_ident.bag.unpack import Budget
 from smp_motor_ident.errors import BagError
 
 _COMMENTS = ("#", "%", "//")
+_LABEL = re.compile(r"(?:^|(?<=[\s,;|]))([A-Za-z_]\w*)\s*[:=,;\s]\s*(?=[-+.\d])")
+"""What a serial plotter's or a debug output's rows have before every number."""
 
 
 class _CsvFile(Tables):
@@ -32,11 +35,20 @@ class _CsvFile(Tables):
         seen = filled[:60]
         if sum(map(_is_quoted_row, (self._lines[k] for k in seen))) > len(seen) / 2:
             self._lines = [s.strip()[1:-1] if _is_quoted_row(s) else s for s in self._lines]
+        if any(self._lines[k].lstrip().startswith("[") for k in seen):  # rows of a matrix, or lists
+            self._lines = [s if _letters(s) else s.strip(" \t[];") for s in self._lines]
+        labels = self._labels(seen)
         self._separator = _separator([self._lines[k] for k in seen])
         rows = [self._row(self._lines[k]) for k in seen]
+        if self._separator == " ":
+            rows = [
+                self._spaced(self._lines[k], row, len(rows[len(rows) // 2]))
+                for k, row in zip(seen, rows)
+            ]
         self._grid = grid.head(rows, str(path))
         self._first = seen[self._grid.first]
-        if not self._grid.named and (above := self._commented(len(rows[self._grid.first]))):
+        above = [labels] if labels else self._commented(len(rows[self._grid.first]))
+        if above and not self._grid.named:
             self._grid = grid.head([*above, *rows[self._grid.first :]], str(path))
         self.problems += self._grid.findings
 
@@ -77,6 +89,25 @@ class _CsvFile(Tables):
             return None
         return [values[:, k].copy() for k in range(len(use))]
 
+    def _labels(self, seen: list[int]) -> list[str]:
+        """Take the labels off rows that have one before every number, and return them."""
+        labels: list[str] = _LABEL.findall(self._lines[seen[len(seen) // 2]])
+        alike = [k for k in seen if labels and _LABEL.findall(self._lines[k]) == labels]
+        bare = [_LABEL.sub("", self._lines[k]) for k in alike]
+        parts = [re.split(r"[\s,;|]+", text.strip()) for text in bare]
+        if len(alike) <= len(seen) / 2 or any(len(part) != len(labels) for part in parts):
+            return []
+        self._lines = [_LABEL.sub("", line) for line in self._lines]
+        return labels
+
+    @staticmethod
+    def _spaced(line: str, row: list[str], width: int) -> list[str]:
+        """Return a row of names whose words are closer than its columns; none where that fails."""
+        if len(row) <= width or grid.is_data(row):
+            return row
+        apart = re.split(r"\s{2,}", line.strip())
+        return apart if len(apart) == width else []
+
     def _commented(self, width: int) -> list[list[str]]:
         """Return the comments right above the numbers that name columns, and their units."""
         above: list[list[str]] = []
@@ -99,12 +130,20 @@ class _CsvFile(Tables):
         return next((c for c in several if len(c) == width and all(c)), [])
 
     def _row(self, line: str) -> list[str]:
-        if self._separator == " ":
-            return line.split()
-        try:
-            return next(csv.reader([line], delimiter=self._separator, skipinitialspace=True), [])
-        except csv.Error:
-            return line.split(self._separator)
+        return _row(line, self._separator)
+
+
+def _row(line: str, separator: str) -> list[str]:
+    if separator == " ":
+        return line.split()
+    try:
+        return next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])
+    except csv.Error:
+        return line.split(separator)
+
+
+def _letters(line: str) -> bool:
+    return re.search(r"[A-Za-z]{2}", line) is not None
 
 
 def _is_quoted_row(line: str) -> bool:
@@ -116,12 +155,12 @@ def _is_quoted_row(line: str) -> bool:
 
 
 def _separator(lines: list[str]) -> str:
-    """Return what most lines are divided by; a comma may be a decimal one."""
+    """Return what divides most lines, and that into numbers; a comma may be a decimal one."""
     usual = lines[len(lines) // 2 :]
-    for candidate in ";\t|,":
-        if sum(candidate in line for line in usual) > 2 / 3 * len(usual):
-            return candidate
-    return " " if any(" " in line.strip() for line in usual) else ","
+    likely = [c for c in ";\t|," if sum(c in line for line in usual) > 2 / 3 * len(usual)]
+    likely += [" "] if any(" " in line.strip() for line in usual) else []
+    sound = {c: sum(grid.share_of_numbers(_row(line, c)) for line in usual) for c in likely}
+    return max(sound, key=lambda c: sound[c], default=",")
 
 
 def _text(path: Path) -> str:

@@ -98,9 +98,13 @@ def _bare(cell: Any) -> str:
 
 def is_data(row: Row) -> bool:
     """Return whether at least half of a row's cells are numbers."""
-    cells = [cell for cell in row if not _empty(cell)]
-    good = sum(_sound(cell) for cell in cells)
-    return bool(cells) and good >= len(cells) / 2
+    return share_of_numbers(row) >= 0.5
+
+
+def share_of_numbers(row: Row) -> float:
+    """Return how many of a row's cells that are not empty are numbers."""
+    sound = [_sound(cell) for cell in row if not _empty(cell)]
+    return sum(sound) / max(len(sound), 1)
 
 
 def _sound(cell: Any) -> bool:

@@ -96,6 +96,54 @@ def test_a_comment_right_above_the_numbers_may_name_the_columns(
     np.testing.assert_allclose(record["motor"].velocity, np.deg2rad(Y))
 
 
+@pytest.mark.parametrize(
+    ("head", "row", "end"),
+    [
+        pytest.param("t,u,y", "[{}, {}, {}]", "", id="Python lists"),
+        pytest.param("t u y", "{} {} {};", "", id="a MATLAB matrix"),
+        pytest.param("t,u,y", "{},{},{};", "", id="a MATLAB matrix of commas"),
+        pytest.param("t     u     y", "{:f}   {:f}   {:f}", ",", id="decimal commas, blanks"),
+        pytest.param("", "t:{},u:{},y:{}", "", id="a serial plotter"),
+        pytest.param("", "t: {}\tu: {}\ty: {}", "", id="a serial plotter of tabs"),
+        pytest.param("", "t={} u={} y={}", "", id="equations"),
+        pytest.param("log of 2024", "t,{},u,{},y,{}", "", id="names between the numbers"),
+    ],
+)
+def test_rows_as_programs_print_them_are_read(
+    tmp_path: Path, head: str, row: str, end: str
+) -> None:
+    rows = [row.format(*x) for x in zip(np.arange(5) * 0.02, U, Y)]
+    rows[0] = "[" + rows[0] if row.endswith(";") else rows[0]
+    rows = [text.replace(".", ",") if end else text for text in rows]
+    rows += ["];"] if row.endswith(";") else []
+    (tmp_path / "log.txt").write_text("\n".join([head, *rows]))
+    record = read_records(tmp_path / "log.txt", MAP)["motor"]
+    np.testing.assert_allclose(record.velocity, np.deg2rad(Y))
+    np.testing.assert_allclose(record.voltage[1:], U[:-1])
+    np.testing.assert_allclose(np.diff(record.time), 0.02)
+
+
+@pytest.mark.parametrize(
+    ("head", "names"),
+    [
+        ("Time   Commanded Pos   Encoder 1", ["Time", "Commanded Pos", "Encoder 1"]),
+        ("Time Commanded Pos Encoder 1", ["c1", "c2", "c3"]),
+    ],
+)
+def test_names_of_several_words_are_not_shifted(
+    tmp_path: Path, head: str, names: list[str]
+) -> None:
+    (tmp_path / "log.txt").write_text(head + "\n" + table(" ").partition("\n")[2])
+    assert list_topics(tmp_path / "log.txt")[0].offers[0].fields == names
+
+
+def test_a_time_of_day_is_no_label(tmp_path: Path) -> None:
+    rows = [f"2024-05-06T12:00:0{k},{u},{y}" for k, (u, y) in enumerate(zip(U, Y))]
+    (tmp_path / "log.csv").write_text("\n".join(["t,u,y", *rows]))
+    record = read_records(tmp_path / "log.csv", MAP)["motor"]
+    np.testing.assert_allclose(record.time, np.arange(5))
+
+
 def test_notes_below_a_short_table_are_no_part_of_it(tmp_path: Path) -> None:
     path = tmp_path / "log.csv"
     path.write_text(table(", ", head="t, u, y") + "Acceleration: 9.46\n")
