@@ -1,8 +1,7 @@
 """A mapping proposed by names, kept only where the signals behave as what they are called.
 
-A voltage explains the speed: its past predicts the speed better than the speed's own past does
-(Granger's test, an F test of two nested regressions).  What decides of units, such as the full
-scale of a PWM, is asked for and never guessed.
+What decides of units, such as the full scale of a PWM, is asked for and never guessed.  Where names
+do not tell the time, the voltage or the motion of a table, what the data show is proposed.
 """
 
 from __future__ import annotations
@@ -10,51 +9,40 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
-from scipy.special import fdtrc
 
+from smp_motor_ident.bag.axis import Series
+from smp_motor_ident.bag.checks import signed
 from smp_motor_ident.bag.decode import collect
-from smp_motor_ident.bag.limits import EXPLAINS
+from smp_motor_ident.bag.drives import LAGS, clock_of, follows, unexplained
 from smp_motor_ident.bag.mapping import DEFAULT_MOTOR, SignalMap, parse
+from smp_motor_ident.bag.names import (
+    MOTIONS,
+    NO_MOTION,
+    NO_VOLTAGE,
+    WORDS_OF_VOLTS,
+    hint_of,
+    role_of,
+    wheel_of,
+)
 from smp_motor_ident.bag.offers import Listing, Offer, offers_of
 from smp_motor_ident.bag.read import STATE, one_line, read_recording
 from smp_motor_ident.bag.runs import runs
 from smp_motor_ident.bag.source import Recording, recordings
 from smp_motor_ident.bag.storage import Array, found
-from smp_motor_ident.bag.tables import TIME_NAMES, self_described
+from smp_motor_ident.bag.tables import EPOCHS, TIME_NAMES, self_described
 from smp_motor_ident.bag.types import Types
 from smp_motor_ident.bag.units import of_the_rim, written_or_named
 from smp_motor_ident.errors import BagError
 
-_ROLES = {
-    # What a field or its topic is called, the most telling first.
-    "voltage": r"volt|spannung|tension|napi[eę]cie|напряж|电压|電圧|pwm|duty|throttle"
-    r"|(?:^|\W|_)(?:cmd|command|effort|u|input)(?:$|\W|_)",
-    "current": r"current|strom|courant|corriente|corrente|(?:^|\W)ток|电流|電流"
-    r"|amp(?:s|ere)?(?:$|\W|_)",
-    "count": r"tick|count|encoder|impuls|(?:^|\W|_)enc(?:$|\W|_)",
-    "velocity": r"rpm|velo[cz]i|speed|omega|drehzahl|geschwindigkeit|vitesse|pr[eę]dko|скорост|速度"
-    r"|(?:^|\W|_)(?:vel|w|y)(?:$|\W|_)",
-    "position": r"position|posici|posizi|angle|winkel|theta|угол|角度|(?:^|\W|_)pos(?:$|\W|_)",
-}
-_MOTIONS = ("velocity", "position", "count")
-_NO_VOLTAGE = r"twist|cmd_vel|linear|angular|batter|supply|vbat|vin(?:$|\W|_)"
-_NO_MOTION = r"set_?point|target|desired|reference|soll|cmd|command"
-_HINTS = (
-    ("velocity", r"rpm|drehzahl", ":rpm"),
-    ("velocity", r"deg", ":deg/s"),
-    ("position", r"deg", ":deg"),
-    ("voltage", r"duty", ":duty"),
-    ("voltage", r"pwm|throttle", ":pwm"),
-)
-_SIDES = ("front", "rear", "back", "left", "right", "fl", "fr", "rl", "rr", "bl", "br")
 _RADIUS = "in metres: what is measured is the way of the rim"
 _MOST = 20_000
 """Samples that are looked at."""
-_LAGS, _OWN = 6, 2
-_WORDS_OF_VOLTS = r"volt|spannung|tension|napi|напряж|电压|電圧"
+_WIDEST = 16
+"""Columns that are tried where their names tell nothing."""
 
 
 @dataclass
@@ -81,11 +69,11 @@ class _Candidate:
         text = f"{self.offer.topic}.{self.path}"
         if unit := written_or_named(self.role, self.offer.units.get(self.path, ""), text):
             return f":{unit}"
-        hint = _hint(self.role, text)
+        hint = hint_of(self.role, text)
         whole = self.value[np.isfinite(self.value)]
         if self.role == "voltage" and not hint and whole.size:
             steps = np.array_equal(whole, np.rint(whole)) and np.abs(whole).max() > 48
-            hint = ":pwm" if steps and not re.search(_WORDS_OF_VOLTS, text, re.IGNORECASE) else ""
+            hint = ":pwm" if steps and not re.search(WORDS_OF_VOLTS, text, re.IGNORECASE) else ""
         if hint == ":duty" and np.abs(whole).max(initial=0.0) > 1:
             hint = ":pwm"  # of a scale that is asked for
         return hint
@@ -135,37 +123,108 @@ def propose(recording: Recording, offers: list[Offer], types: Types) -> Proposal
     if own := _of_the_file(recording):
         return own
     time = _time(offers)
-    wheels: dict[str, list[_Candidate]] = {}
-    for candidate in _candidates(recording, offers, types, time):
-        wheels.setdefault(candidate.wheel, []).append(candidate)
-    shared = [c for c in wheels.get("", []) if c.role == "voltage"]
-    items: list[str] = []
-    asked: dict[str, str] = {}
-    remarks: list[str] = []
-    for wheel, fields in sorted(wheels.items()):
-        voltages = [c for c in fields if c.role == "voltage"] or shared
-        motions = [c for c in fields if c.role in _MOTIONS]
-        chosen = _explained(voltages, motions)
-        if not chosen and (chosen := _untestable(voltages, motions)):
-            remarks.append(_unconfirmed(chosen[0]))
-        if not chosen:
-            continue
-        chosen += [c for c in fields if c.role == "current"][:1]
-        prefix = f"{wheel}." if wheel else ""
-        items += [f"{prefix}{c.role}={c.source}{c.unit}" for c in chosen]
-        voltage = chosen[0]
-        if voltage.unit == ":pwm":
-            largest = np.nanmax(np.abs(voltage.value))
-            asked["pwm_full_scale"] = f"the value that is 100 % (the largest here is {largest:g})"
-        if voltage.unit in (":pwm", ":duty", ":%"):
-            asked["supply_voltage"] = "in volts"
-        if any(of_the_rim(c.role, c.unit[1:]) for c in chosen):
-            asked["wheel_radius"] = _RADIUS
-    if not items:
-        return Proposal(remark=_reason([c for fields in wheels.values() for c in fields]))
+    every = list(_candidates(recording, offers, types, time))
+    alone = recording.is_table and len(offers) == 1
+    if alone and time is None:
+        time = _rising(every)
+    chosen, remarks = _by_names(every)
+    if alone and not chosen and (pair := _by_data([c for c in every if c is not time])):
+        chosen = [("", pair)]
+        remarks = [f"by the data alone: {pair[1].source} follows {pair[0].source}; see to both"]
+    if not chosen:
+        return Proposal(remark="; ".join([_reason(every), *remarks]))
+    items = []
+    for prefix, fields in chosen:
+        items += [f"{prefix}{c.role}={c.source}{c.unit}" for c in fields]
     if time:
         items.append(f"time={time.source}{time.unit}")
+    asked = _asked([c for _, fields in chosen for c in fields], time, recording.is_table)
     return Proposal(items, [f"{key}=… {why}" for key, why in asked.items()], "; ".join(remarks))
+
+
+def _by_names(
+    every: Sequence[_Candidate],
+) -> tuple[list[tuple[str, list[_Candidate]]], list[str]]:
+    """Return by wheel what is called a voltage and a motion, and what no data could confirm."""
+    wheels: dict[str, list[_Candidate]] = {}
+    for candidate in every:
+        wheels.setdefault(candidate.wheel, []).append(candidate)
+    shared = [c for c in wheels.get("", []) if c.role == "voltage"]
+    found_by_wheel, remarks = [], []
+    for wheel, fields in sorted(wheels.items()):
+        ways = [c for c in fields if c.role == "direction"][:1]
+        voltages = [c for c in fields if c.role == "voltage"] or shared
+        motions = [c for c in fields if c.role in MOTIONS]
+        chosen = []
+        try:
+            chosen = _explained([_directed(c, ways[0]) for c in voltages if ways], motions)
+        except BagError as error:  # codes that are no signs
+            remarks.append(str(error))
+        chosen = chosen or _explained(voltages, motions)
+        if not chosen and (chosen := _untestable(voltages, motions)):
+            remarks.append(_unconfirmed(chosen[0]))
+        if chosen:
+            used = ways if chosen[0].value.min() < 0 else []
+            current = [c for c in fields if c.role == "current"][:1]
+            found_by_wheel.append((f"{wheel}." if wheel else "", [*chosen, *used, *current]))
+    return found_by_wheel, remarks
+
+
+def _directed(voltage: _Candidate, way: _Candidate) -> _Candidate:
+    """Return a voltage that is a size with its direction; BagError where that tells no sign."""
+    if not (voltage.value.size and voltage.value.min() >= 0):
+        return voltage
+    size, direction = (Series(c.time.astype(np.int64), c.value) for c in (voltage, way))
+    return replace(voltage, value=signed(size, direction, way.source).value)
+
+
+def _rising(every: list[_Candidate]) -> _Candidate | None:
+    """Return the column without a telling name that rises as a time does."""
+    unnamed = [c for c in every if not c.role]
+    k = clock_of([c.value for c in unnamed])
+    return None if k is None else replace(unnamed[k], role="time")
+
+
+def _by_data(every: list[_Candidate]) -> list[_Candidate]:
+    """Return a voltage and the motion that follows it best, where names do not tell both."""
+    size = max((c.value.size for c in every), default=0)
+    fields = [c for c in every if c.value.size == size][:_WIDEST]
+    unnamed = [c for c in fields if not c.role]
+    voltages = [c for c in fields if c.role == "voltage"] or unnamed
+    motions = [c for c in fields if c.role in MOTIONS] or unnamed
+    best, pair = 0.0, []
+    for u, y in product(voltages, motions) if unnamed else ():
+        share, summed = (0.0, False) if u is y else follows(u.value[:_MOST], y.value[:_MOST])
+        if share > best:
+            way = "count" if np.array_equal(y.value, np.rint(y.value)) else "position"
+            best = share
+            pair = [
+                replace(u, role="voltage"),
+                replace(y, role=y.role or (way if summed else "velocity")),
+            ]
+    return pair
+
+
+def _asked(chosen: list[_Candidate], time: _Candidate | None, table: bool) -> dict[str, str]:
+    """Return what the user must add to a mapping, and why."""
+    asked: dict[str, str] = {}
+    units = [c.unit for c in chosen]
+    if ":pwm" in units:
+        largest = max(np.nanmax(np.abs(c.value)) for c in chosen if c.unit == ":pwm")
+        asked["pwm_full_scale"] = f"the value that is 100 % (the largest here is {largest:g})"
+    if any(unit in (":pwm", ":duty", ":%") for unit in units):
+        asked["supply_voltage"] = "in volts"
+    if any(of_the_rim(c.role, c.unit[1:]) for c in chosen):
+        asked["wheel_radius"] = _RADIUS
+    if any(c.role == "count" or c.unit.startswith(":ticks") for c in chosen):
+        asked["counts_per_revolution"] = "of the motor shaft"
+    if time is None:
+        asked |= {"sample_time": "in seconds, between rows: no column is a time"} if table else {}
+    elif not time.unit and time.value.size > 1:
+        step = float(np.nanmedian(np.diff(time.value)))
+        if step >= 1 and np.nanmax(time.value) < EPOCHS[-1][0]:  # of which the unit is found
+            asked["time"] = f"its unit, such as {time.source}:ms (it rises by {step:g} a row)"
+    return asked
 
 
 def _of_the_file(recording: Recording) -> Proposal | None:
@@ -190,8 +249,8 @@ def _of_the_file(recording: Recording) -> Proposal | None:
 
 def _untestable(voltages: list[_Candidate], motions: list[_Candidate]) -> list[_Candidate]:
     """Return a voltage that changes less often than a test needs, and a motion, by their names."""
-    seldom = [c for c in voltages if c.value.size and _changes(c) < _LAGS]
-    moving = [c for role in _MOTIONS for c in motions if c.role == role and np.ptp(c.value) > 0]
+    seldom = [c for c in voltages if c.value.size and _changes(c) < LAGS]
+    moving = [c for role in MOTIONS for c in motions if c.role == role and np.ptp(c.value) > 0]
     return [seldom[0], moving[0]] if seldom and moving else []
 
 
@@ -213,7 +272,7 @@ def _reason(fields: list[_Candidate]) -> str:
     """Return why nothing is proposed."""
     roles = {c.role for c in fields}
     missing = [] if "voltage" in roles else ["a voltage"]
-    missing += [] if roles & set(_MOTIONS) else ["a motion"]
+    missing += [] if roles & set(MOTIONS) else ["a motion"]
     if missing:
         return f"no field is called {' or '.join(missing)}"
     return "no field that is called a voltage explains one that is called a motion"
@@ -224,7 +283,11 @@ def _filled(items: Sequence[str]) -> SignalMap:
     given = parse(items)
     motors = {
         wheel: replace(
-            motor, hardware={"supply_voltage": 12.0}, pwm_full_scale=1.0, wheel_radius=1.0
+            motor,
+            hardware={"supply_voltage": 12.0, "counts_per_revolution": 1.0},
+            pwm_full_scale=1.0,
+            wheel_radius=1.0,
+            sample_time=1.0,
         )
         for wheel, motor in given.motors.items()
     }
@@ -244,15 +307,16 @@ def _time(offers: list[Offer]) -> _Candidate | None:
 def _candidates(
     recording: Recording, offers: list[Offer], types: Types, time: _Candidate | None
 ) -> Iterator[_Candidate]:
-    """Yield the fields whose names say what they may be, with their values."""
+    """Yield the fields whose names say what they may be, and the others of a table."""
     named: list[tuple[str, Offer, str]] = []
     for offer in offers:
         for path in offer.fields:
             if time is not None and path == time.path:
                 continue
-            role, text = _role(offer.topic, path), f"{offer.type} {offer.topic} {path}"
-            barred = _NO_VOLTAGE if role == "voltage" else _NO_MOTION if role in _MOTIONS else "^$"
-            if role and not re.search(barred, text, re.IGNORECASE):
+            role, text = role_of(offer.topic, path), f"{offer.type} {offer.topic} {path}"
+            barred = NO_VOLTAGE if role == "voltage" else NO_MOTION
+            barred = "^$" if role in ("current", "direction") else barred
+            if (role or offer.table) and not re.search(barred, text, re.IGNORECASE):
                 named.append((role, offer, path))
     wanted: dict[str, list[str]] = {}
     for _, offer, path in named:
@@ -267,13 +331,15 @@ def _candidates(
         value = table.columns[path].astype(np.float64)
         clock = table.stamp if table.stamp is not None and table.stamp.all() else table.log
         if clock is None and time is not None and time.path in table.columns:
-            clock = table.columns[time.path]
+            clock = time.value = table.columns[time.path]
             if len(runs(clock, {})) > 1:  # in the order in which they were written
                 clock = None
         at = np.arange(value.size) if clock is None else clock
         there = table.present.get(path)
         kept = np.isfinite(value) & (True if there is None else there)
-        wheel = _wheel(f"{offer.topic}.{path}")
+        wheel = wheel_of(f"{offer.topic}.{path}")
+        if role == "count" and not np.array_equal(value[kept], np.rint(value[kept])):
+            role = "position"
         yield _Candidate(role, wheel, offer, path, at.astype(np.float64)[kept], value[kept])
 
 
@@ -287,7 +353,7 @@ def _explained(voltages: list[_Candidate], motions: list[_Candidate]) -> list[_C
         if explained and explained[0][1] < least:
             least = explained[0][1]
             first = {c.role: c for c, _ in reversed(explained)}
-            best = [voltage, *(first[role] for role in _MOTIONS[::-1] if role in first)]
+            best = [voltage, *(first[role] for role in MOTIONS[::-1] if role in first)]
     return best
 
 
@@ -297,46 +363,8 @@ def _rest(voltage: _Candidate, motion: _Candidate) -> float | None:
     y = motion.value[order]
     if motion.role != "velocity":
         y = np.diff(y, prepend=y[:1])
-    if voltage.time.size < 2 or y.size < 5 * (_LAGS + _OWN):
+    if voltage.time.size < 2:
         return None
     ranked = np.argsort(voltage.time, kind="stable")
     index = np.searchsorted(voltage.time[ranked], motion.time[order], "right") - 1
-    u = voltage.value[ranked][np.maximum(index, 0)]
-    y, u = y - y.mean(), u - u.mean()
-    if not (np.std(y) > 0 and np.std(u) > 0):
-        return None
-    y, u = y / np.std(y), u / np.std(u)
-    begin = max(_LAGS, _OWN)
-    own = [y[begin - k : y.size - k] for k in range(1, _OWN + 1)]
-    driven = [u[begin - k : u.size - k] for k in range(_LAGS)]
-    target = y[begin:]
-    rests = []
-    for columns in (own, own + driven):
-        matrix = np.stack([*columns, np.ones(target.size)], axis=1)
-        solution = np.linalg.lstsq(matrix, target, rcond=None)[0]
-        rests.append(float(np.sum((target - matrix @ solution) ** 2)) + 1e-12)
-    free = target.size - _OWN - _LAGS - 1
-    ratio = (rests[0] - rests[1]) / _LAGS / (rests[1] / free)
-    return rests[1] / rests[0] if fdtrc(_LAGS, free, ratio) < EXPLAINS.value else None
-
-
-def _role(topic: str, path: str) -> str:
-    """Return what a field is by its own name, or else by its topic's."""
-    for text in (path.partition("[")[0], topic):
-        for role, pattern in _ROLES.items():
-            if re.search(pattern, text, re.IGNORECASE):
-                return role
-    return ""
-
-
-def _hint(role: str, source: str) -> str:
-    for wanted, pattern, text in _HINTS:
-        if wanted == role and re.search(pattern, source, re.IGNORECASE):
-            return text
-    return ""
-
-
-def _wheel(source: str) -> str:
-    """Return the side of the robot that a name tells."""
-    words = re.split(r"[^a-z]+", source.lower())
-    return "_".join(side for side in _SIDES if side in words)
+    return unexplained(voltage.value[ranked][np.maximum(index, 0)], y)

@@ -23,7 +23,7 @@ TIME_NAMES = (
 )
 """What a column of time is called, in the languages of those who log motors."""
 
-_EPOCHS = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
+EPOCHS = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
 """A number of time beyond each is of today in that unit since 1970."""
 
 _MOTIONS = ("velocity", "position", "count")
@@ -174,7 +174,7 @@ def _nanoseconds(table: Table, signal: Signal) -> tuple[Integers, str]:
     unit = signal.unit
     if not unit:
         size = np.nanmedian(np.abs(column.astype(np.float64))) if column.size else 0.0
-        unit = next((name for least, name in _EPOCHS if size > least), "")
+        unit = next((name for least, name in EPOCHS if size > least), "")
     factor = FACTORS["time"][unit or "s"] * signal.scale * 1e9
     if column.dtype.kind in "iu" and factor == round(factor):
         return column.astype(np.int64) * round(factor), unit

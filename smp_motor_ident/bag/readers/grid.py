@@ -25,7 +25,7 @@ _WORDS = {
     **dict.fromkeys(("rev", "reverse", "backward", "backwards", "bwd", "r", "b", "ccw"), -1),
 }
 _ISO = re.compile(
-    r"(?:(\d{4}-\d\d-\d\d)[T ])?(\d\d?:\d\d:\d\d(?:[.,]\d{1,9})?) ?(Z|[+-]\d\d:?\d\d)?"
+    r"(?:(\d{4}-\d\d-\d\d)[T _.])?(\d\d?:\d\d:\d\d(?:[.,]\d{1,9})?) ?(Z|[+-]\d\d:?\d\d)?"
 )
 _BRACKETS = re.compile(r"\s*[\[(]([^\])]*)[\])]\s*$")
 _SEEN = 60

@@ -137,8 +137,9 @@ def test_names_of_several_words_are_not_shifted(
     assert list_topics(tmp_path / "log.txt")[0].offers[0].fields == names
 
 
-def test_a_time_of_day_is_no_label(tmp_path: Path) -> None:
-    rows = [f"2024-05-06T12:00:0{k},{u},{y}" for k, (u, y) in enumerate(zip(U, Y))]
+@pytest.mark.parametrize("between", ["T", " ", "_", "."])
+def test_a_time_of_day_is_no_label(tmp_path: Path, between: str) -> None:
+    rows = [f"2024-05-06{between}12:00:0{k},{u},{y}" for k, (u, y) in enumerate(zip(U, Y))]
     (tmp_path / "log.csv").write_text("\n".join(["t,u,y", *rows]))
     record = read_records(tmp_path / "log.csv", MAP)["motor"]
     np.testing.assert_allclose(record.time, np.arange(5))

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from smp_motor_ident.bag import list_topics, read_records
+from smp_motor_ident.bag import Listing, list_topics, read_records
 
 N = 600
 T = 0.01 * np.arange(N)
@@ -154,3 +154,93 @@ def test_a_mapping_of_the_rim_asks_for_the_wheels_radius(tmp_path: Path) -> None
     assert listing.suggestion[1] == 'velocity="speed (m/s)":m/s'
     assert [text.partition("=")[0] for text in listing.asked] == ["wheel_radius"]
     assert len(read_records(path, [*listing.suggestion, "wheel_radius=0.05"])["motor"]) == N
+
+
+def asked(listing: Listing) -> list[str]:
+    return [text.partition("=")[0] for text in listing.asked]
+
+
+@pytest.mark.parametrize(
+    ("names", "separator", "suggestion"),
+    [
+        (None, " ", ["voltage=c2:pwm", "count=c3", "time=c1"]),
+        (("a", "b", "d"), ";", ["voltage=b:pwm", "count=d", "time=a"]),
+        (("a", "pwm", "d"), ";", ["voltage=pwm:pwm", "count=d", "time=a"]),
+        (("a", "b", "encoder"), ";", ["voltage=b:pwm", "count=encoder", "time=a"]),
+    ],
+)
+def test_where_names_tell_too_little_the_data_do(
+    tmp_path: Path, names: tuple[str, ...] | None, separator: str, suggestion: list[str]
+) -> None:
+    voltage, speed = motor(10)
+    columns = (10 * np.arange(N), np.rint(voltage / 6 * 255), np.rint(np.cumsum(speed) / 20))
+    lines = [separator.join(f"{x:.0f}" for x in row) for row in zip(*columns)]
+    path = tmp_path / "log.txt"
+    path.write_text("\n".join(([separator.join(names)] if names else []) + lines))
+    listing = list_topics(path)[0]
+    assert listing.suggestion == suggestion
+    told = ["pwm_full_scale", "supply_voltage", "counts_per_revolution", "time"]
+    assert asked(listing) == told
+    assert listing.remark.startswith("by the data alone")
+    given = [*listing.suggestion[:2], suggestion[2] + ":ms", "pwm_full_scale=255 supply_voltage=6"]
+    record = read_records(path, [*given, "counts_per_revolution=48"])["motor"]
+    np.testing.assert_allclose(np.diff(record.time), 0.01)
+    np.testing.assert_allclose(record.voltage[1:], voltage[:-1], atol=6 / 255)
+
+
+def test_a_speed_is_not_proposed_as_the_voltage_of_its_own_angle(tmp_path: Path) -> None:
+    speed = motor(11)[1]
+    rows = zip(T, np.cumsum(speed) * 0.01, speed)
+    (tmp_path / "log.txt").write_text("\n".join(f"{t:.2f} {a:.4f} {w:.4f}" for t, a, w in rows))
+    listing = list_topics(tmp_path / "log.txt")[0]
+    assert listing.suggestion == []
+    assert listing.remark == "no field is called a voltage or a motion"
+
+
+def test_the_interval_of_a_table_without_time_is_asked_for(tmp_path: Path) -> None:
+    path = write(tmp_path / "log.csv", **dict(zip("uy", motor(12))))
+    listing = list_topics(path)[0]
+    assert listing.suggestion == ["voltage=u", "velocity=y"]
+    assert asked(listing) == ["sample_time"]
+    assert len(read_records(path, [*listing.suggestion, "sample_time=0.01"])["motor"]) == N
+
+
+@pytest.mark.parametrize(
+    ("name", "full", "unit", "told"),
+    [
+        ("duty", 1.0, ":duty", ["supply_voltage"]),
+        ("duty", 100.0, ":pwm", ["pwm_full_scale", "supply_voltage"]),
+        ("duty_pct", 100.0, ":%", ["supply_voltage"]),
+        ("duty_percent", 1.0, ":%", ["supply_voltage"]),
+    ],
+)
+def test_the_scale_of_a_duty_is_named_or_asked_for(
+    tmp_path: Path, name: str, full: float, unit: str, told: list[str]
+) -> None:
+    voltage, speed = motor(13)
+    path = write(tmp_path / "log.csv", **{"t_ms": 1e3 * T, name: voltage / 6 * full, "w": speed})
+    listing = list_topics(path)[0]
+    assert listing.suggestion == [f"voltage={name}{unit}", "velocity=w", "time=t_ms:ms"]
+    assert asked(listing) == told
+
+
+def test_a_size_is_proposed_with_its_direction(tmp_path: Path) -> None:
+    voltage, speed = motor(14)
+    columns = {"t": T, "u": np.abs(voltage), "dir": voltage > 0, "w": speed}
+    listing = list_topics(write(tmp_path / "log.csv", **columns))[0]
+    assert listing.suggestion == ["voltage=u", "velocity=w", "direction=dir", "time=t"]
+    columns["dir"] = np.where(voltage > 0, 1, 2)
+    listing = list_topics(write(tmp_path / "log.csv", **columns))[0]
+    assert listing.suggestion == []
+    assert "which of them is backwards" in listing.remark
+    columns["w"] = np.abs(speed)
+    listing = list_topics(write(tmp_path / "log.csv", **columns))[0]
+    assert listing.suggestion == ["voltage=u", "velocity=w", "time=t"]
+
+
+def test_what_is_no_whole_number_is_no_count(tmp_path: Path) -> None:
+    voltage, speed = motor(15)
+    path = write(tmp_path / "log.csv", t=T, u=voltage, encoder=np.cumsum(speed) * 0.01)
+    assert list_topics(path)[0].suggestion == ["voltage=u", "position=encoder", "time=t"]
+    path = write(tmp_path / "log.csv", t=T, u=voltage, encoder_V=np.cumsum(speed) * 0.01)
+    assert list_topics(path)[0].suggestion == []
