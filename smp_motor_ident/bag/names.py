@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import re
 
+WORDS_OF_VOLTS = r"volt|spannung|tension|napi[eę]cie|напряж|电压|電圧"
 ROLES = {
     # What a field or its topic is called, the most telling first.
     "direction": r"(?:^|\W|_)dir(?:ection)?(?:$|\W|_)|richtung|sentido|direcci",
-    "voltage": r"volt|spannung|tension|napi[eę]cie|напряж|电压|電圧|pwm|duty|throttle"
-    r"|(?:^|\W|_)(?:cmd|command|effort|u|input)(?:$|\W|_)|^in$|entrada|eingang",
+    "voltage": WORDS_OF_VOLTS + r"|pwm|duty|throttle|entrada|eingang|^in$"
+    r"|(?:^|\W|_)(?:cmd|command|effort|u|input)(?:$|\W|_)",
     "current": r"current|strom|courant|corriente|corrente|(?:^|\W)ток|电流|電流"
     r"|amp(?:s|ere)?(?:$|\W|_)",
     "count": r"tick|count|encoder|impuls|(?:^|\W|_)enc(?:$|\W|_)",
@@ -27,7 +28,6 @@ _HINTS = (
     ("voltage", r"pwm|throttle", ":pwm"),
 )
 _SIDES = ("front", "rear", "back", "left", "right", "fl", "fr", "rl", "rr", "bl", "br")
-WORDS_OF_VOLTS = r"volt|spannung|tension|napi|напряж|电压|電圧"
 
 
 def role_of(topic: str, path: str) -> str:

@@ -35,7 +35,7 @@ from smp_motor_ident.bag.source import Recording, recordings
 from smp_motor_ident.bag.storage import Array, found
 from smp_motor_ident.bag.tables import EPOCHS, TIME_NAMES, self_described
 from smp_motor_ident.bag.types import Types
-from smp_motor_ident.bag.units import of_the_rim, written_or_named
+from smp_motor_ident.bag.units import of_the_rim, unit_of
 from smp_motor_ident.errors import BagError
 
 _RADIUS = "in metres: what is measured is the way of the rim"
@@ -67,7 +67,7 @@ class _Candidate:
     def unit(self) -> str:
         """What follows the source: a unit by name, never a scale."""
         text = f"{self.offer.topic}.{self.path}"
-        if unit := written_or_named(self.role, self.offer.units.get(self.path, ""), text):
+        if unit := unit_of(self.role, self.offer.units.get(self.path, ""), text):
             return f":{unit}"
         hint = hint_of(self.role, text)
         whole = self.value[np.isfinite(self.value)]
@@ -95,17 +95,8 @@ def list_topics(paths: Any, msg_files: Iterable[str] = ()) -> list[Listing]:
                     text = f"a mapping was proposed by names and cannot be read: {error}"
                     recording.findings.append(found("proposal_failed", text))
                     proposal = Proposal(remark="no mapping is suggested that can be read")
-        listings.append(
-            Listing(
-                recording.name,
-                offers,
-                proposal.items,
-                proposal.asked,
-                needed,
-                recording.findings,
-                proposal.remark,
-            )
-        )
+        made = (proposal.items, proposal.asked, needed, recording.findings, proposal.remark)
+        listings.append(Listing(recording.name, offers, *made))
     return listings
 
 
@@ -197,11 +188,8 @@ def _by_data(every: list[_Candidate]) -> list[_Candidate]:
         share, summed = (0.0, False) if u is y else follows(u.value[:_MOST], y.value[:_MOST])
         if share > best:
             way = "count" if np.array_equal(y.value, np.rint(y.value)) else "position"
-            best = share
-            pair = [
-                replace(u, role="voltage"),
-                replace(y, role=y.role or (way if summed else "velocity")),
-            ]
+            way = y.role or (way if summed else "velocity")
+            best, pair = share, [replace(u, role="voltage"), replace(y, role=way)]
     return pair
 
 
@@ -223,7 +211,7 @@ def _asked(chosen: list[_Candidate], time: _Candidate | None, table: bool) -> di
     elif not time.unit and time.value.size > 1:
         step = float(np.nanmedian(np.diff(time.value)))
         if step >= 1 and np.nanmax(time.value) < EPOCHS[-1][0]:  # of which the unit is found
-            asked["time"] = f"its unit, such as {time.source}:ms (it rises by {step:g} a row)"
+            asked["time"] = f"its unit, {time.source}:ms or :us (it rises by {step:g} a row)"
     return asked
 
 
@@ -262,10 +250,8 @@ def _unconfirmed(voltage: _Candidate) -> str:
     """Return what the data could not tell of a voltage."""
     times = _changes(voltage)
     how = f"changes {times} time{'s' * (times > 1)} only" if times else "is constant"
-    return (
-        f"{voltage.source} {how}, so that the data cannot confirm that it drives the motor; "
-        "this is by the names alone"
-    )
+    untold = "so that the data cannot confirm that it drives the motor"
+    return f"{voltage.source} {how}, {untold}; this is by the names alone"
 
 
 def _reason(fields: list[_Candidate]) -> str:
@@ -281,15 +267,10 @@ def _reason(fields: list[_Candidate]) -> str:
 def _filled(items: Sequence[str]) -> SignalMap:
     """Return the mapping of a proposal, with any value for what the user must add."""
     given = parse(items)
+    hardware = {"supply_voltage": 12.0, "counts_per_revolution": 1.0}
+    ones: Any = dict.fromkeys(("pwm_full_scale", "wheel_radius", "sample_time"), 1.0)
     motors = {
-        wheel: replace(
-            motor,
-            hardware={"supply_voltage": 12.0, "counts_per_revolution": 1.0},
-            pwm_full_scale=1.0,
-            wheel_radius=1.0,
-            sample_time=1.0,
-        )
-        for wheel, motor in given.motors.items()
+        wheel: replace(motor, hardware=hardware, **ones) for wheel, motor in given.motors.items()
     }
     return replace(given, motors=motors)
 

@@ -14,7 +14,7 @@ from smp_motor_ident.bag.readers.grid import without_unit
 from smp_motor_ident.bag.runs import laid_out
 from smp_motor_ident.bag.source import Recording
 from smp_motor_ident.bag.storage import TABLE, Channel, Integers, Table, found
-from smp_motor_ident.bag.units import FACTORS, written_or_named
+from smp_motor_ident.bag.units import FACTORS, unit_of
 from smp_motor_ident.errors import BagError
 
 TIME_NAMES = (
@@ -62,7 +62,7 @@ def _unit(name: str, signal: Signal, channel: Channel, field: str) -> str:
     """Return a signal's unit: as mapped, else as the file writes it."""
     if signal.unit or (signal.scale, signal.offset) != (1.0, 0.0):
         return signal.unit
-    return written_or_named(name, channel.units.get(field, ""), field)
+    return unit_of(name, channel.units.get(field, ""), field)
 
 
 def self_described(

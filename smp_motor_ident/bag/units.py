@@ -111,33 +111,21 @@ def written_unit(text: str) -> str | None:
     return None
 
 
-def written_or_named(signal: str, written: str, name: str) -> str:
-    """Return the unit that a file writes of a signal, or that its name tells; empty for none."""
-    try:
-        return check_unit(signal, written) if written else unit_in_name(signal, name)
-    except BagError:
-        return ""
+def unit_of(signal: str, written: str, name: str) -> str:
+    """Return the unit that a file writes of a signal, or else a word of its name that is one.
 
-
-def unit_in_name(signal: str, name: str) -> str:
-    """Return the unit of a signal that is a word of a name; empty where there is no other than SI.
-
-    A single letter is none: the angle ``theta_m`` is the motor's.
-
-    Examples
-    --------
-    >>> unit_in_name("velocity", "speed_deg_s"), unit_in_name("time", "t_ms")
-    ('deg/s', 'ms')
+    Empty where there is none but SI.  A single letter is none: ``theta_m`` is the motor's angle.
     """
     words = re.split(r"[\W_]+(?:per[\W_]+)?|(?<=[a-z]{2})(?=[A-Z])", name)
-    for k in reversed(range(len(words))):
-        for text in ("/".join(words[k : k + 2]), words[k]):
-            try:
-                unit = check_unit(signal, text) if len(text) > 1 else ""
-            except BagError:
-                continue
-            if unit not in ("", _known(signal)[0], "duty", _PWM):  # the last are signals' names too
-                return unit
+    ends = [text for k in range(len(words)) for text in (words[k], "/".join(words[k : k + 2]))]
+    for text in [written] if written else ends[::-1]:
+        try:
+            unit = check_unit(signal, text) if written or len(text) > 1 else ""
+        except BagError:
+            continue
+        # What a name may call the signal itself is no unit.
+        if written or unit not in ("", _known(signal)[0], "duty", _PWM):
+            return unit
     return ""
 
 

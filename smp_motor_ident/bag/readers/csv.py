@@ -19,6 +19,8 @@ from smp_motor_ident.bag.unpack import Budget
 from smp_motor_ident.errors import BagError
 
 _COMMENTS = ("#", "%", "//")
+_MATRIX = re.compile(r"^\s*\[(?=[\s\d.+-])|(?<=\d)\s*\]?;?\s*$|^\];?\s*$")
+"""What stands around the rows of a matrix or of lists."""
 _LABEL = re.compile(r"(?:^|(?<=[\s,;|]))([A-Za-z_]\w*)\s*[:=,;\s]\s*(?=[-+.\d])")
 """What a serial plotter's or a debug output's rows have before every number."""
 
@@ -35,11 +37,11 @@ class _CsvFile(Tables):
         seen = filled[:60]
         if sum(map(_is_quoted_row, (self._lines[k] for k in seen))) > len(seen) / 2:
             self._lines = [s.strip()[1:-1] if _is_quoted_row(s) else s for s in self._lines]
-        if any(self._lines[k].lstrip().startswith("[") for k in seen):  # rows of a matrix, or lists
-            self._lines = [s if _letters(s) else s.strip(" \t[];") for s in self._lines]
+        if any(self._lines[k].lstrip().startswith("[") for k in seen):
+            self._lines = [_MATRIX.sub("", s) for s in self._lines]
         labels = self._labels(seen)
         self._separator = _separator([self._lines[k] for k in seen])
-        rows = [self._row(self._lines[k]) for k in seen]
+        rows = [_row(self._lines[k], self._separator) for k in seen]
         if self._separator == " ":
             rows = [
                 self._spaced(self._lines[k], row, len(rows[len(rows) // 2]))
@@ -66,7 +68,7 @@ class _CsvFile(Tables):
         if fast is not None:
             return Table(None, None, dict(zip(fields, fast)))
         numbered = [(k, s) for k, s in enumerate(body, self._first + 1) if not s.startswith("#")]
-        rows = [self._row(s) for _, s in numbered]
+        rows = [_row(s, self._separator) for _, s in numbered]
         values, findings, dates = grid.columns(
             rows, use, fields, str(self.path), [k for k, _ in numbered]
         )
@@ -129,9 +131,6 @@ class _CsvFile(Tables):
             several.append(text.split())
         return next((c for c in several if len(c) == width and all(c)), [])
 
-    def _row(self, line: str) -> list[str]:
-        return _row(line, self._separator)
-
 
 def _row(line: str, separator: str) -> list[str]:
     if separator == " ":
@@ -140,10 +139,6 @@ def _row(line: str, separator: str) -> list[str]:
         return next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])
     except csv.Error:
         return line.split(separator)
-
-
-def _letters(line: str) -> bool:
-    return re.search(r"[A-Za-z]{2}", line) is not None
 
 
 def _is_quoted_row(line: str) -> bool:
