@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ import yaml
 from smp_motor_control import WHEELS
 from smp_motor_control.pid import PidGains
 from smp_motor_ident.cli.tune import main
+from smp_motor_ident.cli.tuning import row
 from smp_motor_ident.record import Hardware
 from smp_motor_ident.report.document import identification_document
 from smp_motor_ident.result import Estimate, Quantity
@@ -76,6 +78,22 @@ def test_comparison_lists_every_method_and_recommends_one(identified, capsys):
     for method in ("margin", "optimise", "simc", "amigo", "relay"):
         assert f" {method} " in words_shown
     assert "* recommended: " in words_shown
+
+
+def test_small_gains_are_shown_with_their_digits():
+    design = SimpleNamespace(
+        gains=PidGains(p=1.49e-4, i=1.5e-3),
+        margins=SimpleNamespace(phase=88.0, gain=560.65, sensitivity=1.02),
+        performance=SimpleNamespace(
+            settling=2.07,
+            overshoot=0.0,
+            load_integral=6.62e-4,
+            peak_voltage=4.04,
+            control_noise=0.1,
+        ),
+    )
+    assert row(design).split()[:3] == ["0.000149", "0.0015", "0"]
+    assert "0.000662" in row(design)
 
 
 def test_nothing_is_overwritten_without_force(identified, capsys):
