@@ -15,6 +15,7 @@ FORMATS: tuple[Format, ...] = (
     sqlite.FORMAT,
     ros1.FORMAT,
     wpilog.FORMAT,
+    mat.FORMAT_4,
     mat.FORMAT_5,
     mat.FORMAT_73,
     xlsx.FORMAT,

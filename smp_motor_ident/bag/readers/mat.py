@@ -1,4 +1,4 @@
-"""MATLAB files: version 5 by scipy, version 7.3 by h5py where it is installed.
+"""MATLAB files: version 4, version 5 by scipy, version 7.3 by h5py where it is installed.
 
 Vectors and the columns of matrices become columns of one table per length, fields of structures
 by their path.  The layout that is checked before scipy may trust it is that of MathWorks' "MAT-File
@@ -29,6 +29,7 @@ _OPAQUE = 17
 """Class of a matrix that is an object of MATLAB."""
 _TOLD = 4
 """Objects that are named in a message."""
+_TYPES_4 = ("<f8", "<f4", "<i4", "<i2", "<u2", "u1")
 _DEEPEST = 16
 _WIDEST = 64
 """Columns of a matrix that are taken as signals; a wider one is something else."""
@@ -47,6 +48,26 @@ def _check_survivable(data: bytes, name: str) -> None:
     done = subprocess.run(command, input=data, stdout=nowhere, stderr=nowhere, check=False)
     if done.returncode < 0:
         raise BagError(f"{name}: damaged MATLAB file (scipy's reader ends by {-done.returncode})")
+
+
+def _open_4(path: Path, name: str, budget: Budget) -> ColumnFile:
+    """Read a file of version 4, as QUARC writes: before every matrix five numbers and its name."""
+    data, at = path.read_bytes(), 0
+    taken: dict[str, Any] = {}
+    while at < len(data):
+        try:
+            kind, rows, columns, imaginary, length = struct.unpack_from("<5i", data, at)
+            if min(kind, rows, columns, length - 1) < 0:
+                raise ValueError
+            begin = at + 20 + length
+            flat = np.frombuffer(data, _TYPES_4[kind // 10], rows * columns, begin)
+        except (struct.error, LookupError, ValueError):
+            raise BagError(f"{name}: is cut off or damaged at byte {at} of {len(data)}") from None
+        if kind % 10 == 0:  # no text
+            key = data[begin - length : begin].rstrip(b"\0").decode("latin-1")
+            taken[key] = flat.reshape(columns, rows).T
+        at = begin + flat.nbytes * (1 + (imaginary != 0))
+    return ColumnFile(path, name, dict(_columns("", taken, 0)))
 
 
 def _open_5(path: Path, name: str, budget: Budget) -> ColumnFile:
@@ -210,5 +231,6 @@ def _check_size(inside: bytes, order: str, name: str) -> None:
         )
 
 
+FORMAT_4 = Format("MATLAB 4", (".mat",), b"\0\0\0\0", _open_4)
 FORMAT_5 = Format("MATLAB", (".mat",), b"MATLAB 5.0 MAT", _open_5)
 FORMAT_73 = Format("MATLAB 7.3", (".mat",), b"MATLAB 7.3 MAT", _open_73)

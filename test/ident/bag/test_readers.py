@@ -98,6 +98,18 @@ def test_objects_of_matlab_are_named_and_the_other_variables_read(
         list_topics(path)
 
 
+def test_a_matlab_file_of_version_4_has_signals_in_its_rows(tmp_path: Path) -> None:
+    path = tmp_path / "log.mat"
+    content = {"data": np.stack([TIME, VOLTAGE, SPEED]), "note": "QUARC", "fs": np.float32(100)}
+    scipy.io.savemat(path, content, format="4")
+    assert_motor(
+        read_records(path, ["voltage=data[1] velocity=data[2]:rad/s time=data[0]"])["motor"]
+    )
+    path.write_bytes(path.read_bytes()[:-9])
+    with pytest.raises(BagError, match=r"log\.mat: is cut off or damaged at byte"):
+        list_topics(path)
+
+
 def test_a_matlab_file_of_another_version_or_cut_off_is_one_line(tmp_path: Path) -> None:
     hdf = tmp_path / "new.mat"
     hdf.write_bytes(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(512) + b"\x89HDF\r\n\x1a\n")
