@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from smp_motor_ident.bag.clock import mean_held, rhythm
 from smp_motor_ident.bag.counter import Unwrapped, unwrap
+from smp_motor_ident.bag.drives import answers_in_its_row
 from smp_motor_ident.bag.mapping import MotorMap
 from smp_motor_ident.bag.storage import Array, Integers, Table, found
 from smp_motor_ident.errors import BagError
@@ -67,12 +68,12 @@ class Series:
 
 def on_one_axis(motor: Motor, series: dict[str, Series], axis_name: str) -> Record:
     """Make a record of signals that were sampled each at its own instants."""
-    held = motor.plan.held or "after"
     if "supply" in series:
         _times_supply(series)
     voltage = _finite(series["voltage"])
     axis = series[axis_name].time
     alike = np.array_equal(voltage.time, axis)
+    held = motor.plan.held or (_held(motor, voltage, series, axis_name) if alike else "after")
     keep = np.ones(axis.size, bool) if alike else _covered(motor, voltage, axis)
     if keep.sum() < 2:
         raise BagError(f"{motor.where}: fewer than 2 samples have a voltage and an output")
@@ -101,6 +102,18 @@ def on_one_axis(motor: Motor, series: dict[str, Series], axis_name: str) -> Reco
         velocity_window=motor.plan.velocity_window,
         **columns,
     )
+
+
+def _held(motor: Motor, voltage: Series, series: Mapping[str, Series], name: str) -> str:
+    """Return whether a voltage holds from its row on, or held up to it, as the motion tells."""
+    motion = series[name].value
+    if name != "velocity":
+        motion = np.diff(motion, prepend=motion[:1])
+    if not answers_in_its_row(voltage.value, motion):
+        return "after"
+    text = f"the {name} answers in the rows in which the voltage changes: it held up to its row"
+    motor.tell("held_before", f"{text} (held=before; map held=after if it did not)")
+    return "before"
 
 
 def _mean_voltage(voltage: Series, axis: Integers, held: str, alike: bool) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.special import fdtrc
+from scipy.special import fdtrc, ndtri
 
 from smp_motor_ident.bag.limits import EXPLAINS
 from smp_motor_ident.bag.storage import Array
@@ -36,6 +36,23 @@ def unexplained(u: Array, y: Array) -> float | None:
     free = target.size - OWN - LAGS - 1
     ratio = (rests[0] - rests[1]) / LAGS / (rests[1] / free)
     return rests[1] / rests[0] if fdtrc(LAGS, free, ratio) < EXPLAINS.value else None
+
+
+def answers_in_its_row(u: Array, y: Array) -> bool:
+    """Return whether a motion answers a command in the very row in which the command is new.
+
+    Then the command is that of the interval that ends at the row: what begins there cannot have
+    moved anything yet.  The increments of a motion that is driven jump where the drive does; the
+    jumps at steps of a held command are held against those elsewhere (a normal test).
+    """
+    steps, jumps = np.diff(u), np.diff(y, 2)
+    new = np.flatnonzero((steps[1:-1] != 0) & (steps[:-2] == 0))  # of one that was held before
+    if new.size < LAGS:
+        return False
+    size = steps[new + 1]
+    at_once, later = float(size @ jumps[new]), float(size @ jumps[new + 1])
+    scatter = float(np.std(np.delete(jumps, new)) * np.linalg.norm(size))
+    return at_once > max(-float(ndtri(EXPLAINS.value)) * scatter, later)
 
 
 def follows(u: Array, y: Array) -> tuple[float, bool]:

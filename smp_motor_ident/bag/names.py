@@ -20,13 +20,11 @@ ROLES = {
 MOTIONS = ("velocity", "position", "count")
 NO_VOLTAGE = r"twist|cmd_vel|linear|angular|batter|supply|vbat|vin(?:$|\W|_)"
 NO_MOTION = r"set_?point|target|desired|reference|soll|cmd|command|[\W_]m?v$"
-_HINTS = (
-    ("velocity", r"rpm|drehzahl", ":rpm"),
-    ("velocity", r"deg", ":deg/s"),
-    ("position", r"deg", ":deg"),
-    ("voltage", r"duty", ":duty"),
-    ("voltage", r"pwm|throttle", ":pwm"),
-)
+_HINTS = {
+    "velocity": ((r"rpm|drehzahl", ":rpm"), (r"deg", ":deg/s")),
+    "position": ((r"deg", ":deg"),),
+    "voltage": ((r"duty", ":duty"), (r"pwm|throttle", ":pwm")),
+}
 _SIDES = ("front", "rear", "back", "left", "right", "fl", "fr", "rl", "rr", "bl", "br")
 
 
@@ -41,10 +39,8 @@ def role_of(topic: str, path: str) -> str:
 
 def hint_of(role: str, source: str) -> str:
     """Return the unit that a name hints at, as a mapping writes it."""
-    for wanted, pattern, text in _HINTS:
-        if wanted == role and re.search(pattern, source, re.IGNORECASE):
-            return text
-    return ""
+    hints = (text for pattern, text in _HINTS.get(role, ()) if re.search(pattern, source, re.I))
+    return next(hints, "")
 
 
 def wheel_of(source: str) -> str:

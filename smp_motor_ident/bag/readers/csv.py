@@ -125,10 +125,8 @@ class _CsvFile(Tables):
 
     def _cells(self, text: str, width: int) -> list[str]:
         """Return the cells of a comment where it has as many as the rows, none of them empty."""
-        marks = dict.fromkeys([*self._separator.strip(), *";\t|,"])
+        marks = [*self._separator.strip(), *";\t|,", *[None][: self._separator == " "]]
         several = [[cell.strip(' \t"') for cell in text.split(mark)] for mark in marks]
-        if self._separator == " ":
-            several.append(text.split())
         return next((c for c in several if len(c) == width and all(c)), [])
 
 

@@ -166,6 +166,50 @@ def test_a_voltage_may_have_been_held_up_to_its_row(tmp_path: Path) -> None:
     np.testing.assert_allclose(record.voltage, U)
 
 
+@pytest.mark.parametrize("output", ["velocity", "position", "count"])
+@pytest.mark.parametrize("lead", [False, True])
+def test_the_motion_tells_whether_a_voltage_held_up_to_its_row(
+    tmp_path: Path, lead: bool, output: str
+) -> None:
+    rng = np.random.default_rng(1)
+    volts = np.repeat(rng.uniform(-6, 6, 30), 20)
+    speed = np.zeros(volts.size)
+    for k in range(1, volts.size):
+        acting = volts[k] if lead else volts[k - 1]
+        speed[k] = speed[k - 1] + (1 - np.exp(-0.1)) * (20 * acting - speed[k - 1])
+    motion = speed + rng.normal(0, 0.3, speed.size)
+    if output != "velocity":
+        motion = np.rint(10 * np.cumsum(speed))
+    rows = [f"{0.01 * k},{u},{y:g}" for k, (u, y) in enumerate(zip(volts, motion))]
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join(["t,u,y", *rows]))
+    mapping = [f"voltage=u {output}=y time=t"]
+    record = read_records(path, mapping)["motor"]
+    assert ("held_before" in [f.code for f in record.findings]) is lead
+    np.testing.assert_allclose(record.voltage[1:], volts[1:] if lead else volts[:-1])
+    (given,) = read_records(path, [*mapping, "held=after"]).values()
+    np.testing.assert_allclose(given.voltage[1:], volts[:-1])
+
+
+@pytest.mark.parametrize("noise", [0.3, 3.0])
+def test_a_loop_that_answers_its_own_rows_is_not_taken_for_its_motor(
+    tmp_path: Path, noise: float
+) -> None:
+    """A controller's command answers the row's speed at once; the speed does not answer it."""
+    rng = np.random.default_rng(2)
+    target = np.repeat(rng.uniform(-100, 100, 30), 20)
+    rows, speed, integral = ["t,u,y"], 0.0, 0.0
+    for k, goal in enumerate(target):
+        measured = speed + rng.normal(0, noise)
+        integral += 0.002 * (goal - measured)
+        volts = round(0.02 * (goal - measured) + integral, 1)
+        rows.append(f"{0.01 * k},{volts},{measured:g}")
+        speed += (1 - np.exp(-0.1)) * (20 * volts - speed)
+    (tmp_path / "log.csv").write_text("\n".join(rows))
+    record = read_records(tmp_path / "log.csv", ["voltage=u velocity=y time=t"])["motor"]
+    assert "held_before" not in [f.code for f in record.findings]
+
+
 def test_empty_cells_are_missing_values(tmp_path: Path) -> None:
     text = "t,u,y,i\n" + "".join(f"{k * 0.01},{k},{k if k % 10 else ''},nan\n" for k in range(100))
     (tmp_path / "log.csv").write_text(text)
