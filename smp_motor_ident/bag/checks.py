@@ -74,16 +74,11 @@ def is_unsigned(voltage: Series, current: Series) -> bool:
 def signed(size: Series, direction: Series, where: str) -> Series:
     """Return a signal with the sign of a direction column: negative where it is 0 or below."""
     levels = np.unique(direction.value[np.isfinite(direction.value)])
-    if not 1 <= levels.size <= 3:
+    if not 1 <= levels.size <= 3 or (levels.min() >= 0 and (levels > 0).sum() > 1):
+        codes = ", ".join(f"{level:g}" for level in levels[:4]) + ", …" * (levels.size > 4)
         raise BagError(
-            f"{where}: direction has {levels.size} values; two, such as 0 and 1, are signs"
-        )
-    if levels.min() >= 0 and (levels > 0).sum() > 1:
-        codes = ", ".join(f"{level:g}" for level in levels)
-        raise BagError(
-            f"{where}: direction has the values {codes}: which of them is backwards? Scale it so "
-            "that backwards is negative, such as direction=COLUMN*-1+1.5 where 1 is forwards and "
-            "2 backwards"
+            f"{where}: direction has the values {codes}: which of them is backwards? Scale them "
+            "to signs: direction=COLUMN*-1+1.5 where 1 is forwards and 2 backwards"
         )
     sign = np.sign(direction.value)
     if levels.min() >= 0:  # 0 and 1
