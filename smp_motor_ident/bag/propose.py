@@ -146,16 +146,17 @@ def _by_names(
         ways = [c for c in fields if c.role == "direction"][:1]
         voltages = [c for c in fields if c.role == "voltage"] or shared
         motions = [c for c in fields if c.role in MOTIONS]
+        sizes = [c for c in voltages if ways and c.value.size and c.value.min() >= 0]
         chosen = []
         try:
-            chosen = _explained([_directed(c, ways[0]) for c in voltages if ways], motions)
+            chosen = _explained([_directed(c, ways[0]) for c in sizes], motions)
         except BagError as error:  # codes that are no signs
             remarks.append(str(error))
+        used = ways if chosen else []
         chosen = chosen or _explained(voltages, motions)
         if not chosen and (chosen := _untestable(voltages, motions)):
             remarks.append(_unconfirmed(chosen[0]))
         if chosen:
-            used = ways if chosen[0].value.min() < 0 else []
             current = [c for c in fields if c.role == "current"][:1]
             found_by_wheel.append((f"{wheel}." if wheel else "", [*chosen, *used, *current]))
     return found_by_wheel, remarks
@@ -163,8 +164,6 @@ def _by_names(
 
 def _directed(voltage: _Candidate, way: _Candidate) -> _Candidate:
     """Return a voltage that is a size with its direction; BagError where that tells no sign."""
-    if not (voltage.value.size and voltage.value.min() >= 0):
-        return voltage
     size, direction = (Series(c.time.astype(np.int64), c.value) for c in (voltage, way))
     return replace(voltage, value=signed(size, direction, way.source).value)
 

@@ -21,6 +21,7 @@ from smp_motor_ident.errors import BagError
 _COMMENTS = ("#", "%", "//")
 _MATRIX = re.compile(r"^\s*\[(?=[\s\d.+-])|(?<=\d)\s*\]?;?\s*$|^\];?\s*$")
 """What stands around the rows of a matrix or of lists."""
+_ARROW, _TIME = " -> ", re.compile(r"\d\d?:\d\d:\d\d")
 _LABEL = re.compile(r"(?:^|(?<=[\s,;|]))([A-Za-z_]\w*)\s*[:=,;\s]\s*(?=[-+.\d])")
 """What a serial plotter's or a debug output's rows have before every number."""
 
@@ -39,6 +40,10 @@ class _CsvFile(Tables):
             self._lines = [s.strip()[1:-1] if _is_quoted_row(s) else s for s in self._lines]
         if any(self._lines[k].lstrip().startswith("[") for k in seen):
             self._lines = [_MATRIX.sub("", s) for s in self._lines]
+        usual = self._lines[seen[len(seen) // 2]]
+        if _ARROW in usual:  # behind a serial monitor's time of arrival
+            mark = next((c for c in ";\t," if c in usual), " ")
+            self._lines = [s.replace(_ARROW, mark) for s in self._lines]
         labels = self._labels(seen)
         self._separator = _separator([self._lines[k] for k in seen])
         rows = [_row(self._lines[k], self._separator) for k in seen]
@@ -96,11 +101,12 @@ class _CsvFile(Tables):
         labels: list[str] = _LABEL.findall(self._lines[seen[len(seen) // 2]])
         alike = [k for k in seen if labels and _LABEL.findall(self._lines[k]) == labels]
         bare = [_LABEL.sub("", self._lines[k]) for k in alike]
-        parts = [re.split(r"[\s,;|]+", text.strip()) for text in bare]
-        if len(alike) <= len(seen) / 2 or any(len(part) != len(labels) for part in parts):
+        widths = {len(re.split(r"[\s,;|]+", text.strip())) for text in bare}
+        names = (["time"] if bare and _TIME.match(bare[0].strip()) else []) + labels
+        if len(alike) <= len(seen) / 2 or widths != {len(names)}:
             return []
         self._lines = [_LABEL.sub("", line) for line in self._lines]
-        return labels
+        return names
 
     @staticmethod
     def _spaced(line: str, row: list[str], width: int) -> list[str]:

@@ -123,6 +123,19 @@ def test_rows_as_programs_print_them_are_read(
     np.testing.assert_allclose(np.diff(record.time), 0.02)
 
 
+@pytest.mark.parametrize("row", ["{},{}", "{} {}", "{}\t{}", "u:{},y:{}", "u={} y={}"])
+def test_rows_behind_a_serial_monitors_stamps_are_read(tmp_path: Path, row: str) -> None:
+    rows = [f"12:00:0{k}.500 -> {row.format(u, y)}" for k, (u, y) in enumerate(zip(U, Y))]
+    (tmp_path / "log.txt").write_text("\n".join(rows))
+    names = ("time", "u", "y") if "u" in row else ("c1", "c2", "c3")
+    assert list_topics(tmp_path / "log.txt")[0].offers[0].fields == list(names)
+    mapping = "time={} voltage={} velocity={}:deg/s".format(*names)
+    record = read_records(tmp_path / "log.txt", [mapping])["motor"]
+    np.testing.assert_allclose(record.time, np.arange(5))
+    np.testing.assert_allclose(record.velocity, np.deg2rad(Y))
+    np.testing.assert_allclose(record.voltage[1:], U[:-1])
+
+
 @pytest.mark.parametrize(
     ("head", "names"),
     [

@@ -229,6 +229,8 @@ def test_a_size_is_proposed_with_its_direction(tmp_path: Path) -> None:
     columns = {"t": T, "u": np.abs(voltage), "dir": voltage > 0, "w": speed}
     listing = list_topics(write(tmp_path / "log.csv", **columns))[0]
     assert listing.suggestion == ["voltage=u", "velocity=w", "direction=dir", "time=t"]
+    listing = list_topics(write(tmp_path / "log.csv", **{**columns, "u": voltage}))[0]
+    assert listing.suggestion == ["voltage=u", "velocity=w", "time=t"]  # it has its sign
     columns["dir"] = np.where(voltage > 0, 1, 2)
     listing = list_topics(write(tmp_path / "log.csv", **columns))[0]
     assert listing.suggestion == []
