@@ -111,12 +111,21 @@ def consider_left_out(data: Experiments, fit: Fit) -> Fit:
         beside = _beside(data, with_lag(fit, little) if little else fit, richer, coordinate)
         own, found = factor * beside.variance, beside.size + little
         early = little > 0 and found < 0  # which no sensor is
-        left = mean_square(found, own, most)
+        room = _room(s, coordinate, beside.answer)
+        left = mean_square(found, own, min(most, room))
         # Akaike: with it the motor is predicted better.
         if beside.seen and found**2 > 2 * own and not early:
-            left = max(left, found**2 - own)
+            left = max(left, min(found**2 - own, room**2))
         wider = wider.wider(beside.covariance(left)) if left > 0 else wider
     return wider
+
+
+def _room(structure: Structure, coordinate: str, answer: Array) -> float:
+    """Return the longest delay whose place a second lag can have taken: all of it, and no more."""
+    if coordinate != "delay" or "ln_a2" not in structure.free:
+        return math.inf
+    share = float(answer[structure.free.index("ln_a2")])  # of the second lag, for a second of delay
+    return 1 / share if share > 0 else math.inf
 
 
 def mean_square(found: float, variance: float, most: float) -> float:

@@ -21,6 +21,7 @@ from smp_motor_ident.estimation.fitted import long_run
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.noise import whitening
 from smp_motor_ident.likelihood.passes import answers, own_columns
+from smp_motor_ident.model.coordinates import PLAUSIBLE
 
 Array = NDArray[np.float64]
 
@@ -80,7 +81,8 @@ def _moves(data: Experiments, fit: Fit) -> Array:
         parts[-1][size:, size:] += np.diag(data.known_initial[g, own])
         inner = parts[-1][:size, size:] @ prediction.inverse(parts[-1][size:, size:])
         seen.append(parts[-1][:size, :size] - inner @ parts[-1][size:, :size])
-    whole = np.sum(seen, axis=0)
+    # As in the covariance: a piece moves a coordinate that no data tell within any motor's.
+    whole = np.sum(seen, axis=0) + np.diag(fit.structure.of_free(PLAUSIBLE))
     free = rows[:, :size]
     share = np.einsum("nf,nf->n", free @ prediction.inverse(whole), free)
     leverage = np.cumsum(share)
@@ -92,8 +94,7 @@ def _moves(data: Experiments, fit: Fit) -> Array:
         normal = parts[g].copy()
         normal[:size, :size] += whole - seen[g]
         inverse, piece = prediction.inverse(normal), rows[a:b].T @ rows[a:b]
-        values, vectors = np.linalg.eigh(inverse)
-        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        root = _root(inverse)
         taken, along = np.linalg.eigh(root.T @ piece @ root)
         taken = np.clip(taken, 1e-12, 1 - 1e-6)
         more = root @ along * ((1 / np.sqrt(1 - taken) - 1) / taken)
@@ -101,3 +102,10 @@ def _moves(data: Experiments, fit: Fit) -> Array:
         gradient = gradient + piece @ more @ (root @ along).T @ gradient
         moves.append((inverse @ gradient)[:size])
     return np.array(moves)
+
+
+def _root(covariance: Array) -> Array:
+    """Return a root of a covariance, whatever the units of its coordinates."""
+    deviation = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    values, vectors = np.linalg.eigh(covariance / np.outer(deviation, deviation))
+    return np.asarray(deviation[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)))

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import independent
 import motors
 import numpy as np
 import pytest
@@ -164,6 +165,31 @@ def test_a_delay_not_worth_its_price_is_in_the_interval():
         wider = consider_left_out(moved, replace(fit, added=None))
         lags = wider.conditional()[2, 2] / fit.conditional()[2, 2]
         assert 1.0 < lags < 1.1 if times == 0.0 else lags > 2.0
+
+
+@pytest.mark.parametrize("late, noise", [(0.0, 1e-4), (3.0, 3e-3)])
+def test_a_delay_in_the_place_of_a_second_lag_is_as_long_at_most(late, noise):
+    """A finely known angle shows 20 us in rows of 5 ms: winding or delay, never ms of either."""
+    rng = np.random.default_rng(4)
+    t = np.arange(2800) / 200.0
+    volts = np.repeat([0.0, 12.0, -24.0, 16.0, -36.0, 8.0, 28.0], 400)
+    volts = independent.excitation(t, "fourier", 36.0) if late else volts
+    motion = independent.simulate(t, volts, 1.0, 2e-5, 0.2, 0.004, 1e-3, 0.0, np.zeros(t.size), 500)
+    angle = motion[:, 2] + noise * rng.standard_normal(t.size)
+    data = prepare([Record("motor", t, volts, position=angle)], False)
+    fit = initial_fit(data, SecondOrder(friction="none"), Options())
+    assert fit.z.second_lag == pytest.approx(2e-5, rel=0.5)
+    richer = fit.structure.with_(delay=True)
+    step, cov = predicted_decrease(data, fit, richer)[1:]
+    at = richer.free.index("delay")
+    # As far from none as chance puts one delay in twenty: Akaike has it in the interval.
+    shift = late * float(np.sqrt(cov[at, at])) - step[at] if late else 0.0
+    moved = replace(data, hold_end=data.hold_end - shift)
+    row = fit.structure.of_free(np.eye(12)[1] - np.eye(12)[0]) * fit.z.time_constant
+    fit = replace(fit, added=None)
+    own, wider = fit.conditional(), consider_left_out(moved, fit).conditional()
+    both = np.hypot(np.sqrt(row @ own @ row), fit.z.second_lag)
+    assert np.sqrt(row @ wider @ row) < 1.05 * both  # a left-out load adds little
 
 
 @pytest.mark.parametrize("found, deviation", [(0.3, 0.02), (0.0, 0.05), (0.2, 0.1), (-0.5, 2.0)])

@@ -5,13 +5,14 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from independent import simulate
 from scipy.linalg import fractional_matrix_power
 
 from smp_motor_ident.estimation.fit import Options, solve
 from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.estimation.transients import widened_by_pieces
 from smp_motor_ident.likelihood.experiments import prepare
-from smp_motor_ident.model.structures import FirstOrder
+from smp_motor_ident.model.structures import FirstOrder, SecondOrder
 from smp_motor_ident.record import Record
 
 GAIN, LAG, RATE, STEP = 20.0, 0.05, 1000.0, 8.0  # rad/s/V, s, Hz, V
@@ -81,3 +82,28 @@ def test_a_step_alone_scatters_as_it_says(seed):
 def test_what_is_noise_or_comes_again_and_again_is_left_as_it_is(uneven, often):
     data, fit = fitted(stepped(5, uneven, often))
     assert lag_of(widened_by_pieces(data, fit)) < 1.05 * lag_of(fit)
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.4])
+def test_an_angle_known_finely_loses_nothing_where_a_direction_is_unknown(friction):
+    """A winding of 20 us and the current at first, of which no row tells, move no other number.
+
+    Beside them the gain is known to a millionth: a root of the covariance that is exact to a
+    share of its largest element would hide it.
+    """
+    rng = np.random.default_rng(3)
+    t = np.arange(2800) / 200.0
+    volts = 4 * np.repeat([0.0, 3.0, 6.0, 4.0, 9.0, 2.0, 7.0], 400)
+    R, K, J = 1.0, 0.2, 0.004
+    motion = simulate(t, volts, R, 2e-5, K, J, 1e-3, friction, np.zeros(t.size), 500)
+    angle = motion[:, 2] + 1e-5 * rng.standard_normal(t.size)
+    data = prepare([Record("motor", t, volts, position=angle)], False)
+    kind = "symmetric" if friction else "none"
+    fit = free_run(data, initial_fit(data, SecondOrder(friction=kind, shape=True), Options()))
+    before, after = (np.sqrt(np.diag(f.conditional())) for f in (fit, widened_by_pieces(data, fit)))
+    assert before[0] < 1e-5  # of the gain, as sure as it is
+    told = before < 0.05  # not L/R, which hangs on a row or two, or on none
+    assert told[:3].all()
+    assert np.all(after[told] < 2.5 * before[told])  # 24 pieces of chance
+    # What no data tell is known as beforehand.
+    assert friction or after[3] < 2.0 * before[3]
