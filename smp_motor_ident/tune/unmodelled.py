@@ -51,7 +51,9 @@ def unmodelled_dynamics(estimate: Estimate) -> UnmodelledDynamics | None:
 
     An error that is shown counts with all of its bound, up to what a resonance makes of it; where
     more than the response itself is shown, for such a resonance, of which a band holds the mean.
-    One that merely is not excluded counts for no more than what is taken where nothing is known.
+    One that merely is not excluded counts for no more than what is taken where nothing is known,
+    and below all frequencies at which the recording moved the motor as at the lowest of these:
+    masses on springs, freed, answer slower changes as one mass.
     """
     error = estimate.residuals.model_error
     if error is None:
@@ -60,6 +62,9 @@ def unmodelled_dynamics(estimate: Estimate) -> UnmodelledDynamics | None:
     least = 2 * shown - bound
     taken = np.minimum(bound, np.where(least > 0, RESONANCE.value, UNKNOWN_RESPONSE.value))
     taken = np.where(least > 1, RESONANCE.value, taken)
+    lowest = int(np.argmax(taken < 1))
+    slower = (np.arange(taken.size) < lowest) & ~(least > 0)
+    taken = np.where(slower, taken[lowest], taken)
     return UnmodelledDynamics(np.array(error.frequency), taken)
 
 

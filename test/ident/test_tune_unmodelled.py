@@ -95,6 +95,20 @@ def test_error_that_is_not_shown_does_not_count_in_full():
     assert weight(np.array([5000.0])) == pytest.approx(2.0)
 
 
+def test_voltage_that_changes_at_one_pace_leaves_a_loop_what_is_slower():
+    """A sine moves the motor nowhere below its frequency; integral action needs the gain there."""
+    loop = replace(LOOP, difference_window=0)
+    bound = tuple(50.0 if f < 10.0 else 0.05 for f in FREQUENCY)
+    one = design(estimate(tuple(5.0 if b > 1 else 0.01 for b in bound), bound), loop)
+    known = design(known_up_to(600.0), loop)
+    assert one.gains.i == pytest.approx(known.gains.i, rel=1e-6)
+    # What is shown there counts: the response itself may be gone.
+    shown = tuple(20.0 if b > 1 else 0.01 for b in bound)
+    bound = tuple(21.0 if b > 1 else b for b in bound)
+    with pytest.raises(DesignError):
+        design(estimate(shown, bound), loop)
+
+
 def test_recording_that_shows_nothing_is_refused_with_the_reason():
     nothing = estimate((0.5,) * len(FREQUENCY), (5.0,) * len(FREQUENCY))
     with pytest.raises(DesignError, match=r"shows the motor's response up to 0\.5 rad/s"):
