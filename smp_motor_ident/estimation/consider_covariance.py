@@ -15,17 +15,20 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import erfcx
 
 from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.current_lag import LITTLE, with_lag
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.coordinates import direction
+from smp_motor_ident.model.physical import physical_gradients
 from smp_motor_ident.model.structures import Electromechanical, Structure
 
 Array = NDArray[np.float64]
 
 POINTS = 64  # at which a lag may be
+FAR = 1e3  # deviations beyond which what is left of a normal variable is exponential
 SEEN, ROUNDING = 1e-6, 1e-11
 """Shares of a coordinate's information below which kinks, or rounding, decide what is left."""
 
@@ -76,6 +79,33 @@ def consider_drop(data: Experiments, fit: Fit) -> Fit:
         return fit
     drop = float(np.exp(fit.z.ln_r) * fit.z.current_offset)
     return fit.along(s.of_free(direction(vc_plus=drop, vc_minus=drop)))
+
+
+def consider_bound(free: Fit, bound: Fit, name: str) -> Fit:
+    """Return a fit whose parameter is held at zero, widened by what that may be above it.
+
+    ``free`` is the same fit without the bound, where the parameter is negative.
+    """
+    value, row = physical_gradients(free.z)[name]
+    row = row @ free.structure.matrix
+    covariance = free.conditional()
+    variance = float(row @ covariance @ row)
+    if not 0 < variance < math.inf:
+        return bound
+    size = above_zero(value, math.sqrt(variance))
+    return bound.along(size / variance * (covariance @ row))
+
+
+def above_zero(value: float, deviation: float) -> float:
+    """Return the root mean square of what is known as a normal variable, and to be positive.
+
+    Of ``N(value, deviation^2)`` above zero: ``E x^2 = deviation^2 + value E x``.
+    """
+    below = -value / deviation
+    if below > FAR:
+        return math.sqrt(2) * deviation / below
+    mean = deviation * (math.sqrt(2 / math.pi) / float(erfcx(below / math.sqrt(2))) - below)
+    return math.sqrt(deviation**2 + value * mean)
 
 
 def consider_friction(data: Experiments, fit: Fit) -> tuple[Fit, float]:

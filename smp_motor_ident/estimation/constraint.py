@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from smp_motor_control.motor.parameters import PHYSICAL
+from smp_motor_ident.estimation.consider_covariance import consider_bound
 from smp_motor_ident.estimation.descent import refine
 from smp_motor_ident.estimation.fit import Fit, Prior
 from smp_motor_ident.estimation.request import Request
@@ -31,15 +32,12 @@ def constrained(data: Experiments, fit: Fit, request: Request) -> Fit:
     for name, (low, high) in request.bounds.items():
         if not low <= values[name] <= high:
             priors.append(Prior(name, float(np.clip(values[name], low, high)), 1e-4 * scale[name]))
-    if values["viscous_friction"] < 0 and "viscous_friction" not in known:
-        priors.append(
-            Prior(
-                "viscous_friction",
-                1e-9 * scale["viscous_friction"],
-                1e-4 * scale["viscous_friction"],
-            )
-        )
+    negative = values["viscous_friction"] < 0 and "viscous_friction" not in known
+    if negative:
+        most = scale["viscous_friction"]
+        priors.append(Prior("viscous_friction", 1e-9 * most, 1e-4 * most))
     if not priors:
         return fit
     bound = replace(request.options, priors=tuple(priors))
-    return refine(data, fit.structure, fit, fit.z, bound)
+    held = refine(data, fit.structure, fit, fit.z, bound)
+    return consider_bound(fit, held, "viscous_friction") if negative else held

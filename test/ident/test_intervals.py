@@ -13,7 +13,11 @@ from smp_motor_control.excitation import Fourier
 from smp_motor_control.motor.parameters import PHYSICAL
 from smp_motor_ident.diagnosis.identifiability import what_next
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.estimation.consider_covariance import consider_left_out, mean_square
+from smp_motor_ident.estimation.consider_covariance import (
+    above_zero,
+    consider_left_out,
+    mean_square,
+)
 from smp_motor_ident.estimation.fitted import Options, long_run
 from smp_motor_ident.estimation.hold_choice import instant_deviation
 from smp_motor_ident.estimation.initialisation import initial_fit
@@ -23,7 +27,7 @@ from smp_motor_ident.estimation.thinning import thinned
 from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.model.structures import FirstOrder, SecondOrder
-from smp_motor_ident.record import Record
+from smp_motor_ident.record import Hardware, Record
 
 
 def test_a_friction_that_does_not_show_is_nothing_within_an_interval():
@@ -244,3 +248,33 @@ def test_a_speed_that_is_a_difference_of_counts_is_right_on_average() -> None:
     assert data.quantum > 0
     fit = initial_fit(data, FirstOrder(), Options())
     assert widened(data, fit) is fit
+
+
+def test_friction_that_noise_puts_below_nothing_leaves_the_motor_as_open_as_it_is():
+    """A winding's noise of 0.2 A makes a motor that pushes itself of one that hardly rubs."""
+    R, L, K, J, B, TC = 2.0, 4e-3, 0.04, 8e-4, 4e-5, 0.02
+    rng = np.random.default_rng(4)
+    t = np.arange(600) / 200.0
+    volts = independent.excitation(t, "fourier", 9.0, 4)
+    motion = independent.simulate(t, volts, R, L, K, J, B, TC, np.zeros(t.size), 200)
+    count = np.floor(motion[:, 2] * 48 / (2 * np.pi) + rng.uniform()).astype(np.int64)
+    amps = motion[:, 0] + 0.2 * rng.standard_normal(t.size)
+    found = estimate(Record("motor", t, volts, amps, count=count, hardware=Hardware(1.0, 48.0)))
+    for name, true in (("motor_constant", K), ("inertia", J), ("resistance", R)):
+        q = found.parameters[name]
+        assert abs(q.value - true) < 3 * q.std < 0.3 * true, name  # known, and no better
+    rubs = found.parameters["viscous_friction"]
+    assert rubs.value is None or abs(rubs.value - B) < 3 * rubs.std
+
+
+@pytest.mark.parametrize("value, deviation", [(-0.1, 1.0), (-3e-3, 2e-3), (-8.0, 1.0)])
+def test_what_is_positive_is_as_large_as_its_own_square_says(value, deviation):
+    whole = norm.sf(0.0, value, deviation)
+    square = quad(lambda x: x * x * norm.pdf(x, value, deviation), 0.0, 9 * deviation)[0]
+    assert above_zero(value, deviation) == pytest.approx(np.sqrt(square / whole), rel=1e-6)
+
+
+def test_what_is_far_below_nothing_is_exponential_above_it():
+    # The density falls by e in deviation^2 / |value|, and a mean square is twice that squared.
+    for value in (-990.0, -1010.0):
+        assert above_zero(value, 1.0) == pytest.approx(np.sqrt(2) / -value, rel=1e-4)
