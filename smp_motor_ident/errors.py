@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from smp_motor_control.errors import ParameterError, SmpError
 
 __all__ = [
@@ -12,6 +14,7 @@ __all__ = [
     "ParameterError",
     "SignalError",
     "SmpError",
+    "UnknownLagError",
 ]
 
 
@@ -33,6 +36,12 @@ class InsufficientExcitationError(SmpError):
     """The data do not support the answer; the message says what to record next."""
 
     exit_code = 1
+
+
+class UnknownLagError(InsufficientExcitationError):
+    """The data tell a gain and no time constant; ``estimate`` is the answer without one."""
+
+    estimate: Any = None
 
 
 class DesignError(SmpError):

@@ -23,7 +23,7 @@ from smp_motor_ident.diagnosis.lost_rows import bridged
 from smp_motor_ident.diagnosis.misfit import widened_by_misfit
 from smp_motor_ident.diagnosis.model_error import regression
 from smp_motor_ident.diagnosis.noise_or_effect import in_place_of_noise
-from smp_motor_ident.diagnosis.refusal import no_candidate, refuse
+from smp_motor_ident.diagnosis.refusal import lag_unknown, no_candidate, refuse
 from smp_motor_ident.diagnosis.residuals import residual_tests
 from smp_motor_ident.diagnosis.scope import (
     UNDECIDED,
@@ -39,6 +39,7 @@ from smp_motor_ident.errors import (
     InsufficientExcitationError,
     SignalError,
     SmpError,
+    UnknownLagError,
 )
 from smp_motor_ident.estimation import flexible_shaft, order_selection
 from smp_motor_ident.estimation.averaging import candidate_weights, covering
@@ -56,7 +57,7 @@ from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.hold_choice import chosen_hold, instant_deviation, otherwise
 from smp_motor_ident.estimation.profile import profiled
 from smp_motor_ident.estimation.quantisation import widened
-from smp_motor_ident.estimation.quantities import Answer, answer, driven_longest
+from smp_motor_ident.estimation.quantities import Answer, answer, driven_longest, without_lag
 from smp_motor_ident.estimation.request import Request, base_structure, checked
 from smp_motor_ident.estimation.segments import heterogeneous
 from smp_motor_ident.estimation.selection import FittedCandidate
@@ -135,7 +136,11 @@ def estimate(
     group = counts_again([bridged(merge_bunches(on_beat(r))) for r in group])
 
     def behind(records: list[Record], kept: Sequence[Record] | None) -> Estimate:
-        return _checked(records, replace(request, validation=kept))
+        try:
+            return _checked(records, replace(request, validation=kept))
+        except UnknownLagError as refusal:
+            without_one: Estimate = refusal.estimate
+            return without_one
 
     return declared(behind, group, request.validation, request.known)
 
@@ -284,7 +289,7 @@ def _stated(
 
     result, alike = said(chosen)
     fitted = validate.speed_fit(group, final, chosen)
-    refuse(group, final, chosen, result, fitted)
+    refusal = _without_lag(group, final, chosen, result, fitted)
     request.say("validating")
     own, common = validate.validated(group, request, final, chosen, hold)
     percent = FitPercent(fitted, own)
@@ -297,8 +302,10 @@ def _stated(
     if not any(f.severity == "unreliable" for f in lacks):
         lacks += in_place_of_noise(final, chosen, gear, numbers, request.options)
     (result, alike), beside = widened_by_misfit(final, chosen, possible, said)
+    result = without_lag(result) if refusal else result
     findings = [
         *found,
+        *lag_unknown(result, refusal, data.step),
         *assess(final, chosen, FitPercent(fitted, common), tests),
         *lacks,
         *parts,
@@ -307,7 +314,7 @@ def _stated(
         *advise(chosen, result, request.known),
         *scope(final, result, change, alike, group[0].hardware.resistance),
     ]
-    return Estimate(
+    estimate = Estimate(
         model=chosen.structure.title,
         parameters=result.parameters,
         combinations=result.combinations,
@@ -322,6 +329,21 @@ def _stated(
         speed_noise=_speed_noise(group, data, chosen),
         **_provenance(group),
     )
+    if refusal is not None:
+        refusal.estimate = estimate
+        raise refusal
+    return estimate
+
+
+def _without_lag(
+    group: list[Record], data: Experiments, fit: Fit, result: Answer, fitted: float
+) -> UnknownLagError | None:
+    """Refuse what cannot be stated; return the refusal of which the lag alone is the reason."""
+    try:
+        refuse(group, data, fit, result, fitted)
+    except UnknownLagError as refusal:
+        return refusal
+    return None
 
 
 def _prepared(

@@ -8,10 +8,16 @@ import numpy as np
 
 from smp_motor_ident.diagnosis.limits import LARGEST_OFFSET, LOOSE_QUANTITY, WORST_FIT
 from smp_motor_ident.diagnosis.validation import speed_fit, stands, within_resolution
-from smp_motor_ident.errors import CurrentError, InsufficientExcitationError, SignalError
+from smp_motor_ident.errors import (
+    CurrentError,
+    InsufficientExcitationError,
+    SignalError,
+    UnknownLagError,
+)
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.prediction import simulate
 from smp_motor_ident.estimation.quantities import Answer
+from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.record import Record
 
@@ -46,6 +52,7 @@ def refuse(
             "that voltage and encoder belong to the same motor, that the driver puts out what is "
             "commanded (no clip at the supply, no coasting), and that nothing else drives it"
         )
+    _refuse_offset(group, fit)
     loose = [
         n
         for n in ("dc_gain", "time_constant")
@@ -54,11 +61,31 @@ def refuse(
     ]
     if loose:
         _refuse_integral(group, fit)
-        raise InsufficientExcitationError(
+        refusal = UnknownLagError if loose == ["time_constant"] else InsufficientExcitationError
+        raise refusal(
             f"{where(group)}: the data do not tell {' and '.join(loose)}; record a longer "
             "excitation with several frequencies, in both directions and well above the friction"
         )
-    _refuse_offset(group, fit)
+
+
+def lag_unknown(result: Answer, refusal: UnknownLagError | None, step: float) -> list[Finding]:
+    """Say that an answer leaves open how slow the motor is, at this sampling interval [s]."""
+    if refusal is None:
+        return []
+    low, high = result.combinations["time_constant"].ci95 or (0.0, np.inf)
+    quick = high < step
+    cause = "a load that fluctuates, or what the model lacks, takes its place"
+    advice = "record longer, with several frequencies, in both directions and well above friction"
+    return [
+        Finding(
+            "lag_unknown",
+            "warning" if quick else "unreliable",
+            f"the data do not tell time_constant: it may be anything from {low:.3g} to {high:.3g} "
+            f"s; {f'it is over within the {step:.3g} s between samples' if quick else cause}",
+            {"low": float(low), "high": float(high), "sample_time": step},
+            "sample faster" if quick else advice,
+        )
+    ]
 
 
 def _follows(group: Sequence[Record], data: Experiments, fit: Fit) -> bool:

@@ -33,7 +33,8 @@ from smp_motor_ident.model.second_order import internal
 Array = NDArray[np.float64]
 
 RISE = float(chdtri(1, 0.05))  # of the deviance at the end of a 95 % interval
-NONLINEAR = ("vc_plus", "ln_a2", "delay", "window", "current_lag")
+NONLINEAR = ("vc_plus", "ln_a1", "ln_a2", "delay", "window", "current_lag")
+LAGS = ("ln_a1", "ln_a2")  # logarithms
 """Coordinates that act other than linearly, in the order in which they are followed."""
 NEAR = 3.0  # standard deviations to a bound within which no parabola is trusted
 STEPS = 8  # points on each side
@@ -76,8 +77,8 @@ def profiled(data: Experiments, fit: Fit, options: Options) -> Fit:
             held = replace(fit, structure=fit.structure.with_(fixed=friction))
             continue
         value = fit.z.value(coordinate)
-        loose = std[i] > PROFILE_FROM.value * (1.0 if coordinate == "ln_a2" else abs(value))
-        if not loose and (coordinate == "ln_a2" or value > NEAR * std[i]):
+        loose = std[i] > PROFILE_FROM.value * (1.0 if coordinate in LAGS else abs(value))
+        if not loose and (coordinate in LAGS or value > NEAR * std[i]):
             continue
         found.append(_followed(data, held, coordinate, float(std[i]), target, options))
     return replace(fit, profiles=tuple(found))
@@ -112,7 +113,7 @@ def _followed(
 ) -> Profile:
     low, high = _range(data, fit, coordinate)
     value = fit.z.value(coordinate)
-    size = max(value, 0.02 * high) if coordinate != "ln_a2" else 1.0
+    size = max(value, 0.02 * high) if coordinate not in LAGS else 1.0
     first = float(np.clip(NORMAL_95 * std, 0.05 * size, size))
     target *= data.size / fit.samples
     here = solve(data, fit.structure, fit.at(fit.z, initial_of(data, fit)), options, 6)
@@ -146,6 +147,8 @@ def _range(data: Experiments, fit: Fit, coordinate: str) -> tuple[float, float]:
     if coordinate == "ln_a2":
         slowest = 2 * fit.z.ln_a1 - fit.z.ln_a0  # a winding as slow as the rotor
         return value - FARTHEST, max(value + FARTHEST, slowest)
+    if coordinate == "ln_a1":
+        return value - FARTHEST, value + FARTHEST
     if coordinate == "vc_plus":
         full = float(np.abs(data.hold_value).max())
         if not fit.structure.current:

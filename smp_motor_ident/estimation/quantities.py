@@ -6,7 +6,7 @@ Derivation: docs/derivations.md, sections 9 and 11.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -124,6 +124,22 @@ def answer(
         joint[np.ix_(keep, keep)],
         loose,
         level if one_level else 0.0,
+    )
+
+
+def without_lag(result: Answer) -> Answer:
+    """Return an answer that leaves open how slow the motor is."""
+    hidden: dict[str, Quantity] = {
+        name: Quantity(None, None, result.combinations[name].ci95, UNITS[name], "unidentifiable")
+        for name in ("time_constant", "time_constant_product")
+        if name in result.combinations
+    }
+    keep = [i for i, n in enumerate(result.names) if n not in hidden]
+    return replace(
+        result,
+        combinations={**result.combinations, **hidden},
+        names=tuple(result.names[i] for i in keep),
+        covariance=result.covariance[np.ix_(keep, keep)],
     )
 
 

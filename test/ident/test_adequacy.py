@@ -35,9 +35,17 @@ def test_clean_data_show_no_effect() -> None:
         assert not codes & {f.code for f in found if f.severity == "unreliable"}
 
 
-def test_a_clipped_command_is_no_sound_result() -> None:
+def test_a_clipped_command_is_found_out() -> None:
+    found = estimate(commanded(top=6.0))
+    clip = found.combinations["clip_voltage"]
+    assert abs(clip.value - 6.0) < 4 * clip.std
+    assert any(f.severity == "warning" and "record" in f.advice for f in found.findings)
+
+
+def test_a_clipped_command_is_no_sound_result_without_its_driver(monkeypatch) -> None:
+    monkeypatch.setattr("smp_motor_ident.estimate.likeliest", lambda *_: None)
     found = [f for f in estimate(commanded(top=6.0)).findings if f.severity == "unreliable"]
-    assert any(f.evidence.get("quantity") and "record" in f.advice for f in found)
+    assert any(f.evidence.get("quantity") and f.advice for f in found)
 
 
 def test_an_effect_whose_shape_the_model_has_to_a_twentieth_is_not_tried() -> None:

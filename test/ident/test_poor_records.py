@@ -191,6 +191,28 @@ def test_the_scatter_of_an_angle_at_rest_is_no_motion():
     assert abs(found.value - truth.value) < 3 * found.std
 
 
+def staircase(lag: float, scatter: float) -> Record:
+    """Return a speed at 1 Hz of a motor of gain 20 with friction of 0.5 V under 30 levels."""
+    rng = np.random.default_rng(4)
+    voltage = np.repeat(rng.uniform(-10.0, 10.0, 30), 10)
+    steady = 20.0 * (voltage - np.clip(voltage, -0.5, 0.5))
+    keep = np.exp(-1.0 / lag)
+    speed = lfilter([1 - keep], [1.0, -keep], steady)
+    noisy = speed + scatter * rng.standard_normal(speed.size)
+    return Record("motor", np.arange(voltage.size) * 1.0, voltage, velocity=noisy)
+
+
+def test_a_lag_below_the_sampling_interval_leaves_a_gain():
+    found = estimate(staircase(0.05, 5.0))
+    lag, gain = (found.combinations[n] for n in ("time_constant", "dc_gain"))
+    assert lag.value is None
+    assert lag.ci95[0] < 0.05 < lag.ci95[1] < 1.0
+    assert abs(gain.value - 20.0) < 3 * gain.std < 1.0
+    (said,) = [f for f in found.findings if f.code == "lag_unknown"]
+    assert (said.severity, said.advice) == ("warning", "sample faster")
+    assert estimate(staircase(1.0, 5.0)).combinations["time_constant"].value is not None
+
+
 def test_an_angle_that_is_given_as_a_speed_is_recognised():
     rng = np.random.default_rng(11)
     rate, turns = 50.0, np.array([0.6, 0.0, -0.7, 0.0, 0.5, -0.6])
