@@ -58,7 +58,9 @@ def weights(data: Callable[[Fit], Experiments], fits: Sequence[Fit], seed: int =
     runs = np.array(rows)
     rng = np.random.default_rng(seed)
     shares = rng.dirichlet(np.ones(BLOCKS), DRAWS) * BLOCKS
-    price = np.array([POLICY.price(f.structure.size, f.samples) for f in fits])
+    # Of a choice between two holds nobody knows the odds: a second lag is as likely as the later.
+    sizes = [f.structure.size + (f.structure.shift > 0) for f in fits]
+    price = np.array([POLICY.price(n, f.samples) for n, f in zip(sizes, fits, strict=True)])
     total = shares @ runs.T + price
     each = np.exp(-0.5 * (total - total.min(axis=1, keepdims=True)))
     return np.asarray((each / each.sum(axis=1, keepdims=True)).mean(axis=0))
@@ -141,6 +143,7 @@ def _value(answer: Answer, name: str, own: float) -> float:
 def _shifted(
     quantities: Mapping[str, Quantity], shift: Mapping[str, tuple[float, float, float]]
 ) -> dict[str, Quantity]:
+    """Return means over structures; of each the interval keeps what the choice alone says."""
     out = dict(quantities)
     for name, quantity in quantities.items():
         if name not in shift or quantity.value is None or quantity.std is None:
@@ -149,11 +152,11 @@ def _shifted(
         low, high = quantity.ci95 or (quantity.value, quantity.value)
         reach = NORMAL_95**2 * between
         down = mean - float(np.sqrt((factor * (quantity.value - low)) ** 2 + reach))
+        up = mean + float(np.sqrt((factor * (high - quantity.value)) ** 2 + reach))
         out[name] = replace(
             quantity,
             value=mean,
             std=float(np.hypot(factor * quantity.std, np.sqrt(between))),
-            ci95=(max(down, 0.0) if low >= 0 else down,
-                  mean + float(np.sqrt((factor * (high - quantity.value)) ** 2 + reach))),
-        )  # fmt: skip
+            ci95=(min(max(down, 0.0) if low >= 0 else down, low), max(up, high)),
+        )
     return out
