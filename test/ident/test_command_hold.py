@@ -49,6 +49,17 @@ def test_a_command_that_is_logged_before_it_runs_is_no_slower_motor(kind):
         assert "late_command" in [f.code for f in found.findings]
 
 
+def test_a_winding_of_one_interval_is_not_surely_a_later_command():
+    t = np.arange(8000) / 1000
+    v = 9.0 * np.interp((t / 2.0) % 4.0, [0.0, 1.0, 3.0, 4.0], [0.0, 1.0, -1.0, 0.0])
+    out = simulate(t, v, R, R / 1000, K, J, B, TC, np.zeros(t.size), 100)
+    count = np.floor(out[:, 2] * 500 / (2 * np.pi)).astype(np.int64)
+    found = estimate(Record("motor", t, v, count=count, hardware=Hardware(1.0, 500.0)))
+    assert found.combinations["delay"].ci95[0] == 0.0
+    lag = found.combinations["time_constant"]
+    assert lag.ci95[0] < (R * J + R / 1000 * B) / (R * B + K * K) < lag.ci95[1]
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_a_command_that_runs_straight_from_row_to_row_is_no_longer_winding(seed):
     rng = np.random.default_rng(seed)
