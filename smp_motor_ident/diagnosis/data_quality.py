@@ -24,7 +24,7 @@ from smp_motor_ident.diagnosis.limits import (
 from smp_motor_ident.diagnosis.lost_sign import lost_sign
 from smp_motor_ident.diagnosis.signs import lagged, likeness
 from smp_motor_ident.diagnosis.silence import silent
-from smp_motor_ident.diagnosis.units import implausible_voltage
+from smp_motor_ident.diagnosis.units import cause_of_ratio, implausible_voltage
 from smp_motor_ident.errors import InsufficientExcitationError, SignalError
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.record import Record
@@ -221,10 +221,10 @@ def _compare(record: Record, angle: Array, what: str, other_values: Array, other
     # Where either is noisy, or late, their ratio lies between the two regressions (Frisch 1934).
     low, high = float(a @ b / (a @ a)), float(b @ b / (a @ b))
     if low > 1.05 or high < 0.95:
+        ratio = float(np.sqrt(low * high))
         raise SignalError(
-            f"{where}: {other} is {np.sqrt(low * high):.4g} times what the {what} says; wrong gear "
-            f"ratio (now {record.hardware.gear_ratio:g}) or counts per revolution (now "
-            f"{record.hardware.counts_per_revolution or 0:g}), correct the motor description"
+            f"{where}: {other} is {ratio:.4g} times what the {what} says; "
+            f"{cause_of_ratio(ratio, record.hardware)}"
         )
 
 

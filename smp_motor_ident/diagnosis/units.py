@@ -2,13 +2,38 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 
 from smp_motor_ident.diagnosis.limits import EXTRA_LOW_VOLTAGE, LOW_VOLTAGE
 from smp_motor_ident.finding import Finding
-from smp_motor_ident.record import Record
+from smp_motor_ident.record import Hardware, Record
+
+RATIOS = {
+    30 / math.pi: "in rpm, the other in radians",
+    60.0: "in rpm, the other in turns",
+    6.0: "in rpm, the other in degrees",
+    180 / math.pi: "in degrees, the other in radians",
+    2 * math.pi: "in radians, the other in turns",
+    360.0: "in degrees, the other in turns",
+    1000.0: "in thousandths of the other's unit",
+}
+"""What a speed and an angle that differ by such a factor may be in."""
+EXACT = 0.01  # of a ratio: two units' is exact, and a gear's is none of these as a rule
+
+
+def cause_of_ratio(ratio: float, hardware: Hardware) -> str:
+    """Return what makes a speed so many times the slope of its angle, and what to do."""
+    for size, words in RATIOS.items():
+        for factor, to in ((size, "the speed is"), (1 / size, "the angle is")):
+            if abs(ratio / factor - 1) < EXACT:
+                return f"{to} {words}: map it with its unit, such as velocity=COLUMN:rpm"
+    return (
+        f"wrong gear ratio (now {hardware.gear_ratio:g}) or counts per revolution (now "
+        f"{hardware.counts_per_revolution or 0:g}), correct the motor description"
+    )
 
 
 def implausible_voltage(records: Sequence[Record]) -> list[Finding]:

@@ -183,3 +183,19 @@ def test_a_motor_below_its_friction_stands_whatever_offset_its_sensor_shows(sign
     offset = replace(GOOD, count=None, current=None, voltage=volts, velocity=np.full(N, 0.13))
     with pytest.raises(SignalError, match=r"standing motor.*no excitation above friction"):
         estimate(offset)
+
+
+@pytest.mark.parametrize(
+    ("speed", "angle", "words"),
+    [
+        (30 / np.pi, 1.0, "speed is in rpm, the other in radians"),
+        (30 / np.pi, 0.5 / np.pi, "speed is in rpm, the other in turns"),
+        (1.0, 180 / np.pi, "angle is in degrees, the other in radians"),
+        (1.7, 1.0, "wrong gear ratio"),
+    ],
+)
+def test_a_speed_that_is_an_angles_slope_in_another_unit_names_both(speed, angle, words):
+    turned = np.cumsum(GOOD.velocity) * np.median(np.diff(GOOD.time))
+    mixed = replace(GOOD, count=None, velocity=speed * GOOD.velocity, position=angle * turned)
+    with pytest.raises(SignalError, match=words):
+        screen([mixed])
