@@ -241,7 +241,9 @@ def _through_driver(
         e = _estimated(driver.records, replace(request, driver=driver, validation=kept), found)
     except (SignalError, InsufficientExcitationError):
         return None
-    return None if e.unreliable else through(e, driver)
+    emptied = {"implausible_motor", "one_level", "one_size_of_voltage"}
+    hollow = any(f.code in emptied for f in e.findings)  # little is left of what was recorded
+    return None if e.unreliable or hollow else through(e, driver)
 
 
 def _in_turn(candidates: list[FittedCandidate]) -> list[FittedCandidate]:

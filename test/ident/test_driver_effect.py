@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from smp_motor_ident.errors import ParameterError
+from smp_motor_ident.errors import ParameterError, SmpError
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.estimation.driver_effect import driver_of
 from smp_motor_ident.model import driver
@@ -143,3 +143,20 @@ def test_a_slew_limit_remembers_where_it_was():
     limited = Driver(driver.SLEW, 100.0, 10.0)
     assert terminal_voltage(limited, 3.0, 0.0, 1.0, 0.01) == pytest.approx((1.5, 2.0))
     assert terminal_voltage(limited, 1.5, 0.0, 1.0, 0.01) == pytest.approx((1.375, 1.5))
+
+
+def test_a_driver_that_leaves_nothing_of_the_record_is_no_explanation():
+    """Current flows in the on-time alone, and 26 levels one way look clipped at the lowest."""
+    rng = np.random.default_rng(1)
+    duty = np.repeat(np.arange(26) / 25, 200)
+    w, speed = 0.0, np.zeros(duty.size)
+    for k in range(duty.size):
+        drive = duty[k] * (12 - w / 4.5) * 4.5 - 0.12 * w - 2.0 * (w > 0 or duty[k] > 0.05)
+        w = max(w + 0.01 / 0.15 * drive, 0.0)
+        speed[k] = w + 0.2 * rng.standard_normal()
+    voltage = np.r_[0.0, 12 * duty[:-1]]
+    try:
+        found = estimate(Record("motor", 0.01 * np.arange(duty.size), voltage, velocity=speed))
+    except SmpError:
+        return
+    assert found.unreliable
