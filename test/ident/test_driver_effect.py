@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from smp_motor_ident.errors import ParameterError, SmpError
+from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.estimation.driver_effect import driver_of
 from smp_motor_ident.model import driver
@@ -145,18 +145,18 @@ def test_a_slew_limit_remembers_where_it_was():
     assert terminal_voltage(limited, 1.5, 0.0, 1.0, 0.01) == pytest.approx((1.375, 1.5))
 
 
-def test_a_driver_that_leaves_nothing_of_the_record_is_no_explanation():
-    """Current flows in the on-time alone, and 26 levels one way look clipped at the lowest."""
+@pytest.mark.parametrize("rows", [200, 500])
+def test_no_driver_is_found_that_leaves_nothing_of_the_record(rows):
+    """Current flows in the on-time alone; 26 levels one way look clipped at the lowest, too."""
     rng = np.random.default_rng(1)
-    duty = np.repeat(np.arange(26) / 25, 200)
+    duty = np.repeat(np.arange(26) / 25, rows)
     w, speed = 0.0, np.zeros(duty.size)
     for k in range(duty.size):
         drive = duty[k] * (12 - w / 4.5) * 4.5 - 0.12 * w - 2.0 * (w > 0 or duty[k] > 0.05)
         w = max(w + 0.01 / 0.15 * drive, 0.0)
         speed[k] = w + 0.2 * rng.standard_normal()
     voltage = np.r_[0.0, 12 * duty[:-1]]
-    try:
-        found = estimate(Record("motor", 0.01 * np.arange(duty.size), voltage, velocity=speed))
-    except SmpError:
-        return
-    assert found.unreliable
+    found = estimate(Record("motor", 0.01 * np.arange(duty.size), voltage, velocity=speed))
+    gain = found.combinations["dc_gain"]
+    right = gain.std and abs(gain.value - 4.5 / 1.12) < 5 * gain.std
+    assert found.unreliable or (right and driver_of(found).kind == driver.COAST)
