@@ -16,6 +16,7 @@ docs/derivations.md, section 1.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 
@@ -167,4 +168,4 @@ def direction(**weights: float) -> Array:
 
 def _exp(x: float) -> float:
     """Return e^x, infinite where it overflows."""
-    return float(np.exp(x))
+    return math.inf if x > 709.0 else math.exp(x)
