@@ -329,6 +329,7 @@ def _stated(
         samples=data.size,
         sample_time=data.step,
         speed_noise=_speed_noise(group, data, chosen),
+        angle_noise=_angle_noise(group, data, chosen),
         **_provenance(group),
     )
     if refusal is not None:
@@ -361,6 +362,14 @@ def _speed_noise(group: Sequence[Record], data: Experiments, fit: Fit) -> float:
     """Return the noise of the speed that was recorded [rad/s], 0 where only an angle was."""
     if data.kind == ANGLE:
         return max(map(rounding, group))
+    return float(np.sqrt(fit.noise[0, 0]))
+
+
+def _angle_noise(group: Sequence[Record], data: Experiments, fit: Fit) -> float:
+    """Return the noise of the angle that was recorded [rad], 0 where counts or a speed were."""
+    counted = any(r.count is not None and r.hardware.counts_per_revolution for r in group)
+    if data.kind != ANGLE or counted or max(map(rounding, group)) > 0.0:
+        return 0.0
     return float(np.sqrt(fit.noise[0, 0]))
 
 

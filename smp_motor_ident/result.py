@@ -153,6 +153,9 @@ class Estimate:
     speed_noise : float
         Standard deviation [rad/s] of the noise on the recorded speed that the model was fitted to;
         0 where it was fitted to an angle.
+    angle_noise : float
+        Standard deviation [rad] of the noise on the recorded angle that the model was fitted to; 0
+        where that was made of counts, whose quantisation is known, or where it was a speed.
     """
 
     wheel: str
@@ -169,6 +172,7 @@ class Estimate:
     duration: float = 0.0
     sample_time: float = 0.0
     speed_noise: float = 0.0
+    angle_noise: float = 0.0
     largest_voltage: float = 0.0
     sources: tuple[str, ...] = ()
     hardware: Hardware = Hardware()
@@ -286,6 +290,7 @@ class Estimate:
             "duration": _number(self.duration),
             "sample_time": _number(self.sample_time),
             "speed_noise": _number(self.speed_noise),
+            "angle_noise": _number(self.angle_noise),
             "largest_voltage": _number(self.largest_voltage),
             "sources": list(self.sources),
             "hardware": {n: _number(x) for n, x in asdict(self.hardware).items()},

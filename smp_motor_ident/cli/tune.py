@@ -90,6 +90,9 @@ def _add_loop(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--speed-noise", type=float,
                        help="of the reported speed, standard deviation [rad/s, motor]; "
                        "else as identified")  # fmt: skip
+    group.add_argument("--angle-noise", type=float,
+                       help="of the angle that the speed is made from, beside counts, standard "
+                       "deviation [rad, motor]; else as identified")  # fmt: skip
     group.add_argument("--gear-ratio", type=float, help="else as identified")
     group.add_argument("--counts-per-revolution", type=float, help="else as identified")
     group.add_argument("--supply", type=float, help="[V]; else as identified")

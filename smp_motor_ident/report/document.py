@@ -101,8 +101,11 @@ def _check(estimate: Estimate) -> None:
         value = getattr(hardware, name)
         if value is not None and value <= 0:
             raise ValueError(f"{name} is {value}; it must be positive")
-    if not 0 <= hardware.encoder_bits <= 64 or min(estimate.sample_time, estimate.speed_noise) < 0:
-        raise ValueError("encoder_bits, sample_time or speed_noise is impossible")
+    if not 0 <= hardware.encoder_bits <= 64:
+        raise ValueError("encoder_bits is impossible")
+    for name in ("sample_time", "speed_noise", "angle_noise"):
+        if getattr(estimate, name) < 0:
+            raise ValueError(f"{name} is negative")
 
 
 def _known(quantity: Quantity | None) -> bool:

@@ -151,7 +151,7 @@ def solve(case: Case) -> tuple[Feedback, float, Robustness]:
 
 
 def _within_clamp(problem: Problem, feedback: Feedback) -> tuple[Feedback, float]:
-    """Soften gains until what quantisation makes at the output leaves room within the clamp."""
+    """Soften gains until the control noise leaves room within the clamp."""
     factor, trial = 1.0, feedback
     while control_noise(problem, trial) > CLAMPED * problem.loop.supply_voltage and factor > 0.01:
         factor *= 0.95

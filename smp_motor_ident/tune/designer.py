@@ -230,7 +230,7 @@ def _explain(
     if factor < 1:
         words.append(
             f"gains backed off to {factor:.0%} of the rule's so that 99 % hold and the control "
-            "noise from the encoder stays within the clamp"
+            "noise stays within the clamp"
         )
     unmodelled = case.problem.unmodelled
     if unmodelled is not None:
@@ -242,7 +242,7 @@ def _explain(
             findings.append(_held_back(unmodelled))
     if figures.control_noise > 1.05 * loop.noise_limit:
         noisy = (
-            f"encoder quantisation makes {figures.control_noise:.2g} V of control noise, above "
+            f"the measurement makes {figures.control_noise:.2g} V of control noise, above "
             f"{loop.noise_limit:.2g} V"
         )
         findings.append(Finding("control_noise", "warning", noisy))

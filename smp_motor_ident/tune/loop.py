@@ -48,10 +48,13 @@ class Loop:
     observer_bandwidth : float or None
         Bandwidth of the speed observer [rad/s]; None leaves it to the design.
     noise_voltage : float or None
-        Largest control noise [V rms] that encoder quantisation may cause at the output;
+        Largest control noise [V rms] that the measurement may cause at the output;
         None takes 4 % of the supply.
     speed_noise : float
         Standard deviation of the noise on a reported speed [rad/s, motor], beside quantisation.
+    angle_noise : float
+        Standard deviation of the noise on the angle that the speed is made from [rad, motor],
+        beside quantisation.
     averaging_given : bool
         Whether ``difference_window`` holds for a reported speed whatever averaging was identified.
 
@@ -74,6 +77,7 @@ class Loop:
     observer_bandwidth: float | None = None
     noise_voltage: float | None = None
     speed_noise: float = 0.0
+    angle_noise: float = 0.0
     averaging_given: bool = False
 
     def __post_init__(self) -> None:
@@ -126,7 +130,7 @@ class Loop:
 
     @property
     def noise_limit(self) -> float:
-        """Largest control noise from quantisation [V rms]: as given, or 4 % of the supply."""
+        """Largest control noise [V rms]: as given, or 4 % of the supply."""
         return 0.04 * self.supply_voltage if self.noise_voltage is None else self.noise_voltage
 
     @property

@@ -168,10 +168,11 @@ def measured_lag(plant: Plant, delay: float) -> float:
 def noise_density(plant: Plant, loop: Loop, omega: Array) -> Array:
     """Return the noise density of the measured speed.
 
-    Quantisation of the count is taken as white and uniform over one count, then differenced or
-    observed.
+    The angle's own noise, and the quantisation of its count, uniform over one, are taken as white,
+    then differenced or observed.
     """
-    density: Array = plant.angle_noise(omega) * loop.count_angle**2 / 12
+    angle = loop.count_angle**2 / 12 + loop.angle_noise**2
+    density: Array = plant.angle_noise(omega) * angle
     return density + loop.reported_noise**2
 
 

@@ -53,6 +53,14 @@ class Inputs:
     forward: Array | None = None  # [V]: Feed-forward
     load: Array | None = None  # [V]: what a load takes
     noise: Array | None = None  # [rad/s]: on the measured speed, shape (n, k)
+    angle_noise: Array | None = None  # [rad]: on the angle that it is made from, shape (n, k)
+
+
+def white(deviation: float, shape: tuple[int, int]) -> Array | None:
+    """Return white noise, the same every time; None where there is none."""
+    if deviation == 0.0:
+        return None
+    return np.asarray(deviation * np.random.default_rng(0).standard_normal(shape))
 
 
 def simulate(
@@ -74,7 +82,9 @@ def simulate(
     numbers = (fb.p, fb.i, fb.d, fb.filter_time, controller.weight, controller.weight_d,
                controller.limit, back)  # fmt: skip
     observer, none = plant.observer or NO_OBSERVER, np.zeros(steps)
-    noise = np.zeros((n, steps)) if inputs.noise is None else inputs.noise
+    still = np.broadcast_to(0.0, (n, steps))
+    noise = still if inputs.noise is None else inputs.noise
+    of_angle = still if inputs.angle_noise is None else inputs.angle_noise
     speed, voltage = _run(
         plant.phi, plant.taps, plant.phi_angle, plant.taps_angle, plant.sample_time, plant.sensor,
         plant.average, observer.advance, observer.by_angle, observer.by_voltage, observer.taps,
@@ -84,7 +94,8 @@ def simulate(
         none if inputs.forward is None else inputs.forward,
         none if inputs.load is None else inputs.load,
         np.zeros(n) if friction is None else np.ascontiguousarray(friction),
-        modelled, count_angle, noise, driver, np.broadcast_to(plant.motors.a0, n),
+        modelled, count_angle, np.ascontiguousarray(noise), np.ascontiguousarray(of_angle), driver,
+        np.broadcast_to(plant.motors.a0, n),
     )  # fmt: skip
     return Response(speed, voltage)
 
@@ -161,6 +172,7 @@ def _run(
     modelled: float,
     count_angle: float,
     noise: Array,
+    angle_noise: Array,
     driver: Driver,
     back_emf: Array,
 ) -> tuple[Array, Array]:
@@ -171,7 +183,7 @@ def _run(
         p, i, d, filter_time, weight, weight_d, limit, back = controllers[j]
         x, following, past, put_out = np.zeros(s), np.zeros(s), np.zeros(m), np.zeros(m)
         angle = np.full(window + 1, count_angle * ((0.5 + 0.618034 * j) % 1.0))
-        observer = np.zeros(by_angle.size)
+        observer, place = np.zeros(by_angle.size), angle[0]
         integral = previous = rate = last = 0.0
         for k in range(steps):
             measured = observer[SPEED] if observer.size else x[sensor]
@@ -209,7 +221,8 @@ def _run(
             for q in range(window, 0, -1):
                 angle[q] = angle[q - 1]
             before = angle[0]
-            angle[0] += swept
+            place += swept
+            angle[0] = place + angle_noise[j, k]
             if observer.size:
                 swept = _turned(angle[0], before, count_angle)
                 delayed = _weighted(observer_taps, past)

@@ -33,7 +33,7 @@ class Trial:
     loop: Loop  # with the source
     # Integral gain within the margins [V/rad, wheel]; the error that a load leaves is its inverse
     integral: float
-    control_noise: float  # voltage from quantisation [V rms]
+    control_noise: float  # voltage from the measurement's noise [V rms]
 
     @property
     def name(self) -> str:
@@ -49,18 +49,12 @@ def choose_source(estimate: Estimate, loop: Loop, **targets: Any) -> tuple[Loop,
     """Return the loop with the speed source to take, and the reason."""
     usual = _trial(estimate, loop, targets)
     if loop.counts_per_revolution is None:
-        return loop, "the reported speed: the encoder's counts are not known"
-    # Averaging longer helps only where the control noise is what holds the gains back.
-    noisy = usual is None or usual.control_noise > 0.9 * loop.noise_limit
-    windows = [
-        _trial(estimate, replace(loop, speed_source="difference", difference_window=w), targets)
-        for w in WINDOWS
-        if noisy and w > loop.difference_window
-    ]
+        words = "the reported speed: the encoder's counts are not known"
+        return loop, words + _averaged(estimate, loop, usual, targets)
+    longer = _longer(estimate, replace(loop, speed_source="difference"), usual, targets)
     lacks = _lacking(estimate)
     watched = None if lacks else _trial(estimate, replace(loop, speed_source="observer"), targets)
     best = usual
-    longer = max((t for t in windows if t is not None), key=lambda t: t.integral, default=None)
     for trial, worth in ((longer, WORTH_WINDOW), (watched, WORTH_OBSERVER)):
         if trial is not None and (best is None or trial.integral > worth * best.integral):
             best = trial
@@ -73,6 +67,41 @@ def choose_source(estimate: Estimate, loop: Loop, **targets: Any) -> tuple[Loop,
         if t is not None
     )
     return best.loop, f"{best.name}: {compared}{lacks}"
+
+
+def _longer(
+    estimate: Estimate, loop: Loop, usual: Trial | None, targets: dict[str, Any]
+) -> Trial | None:
+    """Return the best of the longer windows, where the control noise is what holds gains back."""
+    if usual is not None and usual.control_noise <= 0.9 * loop.noise_limit:
+        return None
+    windows = [
+        _trial(estimate, replace(loop, difference_window=w), targets)
+        for w in WINDOWS
+        if w > loop.difference_window
+    ]
+    return max((t for t in windows if t is not None), key=lambda t: t.integral, default=None)
+
+
+def _averaged(estimate: Estimate, loop: Loop, usual: Trial | None, targets: dict[str, Any]) -> str:
+    """Return in words what an angle without counts would allow, differenced over more samples.
+
+    What reports the speed makes it of the angle: its window is not the controller's to choose.
+    """
+    if not (loop.angle_noise and loop.difference_window and loop.reports_speed):
+        return ""
+    taken = (
+        f", and it is taken for the angle's difference over {loop.difference_window} of the loop's "
+        "samples"
+    )
+    longer = _longer(estimate, loop, usual, targets)
+    if longer is None or (usual is not None and longer.integral < WORTH_WINDOW * usual.integral):
+        return taken
+    window, now = longer.loop.difference_window, 0.0 if usual is None else usual.integral
+    return (
+        f"{taken}, which allows i = {now:.3g} V/rad; report it differenced over {window}, and say "
+        f"--difference-window {window}, for i = {longer.integral:.3g} V/rad"
+    )
 
 
 def _lacking(estimate: Estimate) -> str:

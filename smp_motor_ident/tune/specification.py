@@ -21,6 +21,7 @@ from smp_motor_ident.tune.simulation import (
     settled,
     simulate,
     step_figures,
+    white,
 )
 from smp_motor_ident.tune.unmodelled import resonance_beyond
 
@@ -41,7 +42,7 @@ class Performance:
     load_integral: float  # integral of the magnitude of the error per volt of load [rad/V]
     load_recovery: float  # until a tenth of the loss is left [s]
     peak_voltage: float  # largest voltage of the set-point step [V]
-    control_noise: float  # voltage from quantisation at constant speed [V rms]
+    control_noise: float  # voltage from the measurement's noise at constant speed [V rms]
 
 
 @dataclass(frozen=True)
@@ -96,16 +97,19 @@ def figures_of(
     figures = _performance(problem, controller.feedback, time, planned, control_noise)
     drawn = case.ensemble.plant.motors.first(max(int(min(DRAWS, WORK / time.size)), FEWEST))
     plant = sample(drawn, loop, believed=nominal) if case.drawn else usual
-    noise = None
-    if loop.reported_noise > 0:
-        shape = (len(plant), time.size)
-        noise = loop.reported_noise * np.random.default_rng(0).standard_normal(shape)
+    shape = (len(plant), time.size)
+    filtered = bool(np.any(plant.motors.sensor_lag > 0))
     forward = plan.forward + case.swallowed * np.sign(plan.reference + plan.forward)
     run = simulate(
         plant,
         controller,
-        replace(plan.inputs, forward=forward, noise=noise),
-        count_angle=0.0 if np.any(plant.motors.sensor_lag > 0) else loop.count_angle,
+        replace(
+            plan.inputs,
+            forward=forward,
+            noise=white(loop.reported_noise, shape),
+            angle_noise=white(0.0 if filtered else loop.angle_noise, shape),
+        ),
+        count_angle=0.0 if filtered else loop.count_angle,
         friction=drawn.static_voltage if case.drawn else np.array([known]),
         modelled=case.swallowed,
         driver=case.driver,
