@@ -46,6 +46,7 @@ class Problem:
     loop: Loop  # the loop that will run
     targets: Mapping[str, Any] = field(default_factory=dict)  # what the caller asks of the method
     unmodelled: UnmodelledDynamics | None = None  # what the motor may do beside its model
+    shaking: float = 1.0  # of the speed, by noise, that is allowed: times the usual limit
 
     @cached_property
     def omega(self) -> Array:

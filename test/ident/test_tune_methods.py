@@ -210,6 +210,35 @@ def test_margin_method_does_not_let_counts_shake_the_wheel_out_of_its_band():
     assert shaking <= 2.5e-3 * 12 * 34.0 * 1.01
 
 
+def shaking(one, feedback) -> float:
+    """Return what noise shakes the wheel by, over the usual limit."""
+    through = feedback.response(one.omega, one.loop.sample_time)
+    through = through * one.true_response / (1 + through * one.response)
+    top = one.loop.supply_voltage / one.plant.motors.a0[0]
+    return float(one.noise_rms(through) / (2.5e-3 * top))
+
+
+def test_a_noisy_speed_does_not_leave_a_load_to_itself():
+    """With 7 % of noise the limit of shaking alone would leave 32 mV where 480 mV are allowed."""
+    one = problem((1 / 114.0, 0.2 / 114.0, 0.0), 0.018)
+    loop = replace(one.loop, counts_per_revolution=None, difference_window=0, speed_noise=90.0)
+    strict = Problem(sample(one.plant.motors, loop), replace(loop, noise_voltage=loop.noise_limit))
+    still, found = (METHODS["margin"].solve(p) for p in (strict, replace(strict, loop=loop)))
+    assert shaking(strict, still) <= 1.0
+    # What shakes a slow loop goes with the root of its bandwidth: 1.2^8 squared is 18.
+    assert found.i > 10 * still.i
+    assert control_noise(strict, found) <= loop.noise_limit
+    margins = loop_margins(strict.plant, found)
+    assert margins.phase >= 59.9 and margins.sensitivity <= 1.4
+    assert shaking(strict, found) <= 1.2**8
+
+
+def test_a_wheel_is_shaken_no_more_than_usual_where_gains_are_no_softer_than_simc():
+    one = problem((1 / 34.0, 0.01 / 34.0, 0.019 * 0.01**2 / 34.0), 0.01)
+    one = Problem(one.plant, replace(one.loop, counts_per_revolution=24.0))
+    assert shaking(one, METHODS["margin"].solve(one)) <= 1.0
+
+
 def test_margin_method_rejects_a_load_better_than_a_grid_of_pi_gains():
     """No PI controller of a dense grid that keeps the same limits has more integral gain."""
     one = problem(structure="pi")
