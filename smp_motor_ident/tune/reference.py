@@ -81,6 +81,7 @@ class Change:
     reference: Array
     high: Array
     forward: Array  # [V]: Feed-forward without dry friction
+    friction: Array  # [-]: Share of the voltage against dry friction that is fed forward
 
     @property
     def inputs(self) -> Inputs:
@@ -103,7 +104,12 @@ def planned_change(plant: Plant, plan: Reference, distance: float, time: Array) 
         for late in (plan.doubt, 0.0, -min(plan.doubt, plan.lag))
     ]
     low, high = np.min(around, axis=0), np.max(around, axis=0)
-    return Change(low, around[1], high, forward)
+    # From rest the running loop leads along a ramp, with what the rate of its current takes.
+    electrical = float(m.a2[0] / m.a1[0])
+    reach = rate * max(0.25 * electrical, 0.5 * T)
+    share = np.clip(np.divide(speed, reach, out=np.sign(speed), where=reach != 0), -1.0, 1.0)
+    friction = 0.5 * (share[1:] + share[:-1]) + electrical * np.diff(share) / T
+    return Change(low, around[1], high, forward, friction)
 
 
 def top_speed(plant: Plant, supply: float) -> float:

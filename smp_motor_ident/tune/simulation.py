@@ -197,7 +197,9 @@ def _run(
             wanted = p * (weight * reference - measured) + integral + d * rate
             wanted += forward[k]
             given = min(max(wanted, -limit), limit)
-            integral += T * (i * (reference - measured) + (given - wanted) * back)
+            # Without an error nothing is integrated, nor taken back.
+            change = i * (reference - measured) + (given - wanted) * back
+            integral += T * change * (reference != measured)
             speed[j, k], voltage[j, k] = x[0], given
             for q in range(m - 1, 0, -1):
                 past[q], put_out[q] = past[q - 1], put_out[q - 1]

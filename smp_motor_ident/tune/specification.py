@@ -99,7 +99,7 @@ def figures_of(
     plant = sample(drawn, loop, believed=nominal) if case.drawn else usual
     shape = (len(plant), time.size)
     filtered = bool(np.any(plant.motors.sensor_lag > 0))
-    forward = plan.forward + case.swallowed * np.sign(plan.reference + plan.forward)
+    forward = plan.forward + case.swallowed * plan.friction
     run = simulate(
         plant,
         controller,

@@ -17,9 +17,11 @@ from smp_motor_control.reference.time_optimal import VoltageLimited
 from smp_motor_control.wheel.loop import LoopSettings, WheelLoop
 from smp_motor_ident.cli.tuning import read_estimates
 from smp_motor_ident.tune import Loop, design, design_wheels
+from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.motors import motors_of
 from smp_motor_ident.tune.plant import sample
 from smp_motor_ident.tune.reference import planned_change
+from smp_motor_ident.tune.simulation import Controller, Inputs, simulate
 
 MOTORS = Path(__file__).resolve().parents[2] / "config" / "motors_paper.yaml"
 STEP = 1.2
@@ -47,11 +49,11 @@ def estimates():
 
 
 @pytest.mark.parametrize("share", [0.05, 0.9])
-def test_wheel_loop_feeds_forward_what_the_design_planned(estimates, share):
-    T = 0.005
+@pytest.mark.parametrize(("T", "static"), [(0.005, 0.0), (0.005, 0.5), (2e-4, 0.5)])
+def test_wheel_loop_feeds_forward_what_the_design_planned(estimates, share, T, static):
     one = design(estimates["front_left"], Loop(sample_time=T))
     settings = settings_of(one)
-    loop = WheelLoop(replace(settings, gains=replace(settings.gains, feedforward_static=0.0)))
+    loop = WheelLoop(replace(settings, gains=replace(settings.gains, feedforward_static=static)))
     loop.start(0.0)
     target = share * one.reference.max_velocity
     ratio = one.loop.gear_ratio
@@ -65,7 +67,19 @@ def test_wheel_loop_feeds_forward_what_the_design_planned(estimates, share):
     planned = planned_change(plant, one.reference, target, time)
     # Both interpolate linearly between the same samples.
     np.testing.assert_allclose(references, planned.reference, atol=1e-9 * target)
-    np.testing.assert_allclose(outs, planned.forward, atol=1e-9 * 12)
+    forward = planned.forward + static * planned.friction
+    np.testing.assert_allclose(outs, forward, atol=1e-9 * 12)
+    # From rest more than the friction is led: the rate of its current.
+    assert planned.friction.max() > 1.5
+
+
+def test_a_clamped_lead_without_an_error_leaves_the_simulated_integral_alone(estimates):
+    """As the running controller, which takes nothing back while a measurement is left alone."""
+    plant = sample(motors_of(estimates["front_left"]), Loop(sample_time=0.005))
+    controller = Controller(Feedback(0.1, 1.0), limit=12.0, tracking=0.01)
+    lead = np.where(np.arange(40) < 3, 20.0, 5.0)
+    run = simulate(plant, controller, Inputs(np.full(40, -1e9), np.full(40, 1e9), lead))
+    np.testing.assert_array_equal(run.voltage[0], np.minimum(lead, 12.0))
 
 
 @pytest.mark.parametrize("rate", [100.0, 200.0, 1000.0])
