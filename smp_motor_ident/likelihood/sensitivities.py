@@ -243,9 +243,10 @@ def stay(h: float, par: Array, x: Array, m: Array, v: float) -> None:
 @compiled
 def fade(m: Array) -> None:
     """Put to nothing what has decayed so far: numbers below the normal ones cost ten times more."""
-    for j in range(3 * LANES):
-        if abs(m[j]) < GONE:
-            m[j] = 0.0
+    for at in (SQ, SW, ST, KEPT):
+        for j in range(at, at + LANES):
+            if abs(m[j]) < GONE:
+                m[j] = 0.0
 
 
 @compiled
