@@ -41,10 +41,14 @@ def recall(ring: Array, k: int, first: int, t: float, p: int, past: Array) -> fl
             past[1 + j] = a[3 + j] + (t - a[0]) * a[3 + p + j]
         past[0] = a[1] + (t - a[0]) * a[2]
         return float(a[2])
-    i = k
-    while i > oldest and ring[(i - 1) % n][0] > t:
-        i -= 1
-    a, b = ring[(i - 1) % n], ring[i % n]
+    before, i = oldest, k
+    while i - before > 1:  # a window may span thousands of samples
+        middle = (before + i) // 2
+        if ring[middle % n, 0] > t:
+            i = middle
+        else:
+            before = middle
+    a, b = ring[before % n], ring[i % n]
     h = b[0] - a[0]
     u = (t - a[0]) / h
     h00 = (1 + 2 * u) * (1 - u) * (1 - u)
