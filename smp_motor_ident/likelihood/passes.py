@@ -235,6 +235,8 @@ def evaluate(
         return nowhere
     sums = gather(data, structure, z, initial, noise)
     total = float(sums.cost.sum())
+    if not math.isfinite(total):
+        return nowhere
     for row, miss in priors:
         common += np.outer(row, row)
         score += row * miss

@@ -8,6 +8,8 @@ Derivation: docs/derivations.md, sections 4 to 7.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -287,6 +289,11 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
                         _put(beside[section], m, PUSH, p, False)
                     if late:
                         _switch(v, hold_value[section], load, direction, friction, par, m)
+            # A state that is no number would pass for a lost sample, after all events there may be.
+            if not abs(x[0]) + abs(x[1]) + abs(x[2]) < math.inf:
+                predicted[k:] = math.nan
+                cost[g] = spread[0] = math.inf
+                return block + 1
             y0 = observe(kind, k, first, target, par, x, m, ring, past, columns)
             y1 = 0.0
             if has_current and sensor > 0:
