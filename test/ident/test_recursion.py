@@ -118,6 +118,20 @@ def test_coordinates_that_are_no_numbers_are_no_motor_and_no_crash():
     assert found.objective == np.inf
 
 
+@pytest.mark.parametrize("resistance", [-80.0, 80.0])
+def test_a_motion_that_is_no_number_ends_the_pass_and_is_no_motor(resistance):
+    _, data, z = exact(seconds=1.0)
+    # Corrections by a current of 1e35 A, or by one of none, a thousand times over.
+    gain = np.array([[0.0, 1e3], [0.0, 1e3], [1e3, 1e3]])
+    noise = NoiseModel(gain=gain)
+    wild = z.with_(ln_r=resistance)
+    assert evaluate(
+        data, Electromechanical(), wild, data.initial, data.initial, noise
+    ).objective == np.inf  # fmt: skip
+    out = predict(data, Electromechanical(), wild, gain)
+    assert np.isnan(out[-1]).all()
+
+
 def test_a_beginning_that_has_faded_is_nothing_and_costs_nothing():
     recording = motors.record("rear_right", current=False, kinds=("sine",), seconds=60.0)
     data = prepare([recording], False, "speed")
