@@ -168,4 +168,4 @@ def direction(**weights: float) -> Array:
 
 def _exp(x: float) -> float:
     """Return e^x, infinite where it overflows."""
-    return math.inf if x > 709.0 else math.exp(x)
+    return math.inf if x > 709.0 else float(np.exp(x))
