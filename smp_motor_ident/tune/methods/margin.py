@@ -92,8 +92,8 @@ def _no_softer_than_simc(
 ) -> _Found | None:
     """Allow more noise, as little as it takes, where its default limits cost more than SIMC.
 
-    SIMC looks at no noise; who compares at the same Ms shall not lose here.  A wheel that is shaken
-    out of the band of its settling costs more than a voltage: that is allowed last.
+    SIMC looks at no noise; who compares at the same Ms shall not lose here.  A wheel that noise
+    moves out of the band of its settling costs more than a voltage: that is allowed last.
     """
     loop = problem.loop
     if loop.noise_voltage is not None:
