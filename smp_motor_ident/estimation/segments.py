@@ -100,9 +100,7 @@ def _steps(data: Experiments, fit: Fit) -> tuple[Array, Array, Array, list[int]]
     plausible = np.diag(structure.of_free(PLAUSIBLE))
     middle, steps, covs = [], [], []
     for b, (normal, gradient) in enumerate(zip(sums.normal, sums.gradient, strict=True)):
-        own = inverse_of(normal[f:, f:])
-        left = normal[:f, :f] - normal[:f, f:] @ own @ normal[f:, :f]
-        score = gradient[:f] - normal[:f, f:] @ own @ gradient[f:]
+        left, score = _without_beginning(normal, gradient, f)
         inverse = _bounded_inverse(left + plausible)
         middle.append(0.5 * (cut.starts[b] + cut.starts[b + 1]) / data.size)
         steps.append(inverse @ score)
@@ -119,6 +117,19 @@ def _steps(data: Experiments, fit: Fit) -> tuple[Array, Array, Array, list[int]]
         return None
     at = np.ix_(keep, common, common)
     return when[keep] - when[keep].mean(), step[np.ix_(keep, common)], cov[at], common
+
+
+def _without_beginning(normal: Array, gradient: Array, f: int) -> tuple[Array, Array]:
+    """Return a part's information and score of ``f`` coordinates, its own beginning eliminated.
+
+    What that takes all of a coordinate's is known to rounding, and tells nothing.
+    """
+    own = inverse_of(normal[f:, f:])
+    left = normal[:f, :f] - normal[:f, f:] @ own @ normal[f:, :f]
+    score = gradient[:f] - normal[:f, f:] @ own @ gradient[f:]
+    gone = np.diag(left) < ROUNDING * np.diag(normal)[:f]
+    left[gone], left[:, gone], score[gone] = 0.0, 0.0, 0.0
+    return left, score
 
 
 def _bounded_inverse(information: Array) -> Array:

@@ -5,6 +5,7 @@ from dataclasses import replace
 import independent
 import motors
 import numpy as np
+import pytest
 
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.estimation import segments
@@ -95,3 +96,16 @@ def test_what_a_part_knows_but_for_rounding_is_a_covariance():
         covariance = segments._bounded_inverse(information)
         assert np.linalg.eigvalsh(covariance)[0] > 0
         np.testing.assert_allclose(np.ones(2) @ information @ covariance, np.ones(2), rtol=1e-3)
+
+
+def test_a_part_tells_nothing_of_what_its_beginning_takes_all_of():
+    rng = np.random.default_rng(2)
+    own = rng.standard_normal((400, 2))
+    free = rng.standard_normal((400, 3))
+    free[:, 1] = own @ [0.7, -1.3]
+    both, error = np.hstack([free, own]), rng.standard_normal(400)
+    left, score = segments._without_beginning(both.T @ both, both.T @ error, 3)
+    projected = free - own @ np.linalg.lstsq(own, free, rcond=None)[0]
+    assert not left[1].any() and not left[:, 1].any() and score[1] == 0.0
+    assert left[::2, ::2] == pytest.approx((projected.T @ projected)[::2, ::2])
+    assert score[::2] == pytest.approx((projected.T @ error)[::2])
