@@ -90,7 +90,7 @@ def declared(
     known: Mapping[str, float],
 ) -> Estimate:
     """Return the estimate of a motor behind a driver of which the user says what it does."""
-    there = [(effect, known[name]) for name, effect in DECLARABLE.items() if name in known]
+    there = [(e, float(known[name])) for name, e in DECLARABLE.items() if name in known]
     drivers = []
     for effect, size in there:
         driver = Driver(effect.kind, size, max(float(np.abs(r.voltage).max()) for r in group))

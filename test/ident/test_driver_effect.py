@@ -92,7 +92,7 @@ def test_a_plain_driver_has_no_effect():
 
 
 def test_a_declared_driver_is_taken_for_known():
-    found = estimate(recorded("dead_zone", 0), fixed={"dead_zone": 1.0})
+    found = estimate(recorded("dead_zone", 0), fixed={"dead_zone": 1})
     zone = found.combinations["dead_zone"]
     assert (zone.value, zone.std, zone.status) == (1.0, None, "fixed")
     gain = found.combinations["dc_gain"]
