@@ -241,8 +241,11 @@ def judge(record: Record, truth: dict, words: str = "") -> dict:
     claims = {n: q for n, q in {**e.combinations, **e.parameters}.items()
               if q.status == "estimated" and q.std and n in truth}  # fmt: skip
     errors = {n: abs(q.value - truth[n]) / q.std for n, q in claims.items()}
-    worst = max(errors, key=lambda n: errors[n])
     doubt = e.unreliable
+    if not errors:
+        return {"says": "unreliable" if doubt else "right", "words": "; ".join(e.warnings),
+                "model": e.model, "spent": time.perf_counter() - begun}  # fmt: skip
+    worst = max(errors, key=lambda n: errors[n])
     says = "unreliable" if doubt else ("wrong" if errors[worst] > FAR else "right")
     off = abs(claims[worst].value / truth[worst] - 1) if truth[worst] else claims[worst].value
     return {"says": says, "words": "; ".join(e.warnings), "worst": worst, "sigmas": errors[worst],

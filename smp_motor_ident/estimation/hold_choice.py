@@ -20,9 +20,11 @@ from smp_motor_ident.estimation.data_window import extend, grow
 from smp_motor_ident.estimation.descent import ROUGHLY, refine, restate, screening_subset
 from smp_motor_ident.estimation.fit import Fit, Options
 from smp_motor_ident.estimation.initialisation import initial_fit
+from smp_motor_ident.estimation.multistart import tried
 from smp_motor_ident.estimation.request import Request
 from smp_motor_ident.estimation.selection import POLICY, FittedCandidate
 from smp_motor_ident.estimation.thinning import thinned
+from smp_motor_ident.estimation.trials import LAGS
 from smp_motor_ident.likelihood.experiments import Experiments, prepare
 from smp_motor_ident.likelihood.hold import between_samples
 from smp_motor_ident.model.coordinates import direction
@@ -33,8 +35,9 @@ from smp_motor_ident.record import Record
 LOOKS = (1_000, 4_000, np.inf)
 """Samples on which it is asked whether another hold is worth a search: few, where it comes near
 more, and all before the search."""
-EARLIER = {"after": 1.0, "interpolated": 0.5}
-"""Samples of delay that a hold takes the place of."""
+EARLIER = {"before": -0.5, "after": 1.0, "interpolated": 0.5}
+"""Samples of delay that a hold takes the place of: a command up to its row, with means that moved
+its switches before; one from its row on; one straight from row to row."""
 
 
 def chosen_hold(
@@ -124,9 +127,10 @@ def _worth_a_search(
             break
     late = best.z.delay / data.step
     out = []
-    for other, how in [("held", "before")] * (hold != "held") + [(hold, how) for how in EARLIER]:
+    others = [("held", "before")] * (hold != "held") + [(hold, "after"), (hold, "interpolated")]
+    for other, how in others:
         there = data if other == hold else prepare(group, s.current, hold=other)
-        there, lag = of_kind(there.held(how), best), late - EARLIER.get(how, 0.0)
+        there, lag = of_kind(there.held(how), best), late - EARLIER[how]
         found: Fit | None = None
         for duration, least in looks.items():
             part = there.data_window(duration)
@@ -171,8 +175,10 @@ def _delayed(
     fit, structure = min(fits, key=lambda f: f[0].deviance)
     found = restate(part, structure, fit, options)
     # Another hold may be another part of a sample late.
-    freed = refine(part, structure, found, found.z, options, ROUGHLY) if structure.delay else found
-    return min(found, freed, key=lambda f: f.deviance)
+    if structure.delay:
+        freed = refine(part, structure, found, found.z, options, ROUGHLY)
+        found = tried(part, min(found, freed, key=lambda f: f.deviance), LAGS, options)
+    return found
 
 
 def instant_deviation(group: Sequence[Record], hold: str) -> float:

@@ -31,7 +31,7 @@ from smp_motor_ident.estimation.memory import remembered
 from smp_motor_ident.estimation.multistart import tried as other_starts
 from smp_motor_ident.estimation.selection import POLICY, FittedCandidate, sandwich_factor
 from smp_motor_ident.estimation.thinning import thinned
-from smp_motor_ident.estimation.trials import RANDOM, slower_winding
+from smp_motor_ident.estimation.trials import LAGS, RANDOM, slower_winding
 from smp_motor_ident.estimation.variations import friction_shows, may_rub, varied
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.measurement import ANGLE, SPEED
@@ -274,7 +274,7 @@ def _on_subset(part: Experiments, firsts: list[Fit], options: Options) -> list[F
     for first in firsts:
         there = of_kind(part, first)
         fitted = settled(there, first, options, _near(first.structure, tried), rival)
-        tried.append(no_worse(there, fitted, tried, options))
+        tried.append(no_worse(there, other_starts(there, fitted, LAGS, options), tried, options))
     return from_rivals(part, from_richer(part, tried, options), options)
 
 

@@ -96,6 +96,10 @@ def _deviation(fit: Fit, name: str) -> float:
     return float(np.sqrt(fit.covariance()[i, i]))
 
 
+def _late_twice(data: Experiments, best: Fit) -> bool:
+    return not best.structure.current and {"delay", "ln_a2"} <= set(best.structure.free)
+
+
 def _full(data: Experiments) -> float:
     return float(np.abs(data.hold_value).max())
 
@@ -126,6 +130,14 @@ def _other_lags(data: Experiments, best: Fit, options: Options) -> Iterator[Star
     for share in SECOND_LAGS:
         z = best.z.with_second_lag(share * best.z.time_constant)
         yield best.at(z.with_(ln_te=z.ln_te + 0.02))
+
+
+def _exchanged(data: Experiments, best: Fit, options: Options) -> Iterator[Start]:
+    """Yield what answers late as delay next to all, and as second lag next to all."""
+    late, little = best.z.delay + best.z.second_lag, 0.1 * data.step
+    for delay in (late - little, little):
+        if 0 < delay < late:
+            yield best.at(best.z.with_second_lag(late - delay).with_(delay=delay))
 
 
 def _scaled(factor: float, way: Array) -> Starts:
@@ -183,6 +195,9 @@ def _by_profile(data: Experiments, best: Fit, options: Options) -> Iterator[Star
     if found.deviance < best.deviance - 1:
         yield found.at(found.z, noise_ratio=best.noise_ratio)
 
+
+LAGS = (Trial("delay and second lag exchanged", _late_twice, _exchanged),)
+"""Of a motor late by both: either may stand for the other, with a minimum each."""
 
 RANDOM = tuple(Trial(f"random restart {n + 1}", _unsettled, _nearby(n)) for n in range(RESTARTS))
 """Around a descent that did not settle."""

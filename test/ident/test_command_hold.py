@@ -75,16 +75,23 @@ def test_a_command_that_runs_straight_from_row_to_row_is_no_longer_winding(seed)
 
 
 def late_record(seed, tones, rate, samples, per_turn, late=None):
-    """Return counts of a motor that takes each command up none or some tenths of a sample late."""
+    """Return counts of a motor that takes tones up none or some tenths of a sample late."""
     rng = np.random.default_rng(seed)
     drawn = int(rng.integers(0, 10)) if rng.random() < 0.5 else 0
     late = drawn if late is None else late
     t = np.arange(samples) / rate
     v = sum(rng.uniform(1, 3) * np.sin(2 * np.pi * f * t + rng.uniform(0, 6)) for f in tones)
-    ran = np.concatenate([np.full(1 + late, v[0]), np.repeat(v[1:], 10)])[: 10 * (samples - 1) + 1]
     r, el, k, j, b = TABLE_1["rear_left"]
+    return late_counts(rng, v, rate, per_turn, late, (r, el, k, j, b, 0.3 * k / r))
+
+
+def late_counts(rng, v, rate, per_turn, late, motor):
+    """Return counts of a motor that takes each command up some tenths of a sample late."""
+    samples = v.size
+    t = np.arange(samples) / rate
+    ran = np.concatenate([np.full(1 + late, v[0]), np.repeat(v[1:], 10)])[: 10 * (samples - 1) + 1]
     fine = np.arange(ran.size) / (10 * rate)
-    out = simulate(fine, ran, r, el, k, j, b, 0.3 * k / r, np.zeros(ran.size), 4)[::10]
+    out = simulate(fine, ran, *motor, np.zeros(ran.size), 10)[::10]
     count = np.floor(out[:, 2] * per_turn / (2 * np.pi) + rng.uniform()).astype(np.int64)
     return Record("motor", t, v, count=count, hardware=Hardware(1.0, per_turn))
 
@@ -96,6 +103,23 @@ def test_a_part_of_a_sample_that_a_command_comes_late_is_no_switch_in_its_middle
     known = truth("rear_left", 0.3)
     right(record, {name: known[name] for name in TRUTH})
     assert estimate(record).value("delay") == pytest.approx(late / 10 / 200, abs=0.02 / 200)
+
+
+@pytest.mark.parametrize("seed", [0, 3, 5])
+def test_half_a_sample_that_a_ramp_between_levels_comes_late_is_no_longer_lag(seed):
+    """Switches in the middle of the intervals look like it, and take its place if they may."""
+    motor = 13.6, 3.2e-3, 0.014, 7.5e-7, 3.2e-6, 4.4e-4
+    rng = np.random.default_rng(seed)
+    corners, length = np.cumsum(rng.uniform(0.3, 2.5, 12)), int(rng.integers(4, 13))
+    corners = np.sort(np.concatenate([corners, corners + length / 200]))
+    levels = np.repeat(rng.uniform(1.2, 3.5, 13), 2)[1:-1]
+    v = np.interp(np.arange(1900) / 200, corners, levels)
+    v[0] = 0.0
+    r, el, k, j, b, tc = motor
+    below = k * k + r * b
+    lags = {"time_constant": (r * j + el * b) / below, "time_constant_product": el * j / below}
+    record = late_counts(rng, v, 200, 2000.0, 5, motor)
+    right(record, {"dc_gain": k / below, **lags, "static_voltage": r * tc / k})
 
 
 def test_lags_bear_a_part_of_a_sample_that_slow_commands_do_not_show():
