@@ -43,7 +43,7 @@ UNITS: Mapping[str, str] = {
     "slew_rate": "V/s",
     "source_resistance_ratio": "1",
     "brush_drop": "V",
-    "coasting_share": "1",
+    "fast_decay_ratio": "1",
     "resonance_frequency": "rad/s",
     "resonance_damping": "1",
 }

@@ -14,6 +14,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
 from scipy.optimize import fminbound
 
 from smp_motor_ident.estimation import prediction
@@ -25,12 +26,14 @@ from smp_motor_ident.estimation.selection import POLICY, sandwich_factor
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import Experiments, prepare
 from smp_motor_ident.model.driver import DECLARABLE, EFFECTS, SLEW, Driver, DriverEffect, Rows
+from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.model.structures import FirstOrder
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import UNITS, Estimate, Quantity
 
 Array = NDArray[np.float64]
 
+SMOOTHED = 0.2  # of the motor's lag: what a measured speed is a mean over
 TURNS = 3  # of a motion that the effect asks for, and that follows from it
 NEAR = 0.02  # e-folds of the size at which its deviance is first looked at beside the best
 RISE = 2.0  # of the deviance on both sides together, from which its curvature is read
@@ -123,7 +126,7 @@ def _behind(
         "warning" if quantity.status == "estimated" else "note",
         f"{words}; the motor is estimated behind it, and a controller meets both",
         {"quantity": effect.quantity, "size": driver.size, "std": quantity.std,
-         "largest_command": driver.top},
+         "full_duty": driver.full_duty},
         "" if quantity.status == "fixed" else "record the voltage at the motor's terminals to see "
         f"it, or declare it with --fix {effect.quantity}=",
     )  # fmt: skip
@@ -135,9 +138,9 @@ def driver_of(estimate: Estimate) -> Driver:
     """Return the driver behind which a motor was estimated."""
     for effect in EFFECTS:
         for finding in estimate.findings:
-            size, top = (finding.evidence.get(n) for n in ("size", "largest_command"))
-            if finding.code == effect.code and isinstance(size, float) and isinstance(top, float):
-                return Driver(effect.kind, size, top)
+            size, full = (finding.evidence.get(n) for n in ("size", "full_duty"))
+            if finding.code == effect.code and isinstance(size, float) and isinstance(full, float):
+                return Driver(effect.kind, size, full)
     return Driver()
 
 
@@ -147,9 +150,11 @@ def with_voltages(group: Sequence[Record], voltage: Array) -> list[Record]:
     return [replace(r, voltage=voltage[a:b]) for r, (a, b) in zip(group, pairwise(ends))]
 
 
-def rows_of(data: Experiments, group: Sequence[Record], fit: Fit) -> Rows:
-    """Return the commands of records and how the fitted motor runs."""
-    speed = prediction.simulate(data, fit)[:, 0]
+def rows_of(
+    data: Experiments, group: Sequence[Record], fit: Fit, measured: bool = False
+) -> Rows:
+    """Return the commands of records and how the fitted motor runs, or did as measured."""
+    speed = _measured(data, fit) if measured else prediction.simulate(data, fit)[:, 0]
     first = np.zeros(data.size, dtype=np.bool_)
     first[data.starts[:-1]] = True
     middle, interval = speed.copy(), np.full(data.size, data.step)
@@ -157,7 +162,18 @@ def rows_of(data: Experiments, group: Sequence[Record], fit: Fit) -> Rows:
     interval[1:] = np.where(first[1:], data.step, np.diff(data.time))
     back = float(fit.structure.internal(fit.z)[0][2])
     command = np.concatenate([r.voltage for r in group])
-    return Rows(command, back * middle, interval, first, fit.z.time_constant)
+    supply = min((r.hardware.supply_voltage or 0.0 for r in group), default=0.0)
+    return Rows(command, back * middle, interval, first, fit.z.time_constant, supply)
+
+
+def _measured(data: Experiments, fit: Fit) -> Array:
+    """Return the speed as measured, a mean over a fraction of the motor's lag."""
+    there = np.isfinite(data.output)
+    speed = np.interp(data.time, data.time[there], data.output[there])
+    if data.kind == ANGLE:
+        speed = np.gradient(speed, data.time)
+    width = max(int(SMOOTHED * fit.z.time_constant / data.step), 1)
+    return np.asarray(uniform_filter1d(speed, width, mode="nearest"))
 
 
 def likeliest(group: Sequence[Record], fit: Fit, hold: str, options: Options) -> DriverFit | None:
@@ -248,9 +264,9 @@ class _Search:
     def at(self, size: float, passes: int = 30) -> tuple[Fit, Experiments, list[Record]]:
         """Return the motor fitted for a size, and what it was fitted to."""
         data, fit, records = self.data, self.near, self.group
-        for _ in range(self.turns):
-            rows = rows_of(data, self.group, fit)
-            voltage = rows.through(Driver(self.effect.kind, size, rows.top))
+        for turn in range(self.turns):
+            rows = rows_of(data, self.group, fit, measured=self.turns > 1 and turn == 0)
+            voltage = rows.through(Driver(self.effect.kind, size, rows.full_duty))
             records = with_voltages(self.group, voltage)
             data = _prepared(records, self.hold, self.near)
             start = fit.at(fit.z, initial_of(data, fit))
@@ -305,7 +321,7 @@ class _Search:
             x += float(np.clip(move, -2 * away, 2 * away))
             away = min(max(std, 0.1 * NEAR), 1.0)
         self.size, size = x, float(np.exp(x))
-        driver = Driver(self.effect.kind, size, rows_of(self.data, self.group, fit).top)
+        driver = Driver(self.effect.kind, size, rows_of(self.data, self.group, fit).full_duty)
         more = self.at(size * float(np.exp(std)))[2]
         return DriverFit(self.effect, driver, size * std, self.group, records, more, self, fit)
 

@@ -10,6 +10,7 @@ Automatica 38 (2002), 853-860 (one number beside a linear system: separable leas
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -30,7 +31,7 @@ class Driver(NamedTuple):
 
     kind: int = NOTHING
     size: float = 0.0
-    top: float = 1.0  # command [V] at which it is always on: what duty refers to
+    full_duty: float = 1.0  # command [V] at which it is always on
 
     @property
     def threshold(self) -> float:
@@ -52,6 +53,25 @@ def _beyond(voltage: float, threshold: float) -> float:
     return voltage - min(max(voltage, -threshold), threshold)
 
 
+@inlined
+def _fast_decay(size: float, command: float, back_emf: float, supply: float) -> float:
+    """Return the mean voltage of a bridge that is off for the rest of each PWM period [V].
+
+    The current that rose meanwhile falls against the supply, through the diodes, until it is none
+    or the next period begins; without one the terminals show the back-EMF.  ``size``: the
+    electrical time constant in periods.
+    """
+    duty = min(abs(command) / supply, 1.0)
+    with_it = back_emf if command > 0 else -back_emf
+    drive, brake = supply - with_it, supply + with_it
+    if drive <= 0.0 or brake <= 0.0:  # beyond what the supply can reach: as if it braked
+        return command
+    rise = drive * (1.0 - math.exp(-duty / size))
+    fall = min(size * math.log1p(rise / brake), 1.0 - duty)
+    mean = with_it + duty * drive - fall * brake
+    return mean if command > 0 else -mean
+
+
 @compiled
 def terminal_voltage(
     driver: Driver, command: float, back_emf: float, before: float, interval: float
@@ -60,7 +80,7 @@ def terminal_voltage(
 
     ``before`` is the voltage at its beginning; only a slew limit remembers it.
     """
-    kind, size, top = driver
+    kind, size, full_duty = driver
     out = command
     if kind == DEAD_ZONE:
         out = _beyond(command, size)
@@ -72,12 +92,12 @@ def terminal_voltage(
         ramp = min(abs(step) / most, 1.0) if most > 0.0 else 1.0
         return end - 0.5 * (end - before) * ramp, end
     elif kind == SAG:  # a source's own resistance, which sees duty times the current
-        duty = command / top
+        duty = command / full_duty
         out = back_emf + (command - back_emf) / (1 + size * duty * duty)
     elif kind == DROP:
         out = back_emf + _beyond(command - back_emf, size)
-    elif kind == COAST:  # free for the rest of each period
-        out = command + size * (1 - abs(command) / top) * back_emf
+    elif kind == COAST:
+        out = _fast_decay(size, command, back_emf, full_duty)
     return out, out
 
 
@@ -90,11 +110,17 @@ class Rows:
     interval: Array  # its length [s]
     first: Flags  # where a segment begins
     time_constant: float  # of the motor [s]
+    supply: float = 0.0  # [V]; 0 where it is not known
 
     @property
     def top(self) -> float:
         """Largest command [V]."""
         return float(np.abs(self.command).max(initial=0.0)) or 1.0
+
+    @property
+    def full_duty(self) -> float:
+        """Command [V] at which the driver is always on; the largest where that is not known."""
+        return max(self.supply, self.top)
 
     def through(self, driver: Driver) -> Array:
         """Return the mean voltage at the terminals over each row's interval [V]."""
@@ -158,8 +184,8 @@ EFFECTS = (
         (0.01, 0.03, 0.1, 0.3),
     ),
     DriverEffect(
-        COAST, "coast", "coasting_share", "a driver that lets the motor coast (fast decay)",
-        (0.1, 0.3, 0.6, 1.0),
+        COAST, "coast", "fast_decay_ratio", "a driver that lets the motor coast (fast decay)",
+        (0.03, 0.1, 0.3, 1.0, 3.0),
     ),
 )  # fmt: skip
 

@@ -139,6 +139,29 @@ def test_voltage_at_the_terminals(kind, size, command, back_emf, expected):
     assert end == mean
 
 
+@pytest.mark.parametrize("ratio", [0.05, 0.4, 2.0, 20.0])
+@pytest.mark.parametrize("duty", [0.1, 0.5, 0.9])
+@pytest.mark.parametrize("share", [-0.4, 0.0, 0.6])
+def test_a_bridge_that_is_off_for_the_rest_of_each_period(ratio, duty, share):
+    """A winding's current in small steps, against the supply through diodes while it is off."""
+    supply, steps, current, volts, periods = 10.0, 2000, 0.0, 0.0, 1 + int(20 * ratio)
+    keep, back = np.exp(-1 / (steps * ratio)), share * supply
+    for k in range(periods * steps):
+        on = k % steps < duty * steps
+        applied = supply if on else -supply
+        after = keep * current + (1 - keep) * (applied - back)  # times the resistance
+        if not on and after < 0.0:
+            applied, after = back, 0.0
+        volts += applied * (k >= (periods - 1) * steps)
+        current = after
+    mean, _ = terminal_voltage(Driver(driver.COAST, ratio, supply), duty * supply, back, 0.0, STEP)
+    assert mean == pytest.approx(volts / steps, abs=0.01 * supply)
+    mirrored = terminal_voltage(
+        Driver(driver.COAST, ratio, supply), -duty * supply, -back, 0.0, STEP
+    )
+    assert mirrored[0] == pytest.approx(-mean)
+
+
 def test_a_slew_limit_remembers_where_it_was():
     limited = Driver(driver.SLEW, 100.0, 10.0)
     assert terminal_voltage(limited, 3.0, 0.0, 1.0, 0.01) == pytest.approx((1.5, 2.0))
