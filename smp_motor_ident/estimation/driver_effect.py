@@ -190,10 +190,14 @@ def likeliest(group: Sequence[Record], fit: Fit, hold: str, options: Options) ->
         for effect in EFFECTS
         for start, how in _starts(few, fit, hold, options, effect)
     ]
-    found = [driver for s in searches if (driver := s.best()) is not None]
+    without = refine(_prepared(few, hold, fit), fit.structure, fit, fit.z, options, ROUGHLY)
+    behind = POLICY.hopeless * sandwich_factor(fit)
+    found = [d for s in searches if (d := s.best(without.deviance + behind)) is not None]
     found.sort(key=lambda d: cost(d.fit))
     if sum(map(len, few)) < sum(map(len, group)):
-        found = [d.search.on(list(group)) for d in found[:FINALISTS]]
+        most = fit.deviance + behind
+        every = [d.search.on(list(group), most, behind) for d in found[:FINALISTS]]
+        found = [d for d in every if d is not None]
     found = sorted((d for d in found if cost(d.fit) + price < cost(fit)), key=lambda d: cost(d.fit))
     if not found:
         return None
@@ -280,8 +284,11 @@ class _Search:
             self.near, self.data = fit, data
         return fit.deviance if np.isfinite(fit.deviance) else 1e300
 
-    def best(self) -> DriverFit | None:
-        """Return the likeliest size with its deviation; None where none is likelier than none."""
+    def best(self, most: float) -> DriverFit | None:
+        """Return the likeliest size with its deviation.
+
+        None where none is likelier than none, or the likeliest is beyond a deviance.
+        """
         none = self.near.deviance
         rows = rows_of(self.data, self.group, self.near)
         grid = np.log(self.effect.scale(rows) * np.array(self.effect.shares))
@@ -291,20 +298,29 @@ class _Search:
             return None
         low = float(grid[k - 1] if k else 2 * grid[0] - grid[1])
         high = float(grid[k + 1] if k + 1 < grid.size else 2 * grid[-1] - grid[-2])
-        return self._between(low, high)
+        return self._polished(self._between(low, high), most)
 
-    def on(self, group: list[Record]) -> DriverFit:
-        """Go on from the size that was found, with more records."""
+    def on(self, group: list[Record], most: float, behind: float) -> DriverFit | None:
+        """Go on from the size that was found, with more records.
+
+        That size is off by chance alone, which costs so many times more as there are rows more;
+        where it costs far more than a deviance with that the effect is none of theirs.
+        """
         near = replace(self.near, initial=_prepared(group, self.hold, self.near).initial)
         more = _Search(group, self.hold, near, self.options, self.effect)
-        return more._between(self.size - AROUND, self.size + AROUND)
+        if more.deviance(self.size) > most + behind * more.data.size / self.data.size:
+            return None
+        return more._polished(more._between(self.size - AROUND, self.size + AROUND), most)
 
-    def _between(self, low: float, high: float) -> DriverFit:
+    def _between(self, low: float, high: float) -> float:
         x = fminbound(self.deviance, low, high, xtol=1e-2, maxfun=MOST, disp=0)
-        return self._polished(float(x))
+        return float(x)
 
-    def _polished(self, x: float) -> DriverFit:
-        """Go on to the bottom by parabolas through three deviances, whose curvature is its std."""
+    def _polished(self, x: float, most: float) -> DriverFit | None:
+        """Go on to the bottom by parabolas through three deviances, whose curvature is its std.
+
+        None where a parabola's bottom is beyond a deviance.
+        """
         away = NEAR
         for _ in range(PARABOLAS):
             fit, data, records = self.at(float(np.exp(x)))
@@ -316,6 +332,8 @@ class _Search:
             curved = max(low + high - 2 * fit.deviance, 0.1 * RISE)
             std = away * float(np.sqrt(2 * sandwich_factor(fit) / curved))
             move = 0.5 * away * (low - high) / curved
+            if fit.deviance - 0.125 * (low - high) ** 2 / curved > most:
+                return None
             if abs(move) < CLOSE * std:
                 break
             x += float(np.clip(move, -2 * away, 2 * away))
