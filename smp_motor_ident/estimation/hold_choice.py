@@ -93,8 +93,8 @@ def otherwise(
         again = data if other == hold else prepare(group, request.use_current, hold=other)
         again = again.measured_as(data.kind).held(fit.structure.held)
         there = base.with_(held=fit.structure.held, shift=fit.structure.shift)
-        auto = request.model == "auto"
-        rivals = order_selection.explore(again, there, request.options, auto, request.say)
+        lost = not fit.converged and _lost(again, there, request, data, candidates[-1].fit)
+        rivals = [] if lost else _explored(again, there, request)
         whole = extend(of_kind(again, fit), fit.structure, fit, request.options)
         near = FittedCandidate(whole, f"as {candidates[-1].label}")
         first = not rivals or near.bic < rivals[-1].bic
@@ -105,6 +105,25 @@ def otherwise(
         elif better:
             data, hold, candidates = again, other, rivals
     return data, hold, candidates
+
+
+def _explored(data: Experiments, base: Structure, request: Request) -> list[FittedCandidate]:
+    return order_selection.explore(
+        data, base, request.options, request.model == "auto", request.say
+    )
+
+
+def _lost(
+    again: Experiments, base: Structure, request: Request, data: Experiments, best: Fit
+) -> bool:
+    """Tell whether a part of a long record rejects by far all that a search under a hold finds."""
+    duration = LOOKS[1] * data.step
+    part, own = again.data_window(duration), of_kind(data.data_window(duration), best)
+    if data.size <= 3 * part.size or part.size != own.size:
+        return False
+    known = refine(own, best.structure, best, best.z, request.options, ROUGHLY)
+    rivals = _explored(part, base, request)
+    return all(POLICY.rejects_on_subset(r.fit, known.deviance) for r in rivals) and bool(rivals)
 
 
 def _worth_a_search(
@@ -130,10 +149,10 @@ def _worth_a_search(
     others = [("held", "before")] * (hold != "held") + [(hold, "after"), (hold, "interpolated")]
     for other, how in others:
         there = data if other == hold else prepare(group, s.current, hold=other)
-        there, lag = of_kind(there.held(how), best), late - EARLIER[how]
+        there, lag = of_kind(there, best), late - EARLIER[how]
         found: Fit | None = None
         for duration, least in looks.items():
-            part = there.data_window(duration)
+            part = there.data_window(duration).held(how)
             found = _delayed(part, least, how, lag, options, found)
             # What has not settled, or saw little of the data, tells against a search only where
             # its residuals are of another size.
