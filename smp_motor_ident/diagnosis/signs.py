@@ -48,14 +48,21 @@ def likeness(records: Sequence[Record], signals: Sequence[Array], lags: bool) ->
         every = max(1, int(lag / (FINE * max(step for step, _, _ in pairs))))
         fewer = [(every * step, _every(v, every), _every(y, every)) for step, v, y in pairs]
         power = sum(float(y @ y) for _, _, y in fewer)
-        for half in (1, 2):  # a mean of two comes half a sample later
-            late = [(_means(lagged(v, lag / step), half), y) for step, v, y in fewer]
-            size = float(np.sqrt(sum(float(x @ x) for x, _ in late) * power)) or 1.0
-            for k in range(int(SIGN_LATE.value / every) + 2 - half):
-                alike = sum(float(x[: x.size - k] @ y[k:]) for x, y in late) / size
-                best = max(best, alike)
-                if alike < worst:
-                    worst, reverse = alike, late
+        late = [(lagged(v, lag / step), y) for step, v, y in fewer]
+        products = [
+            sum(float(x[: x.size - k] @ y[k:]) for x, y in late)
+            for k in range(int(SIGN_LATE.value / every) + 1)
+        ]
+        square = sum(float(x @ x) for x, _ in late)
+        next_to = sum(float(2 * (x[1:] @ x[:-1]) - x[-1] ** 2) for x, _ in late)
+        whole = np.array(products) / (np.sqrt(square * power) or 1.0)
+        # A mean of two comes half a sample later.
+        both = 0.5 * (np.array(products[1:]) + products[:-1])
+        both /= np.sqrt(max(0.25 * (2 * square + next_to), 0.0) * power) or 1.0
+        best = max(best, *whole, *both)
+        for alike, half in ((whole, 1), (both, 2)):
+            if alike.min(initial=0.0) < worst:
+                worst, reverse = float(alike.min()), [(_means(x, half), y) for x, y in late]
     if -worst <= SIGN_LEAST.value:  # then nobody asks what chance would make of it
         return Likeness(best, -worst, np.inf)
     sizes = [float(np.sqrt((x @ x) * (y @ y))) for x, y in reverse]
