@@ -127,6 +127,10 @@ def with_low_pass(
     richer = s.with_(window=True, low_pass=True)
     low = data.measured_as(richer.speed)
     if not s.window:
+        # To first order a low-passed speed is a late one, whose score is known by now.
+        late = s.with_(delay="delay" not in s.fixed)
+        if late != s and not POLICY.worth_a_fit(data, near, late):
+            return best
         hardly = replace(near, z=near.z.with_(window=HARDLY * data.step))
         if not apart or not POLICY.worth_a_fit(low, hardly, richer):
             return best
