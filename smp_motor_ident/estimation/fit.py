@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from smp_motor_ident.diagnosis.limits import MOST_FRICTION, SUBSET_HOPELESS
 from smp_motor_ident.estimation import shape_constraint
 from smp_motor_ident.estimation.fitted import Fit, Options, Prior, Start
+from smp_motor_ident.estimation.memory import remembered
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.noise import NoiseModel, deviance, gain_for, proper, renewed
 from smp_motor_ident.likelihood.normal_equations import damped_step
@@ -245,7 +246,8 @@ def solve(
     One that is far above it and does not come nearer in its passes is given up.
     """
     options = options or Options()
-    descent = _Descent(data, structure, start, options, _bounds(data), known)
+    bounds = remembered(data, "bounds", 1, (), lambda: _bounds(data))
+    descent = _Descent(data, structure, start, options, bounds, known)
     for n in range(ROUNDS):
         if not math.isfinite(descent.here.objective):
             break

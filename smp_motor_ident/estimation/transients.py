@@ -26,6 +26,7 @@ from smp_motor_ident.model.coordinates import PLAUSIBLE
 Array = NDArray[np.float64]
 
 PIECES = 24
+RANK = 1e-13  # of the largest eigenvalue, below which one is rounding
 MOST = 1_000_000  # samples whose sensitivities are held in memory at once
 
 
@@ -93,19 +94,20 @@ def _moves(data: Experiments, fit: Fit) -> Array:
         g = int(np.searchsorted(data.starts, a, side="right")) - 1
         normal = parts[g].copy()
         normal[:size, :size] += whole - seen[g]
-        inverse, piece = prediction.inverse(normal), rows[a:b].T @ rows[a:b]
-        root = _root(inverse)
+        root, piece = _root_of_inverse(normal), rows[a:b].T @ rows[a:b]
         taken, along = np.linalg.eigh(root.T @ piece @ root)
         taken = np.clip(taken, 1e-12, 1 - 1e-6)
         more = root @ along * ((1 / np.sqrt(1 - taken) - 1) / taken)
         gradient = rows[a:b].T @ error[a:b]
         gradient = gradient + piece @ more @ (root @ along).T @ gradient
-        moves.append((inverse @ gradient)[:size])
+        moves.append((root @ (root.T @ gradient))[:size])
     return np.array(moves)
 
 
-def _root(covariance: Array) -> Array:
-    """Return a root of a covariance, whatever the units of its coordinates."""
-    deviation = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-    values, vectors = np.linalg.eigh(covariance / np.outer(deviation, deviation))
-    return np.asarray(deviation[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)))
+def _root_of_inverse(normal: Array) -> Array:
+    """Return a root of the pseudo-inverse that `prediction.inverse` gives of a normal matrix."""
+    known = np.diag(normal)
+    scale = np.sqrt(np.where(known > 1e-200, known, np.inf))
+    values, vectors = np.linalg.eigh(normal / np.outer(scale, scale))
+    told = values > RANK * values[-1]
+    return np.asarray(vectors / np.sqrt(np.where(told, values, np.inf)) / scale[:, None])
