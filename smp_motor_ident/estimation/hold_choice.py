@@ -93,7 +93,9 @@ def otherwise(
         again = data if other == hold else prepare(group, request.use_current, hold=other)
         again = again.measured_as(data.kind).held(fit.structure.held)
         there = base.with_(held=fit.structure.held, shift=fit.structure.shift)
-        lost = not fit.converged and _lost(again, there, request, data, candidates[-1].fit)
+        best = candidates[-1].fit
+        far = POLICY.rejects_on_subset(fit, best.deviance)
+        lost = far and _lost(again, there, request, data, best)
         rivals = [] if lost else _explored(again, there, request)
         whole = extend(of_kind(again, fit), fit.structure, fit, request.options)
         near = FittedCandidate(whole, f"as {candidates[-1].label}")
