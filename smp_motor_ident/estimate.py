@@ -52,7 +52,13 @@ from smp_motor_ident.estimation.consider_covariance import (
     consider_timing,
 )
 from smp_motor_ident.estimation.constraint import constrained
-from smp_motor_ident.estimation.driver_effect import declared, likeliest, through
+from smp_motor_ident.estimation.driver_effect import (
+    DriverFit,
+    declared,
+    likeliest,
+    suspecting,
+    through,
+)
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.hold_choice import chosen_hold, instant_deviation, otherwise
 from smp_motor_ident.estimation.profile import profiled
@@ -60,7 +66,7 @@ from smp_motor_ident.estimation.quantisation import widened
 from smp_motor_ident.estimation.quantities import Answer, answer, driven_longest, without_lag
 from smp_motor_ident.estimation.request import Request, base_structure, checked
 from smp_motor_ident.estimation.segments import heterogeneous
-from smp_motor_ident.estimation.selection import FittedCandidate
+from smp_motor_ident.estimation.selection import FittedCandidate, in_turn
 from smp_motor_ident.estimation.subset import excited
 from smp_motor_ident.estimation.thinning import thinned
 from smp_motor_ident.estimation.transients import widened_by_pieces
@@ -198,14 +204,15 @@ def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) 
     data, hold, candidates = otherwise(group, base, request, data, hold, candidates)
     refused: SmpError | None = None
     left = list(candidates)
-    for one in _in_turn(candidates):
+    for one in in_turn(candidates):
         left = [r for r in left if r.fit is not one.fit]
         try:
             words = [*found, *_fallen_back(refused, one)]
             plain = _stated(group, request, words, data, hold, [*left, one])
             if not lacks_something(plain):
                 return plain
-            return _through_driver(group, request, found, data, hold, one.fit) or plain
+            behind, driver = _through_driver(group, request, found, data, hold, one.fit)
+            return behind or suspecting(plain, driver, one.fit)
         except (SignalError, InsufficientExcitationError) as refusal:
             refused = refused or refusal
             # What was refused, and what is richer, is no rival that another's answer must cover.
@@ -213,7 +220,7 @@ def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) 
             left = [replace(r, whole=r.whole and r.fit.structure.size <= most) for r in left]
             left.append(replace(one, reason=f"refused: {refusal}", whole=False))
     assert refused is not None
-    again = _through_driver(group, request, found, data, hold, candidates[-1].fit)
+    again, _ = _through_driver(group, request, found, data, hold, candidates[-1].fit)
     if again:
         return again
     raise refused
@@ -226,31 +233,23 @@ def _through_driver(
     data: Experiments,
     hold: str,
     fit: Fit,
-) -> Estimate | None:
-    """Return the estimate of a motor behind the driver that explains the records, if one does."""
+) -> tuple[Estimate | None, DriverFit | None]:
+    """Return the estimate behind the likeliest driver, if it holds, and that driver."""
     if request.driver is not None or one_size_or_swing(data):
-        return None
+        return None, None
     request.say("what the driver makes of its command")
     driver = likeliest(group, fit, hold, request.options)
     if driver is None:
-        return None
+        return None, None
     known = request.validation
     kept = None if known is None else driver.applied(known, fit, hold)
     try:
         e = _estimated(driver.records, replace(request, driver=driver, validation=kept), found)
     except (SignalError, InsufficientExcitationError):
-        return None
+        return None, driver
     emptied = {"implausible_motor", "one_level", "one_size_of_voltage"}
     hollow = any(f.code in emptied for f in e.findings)  # little is left of what was recorded
-    return None if e.unreliable or hollow else through(e, driver)
-
-
-def _in_turn(candidates: list[FittedCandidate]) -> list[FittedCandidate]:
-    """Return the choice, then those that are no richer; whose descent did not settle come last."""
-    most = candidates[-1].fit.structure.size
-    others = [r for r in candidates[:-1] if r.whole and r.fit.structure.size <= most]
-    others.sort(key=lambda r: (not r.fit.converged, r.bic))
-    return [candidates[-1], *others]
+    return (None if e.unreliable or hollow else through(e, driver)), driver
 
 
 def _fallen_back(refusal: SmpError | None, other: FittedCandidate) -> list[Finding]:

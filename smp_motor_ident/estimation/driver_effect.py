@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 from scipy.optimize import fminbound
 
+from smp_motor_ident.diagnosis.limits import HALF_EXPLAINED
 from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.candidate_starts import of_kind
 from smp_motor_ident.estimation.descent import ROUGHLY, initial_of, refine
@@ -33,7 +34,7 @@ from smp_motor_ident.result import UNITS, Estimate, Quantity
 
 Array = NDArray[np.float64]
 
-SMOOTHED = 0.2  # of the motor's lag: what a measured speed is a mean over
+SMOOTHED, MOST_SMOOTHED = 0.2, 1_000  # of the motor's lag, and rows: a measured speed is its mean
 TURNS = 3  # of a motion that the effect asks for, and that follows from it
 NEAR = 0.02  # e-folds of the size at which its deviance is first looked at beside the best
 RISE = 2.0  # of the deviance on both sides together, from which its curvature is read
@@ -84,6 +85,23 @@ def through(estimate: Estimate, found: DriverFit) -> Estimate:
     unit = UNITS[found.effect.quantity]
     words = f"the records show {found.effect.cause}: {size:.3g} ± {std:.2g} {unit}"
     return _behind(estimate, found.effect, Quantity(size, std, interval, unit), words, found.driver)
+
+
+def suspecting(estimate: Estimate, found: DriverFit | None, fit: Fit) -> Estimate:
+    """Return an unreliable estimate with the driver that would explain most of what it does not."""
+    if found is None or not estimate.unreliable:
+        return estimate
+    left = math.exp((found.fit.deviance - fit.deviance) / fit.samples)
+    codes = {f.code for f in estimate.findings if f.severity == "unreliable"}
+    if left > HALF_EXPLAINED.value or found.effect.code in codes:
+        return estimate
+    words = (
+        f"{found.effect.cause} would explain {1 - left:.0%} of the error, but the motor behind it "
+        "does not hold either"
+    )
+    advice = "record the voltage at the motor's terminals, or set the driver to follow its command"
+    finding = Finding(found.effect.code, "unreliable", words, {"explains": 1 - left}, advice)
+    return replace(estimate, findings=(finding, *estimate.findings))
 
 
 def declared(
@@ -150,9 +168,7 @@ def with_voltages(group: Sequence[Record], voltage: Array) -> list[Record]:
     return [replace(r, voltage=voltage[a:b]) for r, (a, b) in zip(group, pairwise(ends))]
 
 
-def rows_of(
-    data: Experiments, group: Sequence[Record], fit: Fit, measured: bool = False
-) -> Rows:
+def rows_of(data: Experiments, group: Sequence[Record], fit: Fit, measured: bool = False) -> Rows:
     """Return the commands of records and how the fitted motor runs, or did as measured."""
     speed = _measured(data, fit) if measured else prediction.simulate(data, fit)[:, 0]
     first = np.zeros(data.size, dtype=np.bool_)
@@ -172,7 +188,7 @@ def _measured(data: Experiments, fit: Fit) -> Array:
     speed = np.interp(data.time, data.time[there], data.output[there])
     if data.kind == ANGLE:
         speed = np.gradient(speed, data.time)
-    width = max(int(SMOOTHED * fit.z.time_constant / data.step), 1)
+    width = int(np.clip(SMOOTHED * fit.z.time_constant / data.step, 1, MOST_SMOOTHED))
     return np.asarray(uniform_filter1d(speed, width, mode="nearest"))
 
 
@@ -332,7 +348,7 @@ class _Search:
             curved = max(low + high - 2 * fit.deviance, 0.1 * RISE)
             std = away * float(np.sqrt(2 * sandwich_factor(fit) / curved))
             move = 0.5 * away * (low - high) / curved
-            if fit.deviance - 0.125 * (low - high) ** 2 / curved > most:
+            if fit.deviance - 0.125 * (low - high) / curved * (low - high) > most:
                 return None
             if abs(move) < CLOSE * std:
                 break

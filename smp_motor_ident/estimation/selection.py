@@ -154,3 +154,11 @@ class SelectionPolicy:
 
 POLICY = SelectionPolicy()
 """The policy of every estimate."""
+
+
+def in_turn(candidates: list[FittedCandidate]) -> list[FittedCandidate]:
+    """Return the choice, then those that are no richer; whose descent did not settle come last."""
+    most = candidates[-1].fit.structure.size
+    others = [r for r in candidates[:-1] if r.whole and r.fit.structure.size <= most]
+    others.sort(key=lambda r: (not r.fit.converged, r.bic))
+    return [candidates[-1], *others]
