@@ -55,6 +55,7 @@ def screen(records: Sequence[Record]) -> list[Finding]:
     _motion(records, where)
     _signs(records, where)
     for record in records:
+        _signs([record], _where([record]), late=False)  # the many do not hide the one
         _offset(record)
     read = [finding for record in records for finding in record.findings]
     return [*warnings, *(f for k, f in enumerate(read) if f not in read[:k])]
@@ -303,7 +304,7 @@ def _motion(records: Sequence[Record], where: str) -> None:
         )
 
 
-def _signs(records: Sequence[Record], where: str) -> None:
+def _signs(records: Sequence[Record], where: str, late: bool = True) -> None:
     """Refuse speed or current that answers the voltage with the wrong sign, or so late that a late
     answer is a reversed one.
     """
@@ -323,7 +324,7 @@ def _signs(records: Sequence[Record], where: str) -> None:
                 f"(correlation {-found.wrong:.2f}); {remedy}"
             )
         follows = found.wrong > max(least, min(sure, SIGN_ALIKE.value))
-        if what == "speed" and follows and found.wrong > SIGN_NEARER.value * found.right:
+        if late and what == "speed" and follows and found.wrong > SIGN_NEARER.value * found.right:
             raise InsufficientExcitationError(
                 f"{where}: the voltage changes too fast for its sampling, {_period(records):.2g} "
                 "samples a period: a speed that comes late looks like one of the other sign; "
