@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,13 +17,14 @@ from smp_motor_ident.diagnosis.bunched import merge_bunches
 from smp_motor_ident.diagnosis.conditions import dependent
 from smp_motor_ident.diagnosis.current_kind import ARMATURE, current_kind
 from smp_motor_ident.diagnosis.data_quality import screen
-from smp_motor_ident.diagnosis.differenced import counts_again, rounding
+from smp_motor_ident.diagnosis.differenced import counts_again
 from smp_motor_ident.diagnosis.limits import PROFILED
 from smp_motor_ident.diagnosis.lost_rows import bridged
 from smp_motor_ident.diagnosis.misfit import widened_by_misfit
 from smp_motor_ident.diagnosis.model_error import regression
 from smp_motor_ident.diagnosis.noise_or_effect import in_place_of_noise
-from smp_motor_ident.diagnosis.refusal import lag_unknown, no_candidate, refuse
+from smp_motor_ident.diagnosis.provenance import provenance
+from smp_motor_ident.diagnosis.refusal import lag_unknown, no_candidate, of_which, refuse
 from smp_motor_ident.diagnosis.residuals import residual_tests
 from smp_motor_ident.diagnosis.scope import (
     UNDECIDED,
@@ -65,14 +66,13 @@ from smp_motor_ident.estimation.profile import profiled
 from smp_motor_ident.estimation.quantisation import widened
 from smp_motor_ident.estimation.quantities import Answer, answer, driven_longest, without_lag
 from smp_motor_ident.estimation.request import Request, base_structure, checked
-from smp_motor_ident.estimation.segments import heterogeneous
+from smp_motor_ident.estimation.segments import Change, heterogeneous
 from smp_motor_ident.estimation.selection import FittedCandidate, in_turn
 from smp_motor_ident.estimation.subset import excited
 from smp_motor_ident.estimation.thinning import thinned
 from smp_motor_ident.estimation.transients import widened_by_pieces
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import Experiments, prepare
-from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.model.structures import Structure
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import Estimate, FitPercent
@@ -147,7 +147,10 @@ def estimate(
         except UnknownLagError as refusal:
             return cast(Estimate, refusal.estimate)
 
-    return declared(behind, group, request.validation, request.known)
+    try:
+        return declared(behind, group, request.validation, request.known)
+    except (SignalError, InsufficientExcitationError) as refusal:
+        raise of_which(group, refusal, lambda r: behind([r], None)) from None
 
 
 def _checked(group: list[Record], request: Request) -> Estimate:
@@ -312,7 +315,7 @@ def _stated(
         *beside,
         *unsettled_rival(candidates, result, request.known),
         *advise(chosen, result, request.known),
-        *scope(final, result, change, alike, group[0].hardware.resistance),
+        *scope(final, result, change, alike, group),
     ]
     estimate = Estimate(
         model=chosen.structure.title,
@@ -324,11 +327,7 @@ def _stated(
         candidates=validate.candidates_of(candidates, chosen, group, data),
         residuals=tests,
         findings=tuple(findings),
-        samples=data.size,
-        sample_time=data.step,
-        speed_noise=_speed_noise(group, data, chosen),
-        angle_noise=_angle_noise(group, data, chosen),
-        **_provenance(group),
+        **provenance(group, data, chosen),
     )
     if refusal is not None:
         refusal.estimate = estimate
@@ -356,35 +355,9 @@ def _prepared(
     return data.measured_as(base.speed), hold, first
 
 
-def _speed_noise(group: Sequence[Record], data: Experiments, fit: Fit) -> float:
-    """Return the noise of the speed that was recorded [rad/s], 0 where only an angle was."""
-    if data.kind == ANGLE:
-        return max(map(rounding, group))
-    return float(np.sqrt(fit.noise[0, 0]))
-
-
-def _angle_noise(group: Sequence[Record], data: Experiments, fit: Fit) -> float:
-    """Return the noise of the angle that was recorded [rad], 0 where counts or a speed were."""
-    counted = any(r.count is not None and r.hardware.counts_per_revolution for r in group)
-    if data.kind != ANGLE or counted or max(map(rounding, group)) > 0.0:
-        return 0.0
-    return float(np.sqrt(fit.noise[0, 0]))
-
-
-def _provenance(group: Sequence[Record]) -> dict[str, Any]:
-    """Return what an estimate says of its records."""
-    return {
-        "wheel": group[0].wheel,
-        "duration": float(sum(r.duration for r in group)),
-        "largest_voltage": max(float(np.abs(r.voltage).max()) for r in group),
-        "sources": tuple(dict.fromkeys(r.source for r in group if r.source)),
-        "hardware": group[0].hardware,
-    }
-
-
 def _certain(
     data: Experiments, fit: Fit, request: Request, group: Sequence[Record], hold: str
-) -> tuple[Fit, float, dict[str, float]]:
+) -> tuple[Fit, float, Change]:
     """Return the chosen fit with all of its uncertainty, and how the motor changes."""
     final = of_kind(data, fit)
     chosen = constrained(final, fit, request)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from smp_motor_ident.errors import (
     CurrentError,
     InsufficientExcitationError,
     SignalError,
+    SmpError,
     UnknownLagError,
 )
 from smp_motor_ident.estimation.fit import Fit
@@ -34,6 +35,29 @@ def no_candidate(group: Sequence[Record]) -> InsufficientExcitationError:
         f"{where(group)}: no motor model explains these data; record 20 s or more of a "
         "square or Fourier voltage that turns the motor in both directions"
     )
+
+
+def of_which(
+    group: Sequence[Record], refusal: SmpError, alone: Callable[[Record], object]
+) -> SmpError:
+    """Return the refusal of several records, with those by name of which ``alone`` is refused."""
+    if len(group) < 2 or not str(refusal).startswith(where(group)):
+        return refusal
+    refused: dict[str, str] = {}
+    names = [r.source or f"record {n + 1}" for n, r in enumerate(group)]
+    for name, record in zip(names, group, strict=True):
+        try:
+            alone(record)
+        except (SignalError, InsufficientExcitationError) as own:
+            refused[name] = str(own)
+    if len(refused) == len(group):
+        return refusal
+    if not refused:
+        words = "each of them alone is explained: they are not of one motor, wiring and scale"
+    else:
+        words = "the others are explained without " + " and ".join(refused)
+        words += f"; alone: {next(iter(refused.values()))}"
+    return type(refusal)(f"{refusal}; {words}")
 
 
 def refuse(

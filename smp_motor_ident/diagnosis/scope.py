@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -16,9 +16,11 @@ from smp_motor_ident.diagnosis.limits import (
     SAME_LEVEL,
 )
 from smp_motor_ident.estimation.quantities import Answer
+from smp_motor_ident.estimation.segments import Change
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import Experiments
-from smp_motor_ident.model.coordinates import STANDS_FOR
+from smp_motor_ident.model.coordinates import LOGARITHMS, STANDS_FOR
+from smp_motor_ident.record import Record
 from smp_motor_ident.result import Estimate
 
 FEWEST_SWINGS = 6  # of which it can be said that they are alike
@@ -27,9 +29,9 @@ FEWEST_SWINGS = 6  # of which it can be said that they are alike
 def scope(
     data: Experiments,
     result: Answer,
-    change: Mapping[str, float],
+    change: Change,
     alike: Mapping[str, float],
-    ohmmeter: float | None,
+    group: Sequence[Record],
 ) -> list[Finding]:
     """Return what a reader must know of the values' meaning."""
     size = _one_size(data)
@@ -39,19 +41,51 @@ def scope(
         out.append(_alike(alike))
     if result.level:
         out.append(_one_level(result))
-    out += _current_scale(result, ohmmeter, size > 0)
-    if change:
-        out.append(
-            Finding(
-                "motor_changes",
-                "note",
-                "parts of the recordings differ by more than their noise (temperature, friction): "
-                "the intervals are those of another recording of this motor",
-                {STANDS_FOR.get(n, n): deviation for n, deviation in change.items()},
-                "let the motor warm up, or record on several days, to know how much it changes",
-            )
-        )
+    out += _current_scale(result, group[0].hardware.resistance, size > 0)
+    if change.std:
+        out.append(_motor_changes(change, group, float(np.abs(data.voltage).max())))
     return out
+
+
+def _motor_changes(change: Change, group: Sequence[Record], top: float) -> Finding:
+    """Say that a motor changes, and name the record that alone differs from the others."""
+    evidence: dict[str, float | str | None] = {
+        STANDS_FOR.get(n, n): deviation for n, deviation in change.std.items()
+    }
+    advice = "let the motor warm up, or record on several days, to know how much it changes"
+    units = {n: 1.0 if n in LOGARITHMS else top for n in change.differs}
+    far = any(abs(d) > RELEVANT_BIAS.value * units[n] for n, d in change.differs.items())
+    if change.segment is None or len(group) < 2 or not far:
+        return Finding(
+            "motor_changes",
+            "note",
+            "parts of the recordings differ by more than their noise (temperature, friction): "
+            "the intervals are those of another recording of this motor",
+            evidence,
+            advice,
+        )
+    ends = np.cumsum([len(r.starts) for r in group])
+    place = int(np.searchsorted(ends, change.segment, side="right"))
+    name = group[place].source or f"record {place + 1}"
+    return Finding(
+        "motor_changes",
+        "warning",
+        f"{name} differs from the other recordings, which agree ({_differs(change.differs)}): "
+        "another motor, wiring or scale, or a motor that changed in between; the values lie "
+        "between, and the intervals are those of another recording",
+        evidence | {"record": name},
+        f"leave {name} out, unless the motor changes like that; then record more",
+    )
+
+
+def _differs(by: Mapping[str, float]) -> str:
+    """Return in words by how much the coordinates of a record differ."""
+    gain = by.get("ln_a0", 0.0)
+    logarithms = {"ln_a0": -gain, "ln_a1": by.get("ln_a1", 0.0) - gain, "ln_r": by.get("ln_r", 0.0)}
+    shares = {STANDS_FOR[n]: 100 * np.expm1(d) for n, d in logarithms.items() if n in by}
+    words = [f"{name} {share:+.2g} %" for name, share in shares.items()]
+    volts = [n for n in ("vc_plus", "vc_minus", "load") if n in by]
+    return ", ".join([*words, *(f"{STANDS_FOR[n]} {by[n]:+.2g} V" for n in volts)])
 
 
 def _alike(weights: Mapping[str, float]) -> Finding:

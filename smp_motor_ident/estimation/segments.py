@@ -13,7 +13,9 @@ Higgins, Thompson and Spiegelhalter, J. R. Stat. Soc. A 172 (2009), 137 (interva
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,40 +36,141 @@ Array = NDArray[np.float64]
 
 FEWEST = 4  # parts of which a scatter can be taken
 ORDERED = 6  # parts of which a drift is distinguishable from scatter
+WHOLE = 1  # part of all that is recorded: cut only where the segments begin
 LOOSE = 0.3  # e-folds, or of the value: a coordinate known worse from a part is left out
 ROUNDING = 1e-12  # of the largest eigenvalue: what the sums of a part are exact to
 
 
-def heterogeneous(data: Experiments, fit: Fit) -> tuple[Fit, dict[str, float]]:
-    """Return the fit with its covariance widened by how the motor changes."""
-    found = _steps(data, fit)
-    if found is None:
-        return fit, {}
-    middle, step, cov, free = found
+@dataclass(frozen=True)
+class Change:
+    """How a motor changes from part to part: nothing where it does not."""
+
+    std: Mapping[str, float] = field(default_factory=dict)  # by coordinate
+    segment: int | None = None  # the only one that differs from the others, which agree
+    differs: Mapping[str, float] = field(default_factory=dict)  # by how much, by coordinate
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """What parts of the data ask for, each from the common estimate."""
+
+    middle: Array  # when, of the whole, 0 in the middle
+    step: Array
+    cov: Array
+    known: Array  # variances where residuals are white, and what is in the intervals beside
+    owner: NDArray[np.int64]  # which segment a part is of
+    free: list[int]  # which of the coordinates
+
+    def without(self, segment: int) -> Steps:
+        """Return the steps of all other segments."""
+        kept = self.owner != segment
+        when = self.middle[kept]
+        return Steps(when - when.mean(), self.step[kept], self.cov[kept], self.known[kept],
+                     self.owner[kept], self.free)  # fmt: skip
+
+    def by_segment(self) -> tuple[Array, Array, Array, int]:
+        """Return the segments' means and numbers of parts, and the parts' scatter around them."""
+        owners, place, count = np.unique(self.owner, return_inverse=True, return_counts=True)
+        means = np.zeros((owners.size, self.step.shape[1]))
+        np.add.at(means, place, self.step)
+        means /= count[:, None]
+        left, freedom = self.step - means[place], len(self.step) - owners.size
+        return means, count.astype(np.float64), left.T @ left / max(freedom, 1), freedom
+
+
+def heterogeneous(data: Experiments, fit: Fit) -> tuple[Fit, Change]:
+    """Return the fit with its covariance widened by how the motor changes.
+
+    Segments are compared whole as well: one that is too poor in parts may tell all of the motor.
+    """
+    parts = _steps(data, fit, int(SEGMENTS.value))
+    whole = _steps(data, fit, WHOLE) if len(data.starts) > 2 else None
+    level = HOMOGENEITY.value / (1 if whole is None else 3)
+    unlike = _unlike(whole, parts, level)
+    use = whole if unlike and (parts is None or len(data.starts) > FEWEST) else parts
+    if use is None or not (unlike or _changed(use, level)):
+        return fit, Change()
+    ordered = len(data.starts) - 1 < FEWEST and len(use.step) >= ORDERED  # no sequence of records
+    between, freedom = _between(use.middle, use.step, _noise(use, parts, level), ordered)
+    between = between * (stdtrit(freedom, 0.975) / NORMAL_95) ** 2
+    names = [fit.structure.free[i] for i in use.free]
+    added = np.zeros((len(fit.structure.free),) * 2)
+    added[np.ix_(use.free, use.free)] = between
+    std = dict(zip(names, map(float, np.sqrt(np.diag(between))), strict=True))
+    widened = added + (0.0 if fit.added is None else fit.added)
+    return replace(fit, added=widened), _named(whole, parts, level, fit, Change(std))
+
+
+def _noise(use: Steps, parts: Steps | None, level: float) -> Array:
+    """Return the covariance of a step of a motor that does not change.
+
+    Where segments differ, so do the scores within one, and what these let expect is too much:
+    parts of one segment tell.
+    """
+    expected = np.asarray(use.cov.mean(axis=0))
+    if parts is None or parts.free != use.free or not _differ(parts, level):
+        return expected
+    _, count, scatter, _ = parts.by_segment()
+    return scatter if use is parts else scatter / float(count.mean())
+
+
+def _unlike(whole: Steps | None, parts: Steps | None, level: float) -> bool:
+    """Tell whether segments are of different motors."""
+    if whole is None:
+        return False
+    return _changed(whole, level) or (parts is not None and _differ(parts, level))
+
+
+def _differ(parts: Steps, level: float) -> bool:
+    """Tell whether segments differ by more than their own parts do (analysis of variance)."""
+    means, count, scatter, freedom = parts.by_segment()
+    between = len(means) - 1
+    if between < 1 or freedom < 2:
+        return False
+    square = count @ np.square(means - count @ means / count.sum())
+    each = level / means.shape[1]
+    ratio = square / between / np.maximum(np.diag(scatter), 1e-300)
+    sure = square > chdtri(between, each) * parts.known.mean(axis=0)  # rounding is no change
+    return bool((sure & (ratio > fdtri(between, freedom, 1 - each))).any())
+
+
+def _changed(steps: Steps, level: float) -> bool:
+    """Tell whether steps scatter or drift more than their covariances let them."""
+    middle, step, cov = steps.middle, steps.step, steps.cov
     parts, size = step.shape
     # Nothing of what stands at its bound in every part.
     expected = np.maximum(np.einsum("bii->i", cov) / parts, 1e-300)
-    square = float(np.square(middle).sum())
     scatter = np.square(step - step.mean(axis=0)).sum(axis=0)
-    drift = np.square(middle @ step) / square
+    if parts < FEWEST:
+        return bool(parts > 1 and (scatter / expected > chdtri(parts - 1, level / size)).any())
+    drift = np.square(middle @ step) / float(np.square(middle).sum())
     own = (scatter - drift) / (parts - 2)  # a drift is judged by its own scatter as well
-    each = HOMOGENEITY.value / (3 * size)  # Bonferroni: three tests of each coordinate
+    each = level / (3 * size)  # Bonferroni: three tests of each coordinate
     changed = (
         (scatter / expected > chdtri(parts - 1, each))
         | (drift / expected > chdtri(1, each))
         | (drift / np.maximum(own, 1e-300) > fdtri(1, parts - 2, 1 - each))
     )
-    if not changed.any():
-        return fit, {}
-    ordered = len(data.starts) - 1 < FEWEST and parts >= ORDERED  # records are not a sequence
-    between, freedom = _between(middle, step, cov.mean(axis=0), ordered)
-    between = between * (stdtrit(freedom, 0.975) / NORMAL_95) ** 2
-    added = np.zeros((len(fit.structure.free),) * 2)
-    added[np.ix_(free, free)] = between
-    std = np.sqrt(np.diag(between))
-    names = [fit.structure.free[i] for i in free]
-    widened = added + (0.0 if fit.added is None else fit.added)
-    return replace(fit, added=widened), dict(zip(names, map(float, std), strict=True))
+    return bool(changed.any())
+
+
+def _named(
+    whole: Steps | None, parts: Steps | None, level: float, fit: Fit, change: Change
+) -> Change:
+    """Return a change with the only segment without which all others are of one motor."""
+    if whole is None or len(whole.step) < 3 or not _unlike(whole, parts, level):
+        return change
+    alone = [
+        b
+        for b in whole.owner
+        if not _unlike(whole.without(b), None if parts is None else parts.without(b), level)
+    ]
+    if len(alone) != 1:
+        return change
+    at = whole.owner == alone[0]
+    by = whole.step[at].mean(axis=0) - whole.step[~at].mean(axis=0)
+    names = [fit.structure.free[i] for i in whole.free]
+    return replace(change, segment=int(alone[0]), differs=dict(zip(names, map(float, by))))
 
 
 def _between(middle: Array, step: Array, noise: Array, ordered: bool) -> tuple[Array, int]:
@@ -90,10 +193,11 @@ def _positive(matrix: Array, scale: Array) -> Array:
     return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T * np.outer(unit, unit))
 
 
-def _steps(data: Experiments, fit: Fit) -> tuple[Array, Array, Array, list[int]] | None:
-    """Return time (of the whole, 0 in the middle), step and covariance of each part."""
+def _steps(data: Experiments, fit: Fit, count: int) -> Steps | None:
+    """Return the steps of the segments, of what is cut into ``count`` parts at least."""
     structure, f = fit.structure, len(fit.structure.free)
-    cut = _parted(data, fit, int(SEGMENTS.value))
+    cut = _parted(data, fit, count)
+    fewest = FEWEST if count > WHOLE else 2
     sums = gather(cut, structure, fit.z, cut.initial, fit.noise_model())
     common = [i for i, c in enumerate(structure.free) if c != "ln_te"]
     factors = np.sqrt(_fast_factors(fit))
@@ -113,10 +217,14 @@ def _steps(data: Experiments, fit: Fit) -> tuple[Array, Array, Array, list[int]]
     common = [i for i in common
               if np.median(variance[:, i]) < (LOOSE * max(size[i], 1e-12)) ** 2]  # fmt: skip
     keep = enough[:, common].all(axis=1)
-    if keep.sum() < FEWEST or not common:
+    if keep.sum() < fewest or not common:
         return None
     at = np.ix_(keep, common, common)
-    return when[keep] - when[keep].mean(), step[np.ix_(keep, common)], cov[at], common
+    middles = when[keep] - when[keep].mean()
+    owner = np.searchsorted(data.starts, cut.starts[:-1], side="right") - 1
+    beside = 0.0 if fit.added is None else np.diag(fit.added)
+    own = (variance / np.square(factors) + beside)[np.ix_(keep, common)]
+    return Steps(middles, step[np.ix_(keep, common)], cov[at], own, owner[keep], common)
 
 
 def _without_beginning(normal: Array, gradient: Array, f: int) -> tuple[Array, Array]:
@@ -154,11 +262,20 @@ def _fast_factors(fit: Fit) -> Array:
     return np.asarray(np.maximum(1.0, sandwich / np.maximum(np.diag(cov), 1e-300)))
 
 
+def _edges(data: Experiments, parts: int) -> list[int]:
+    """Return where to cut: each segment that is not short in two parts at least."""
+    edges: list[int] = []
+    for begin, end in pairwise(map(int, data.starts)):
+        size = end - begin
+        if parts > WHOLE and size > data.size // (3 * parts):
+            count = max(2, round(parts * size / data.size))
+            edges += [begin + size * k // count for k in range(1, count)]
+    return edges
+
+
 def _parted(data: Experiments, fit: Fit, parts: int) -> Experiments:
     """Return the experiments cut into parts that begin as the fitted motor passes there."""
-    edges = np.linspace(0, data.size, parts + 1).astype(np.int64)
-    near = [int(e) for e in edges[1:-1] if np.abs(data.starts - e).min() > data.size // (3 * parts)]
-    starts = np.array(sorted({*map(int, data.starts), *near}), dtype=np.int64)
+    starts = np.array(sorted({*map(int, data.starts), *_edges(data, parts)}), dtype=np.int64)
     owner = np.searchsorted(data.starts, starts[:-1], side="right") - 1
     first = np.empty(starts.size - 1, dtype=np.int64)
     initial = np.zeros((starts.size - 1, 5))

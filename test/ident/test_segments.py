@@ -7,6 +7,8 @@ import motors
 import numpy as np
 import pytest
 
+from smp_motor_ident.diagnosis import refusal
+from smp_motor_ident.errors import SignalError
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.estimation import segments
 from smp_motor_ident.record import Record
@@ -109,3 +111,61 @@ def test_a_part_tells_nothing_of_what_its_beginning_takes_all_of():
     assert not left[1].any() and not left[:, 1].any() and score[1] == 0.0
     assert left[::2, ::2] == pytest.approx((projected.T @ projected)[::2, ::2])
     assert score[::2] == pytest.approx((projected.T @ error)[::2])
+
+
+def _runs(gains, named=True):
+    """Return records of a motor whose gain is another in each; of 8 s, of two levels and rest."""
+    runs = [_first_order(g, 0.08, 0.6, 20 + n, seconds=8.0) for n, g in enumerate(gains)]
+    return [replace(r, source=f"run{n}") if named else r for n, r in enumerate(runs)]
+
+
+def test_the_record_that_alone_differs_is_named():
+    found = estimate(_runs([10.0, 10.0, 7.5, 10.0]), "first_order")
+    (change,) = [f for f in found.findings if f.code == "motor_changes"]
+    assert change.severity == "warning" and change.evidence["record"] == "run2"
+    assert "dc_gain -2" in change.message
+    gain = found.combinations["dc_gain"]
+    assert gain.ci95[0] < 7.5 and gain.ci95[1] > 10.0
+
+
+def test_records_that_all_differ_are_of_one_changing_motor():
+    found = estimate(_runs([10.0, 9.2, 10.8, 9.6, 10.5]), "first_order")
+    (change,) = [f for f in found.findings if f.code == "motor_changes"]
+    assert change.severity == "note"
+    gain = found.combinations["dc_gain"]
+    spread = np.std([10.0, 9.2, 10.8, 9.6, 10.5], ddof=1)
+    # Of another recording, by Student's t of four degrees of freedom, and the mean's own.
+    assert 0.9 * spread < gain.std < 2.0 * spread
+
+
+def test_two_records_of_different_motors_are_said_to_differ():
+    found = estimate(_runs([10.0, 8.0]), "first_order")
+    assert [f for f in found.findings if f.code == "motor_changes"]
+
+
+def test_records_of_one_motor_are_rarely_said_to_differ():
+    groups = ([_first_order(10.0, 0.08, 0.6, 100 + 4 * k + j, 8.0) for j in range(4)]
+              for k in range(8))  # fmt: skip
+    assert sum(bool(_changes(g)) for g in groups) < 2
+
+
+def test_the_record_of_swapped_sign_is_named_among_others():
+    records = _runs([10.0] * 4)
+    records[1] = replace(records[1], velocity=-records[1].velocity)
+    with pytest.raises(SignalError, match="run1: motor: swapped sign"):
+        estimate(records, "first_order")
+
+
+def test_a_refusal_of_several_names_those_that_are_refused_alone():
+    records = _runs([10.0] * 3)
+    together = SignalError("run0, run1, run2: motor: no")
+
+    def alone(record):
+        if record.source == "run1":
+            raise SignalError("run1: motor: a reason")
+
+    said = str(refusal.of_which(records, together, alone))
+    assert said.endswith("the others are explained without run1; alone: run1: motor: a reason")
+    assert "not of one motor" in str(refusal.of_which(records, together, lambda _: None))
+    own = SignalError("run1: motor: of one record")
+    assert refusal.of_which(records, own, alone) is own

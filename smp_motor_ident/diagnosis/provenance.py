@@ -1,0 +1,44 @@
+"""What an estimate says of its records, and of the noise that was in them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from smp_motor_ident.diagnosis.differenced import rounding
+from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.likelihood.experiments import Experiments
+from smp_motor_ident.model.measurement import ANGLE
+from smp_motor_ident.record import Record
+
+
+def provenance(group: Sequence[Record], data: Experiments, fit: Fit) -> dict[str, Any]:
+    """Return the fields of an `Estimate` that are of its records."""
+    return {
+        "wheel": group[0].wheel,
+        "duration": float(sum(r.duration for r in group)),
+        "largest_voltage": max(float(np.abs(r.voltage).max()) for r in group),
+        "sources": tuple(dict.fromkeys(r.source for r in group if r.source)),
+        "hardware": group[0].hardware,
+        "samples": data.size,
+        "sample_time": data.step,
+        "speed_noise": _speed_noise(group, data, fit),
+        "angle_noise": _angle_noise(group, data, fit),
+    }
+
+
+def _speed_noise(group: Sequence[Record], data: Experiments, fit: Fit) -> float:
+    """Return the noise of the speed that was recorded [rad/s], 0 where only an angle was."""
+    if data.kind == ANGLE:
+        return max(map(rounding, group))
+    return float(np.sqrt(fit.noise[0, 0]))
+
+
+def _angle_noise(group: Sequence[Record], data: Experiments, fit: Fit) -> float:
+    """Return the noise of the angle that was recorded [rad], 0 where counts or a speed were."""
+    counted = any(r.count is not None and r.hardware.counts_per_revolution for r in group)
+    if data.kind != ANGLE or counted or max(map(rounding, group)) > 0.0:
+        return 0.0
+    return float(np.sqrt(fit.noise[0, 0]))
