@@ -302,15 +302,19 @@ def _stated(
         tests = replace(tests, model_error=unmodelled_dynamics(there, chosen))
     numbers = stated(chosen, result)
     lacks, possible = adequacy(errors, data.step, numbers, tests)
+    for_noise: list[Finding] = []
     if not any(f.severity == "unreliable" for f in lacks):
-        lacks += in_place_of_noise(final, chosen, gear, numbers, request.options)
+        for_noise = in_place_of_noise(final, chosen, gear, numbers, request.options)
     (result, alike), beside = widened_by_misfit(final, chosen, possible, said)
+    if beside:  # what a number's interval holds in the end does not make it unreliable
+        lacks, _ = adequacy(errors, data.step, stated(chosen, result), tests)
     result = without_lag(result) if refusal else result
     findings = [
         *found,
         *lag_unknown(result, refusal, data.step),
         *assess(final, chosen, FitPercent(fitted, common), tests),
         *lacks,
+        *for_noise,
         *parts,
         *beside,
         *unsettled_rival(candidates, result, request.known),

@@ -181,3 +181,20 @@ def test_a_motor_at_rest_turns_by_no_rounding_error():
     signals = (data.time, record.voltage, speed, np.zeros(size))
     motion = model_error._motion(data, 1.0, signals, 0.1, np.array([size]))
     assert not motion.speed[: size // 2].any() and motion.speed[-1] == motion.fastest == 30.0
+
+
+def test_an_effect_is_held_against_the_intervals_that_are_stated(monkeypatch) -> None:
+    """What moves a number beyond the likelihood's interval may be within that of the answer."""
+    record = commanded(top=6.0)
+    monkeypatch.setattr("smp_motor_ident.estimate.likeliest", lambda *_: None)
+
+    def unreliable() -> set[str]:
+        return {f.code for f in estimate(record).findings if f.evidence.get("shift_std", 0) > 2}
+
+    def late(data, fit):
+        wide = fit.wider(np.diag(np.square(np.full(len(fit.structure.free), 0.15))))
+        return wide, [Finding("command_jitter", "note", "it is late")]
+
+    narrow = unreliable()
+    monkeypatch.setattr("smp_motor_ident.diagnosis.misfit.jittered", late)
+    assert narrow and not unreliable()
