@@ -60,12 +60,15 @@ def speed_fit(
 
 
 def within_resolution(data: Experiments, fit: Fit) -> bool:
-    """Tell whether the free run follows an angle as closely as its sensor lets anything.
+    """Tell whether the free run follows an output as closely as its sensor lets anything.
 
-    That is a counter's rounding, or the scatter of an angle whose motion is smooth beside it.
+    That is a counter's rounding, or the scatter of an angle whose motion is smooth beside it.  A
+    difference of counts that is one more with the probability p has a variance of p (1 - p).
     """
-    if data.kind != ANGLE or fit.noise_ratio > 0:
+    if fit.noise_ratio > 0:
         return False
+    if data.kind != ANGLE:
+        return bool(fit.noise[0, 0] < data.quantum**2 / 4)
     moved = _roughness(prediction.simulate(data, fit)[:, 1])
     scatter = _roughness(data.output)
     own = max(data.quantum**2 / 12, scatter if moved < SMOOTH * scatter else 0.0)

@@ -199,3 +199,34 @@ def test_a_speed_that_is_an_angles_slope_in_another_unit_names_both(speed, angle
     mixed = replace(GOOD, count=None, velocity=speed * GOOD.velocity, position=angle * turned)
     with pytest.raises(SignalError, match=words):
         screen([mixed])
+
+
+def _coarse(record: Record, counts: float, samples: int) -> Record:
+    """Return a record with the speed that a firmware makes of counts over some samples."""
+    turned = np.cumsum(record.velocity) * record.sample_time
+    count = np.floor(turned / (2 * np.pi) * counts)
+    moved = count - np.concatenate([np.full(samples, count[0]), count[:-samples]])
+    speed = moved * 2 * np.pi / counts / samples / record.sample_time
+    return replace(record, velocity=speed, count=None, position=None)
+
+
+def test_a_speed_of_few_counts_is_explained_as_closely_as_counts_let_it():
+    fine = motors.record("rear_left", current=False, seconds=20.0, kinds=("fourier", "square"))
+    coarse = _coarse(replace(fine, count=None), 2.0, 4)
+    found = estimate(coarse)  # a count more or less is 157 rad/s of at most 300
+    assert found.fit_percent.estimation < 70  # below which a speed is said to be ill explained
+    assert not found.unreliable
+    gain, true = found.combinations["dc_gain"], motors.truth("rear_left", 0.3)["dc_gain"]
+    assert abs(gain.value - true) < 4 * gain.std
+
+
+def test_a_speed_of_few_counts_of_another_motor_is_refused():
+    fine = motors.record("rear_left", current=False, seconds=20.0, kinds=("fourier", "square"))
+    coarse = _coarse(replace(fine, count=None), 2.0, 4)
+    rng = np.random.default_rng(4)
+    other = np.repeat(rng.uniform(-10.0, 10.0, len(fine) // 40 + 1), 40)[: len(fine)]
+    try:
+        found = estimate(replace(coarse, voltage=other))
+    except (InsufficientExcitationError, SignalError):
+        return
+    assert found.unreliable
