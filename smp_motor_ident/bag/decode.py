@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -18,7 +18,6 @@ from smp_motor_ident.bag.types import Definitions, Types
 from smp_motor_ident.bag.unpack import Budget, decompress_messages
 from smp_motor_ident.errors import BagError
 
-Progress = Callable[[float, str], None]
 STAMP = ("header.stamp.sec", "header.stamp.nanosec")
 
 
@@ -120,10 +119,7 @@ def _stamps(columns: dict[str, NDArray[Any]]) -> Integers | None:
 
 
 def collect(
-    recording: Recording,
-    wanted: Mapping[str, list[str]],
-    types: Types,
-    progress: Progress | None = None,
+    recording: Recording, wanted: Mapping[str, list[str]], types: Types
 ) -> dict[str, Table]:
     """Read the wanted fields by topic in one pass over a recording's files.
 
@@ -134,13 +130,12 @@ def collect(
     collectors = {
         topic: _Collector(topic, paths, types, recording.budget) for topic, paths in wanted.items()
     }
-    for fraction, batch in recording.batches(lambda channel: channel.topic in collectors):
+    batches = recording.batches(lambda channel: channel.topic in collectors)
+    for batch in chain.from_iterable(batches):
         try:
             collectors[batch.channel.topic].add(batch)
         except BagError as error:
             raise BagError(f"{recording.name}: {error}") from None
-        if progress is not None:
-            progress(fraction, recording.name)
     return {topic: collector.table() for topic, collector in collectors.items()}
 
 
@@ -159,7 +154,7 @@ def read_columns(path: Path, wanted: Mapping[str, Sequence[str]]) -> dict[str, C
     asked = {topic: list(fields) for topic, fields in wanted.items()}
     found = {}
     for recording in recordings([path]):
-        for topic, table in collect(recording, asked, Types(()), None).items():
+        for topic, table in collect(recording, asked, Types()).items():
             clock = table.logged if table.stamp is None else table.stamp
             if clock.size == 0:
                 raise BagError(f"{recording.name}: has no message on {topic}")

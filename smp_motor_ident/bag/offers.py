@@ -66,7 +66,7 @@ def offers_of(recording: Recording, types: Types) -> list[Offer]:
     spans: dict[str, tuple[int, int]] = {}
     for channel in recording.channels():
         found.setdefault(channel.topic, Offer(channel.topic, channel.type))
-    for _, batch in recording.batches(lambda _: True):
+    for batch in chain.from_iterable(recording.batches(lambda _: True)):
         topic = batch.channel.topic
         offer = found.setdefault(topic, Offer(topic, batch.channel.type))
         if not offer.count:

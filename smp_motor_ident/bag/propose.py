@@ -90,7 +90,7 @@ def list_topics(paths: Any, msg_files: Iterable[str] = ()) -> list[Listing]:
             proposal = propose(recording, offers, types) if needed else Proposal()
             if proposal.items:
                 try:
-                    read_recording(recording, _filled(proposal.items), types, None)
+                    read_recording(recording, _filled(proposal.items), types)
                 except BagError as error:
                     text = f"a mapping was proposed by names and cannot be read: {error}"
                     recording.findings.append(found("proposal_failed", text))

@@ -13,7 +13,7 @@ import numpy as np
 
 from smp_motor_ident.bag import mapping as mappings
 from smp_motor_ident.bag.assemble import assemble
-from smp_motor_ident.bag.decode import Progress, collect
+from smp_motor_ident.bag.decode import collect
 from smp_motor_ident.bag.join import join_records
 from smp_motor_ident.bag.mapping import MotorMap, Signal, SignalMap
 from smp_motor_ident.bag.source import Recording, recordings
@@ -34,9 +34,7 @@ OWN_FIELDS = {
 }
 
 
-def read_experiments(
-    paths: Any, mapping: Any = None, *, progress: Progress | None = None
-) -> dict[str, list[Record]]:
+def read_experiments(paths: Any, mapping: Any = None) -> dict[str, list[Record]]:
     """Read recordings, each as records of its own.
 
     Parameters
@@ -47,8 +45,6 @@ def read_experiments(
     mapping : SignalMap, dict, path of a YAML file, list of command-line items, or None
         Which topics, fields or columns are which signals; not needed for recordings of
         our own messages.
-    progress : callable, optional
-        ``progress(fraction, name)``, called while files are read.
 
     Returns
     -------
@@ -66,19 +62,14 @@ def read_experiments(
     read: dict[str, list[Record]] = {}
     failures: list[BagError] = []
     topics = {s.topic for motor in asked.motors.values() for s in motor.signals.values()}
-    every = recordings(paths, topics)
-    total, before = max(sum(r.size() for r in every), 1), 0
-    for recording in every:
-        part = recording.size() / total
-        report = None if progress is None else _scaled(progress, before / total, part)
+    for recording in recordings(paths, topics):
         try:
-            for record in read_recording(recording, asked, types, report):
+            for record in read_recording(recording, asked, types):
                 read.setdefault(record.wheel, []).append(record)
         except BagError as error:
             if not recording.one_of_many:
                 raise
             failures.append(error)
-        before += recording.size()
     if failures and not read:
         raise failures[0]
     if failures:
@@ -87,14 +78,10 @@ def read_experiments(
             wheel: [replace(record, findings=(*record.findings, *missing)) for record in records]
             for wheel, records in read.items()
         }
-    if progress is not None:
-        progress(1.0, every[-1].name)
     return read
 
 
-def read_records(
-    paths: Any, mapping: Any = None, *, progress: Progress | None = None
-) -> dict[str, Record]:
+def read_records(paths: Any, mapping: Any = None) -> dict[str, Record]:
     """Read recordings as one record per wheel; each recording begins a segment of its own.
 
     Parameters
@@ -102,8 +89,6 @@ def read_records(
     paths : path or sequence of paths
         As for `read_experiments`.
     mapping : SignalMap, dict, path of a YAML file, list of command-line items, or None
-        As for `read_experiments`.
-    progress : callable, optional
         As for `read_experiments`.
 
     Returns
@@ -116,16 +101,14 @@ def read_records(
     BagError
         As `read_experiments`, and when recordings of one wheel contradict each other.
     """
-    experiments = read_experiments(paths, mapping, progress=progress)
+    experiments = read_experiments(paths, mapping)
     return {wheel: join_records(records) for wheel, records in experiments.items()}
 
 
-def read_recording(
-    recording: Recording, asked: SignalMap, types: Types, progress: Progress | None
-) -> list[Record]:
+def read_recording(recording: Recording, asked: SignalMap, types: Types) -> list[Record]:
     """Return a recording's records."""
     with one_line(recording):
-        return _records(recording, asked, types, progress)
+        return _records(recording, asked, types)
 
 
 @contextmanager
@@ -152,13 +135,7 @@ _SPOILT = (
 """What spoilt bytes lead readers to: the message names the file, not the code."""
 
 
-def _scaled(progress: Progress, begin: float, part: float) -> Progress:
-    return lambda fraction, name: progress(begin + fraction * part, name)
-
-
-def _records(
-    recording: Recording, asked: SignalMap, types: Types, progress: Progress | None
-) -> list[Record]:
+def _records(recording: Recording, asked: SignalMap, types: Types) -> list[Record]:
     """Return the records of a bag or of tables."""
     channels = recording.channels()
     plans = _plans(recording, asked, channels)
@@ -172,7 +149,7 @@ def _records(
     wanted.update({topic: list(mappings.HARDWARE) for topic in descriptions})
     if recording.is_table:
         add_time_columns(recording, plans, channels, wanted)
-    tables = collect(recording, wanted, types, progress)
+    tables = collect(recording, wanted, types)
     records: list[Record] = []
     failures: list[BagError] = []
     for wheel in list(plans):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Callable, Iterator
-from itertools import count, groupby
+from itertools import count
 from pathlib import Path
 
 import yaml
@@ -47,10 +47,9 @@ class Replay:
         waiting: list[Entry] = []
         number = count()
         self._recording.findings.clear()
-        # Batches of one chunk come together, channel by channel.
-        for _, group in groupby(self._recording.batches(wanted), key=lambda item: item[0]):
+        for together in self._recording.batches(wanted):
             fresh: list[Entry] = []
-            for _, packed in group:
+            for packed in together:
                 batch, _ = decompress_messages(packed, self._recording.budget)
                 fresh += [
                     (t, next(number), batch, k) for k, t in enumerate(batch.log_time.tolist())

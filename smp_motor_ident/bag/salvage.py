@@ -98,7 +98,7 @@ def _row(pages: _Pages, page: bytes, at: int) -> Row | None:
     return (key, topic, stamp, data) if len(data) == length else None
 
 
-def salvage(path: Path) -> Iterator[tuple[float, list[Row]]]:
+def salvage(path: Path) -> Iterator[list[Row]]:
     """Read the messages of every whole leaf page, in the order of the file."""
     count = path.stat().st_size
     with path.open("rb") as file:
@@ -119,4 +119,4 @@ def salvage(path: Path) -> Iterator[tuple[float, list[Row]]]:
                 if row is not None:
                     rows.append(row)
             if rows:
-                yield number * pages.size / count, rows
+                yield rows

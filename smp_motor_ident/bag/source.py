@@ -86,19 +86,18 @@ class Recording:
                         return source.table(channel.topic, fields)
         raise BagError(f"{self.name}: has no {topic or 'table'}")
 
-    def batches(self, wanted: Callable[[Channel], bool]) -> Iterator[tuple[float, Batch]]:
+    def batches(self, wanted: Callable[[Channel], bool]) -> Iterator[list[Batch]]:
         """Read all files, and note every message that is missing."""
         counts: Counter[str] = Counter()
         seen: set[str] = set()
-        total, before = max(self.size(), 1), 0
         for path in self.files:
-            size = path.stat().st_size
             source = cast("Messages | None", self._source(path))
             if source is not None:
                 mine: Counter[str] = Counter()
-                for fraction, batch in source.batches(wanted):
-                    mine[batch.channel.topic] += len(batch)
-                    yield (before + fraction * size) / total, batch
+                for batches in source.batches(wanted):
+                    for batch in batches:
+                        mine[batch.channel.topic] += len(batch)
+                    yield batches
                 asked = {c.topic for c in source.channels() if wanted(c)}
                 seen |= asked
                 self._note(*source.problems)
@@ -106,7 +105,6 @@ class Recording:
                     if topic in asked and mine[topic] < count:
                         self._lost(path.name, topic, mine[topic], count)
                 counts += mine
-            before += size
         for topic, count in (self.declared or {}).items():
             if topic in seen and counts[topic] < count:
                 self._lost("metadata.yaml", topic, counts[topic], count)

@@ -82,7 +82,7 @@ def _of_recording(recording: Recording) -> dict[str, TransportDelay]:
         if kind == STATE and kinds.get(f"{place}/motor_command") == COMMAND:
             pairs[place.rpartition("/")[2]] = topic, f"{place}/motor_command"
     wanted = {topic: ["voltage"] for pair in pairs.values() for topic in pair}
-    tables = collect(recording, wanted, Types(()), None)
+    tables = collect(recording, wanted, Types())
     delays = {
         wheel: _delay(tables[state], tables[command]) for wheel, (state, command) in pairs.items()
     }

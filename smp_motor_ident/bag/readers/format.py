@@ -54,8 +54,8 @@ class Messages(Source):
         return None
 
     @abstractmethod
-    def batches(self, wanted: Callable[[Channel], bool]) -> Iterator[tuple[float, Batch]]:
-        """Yield the fraction of the file that is read, and a batch."""
+    def batches(self, wanted: Callable[[Channel], bool]) -> Iterator[list[Batch]]:
+        """Yield the messages that stand together in the file, channel by channel."""
 
 
 class Tables(Source):

@@ -85,7 +85,7 @@ class _McapFile(Messages):
             counts[channel.topic] += self._summary.statistics.channel_message_counts.get(key, 0)
         return dict(counts)
 
-    def batches(self, wanted: Callable[[Channel], bool]) -> Iterator[tuple[float, Batch]]:
+    def batches(self, wanted: Callable[[Channel], bool]) -> Iterator[list[Batch]]:
         """Walk over the file."""
         size = self.path.stat().st_size
         with self.path.open("rb") as file:
@@ -103,13 +103,12 @@ class _McapFile(Messages):
                 whole = start + 9 + length <= size
                 if op == _CHUNK_RECORD and not (whole and self._skippable(start, wanted)):
                     body = file.read(min(length, size - start - 9))
-                    for batch in self._chunk(body, start, whole, wanted):
-                        yield file.tell() / size, batch
+                    yield self._chunk(body, start, whole, wanted)
                 elif op == 0 or not whole:
                     if not self._resume(file, start):
                         break
                 elif op == _MESSAGE:
-                    yield from self._top_level(file, start, length, size, wanted)
+                    yield self._top_level(file, start, length, wanted)
                 else:
                     self._pass(file, op, length)
         self._scanned = True
@@ -122,25 +121,19 @@ class _McapFile(Messages):
             file.seek(length, io.SEEK_CUR)
 
     def _top_level(
-        self,
-        file: BinaryIO,
-        start: int,
-        length: int,
-        size: int,
-        wanted: Callable[[Channel], bool],
-    ) -> Iterator[tuple[float, Batch]]:
-        """Yield messages that stand outside of chunks, a block of the file at a time."""
+        self, file: BinaryIO, start: int, length: int, wanted: Callable[[Channel], bool]
+    ) -> list[Batch]:
+        """Return messages that stand outside of chunks, of a block of the file."""
         file.seek(start)
         data = file.read(max(_BLOCK, length + 9))
         positions, end = self._walk(data)
         file.seek(start + end)
-        for batch in self._split(data, positions, wanted):
-            yield file.tell() / size, batch
+        return self._split(data, positions, wanted)
 
     def _chunk(
         self, body: bytes, start: int, whole: bool, wanted: Callable[[Channel], bool]
-    ) -> Iterator[Batch]:
-        """Yield the messages of a chunk; of one that is cut off, those that are there."""
+    ) -> list[Batch]:
+        """Return the messages of a chunk; of one that is cut off, those that are there."""
         try:
             _, _, size, crc = _CHUNK.unpack_from(body)
             stream = ReadDataStream(io.BytesIO(body[28:]))
@@ -148,7 +141,7 @@ class _McapFile(Messages):
             stored = stream.read8()
         except _DAMAGE:
             self._cut(start, "inside a chunk's head")
-            return
+            return []
         packed = body[28 + stream.count :][:stored]
         data = decompress(packed, compression, size, self._budget)
         sound = len(data) == size and (not crc or zlib.crc32(data) == crc)
@@ -157,7 +150,7 @@ class _McapFile(Messages):
                 f"the chunk at byte {start} is damaged and was left out"
                 f"{self._count_of_chunk(start)}"
             )
-            return
+            return []
         positions, end = self._walk(data)
         if not whole:
             self._cut(start, f"inside a chunk of which {len(positions)} messages could be read")
@@ -166,7 +159,7 @@ class _McapFile(Messages):
                 f"the chunk at byte {start} ends inside a record; "
                 f"{len(data) - end} of its bytes were left out"
             )
-        yield from self._split(data, positions, wanted)
+        return self._split(data, positions, wanted)
 
     def _walk(self, data: bytes) -> tuple[list[int], int]:
         """Return where messages begin, and where the last whole record ends.
@@ -191,10 +184,11 @@ class _McapFile(Messages):
 
     def _split(
         self, data: bytes, positions: list[int], wanted: Callable[[Channel], bool]
-    ) -> Iterator[Batch]:
-        """Yield the messages at the given positions, channel by channel."""
+    ) -> list[Batch]:
+        """Return the messages at the given positions, channel by channel."""
+        batches: list[Batch] = []
         if not positions:
-            return
+            return batches
         raw: Bytes = np.frombuffer(data, np.uint8)
         at = np.array(positions, np.int64)
         length: Integers = gather(raw, at + 1, "<i8") - 22
@@ -216,7 +210,8 @@ class _McapFile(Messages):
                 sequence = None
                 if channel.numbered:
                     sequence = gather(raw, mine + 11, "<u4").astype(np.int64)
-                yield Batch(channel, raw, mine + 31, length[which], log_time, sequence)
+                batches.append(Batch(channel, raw, mine + 31, length[which], log_time, sequence))
+        return batches
 
     def _define(self, op: int, body: bytes) -> None:
         """Take in a schema or a channel; a damaged one is reported by its messages."""

@@ -37,7 +37,7 @@ class _Ros1Bag(Messages):
                 version = line[len(MAGIC) - 1 :].strip().decode("latin-1")
                 raise BagError(f"{name}: is a ROS 1 bag of version {version!r}; only 2.0 is read")
 
-    def batches(self, wanted: Callable[[Channel], bool]) -> Iterator[tuple[float, Batch]]:
+    def batches(self, wanted: Callable[[Channel], bool]) -> Iterator[list[Batch]]:
         """Walk over the file, a chunk at a time."""
         size = self.path.stat().st_size
         with self.path.open("rb") as file:
@@ -47,7 +47,7 @@ class _Ros1Bag(Messages):
 
     def _walk(
         self, file: Any, size: int, wanted: Callable[[Channel], bool], *, inside: bool
-    ) -> Iterator[tuple[float, Batch]]:
+    ) -> Iterator[list[Batch]]:
         """Yield the messages of a file, or of an unpacked chunk, by connection."""
         messages: dict[int, list[tuple[int, bytes]]] = defaultdict(list)
         while (start := file.tell()) < size:
@@ -63,8 +63,7 @@ class _Ros1Bag(Messages):
                     data = decompress(file.read(length), packed, whole, self._budget)
                     if len(data) != whole:
                         self._amiss(f"the chunk at byte {start} is damaged; its rest is left out")
-                    for _, batch in self._walk(io.BytesIO(data), len(data), wanted, inside=True):
-                        yield file.tell() / size, batch
+                    yield from self._walk(io.BytesIO(data), len(data), wanted, inside=True)
                 elif kind == RecordType.CONNECTION:
                     self._connect(header, file.read(length))
                 elif kind == RecordType.MSGDATA:
@@ -76,13 +75,15 @@ class _Ros1Bag(Messages):
                 where = "inside a chunk" if inside else f"at byte {start} of {size}"
                 self._amiss(f"cut off or damaged {where}")
                 break
+        batches = []
         for key, sent in messages.items():
             channel = self._channels.get(key)
             if channel is None:
                 self._amiss(f"{len(sent)} messages of connection {key}, which it does not describe")
             elif wanted(channel):
                 log = np.array([time for time, _ in sent], np.int64)
-                yield 1.0, join(channel, [data for _, data in sent], log)
+                batches.append(join(channel, [data for _, data in sent], log))
+        yield batches
 
     def _connect(self, header: Any, body: bytes) -> None:
         """Take in a connection: its topic, and the definition of its type."""

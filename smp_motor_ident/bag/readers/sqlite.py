@@ -120,18 +120,17 @@ class _SqliteFile(Messages):
         """Return the topics of the file."""
         return self._topics
 
-    def batches(self, wanted: Callable[[Channel], bool]) -> Iterator[tuple[float, Batch]]:
+    def batches(self, wanted: Callable[[Channel], bool]) -> Iterator[list[Batch]]:
         """Read the messages in the order in which they were written."""
         asked = {channel.id: channel for channel in self._topics if wanted(channel)}
         if not asked:
             return
-        last, total = -(2**63), self._last_row()
+        last = -(2**63)
         try:
             if self._cut_off:
                 raise sqlite3.DatabaseError("cut off")
-            for last, batches in self._reads(asked):
-                for batch in batches:
-                    yield min(1.0, last / total) if total > 0 else 1.0, batch
+            for last, batches in self._reads(asked):  # noqa: B007 (where damage begins)
+                yield batches
         except sqlite3.DatabaseError as error:
             if not self._cut_off:
                 self._amiss(f"damaged behind message {last} ({error})")
@@ -152,7 +151,7 @@ class _SqliteFile(Messages):
         query = f"SELECT id, topic_id, timestamp, data {source}"
         while rows := self._rows(query, last):
             last = rows[-1][0]
-            yield last, list(self._split(rows, asked))
+            yield last, self._split(rows, asked)
 
     def _rows(self, query: str, last: int) -> list[tuple[int, int, int, bytes]]:
         """Return the next rows; spoilt pages may give the same bytes to many of them."""
@@ -202,26 +201,18 @@ class _SqliteFile(Messages):
         channel = self._topics[0]  # the caller tells topics apart
         return last, topic, Batch(channel, raw, np.cumsum(length) - length, length, log)
 
-    def _salvaged(self, asked: dict[int, Channel], last: int) -> Iterator[tuple[float, Batch]]:
+    def _salvaged(self, asked: dict[int, Channel], last: int) -> Iterator[list[Batch]]:
         """Yield what single pages still hold behind the last row that the tree gave."""
-        for fraction, rows in salvage(self._path_read):
+        for rows in salvage(self._path_read):
             wanted = [row for row in rows if row[0] > last and row[1] in asked]
             self._budget.take(sum(len(row[3]) for row in wanted))
             if wanted:
-                for batch in self._split(wanted, asked):
-                    yield fraction, batch
-
-    def _last_row(self) -> int:
-        try:
-            row = self._database.execute("SELECT max(id) FROM messages").fetchone()
-        except sqlite3.DatabaseError:
-            return 0
-        return int(row[0] or 0)
+                yield self._split(wanted, asked)
 
     def _split(
         self, rows: list[tuple[int, int, int, bytes]], asked: dict[int, Channel]
-    ) -> Iterator[Batch]:
-        """Yield rows as batches, topic by topic."""
+    ) -> list[Batch]:
+        """Return rows as batches, topic by topic."""
         _, keys, times, blobs = zip(*rows)
         every = next(iter(asked.values()))
         try:
@@ -229,10 +220,8 @@ class _SqliteFile(Messages):
         except (TypeError, OverflowError):
             sound = [r for r in rows if isinstance(r[3], bytes) and isinstance(r[2], int)]
             self._amiss(f"{len(rows) - len(sound)} messages without data were left out")
-            if sound:
-                yield from self._split(sound, asked)
-            return
-        yield from self._by_topic(np.array(keys, np.int64), joined, asked)
+            return self._split(sound, asked) if sound else []
+        return self._by_topic(np.array(keys, np.int64), joined, asked)
 
     @staticmethod
     def _by_topic(topic: Integers, batch: Batch, asked: dict[int, Channel]) -> list[Batch]:
