@@ -22,22 +22,13 @@ def _clamp(value: float, lower: float, upper: float) -> float:
     return min(max(value, lower), upper)
 
 
-class RateLimiter:
-    """Limits of a value and its first two derivatives; None or NaN is no limit.
+@dataclass(eq=False)
+class SpeedLimiter:
+    """Limits of a speed, its acceleration and its jerk; NaN or None is no limit.
 
-    Each maximum switches its pair on; a minimum that is not given is the negative maximum,
-    and limits for slowing down that are not given are those for speeding up.
-
-    Parameters
-    ----------
-    min_value, max_value : float or None
-        Of the value.
-    min_first_derivative_neg, max_first_derivative_pos : float or None
-        While the value is negative and falls; while it is positive and rises.
-    min_first_derivative_pos, max_first_derivative_neg : float or None
-        While the value is positive and falls; while it is negative and rises.
-    min_second_derivative, max_second_derivative : float or None
-        Of the change of the first derivative.
+    Each maximum switches its pair on; a minimum that is not given is the negative maximum, and
+    limits for slowing down that are not given are those for speeding up.  Accelerations in reverse
+    and decelerations forward are negative, as in diff_drive_controller.
 
     Raises
     ------
@@ -47,94 +38,6 @@ class RateLimiter:
     References
     ----------
     ros-controls/control_toolbox, ``rate_limiter``: order jerk, acceleration, value.
-    """
-
-    def __init__(
-        self,
-        min_value: float | None = None,
-        max_value: float | None = None,
-        min_first_derivative_neg: float | None = None,
-        max_first_derivative_pos: float | None = None,
-        min_first_derivative_pos: float | None = None,
-        max_first_derivative_neg: float | None = None,
-        min_second_derivative: float | None = None,
-        max_second_derivative: float | None = None,
-    ) -> None:
-        self._value = _pair("value", min_value, max_value)
-        self._speeding = _pair(
-            "first derivative", min_first_derivative_neg, max_first_derivative_pos
-        )
-        self._second = _pair("second derivative", min_second_derivative, max_second_derivative)
-        self._slowing = None
-        if self._speeding is not None:
-            falling, rising = self._speeding
-            self._slowing = _pair(
-                "first derivative while slowing down",
-                falling if _absent(min_first_derivative_pos) else min_first_derivative_pos,
-                rising if _absent(max_first_derivative_neg) else max_first_derivative_neg,
-            )
-
-    def limit(self, v: float, v0: float, v1: float, dt: float) -> Limited:
-        """Apply jerk, then acceleration, then value limits.
-
-        Parameters
-        ----------
-        v : float
-            Asked for.
-        v0, v1 : float
-            Commanded one and two steps before.
-        dt : float
-            [s].
-
-        Returns
-        -------
-        Limited
-            What may be commanded.
-
-        Raises
-        ------
-        ParameterError
-            When an argument is not finite, or dt is negative.
-        """
-        value = self.limit_second_derivative(v, v0, v1, dt).value
-        value = self.limit_first_derivative(value, v0, dt).value
-        value = self.limit_value(value).value
-        return _share(value, v)
-
-    def limit_value(self, v: float) -> Limited:
-        """Apply the limits of the value alone."""
-        _require_finite(v)
-        return _share(v if self._value is None else _clamp(v, *self._value), v)
-
-    def limit_first_derivative(self, v: float, v0: float, dt: float) -> Limited:
-        """Apply the limits of the first derivative alone."""
-        _require_finite(v, v0, dt)
-        if self._speeding is None or self._slowing is None:
-            return _share(v, v)
-        falling = self._slowing[0] if v0 > 0.0 else self._speeding[0]
-        rising = self._slowing[1] if v0 < 0.0 else self._speeding[1]
-        return _share(v0 + _clamp(v - v0, falling * dt, rising * dt), v)
-
-    def limit_second_derivative(self, v: float, v0: float, v1: float, dt: float) -> Limited:
-        """Apply the limits of the second derivative alone, and not while easing off."""
-        _require_finite(v, v0, dt, v1)
-        change, before = v - v0, v0 - v1
-        if self._second is None or (change - before) * change <= 0.0:
-            return _share(v, v)
-        lower, upper = (bound * dt * dt for bound in self._second)
-        return _share(v0 + before + _clamp(change - before, lower, upper), v)
-
-
-@dataclass(eq=False)
-class SpeedLimiter(RateLimiter):
-    """A :class:`RateLimiter` with the parameters of a diff_drive_controller; NaN is None.
-
-    Accelerations in reverse and decelerations forward are negative there, as they are here.
-
-    Raises
-    ------
-    ParameterError
-        When a minimum is above its maximum.
 
     Examples
     --------
@@ -166,7 +69,67 @@ class SpeedLimiter(RateLimiter):
     )
 
     def __post_init__(self) -> None:
-        super().__init__(*vars(self).values())
+        self._velocity = _pair("velocity", self.min_velocity, self.max_velocity)
+        self._jerk = _pair("jerk", self.min_jerk, self.max_jerk)
+        self._speeding = self._slowing = _pair(
+            "acceleration", self.max_acceleration_reverse, self.max_acceleration
+        )
+        if self._speeding is not None:
+            falling, rising = self.max_deceleration, self.max_deceleration_reverse
+            self._slowing = _pair(
+                "acceleration while slowing down",
+                self._speeding[0] if _absent(falling) else falling,
+                self._speeding[1] if _absent(rising) else rising,
+            )
+
+    def limit(self, v: float, v0: float, v1: float, dt: float) -> Limited:
+        """Apply jerk, then acceleration, then velocity limits.
+
+        Parameters
+        ----------
+        v : float
+            Asked for.
+        v0, v1 : float
+            Commanded one and two steps before.
+        dt : float
+            [s].
+
+        Returns
+        -------
+        Limited
+            What may be commanded.
+
+        Raises
+        ------
+        ParameterError
+            When an argument is not finite, or dt is negative.
+        """
+        value = self.limit_jerk(v, v0, v1, dt).value
+        value = self.limit_acceleration(value, v0, dt).value
+        return _share(self.limit_velocity(value).value, v)
+
+    def limit_velocity(self, v: float) -> Limited:
+        """Apply the limits of the velocity alone."""
+        _require_finite(v)
+        return _share(v if self._velocity is None else _clamp(v, *self._velocity), v)
+
+    def limit_acceleration(self, v: float, v0: float, dt: float) -> Limited:
+        """Apply the limits of the acceleration alone."""
+        _require_finite(v, v0, dt)
+        if self._speeding is None or self._slowing is None:
+            return _share(v, v)
+        falling = self._slowing[0] if v0 > 0.0 else self._speeding[0]
+        rising = self._slowing[1] if v0 < 0.0 else self._speeding[1]
+        return _share(v0 + _clamp(v - v0, falling * dt, rising * dt), v)
+
+    def limit_jerk(self, v: float, v0: float, v1: float, dt: float) -> Limited:
+        """Apply the limits of the jerk alone, and not while easing off."""
+        _require_finite(v, v0, dt, v1)
+        change, before = v - v0, v0 - v1
+        if self._jerk is None or (change - before) * change <= 0.0:
+            return _share(v, v)
+        lower, upper = (bound * dt * dt for bound in self._jerk)
+        return _share(v0 + before + _clamp(change - before, lower, upper), v)
 
 
 def _absent(limit: float | None) -> bool:

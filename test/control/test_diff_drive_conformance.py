@@ -14,12 +14,35 @@ import pytest
 
 from smp_motor_control.body.kinematics import SkidSteer
 from smp_motor_control.body.odometry import Odometry
-from smp_motor_control.body.speed_limiter import RateLimiter, SpeedLimiter
+from smp_motor_control.body.speed_limiter import SpeedLimiter
 from smp_motor_control.errors import ParameterError
 
 FILE = Path(__file__).parent.parent / "data" / "conformance" / "diff_drive_cases.json"
 CASES = json.loads(FILE.read_text(encoding="utf-8"))
 ROUNDING = 1e-12
+
+
+LIMITS = {
+    "min_value": "min_velocity",
+    "max_value": "max_velocity",
+    "min_first_derivative_neg": "max_acceleration_reverse",
+    "max_first_derivative_pos": "max_acceleration",
+    "min_first_derivative_pos": "max_deceleration",
+    "max_first_derivative_neg": "max_deceleration_reverse",
+    "min_second_derivative": "min_jerk",
+    "max_second_derivative": "max_jerk",
+}
+FUNCTIONS = {
+    "limit": "limit",
+    "limit_value": "limit_velocity",
+    "limit_first_derivative": "limit_acceleration",
+    "limit_second_derivative": "limit_jerk",
+}
+"""Names of control_toolbox's rate_limiter, and those of a speed's."""
+
+
+def limiter_of(limits: dict[str, float | None]) -> SpeedLimiter:
+    return SpeedLimiter(**{LIMITS[name]: limit for name, limit in limits.items()})
 
 
 def cases(name: str):
@@ -28,9 +51,9 @@ def cases(name: str):
 
 @cases("rate_limiter_cases")
 def test_limiter_gives_value_and_factor(case: dict) -> None:
-    limiter = RateLimiter(**case["limits"])
+    limiter = limiter_of(case["limits"])
     arguments = [case[name] for name in ("v", "v0", "v1", "dt") if case[name] is not None]
-    value, factor = getattr(limiter, case["function"])(*arguments)
+    value, factor = getattr(limiter, FUNCTIONS[case["function"]])(*arguments)
     assert value == pytest.approx(case["expect_v"], abs=ROUNDING)
     assert factor == pytest.approx(case["expect_factor"], abs=ROUNDING)
 
@@ -38,14 +61,14 @@ def test_limiter_gives_value_and_factor(case: dict) -> None:
 @cases("rate_limiter_invalid")
 def test_limits_out_of_order_are_refused(case: dict) -> None:
     with pytest.raises(ParameterError, match="minimum"):
-        RateLimiter(**case["limits"])
+        limiter_of(case["limits"])
 
 
 @cases("rate_limiter_valid")
 @pytest.mark.parametrize("absent", [None, math.nan])
 def test_limits_that_are_not_given_are_accepted(case: dict, absent: float | None) -> None:
     limits = {name: absent if x is None else x for name, x in case["limits"].items()}
-    assert math.isfinite(RateLimiter(**limits).limit(10.0, 0.0, 0.0, 0.1).value)
+    assert math.isfinite(limiter_of(limits).limit(10.0, 0.0, 0.0, 0.1).value)
 
 
 @cases("inverse_kinematics_cases")
