@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import os
+from collections.abc import Callable
 
 from rclpy.node import Node
 
@@ -15,23 +16,22 @@ def keep_time(node: Node, priority: int, affinity: tuple[int, ...]) -> list[str]
     Freezes what is allocated so far out of the garbage collector's sight and turns the
     collector off; who calls this collects where it does no harm.
     """
-    refused = []
+    asked: dict[str, Callable[[int], None]] = {}
     if priority > 0:
-        try:
-            for thread in _threads():
-                with contextlib.suppress(ProcessLookupError):
-                    os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority))
-        except (OSError, AttributeError) as error:
-            refused.append(f"scheduling_priority {priority} not granted: {error}")
+        asked[f"scheduling_priority {priority}"] = lambda thread: os.sched_setscheduler(
+            thread, os.SCHED_FIFO, os.sched_param(priority)
+        )
     if affinity:
+        asked[f"cpu_affinity {list(affinity)}"] = lambda t: os.sched_setaffinity(t, affinity)
+    refused = []
+    for what, ask in asked.items():
         try:
             for thread in _threads():
                 with contextlib.suppress(ProcessLookupError):
-                    os.sched_setaffinity(thread, affinity)
+                    ask(thread)
         except (OSError, ValueError, OverflowError, AttributeError) as error:
-            refused.append(f"cpu_affinity {list(affinity)} not granted: {error}")
-    for line in refused:
-        node.get_logger().warning(f"{line}; running without it")
+            refused.append(f"{what} not granted: {error}")
+            node.get_logger().warning(f"{refused[-1]}; running without it")
     gc.collect()
     gc.freeze()
     gc.disable()

@@ -39,39 +39,25 @@ _COUNTS = {"velocity": "ticks/s", "position": "ticks"}
 _DUTY = {"duty": 1.0, "%": 1e-2}
 _PWM = "pwm"
 _ALIASES = {
-    "count": "ticks",
-    "counts": "ticks",
-    "tick": "ticks",
-    "counts/s": "ticks/s",
-    "volt": "V",
-    "volts": "V",
-    "ampere": "A",
-    "amperes": "A",
-    "amps": "A",
-    "percent": "%",
-    "pct": "%",
-    "rps": "rev/s",
-    "rev/min": "rpm",
-    "u/min": "rpm",
-    "1/min": "rpm",
-    "turns": "rev",
-    "turn": "rev",
-    "degree": "deg",
-    "degrees": "deg",
-    "°": "deg",
-    "°/s": "deg/s",
-    "dps": "deg/s",
-    "µs": "us",
-    "sec": "s",
-    "seconds": "s",
-    "msec": "ms",
-    "millis": "ms",
-    "milliseconds": "ms",
-    "usec": "us",
-    "micros": "us",
-    "microseconds": "us",
-    "kph": "km/h",
-    "mps": "m/s",
+    alias: unit
+    for unit, aliases in {
+        "ticks": ("count", "counts", "tick"),
+        "ticks/s": ("counts/s",),
+        "V": ("volt", "volts"),
+        "A": ("ampere", "amperes", "amps"),
+        "%": ("percent", "pct"),
+        "rev/s": ("rps",),
+        "rpm": ("rev/min", "u/min", "1/min"),
+        "rev": ("turn", "turns"),
+        "deg": ("degree", "degrees", "°"),
+        "deg/s": ("°/s", "dps"),
+        "s": ("sec", "seconds"),
+        "ms": ("msec", "millis", "milliseconds"),
+        "us": ("µs", "usec", "micros", "microseconds"),
+        "km/h": ("kph",),
+        "m/s": ("mps",),
+    }.items()
+    for alias in aliases
 }
 
 

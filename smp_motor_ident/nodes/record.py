@@ -10,19 +10,13 @@ from __future__ import annotations
 import argparse
 import shutil
 import sys
-from collections import Counter
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from rclpy.node import Node
-from rclpy.qos import (
-    DurabilityPolicy,
-    HistoryPolicy,
-    QoSProfile,
-    ReliabilityPolicy,
-)
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
@@ -46,7 +40,6 @@ class Topic:
     type: str
     subscription: Subscription
     publishers: int
-    reliable: bool
     last_number: int = 0
     lost: int = 0
 
@@ -135,8 +128,7 @@ class Recorder(Node):
         profiles = [qos_document(info.qos_profile) for info in infos]
         if not self._writer.add_topic(name, type_name, profiles, numbered=True):
             self.get_logger().warning(f"{name}: {type_name} is kept without its definition")
-        reliable = qos.reliability == ReliabilityPolicy.RELIABLE
-        self._topics[name] = Topic(type_name, subscription, len(infos), reliable)
+        self._topics[name] = Topic(type_name, subscription, len(infos))
         self.get_logger().info(f"{name} ({type_name})")
 
     def _subscribe(self, name: str, message: Any, qos: QoSProfile) -> Subscription:
@@ -149,16 +141,13 @@ class Recorder(Node):
         topic.publishers, topic.last_number = len(infos), 0
         qos = subscription_qos([info.qos_profile for info in infos])
         old = topic.subscription.qos_profile
-        if (qos.reliability, qos.durability) == (old.reliability, old.durability):
-            return
-        weaker = qos.reliability != old.reliability and topic.reliable
+        weaker = old.reliability != qos.reliability == ReliabilityPolicy.BEST_EFFORT
         if not weaker and qos.durability == old.durability:
             return
         self._take(name, topic)
         self.get_logger().info(f"{name}: following a publisher that offers another QoS")
         self.destroy_subscription(topic.subscription)
         topic.subscription = self._subscribe(name, topic.subscription.msg_type, qos)
-        topic.reliable = qos.reliability == ReliabilityPolicy.RELIABLE
 
     def _take_all(self) -> None:
         for name, topic in self._topics.items():
@@ -188,11 +177,11 @@ class Recorder(Node):
             self._writer.close()
         except SmpError as error:  # the disk is full: what is there is whole
             print(f"record: {error}", file=sys.stderr, flush=True)
-        for name, count in sorted(self._writer.counts.items()):
+        counts = self._writer.counts
+        for name, count in sorted(counts.items()):
             lost = self._topics[name].lost
             print(f"{count:9d}  {name}" + (f"  ({lost} lost)" if lost else ""), flush=True)
-        counts: Counter[str] = Counter(self._writer.counts)
-        print(f"{counts.total():9d}  messages in {self._writer.path}", flush=True)
+        print(f"{sum(counts.values()):9d}  messages in {self._writer.path}", flush=True)
 
 
 def parser() -> argparse.ArgumentParser:
