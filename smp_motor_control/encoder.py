@@ -18,11 +18,6 @@ MAX_BITS = 63
 class Encoder:
     """An incremental encoder on the motor shaft.
 
-    Raises
-    ------
-    ParameterError
-        When a value is out of range.
-
     Examples
     --------
     >>> Encoder(500.0, bits=8).count(2 * math.pi * 0.26)   # 130 counts in eight bits
@@ -74,18 +69,7 @@ def unwrap(counts: ArrayLike, bits: int) -> NDArray[np.int64]:
 
 
 class Unwrapper:
-    """The same as :func:`unwrap`, one count at a time.
-
-    Parameters
-    ----------
-    bits : int
-        Width of the counter; 0 never wraps.
-
-    Raises
-    ------
-    ParameterError
-        When ``bits`` is out of range.
-    """
+    """The same as :func:`unwrap`, one count at a time."""
 
     def __init__(self, bits: int) -> None:
         _check_bits(bits)
@@ -108,27 +92,7 @@ class Unwrapper:
 
 
 class DifferencedSpeed:
-    """Motor speed as counts moved over a window of samples.
-
-    Averages over the window: one sample is the noisiest and the fastest.
-
-    Parameters
-    ----------
-    encoder : Encoder
-        Its counts and width.
-    window : int
-        Length of the window in samples, at least 1.
-
-    Attributes
-    ----------
-    total : int
-        Unwrapped counts at the last sample.
-
-    Raises
-    ------
-    ParameterError
-        When the window is not positive.
-    """
+    """Motor speed [rad/s] as counts moved over a window of samples; one is noisiest and fastest."""
 
     def __init__(self, encoder: Encoder, window: int = 1) -> None:
         if window < 1:
@@ -136,7 +100,7 @@ class DifferencedSpeed:
         self._scale = encoder.angle_per_count
         self._unwrap = Unwrapper(encoder.bits)
         self._past: deque[tuple[float, int]] = deque(maxlen=window + 1)
-        self.total = 0
+        self.total = 0  # unwrapped counts at the last sample
 
     def reset(self) -> None:
         """Forget the past, as after lost feedback."""

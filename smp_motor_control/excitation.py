@@ -29,13 +29,7 @@ _GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 
 @dataclass(frozen=True, kw_only=True)
 class Excitation(ABC):
-    """Base of all signals: bounded by ``amplitude`` and zero before time zero.
-
-    Raises
-    ------
-    ParameterError
-        When a value makes no signal.
-    """
+    """Base of all signals: bounded by ``amplitude`` and zero before time zero."""
 
     amplitude: float  # largest absolute value [V], positive
 

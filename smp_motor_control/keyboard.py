@@ -56,13 +56,7 @@ def keys_of(text: str) -> list[str]:
 
 @dataclass(frozen=True, kw_only=True)
 class Speeds:
-    """What a held key asks for.
-
-    Raises
-    ------
-    ParameterError
-        When a speed, the step or the time-out is not positive and finite.
-    """
+    """What a held key asks for."""
 
     # linear, angular, wheel: [m/s], [rad/s] of the body, [rad/s] of a wheel
     linear: float = 0.2
@@ -77,36 +71,17 @@ class Speeds:
 
 
 class Keyboard:
-    """What the keys ask for now.
-
-    Parameters
-    ----------
-    speeds : Speeds
-        At the start.
-    wheel_names : sequence of str
-        In the order of the keys 1, 2, ...
-
-    Attributes
-    ----------
-    body_mode : bool
-        Whether keys drive the body; else the selected wheels.
-    selected : set of str
-        Wheels that the keys drive in wheel mode.
-    scale : float
-        By what + and - have changed the speeds.
-    quitting : bool
-        Whether the user asked to leave.
-    """
+    """What the keys ask for now; the keys 1, 2, ... are the wheels in their order."""
 
     SLOWEST, FASTEST = 0.1, 4.0
 
     def __init__(self, speeds: Speeds, wheel_names: Sequence[str] = WHEELS) -> None:
         self.speeds = speeds
         self.wheel_names = tuple(wheel_names)
-        self.body_mode = True
+        self.body_mode = True  # whether keys drive the body; else the selected wheels
         self.selected = set(self.wheel_names)
-        self.scale = 1.0
-        self.quitting = False
+        self.scale = 1.0  # by what + and - have changed the speeds
+        self.quitting = False  # whether the user asked to leave
         self._held = ""
         self._seen = -math.inf
 

@@ -46,13 +46,7 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(6)
 
 @dataclass(frozen=True, kw_only=True)
 class ObserverNoise:
-    """How far the observer trusts the model and the counts.
-
-    Raises
-    ------
-    ParameterError
-        When a value is not positive, or beyond what the arithmetic can hold.
-    """
+    """How far the observer trusts the model and the counts."""
 
     # More of the first raises the bandwidth with which changes of the load are seen; the second
     # stands for what the model leaves out, too; the third's default is quantisation alone.
@@ -160,19 +154,12 @@ class SpeedObserver:
 
     Attributes
     ----------
-    speed : float
-        Of the motor shaft [rad/s]; NaN before the second sample.
-    acceleration : float
-        [rad/s^2].
+    speed, acceleration : float
+        Of the motor shaft [rad/s], NaN before the second sample, and [rad/s^2].
     load : float
         Voltage that the load takes beyond the model, positive against forward turning [V].
     trusted : bool
         Whether counts and model agree; the speed is differenced while they do not.
-
-    Raises
-    ------
-    ParameterError
-        When ``sample_time``, ``window`` or ``max_load`` is out of range.
     """
 
     def __init__(

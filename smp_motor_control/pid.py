@@ -27,28 +27,15 @@ __all__ = ["EPSILON", "STRATEGIES", "Pid", "PidGains", "PidOutput"]
 
 
 class PidOutput(NamedTuple):
-    """What one step of a controller computed; immutable, a new one every step.
+    """What one step of a controller computed; immutable, a new one every step."""
 
-    Attributes
-    ----------
-    output : float
-        The command within its clamps; NaN when an input was not finite.
-    unsaturated : float
-        The command before its clamps.
-    p_term, i_term, d_term, feedforward : float
-        Its parts, of which ``i_term`` is the integral after the step (the command holds the
-        one before it).
-    saturated : bool
-        Whether the clamps changed the command.
-    """
-
-    output: float
-    unsaturated: float
+    output: float  # the command within its clamps; NaN when an input was not finite
+    unsaturated: float  # the command before its clamps
     p_term: float
-    i_term: float
+    i_term: float  # the integral after the step; the command holds the one before it
     d_term: float
     feedforward: float
-    saturated: bool
+    saturated: bool  # whether the clamps changed the command
 
 
 _NAN = math.nan
@@ -261,11 +248,6 @@ class Pid:
         The integral takes up what the other terms change by at the inputs of the last step,
         as far as its clamps let it.  Without integral action there is nothing that could
         unwind it later: the integral is zero then.
-
-        Parameters
-        ----------
-        gains : PidGains
-            The new settings, valid by construction.
         """
         before = self._without_integral()
         self._adopt(gains)

@@ -18,15 +18,8 @@ class Verdict(Enum):
 
 
 class BodyCommand:
-    """The newest velocity command, which brakes when it is not renewed.
+    """The newest velocity command, which brakes when it is not renewed in time; 0: it never does.
 
-    Parameters
-    ----------
-    timeout : float
-        [s]; 0 lets a command hold for ever.
-
-    Notes
-    -----
     Age is counted on a steady clock from the arrival, plus the age that the command had then
     by its stamp, so that a jump of the wall clock or a stamp from the future cannot keep
     wheels turning.  A command that is not finite is no sign of life: the body brakes after the

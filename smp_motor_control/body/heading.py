@@ -15,24 +15,9 @@ def wrapped(angle: float) -> float:
 class HeadingHold:
     """PI controller of the yaw whose reference is the integral of the commanded yaw rate.
 
-    ``w_out = w_cmd + clamp(p e + i integral(e))`` with ``e = wrap(integral(w_cmd) - yaw)``.
-
-    Parameters
-    ----------
-    p : float
-        [1/s].
-    i : float
-        [1/s^2].
-    max_correction : float
-        Largest yaw rate that is added [rad/s].
-    max_error : float
-        Beyond this the body was turned by something stronger: the present yaw is the new
-        reference [rad].
-
-    Raises
-    ------
-    ParameterError
-        When a gain is negative or a limit not positive.
+    ``w_out = w_cmd + clamp(p e + i integral(e))`` with ``e = wrap(integral(w_cmd) - yaw)``, p [1/s]
+    and i [1/s^2].  Beyond ``max_error`` [rad] the body was turned by something stronger: the
+    present yaw is the new reference.
 
     Examples
     --------

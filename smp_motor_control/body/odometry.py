@@ -116,20 +116,7 @@ class Odometry:
         self._positions: tuple[float, float] | None = None
 
     def update_from_velocity(self, left: float, right: float, dt: float) -> bool:
-        """Integrate the wheel speeds of both sides.
-
-        Parameters
-        ----------
-        left, right : float
-            Mean of the side's wheels [rad/s].
-        dt : float
-            [s].
-
-        Returns
-        -------
-        bool
-            False where the step is too short, or a speed not finite: nothing has changed.
-        """
+        """Integrate the mean speeds of both sides [rad/s]; False where nothing could be."""
         if not (LEAST_STEP <= dt < math.inf and math.isfinite(left) and math.isfinite(right)):
             return False
         left, right = left * self._left, right * self._right
@@ -145,19 +132,9 @@ class Odometry:
     def update_from_travel(
         self, left: float, right: float, left_speed: float, right_speed: float
     ) -> bool:
-        """Integrate how far both sides turned, and take their speeds as they are.
+        """Integrate how far both sides turned [rad], and take their speeds [rad/s] as they are.
 
-        Parameters
-        ----------
-        left, right : float
-            Since the step before [rad].
-        left_speed, right_speed : float
-            Now [rad/s].
-
-        Returns
-        -------
-        bool
-            False where a number is not finite: nothing has changed.
+        False where a number is not finite: nothing has changed.
         """
         if not math.isfinite(abs(left) + abs(right) + abs(left_speed) + abs(right_speed)):
             return False
@@ -179,20 +156,7 @@ class Odometry:
         return self.update_from_velocity(turned_left / dt, turned_right / dt, dt)
 
     def update_open_loop(self, linear: float, angular: float, dt: float) -> bool:
-        """Integrate what was commanded, where no wheel tells how it turned.
-
-        Parameters
-        ----------
-        linear, angular : float
-            [m/s], [rad/s].
-        dt : float
-            [s].
-
-        Returns
-        -------
-        bool
-            False where the step is too short, or a speed not finite: nothing has changed.
-        """
+        """Integrate what was commanded [m/s], [rad/s], where no wheel tells how it turned."""
         if not (LEAST_STEP <= dt < math.inf and math.isfinite(linear) and math.isfinite(angular)):
             return False
         self.linear, self.angular = linear, angular
@@ -201,18 +165,7 @@ class Odometry:
         return True
 
     def twist_variances(self, span: float) -> tuple[float, float]:
-        """Return how sure the reported velocity is.
-
-        Parameters
-        ----------
-        span : float
-            Time that the velocity is averaged over [s].
-
-        Returns
-        -------
-        tuple of float
-            Variance of the linear [m^2/s^2] and of the angular velocity [rad^2/s^2].
-        """
+        """Return the variances of the linear and angular velocity, averaged over a span [s]."""
         half = self.angular * self._separation / 2.0
         rolled = self._travel_noise * (abs(self.linear - half) + abs(self.linear + half)) / span
         skidded = self._turn_noise * abs(self.angular) / span

@@ -83,27 +83,7 @@ class SpeedLimiter:
             )
 
     def limit(self, v: float, v0: float, v1: float, dt: float) -> Limited:
-        """Apply jerk, then acceleration, then velocity limits.
-
-        Parameters
-        ----------
-        v : float
-            Asked for.
-        v0, v1 : float
-            Commanded one and two steps before.
-        dt : float
-            [s].
-
-        Returns
-        -------
-        Limited
-            What may be commanded.
-
-        Raises
-        ------
-        ParameterError
-            When an argument is not finite, or dt is negative.
-        """
+        """Limit a speed by jerk, then acceleration, then velocity, after its last two."""
         value = self.limit_jerk(v, v0, v1, dt).value
         value = self.limit_acceleration(value, v0, dt).value
         return _share(self.limit_velocity(value).value, v)

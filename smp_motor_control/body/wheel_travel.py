@@ -53,15 +53,8 @@ class _Wheel:
 class WheelFeedback:
     """The newest sample of each wheel, and what came of it since it was last taken.
 
-    Parameters
-    ----------
-    left, right : sequence of str
-        Names of the wheels of each side.
-    max_speed : float
-        Positions that would need a faster wheel are a counter that was reset, or a wheel
-        that was replaced, not motion [rad/s].
-    window : float
-        Over which speeds are averaged [s].
+    Positions that would need a wheel faster than ``max_speed`` [rad/s] are a counter that was
+    reset, or a wheel that was replaced, not motion; speeds are averaged over ``window`` [s].
     """
 
     def __init__(

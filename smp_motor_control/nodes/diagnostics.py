@@ -13,13 +13,7 @@ OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.E
 
 
 class Diagnostics:
-    """Publishes a node's health on ``/diagnostics``, every second and at once on a change.
-
-    Attributes
-    ----------
-    due : bool
-        Whether ``assess`` is asked for the report of the second, and not for one between.
-    """
+    """Publishes a node's health on ``/diagnostics``, every second and at once on a change."""
 
     def __init__(
         self,
@@ -33,7 +27,7 @@ class Diagnostics:
         self._hardware_id = hardware_id
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._timer = steady_timer(node, 1.0, self._tick)
-        self.due = False
+        self.due = False  # whether ``assess`` is asked for the report of the second
 
     def _tick(self) -> None:
         self.due = True

@@ -26,15 +26,7 @@ _ZEROS = 3
 
 
 class MotorWriter:
-    """The way of a node to a motor; see :class:`~smp_motor_control.wheel.lease.Lease`.
-
-    Attributes
-    ----------
-    owner : str
-        Another writer that owns the wheel by what the driver says; empty where nobody else does.
-    publisher : rclpy.publisher.Publisher
-        Of ``motor_command``.
-    """
+    """The way of a node to a motor; see :class:`~smp_motor_control.wheel.lease.Lease`."""
 
     def __init__(self, node: Node, prefix: str = "") -> None:
         self._node = node
@@ -48,7 +40,7 @@ class MotorWriter:
         self._owners = node.create_subscription(
             String, f"{prefix}motor_owner", self._heard, LATCHED
         )
-        self.owner = ""
+        self.owner = ""  # another writer that owns the wheel, by what the driver says
 
     def _heard(self, message: String) -> None:
         self.owner = "" if message.data == self._name else message.data

@@ -59,17 +59,7 @@ class RobotError(SmpError):
 
 
 class RobotClient:
-    """A node beside the robot's, spun only while one of its methods waits.
-
-    Parameters
-    ----------
-    arguments : sequence of str
-        ROS arguments, such as the namespace.
-    name : str
-        Of the node.
-    guarded : bool
-        Whether a second process gives back what this one owes when it is killed.
-    """
+    """A node beside the robot's, spun only while one of its methods waits."""
 
     def __init__(
         self, arguments: Sequence[str] = (), name: str = "robot_client", guarded: bool = True

@@ -128,13 +128,7 @@ def _check_range(name: str, value: Any, entry: _Entry) -> None:
 
 
 class Parameters(Generic[S]):
-    """Declares a node's parameters and keeps the settings made of them.
-
-    Attributes
-    ----------
-    settings : object
-        The present settings.
-    """
+    """Declares a node's parameters and keeps the ``settings`` made of them."""
 
     def __init__(
         self,

@@ -22,19 +22,8 @@ _HIDE_CURSOR, _SHOW_CURSOR = "\x1b[?25l", "\x1b[?25h"
 class Terminal:
     """The controlling terminal with keys unechoed and unbuffered.
 
-    Parameters
-    ----------
-    suspend : callable
-        Called before Ctrl-Z suspends the process, and before it is hung up.
-    leave : callable
-        Called when the terminal is gone.
-    resume : callable
-        Called after the process was continued.
-
-    Raises
-    ------
-    SmpError
-        When standard input is no terminal, or the process runs in its background.
+    ``suspend`` is called before Ctrl-Z suspends the process, ``leave`` when the terminal is gone,
+    and ``resume`` after the process was continued.
     """
 
     def __init__(

@@ -41,13 +41,7 @@ class Reference(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class ProfileLimits:
-    """What a reference must keep to; infinite where there is no limit.
-
-    Raises
-    ------
-    ParameterError
-        When a limit is neither infinite nor a number from 1e-6 to 1e12.
-    """
+    """What a reference must keep to; infinite where there is no limit."""
 
     # velocity, acceleration, jerk: [rad/s], [rad/s^2], [rad/s^3], all positive
     velocity: float = math.inf
@@ -74,15 +68,6 @@ class ProfileLimits:
 
 class MinimumJerk:
     """Polynomial of fifth order from a moving start to a target at rest.
-
-    Parameters
-    ----------
-    start : Reference
-        Velocity, acceleration and jerk to begin with.
-    target : float
-        Velocity to end with [rad/s].
-    duration : float
-        [s], positive.
 
     References
     ----------
@@ -123,17 +108,7 @@ class MinimumJerk:
 
 
 class Limited:
-    """The fastest transition within limits of acceleration and jerk.
-
-    Parameters
-    ----------
-    start : Reference
-        Velocity and acceleration to begin with.
-    target : float
-        Velocity to end with [rad/s].
-    limits : ProfileLimits
-        Of acceleration and jerk; without either the target is reached at once.
-    """
+    """The fastest transition within limits of acceleration and jerk; without either, a jump."""
 
     __slots__ = ("_legs", "duration", "target")
 

@@ -17,13 +17,7 @@ _NO_WEIGHT = 1e-12
 
 
 class ReferencePath:
-    """Leads the reference of a profile, and remembers where it was.
-
-    Attributes
-    ----------
-    now, following : Reference
-        At this sample, and at the next one if the interval is as usual.
-    """
+    """Leads the reference of a profile, and remembers where it was."""
 
     def __init__(self, profile: Profile) -> None:
         self.profile = profile
@@ -33,6 +27,7 @@ class ReferencePath:
     def start(self, velocity: float) -> None:
         """Rest at a velocity."""
         self.profile.reset(velocity)
+        # At this sample, and at the next one if the interval is as usual
         self.now = self.following = self.profile.now
         self._from = velocity
         self._elapsed = 0.0

@@ -44,11 +44,6 @@ class Profile:
         The motor and its voltage, where changes shall keep to that: one for which the voltage
         does not do in ``transition_time`` is made as fast as the voltage allows.
 
-    Raises
-    ------
-    ParameterError
-        When ``transition_time`` is negative or not finite.
-
     Examples
     --------
     >>> profile = Profile(ProfileLimits(acceleration=2.0))

@@ -28,13 +28,7 @@ _FIRST_ORDER = 1e-6
 
 @dataclass(frozen=True, kw_only=True)
 class Drive:
-    """What a motor can do with the voltage that a change of speed may use.
-
-    Raises
-    ------
-    ParameterError
-        When a value is not finite, or is one that no motor has.
-    """
+    """What a motor can do with the voltage that a change of speed may use."""
 
     top_speed: float  # that this voltage, less what dry friction takes, would hold for ever [rad/s]
     time_constant: float  # sum of the motor's time constants [s]
@@ -88,28 +82,8 @@ class _Motor:
 
 
 class VoltageLimited:
-    """The fastest transition within a voltage, of whole samples.
+    """The fastest transition within a voltage, of whole samples, of ``least`` seconds in any case.
 
-    Parameters
-    ----------
-    start : Reference
-        Speed and acceleration to begin with.
-    target : float
-        Speed to end with [rad/s].
-    drive : Drive
-        The motor and its voltage.
-    sample_time : float
-        Interval over which the voltage is held [s].
-    least : float
-        Duration that it takes in any case [s].
-
-    Raises
-    ------
-    ParameterError
-        When ``sample_time`` is out of range.
-
-    Notes
-    -----
     A target at or beyond the top speed is headed for with as much voltage as holding it takes
     and a fiftieth more.
     """

@@ -99,25 +99,10 @@ class SignalMap:
 
 
 def parse(items: Iterable[str], msg_files: Iterable[str] = ()) -> SignalMap:
-    """Read a mapping as it is written on the command line.
+    """Read a mapping as it is written on the command line: ``[WHEEL.]KEY=VALUE``.
 
-    Parameters
-    ----------
-    items : iterable of str
-        ``[WHEEL.]KEY=VALUE``; KEY is a signal, a property of the hardware or an option.
-        A string may hold several, separated by blanks.
-    msg_files : iterable of str
-        ``.msg`` files or folders.
-
-    Returns
-    -------
-    SignalMap
-        Validated, as far as that is possible without the recording.
-
-    Raises
-    ------
-    BagError
-        Naming the item that is wrong and what it may be.
+    KEY is a signal, a property of the hardware or an option; an item may hold several, separated by
+    blanks.
 
     Examples
     --------
@@ -149,23 +134,7 @@ def _separate(text: str) -> list[str]:
 
 
 def load(path: str | os.PathLike[str]) -> SignalMap:
-    """Read a mapping from a YAML file.
-
-    Parameters
-    ----------
-    path : path
-        Of the file; docs/mapping.md shows what it holds.
-
-    Returns
-    -------
-    SignalMap
-        Paths of ``types`` are relative to the file.
-
-    Raises
-    ------
-    BagError
-        Naming file, key and what it may be.
-    """
+    """Read a mapping from a YAML file; paths of its ``types`` are relative to it."""
     path = Path(path)
     try:
         document = read_yaml(path)

@@ -35,27 +35,9 @@ OWN_FIELDS = {
 
 
 def read_experiments(paths: Any, mapping: Any = None) -> dict[str, list[Record]]:
-    """Read recordings, each as records of its own.
+    """Read recordings as `read_records` does, each as records of its own, in their order.
 
-    Parameters
-    ----------
-    paths : path or sequence of paths
-        Bags (folders or bare files), folders of bags, or tables of any format of
-        `smp_motor_ident.bag.readers`.
-    mapping : SignalMap, dict, path of a YAML file, list of command-line items, or None
-        Which topics, fields or columns are which signals; not needed for recordings of
-        our own messages.
-
-    Returns
-    -------
-    dict of str to list of Record
-        By wheel, in the order of the recordings that have it.
-
-    Raises
-    ------
-    BagError
-        When a path cannot be read, or holds no motor; the message says which.  Of a folder
-        with several recordings those that cannot be read become findings of the others.
+    Of a folder with several recordings those that cannot be read become findings of the others.
     """
     asked = mappings.of(mapping)
     types = Types(asked.msg_files)
@@ -87,9 +69,11 @@ def read_records(paths: Any, mapping: Any = None) -> dict[str, Record]:
     Parameters
     ----------
     paths : path or sequence of paths
-        As for `read_experiments`.
+        Bags (folders or bare files), folders of bags, or tables of any format of
+        `smp_motor_ident.bag.readers`.
     mapping : SignalMap, dict, path of a YAML file, list of command-line items, or None
-        As for `read_experiments`.
+        Which topics, fields or columns are which signals; not needed for recordings of
+        our own messages.
 
     Returns
     -------
@@ -99,7 +83,8 @@ def read_records(paths: Any, mapping: Any = None) -> dict[str, Record]:
     Raises
     ------
     BagError
-        As `read_experiments`, and when recordings of one wheel contradict each other.
+        When a path cannot be read, holds no motor, or recordings of one wheel contradict each
+        other; the message says which.
     """
     experiments = read_experiments(paths, mapping)
     return {wheel: join_records(records) for wheel, records in experiments.items()}

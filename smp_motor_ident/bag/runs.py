@@ -29,18 +29,6 @@ def runs(time: NDArray[Any], columns: Mapping[str, NDArray[Any]]) -> Parts:
     It does where the time goes back by more than jitter, the rows go on from there, and they cover
     again what the rows before have covered.  Single rows out of order, a block that was
     flushed late and rows that are there twice are no new run; they are sorted.
-
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        In any unit.
-    columns : mapping of str to ndarray, shape (n,)
-        The signals of the same rows.
-
-    Returns
-    -------
-    list of tuple of int
-        Begin and end of each run.
     """
     parts = _parts(time, columns)
     if len(parts) > 1 and columns:

@@ -21,15 +21,7 @@ LEAST = 10
 
 
 class Window:
-    """The last seconds of one wheel's ``motor_state``, as a record at the motor shaft.
-
-    Parameters
-    ----------
-    wheel : str
-        Name of the wheel.
-    length : float
-        How much is kept [s].
-    """
+    """The last seconds of one wheel's ``motor_state``, as a record at the motor shaft."""
 
     def __init__(self, wheel: str, length: float) -> None:
         self.wheel = wheel
@@ -72,13 +64,7 @@ class Window:
             rows.popleft()
 
     def record(self) -> Record | None:
-        """Return what is held; None below 10 samples.
-
-        Raises
-        ------
-        BagError
-            Where nothing that is held could be read from a bag either.
-        """
+        """Return what is held, refused as a bag of it would be; None below 10 samples."""
         if len(self) < LEAST:
             return None
         rows = zip(*self._rows, strict=True)

@@ -48,19 +48,8 @@ class _Topic:
 class BagWriter:
     """Writes an MCAP bag folder as rosbag2 of ROS 2 Jazzy lays it out (metadata version 9).
 
-    Parameters
-    ----------
-    path : path
-        Folder of the bag; it must not exist.
-    flush_period : float
-        [s]; with messages coming, so much is lost at most when the process is killed.
-    distribution : str
-        Name of the ROS distribution for the metadata; by default ROS_DISTRO.
-
-    Raises
-    ------
-    BagError
-        When the folder exists already, or cannot be made.
+    The folder must not exist.  With messages coming, what came within ``flush_period`` [s] is lost
+    at most when the process is killed.
 
     Examples
     --------
@@ -116,20 +105,9 @@ class BagWriter:
     ) -> bool:
         """Announce a topic; `write` does it by itself where the QoS does not matter.
 
-        Parameters
-        ----------
-        topic, type_name : str
-            Such as ``/pwm`` and ``std_msgs/msg/Float64``.
-        qos : list of dict, optional
-            One profile per publisher, keys as in `DEFAULT_QOS`.
-        numbered : bool
-            Whether `write` will be given the publisher's own numbers.
-
-        Returns
-        -------
-        bool
-            False where nobody here knows the type, so that its messages are kept without
-            their definition.
+        ``qos`` has a profile for each publisher, with keys as in `DEFAULT_QOS`; ``numbered`` says
+        that `write` will be given the publisher's own numbers.  False where nobody here knows the
+        type, so that its messages are kept without their definition.
         """
         with self._lock:
             if topic in self._topics:
@@ -185,25 +163,10 @@ class BagWriter:
         sent: int | None = None,
         number: int = 0,
     ) -> None:
-        """Write a message.
+        """Write a message, serialized (CDR) with its four bytes of encapsulation.
 
-        Parameters
-        ----------
-        topic, type_name : str
-            Where it belongs.
-        data : bytes
-            Serialized (CDR) with its four bytes of encapsulation.
-        stamp : int
-            When it came, in nanoseconds since 1970.
-        sent : int, optional
-            When it was published, where that is known.
-        number : int
-            The publisher's own number of the message; 0 where that is not known.
-
-        Raises
-        ------
-        BagError
-            When the bag is closed, the topic is of another type, or the disk does not take it.
+        ``stamp`` is when it came, ``sent`` when it was published, in nanoseconds since 1970;
+        ``number`` is the publisher's own, 0 where that is not known.
         """
         with self._lock:
             if self._closed:
@@ -235,18 +198,7 @@ class BagWriter:
                 self.flush()
 
     def flush(self, *, force: bool = False) -> None:
-        """Bring what was written to the disk, where the flush period is over.
-
-        Parameters
-        ----------
-        force : bool
-            Do it at once.
-
-        Raises
-        ------
-        BagError
-            When the disk does not take it.
-        """
+        """Bring what was written to the disk, where the flush period is over or it is forced."""
         # The summary grows with the bag: hours later it is rewritten less often.
         period = max(self._flush_period, len(self._chunk_indexes) / 2e6)
         if self._closed or (not force and time.monotonic() - self._flushed < period):

@@ -53,13 +53,7 @@ def append(path: Path, entries: Sequence[Entry]) -> None:
 
 
 def read(path: Path) -> dict[str, list[Entry]]:
-    """Return the entries of each wheel in the order of their stamps.
-
-    Raises
-    ------
-    BagError
-        Where a line other than a cut last one is no entry.
-    """
+    """Return the entries of each wheel by their stamps, without a last line that was cut off."""
     out: dict[str, list[Entry]] = {}
     lines = path.read_text("utf-8").splitlines()
     for number, line in enumerate(lines, 1):
