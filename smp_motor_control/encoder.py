@@ -1,7 +1,5 @@
 """Incremental encoders: counts from an angle, rollover, and speed from counts."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from dataclasses import dataclass

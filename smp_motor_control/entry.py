@@ -1,7 +1,5 @@
 """The executables: each imports its program while it already listens to Ctrl-C."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import signal

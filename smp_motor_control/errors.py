@@ -3,8 +3,6 @@
 Every message names the value (and the file where there is one) and says what to do.
 """
 
-from __future__ import annotations
-
 import math
 
 LONGEST_MESSAGE = 1000

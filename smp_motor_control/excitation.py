@@ -5,8 +5,6 @@ nominal frequency is detuned by ``sqrt(1.05)``, which no sampling rate is a mult
 Quantisation errors that repeat are a bias; those that do not are noise.
 """
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field

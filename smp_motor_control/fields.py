@@ -1,7 +1,5 @@
 """Fields of settings that say what they are, to people and as parameters of nodes."""
 
-from __future__ import annotations
-
 from dataclasses import field
 from typing import Any
 

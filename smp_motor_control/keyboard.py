@@ -3,8 +3,6 @@
 A terminal tells that a key is held only by repeating it; a command ends with the repeats.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping, Sequence

@@ -18,8 +18,6 @@ Navigation*, Wiley 2001, section 5.4 for the innovation test; B. D. O. Anderson 
 J. B. Moore, *Optimal Filtering*, 1979, section 6.7 for the doubling of the Riccati equation.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """YAML files that people write: ROS parameters and mappings, bounded before anything walks them."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path

@@ -15,8 +15,6 @@ K. J. Astrom and T. Hagglund, *Advanced PID Control*, ISA, 2006: sections 3.3 (s
 weighting), 3.4 (derivative filter), 3.5 (anti-windup) and 13.4 (bumpless changes).
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

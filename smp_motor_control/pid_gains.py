@@ -1,7 +1,5 @@
 """Settings of the PID controller, validated before they are used."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, fields
 

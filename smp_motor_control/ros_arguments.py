@@ -1,7 +1,5 @@
 """Arguments of a program beside those of ROS."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 

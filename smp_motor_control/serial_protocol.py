@@ -13,8 +13,6 @@ encoder count and ``MA`` a current [mA], empty where it is not measured.  A boar
 valid line for 0.2 s turns its motors off.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import NamedTuple

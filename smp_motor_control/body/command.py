@@ -1,7 +1,5 @@
 """What the body is asked to do, and for how long that holds."""
 
-from __future__ import annotations
-
 import math
 from enum import Enum
 

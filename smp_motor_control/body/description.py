@@ -1,7 +1,5 @@
 """The robot as URDF: a box on its wheels, whatever their number, for robot_state_publisher."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement

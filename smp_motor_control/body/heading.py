@@ -1,7 +1,5 @@
 """Holding the heading of the body against uneven ground, with a yaw from outside."""
 
-from __future__ import annotations
-
 import math
 
 from smp_motor_control.errors import check_positive

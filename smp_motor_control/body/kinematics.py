@@ -4,8 +4,6 @@
 separation ``B = wheel_separation * wheel_separation_multiplier``; angles counter-clockwise.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, fields
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Where a body with two sides of wheels is, from how they turned, and how sure that is."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 

@@ -1,7 +1,5 @@
 """Limits of a body's speed, acceleration and jerk, as ros2_controllers computes them."""
 
-from __future__ import annotations
-
 import math
 import sys
 from dataclasses import dataclass

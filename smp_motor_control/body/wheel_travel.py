@@ -1,7 +1,5 @@
 """How far the wheels have turned since last asked, from samples that may be lost or wrong."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """What all nodes do alike: QoS, timers that nothing stops, names, stamps."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from typing import Any

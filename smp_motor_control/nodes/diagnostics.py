@@ -1,7 +1,5 @@
 """A node's health on ``/diagnostics``."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue

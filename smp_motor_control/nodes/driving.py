@@ -1,7 +1,5 @@
 """Drives of the body, or of the wheels past skid_steer, by segments, with zero at the end."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from typing import Any

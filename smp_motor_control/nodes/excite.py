@@ -6,8 +6,6 @@ A wheel that turns too fast, draws too much or is not heard any more ends the si
 all, with exit code 1.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Mapping

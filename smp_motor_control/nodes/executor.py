@@ -9,8 +9,6 @@ While messages come in quick succession it waits for them, for timers and for gu
 alone, and looks at the many other entities of a node only every :data:`LOOK`.
 """
 
-from __future__ import annotations
-
 import inspect
 import time
 from contextlib import ExitStack
@@ -32,7 +30,7 @@ LOOK = 20_000_000
 class _WaitSet:
     """The wait set of one collection of entities, which it keeps alive."""
 
-    def __init__(self, executor: LeanExecutor, key: tuple[tuple[Any, ...], ...]) -> None:
+    def __init__(self, executor: "LeanExecutor", key: tuple[tuple[Any, ...], ...]) -> None:
         self.key = key
         self._stack = ExitStack()
         subscriptions, timers, clients, services, guards, waitables = key

@@ -1,7 +1,5 @@
 """New gains in running wheels on trial: set, watched, and taken back from all if one is bad."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections import deque

@@ -5,8 +5,6 @@ session of its own, so that what ends the tool does not end it: when its standar
 the last line is not empty, it activates the controllers and sets the gains that stand there.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import signal

@@ -1,7 +1,5 @@
 """What a control loop asks of the system and of Python so that it keeps time."""
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import os

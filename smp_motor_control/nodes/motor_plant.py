@@ -9,8 +9,6 @@ Subscribes ``<wheel>/motor_command``, of one writer at a time, and ``<wheel>/loa
 Physics runs on the steady clock over the real intervals; only the stamps are ROS time.
 """
 
-from __future__ import annotations
-
 import gc
 import math
 import time
@@ -72,7 +70,7 @@ by 20 V, shift a motor's angle by half a count of the paper's encoder, for good.
 class Wheel:
     """One motor and its topics."""
 
-    def __init__(self, node: MotorPlant, name: str, motor: DrivenMotor, ohmmeter: bool) -> None:
+    def __init__(self, node: "MotorPlant", name: str, motor: DrivenMotor, ohmmeter: bool) -> None:
         self.name = name
         self.motor = motor
         self.rejected = self.late = 0

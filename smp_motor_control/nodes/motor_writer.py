@@ -1,7 +1,5 @@
 """One wheel's commands, under the sender's name, and who owns the wheel: both of their ends."""
 
-from __future__ import annotations
-
 import math
 import os
 import time

@@ -1,7 +1,5 @@
 """Odometry and joint states as messages: /odom, /joint_states and, where possible, /tf."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 

@@ -4,8 +4,6 @@ First a constant voltage shows the speed to oscillate around, then the relay swi
 Whatever ends it, the last command is zero and the wheel's controller is as it was.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

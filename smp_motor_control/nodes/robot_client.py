@@ -5,8 +5,6 @@ give (``--ros-args -r __ns:=/robot1``).  What the client pauses or puts on trial
 when the block ends; :mod:`smp_motor_control.nodes.guard` does it where the tool was killed.
 """
 
-from __future__ import annotations
-
 import contextlib
 import re
 import time
@@ -69,7 +67,7 @@ class RobotClient:
         self.owed: dict[str, Any] = {}
         self._guard: Guard | None = None
 
-    def __enter__(self) -> RobotClient:
+    def __enter__(self) -> "RobotClient":
         """Join the graph."""
         self._context = Context()
         rclpy.init(

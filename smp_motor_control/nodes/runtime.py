@@ -6,8 +6,6 @@ leaving: SIGINT, SIGTERM, SIGQUIT, SIGHUP (a closed terminal), :func:`finish`, o
 a callback.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import signal

@@ -5,8 +5,6 @@ a wheel whose commands cease gets 0 V after ``command_timeout``, and a board tha
 turns its motors off.  A board that is reset or unplugged is found again by its device.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
 import os

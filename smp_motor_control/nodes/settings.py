@@ -16,8 +16,6 @@ A change is validated, as one with all that is set in the same call, before it t
 a refused one leaves the node as it was and the service call says why.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import difflib
 import math

@@ -1,7 +1,5 @@
 """skid_steer: velocity commands of the body to set-points of its wheels, and odometry back."""
 
-from __future__ import annotations
-
 import math
 import time
 from functools import partial

@@ -1,7 +1,5 @@
 """Parameters of skid_steer, named as those of diff_drive_controller where they mean the same."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """teleop_wheels: keys of a terminal to cmd_vel or to single wheels, while they are held."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """A terminal that gives single keys, and is itself again whatever happens."""
 
-from __future__ import annotations
-
 import atexit
 import contextlib
 import os

@@ -1,7 +1,5 @@
 """``--help`` of the nodes: what a node does, and its parameters."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import os

@@ -5,8 +5,6 @@ A lifecycle node that starts by itself.  It answers every ``motor_state`` with o
 ``~/reset`` releases a wheel that is latched by a fault.
 """
 
-from __future__ import annotations
-
 import time
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What ``wheel_pid`` says of its health: its state, and everything out of the ordinary."""
 
-from __future__ import annotations
-
 import gc
 from collections.abc import Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """Parameters of ``wheel_pid``, and the settings of its core that they make."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any
 

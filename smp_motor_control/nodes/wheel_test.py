@@ -4,8 +4,6 @@ Commands answer samples, so that a wheel that no longer reports is no longer dri
 ends the test, the last command is zero.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
 import time
@@ -58,7 +56,7 @@ class WheelTest:
         self._writers: dict[str, MotorWriter] = {}
 
     @contextlib.contextmanager
-    def open(self) -> Iterator[WheelTest]:
+    def open(self) -> Iterator["WheelTest"]:
         """Hear and drive inside the block."""
         topics = {
             f"{wheel}/motor_state": lambda message, wheel=wheel: self._answer(wheel, message)

@@ -16,8 +16,6 @@ jerk ``10/sqrt(3) |D|/T^2`` at ``s = (1 -+ 1/sqrt(3))/2``.  Wheels that share T 
 whatever their own step.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -57,7 +55,7 @@ class ProfileLimits:
     @classmethod
     def from_parameters(
         cls, max_velocity: float, max_acceleration: float, max_jerk: float
-    ) -> ProfileLimits:
+    ) -> "ProfileLimits":
         """Return the limits that ROS parameters mean, where 0 is no limit."""
         return cls(
             velocity=max_velocity or math.inf,

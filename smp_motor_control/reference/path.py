@@ -1,7 +1,5 @@
 """The reference of a wheel as its loop uses it: fed forward now, compared with some time later."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 

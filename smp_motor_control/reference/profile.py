@@ -1,7 +1,5 @@
 """The reference of a wheel's speed: within its limits, smooth, and on time."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

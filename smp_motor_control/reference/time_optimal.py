@@ -11,8 +11,6 @@ L. S. Pontryagin et al., *The Mathematical Theory of Optimal Processes* (1962), 
 K. J. Astrom, B. Wittenmark, *Computer-Controlled Systems* (1997), section 4.3 on dead-beat.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

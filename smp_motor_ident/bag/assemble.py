@@ -1,7 +1,5 @@
 """From columns to one motor's Record: units, clock, order, repairs, segments."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

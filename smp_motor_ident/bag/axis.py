@@ -1,7 +1,5 @@
 """All signals of a motor on the time axis of its main output, cut where nothing is known."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -60,7 +58,7 @@ class Series:
     number: Integers | None = None
     bits: int | None = None
 
-    def take(self, which: NDArray[Any]) -> Series:
+    def take(self, which: NDArray[Any]) -> "Series":
         """Return some of the samples, by their indices or a mask."""
         number = None if self.number is None else self.number[which]
         return Series(self.time[which], self.value[which], number, self.bits)

@@ -1,7 +1,5 @@
 """What signals cannot be: values that jump impossibly, currents without sign."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter

@@ -1,7 +1,5 @@
 """Time done right: which clock, in what order, where gaps are, and inputs held over intervals."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import pairwise
 

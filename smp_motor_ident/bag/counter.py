@@ -1,7 +1,5 @@
 """Encoder counters that wrap around, and counters that start again."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

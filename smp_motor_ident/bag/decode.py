@@ -1,7 +1,5 @@
 """From messages to columns of numbers by topic."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain

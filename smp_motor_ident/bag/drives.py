@@ -1,7 +1,5 @@
 """Whether one signal drives another: what tells a voltage and its motion from other fields."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.special import fdtrc, ndtri
 

@@ -1,7 +1,5 @@
 """Several recordings of one motor as one record."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -5,8 +5,6 @@ before it: messages of one topic that agree in these have their numbers at the s
 one indexing per field reads them all.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any

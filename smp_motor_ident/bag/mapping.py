@@ -4,8 +4,6 @@ The same mapping is written as a YAML file or as strings on the command line; do
 shows both.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import re

@@ -1,7 +1,5 @@
 """metadata.yaml as rosbag2 of ROS 2 Jazzy writes it (version 9)."""
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Iterable
 from typing import Any

@@ -1,7 +1,5 @@
 """What fields are called: which signal of which wheel a name may mean, and in which unit."""
 
-from __future__ import annotations
-
 import re
 
 WORDS_OF_VOLTS = r"volt|spannung|tension|napi[eę]cie|напряж|电压|電圧"

@@ -1,7 +1,5 @@
 """What a recording offers: topics and the numbers in them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import chain

@@ -4,8 +4,6 @@ What decides of units, such as the full scale of a PWM, is asked for and never g
 do not tell the time, the voltage or the motion of a table, what the data show is proposed.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace

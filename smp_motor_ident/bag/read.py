@@ -1,7 +1,5 @@
 """From paths and a mapping to records: the whole way."""
 
-from __future__ import annotations
-
 import math
 import struct
 from collections.abc import Iterator, Mapping

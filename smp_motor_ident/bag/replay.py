@@ -1,7 +1,5 @@
 """A bag's messages one by one in the order in which they came: what a player needs."""
 
-from __future__ import annotations
-
 import heapq
 from collections.abc import Callable, Iterator
 from itertools import count

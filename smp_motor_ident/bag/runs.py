@@ -1,7 +1,5 @@
 """Tables whose clock starts again: runs written one below another, or a logger that was reset."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise

@@ -5,8 +5,6 @@ the lost ones; yet every leaf page holds whole rows by itself.  The layout of pa
 records is that of https://www.sqlite.org/fileformat2.html, sections 1.6 and 2.1.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO

@@ -1,7 +1,5 @@
 """From paths to recordings: folders, split bags, bare files, tables alone and together."""
 
-from __future__ import annotations
-
 import os
 import re
 import tempfile

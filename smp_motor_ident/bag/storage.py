@@ -1,7 +1,5 @@
 """What recordings consist of: channels, and batches of raw messages or tables of columns."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -73,7 +71,7 @@ class Batch:
         begin = int(self.offset[k])
         return self.data[begin : begin + int(self.length[k])].tobytes()
 
-    def take(self, which: NDArray[Any]) -> Batch:
+    def take(self, which: NDArray[Any]) -> "Batch":
         """Return the chosen messages (indices or a mask), sharing the data."""
         return Batch(
             self.channel,

@@ -1,7 +1,5 @@
 """Files of columns as recordings: which column is which signal, and which is the time."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import replace

@@ -4,8 +4,6 @@ CDR puts a field behind everything that precedes it, aligned to its size from th
 after the four of the encapsulation.  ROS 1 puts it there unaligned, and has no such four bytes.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

@@ -6,8 +6,6 @@ voltage that it applied, the delay that explains it best tells whether the drive
 command on arrival or keeps it until its next sample.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Message definitions: from the bag, from the user's .msg files, from ROS, from rosbags."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Units a recording may come in, and what makes SI of them."""
 
-from __future__ import annotations
-
 import math
 import re
 

@@ -5,8 +5,6 @@ and all pieces of a recording together may not exceed what its size makes believ
 environment variable ``SMP_BAG_UNPACKED`` (bytes, or such as ``8G``) raises that limit.
 """
 
-from __future__ import annotations
-
 import bz2
 import os
 from collections.abc import Iterable, Iterator

@@ -1,7 +1,5 @@
 """A running motor's recent past, read as a bag of it would be."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 

@@ -5,8 +5,6 @@ write; the next flush overwrites that summary.  So the file on disk is a closed 
 up to its last flush, with a metadata.yaml that counts the same messages.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os
@@ -331,7 +329,7 @@ class BagWriter:
                 self._closed = True
                 self._file.close()
 
-    def __enter__(self) -> BagWriter:
+    def __enter__(self) -> "BagWriter":
         """Return the writer."""
         return self
 

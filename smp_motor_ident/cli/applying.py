@@ -1,7 +1,5 @@
 """tune --apply: new gains into running wheel nodes, on trial."""
 
-from __future__ import annotations
-
 import argparse
 import math
 from collections.abc import Mapping

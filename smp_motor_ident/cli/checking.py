@@ -1,7 +1,5 @@
 """The small test of every wheel that ``commission`` begins with: live part of the checks."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """``commission``: the whole way on the user's own running robot, wheels off the ground."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Sequence
 

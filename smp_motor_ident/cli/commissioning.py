@@ -4,8 +4,6 @@ What is done is kept as soon as it is whole: what the checks came to, and every 
 that is gone on with does the rest at the same voltages, and so ends as one that was not cut off.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import shutil

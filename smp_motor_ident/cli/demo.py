@@ -1,7 +1,5 @@
 """``demo``: a simulated robot from four unknown motors to four tuned wheels, checked at the end."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """What ``demo`` does: a simulated robot from four unknown motors to four tuned wheels."""
 
-from __future__ import annotations
-
 import argparse
 import os
 import shutil

@@ -1,7 +1,5 @@
 """How the wheels answered ``cmd_vel``, from the recording of a drive."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -5,8 +5,6 @@ of its files, the options, and the version.  What is there is not computed again
 was cut off goes on where it was; a recording that fails is a row with its reason.
 """
 
-from __future__ import annotations
-
 import argparse
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """What every command-line tool has in common: one-line errors, exit codes, progress."""
 
-from __future__ import annotations
-
 import argparse
 import gc
 import importlib

@@ -1,7 +1,5 @@
 """``identify``: from recordings to motors, each number with its certainty."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Sequence
 

@@ -4,8 +4,6 @@ Python drops an exception that a signal handler raises inside some callbacks, am
 around a fork; a tool that is just starting a process would then go on as if nobody had asked.
 """
 
-from __future__ import annotations
-
 import signal
 import threading
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """``identify --controller``: recordings that hold set-points in the place of voltages."""
 
-from __future__ import annotations
-
 import argparse
 import math
 import re

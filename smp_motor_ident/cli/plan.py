@@ -1,7 +1,5 @@
 """What a commissioning does, and how long it takes: the plan, drawn, and the time that is left."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass

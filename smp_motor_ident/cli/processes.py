@@ -1,7 +1,5 @@
 """Starting the nodes as processes of their own, and leaving none of them behind."""
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import fcntl
@@ -110,7 +108,7 @@ class Processes:
         self._logs = logs
         self._running: dict[str, subprocess.Popen[bytes]] = {}
 
-    def __enter__(self) -> Processes:
+    def __enter__(self) -> "Processes":
         """Begin."""
         self._logs.mkdir(parents=True, exist_ok=True)
         return self

@@ -1,7 +1,5 @@
 """What a commissioning has found so far: written after every step, and what it stops at."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import json

@@ -1,7 +1,5 @@
 """tune --relay: gains of one running wheel from a bounded oscillation, without a model."""
 
-from __future__ import annotations
-
 import argparse
 import math
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """The way from a standing robot to tuned wheels, step by step: shared by demo and commission."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

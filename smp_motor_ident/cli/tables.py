@@ -1,7 +1,5 @@
 """Results as tables for a terminal, a pipe or a log."""
 
-from __future__ import annotations
-
 import sys
 
 from rich import box

@@ -1,7 +1,5 @@
 """What recordings offer, and a mapping that may fit: ``identify --topics``."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """``tune``: identification.json (or motors.yaml) in, gains for wheel nodes or other loops out."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What ``tune`` does: loops as the arguments describe them, designs, and what it tells of them."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Mapping, Sequence
 from pathlib import Path

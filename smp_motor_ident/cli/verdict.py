@@ -1,7 +1,5 @@
 """Results of the demo against the known truth: a table per wheel, and what must hold."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

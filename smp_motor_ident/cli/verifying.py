@@ -1,7 +1,5 @@
 """New gains on trial: a drive of all wheels, held against what the design predicted of it."""
 
-from __future__ import annotations
-
 import contextlib
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Independent pieces of work side by side, in as many processes as there are cores."""
 
-from __future__ import annotations
-
 import ctypes
 import multiprocessing
 import os

@@ -1,7 +1,5 @@
 """What `record` and `play` share: a choice of topics, message classes by name."""
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import re

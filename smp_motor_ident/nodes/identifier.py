@@ -11,8 +11,6 @@ identification besides, warns on ``/diagnostics`` when one has left its band and
 line a wheel to ``history`` every minute, which ``identify --history`` draws.  It changes no gains.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Mapping

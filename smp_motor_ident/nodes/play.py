@@ -1,7 +1,5 @@
 """play: a bag's messages once more, byte for byte and in their own time."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 import threading

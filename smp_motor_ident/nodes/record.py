@@ -5,8 +5,6 @@ small batches from DDS' own queue instead of one callback each: at 4 x 1 kHz tha
 third of the time, and the queue's reception stamps stay exact.
 """
 
-from __future__ import annotations
-
 import argparse
 import shutil
 import sys

@@ -1,7 +1,5 @@
 """A chart as data: what the page's script draws to zoom into, and what is drawn for print."""
 
-from __future__ import annotations
-
 import base64
 from dataclasses import dataclass
 from typing import Any, Literal

@@ -1,7 +1,5 @@
 """Estimates as files: ``identification.json`` and ``motors.yaml``, written all or none."""
 
-from __future__ import annotations
-
 import math
 import os
 import shutil

@@ -1,7 +1,5 @@
 """A chart as SVG: for print, for a browser without script, and for figures in files."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from html import escape

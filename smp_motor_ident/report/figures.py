@@ -1,7 +1,5 @@
 """The charts of one motor: fit over the data, residual correlations, frequency response."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal

@@ -1,7 +1,5 @@
 """Many recordings in one table: robots, wheels and dates, what drifts and what stands out."""
 
-from __future__ import annotations
-
 import csv
 import io
 import math

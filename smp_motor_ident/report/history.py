@@ -4,8 +4,6 @@ Each line is a JSON object: stamp [s], wheel, values (by name value and standard
 validity and codes of findings.  A file is only ever added to, so a crash loses a line at most.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping, Sequence

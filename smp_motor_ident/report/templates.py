@@ -1,7 +1,5 @@
 """Pages that stand alone: a template, with all that it needs in itself."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from importlib import resources

@@ -1,7 +1,5 @@
 """Figure of a tuning: step, load step, loop gain and sensitivity of every wheel."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

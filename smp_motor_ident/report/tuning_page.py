@@ -3,8 +3,6 @@
 Nothing of control is computed in the page; its sliders choose among these designs.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Names, units and explanations in the reader's words."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import replace

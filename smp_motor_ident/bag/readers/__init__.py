@@ -1,7 +1,5 @@
 """Formats of recordings: one file each, one line each in the registry."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from smp_motor_ident.bag.readers import csv, json, mat, mcap, ros1, sqlite, wpilog, xlsx

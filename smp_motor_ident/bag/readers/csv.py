@@ -1,7 +1,5 @@
 """CSV files as loggers, scopes and spreadsheets write them."""
 
-from __future__ import annotations
-
 import csv
 import io
 import re

@@ -1,7 +1,5 @@
 """Rows of cells as spreadsheets and loggers write them: names, units, numbers, times."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -5,8 +5,6 @@ SysId and its forerunner frc-characterization keep lists of rows by the name of 
 (github.com/wpilibsuite/sysid, docs/data-collection.md).
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path

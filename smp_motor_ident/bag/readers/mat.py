@@ -5,8 +5,6 @@ by their path.  The layout that is checked before scipy may trust it is that of 
 Format", section 1: elements of type and size, compressed ones by zlib.
 """
 
-from __future__ import annotations
-
 import io
 import struct
 import subprocess

@@ -5,8 +5,6 @@ the walk over messages is done here, because it hands out positions for bulk dec
 instead of one Python object per message.
 """
 
-from __future__ import annotations
-
 import io
 import struct
 import zlib

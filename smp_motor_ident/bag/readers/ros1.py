@@ -3,8 +3,6 @@
 The format is that of http://wiki.ros.org/Bags/Format/2.0; rosbags reads the records' heads.
 """
 
-from __future__ import annotations
-
 import io
 from collections import defaultdict
 from collections.abc import Callable, Iterator

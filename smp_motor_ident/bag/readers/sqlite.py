@@ -1,7 +1,5 @@
 """SQLite bags of every rosbag2 schema, whole or cut off."""
 
-from __future__ import annotations
-
 import shutil
 import sqlite3
 import tempfile

@@ -5,8 +5,6 @@ records of entry, payload size and microseconds, each of as many bytes as the re
 byte says; entry 0 holds control records that start and finish entries.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

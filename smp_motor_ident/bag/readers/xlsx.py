@@ -1,7 +1,5 @@
 """Excel workbooks by openpyxl, which is asked for only when one is read."""
 
-from __future__ import annotations
-
 import zipfile
 from pathlib import Path
 from typing import Any
