@@ -62,8 +62,7 @@ def unwrap(counts: ArrayLike, bits: int) -> NDArray[np.int64]:
     half = np.int64(1 << (bits - 1))
     mask = np.int64((1 << bits) - 1)
     moved = ((np.diff(shown) + half) & mask) - half
-    total: NDArray[np.int64] = np.concatenate((shown[:1], shown[0] + np.cumsum(moved)))
-    return total
+    return np.concatenate((shown[:1], shown[0] + np.cumsum(moved)))
 
 
 class Unwrapper:

@@ -205,8 +205,7 @@ def _stamp(motor: Motor, table: Table) -> Integers | None:
         whole += round(signal.offset * to_nanoseconds)
         return whole
     values = (column.astype(np.float64) * signal.scale + signal.offset) * to_nanoseconds
-    stamp: Integers = np.rint(np.nan_to_num(values)).astype(np.int64)
-    return stamp
+    return np.rint(np.nan_to_num(values)).astype(np.int64)
 
 
 def _tell_offset(

@@ -25,8 +25,7 @@ class ClockFit:
         """Return stamps on the recorder's clock."""
         since = (stamp - self.origin).astype(np.float64)
         shift = np.rint(self.offset + self.drift * since).astype(np.int64)
-        result: Integers = stamp + shift
-        return result
+        return stamp + shift
 
 
 def fit_clock(stamp: Integers, log: Integers) -> ClockFit:

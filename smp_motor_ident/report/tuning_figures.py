@@ -53,8 +53,7 @@ def tuning_charts(wheels: Mapping[str, Curves], limit: float, prefix: str = "") 
 def _on(x: Array, own: Array, rows: Array) -> Array:
     """Return curves on another axis, shape (..., x.size); NaN outside of their own."""
     flat = [np.interp(x, own, row, left=np.nan, right=np.nan) for row in np.atleast_2d(rows)]
-    on: Array = np.array(flat).reshape(*rows.shape[:-1], x.size)
-    return on
+    return np.array(flat).reshape(*rows.shape[:-1], x.size)
 
 
 def tuning_svg(wheels: Mapping[str, Curves], limit: float) -> str:
