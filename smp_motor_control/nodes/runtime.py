@@ -99,7 +99,8 @@ def run(name: str, make: Callable[[], Node], argv: list[str] | None = None) -> i
     node: Node | None = None
     try:
         _init(arguments)
-        _refuse_other_arguments(arguments)
+        if other := rclpy.utilities.remove_ros_args(arguments)[1:]:
+            raise SmpError(f"unknown argument {other[0]!r}; parameters follow --ros-args")
         node = make()
         return _spin(node, stop)
     except SmpError as error:
@@ -138,12 +139,6 @@ def _init(arguments: list[str]) -> None:
     finally:
         os.dup2(kept, 2)
         os.close(kept)
-
-
-def _refuse_other_arguments(arguments: list[str]) -> None:
-    other = rclpy.utilities.remove_ros_args(arguments)[1:]
-    if other:
-        raise SmpError(f"unknown argument {other[0]!r}; parameters follow --ros-args")
 
 
 def _spin(node: Node, stop: _Stop) -> int:

@@ -5,11 +5,10 @@ mapping says which topics, fields or columns are which signals where the message
 `BagWriter` writes.
 """
 
-from smp_motor_ident.bag.join import join_records
 from smp_motor_ident.bag.mapping import MotorMap, Signal, SignalMap, load, parse
 from smp_motor_ident.bag.offers import Listing, Offer
 from smp_motor_ident.bag.propose import list_topics
-from smp_motor_ident.bag.read import read_experiments, read_records
+from smp_motor_ident.bag.read import join_records, read_experiments, read_records
 from smp_motor_ident.bag.writer import BagWriter
 
 __all__ = [

@@ -231,16 +231,12 @@ def _series(motor: Motor, name: str, signal: Signal, time: Integers) -> Series:
     keep = order if there is None else order[there[order]]
     if not keep.size:
         raise BagError(f"{motor.where}: no message of {signal.topic} has {signal.field}")
-    values = column if keep.size == column.size and _is_identity(keep) else column[keep]
+    values = column[keep]
     number = None if table.number is None else table.number[keep]
     bits = None
     if name == "count" and column.dtype.kind in "iu" and column.dtype.itemsize < 4:
         bits = 8 * column.dtype.itemsize
     return Series(time[keep], _converted(motor, name, signal, values), number, bits)
-
-
-def _is_identity(order: Integers) -> bool:
-    return bool(order[0] == 0 and order[-1] == order.size - 1 and np.all(np.diff(order) == 1))
 
 
 def _order(motor: Motor, time: Integers, table: Table, topic: str) -> Integers:

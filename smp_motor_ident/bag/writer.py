@@ -190,10 +190,7 @@ class BagWriter:
             entry.count += 1
             first, last = self._chunk_range
             self._chunk_range = (min(first, stamp), max(last, stamp))
-            if len(self._chunk) >= CHUNK_SIZE:
-                self.flush(force=True)
-            else:
-                self.flush()
+            self.flush(force=len(self._chunk) >= CHUNK_SIZE)
 
     def flush(self, *, force: bool = False) -> None:
         """Bring what was written to the disk, where the flush period is over or it is forced."""

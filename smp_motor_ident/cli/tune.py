@@ -3,6 +3,7 @@
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from smp_motor_ident.cli import frame
 
@@ -16,22 +17,23 @@ FORMATS = (
 )  # fmt: skip
 SPEED_SOURCES = ("measured", "difference", "observer")
 
-TARGETS = (
-    "phase_margin",
-    "maximum_sensitivity",
-    "focus",
-    "bandwidth",
-    "structure",
-    "closed_loop_time_constant",
-    "natural_frequency",
-    "damping",
-    "relay_amplitude",
-    "rule",
-    "max_velocity",
-    "max_acceleration",
-    "transition_time",
-    "accept_unreliable",
-)
+AIMS: dict[str, dict[str, Any]] = {
+    "phase_margin": dict(type=float, help="[deg], 60"),
+    "maximum_sensitivity": dict(type=float, help="Ms, 1.4"),
+    "focus": dict(choices=("balanced", "tracking", "load")),
+    "bandwidth": dict(type=float, help="crossover [rad/s]"),
+    "structure": dict(choices=("pi", "pid")),
+    "closed_loop_time_constant": dict(type=float, help="[s], of simc and lambda"),
+    "natural_frequency": dict(type=float, help="[rad/s], of pole_placement"),
+    "damping": dict(type=float, help="of pole_placement, 0.8"),
+    "max_velocity": dict(type=float, help="[rad/s, wheel]"),
+    "max_acceleration": dict(type=float, help="[rad/s^2, wheel]"),
+    "transition_time": dict(type=float, help="of a change of set-point [s]"),
+    "rule": dict(choices=("tyreus_luyben", "ziegler_nichols"), help="of --relay"),
+}
+"""Arguments that say what to aim at, each a target of the design."""
+
+TARGETS = (*AIMS, "relay_amplitude", "accept_unreliable")
 
 
 def parser() -> argparse.ArgumentParser:
@@ -65,7 +67,9 @@ def parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     p.add_argument("--force", action="store_true", help="replace files that exist")
     _add_loop(p.add_argument_group("the loop that will run"))
-    _add_aims(p.add_argument_group("what to aim at"))
+    aims = p.add_argument_group("what to aim at")
+    for name, options in AIMS.items():
+        aims.add_argument("--" + name.replace("_", "-"), **options)
     _add_running(p.add_argument_group("wheels that run"))
     return p
 
@@ -94,21 +98,6 @@ def _add_loop(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--gear-ratio", type=float, help="else as identified")
     group.add_argument("--counts-per-revolution", type=float, help="else as identified")
     group.add_argument("--supply", type=float, help="[V]; else as identified")
-
-
-def _add_aims(group: argparse._ArgumentGroup) -> None:
-    group.add_argument("--phase-margin", type=float, help="[deg], 60")
-    group.add_argument("--maximum-sensitivity", type=float, help="Ms, 1.4")
-    group.add_argument("--focus", choices=("balanced", "tracking", "load"))
-    group.add_argument("--bandwidth", type=float, help="crossover [rad/s]")
-    group.add_argument("--structure", choices=("pi", "pid"))
-    group.add_argument("--closed-loop-time-constant", type=float, help="[s], of simc and lambda")
-    group.add_argument("--natural-frequency", type=float, help="[rad/s], of pole_placement")
-    group.add_argument("--damping", type=float, help="of pole_placement, 0.8")
-    group.add_argument("--max-velocity", type=float, help="[rad/s, wheel]")
-    group.add_argument("--max-acceleration", type=float, help="[rad/s^2, wheel]")
-    group.add_argument("--transition-time", type=float, help="of a change of set-point [s]")
-    group.add_argument("--rule", choices=("tyreus_luyben", "ziegler_nichols"), help="of --relay")
 
 
 def _add_running(group: argparse._ArgumentGroup) -> None:
