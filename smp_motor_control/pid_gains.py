@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass, fields
 
 from smp_motor_control.errors import ParameterError, check_range
+from smp_motor_control.fields import described
 
 EPSILON = 2.220446049250313e-16
 """Smallest number that counts as other than zero: of an error, a gain or a time step."""
@@ -13,6 +14,9 @@ LARGEST = 1e9
 
 STRATEGIES = ("none", "back_calculation", "conditional_integration")
 """What may keep the integral from winding up while the output is clamped."""
+
+
+_CLAMP = "limit of the output [V]; the supply limits it too."
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -59,22 +63,28 @@ class PidGains:
     2.0
     """
 
-    p: float = 1.0
-    i: float = 0.0
-    d: float = 0.0
-    u_clamp_min: float = -math.inf
-    u_clamp_max: float = math.inf
-    i_clamp_min: float = -math.inf
-    i_clamp_max: float = math.inf
-    antiwindup_strategy: str = "none"
-    tracking_time_constant: float = 0.0
-    error_deadband: float = EPSILON
-    setpoint_weight_p: float = 1.0
-    setpoint_weight_d: float = 0.0
-    derivative_filter_time_constant: float = 0.0
-    feedforward_static: float = 0.0
-    feedforward_velocity: float = 0.0
-    feedforward_acceleration: float = 0.0
+    p: float = described(1.0, "Proportional gain [V s/rad, wheel].")
+    i: float = described(0.0, "Integral gain [V/rad].")
+    d: float = described(0.0, "Derivative gain [V s^2/rad].")
+    u_clamp_min: float = described(-math.inf, f"Lower {_CLAMP}")
+    u_clamp_max: float = described(math.inf, f"Upper {_CLAMP}")
+    i_clamp_min: float = described(-math.inf, "Lower limit of the integral term [V].")
+    i_clamp_max: float = described(math.inf, "Upper limit of the integral term [V].")
+    antiwindup_strategy: str = described("none", f"{', '.join(STRATEGIES[:2])} or {STRATEGIES[2]}.")
+    tracking_time_constant: float = described(
+        0.0, "Of back-calculation [s]; 0 for its default.", minimum=0.0
+    )
+    error_deadband: float = described(
+        EPSILON, "Error within which the integral rests [rad/s].", minimum=0.0
+    )
+    setpoint_weight_p: float = described(1.0, "Share of the reference in the proportional term.")
+    setpoint_weight_d: float = described(0.0, "Share of the reference in the derivative term.")
+    derivative_filter_time_constant: float = described(
+        0.0, "Of the first-order filter [s]; 0 for none.", minimum=0.0
+    )
+    feedforward_static: float = described(0.0, "Voltage against dry friction [V].", minimum=0.0)
+    feedforward_velocity: float = described(0.0, "Voltage per speed [V s/rad].")
+    feedforward_acceleration: float = described(0.0, "Voltage per acceleration [V s^2/rad].")
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -84,8 +94,10 @@ class PidGains:
             elif isinstance(value, (bool, str)) or not hasattr(value, "__float__"):
                 raise ParameterError(f"{field.name} is {value!r}: must be a number")
             else:
-                _check_number(field.name, float(value))
-                object.__setattr__(self, field.name, float(value))
+                value = float(value)
+                if not (math.isinf(value) and "_clamp_" in field.name):
+                    check_range(field.name, value, field.metadata.get("minimum", -LARGEST), LARGEST)
+                object.__setattr__(self, field.name, value)
         if not self.u_clamp_min < self.u_clamp_max:
             raise ParameterError(
                 f"u_clamp_min is {self.u_clamp_min} and u_clamp_max {self.u_clamp_max}: "
@@ -111,17 +123,6 @@ class PidGains:
         return abs(self.p / self.i)
 
 
-_CLAMPS = frozenset(("u_clamp_min", "u_clamp_max", "i_clamp_min", "i_clamp_max"))
-_NOT_NEGATIVE = frozenset(
-    (
-        "tracking_time_constant",
-        "error_deadband",
-        "derivative_filter_time_constant",
-        "feedforward_static",
-    )
-)
-
-
 def _check_strategy(value: object) -> None:
     if value == "legacy":
         raise ParameterError(
@@ -132,9 +133,3 @@ def _check_strategy(value: object) -> None:
         raise ParameterError(
             f"antiwindup_strategy is {value!r}: must be one of {', '.join(STRATEGIES)}"
         )
-
-
-def _check_number(name: str, value: float) -> None:
-    if math.isinf(value) and name in _CLAMPS:
-        return
-    check_range(name, value, 0.0 if name in _NOT_NEGATIVE else -LARGEST, LARGEST)

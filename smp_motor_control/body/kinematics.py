@@ -86,10 +86,7 @@ class SkidSteer:
         return (left + right) / 2.0, (right - left) / self.effective_separation
 
     def reachable_share(self, linear: float, angular: float) -> float:
-        """Return by what a command must be scaled for every wheel to follow, at most 1.
-
-        Linear and angular velocity shrink alike, so the path keeps its shape.
-        """
+        """Return the share of a command, at most 1, that all wheels can follow on its path."""
         fastest = max(map(abs, self.wheel_speeds(linear, angular)))
         if math.isinf(fastest):  # beyond what a number can hold
             return 0.0

@@ -100,7 +100,7 @@ class Odometry:
     def reset(self) -> None:
         """Start at the origin, at rest, with no wheel position known."""
         self.set_odometry(0.0, 0.0, 0.0)
-        self.forget_positions()
+        self._positions: tuple[float, float] | None = None
         self.linear = self.angular = 0.0
         self._velocities.clear()
 
@@ -108,10 +108,6 @@ class Odometry:
         """Declare where the body is, without doubt."""
         self.x, self.y, self.heading = x, y, heading
         self.covariance = np.zeros((3, 3))
-
-    def forget_positions(self) -> None:
-        """Take the next wheel positions as where the wheels have been all along."""
-        self._positions: tuple[float, float] | None = None
 
     def update_from_velocity(self, left: float, right: float, dt: float) -> bool:
         """Integrate the mean speeds of both sides [rad/s]; False where nothing could be."""

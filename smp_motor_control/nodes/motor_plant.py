@@ -35,7 +35,6 @@ from smp_motor_control.nodes.motor_writer import MotorDriver
 from smp_motor_control.nodes.settings import Parameters, described, fixed, given_parameters, nested
 
 _FIXED = ParameterDescriptor(description="As in a motor file.", read_only=True)
-_DRIVE_DEFAULTS = DriveSettings(pwm_steps=1000, current_noise=0.01, latch=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +45,7 @@ class Settings:
     rate: float = fixed(
         200.0, "Samples per second of every motor [Hz].", minimum=1.0, maximum=2000.0
     )
-    drive: DriveSettings = nested(_DRIVE_DEFAULTS)  # noqa: RUF009
+    drive: DriveSettings = nested(DriveSettings(pwm_steps=1000, current_noise=0.01, latch=True))
     supply_resistance: float = described(
         0.0, "Inner resistance of the battery that all motors share [ohm].", minimum=0.0
     )

@@ -79,8 +79,8 @@ class Settings:
         0.7, "Beyond this the present heading is taken for the wanted one [rad]."
     )
     imu_timeout: float = described(0.2, "Age at which a yaw is not used [s].", minimum=0.01)
-    linear: SpeedLimiter = nested(SpeedLimiter(), prefix="linear.x.")  # noqa: RUF009
-    angular: SpeedLimiter = nested(SpeedLimiter(), prefix="angular.z.")  # noqa: RUF009
+    linear: SpeedLimiter = nested(SpeedLimiter(), prefix="linear.x.")
+    angular: SpeedLimiter = nested(SpeedLimiter(), prefix="angular.z.")
 
     def __post_init__(self) -> None:
         check_wheels(self.left_wheel_names, self.right_wheel_names)

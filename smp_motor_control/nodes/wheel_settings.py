@@ -13,26 +13,6 @@ from smp_motor_control.wheel.controller import WheelSettings
 from smp_motor_control.wheel.faults import FaultLimits
 from smp_motor_control.wheel.loop import LoopSettings
 
-_GAINS = {
-    "p": "Proportional gain [V s/rad, wheel].",
-    "i": "Integral gain [V/rad].",
-    "d": "Derivative gain [V s^2/rad].",
-    "u_clamp_min": "Lower limit of the output [V]; the supply limits it too.",
-    "u_clamp_max": "Upper limit of the output [V]; the supply limits it too.",
-    "i_clamp_min": "Lower limit of the integral term [V].",
-    "i_clamp_max": "Upper limit of the integral term [V].",
-    "antiwindup_strategy": "none, back_calculation or conditional_integration.",
-    "tracking_time_constant": "Of back-calculation [s]; 0 for its default.",
-    "error_deadband": "Error within which the integral rests [rad/s].",
-    "setpoint_weight_p": "Share of the reference in the proportional term.",
-    "setpoint_weight_d": "Share of the reference in the derivative term.",
-    "derivative_filter_time_constant": "Of the first-order filter [s]; 0 for none.",
-    "feedforward_static": "Voltage against dry friction [V].",
-    "feedforward_velocity": "Voltage per speed [V s/rad].",
-    "feedforward_acceleration": "Voltage per acceleration [V s^2/rad].",
-}
-_NO_NOISE_GIVEN, _NO_GAINS_GIVEN, _NO_FAULTS_GIVEN = ObserverNoise(), PidGains(), FaultLimits()
-
 
 def _of(group: str, name: str, description: str) -> Any:
     return described(0.0, description, minimum=0.0, name=f"{group}.{name}")
@@ -52,7 +32,7 @@ class Settings:
         0.2, "Silence or age of feedback after which the voltage is zero [s].",
         minimum=0.005, maximum=10.0,
     )  # fmt: skip
-    gains: PidGains = nested(_NO_GAINS_GIVEN, _GAINS)  # noqa: RUF009
+    gains: PidGains = nested(PidGains())
     max_velocity: float = described(0.0, "Of the reference [rad/s]; 0 for none.", minimum=0.0)
     max_acceleration: float = described(0.0, "Of the reference [rad/s^2]; 0 for none.", minimum=0.0)
     max_jerk: float = described(0.0, "Of the reference [rad/s^3]; 0 for none.", minimum=0.0)
@@ -89,8 +69,8 @@ class Settings:
     )
     model_static_voltage: float = _of("model", "static_voltage", "What dry friction takes [V].")
     model_delay: float = _of("model", "delay", "From voltage to effect [s].")
-    observer: ObserverNoise = nested(_NO_NOISE_GIVEN, prefix="observer.")  # noqa: RUF009
-    faults: FaultLimits = nested(_NO_FAULTS_GIVEN)  # noqa: RUF009
+    observer: ObserverNoise = nested(ObserverNoise(), prefix="observer.")
+    faults: FaultLimits = nested(FaultLimits())
     fault_retry: float = described(
         2.0, "Pause before a wheel at fault is tried again under a set-point that is not zero "
         "[s], doubled every time, three times at most; 0: only after a zero set-point.",

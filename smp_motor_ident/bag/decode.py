@@ -119,10 +119,7 @@ def _stamps(columns: dict[str, NDArray[Any]]) -> Integers | None:
 def collect(
     recording: Recording, wanted: Mapping[str, list[str]], types: Types
 ) -> dict[str, Table]:
-    """Read the wanted fields by topic in one pass over a recording's files.
-
-    Topics without messages give empty tables; a field or type that does not exist is an error.
-    """
+    """Read the wanted fields by topic in one pass; topics without messages give empty tables."""
     if recording.is_table:
         return {topic: recording.table(topic, fields) for topic, fields in wanted.items()}
     collectors = {

@@ -48,10 +48,7 @@ class Layout:
 
 
 class Decoder:
-    """Reads the wanted fields of one channel, template by template.
-
-    Of the ``candidates`` for its type the first that fits a message is used from then on.
-    """
+    """Reads the wanted fields of one channel, by the first candidate that fits a message."""
 
     KEPT = 64
 

@@ -69,10 +69,7 @@ def _message(entry: Entry) -> tuple[Channel, int, bytes]:
 
 
 def offered(channel: Channel) -> tuple[bool, bool]:
-    """Return whether a topic's publishers offered reliable and transient local messages.
-
-    Reliable and volatile where nothing is known.
-    """
+    """Return whether reliable and transient local messages were offered; reliable if unknown."""
     try:
         profiles = yaml.safe_load(channel.qos) if channel.qos else []
         reliability = {str(profile["reliability"]).lower() for profile in profiles}

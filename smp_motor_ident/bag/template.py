@@ -59,10 +59,7 @@ class Text:
 
 @dataclass
 class Template:
-    """One message taken apart: positions instead of values.
-
-    ``lengths`` are the positions of all lengths of strings and sequences.
-    """
+    """One message taken apart: positions instead of values, those of all lengths among them."""
 
     root: dict[str, Any]
     lengths: list[int] = field(default_factory=list)

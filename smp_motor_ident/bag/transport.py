@@ -55,10 +55,7 @@ class TransportDelay:
 
 
 def measure_delay(path: Path) -> dict[str, TransportDelay]:
-    """Measure the delay of every wheel's loop from a bag with motor_state and motor_command.
-
-    Wheels without enough commands that answer a sample are left out; none at all is an error.
-    """
+    """Measure the delay of every wheel's loop from a bag, of those with enough answers."""
     found: dict[str, TransportDelay] = {}
     for recording in recordings([path]):
         found.update(_of_recording(recording))

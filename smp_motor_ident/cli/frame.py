@@ -152,11 +152,7 @@ def number(low: float, high: float = float("inf")) -> Callable[[str], float]:
 
 @contextmanager
 def progress(program: str, quiet: bool = False) -> Iterator[Callable[..., None]]:
-    """Show what takes time: a moving line on a terminal, a line per slow step elsewhere.
-
-    What is yielded takes a text and, where it is known, the share of the work that is done,
-    from which the time left follows.
-    """
+    """Show what takes time, by its text and share of the work: a moving line, or a line each."""
     if quiet:
         yield lambda text, share=None: None
     elif sys.stderr.isatty():

@@ -21,10 +21,7 @@ NAME, REPORT = "commissioning.json", "report.html"
 
 
 class Protocol:
-    """Findings, figures and verdict of a commissioning, in ``commissioning.json`` and a page.
-
-    One that is in the folder already is gone on with; findings of accepted codes stop nothing.
-    """
+    """Findings, figures and verdict in ``commissioning.json`` and a page, gone on with if there."""
 
     def __init__(self, folder: Path, accepted: Sequence[str] = ()) -> None:
         self._folder, self._accepted = folder, tuple(accepted)

@@ -124,10 +124,7 @@ def read_changes(
     designed: Designed,
     namespace: str,
 ) -> tuple[list[Change], float]:
-    """Return every change from rest, measured and predicted, and the longest wait for an answer.
-
-    The wait is that of a wheel for the answer to a sample [s].
-    """
+    """Return every change from rest, and the longest wait of a wheel for an answer [s]."""
     wheels = list(designed.document)
     fields = ["encoder_count", "position", "voltage"]
     wanted = {f"{namespace}/{w}/motor_state": fields for w in wheels}

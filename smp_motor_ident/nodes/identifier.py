@@ -65,7 +65,7 @@ class Settings:
     model: str = described("auto", "Model to fit; auto chooses the simplest that holds.")
     commissioned: str = fixed("", "identification.json, or its folder, of the motors to watch.")
     history: str = fixed("", "File that what is seen of them is added to.")
-    demands: Demands = nested(  # noqa: RUF009 (returns a field)
+    demands: Demands = nested(
         Demands(),
         {
             "duration": "Least time in the window [s].",

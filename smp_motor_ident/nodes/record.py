@@ -75,10 +75,7 @@ def qos_document(qos: QoSProfile) -> dict[str, Any]:
 
 
 class Recorder(Node):
-    """Finds topics as they appear, and writes what comes on them.
-
-    It closes the writer when it stops, which it does by itself after a duration that is not 0 [s].
-    """
+    """Finds topics as they appear, and writes what comes on them, for ``duration`` [s] or ever."""
 
     def __init__(self, writer: BagWriter, choice: Choice, duration: float = 0.0) -> None:
         super().__init__("record")

@@ -160,10 +160,7 @@ class _McapFile(Messages):
         return self._split(data, positions, wanted)
 
     def _walk(self, data: bytes) -> tuple[list[int], int]:
-        """Return where messages begin, and where the last whole record ends.
-
-        Schemas and channels on the way are taken in.
-        """
+        """Take in what is defined; return where messages begin and the last whole record ends."""
         unpack, end, pos = _HEAD.unpack_from, len(data), 0
         messages: list[int] = []
         while end - pos >= 9:
