@@ -22,13 +22,7 @@ from std_msgs.msg import Float64
 
 from smp_interfaces.msg import MotorDescription
 from smp_motor_control.errors import ParameterError
-from smp_motor_control.motor.file import (
-    MotorEntry,
-    load_motors,
-    nest,
-    paper_motors,
-    parse_motors,
-)
+from smp_motor_control.motor.file import MotorEntry, load_motors, nest, paper_motors, parse_motors
 from smp_motor_control.motor.hardware import DrivenMotor, DriveSettings, Supply
 from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.motor_writer import MotorDriver

@@ -25,10 +25,7 @@ class Terminal:
     """
 
     def __init__(
-        self,
-        suspend: Callable[[], None],
-        leave: Callable[[], None],
-        resume: Callable[[], None],
+        self, suspend: Callable[[], None], leave: Callable[[], None], resume: Callable[[], None]
     ) -> None:
         if not sys.stdin.isatty():
             raise SmpError("standard input is not a terminal: start it in a terminal of its own")

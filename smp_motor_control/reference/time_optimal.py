@@ -89,12 +89,7 @@ class VoltageLimited:
     __slots__ = ("_legs", "_motor", "duration", "target")
 
     def __init__(
-        self,
-        start: Reference,
-        target: float,
-        drive: Drive,
-        sample_time: float,
-        least: float = 0.0,
+        self, start: Reference, target: float, drive: Drive, sample_time: float, least: float = 0.0
     ) -> None:
         check_range("sample_time of a transition", sample_time, 1e-9, 1e6, "s")
         self.target = target

@@ -9,14 +9,7 @@ from numpy.typing import NDArray
 from smp_motor_control.motor.friction import Gearbox
 from smp_motor_ident.bag.axis import Motor, Series, on_one_axis, unwrapped
 from smp_motor_ident.bag.checks import impossible, is_unsigned, signed
-from smp_motor_ident.bag.clock import (
-    SAME_CLOCK,
-    ClockFit,
-    epochs,
-    fit_clock,
-    judge_stamps,
-    rhythm,
-)
+from smp_motor_ident.bag.clock import SAME_CLOCK, ClockFit, epochs, fit_clock, judge_stamps, rhythm
 from smp_motor_ident.bag.counter import unwrap_angle
 from smp_motor_ident.bag.mapping import MotorMap, Signal
 from smp_motor_ident.bag.runs import one_after_another, pause_between
@@ -31,11 +24,7 @@ _MOTION = ("velocity", "position")
 
 
 def assemble(
-    wheel: str,
-    plan: MotorMap,
-    hardware: Hardware,
-    tables: Mapping[str, Table],
-    source: str,
+    wheel: str, plan: MotorMap, hardware: Hardware, tables: Mapping[str, Table], source: str
 ) -> Record:
     """Make one motor's record."""
     motor = Motor(wheel, plan, hardware, tables, source)

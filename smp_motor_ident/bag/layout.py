@@ -13,14 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident.bag.storage import Batch, Channel, gather
-from smp_motor_ident.bag.template import (
-    DecodeError,
-    Number,
-    Text,
-    locate,
-    parse_path,
-    take_apart,
-)
+from smp_motor_ident.bag.template import DecodeError, Number, Text, locate, parse_path, take_apart
 from smp_motor_ident.bag.types import Definitions
 from smp_motor_ident.errors import BagError
 

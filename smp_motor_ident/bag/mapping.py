@@ -18,13 +18,7 @@ from smp_motor_ident.bag.units import check_unit
 from smp_motor_ident.errors import BagError, ParameterError
 
 SIGNALS = ("voltage", "current", "velocity", "position", "count", "supply", "direction", "time")
-HARDWARE = (
-    "gear_ratio",
-    "counts_per_revolution",
-    "encoder_bits",
-    "supply_voltage",
-    "resistance",
-)
+HARDWARE = ("gear_ratio", "counts_per_revolution", "encoder_bits", "supply_voltage", "resistance")
 _CHOICES = {
     "held": ("after", "before"),
     "clock": ("auto", "header", "log"),

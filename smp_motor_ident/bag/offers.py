@@ -8,12 +8,7 @@ from typing import Any
 import numpy as np
 
 from smp_motor_ident.bag.source import Recording
-from smp_motor_ident.bag.template import (
-    DecodeError,
-    Number,
-    names_beside,
-    take_apart,
-)
+from smp_motor_ident.bag.template import DecodeError, Number, names_beside, take_apart
 from smp_motor_ident.bag.types import Types
 from smp_motor_ident.bag.unpack import decompress_messages
 from smp_motor_ident.errors import BagError

@@ -131,9 +131,7 @@ def propose(recording: Recording, offers: list[Offer], types: Types) -> Proposal
     return Proposal(items, [f"{key}=… {why}" for key, why in asked.items()], "; ".join(remarks))
 
 
-def _by_names(
-    every: Sequence[_Candidate],
-) -> tuple[list[tuple[str, list[_Candidate]]], list[str]]:
+def _by_names(every: Sequence[_Candidate]) -> tuple[list[tuple[str, list[_Candidate]]], list[str]]:
     """Return by wheel what is called a voltage and a motion, and what no data could confirm."""
     wheels: dict[str, list[_Candidate]] = {}
     for candidate in every:

@@ -241,10 +241,7 @@ def _plans(recording: Recording, asked: SignalMap, channels: list[Channel]) -> d
 
 
 def _description(
-    wheel: str,
-    plan: MotorMap,
-    topics: list[str],
-    tables: Mapping[str, Table],
+    wheel: str, plan: MotorMap, topics: list[str], tables: Mapping[str, Table]
 ) -> tuple[dict[str, float], list[Finding]]:
     """Return the last description of a wheel, and what was found about it."""
     spaces = {signal.topic.rpartition("/")[0] for signal in plan.signals.values()}

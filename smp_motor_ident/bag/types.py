@@ -25,12 +25,7 @@ Definitions = Mapping[str, Fields]
 Lookup = Callable[[str], Fields | None]
 """From a type's full name to its fields, None where they are not known there."""
 
-_STORES = (
-    Stores.ROS2_JAZZY,
-    Stores.ROS2_HUMBLE,
-    Stores.ROS2_FOXY,
-    Stores.ROS2_DASHING,
-)
+_STORES = (Stores.ROS2_JAZZY, Stores.ROS2_HUMBLE, Stores.ROS2_FOXY, Stores.ROS2_DASHING)
 _SPOILT = (TypesysError, BagError, ValueError, LookupError, TypeError, RecursionError)
 _LINE = "=" * 80 + "\n"
 

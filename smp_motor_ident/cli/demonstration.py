@@ -13,12 +13,7 @@ from smp_motor_control.motor.file import load_motors, paper_motors
 from smp_motor_ident.cli import steps
 from smp_motor_ident.cli.demo import NAME
 from smp_motor_ident.cli.driving import Drive, answers_of, drive_figure, longest_stall, read_drive
-from smp_motor_ident.cli.processes import (
-    Processes,
-    connect,
-    free_domain,
-    stop_when_orphaned,
-)
+from smp_motor_ident.cli.processes import Processes, connect, free_domain, stop_when_orphaned
 from smp_motor_ident.cli.verdict import check_drive, check_estimates, show
 from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.result import Estimate

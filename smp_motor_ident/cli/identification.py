@@ -24,12 +24,7 @@ from smp_motor_ident.cli.workers import in_parallel
 from smp_motor_ident.compilation import load
 from smp_motor_ident.diagnosis.identifiability import what_next
 from smp_motor_ident.diagnosis.validation import split
-from smp_motor_ident.errors import (
-    BagError,
-    InsufficientExcitationError,
-    ParameterError,
-    SmpError,
-)
+from smp_motor_ident.errors import BagError, InsufficientExcitationError, ParameterError, SmpError
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.estimation.simulation import simulate
 from smp_motor_ident.record import Record
@@ -202,9 +197,7 @@ def _tunings(outcomes: Mapping[str, Outcome], say: Callable[..., None]) -> dict[
 
 
 def _contents(
-    outcomes: Mapping[str, Outcome],
-    arguments: argparse.Namespace,
-    tunings: Mapping[str, Tuning],
+    outcomes: Mapping[str, Outcome], arguments: argparse.Namespace, tunings: Mapping[str, Tuning]
 ) -> list[str]:
     """Return the three files' texts, in the order of :data:`OUTPUTS`."""
     from smp_motor_ident.report.html import Report, render

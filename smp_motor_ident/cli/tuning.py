@@ -13,12 +13,7 @@ from smp_motor_ident.cli import applying, frame, relaying
 from smp_motor_ident.cli.tune import TARGETS
 from smp_motor_ident.errors import DesignError, ParameterError
 from smp_motor_ident.record import Hardware
-from smp_motor_ident.report.document import (
-    check_free,
-    now,
-    read_identification,
-    write_together,
-)
+from smp_motor_ident.report.document import check_free, now, read_identification, write_together
 from smp_motor_ident.report.tuning_figures import tuning_svg
 from smp_motor_ident.result import Estimate, Quantity
 from smp_motor_ident.tune import METHODS, Design, Loop, compare, design_wheels, recommend
@@ -254,9 +249,7 @@ def _compare(
 
 
 def tell_delays(
-    loops: Mapping[str, Loop],
-    measured: Mapping[str, TransportDelay],
-    arguments: argparse.Namespace,
+    loops: Mapping[str, Loop], measured: Mapping[str, TransportDelay], arguments: argparse.Namespace
 ) -> list[str]:
     """Return where the delays come from, in a line for each wheel, if a bag was to tell them."""
     lines = []

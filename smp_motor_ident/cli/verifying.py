@@ -119,10 +119,7 @@ def drive_undisturbed(
 
 
 def read_changes(
-    bag: Path,
-    plan: Sequence[tuple[str, float, float]],
-    designed: Designed,
-    namespace: str,
+    bag: Path, plan: Sequence[tuple[str, float, float]], designed: Designed, namespace: str
 ) -> tuple[list[Change], float]:
     """Return every change from rest, and the longest wait of a wheel for an answer [s]."""
     wheels = list(designed.document)

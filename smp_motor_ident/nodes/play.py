@@ -209,11 +209,7 @@ def _options(arguments: argparse.Namespace) -> Options:
                 f"{option} is {value:g}; it must be {'positive' if low else '0 or more'}"
             )
     return Options(
-        arguments.rate,
-        arguments.start_offset,
-        arguments.loop,
-        arguments.clock,
-        arguments.delay,
+        arguments.rate, arguments.start_offset, arguments.loop, arguments.clock, arguments.delay
     )
 
 

@@ -154,11 +154,7 @@ def nanoseconds(cell: Any) -> int:
 
 
 def columns(
-    rows: Sequence[Row],
-    use: Sequence[int],
-    names: Sequence[str],
-    where: str,
-    lines: Sequence[int],
+    rows: Sequence[Row], use: Sequence[int], names: Sequence[str], where: str, lines: Sequence[int]
 ) -> tuple[list[NDArray[Any]], list[Finding], set[str]]:
     """Return columns as numbers, what was found, and the names of those that are dates [ns].
 

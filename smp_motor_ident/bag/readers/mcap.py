@@ -21,14 +21,7 @@ from mcap.reader import SeekingReader
 from mcap.summary import Summary
 
 from smp_motor_ident.bag.readers.format import Format, Messages
-from smp_motor_ident.bag.storage import (
-    Batch,
-    Bytes,
-    Channel,
-    Integers,
-    gather,
-    message_type,
-)
+from smp_motor_ident.bag.storage import Batch, Bytes, Channel, Integers, gather, message_type
 from smp_motor_ident.bag.unpack import Budget, decompress
 from smp_motor_ident.errors import BagError
 
