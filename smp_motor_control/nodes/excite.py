@@ -115,14 +115,17 @@ class Excite(Node):
         self._timer = runtime.steady_timer(self, 1.0 / settings.rate, self._tick)
 
     def _tick(self) -> None:
-        now = time.monotonic()
+        now, settings = time.monotonic(), self._settings
         if self._begin is None:
             if not self._heard(now):
                 return
             self._begin = now
-            self._announce()
+            self.get_logger().info(
+                f"{settings.signal} of {settings.amplitude:g} V for {settings.duration:g} s "
+                f"on {', '.join(settings.chosen())}"
+            )
         elapsed = now - self._begin
-        if elapsed >= self._settings.duration:
+        if elapsed >= settings.duration:
             self._timer.cancel()
             runtime.finish(0)
             return
@@ -135,7 +138,7 @@ class Excite(Node):
                 )
             writer.send(signal(elapsed), stamp)
         for wheel in self._unheard:
-            self._unheard[wheel] += 1.0 / self._settings.rate
+            self._unheard[wheel] += 1.0 / settings.rate
             if self._unheard[wheel] > _SILENCE:
                 raise LimitError(
                     f"{wheel}: no motor_state for {_SILENCE:g} s; does its driver run?"
@@ -166,13 +169,6 @@ class Excite(Node):
             p.get_subscription_count() >= self.count_subscribers(p.topic_name) for p in publishers
         ) and not any(self.count_publishers(f"{wheel}/motor_state") for wheel in unheard)
         return waited > _OTHERS and (known or waited > 4 * _OTHERS)
-
-    def _announce(self) -> None:
-        settings = self._settings
-        self.get_logger().info(
-            f"{settings.signal} of {settings.amplitude:g} V for {settings.duration:g} s "
-            f"on {', '.join(settings.chosen())}"
-        )
 
     def _assess(self) -> tuple[bytes, str, Mapping[str, object]]:
         if self._begin is None:

@@ -179,7 +179,6 @@ class MotorPlant(Node):
 
     def _assess(self) -> tuple[bytes, str, Mapping[str, object]]:
         values: dict[str, object] = {"samples": self._samples, "late samples": self._late}
-        level, message = runtime.OK, "simulating"
         for wheel in self._wheels:
             values[f"{wheel.name} duty cycle"] = wheel.motor.duty
             values[f"{wheel.name} commands"] = (
@@ -189,23 +188,20 @@ class MotorPlant(Node):
             values[f"{wheel.name} owner"] = wheel.lease.owner(time.monotonic()) or "none"
             values[f"{wheel.name} refused writers"] = wheel.lease.refused or "none"
             values[f"{wheel.name} late commands"] = wheel.lease.late
-        refused = [wheel.name for wheel in self._wheels if wheel.rejected]
+        rejected = [wheel.name for wheel in self._wheels if wheel.rejected]
+        late = [wheel.name for wheel in self._wheels if wheel.lease.late > wheel.late]
         rivals = {w.name: sorted(w.lease.refused) for w in self._wheels if w.lease.refused}
-        if rivals:
-            listed = "; ".join(f"{wheel}: {', '.join(names)}" for wheel, names in rivals.items())
-            level, message = runtime.WARN, f"not yours, refused on {listed}"
-            for wheel in self._wheels:
-                wheel.lease.refused = {}
-        if late := [wheel.name for wheel in self._wheels if wheel.lease.late > wheel.late]:
-            level, message = (
-                runtime.WARN,
-                f"refused commands that come late by their stamps: {late}",
-            )
         for wheel in self._wheels:
-            wheel.late = wheel.lease.late
-        if refused:
-            level, message = runtime.WARN, f"refused messages that are no numbers: {refused}"
-        return level, message, values
+            wheel.late, wheel.lease.refused = wheel.lease.late, {}
+        message = "simulating"
+        if rejected:
+            message = f"refused messages that are no numbers: {rejected}"
+        elif late:
+            message = f"refused commands that come late by their stamps: {late}"
+        elif rivals:
+            listed = "; ".join(f"{wheel}: {', '.join(names)}" for wheel, names in rivals.items())
+            message = f"not yours, refused on {listed}"
+        return runtime.WARN if rejected or late or rivals else runtime.OK, message, values
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -91,7 +91,7 @@ class Wheel:
         self._encoder = Encoder(settings.counts_per_revolution, settings.encoder_bits)
         self._angle = 0.0
         self._count: int | None = None
-        self._applied = 0.0
+        self.applied = 0.0  # what was last sent [V]
 
     def _command(self, now: float, voltage: float) -> None:
         if math.isfinite(voltage):
@@ -117,15 +117,11 @@ class Wheel:
         step = self._gearbox.to_wheel(turned)
         self._angle += step
         state = self._driver.state
-        state.voltage, state.current = self._applied, current
+        state.voltage, state.current = self.applied, current
         state.velocity, state.position = step / dt, self._angle
         state.encoder_count = count
-        state.duty_cycle = min(max(self._applied / battery, -1.0), 1.0) if battery > 0 else 0.0
+        state.duty_cycle = min(max(self.applied / battery, -1.0), 1.0) if battery > 0 else 0.0
         self._driver.report(stamp)
-
-    def sent(self, voltage: float) -> None:
-        """Note what acts from now on."""
-        self._applied = voltage
 
 
 class SerialDriver(Node):
@@ -225,7 +221,7 @@ class SerialDriver(Node):
         with contextlib.suppress(BlockingIOError):
             os.write(self._fd, encode_voltages(voltages))
             for wheel, voltage in zip(self._wheels, voltages):
-                wheel.sent(voltage)
+                wheel.applied = voltage
         self._written = now
 
     def _assess(self) -> tuple[bytes, str, dict[str, object]]:

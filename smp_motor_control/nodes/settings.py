@@ -43,8 +43,8 @@ def described(
     default: Any,
     description: str,
     *,
-    minimum: float | None = None,
-    maximum: float | None = None,
+    minimum: float = -math.inf,
+    maximum: float = math.inf,
     read_only: bool = False,
     name: str = "",
 ) -> Any:
@@ -80,9 +80,14 @@ class _Entry:
     path: tuple[str, ...]
     default: Any
     description: str
-    minimum: float | None = None
-    maximum: float | None = None
+    minimum: float = -math.inf
+    maximum: float = math.inf
     read_only: bool = False
+
+    @property
+    def limited(self) -> bool:
+        """Whether it is a number with a limit."""
+        return math.isfinite(self.minimum) or math.isfinite(self.maximum)
 
 
 def _entries(settings: type) -> dict[str, _Entry]:
@@ -118,10 +123,7 @@ def coerce(name: str, value: Any, default: Any) -> Any:
 
 def _check_range(name: str, value: Any, entry: _Entry) -> None:
     low, high = entry.minimum, entry.maximum
-    if low is None and high is None:
-        return
-    low, high = (-math.inf if low is None else low), (math.inf if high is None else high)
-    if not low <= value <= high:
+    if entry.limited and not low <= value <= high:
         raise ParameterError(f"{name} is {value!r}; it must be in [{low:g}, {high:g}]")
 
 
@@ -230,15 +232,10 @@ def _descriptor(entry: _Entry) -> ParameterDescriptor:
         # Types are checked by `coerce`, which takes 1 for 1.0 and says what it wants.
         dynamic_typing=True,
     )
-    low, high = entry.minimum, entry.maximum
-    if low is None and high is None:
-        return descriptor
-    if isinstance(entry.default, float):
-        low, high = (-1.7e308 if low is None else low), (1.7e308 if high is None else high)
-        descriptor.floating_point_range = [
-            FloatingPointRange(from_value=float(low), to_value=float(high))
-        ]
-    else:
-        low, high = (-(2**31) if low is None else low), (2**31 - 1 if high is None else high)
+    if entry.limited and isinstance(entry.default, float):
+        low, high = max(float(entry.minimum), -1.7e308), min(float(entry.maximum), 1.7e308)
+        descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
+    elif entry.limited:
+        low, high = max(entry.minimum, -(2**31)), min(entry.maximum, 2**31 - 1)
         descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
     return descriptor

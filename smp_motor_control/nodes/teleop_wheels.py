@@ -147,12 +147,9 @@ class TeleopWheels(Node):
                 "all" if len(keyboard.selected) == len(self._wheels) else min(keyboard.selected)
             )
             line = f"wheel mode  {keyboard.scale * speeds.wheel:.2f} rad/s  {chosen}  | {state}"
-            if self._setpoints.get_subscription_count() and self._others():
+            if takers and self.count_publishers(self._setpoints.topic_name) > 1:
                 line += "  (skid_steer commands the wheels too: use body mode)"
         self._terminal.write_status(line if takers else f"{line}  (nobody listens)")
-
-    def _others(self) -> bool:
-        return self.count_publishers(self._setpoints.topic_name) > 1
 
     def _halt(self) -> None:
         """Command zero now to all that was driven from here."""

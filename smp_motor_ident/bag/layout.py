@@ -5,8 +5,9 @@ before it: messages of one topic that agree in these have their numbers at the s
 one indexing per field reads them all.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import tee
 from typing import Any
 
 import numpy as np
@@ -52,8 +53,7 @@ class Decoder:
         self._encoding = channel.encoding
         self.paths = tuple(paths)
         self._steps = [parse_path(path) for path in paths]
-        self._tried: list[Definitions] = []
-        self._others = iter(candidates)
+        self._candidates = iter(candidates)
         self._layouts: list[Layout] = []
         self.undecodable = 0
         self.reason = ""
@@ -76,26 +76,19 @@ class Decoder:
                 left = left[1:]
         return parts
 
-    def _candidates(self) -> Iterator[Definitions]:
-        """Yield what the type may be; none is looked for before the others have failed."""
-        yield from tuple(self._tried)
-        for definitions in self._others:
-            self._tried.append(definitions)
-            yield definitions
-
     def _learn(self, data: bytes) -> bool:
         """Take a message as template; False where it cannot be taken apart."""
-        template = None
-        for definitions in self._candidates():
+        # None is looked for before the others have failed.
+        self._candidates, candidates = tee(self._candidates)
+        for definitions in candidates:
             try:
                 template = take_apart(data, self.name, definitions, self._encoding)
+                break
             except DecodeError as error:
                 self.reason = self.reason or str(error)
-                continue
-            self._tried, self._others = [definitions], iter(())
-            break
-        if template is None:
+        else:
             return False
+        self._candidates = iter([definitions])
         numbers: list[Number | None] = []
         texts: list[Text] = []
         for path, steps in zip(self.paths, self._steps):

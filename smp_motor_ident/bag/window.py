@@ -2,6 +2,7 @@
 
 import math
 from collections import deque
+from typing import Any
 
 import numpy as np
 
@@ -25,7 +26,7 @@ class Window:
         self.wheel = wheel
         self.hardware = Hardware()
         self._length = round(1e9 * length)
-        self._rows: deque[tuple[int, float, float, float, float, int, int]] = deque(maxlen=CAPACITY)
+        self._rows: deque[tuple[Any, ...]] = deque(maxlen=CAPACITY)
 
     def __len__(self) -> int:
         """Return the number of samples held."""
@@ -36,28 +37,19 @@ class Window:
         """Stamp of the last sample [ns], 0 without one."""
         return self._rows[-1][0] if self._rows else 0
 
-    def add(
-        self,
-        stamp: int,
-        voltage: float,
-        current: float,
-        velocity: float,
-        position: float,
-        count: int,
-        number: int = 0,
-    ) -> None:
-        """Take one sample; a stamp [ns] that was set back begins the window anew.
+    def add(self, stamp: int, state: Any, number: int = 0) -> None:
+        """Take one ``motor_state`` with its publisher's number, 0 where that is not known.
 
-        ``number`` is the publisher's own, 0 where that is not known.
+        A stamp [ns] that was set back begins the window anew.
         """
-        if not math.isfinite(voltage):
+        if not math.isfinite(state.voltage):
             return
         rows = self._rows
         if rows and stamp <= rows[-1][0]:
             if stamp > rows[-1][0] - self._length:
                 return  # late or twice
             rows.clear()  # the clock was set back
-        rows.append((stamp, voltage, current, velocity, position, count, number))
+        rows.append((stamp, number, *(getattr(state, name) for name in OWN_FIELDS.values())))
         while rows[0][0] < stamp - self._length:
             rows.popleft()
 
@@ -65,16 +57,8 @@ class Window:
         """Return what is held, refused as a bag of it would be; None below 10 samples."""
         if len(self) < LEAST:
             return None
-        rows = zip(*self._rows, strict=True)
-        stamp, voltage, current, velocity, position, count, number = rows
-        time, numbers = np.array(stamp, dtype=np.int64), np.array(number, dtype=np.int64)
-        columns = {
-            "voltage": np.array(voltage),
-            "current": np.array(current),
-            "velocity": np.array(velocity),
-            "position": np.array(position),
-            "encoder_count": np.array(count, dtype=np.int64),
-        }
+        time, numbers, *values = map(np.array, zip(*self._rows, strict=True))
+        columns = dict(zip(OWN_FIELDS.values(), values))
         signals = {name: Signal("", path) for name, path in OWN_FIELDS.items()}
         if self.hardware.counts_per_revolution is None or not np.ptp(columns["encoder_count"]):
             del signals["count"]

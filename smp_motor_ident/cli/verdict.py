@@ -112,11 +112,9 @@ def check_estimates(
 
 def check_drive(answers: Mapping[str, Sequence[Answer]]) -> list[Check]:
     """Hold what the wheels did against the limits."""
-    over, settled = [], []
-    for wheel, given in answers.items():
-        for answer in given:
-            over.append((answer.overshoot, f"{wheel} {answer.segment}"))
-            settled.append((answer.settling, f"{wheel} {answer.segment}"))
+    every = [(f"{wheel} {one.segment}", one) for wheel, given in answers.items() for one in given]
+    over = [(one.overshoot, where) for where, one in every]
+    settled = [(one.settling, where) for where, one in every]
     return [
         _worst("overshoot", over, MOST_OVERSHOOT, "%"),
         _worst("settling time", settled, MOST_SETTLING, "s"),

@@ -121,13 +121,10 @@ class Wheel:
     def _on_state(self, message: MotorState, info: Mapping[str, Any]) -> None:
         self.stamp = stamp = message.header.stamp
         nanoseconds = runtime.nanoseconds(stamp)
-        voltage, current, position = message.voltage, message.current, message.position
-        count = message.encoder_count
         if self.monitor is not None:
-            turned = self._turned(count, position)
-            self.monitor.add(1e-9 * nanoseconds, voltage, current, turned)
-        number = info["publication_sequence_number"] or 0
-        self.window.add(nanoseconds, voltage, current, message.velocity, position, count, number)
+            turned = self._turned(message.encoder_count, message.position)
+            self.monitor.add(1e-9 * nanoseconds, message.voltage, message.current, turned)
+        self.window.add(nanoseconds, message, info["publication_sequence_number"] or 0)
 
     def _turned(self, count: int, position: float) -> float:
         """Return the motor's angle since the sample before [rad]; NaN where it is not known."""

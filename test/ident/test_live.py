@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,14 @@ from smp_motor_ident.record import Hardware
 RATIO, COUNTS, STEP = 65.5, 500.0, 0.005
 SECOND = 1_000_000_000
 NOW = 10**9 * SECOND
+
+
+def state(
+    voltage: float, current: float, velocity: float, position: float, count: int
+) -> SimpleNamespace:
+    return SimpleNamespace(
+        voltage=voltage, current=current, velocity=velocity, position=position, encoder_count=count
+    )
 
 
 def filled(seconds: float, voltage: object = None, length: float = 60.0) -> Window:
@@ -30,7 +39,7 @@ def filled(seconds: float, voltage: object = None, length: float = 60.0) -> Wind
     counts = np.floor(angle * COUNTS / (2 * np.pi)).astype(int)
     for t, v, a, c in zip(time, volts, angle, counts, strict=True):
         wrapped = (int(c) + 2**15) % 2**16 - 2**15
-        window.add(NOW + round(1e9 * t), v, np.nan, 25 * v / RATIO, a / RATIO, wrapped)
+        window.add(NOW + round(1e9 * t), state(v, np.nan, 25 * v / RATIO, a / RATIO, wrapped))
     return window
 
 
@@ -57,10 +66,10 @@ def test_window_keeps_only_its_length() -> None:
 def test_a_gap_begins_a_segment_and_a_late_sample_is_left_out() -> None:
     window = filled(5.0)
     before = len(window)
-    window.add(NOW + 2 * SECOND, 1.0, np.nan, 0.0, 0.0, 0)
+    window.add(NOW + 2 * SECOND, state(1.0, np.nan, 0.0, 0.0, 0))
     assert len(window) == before
     for k in range(2):  # a single sample between gaps tells nothing
-        window.add(NOW + 7 * SECOND + k * 5_000_000, 1.0, np.nan, 0.0, 0.0, 0)
+        window.add(NOW + 7 * SECOND + k * 5_000_000, state(1.0, np.nan, 0.0, 0.0, 0))
     record = window.record()
     assert record is not None
     assert record.starts == (0, before)
@@ -74,7 +83,9 @@ def test_samples_that_come_late_from_a_busy_machine_begin_no_segment() -> None:
     for k in range(50, 2000, 50):
         time[k : k + 8] = time[k] + 6 * STEP + np.arange(8) * STEP / 8
     for t in time:
-        window.add(NOW + round(1e9 * t), 3.0, 0.1, 75 / RATIO, 75 * t / RATIO, round(5968 * t))
+        window.add(
+            NOW + round(1e9 * t), state(3.0, 0.1, 75 / RATIO, 75 * t / RATIO, round(5968 * t))
+        )
     record = window.record()
     assert record is not None
     assert record.starts == (0,)
@@ -82,14 +93,14 @@ def test_samples_that_come_late_from_a_busy_machine_begin_no_segment() -> None:
 
 def test_a_clock_that_was_set_back_begins_the_window_anew() -> None:
     window = filled(5.0, length=3.0)
-    window.add(NOW - 3600 * SECOND, 1.0, np.nan, 0.0, 0.0, 0)
+    window.add(NOW - 3600 * SECOND, state(1.0, np.nan, 0.0, 0.0, 0))
     assert len(window) == 1
 
 
 def test_samples_without_voltage_are_left_out() -> None:
     window = filled(1.0)
     before = len(window)
-    window.add(NOW + 50 * SECOND, np.nan, np.nan, 0.0, 0.0, 0)
+    window.add(NOW + 50 * SECOND, state(np.nan, np.nan, 0.0, 0.0, 0))
     assert len(window) == before
 
 
