@@ -164,19 +164,6 @@ class Chirp(Band):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Prbs(Excitation):
-    """Pseudo-random binary voltage."""
-
-    hold: float = 0.05  # nominal shortest time between two changes of sign [s]
-    seed: int = 0  # of the sequence
-
-    def _shape(self, time: Array) -> Array:
-        index = (time * DETUNING / self.hold).astype(np.int64)
-        bits = _random_levels(self.seed)
-        return np.where(bits[index % bits.size] < 0, -1.0, 1.0)
-
-
-@dataclass(frozen=True, kw_only=True)
 class Steps(Excitation):
     """Steps to random voltages of either sign, each held."""
 
@@ -188,6 +175,16 @@ class Steps(Excitation):
         levels = _random_levels(self.seed)
         held: Array = levels[index % levels.size]
         return held
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prbs(Steps):
+    """Pseudo-random binary voltage: steps of full size."""
+
+    hold: float = 0.05  # nominal shortest time between two changes of sign [s]
+
+    def _shape(self, time: Array) -> Array:
+        return np.where(super()._shape(time) < 0, -1.0, 1.0)
 
 
 @lru_cache(maxsize=32)
@@ -236,12 +233,6 @@ class Bounded(Excitation):
 
 
 SIGNALS: dict[str, type[Excitation]] = {
-    "sine": Sine,
-    "square": Square,
-    "fourier": Fourier,
-    "chirp": Chirp,
-    "prbs": Prbs,
-    "steps": Steps,
-    "ramp": Ramp,
+    kind.__name__.lower(): kind for kind in (Sine, Square, Fourier, Chirp, Prbs, Steps, Ramp)
 }
 """The signals by the names that tools and the ``excite`` node use."""

@@ -94,9 +94,8 @@ def _stand(client: RobotClient, send_zero: Callable[[], None], wheels: Sequence[
         if message.setpoint == 0.0:
             heard[wheel] = time.monotonic()
 
-    topics = {f"{wheel}/pid_state": lambda m, wheel=wheel: take(wheel, m) for wheel in wheels}
     followed = time.monotonic() + STANDSTILL
-    with client.listen(PidState, topics):
+    with client.listen_to_wheels(PidState, "pid_state", wheels, take):
         while time.monotonic() < followed or min(heard.values()) < followed:
             if time.monotonic() > followed + PATIENCE:
                 silent = [f"{w}/pid_state" for w in wheels if heard[w] < followed]

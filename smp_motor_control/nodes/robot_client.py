@@ -8,7 +8,8 @@ when the block ends; :mod:`smp_motor_control.nodes.guard` does it where the tool
 import contextlib
 import re
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import rclpy
@@ -127,6 +128,18 @@ class RobotClient:
             for subscription in made:
                 self.node.destroy_subscription(subscription)
 
+    def listen_to_wheels(
+        self,
+        kind: Any,
+        topic: str,
+        wheels: Iterable[str],
+        take: Callable[[str, Any], object],
+        quality: QoSProfile = STREAM_SUBSCRIBER,
+    ) -> Any:
+        """Hand messages of a topic of every wheel to a callable, behind the wheel's name."""
+        topics = {f"{wheel}/{topic}": partial(take, wheel) for wheel in wheels}
+        return self.listen(kind, topics, quality)
+
     def find_wheels(self) -> list[str]:
         """Return the wheels whose hardware reports in the robot's namespace, after a second."""
         self.spin(DISCOVERY)
@@ -137,11 +150,11 @@ class RobotClient:
     def wait_for_wheels(self, wheels: Sequence[str], timeout: float) -> dict[str, float]:
         """Wait until every wheel has reported for half a second; return their rates [Hz]."""
         stamps: dict[str, list[float]] = {wheel: [] for wheel in wheels}
-        topics = {
-            f"{wheel}/motor_state": lambda m, seen=seen: seen.append(seconds(m.header.stamp))
-            for wheel, seen in stamps.items()
-        }
-        with self.listen(MotorState, topics):
+
+        def take(wheel: str, message: MotorState) -> None:
+            stamps[wheel].append(seconds(message.header.stamp))
+
+        with self.listen_to_wheels(MotorState, "motor_state", wheels, take):
             heard = self.until(
                 lambda: all(seen and seen[-1] - seen[0] > 0.5 for seen in stamps.values()), timeout
             )
@@ -299,14 +312,13 @@ class RobotClient:
     def paused(self, wheels: Sequence[str]) -> Any:
         """Deactivate the wheels' active controllers inside the block, and see the wheels free."""
         owners: dict[str, str] = {}
-        topics = {
-            f"{wheel}/motor_owner": lambda m, wheel=wheel: owners.update({wheel: m.data})
-            for wheel in wheels
-        }
-        with self.listen(String, topics, LATCHED):
-            self.spin(
-                DISCOVERY
-            )  # what is discovered together with the wheel is not so at one instant
+
+        def take(wheel: str, message: String) -> None:
+            owners[wheel] = message.data
+
+        with self.listen_to_wheels(String, "motor_owner", wheels, take, LATCHED):
+            # What is discovered together with the wheel is not so at one instant.
+            self.spin(DISCOVERY)
             self.until(lambda: all(self._found(w, w in owners) for w in wheels), PATIENCE)
             for wheel in wheels:
                 if rival := self.strangers(wheel):

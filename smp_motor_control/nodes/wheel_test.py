@@ -58,13 +58,10 @@ class WheelTest:
     @contextlib.contextmanager
     def open(self) -> Iterator["WheelTest"]:
         """Hear and drive inside the block."""
-        topics = {
-            f"{wheel}/motor_state": lambda message, wheel=wheel: self._answer(wheel, message)
-            for wheel in self.tapes
-        }
         self._writers = {w: MotorWriter(self._client.node, f"{w}/") for w in self.tapes}
         try:
-            with self._client.listen(MotorState, topics):
+            listen = self._client.listen_to_wheels
+            with listen(MotorState, "motor_state", self.tapes, self._answer):
                 yield self
         finally:
             for writer in self._writers.values():
@@ -115,11 +112,8 @@ def descriptions(
 ) -> dict[str, MotorDescription]:
     """Return what the hardware says of itself; wheels that say nothing in time are left out."""
     found: dict[str, MotorDescription] = {}
-    topics = {
-        f"{wheel}/motor_description": lambda message, wheel=wheel: found.update({wheel: message})
-        for wheel in wheels
-    }
-    with client.listen(MotorDescription, topics, LATCHED):
+    take = found.__setitem__
+    with client.listen_to_wheels(MotorDescription, "motor_description", wheels, take, LATCHED):
         client.until(lambda: len(found) == len(wheels), patience)
     return found
 

@@ -215,7 +215,7 @@ def _of_the_file(recording: Recording) -> Proposal | None:
     if not recording.is_table:
         return None
     try:
-        plans = self_described(recording, recording.channels(), SignalMap())
+        plans = self_described(recording, SignalMap())
     except BagError:
         return None
     items, rim = [], False

@@ -171,7 +171,7 @@ def _records(recording: Recording, asked: SignalMap, types: Types) -> list[Recor
     descriptions = [c.topic for c in channels if c.type == DESCRIPTION]
     wanted.update({topic: list(mappings.HARDWARE) for topic in descriptions})
     if recording.is_table:
-        add_time_columns(recording, plans, channels, wanted)
+        add_time_columns(recording, plans, wanted)
     tables = collect(recording, wanted, types)
     records: list[Record] = []
     failures: list[BagError] = []
@@ -180,7 +180,7 @@ def _records(recording: Recording, asked: SignalMap, types: Types) -> list[Recor
         description, findings = _description(wheel, plan, descriptions, tables)
         plan = replace(plan, hardware={**description, **plan.hardware})
         try:
-            mine = timed(recording, plan, channels, tables) if recording.is_table else tables
+            mine = timed(recording, plan, tables) if recording.is_table else tables
             record = assemble(wheel, plan, hardware_of(plan.hardware), mine, recording.name)
             records.append(replace(record, findings=(*findings, *record.findings)))
         except BagError as error:
@@ -214,7 +214,7 @@ def _plans(recording: Recording, asked: SignalMap, channels: list[Channel]) -> d
                     )
         return plans
     if recording.is_table:
-        return self_described(recording, channels, asked)
+        return self_described(recording, asked)
     states = sorted(channel.topic for channel in channels if channel.type == STATE)
     if not states:
         raise BagError(

@@ -63,14 +63,13 @@ def _unit(name: str, signal: Signal, channel: Channel, field: str) -> str:
     return unit_of(name, channel.units.get(field, ""), field)
 
 
-def self_described(
-    recording: Recording, channels: list[Channel], asked: SignalMap
-) -> dict[str, MotorMap]:
+def self_described(recording: Recording, asked: SignalMap) -> dict[str, MotorMap]:
     """Return the plans of a table whose columns and units are named as the signals are.
 
     Those of a drivetrain have their side before the name, such as ``left_voltage``.
     """
     plans: dict[str, MotorMap] = {}
+    channels = recording.channels()
     for channel, (wheel, before) in product(channels, _WHEELS):
         named = {
             name: before + name
@@ -92,24 +91,19 @@ def self_described(
 
 
 def add_time_columns(
-    recording: Recording,
-    plans: Mapping[str, MotorMap],
-    channels: list[Channel],
-    wanted: dict[str, list[str]],
+    recording: Recording, plans: Mapping[str, MotorMap], wanted: dict[str, list[str]]
 ) -> None:
     """Ask for the column of time of every table that is wanted."""
     for plan in plans.values():
         for topic in {signal.topic for signal in plan.signals.values()}:
-            signal = _time_signal(recording, plan, topic, channels)
+            signal = _time_signal(recording, plan, topic)
             if signal is not None and signal.field not in wanted[topic]:
                 wanted[topic].append(signal.field)
 
 
-def _time_signal(
-    recording: Recording, plan: MotorMap, topic: str, channels: list[Channel]
-) -> Signal | None:
+def _time_signal(recording: Recording, plan: MotorMap, topic: str) -> Signal | None:
     """Return the column of time of a table; None where it needs none."""
-    channel = next((c for c in channels if c.topic == topic), None)
+    channel = next((c for c in recording.channels() if c.topic == topic), None)
     if channel is None or set(channel.fields) <= {"value"} or channel.fields[:1] == ("value[0]",):
         return None  # an entry with times of its own
     mapped = plan.signals.get("time")
@@ -127,9 +121,7 @@ def _time_signal(
     )
 
 
-def timed(
-    recording: Recording, plan: MotorMap, channels: list[Channel], tables: Mapping[str, Table]
-) -> dict[str, Table]:
+def timed(recording: Recording, plan: MotorMap, tables: Mapping[str, Table]) -> dict[str, Table]:
     """Return a plan's tables with their times in nanoseconds; rows without one are left out."""
     result = {}
     written = []
@@ -139,7 +131,7 @@ def timed(
         log = table.log
         if log is None:
             written.append(topic)
-            signal = _time_signal(recording, plan, topic, channels)
+            signal = _time_signal(recording, plan, topic)
             size = next(iter(table.columns.values())).size
             if signal is None:
                 log = np.rint(np.arange(size) * (plan.sample_time * 1e9)).astype(np.int64)

@@ -106,20 +106,16 @@ def _grouped(
 
 def columns(rows: Sequence[Row]) -> dict[str, list[object]]:
     """Return the table by columns; a number that does not exist is None."""
-    out: dict[str, list[object]] = {
-        "robot": [r.robot for r in rows],
-        "wheel": [r.wheel for r in rows],
-        "date": [r.date for r in rows],
-        "source": [r.source for r in rows],
-    }
+
+    def plain(*names: str) -> dict[str, list[object]]:
+        return {name: [getattr(row, name) for row in rows] for name in names}
+
+    out = plain("robot", "wheel", "date", "source")
     for name in QUANTITIES:
         pairs = [r.values.get(name) for r in rows]
         out[name] = [p[0] if p else None for p in pairs]
         out[f"{name}_std"] = [p[1] if p else None for p in pairs]
-    out["fit_percent"] = [r.fit_percent for r in rows]
-    out["unreliable"] = [r.unreliable for r in rows]
-    out["failure"] = [r.failure for r in rows]
-    return out
+    return out | plain("fit_percent", "unreliable", "failure")
 
 
 def table(rows: Sequence[Row]) -> tuple[str, bytes]:
