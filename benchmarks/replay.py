@@ -32,7 +32,7 @@ def main(folder: Path) -> int:
     import rclpy
 
     from smp_interfaces.msg import MotorParameters
-    from smp_motor_control.nodes.conventions import LATCHED
+    from smp_motor_control.nodes.runtime import LATCHED
 
     offline = read_identification(folder / "identification")
     rclpy.init()

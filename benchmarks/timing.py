@@ -285,7 +285,7 @@ def real_time_granted() -> bool:
 def wheels(rate: float, duration: float, priority: int) -> bool:
     """Measure four wheels at once beside four bare nodes; the feeder gives way to them."""
     from smp_motor_control import WHEELS
-    from smp_motor_control.nodes.keeping_time import keep_time
+    from smp_motor_control.nodes.wheel_pid import keep_time
 
     if priority and not real_time_granted():
         print("  the system grants no real-time priority: running without")

@@ -10,8 +10,8 @@ from sensor_msgs.msg import JointState
 
 from smp_interfaces.msg import PidState
 from smp_motor_control import joint_of
-from smp_motor_control.nodes.conventions import STREAM_PUBLISHER
 from smp_motor_control.nodes.robot_client import PATIENCE, RobotClient, RobotError
+from smp_motor_control.nodes.runtime import STREAM_PUBLISHER
 
 REPEAT = 0.02
 """Interval at which a command is repeated [s]."""

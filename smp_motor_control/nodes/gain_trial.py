@@ -12,8 +12,8 @@ import numpy as np
 from smp_interfaces.msg import PidState
 from smp_motor_control import controller_of
 from smp_motor_control.errors import SmpError
-from smp_motor_control.nodes.conventions import seconds
 from smp_motor_control.nodes.robot_client import LOOK, PATIENCE, RobotClient, RobotError
+from smp_motor_control.nodes.runtime import seconds
 
 BASELINE = 0.5
 """How long the old gains are watched first [s]."""

@@ -11,7 +11,7 @@ from std_msgs.msg import String
 
 from smp_interfaces.msg import MotorCommand, MotorDescription, MotorState
 from smp_motor_control import joint_of
-from smp_motor_control.nodes.conventions import (
+from smp_motor_control.nodes.runtime import (
     LATCHED,
     STREAM_PUBLISHER,
     STREAM_SUBSCRIBER,

@@ -26,9 +26,9 @@ from std_msgs.msg import String
 from smp_interfaces.msg import MotorState
 from smp_motor_control import controller_of
 from smp_motor_control.errors import SmpError
-from smp_motor_control.nodes.conventions import LATCHED, STREAM_SUBSCRIBER, seconds, steady_timer
 from smp_motor_control.nodes.executor import LeanExecutor
 from smp_motor_control.nodes.guard import Guard
+from smp_motor_control.nodes.runtime import LATCHED, STREAM_SUBSCRIBER, seconds, steady_timer
 
 PATIENCE = 10.0
 """Longest wait for a service or a topic [s]; on a busy machine discovery takes seconds."""

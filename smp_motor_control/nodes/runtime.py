@@ -1,4 +1,4 @@
-"""What all nodes share: start, spin, stop with a zero command; and the entry point to the rest.
+"""What all nodes share: start, spin, stop with a zero command; QoS, timers, stamps and health.
 
 A node's ``main`` is ``return run("name", lambda: TheNode(), argv)``.  The node may define
 ``on_stop()``, which :func:`run` calls before it destroys the node whatever the reason of
@@ -11,29 +11,47 @@ import re
 import signal
 import sys
 import threading
+import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException
 from rclpy.lifecycle import LifecycleNode
 from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
+from rclpy.timer import Timer
 
 from smp_motor_control.entry import interrupted
 from smp_motor_control.errors import SmpError
-from smp_motor_control.nodes.conventions import (  # noqa: F401  (offered by this module)
-    LATCHED,
-    STREAM_PUBLISHER,
-    STREAM_SUBSCRIBER,
-    nanoseconds,
-    seconds,
-    send_last,
-    steady_timer,
-)
-from smp_motor_control.nodes.diagnostics import ERROR, OK, WARN, Diagnostics  # noqa: F401
 from smp_motor_control.nodes.executor import LeanExecutor
+
+OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+
+# REP-2003: streams are published reliably and taken best effort, so that both a stock
+# reliable subscriber and a stock best-effort publisher find a partner in our nodes.
+# No lease of liveliness is offered: what keeps it can lock up with the end of another process
+# (docs/decisions/when-a-wheel-stops.md).
+STREAM_PUBLISHER = QoSProfile(depth=5, reliability=ReliabilityPolicy.RELIABLE)
+"""Commands, states, set-points: what is outdated by the next message."""
+
+STREAM_SUBSCRIBER = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""The other end of :data:`STREAM_PUBLISHER`, and of any stock publisher."""
+
+LATCHED = QoSProfile(
+    depth=1,
+    history=HistoryPolicy.KEEP_LAST,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+"""Descriptions: the last one is kept for whoever comes late."""
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGQUIT, signal.SIGHUP)
 
@@ -192,3 +210,78 @@ def refuse_impossible_transitions(node: LifecycleNode) -> None:
             return response
 
     service.callback = guarded
+
+
+def send_last(publisher: Publisher, message: Any) -> None:
+    """Publish a last message and wait until those who take it reliably have it."""
+    publisher.publish(message)
+    publisher.wait_for_all_acked(Duration(seconds=0.3))
+    # Best-effort readers acknowledge nothing: give the datagram time to leave the process.
+    time.sleep(0.02)
+
+
+def steady_timer(node: Node, period: float, callback: Callable[[], None]) -> Timer:
+    """Return a timer that neither simulated nor corrected time can stop."""
+    return node.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+
+def nanoseconds(stamp: Any) -> int:
+    """Return a stamp in whole nanoseconds; 0 where none was given."""
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+def seconds(stamp: Any) -> float:
+    """Return a ``builtin_interfaces/Time`` as seconds."""
+    return float(stamp.sec + 1e-9 * stamp.nanosec)
+
+
+class Diagnostics:
+    """Publishes a node's health on ``/diagnostics``, every second and at once on a change."""
+
+    def __init__(
+        self,
+        node: Node,
+        assess: Callable[[], tuple[bytes, str, Mapping[str, object]]],
+        hardware_id: str = "",
+    ) -> None:
+        self._node = node
+        self._assess = assess
+        self._name = node.get_fully_qualified_name().lstrip("/")
+        self._hardware_id = hardware_id
+        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._timer = steady_timer(node, 1.0, self._tick)
+        self.due = False  # whether ``assess`` is asked for the report of the second
+
+    def _tick(self) -> None:
+        self.due = True
+        self.publish()
+        self.due = False
+
+    def destroy(self) -> None:
+        """Fall silent and give the topic back."""
+        self._node.destroy_timer(self._timer)
+        self._node.destroy_publisher(self._publisher)
+
+    def publish(self) -> None:
+        """Publish the present health now."""
+        level, message, values = self._assess()
+        clock = self._node.get_clock()
+        if clock.ros_time_is_active and clock.now().nanoseconds == 0:
+            level = max(level, WARN)
+            message = f"use_sim_time is set, but nothing is heard on /clock; {message}"
+        array = DiagnosticArray()
+        array.header.stamp = clock.now().to_msg()
+        array.status = [
+            DiagnosticStatus(
+                level=level,
+                name=self._name,
+                message=message,
+                hardware_id=self._hardware_id,
+                values=[KeyValue(key=key, value=_text(value)) for key, value in values.items()],
+            )
+        ]
+        self._publisher.publish(array)
+
+
+def _text(value: object) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -5,10 +5,15 @@ A lifecycle node that starts by itself.  It answers every ``motor_state`` with o
 ``~/reset`` releases a wheel that is latched by a fault.
 """
 
+import contextlib
+import gc
+import os
 import time
+from collections.abc import Callable
 from typing import Any
 
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
@@ -18,7 +23,6 @@ from smp_motor_control.encoder import Encoder
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.motor.parameters import Gearbox
 from smp_motor_control.nodes import runtime
-from smp_motor_control.nodes.keeping_time import keep_time
 from smp_motor_control.nodes.motor_writer import MotorWriter
 from smp_motor_control.nodes.settings import Parameters, given_parameters
 from smp_motor_control.nodes.wheel_report import WheelReport, pid_state
@@ -166,6 +170,42 @@ class WheelPid(LifecycleNode):
 
     def _ros_now(self) -> int:
         return int(self.get_clock().now().nanoseconds)
+
+
+def keep_time(node: Node, priority: int, affinity: tuple[int, ...]) -> list[str]:
+    """Ask the system for what a control loop wants, and do without where it says no.
+
+    Freezes what is allocated so far out of the garbage collector's sight and turns the
+    collector off; who calls this collects where it does no harm.
+    """
+    asked: dict[str, Callable[[int], None]] = {}
+    if priority > 0:
+        asked[f"scheduling_priority {priority}"] = lambda thread: os.sched_setscheduler(
+            thread, os.SCHED_FIFO, os.sched_param(priority)
+        )
+    if affinity:
+        asked[f"cpu_affinity {list(affinity)}"] = lambda t: os.sched_setaffinity(t, affinity)
+    refused = []
+    for what, ask in asked.items():
+        try:
+            for thread in _threads():
+                with contextlib.suppress(ProcessLookupError):
+                    ask(thread)
+        except (OSError, ValueError, OverflowError, AttributeError) as error:
+            refused.append(f"{what} not granted: {error}")
+            node.get_logger().warning(f"{refused[-1]}; running without it")
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    return refused
+
+
+def _threads() -> list[int]:
+    """Return all threads of this process: a sample comes through those of the middleware."""
+    try:
+        return [int(name) for name in os.listdir("/proc/self/task")]
+    except OSError:
+        return [0]
 
 
 def _make() -> WheelPid:

@@ -14,9 +14,9 @@ from sensor_msgs.msg import BatteryState
 
 from smp_interfaces.msg import MotorDescription, MotorState
 from smp_motor_control.encoder import Unwrapper
-from smp_motor_control.nodes.conventions import LATCHED, seconds
 from smp_motor_control.nodes.motor_writer import MotorWriter
 from smp_motor_control.nodes.robot_client import RobotClient, RobotError
+from smp_motor_control.nodes.runtime import LATCHED, seconds
 from smp_motor_control.wheel.protection import Bounds, Protection
 
 Law = Callable[[float], float]

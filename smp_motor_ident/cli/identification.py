@@ -18,8 +18,7 @@ from smp_motor_ident import bag, likelihood
 from smp_motor_ident.cli import known_loop
 from smp_motor_ident.cli.frame import progress
 from smp_motor_ident.cli.identify import NAME
-from smp_motor_ident.cli.tables import console, estimate_table
-from smp_motor_ident.cli.topics import list_topics
+from smp_motor_ident.cli.tables import console, estimate_table, list_topics
 from smp_motor_ident.cli.workers import in_parallel
 from smp_motor_ident.compilation import load
 from smp_motor_ident.diagnosis.identifiability import what_next

@@ -14,7 +14,7 @@ from smp_motor_ident.cli.tune import TARGETS
 from smp_motor_ident.errors import DesignError, ParameterError
 from smp_motor_ident.record import Hardware
 from smp_motor_ident.report.document import check_free, now, read_identification, write_together
-from smp_motor_ident.report.tuning_figures import tuning_svg
+from smp_motor_ident.report.tuning_page import tuning_svg
 from smp_motor_ident.result import Estimate, Quantity
 from smp_motor_ident.tune import METHODS, Design, Loop, compare, design_wheels, recommend
 from smp_motor_ident.tune.case import COMMON

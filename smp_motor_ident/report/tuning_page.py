@@ -1,4 +1,4 @@
-"""The tuning page: designs over bandwidth and phase margin, computed beforehand by `tune`.
+"""Designs drawn: the figure of a tuning, and the page of designs over bandwidth and phase margin.
 
 Nothing of control is computed in the page; its sliders choose among these designs.
 """
@@ -7,12 +7,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from smp_motor_ident.errors import SmpError
-from smp_motor_ident.report.chart import Chart, packed
-from smp_motor_ident.report.tuning_figures import tuning_charts
-from smp_motor_ident.report.words import number
+from smp_motor_ident.report.chart import Chart, Curve, packed
+from smp_motor_ident.report.drawing import document
+from smp_motor_ident.report.words import label, number
 from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune import METHODS, Design, Loop, design
+from smp_motor_ident.tune.arrays import Array
 from smp_motor_ident.tune.curves import Curves, curves
 from smp_motor_ident.tune.specification import Band
 from smp_motor_ident.tune.writing import gains_yaml
@@ -145,3 +148,53 @@ def _rows(found: Design) -> list[tuple[str, str, str]]:
 def _banded(band: Band, scale: float, unit: str) -> tuple[str, str]:
     value, low, high = (f"{round(scale * v, 3):.3g}" for v in (band.value, band.low, band.high))
     return f"{value}{unit}", f"{low} … {high}{unit}"
+
+
+def tuning_charts(wheels: Mapping[str, Curves], limit: float, prefix: str = "") -> list[Chart]:
+    """Return the charts of the designs of all wheels, each name with a prefix."""
+    # Wheels of different time constants are computed over different lengths and bands.
+    longest = max(wheels.values(), key=lambda c: float(c.time[-1]))
+    time = longest.time
+    omega = np.unique(np.concatenate([c.omega for c in wheels.values()]))
+
+    def chart(
+        kind: str, title: str, y_label: str, log: str = "", lines: tuple[float, ...] = ()
+    ) -> Chart:
+        timed = kind in ("step", "load")
+        x = time if timed else omega
+        bands = {
+            wheel: _on(x, c.time if timed else c.omega, getattr(c, kind))
+            for wheel, c in wheels.items()
+        }
+        curves = tuple(
+            Curve(label(wheel), rows[1], f"wheel-{k % 4 + 1}", "line", rows[0], rows[2])
+            for k, (wheel, rows) in enumerate(bands.items())
+        )
+        if kind == "step":
+            curves += (Curve("reference", _on(x, longest.time, longest.reference), "muted"),)
+        return Chart(
+            name=prefix + kind, title=title, y_label=y_label, log=log, lines=lines, curves=curves,
+            x_label="time [ms]" if timed else "frequency [rad/s]",
+            x=1e3 * x if timed else x,
+            summary=f"{title}, of {', '.join(map(label, wheels))}",
+        )  # fmt: skip
+
+    return [
+        chart("step", "Change of set-point", "wheel speed [rad/s]"),
+        chart("load", "Load that takes 1 V", "wheel speed [rad/s]"),
+        chart("gain", "Loop gain: magnitude", "magnitude", "xy", (1.0,)),
+        chart("phase", "Loop gain: phase", "phase [deg]", "x", (-180.0,)),
+        chart("sensitivity", f"Sensitivity (line: Ms {limit:g})", "|S|", "x", (limit,)),
+        chart("noise", "Control noise", "density [V]", "xy"),
+    ]
+
+
+def _on(x: Array, own: Array, rows: Array) -> Array:
+    """Return curves on another axis, shape (..., x.size); NaN outside of their own."""
+    flat = [np.interp(x, own, row, left=np.nan, right=np.nan) for row in np.atleast_2d(rows)]
+    return np.array(flat).reshape(*rows.shape[:-1], x.size)
+
+
+def tuning_svg(wheels: Mapping[str, Curves], limit: float) -> str:
+    """Return the charts one below the other, as an SVG document."""
+    return document(tuning_charts(wheels, limit), list(wheels))

@@ -19,7 +19,7 @@ from smp_motor_ident.report.chart import thin
 from smp_motor_ident.report.drawing import ticks
 from smp_motor_ident.report.figures import Comparison, frequency_charts, residual_charts
 from smp_motor_ident.report.html import Report, render
-from smp_motor_ident.report.tuning_figures import tuning_charts
+from smp_motor_ident.report.tuning_page import tuning_charts
 from smp_motor_ident.result import (
     ResidualTests,
 )

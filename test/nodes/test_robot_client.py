@@ -9,8 +9,8 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from std_msgs.msg import String
 
-from smp_motor_control.nodes.conventions import LATCHED
 from smp_motor_control.nodes.robot_client import RobotClient, RobotError
+from smp_motor_control.nodes.runtime import LATCHED
 
 
 class Wheel:
