@@ -184,12 +184,16 @@ def rows_of(data: Experiments, group: Sequence[Record], fit: Fit, measured: bool
 
 def _measured(data: Experiments, fit: Fit) -> Array:
     """Return the speed as measured, a mean over a fraction of the motor's lag."""
-    there = np.isfinite(data.output)
-    speed = np.interp(data.time, data.time[there], data.output[there])
-    if data.kind == ANGLE:
-        speed = np.gradient(speed, data.time)
     width = int(np.clip(SMOOTHED * fit.z.time_constant / data.step, 1, MOST_SMOOTHED))
-    return np.asarray(uniform_filter1d(speed, width, mode="nearest"))
+    out = []
+    for a, b in pairwise(data.starts):  # the time of each record is its own
+        time, output = data.time[a:b], data.output[a:b]
+        there = np.isfinite(output)
+        speed = np.interp(time, time[there], output[there])
+        if data.kind == ANGLE:
+            speed = np.gradient(speed, time)
+        out.append(uniform_filter1d(speed, width, mode="nearest"))
+    return np.concatenate(out)
 
 
 def likeliest(group: Sequence[Record], fit: Fit, hold: str, options: Options) -> DriverFit | None:

@@ -21,6 +21,7 @@ from smp_motor_ident.model.structures import Structure
 
 Array = NDArray[np.float64]
 
+RANK = 1e-13  # of the largest eigenvalue, below which one is rounding
 PASSES = 8  # normal equations that are kept of each data
 
 
@@ -76,13 +77,21 @@ def _beside(data: Experiments, structure: Structure) -> Structure:
     return more if room else structure
 
 
-def inverse(normal: Array, rcond: float = 1e-13) -> Array:
+def scale_of(normal: Array) -> Array:
+    """Return what each coordinate of a normal matrix is divided by to be of unit information.
+
+    Infinite where nothing is known of it, but for rounding.
+    """
+    known = np.diag(normal)
+    return np.asarray(np.sqrt(np.where(known > 1e-200, known, np.inf)))
+
+
+def inverse(normal: Array, rcond: float = RANK) -> Array:
     """Return the pseudo-inverse of a normal matrix, whatever the units of its coordinates.
 
     Coordinates of which nothing is known, but for rounding, are zero in it.
     """
-    known = np.diag(normal)
-    scale = np.sqrt(np.where(known > 1e-200, known, np.inf))
+    scale = scale_of(normal)
     scaled = np.linalg.pinv(normal / np.outer(scale, scale), rcond=rcond, hermitian=True)
     return np.asarray(scaled / np.outer(scale, scale))
 

@@ -26,7 +26,6 @@ from smp_motor_ident.model.coordinates import PLAUSIBLE
 Array = NDArray[np.float64]
 
 PIECES = 24
-RANK = 1e-13  # of the largest eigenvalue, below which one is rounding
 MOST = 1_000_000  # samples whose sensitivities are held in memory at once
 
 
@@ -106,8 +105,7 @@ def _moves(data: Experiments, fit: Fit) -> Array:
 
 def _root_of_inverse(normal: Array) -> Array:
     """Return a root of the pseudo-inverse that `prediction.inverse` gives of a normal matrix."""
-    known = np.diag(normal)
-    scale = np.sqrt(np.where(known > 1e-200, known, np.inf))
+    scale = prediction.scale_of(normal)
     values, vectors = np.linalg.eigh(normal / np.outer(scale, scale))
-    told = values > RANK * values[-1]
-    return np.asarray(vectors / np.sqrt(np.where(told, values, np.inf)) / scale[:, None])
+    known = values > prediction.RANK * values[-1]
+    return np.asarray(vectors / np.sqrt(np.where(known, values, np.inf)) / scale[:, None])

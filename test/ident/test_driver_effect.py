@@ -1,11 +1,15 @@
 """What a driver makes of its command is estimated beside the motor, declared, and designed for."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.estimation.driver_effect import driver_of
+from smp_motor_ident.estimation.driver_effect import _measured, driver_of
+from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.model import driver
 from smp_motor_ident.model.driver import Driver, terminal_voltage
 from smp_motor_ident.record import Record
@@ -81,6 +85,17 @@ def test_motor_and_driver_are_both_found(name):
     errors = np.array(errors)
     assert np.abs(errors).max() < 4.0
     assert 0.4 < np.sqrt(np.square(errors).mean()) < 1.6  # neither too narrow nor too wide
+
+
+def test_the_motion_of_each_record_is_its_own():
+    record = recorded("dead_zone", 0)
+    fit = SimpleNamespace(z=SimpleNamespace(time_constant=TAU))
+    for one in (record, replace(record, velocity=None, position=np.cumsum(record.velocity) * STEP)):
+        alone = _measured(prepare([one], False), fit)
+        both = _measured(prepare([one, one], False), fit)
+        assert both == pytest.approx(np.tile(alone, 2), abs=NOISE)
+        # A mean over a fifth of the lag.
+        assert np.abs(alone - record.velocity).std() < 0.1 * record.velocity.std()
 
 
 def test_a_plain_driver_has_no_effect():
