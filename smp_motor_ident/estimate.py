@@ -56,10 +56,10 @@ from smp_motor_ident.estimation.constraint import constrained
 from smp_motor_ident.estimation.driver_effect import (
     DriverFit,
     declared,
-    likeliest,
     suspecting,
     through,
 )
+from smp_motor_ident.estimation.driver_search import likeliest
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.hold_choice import chosen_hold, instant_deviation, otherwise
 from smp_motor_ident.estimation.profile import profiled
@@ -245,14 +245,15 @@ def _through_driver(
     if driver is None:
         return None, None
     known = request.validation
-    kept = None if known is None else driver.applied(known, fit, hold)
+    kept = None if known is None else driver.search.applied(known, driver.fit)
     try:
         e = _estimated(driver.records, replace(request, driver=driver, validation=kept), found)
     except (SignalError, InsufficientExcitationError):
         return None, driver
     emptied = {"implausible_motor", "one_level", "one_size_of_voltage"}
     hollow = any(f.code in emptied for f in e.findings)  # little is left of what was recorded
-    return (None if e.unreliable or hollow else through(e, driver)), driver
+    fails = any(f.severity == "unreliable" and not blames_current(f) for f in e.findings)
+    return (None if fails or hollow else through(e, driver)), driver
 
 
 def _fallen_back(refusal: SmpError | None, other: FittedCandidate) -> list[Finding]:
@@ -371,6 +372,6 @@ def _certain(
     timed = consider_drop(final, consider_clock(final, timed, clock_share(group)))
     chosen, friction_std = consider_friction(final, consider_left_out(final, timed))
     if request.driver is not None:
-        chosen = request.driver.widened(chosen, hold, request.options)
+        chosen = request.driver.widened(chosen)
     chosen, change = heterogeneous(final, chosen)
     return chosen, friction_std, change

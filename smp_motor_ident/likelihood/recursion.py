@@ -95,7 +95,7 @@ def _slide(
 
 
 @inlined
-def _move(
+def move(
     h: float,
     slack: float,
     v: float,
@@ -278,7 +278,7 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
                 h = end - now
                 if h > 0.0:
                     slack = 1e-9 * h + 1e-15 * abs(target)
-                    direction = _move(
+                    direction = move(
                         h, slack, v, direction, load, friction, par, x, m, cache, marks, table,
                         scratch, columns,
                     )  # fmt: skip

@@ -32,6 +32,7 @@ class Driver(NamedTuple):
     kind: int = NOTHING
     size: float = 0.0
     full_duty: float = 1.0  # command [V] at which it is always on
+    emf_share: float = 1.0  # of the voltage at steady speed that is back-EMF, not viscous friction
 
     @property
     def threshold(self) -> float:
@@ -78,10 +79,11 @@ def terminal_voltage(
 ) -> tuple[float, float]:
     """Return the mean voltage at the motor's terminals over an interval, and that at its end [V].
 
-    ``before`` is the voltage at its beginning; only a slew limit remembers it.
+    ``back_emf``: what the speed needs if it runs steadily.  ``before``: the voltage at its
+    beginning; only a slew limit remembers it.
     """
-    kind, size, full_duty = driver
-    out = command
+    kind, size, full_duty, share = driver
+    out, back_emf = command, share * back_emf
     if kind == DEAD_ZONE:
         out = _beyond(command, size)
     elif kind == CLIP:
@@ -158,6 +160,11 @@ class DriverEffect:
         return 1.0 if self.kind in (SAG, COAST) else rows.top
 
     @property
+    def numbers(self) -> int:
+        """How many numbers describe it: the size, and of one that coasts the back-EMF's share."""
+        return 2 if self.kind == COAST else 1
+
+    @property
     def follows_motion(self) -> bool:
         """Whether it depends on how the motor runs."""
         return self.kind in (SAG, DROP, COAST)
@@ -185,7 +192,7 @@ EFFECTS = (
     ),
     DriverEffect(
         COAST, "coast", "fast_decay_ratio", "a driver that lets the motor coast (fast decay)",
-        (0.03, 0.1, 0.3, 1.0, 3.0),
+        (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 100.0),
     ),
 )  # fmt: skip
 

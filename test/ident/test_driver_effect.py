@@ -8,7 +8,8 @@ import pytest
 
 from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.estimation.driver_effect import _measured, driver_of
+from smp_motor_ident.estimation.driver_effect import driver_of
+from smp_motor_ident.estimation.driver_search import _measured
 from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.model import driver
 from smp_motor_ident.model.driver import Driver, terminal_voltage
@@ -197,3 +198,54 @@ def test_no_driver_is_found_that_leaves_nothing_of_the_record():
     gain = found.combinations["dc_gain"]
     right = gain.std and abs(gain.value - 4.5 / 1.12) < 5 * gain.std
     assert found.unreliable or (right and driver_of(found).kind == driver.COAST)
+
+
+def coasting(seed: int, viscous: float) -> tuple[Record, dict[str, float]]:
+    """Return a record of a bridge that is off between its pulses, by a fine grid, and its truth."""
+    supply, pwm, resistance, te, constant, inertia = 12.0, 500.0, 2.0, 1.5e-3, 0.05, 2e-4
+    step, fine, torque = 0.01, 400, 0.012
+    dt = step / fine
+    rng = np.random.default_rng(seed)
+    command = np.repeat(rng.uniform(-11.0, 11.0, 40), rng.integers(15, 40, 40))
+    i = w = 0.0
+    speed = np.zeros(command.size)
+    for k in range(1, command.size):
+        duty, sign = abs(command[k]) / supply, np.sign(command[k])
+        for n in range(fine):
+            on = (n * dt * pwm) % 1.0 < duty
+            applied = sign * supply if on else -np.sign(i) * supply
+            after = i
+            if on or i != 0.0:
+                after = i + dt / te * ((applied - constant * w) / resistance - i)
+            if not on and i * after < 0.0:
+                after = 0.0
+            drive = constant * 0.5 * (i + after) - viscous * w
+            i = after
+            drag = torque * (np.sign(w) if w != 0.0 else np.clip(drive / torque, -1.0, 1.0))
+            turned = w + dt / inertia * (drive - drag)
+            w = 0.0 if w * turned < 0.0 else turned
+        speed[k] = w + 0.2 * rng.standard_normal()
+    a0 = constant + resistance * viscous / constant
+    truth = {
+        "dc_gain": 1 / a0,
+        "time_constant": (resistance * inertia / constant + te * (a0 - constant)) / a0,
+        "static_voltage": torque * resistance / constant,
+        "fast_decay_ratio": te * pwm,
+    }
+    return Record("motor", step * np.arange(command.size), command, velocity=speed), truth
+
+
+@pytest.mark.parametrize(("seed", "viscous"), [(0, 1e-5), (1, 2.5e-4)])
+def test_a_coasting_bridge_is_fitted_together_with_its_motor(seed, viscous):
+    record, truth = coasting(seed, viscous)
+    record = replace(record, hardware=replace(record.hardware, supply_voltage=12.0))
+    found = estimate(record)
+    assert not found.unreliable
+    for name, value in truth.items():
+        q = found.combinations[name]
+        assert abs(q.value - value) < max(4 * q.std, 0.02 * value), name
+        assert q.std < 0.2 * value
+    behind = driver_of(found)
+    constant = 0.05 / (0.05 + 2.0 * viscous / 0.05)
+    assert (behind.kind, behind.full_duty) == (driver.COAST, 12.0)
+    assert behind.emf_share == pytest.approx(constant, abs=0.03)

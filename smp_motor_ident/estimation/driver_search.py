@@ -1,0 +1,360 @@
+"""A driver's effect on its command, estimated beside the motor: the likeliest of a table.
+
+The size is sought along the profile of the likelihood, all of the motor fitted again for each; of
+a driver that coasts together with the motor.
+
+Derivation: docs/derivations.md, section 13.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
+from scipy.optimize import fminbound
+
+from smp_motor_ident.estimation import fast_decay, prediction
+from smp_motor_ident.estimation.candidate_starts import of_kind
+from smp_motor_ident.estimation.descent import (
+    ROUGHLY,
+    SCREENING_SAMPLES,
+    initial_of,
+    refine,
+)
+from smp_motor_ident.estimation.driver_effect import DriverFit
+from smp_motor_ident.estimation.fit import Fit, Options, solve
+from smp_motor_ident.estimation.initialisation import initial_fit
+from smp_motor_ident.estimation.selection import POLICY, sandwich_factor
+from smp_motor_ident.likelihood.experiments import Experiments, prepare
+from smp_motor_ident.model.driver import COAST, EFFECTS, SLEW, Driver, DriverEffect, Rows
+from smp_motor_ident.model.measurement import ANGLE
+from smp_motor_ident.model.structures import FirstOrder
+from smp_motor_ident.record import Record
+
+Array = NDArray[np.float64]
+
+TURNS = 3  # of a motion that the effect asks for, and that follows from it
+SMOOTHED, MOST_SMOOTHED = 0.2, 1_000  # of the motor's lag, and rows: a measured speed is its mean
+NEAR = 0.02  # e-folds of the size at which its deviance is first looked at beside the best
+RISE = 2.0  # of the deviance on both sides together, from which its curvature is read
+PARABOLAS = 5  # that are laid through it at most
+CLOSE = 0.2  # standard deviations within which a size is the likeliest
+MOST = 25  # sizes that are tried between those of the table
+SUBSET, PIECES, LAGS = 5_000, 5, 10  # rows on which effects are ranked, in pieces of so many lags
+AROUND = 0.3  # e-folds of the size that these may be off by
+FINALISTS = 3  # that are held against each other on all of them
+FEW = 12  # passes of a descent while the size is sought
+
+
+def likeliest(group: Sequence[Record], fit: Fit, hold: str, options: Options) -> DriverFit | None:
+    """Return the effect that explains the records best; None where none is worth its number.
+
+    All run free: torque noise would stand for the effect.
+    """
+    if fit.noise_ratio > 0:
+        fit = replace(fit, noise_ratio=0.0)
+        fit = refine(_prepared(group, hold, fit), fit.structure, fit, fit.z, options)
+    step = float(np.median(np.diff(group[0].time)))
+    few = _pieces(group, step, fit.z.time_constant)
+    price, factor = POLICY.price(1, fit.samples), sandwich_factor(fit)
+
+    def cost(one: DriverFit) -> float:
+        return one.cost(price, factor)
+
+    plain = fit.deviance / factor + price * fit.structure.size
+    searches: list[_Profile | _Joint] = [
+        _Profile(few, how, start, options, effect)
+        for effect in EFFECTS
+        if effect.kind != COAST
+        for start, how in _starts(few, fit, hold, options, effect)
+    ]
+    searches += [
+        _Joint(few, list(group), fit, options, effect) for effect in EFFECTS if effect.kind == COAST
+    ]
+    without = refine(_prepared(few, hold, fit), fit.structure, fit, fit.z, options, ROUGHLY)
+    behind = POLICY.hopeless * factor
+    found = [d for s in searches if (d := s.best(without.deviance + behind)) is not None]
+    found.sort(key=cost)
+    if sum(map(len, few)) < sum(map(len, group)):
+        most = fit.deviance + behind
+        every = [d.search.on(list(group), most, behind) for d in found[:FINALISTS]]
+        found = [d for d in every if d is not None]
+    found = sorted((d for d in found if cost(d) < plain), key=cost)
+    if not found:
+        return None
+    best, *others = found
+    near = [d.fit for d in others if cost(d) < cost(best) + price]
+    return replace(best, rivals=tuple(near))
+
+
+def with_voltages(group: Sequence[Record], voltage: Array) -> list[Record]:
+    """Return records with other voltages, one after the other."""
+    ends = np.cumsum([0, *map(len, group)])
+    return [replace(r, voltage=voltage[a:b]) for r, (a, b) in zip(group, pairwise(ends))]
+
+
+def rows_of(data: Experiments, group: Sequence[Record], fit: Fit, measured: bool = False) -> Rows:
+    """Return the commands of records and how the fitted motor runs, or did as measured."""
+    speed = _measured(data, fit) if measured else prediction.simulate(data, fit)[:, 0]
+    first = np.zeros(data.size, dtype=np.bool_)
+    first[data.starts[:-1]] = True
+    middle, interval = speed.copy(), np.full(data.size, data.step)
+    middle[1:] = np.where(first[1:], speed[1:], 0.5 * (speed[1:] + speed[:-1]))
+    interval[1:] = np.where(first[1:], data.step, np.diff(data.time))
+    back = float(fit.structure.internal(fit.z)[0][2])
+    command = np.concatenate([r.voltage for r in group])
+    supply = min((r.hardware.supply_voltage or 0.0 for r in group), default=0.0)
+    return Rows(command, back * middle, interval, first, fit.z.time_constant, supply)
+
+
+def _measured(data: Experiments, fit: Fit) -> Array:
+    """Return the speed as measured, a mean over a fraction of the motor's lag."""
+    width = int(np.clip(SMOOTHED * fit.z.time_constant / data.step, 1, MOST_SMOOTHED))
+    out = []
+    for a, b in pairwise(data.starts):  # the time of each record is its own
+        time, output = data.time[a:b], data.output[a:b]
+        there = np.isfinite(output)
+        if b - a < 2:
+            out.append(np.zeros(b - a))
+            continue
+        speed = np.interp(time, time[there], output[there])
+        if data.kind == ANGLE:
+            speed = np.gradient(speed, time)
+        out.append(uniform_filter1d(speed, width, mode="nearest"))
+    return np.concatenate(out)
+
+
+def _pieces(group: Sequence[Record], step: float, lag: float) -> list[Record]:
+    """Return pieces of long records, all over them, that outlive a motor's lag."""
+    rows = sum(map(len, group))
+    length = int(np.clip(LAGS * lag / step, SUBSET / PIECES, SUBSET))
+    every = rows * length / SUBSET
+    if every < 2 * length:
+        return list(group)
+    return [
+        record.slice(a, a + length)
+        for record in group
+        for a in np.arange(0, len(record) - length + 1, every).astype(int)
+    ] or list(group)
+
+
+def _starts(
+    group: Sequence[Record], fit: Fit, hold: str, options: Options, effect: DriverEffect
+) -> list[tuple[Fit, str]]:
+    """Return the motors with which an effect's size is sought, and how the command was held.
+
+    All that may stand for the effect is put back: torque noise, a command that ran otherwise or
+    comes late, of a limited rate a second lag; and friction, for which the effect may stand.
+    """
+    s = fit.structure
+    if s.friction == "none" and "vc_plus" not in s.fixed:
+        s = s.with_(friction="symmetric")
+    ways = [(s, hold)]
+    plain = s.with_(held="before", shift=0.0, delay=s.delay and "delay" in s.fixed)
+    if plain != s or hold != "held":
+        ways.append((plain, "held"))
+    if effect.kind == SLEW and s.order == 2 and not s.current:
+        ways.append((FirstOrder.like(plain), "held"))
+    out = []
+    for structure, how in ways:
+        near = replace(fit, structure=structure, noise_ratio=0.0)
+        data = _prepared(group, how, near)
+        out.append((refine(data, structure, near, structure.complete(fit.z), options), how))
+    return out
+
+
+def _prepared(group: Sequence[Record], hold: str, fit: Fit) -> Experiments:
+    return of_kind(prepare(group, fit.structure.current, hold=hold), fit)
+
+
+class _Profile:
+    """The profile of the likelihood along one effect's size."""
+
+    def __init__(
+        self,
+        group: list[Record],
+        hold: str,
+        fit: Fit,
+        options: Options,
+        effect: DriverEffect,
+    ) -> None:
+        self.group, self.hold, self.options, self.effect = group, hold, options, effect
+        self.data, self.near = _prepared(group, hold, fit), fit
+        self.turns = TURNS if effect.follows_motion else 1
+        self.size = math.nan  # logarithm of the likeliest
+        self.beside: list[Record] = []  # with the voltage for a size one standard deviation greater
+
+    def at(self, size: float, passes: int = 30) -> tuple[Fit, Experiments, list[Record]]:
+        """Return the motor fitted for a size, and what it was fitted to."""
+        data, fit, records = self.data, self.near, self.group
+        for turn in range(self.turns):
+            rows = rows_of(data, self.group, fit, measured=self.turns > 1 and turn == 0)
+            voltage = rows.through(Driver(self.effect.kind, size, rows.full_duty))
+            records = with_voltages(self.group, voltage)
+            data = _prepared(records, self.hold, self.near)
+            start = fit.at(fit.z, initial_of(data, fit))
+            fit = solve(data, fit.structure, start, self.options, passes, ROUGHLY)
+        return fit, data, records
+
+    def deviance(self, logarithm: float) -> float:
+        """Return the deviance at a size's logarithm; the next fit begins from the best so far."""
+        fit, data, _ = self.at(float(np.exp(logarithm)), FEW)
+        if fit.deviance < self.near.deviance:
+            self.near, self.data = fit, data
+        return fit.deviance if np.isfinite(fit.deviance) else 1e300
+
+    def best(self, most: float) -> DriverFit | None:
+        """Return the likeliest size with its deviation.
+
+        None where none is likelier than none, or the likeliest is beyond a deviance.
+        """
+        none = self.near.deviance
+        rows = rows_of(self.data, self.group, self.near)
+        grid = np.log(self.effect.scale(rows) * np.array(self.effect.shares))
+        values = [self.deviance(x) for x in grid]
+        k = int(np.argmin(values))
+        if not values[k] < none:
+            return None
+        low = float(grid[k - 1] if k else 2 * grid[0] - grid[1])
+        high = float(grid[k + 1] if k + 1 < grid.size else 2 * grid[-1] - grid[-2])
+        return self._polished(self._between(low, high), most)
+
+    def on(self, group: list[Record], most: float, behind: float) -> DriverFit | None:
+        """Go on from the size that was found, with more records.
+
+        That size is off by chance alone, which costs so many times more as there are rows more;
+        where it costs far more than a deviance with that the effect is none of theirs.
+        """
+        near = replace(self.near, initial=_prepared(group, self.hold, self.near).initial)
+        more = _Profile(group, self.hold, near, self.options, self.effect)
+        if more.deviance(self.size) > most + behind * more.data.size / self.data.size:
+            return None
+        return more._polished(more._between(self.size - AROUND, self.size + AROUND), most)
+
+    def _between(self, low: float, high: float) -> float:
+        x = fminbound(self.deviance, low, high, xtol=1e-2, maxfun=MOST, disp=0)
+        return float(x)
+
+    def _polished(self, x: float, most: float) -> DriverFit | None:
+        """Go on to the bottom by parabolas through three deviances, whose curvature is its std.
+
+        None where a parabola's bottom is beyond a deviance.
+        """
+        away = NEAR
+        for _ in range(PARABOLAS):
+            fit, data, records = self.at(float(np.exp(x)))
+            self.near, self.data = fit, data
+            low, high = self._beside(x, away)
+            while low + high - 2 * fit.deviance < RISE and away < 1.0:
+                away *= 2
+                low, high = self._beside(x, away)
+            curved = max(low + high - 2 * fit.deviance, 0.1 * RISE)
+            std = away * float(np.sqrt(2 * sandwich_factor(fit) / curved))
+            move = 0.5 * away * (low - high) / curved
+            if fit.deviance - 0.125 * (low - high) / curved * (low - high) > most:
+                return None
+            if abs(move) < CLOSE * std:
+                break
+            x += float(np.clip(move, -2 * away, 2 * away))
+            away = min(max(std, 0.1 * NEAR), 1.0)
+        self.size, size = x, float(np.exp(x))
+        driver = Driver(self.effect.kind, size, rows_of(self.data, self.group, fit).full_duty)
+        self.beside = self.at(size * float(np.exp(std)))[2]
+        return DriverFit(self.effect, driver, size * std, self.group, records, self, fit)
+
+    def moves(self, fit: Fit) -> list[Array]:
+        """Return the move of a motor with the size, one standard deviation of it."""
+        data = _prepared(self.beside, self.hold, fit)
+        return [refine(data, fit.structure, fit, fit.z, self.options).z.array - fit.z.array]
+
+    def applied(self, records: Sequence[Record], fit: Fit) -> list[Record]:
+        """Return other records of the motor with the voltage at the terminals."""
+        data = of_kind(prepare(records, False, hold=self.hold), fit)
+        rows = rows_of(data, records, prediction.settle(data, fit))
+        driver = Driver(self.effect.kind, float(np.exp(self.size)), rows.full_duty)
+        return with_voltages(records, rows.through(driver))
+
+    def _beside(self, x: float, away: float) -> tuple[float, float]:
+        """Return the deviances so many e-folds of the size below and above."""
+        low, high = (self.at(float(np.exp(x + s * away)))[0].deviance for s in (-1, 1))
+        return low, high
+
+
+class _Joint:
+    """A driver that coasts, sought together with the motor."""
+
+    def __init__(
+        self,
+        group: list[Record],
+        every: list[Record],
+        fit: Fit,
+        options: Options,
+        effect: DriverEffect,
+    ) -> None:
+        self.group, self.near, self.options, self.effect = group, fit, options, effect
+        # Pieces do not tell the back-EMF's share, which steady speeds do.
+        self.most = every if sum(map(len, every)) <= SCREENING_SAMPLES else group
+        self.found: fast_decay.Joint | None = None
+
+    def _data(self, records: Sequence[Record]) -> Experiments:
+        s = self.near.structure
+        data = prepare(records, False).measured_as(s.speed)
+        return data if s.held == "interpolated" else data.held(s.held)
+
+    def best(self, most: float) -> DriverFit | None:
+        """Return the likeliest driver; None where there is none, or beyond a deviance."""
+        data = self._data(self.most)
+        supply = min(r.hardware.supply_voltage or 0.0 for r in self.group)
+        full = max(float(np.abs(data.hold_value).max(initial=0.0)), supply)
+        self.found = fast_decay.fitted(data, self.near, full, self.options)
+        if self.most is self.group or self.found is None:
+            return self._driver_fit(self.found, data, most)
+        few = self._data(self.group)
+        return self._driver_fit(fast_decay.continued(few, self.found, self.options), few, most)
+
+    def on(self, group: list[Record], most: float, behind: float) -> DriverFit | None:
+        """Go on from there with more records."""
+        data = self._data(group)
+        more = _Joint(group, group, self.near, self.options, self.effect)
+        assert self.found is not None
+        more.found = fast_decay.continued(data, self.found, self.options)
+        return more._driver_fit(more.found, data, most)
+
+    def _driver_fit(
+        self, joint: fast_decay.Joint | None, data: Experiments, most: float
+    ) -> DriverFit | None:
+        if joint is None:
+            return None
+        records = with_voltages(self.group, fast_decay.rows_of(data, joint.voltage))
+        fit = self._with_current(records, joint.fit) if self.near.structure.current else joint.fit
+        if fit is None or fit.deviance > most:
+            return None
+        return DriverFit(self.effect, joint.driver, joint.std[0], self.group, records, self, fit)
+
+    def _with_current(self, records: list[Record], fit: Fit) -> Fit | None:
+        """Return the motor that a measured current shows under the voltage that was found."""
+        near, s = self.near, self.near.structure
+        data = _prepared(records, "held", near)
+        z = near.z.with_(ln_a0=fit.z.ln_a0, ln_a1=fit.z.ln_a1).with_friction(fit.z.vc_plus)
+        tried = [
+            refine(data, s, near, s.complete(z), self.options),
+            initial_fit(data, s, self.options),
+        ]
+        return min((f for f in tried if f is not None), key=lambda f: f.deviance, default=None)
+
+    def moves(self, fit: Fit) -> list[Array]:
+        """Return by how much less is known of a motor than under a voltage that is known."""
+        return list(self.found.moves) if self.found else []
+
+    def applied(self, records: Sequence[Record], fit: Fit) -> list[Record]:
+        """Return other records of the motor with the voltage at the terminals."""
+        assert self.found is not None
+        data = self._data(records)
+        return with_voltages(
+            records, fast_decay.rows_of(data, fast_decay.voltage_of(data, self.found))
+        )
