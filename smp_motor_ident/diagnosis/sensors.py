@@ -108,11 +108,11 @@ def _fit_of_current(data: Experiments, fit: Fit) -> list[Finding]:
 
 def _current_lag(sensor: str, lag: float) -> Finding:
     """Say how the current's sensor is late."""
-    how = (
-        f"its mean over {2e3 * lag:.3g} ms"
-        if sensor == "averaged"
-        else f"a low-pass of it with a time constant of {1e3 * lag:.3g} ms"
-    )
+    how = {
+        "averaged": f"its mean over {2e3 * lag:.3g} ms",
+        "low_passed": f"a low-pass of it with a time constant of {1e3 * lag:.3g} ms",
+        "smoothed": f"its samples exponentially smoothed, {1e3 * lag:.3g} ms late on average",
+    }[sensor]
     return Finding(
         "current_lag",
         "note",

@@ -1,4 +1,4 @@
-"""A current that its sensor averages or low-passes: asked for by a score, from several starts.
+"""A current that its sensor averages, low-passes or smooths: asked for by a score, from several starts.
 
 Left out, the lag of the sensor is taken for that of the winding: L comes out too large.
 Derivation: docs/derivations.md, section 12.

@@ -1,8 +1,9 @@
-"""What a sensor shows of the current: its value, its mean over a window, or a low-pass of it.
+"""What a sensor shows of the current: its value, a mean over a window, or a low-pass of it.
 
 Over a piece of constant voltage and friction the integrals of the state follow from the state at
 its ends, whatever happens between: ``int q = v h - K dth - te dq`` for the mean, and for the
-low-pass the same equations under the weight ``a e^{-a (h - s)}``.
+low-pass the same equations under the weight ``a e^{-a (h - s)}``.  A digital low-pass follows what
+the current is at the samples.
 Derivation: docs/derivations.md, section 6.
 """
 
@@ -13,7 +14,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident._compile import compiled
+from smp_motor_ident._compile import compiled, inlined
 from smp_motor_ident.likelihood.propagator import BE, TE, TM, K
 from smp_motor_ident.likelihood.sensitivities import (
     BEFORE,
@@ -33,7 +34,7 @@ from smp_motor_ident.model.columns import CURRENT_LAG, LN_R, OFFSET
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-DIRECT, AVERAGED, LOW_PASSED = range(3)
+DIRECT, AVERAGED, LOW_PASSED, SMOOTHED = range(4)
 # The state and what the sensor keeps (the charge R int i, or R times the low-passed current); the
 # state before the last move.
 KEEPS, Q0, W0, TH0, STATE = range(3, 8)
@@ -60,12 +61,12 @@ def sensor_rate(sensor: int, par: Array) -> float:
 
 
 @compiled
-def begin_current(more: float, own: Integers, x: Array, m: Array, marks: Array) -> None:
+def begin_current(more: float, own: Integers, x: Array, m: Array, sensor: int) -> None:
     """Begin a segment: no charge yet, or a low-pass that has settled on the current before it.
 
     That was more than the first by so many volts, of which the columns ``own`` are the derivative.
     """
-    low = marks[SENSOR] == LOW_PASSED
+    low = sensor != AVERAGED
     x[KEEPS] = x[0] + more if low else 0.0
     for j in range(LANES):
         m[KEPT + j] = m[SQ + j] if low else 0.0
@@ -156,6 +157,22 @@ def _low_pass(
 
 
 @compiled
+def smooth(lag: float, period: float, x: Array, m: Array) -> None:
+    """Let a digital low-pass take its next sample, ``y += a (q - y)``, ``a = T / (T + lag)``."""
+    a = period / (period + lag)
+    more, by_lag = a * (x[0] - x[KEEPS]), a * (x[0] - x[KEEPS]) / (period + lag)
+    for j in range(LANES):
+        m[KEPT + j] += a * (m[SQ + j] - m[KEPT + j]) - by_lag * m[ON_LAG + j]
+    x[KEEPS] += more
+
+
+@inlined
+def samples_between(h: float, period: float) -> float:
+    """Return how many samples a digital filter takes in h seconds: of rows that are lost, too."""
+    return max(1.0, math.floor(h / period + 0.5))
+
+
+@compiled
 def mark_first(
     trail: Array, time: Array, first: int, last: int, width: float, more: float, own: Integers,
     x: Array, m: Array,
@@ -193,7 +210,7 @@ def observe_lagging(sensor: int, k: int, par: Array, x: Array, m: Array, on: int
                     trail: Array) -> float:  # fmt: skip
     """Return the current that a sensor shows; put its derivative into row ``on``."""
     r = par[LN_R]
-    if sensor == LOW_PASSED:
+    if sensor != AVERAGED:
         amps = x[KEEPS] / r
         for j in range(LANES):
             m[on + j] = m[KEPT + j] / r + m[ON_OFFSET + j] - amps * m[ON_R + j]

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from smp_motor_ident._compile import compiled, inlined
 from smp_motor_ident.likelihood.current_sensor import (
     AVERAGED,
+    SMOOTHED,
     STATE,
     after_move,
     before_move,
@@ -23,7 +24,9 @@ from smp_motor_ident.likelihood.current_sensor import (
     mark,
     mark_first,
     observe_lagging,
+    samples_between,
     sensor_rate,
+    smooth,
 )
 from smp_motor_ident.likelihood.events import STUCK, advance, keeps_turning
 from smp_motor_ident.likelihood.normal_equations import ROOM, TILE, robust, sum_up
@@ -203,6 +206,7 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
     ring: Array,
     sensor: int,
     trail: Array,
+    period: float,
     predicted: Array,
     usual: float,
     beside: Array,
@@ -220,7 +224,8 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
     delay = par[DELAY]
     late = bool(np.any(slope[DELAY] != 0.0))
     m, cache, marks, scratch = begin(slope, local, friction)
-    marks[SENSOR], marks[RATE] = sensor, sensor_rate(sensor, par)
+    smoothed = sensor == SMOOTHED  # which follows no move
+    marks[SENSOR], marks[RATE] = 0.0 if smoothed else sensor, sensor_rate(sensor, par)
     marks[PUSHED] = 1.0 if pushed else 0.0
     averaged, width = sensor == AVERAGED, 2 * par[CURRENT_LAG]
     table = tabulate(usual, par, m, cache, marks, scratch)
@@ -243,8 +248,7 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
         ahead = last  # the next sample whose window of the current begins
         if sensor > 0:
             own = n_common + np.flatnonzero(local == 4)
-            begin_current(initial[g, 4], own, x, m, marks)
-            ahead = first
+            begin_current(initial[g, 4], own, x, m, sensor)
             if averaged:
                 ahead = mark_first(trail, time, first, last, width, initial[g, 4], own, x, m)
         load = par[LOAD] + initial[g, 3]
@@ -265,6 +269,8 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
             _put(beside[section], m, PUSH, p, False)
         for k in range(first, last):
             target = time[k]
+            due = samples_between(target - now, period) if smoothed and k > first else 0.0
+            pause = (target - now) / due if due > 0.0 else 0.0
             while now < target:
                 if averaged:
                     ahead = mark(trail, time, ahead, last, now, width, x, m)
@@ -274,6 +280,8 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
                     end = change
                 if averaged and ahead < last:
                     end = min(end, time[ahead] - width)
+                take = target - (due - 1.0) * pause  # when a digital filter takes its next sample
+                end = min(end, take)
                 v = hold_value[section]
                 h = end - now
                 if h > 0.0:
@@ -289,6 +297,9 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
                         _put(beside[section], m, PUSH, p, False)
                     if late:
                         _switch(v, hold_value[section], load, direction, friction, par, m)
+                if due > 0.0 and now >= take:
+                    smooth(par[CURRENT_LAG], period, x, m)
+                    due -= 1.0
             # A state that is no number would pass for a lost sample, after all events there may be.
             if not abs(x[0]) + abs(x[1]) + abs(x[2]) < math.inf:
                 predicted[k:] = math.nan

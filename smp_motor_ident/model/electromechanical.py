@@ -10,9 +10,10 @@ from smp_motor_ident.model.coordinates import Coordinates
 from smp_motor_ident.model.second_order import SecondOrder
 from smp_motor_ident.model.structure import Regressions, Structure
 
-SENSORS = ("", "averaged", "low_passed")
+SENSORS = ("", "averaged", "low_passed", "smoothed")
 """What a sensor shows of the current: its value, its mean over a trailing window of twice
-`current_lag`, or a first-order low-pass of it of that time constant."""
+`current_lag`, a first-order low-pass of it of that time constant, or its values at the samples,
+exponentially smoothed (a digital filter at the rate of the log) and late by that on average."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,7 @@ class Electromechanical(SecondOrder):
         yield from others
         yield self.current_sensor == "averaged", "averaged current"
         yield self.current_sensor == "low_passed", "low-passed current"
+        yield self.current_sensor == "smoothed", "smoothed current"
         yield self.offset, "current offset"
         yield from (after, interpolated)
 

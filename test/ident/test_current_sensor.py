@@ -32,6 +32,9 @@ FINE = 200
 
 def shown(current: np.ndarray, step: float, sensor: str, lag: float, every: int) -> np.ndarray:
     """Return what a sensor shows, every so many of the small steps of a current."""
+    if sensor == "smoothed":
+        a = step * every / (step * every + lag)
+        return lfilter([a], [1, a - 1], current[::every])
     if sensor == "low_passed":
         a = 0.5 * step / lag  # trapezoids
         out = lfilter([a / (1 + a), a / (1 + a)], [1, (a - 1) / (1 + a)], current)
@@ -72,6 +75,9 @@ def test_a_sensor_shows_the_current_of_a_locked_rotor_as_the_formula_says(sensor
     if sensor == "averaged":
         charge = lambda t: np.where(t > 0, t - te * -np.expm1(-t / te), 0.0)  # noqa: E731
         expected = (charge(time) - charge(time - window)) / window
+    elif sensor == "smoothed":
+        a, e = 5e-3 / (5e-3 + lag), np.exp(-time / te)
+        expected = lfilter([a], [1, a - 1], 1 - e)
     elif lag == te:
         expected = 1 - (1 + time / te) * np.exp(-time / te)
     else:
@@ -128,7 +134,7 @@ def test_gradient_by_the_lag_is_that_of_finite_differences(sensor, delay, with_g
 
 @pytest.mark.parametrize(
     ("sensor", "samples"),
-    [("averaged", 0.5), ("averaged", 1.5), ("low_passed", 0.3), ("low_passed", 3.0)],
+    [("averaged", 0.5), ("averaged", 1.5), ("low_passed", 0.3), ("low_passed", 3.0), ("smoothed", 0.7), ("smoothed", 8.0)],
 )
 def test_the_lag_of_the_sensor_is_not_taken_for_that_of_the_winding(sensor, samples):
     lag = samples * 5e-3

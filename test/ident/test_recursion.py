@@ -13,7 +13,7 @@ from smp_motor_ident.likelihood.passes import answers, evaluate, gather
 from smp_motor_ident.model.coordinates import LOGARITHMS, NAMES, Coordinates
 from smp_motor_ident.model.measurement import ANGLE, MEAN_SPEED
 from smp_motor_ident.model.physical import from_physical
-from smp_motor_ident.model.structures import Electromechanical, FirstOrder, SecondOrder
+from smp_motor_ident.model.structures import SENSORS, Electromechanical, FirstOrder, SecondOrder
 
 
 def predict(data, structure, z, gain=NO_GAIN):
@@ -143,7 +143,7 @@ def test_a_beginning_that_has_faded_is_nothing_and_costs_nothing():
     assert not own.any()
 
 
-@pytest.mark.parametrize("sensor", ["", "averaged", "low_passed"])
+@pytest.mark.parametrize("sensor", SENSORS)
 @pytest.mark.parametrize("with_gain", [False, True])
 def test_answer_to_a_signal_is_what_little_of_it_changes(sensor, with_gain):
     _, data, z = exact(static_voltage=0.3, kind="sine", seconds=3.0)
