@@ -24,6 +24,8 @@ BEYOND = 0.6  # of a sample: the mean lag of a window that reaches beyond the la
 SHARES = (0.3, 0.8)  # of the winding's lag that may be the sensor's
 SAMPLES = (0.25, 0.5, 1.5, 5.0)  # of lag at which a descent begins
 FEW, KEPT = 4, 2  # passes after which starts are ranked, and how many go on
+# What is left of a winding whose lag is the sensor's: samples or a share; passes it is given.
+QUICK, LEFT, SETTLED = 0.5, 0.1, 8
 
 
 def with_current_lag(
@@ -36,7 +38,10 @@ def with_current_lag(
     """Return the fit, or one with the lag of the current's sensor where the data ask for it."""
     direct = best
     own = direct.structure
-    if not isinstance(own, Electromechanical) or own.lags or not _asked_for(data, direct):
+    if not isinstance(own, Electromechanical) or own.lags:
+        return best
+    exchanged = _exchanged(data, direct, options)
+    if not exchanged and not _asked_for(data, direct):
         return best
     for sensor in SENSORS[1:]:
         richer = own.with_(current_sensor=sensor)
@@ -44,6 +49,7 @@ def with_current_lag(
             continue
         say(f"trying {richer.label}")
         starts = _leading(data, direct, richer, options) + [best.z] * best.structure.lags
+        starts += exchanged
         # What looks like torque noise may be this.
         near = [best] if best.noise_ratio == 0 else [best, replace(best, noise_ratio=0.0)]
         tried = [descent.refine(data, richer, n, z, options) for z in starts for n in near]
@@ -74,11 +80,37 @@ def _asked_for(data: Experiments, direct: Fit) -> bool:
         return True
     averaged = direct.structure.with_(current_sensor="averaged")
     least = _predicted(data, direct, direct.structure)
-    price = float(np.log(direct.samples)) * sandwich_factor(direct)
     return any(
-        not least - _predicted(data, with_lag(direct, lag * data.step), averaged) < price
+        not least - _predicted(data, with_lag(direct, lag * data.step), averaged) < _price(direct)
         for lag in (LITTLE, BEYOND)
     )
+
+
+def _price(direct: Fit) -> float:
+    return float(np.log(direct.samples)) * sandwich_factor(direct)
+
+
+def _exchanged(data: Experiments, direct: Fit, options: Options) -> list[Coordinates]:
+    """Return a start at which the sensor has the winding's lag, if a few passes put it ahead.
+
+    A filter of many samples makes a winding of as many, from which no score leads back.  Both run
+    freely: where the data correct the state, either follows them.
+    """
+    te = direct.z.electrical_time_constant
+    if te < data.step:
+        return []
+    richer = direct.structure.with_(current_sensor="smoothed")
+    free = replace(direct, noise_ratio=0.0)
+    starts = [
+        richer.complete(slower_winding(direct.z, float(np.log(left))).with_(current_lag=te))
+        for left in (QUICK * data.step, LEFT * te)
+    ]
+    tried = [solve(data, richer, free.at(z), options, SETTLED) for z in starts]
+    other = min(tried, key=lambda f: f.deviance)
+    if direct.noise_ratio > 0:
+        free = solve(data, direct.structure, free, options, FEW)
+    ahead = free.deviance - other.deviance > _price(direct)
+    return [other.z] if ahead and other.z.current_lag > LITTLE * data.step else []
 
 
 def _predicted(data: Experiments, fit: Fit, structure: Structure) -> float:
