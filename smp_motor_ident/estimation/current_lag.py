@@ -1,4 +1,4 @@
-"""A current that its sensor averages, low-passes or smooths: asked for by a score, from several starts.
+"""A current that its sensor filters: asked for by a score, fitted from several starts.
 
 Left out, the lag of the sensor is taken for that of the winding: L comes out too large.
 Derivation: docs/derivations.md, section 12.
@@ -12,6 +12,8 @@ from dataclasses import replace
 import numpy as np
 
 from smp_motor_ident.estimation import data_window, descent, prediction
+from smp_motor_ident.estimation.candidate_starts import of_kind
+from smp_motor_ident.estimation.delay_and_averaging import with_average
 from smp_motor_ident.estimation.fit import Fit, Options, solve
 from smp_motor_ident.estimation.selection import POLICY, FittedCandidate, sandwich_factor
 from smp_motor_ident.estimation.trials import slower_winding
@@ -34,14 +36,18 @@ def with_current_lag(
     options: Options,
     candidates: list[FittedCandidate],
     say: Callable[[str], None],
+    surely: bool = False,
 ) -> Fit:
-    """Return the fit, or one with the lag of the current's sensor where the data ask for it."""
+    """Return the fit, or one with the lag of the current's sensor where the data ask for it.
+
+    ``surely``: they are known to ask.
+    """
     direct = best
     own = direct.structure
     if not isinstance(own, Electromechanical) or own.lags:
         return best
     exchanged = _exchanged(data, direct, options)
-    if not exchanged and not _asked_for(data, direct):
+    if not surely and not exchanged and not _asked_for(data, direct):
         return best
     for sensor in SENSORS[1:]:
         richer = own.with_(current_sensor=sensor)
@@ -65,6 +71,31 @@ def with_current_lag(
     return best
 
 
+def with_both_filters(
+    data: Experiments,
+    first: Fit,
+    options: Options,
+    candidates: list[FittedCandidate],
+    say: Callable[[str], None],
+) -> Fit:
+    """Return the fit with a lag of the current, a speed that is averaged, or both: as asked for.
+
+    Left out, the one is taken for another shape of the other, so that both orders are tried.
+    """
+    best = with_average(
+        data, with_current_lag(data, first, options, candidates, say), options, candidates, say
+    )
+    if not best.structure.has("current_lag"):
+        return best
+    with_average(data, first, options, candidates, say)
+    structure = first.structure.with_(window=True)
+    mean = next((r.fit for r in candidates if r.fit.structure == structure), first)
+    if mean is first:  # which could not be fitted
+        return best
+    other = with_current_lag(of_kind(data, mean), mean, options, candidates, say, surely=True)
+    return other if POLICY.replaces(best, other)[0] else best
+
+
 def with_lag(fit: Fit, lag: float) -> Fit:
     """Return a fit at another lag of the current's sensor [s]."""
     return replace(fit, z=fit.z.with_(current_lag=lag))
@@ -78,12 +109,14 @@ def _asked_for(data: Experiments, direct: Fit) -> bool:
     """
     if not direct.converged:
         return True
-    averaged = direct.structure.with_(current_sensor="averaged")
-    least = _predicted(data, direct, direct.structure)
-    return any(
-        not least - _predicted(data, with_lag(direct, lag * data.step), averaged) < _price(direct)
-        for lag in (LITTLE, BEYOND)
-    )
+    least, price = _predicted(data, direct, direct.structure), _price(direct)
+
+    def left(sensor: str, lag: float) -> float:
+        richer = direct.structure.with_(current_sensor=sensor)
+        return _predicted(data, with_lag(direct, lag * data.step), richer)
+
+    trials = (("averaged", LITTLE), ("averaged", BEYOND), ("smoothed", BEYOND))
+    return any(not least - left(*trial) < price for trial in trials)
 
 
 def _price(direct: Fit) -> float:

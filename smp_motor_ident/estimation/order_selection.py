@@ -16,12 +16,11 @@ from smp_motor_ident.estimation.candidate_starts import (
     of_kind,
     under_load,
 )
-from smp_motor_ident.estimation.current_lag import with_current_lag
+from smp_motor_ident.estimation.current_lag import with_both_filters, with_current_lag
 from smp_motor_ident.estimation.delay_and_averaging import (
     first_with_averaging,
     first_with_delay,
     settled,
-    with_average,
     with_delay,
 )
 from smp_motor_ident.estimation.fit import Fit, Options, solve
@@ -63,9 +62,10 @@ def explore(
         candidates.append(
             FittedCandidate(first, "asked for" if not auto else "current is measured")
         )
-        best = with_current_lag(data, first, options, candidates, say)
         if auto and data.kind == SPEED:
-            best = with_average(data, best, options, candidates, say)
+            best = with_both_filters(data, first, options, candidates, say)
+        else:
+            best = with_current_lag(data, first, options, candidates, say)
     else:
         if (found := _orders(data, base, options, say, candidates)) is None:
             return []

@@ -169,8 +169,8 @@ def gather(
             data.output, data.current, data.kind.code, structure.friction != "none", par, slope,
             initial, own, noise.gain, whitening(noise.covariance), noise.huber, normal, gradient,
             cost, spread, length, scores, owner, _ring(data, par, max(p, beside.answers.shape[-1])),
-            SENSORS.index(sensor_of(structure)),
-            _trail(data, structure, par), data.step, np.zeros((0, 3)) if predicted is None else predicted,
+            SENSORS.index(sensor_of(structure)), _trail(data, structure, par), data.step,
+            np.zeros((0, 3)) if predicted is None else predicted,
             data.jittered, beside.voltage, beside.added, beside.answers, beside.together,
         )  # fmt: skip
     return Sums(normal, gradient, cost, spread, scores[:used], owner[:used])
