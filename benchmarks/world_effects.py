@@ -300,4 +300,6 @@ EFFECTS = (
         stall_time=(0.9, 0.7, 0.4)[n] * c.samples * c.step), ("blocked",), "refuse"),
     Effect("swapped sign", _swapped, (), "refuse"),
     Effect("standing motor", _standing, (), "refuse"),
+    Effect("current smoothed", _sensor("i_smooth", (0.5, 2.0, 8.0)), ("current_lag",),
+           current=True),
 )  # fmt: skip

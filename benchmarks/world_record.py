@@ -176,6 +176,8 @@ def _current(
     span = s.get("i_window", c.step if c.drive.get("pwm") or s.get("i_supply") else 0.0)
     if span:
         y = _window(np.cumsum(out[:, 6 if s.get("i_supply") else 5]) * fine, fine, span, at)
+    if s.get("i_smooth"):  # a digital filter at the rate of the log, by so many samples late
+        y = filtered(y, 1 / (1 + s["i_smooth"]))
     if s.get("i_abs"):
         y = np.abs(y)
     y = y * (1 + s.get("i_scale", 0.0)) + s.get("i_offset", 0.0)

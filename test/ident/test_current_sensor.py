@@ -1,4 +1,4 @@
-"""A current that its sensor averages or low-passes: shown exactly, apart from the winding.
+"""A current that its sensor averages, low-passes or smooths: shown exactly, apart from the winding.
 
 What a sensor shows of a locked rotor's current is a formula; of a turning motor it is taken of a
 simulation in steps 200 times as small.
@@ -134,7 +134,15 @@ def test_gradient_by_the_lag_is_that_of_finite_differences(sensor, delay, with_g
 
 @pytest.mark.parametrize(
     ("sensor", "samples"),
-    [("averaged", 0.5), ("averaged", 1.5), ("low_passed", 0.3), ("low_passed", 3.0), ("smoothed", 0.7), ("smoothed", 8.0)],
+    [
+        ("averaged", 0.5),
+        ("averaged", 1.5),
+        ("low_passed", 0.3),
+        ("low_passed", 3.0),
+        ("smoothed", 0.7),
+        ("smoothed", 3.0),
+        ("smoothed", 19.0),
+    ],
 )
 def test_the_lag_of_the_sensor_is_not_taken_for_that_of_the_winding(sensor, samples):
     lag = samples * 5e-3
@@ -169,9 +177,10 @@ def test_where_winding_and_sensor_look_alike_the_interval_covers_both():
     assert q.value is None or q.ci95[0] <= small <= q.ci95[1]
 
 
-def test_a_record_may_begin_while_the_current_flows():
+@pytest.mark.parametrize("sensor", ["low_passed", "smoothed"])
+def test_a_record_may_begin_while_the_current_flows(sensor):
     lag = 7.5e-3
-    whole = simulated(200.0, "square", 8.0, "low_passed", lag)
+    whole = simulated(200.0, "square", 8.0, sensor, lag)
     begun = replace(
         whole, time=whole.time[433:] - whole.time[433], voltage=whole.voltage[433:],
         current=whole.current[433:], count=whole.count[433:],
@@ -190,6 +199,36 @@ def test_a_sensor_that_would_be_early_shows_the_current_at_once(sensor):
     direct = predict(data, Electromechanical(), z)
     # A thousandth of a sample late: 5 us of what 12 V change in L.
     np.testing.assert_allclose(early[:, 2], direct[:, 2], atol=5e-6 * 2 * 12 / L)
+
+
+def test_a_digital_filter_has_taken_the_rows_that_a_log_has_lost():
+    _, data, z = exact(WHEEL, kind="square", seconds=2.0)
+    structure, z = Electromechanical(current_sensor="smoothed"), z.with_(current_lag=8e-3)
+    kept = np.random.default_rng(5).random(data.size) > 0.3
+    kept[0] = True
+    fewer = replace(
+        data, time=data.time[kept], output=data.output[kept], current=data.current[kept],
+        starts=np.array([0, kept.sum()]),
+    )  # fmt: skip
+    whole = predict(data, structure, z)[kept, 2]
+    np.testing.assert_allclose(predict(fewer, structure, z)[:, 2], whole, atol=1e-9)
+
+
+@pytest.mark.parametrize("lag", [1.8e-3, 15e-3])
+def test_a_speed_of_differences_does_not_hide_the_filter_of_the_current(lag):
+    el = 2.8e-3 * R  # settled half-way within a sample
+    made = simulated(200.0, "square", 8.0, "smoothed", lag, el)
+    counts = made.count
+    assert counts is not None
+    result = estimate(
+        replace(made, count=None, velocity=200 * motors.QUANTUM * np.diff(counts, prepend=0))
+    )
+    assert not result.unreliable
+    true = motors.truth(WHEEL, 0.3) | {"inductance": el}
+    for name in ("resistance", "inductance", "motor_constant", "inertia"):
+        q = result.parameters[name]
+        if q.value is not None:
+            assert abs(q.value - true[name]) < 4 * q.std + 2e-3 * true[name], name  # as above
 
 
 def test_a_current_is_not_given_up_for_a_speed_that_is_a_mean():
