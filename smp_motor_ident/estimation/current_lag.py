@@ -124,18 +124,19 @@ def _price(direct: Fit) -> float:
 
 
 def _exchanged(data: Experiments, direct: Fit, options: Options) -> list[Coordinates]:
-    """Return a start at which the sensor has the winding's lag, if a few passes put it ahead.
+    """Return a start at which a digital filter has the winding's pole, if a few passes favour it.
 
-    A filter of many samples makes a winding of as many, from which no score leads back.  Both run
-    freely: where the data correct the state, either follows them.
+    Under a held voltage the current steps alike behind either, and no score leads from the one to
+    the other.  Both run freely: where the data correct the state, either follows them.
     """
     te = direct.z.electrical_time_constant
-    if te < data.step:
+    lag = data.step / float(np.expm1(data.step / te))  # e^(-T/te) = lag / (T + lag)
+    if not lag > LITTLE * data.step:
         return []
     richer = direct.structure.with_(current_sensor="smoothed")
     free = replace(direct, noise_ratio=0.0)
     starts = [
-        richer.complete(slower_winding(direct.z, float(np.log(left))).with_(current_lag=te))
+        richer.complete(slower_winding(direct.z, float(np.log(left))).with_(current_lag=lag))
         for left in (QUICK * data.step, LEFT * te)
     ]
     tried = [solve(data, richer, free.at(z), options, SETTLED) for z in starts]
