@@ -130,7 +130,8 @@ def _exchanged(data: Experiments, direct: Fit, options: Options) -> list[Coordin
     the other.  Both run freely: where the data correct the state, either follows them.
     """
     te = direct.z.electrical_time_constant
-    lag = data.step / float(np.expm1(data.step / te))  # e^(-T/te) = lag / (T + lag)
+    # Of the same pole: e^(-T/te) = lag / (T + lag).
+    lag = float(-data.step * np.exp(-data.step / te) / np.expm1(-data.step / te))
     if not lag > LITTLE * data.step:
         return []
     richer = direct.structure.with_(current_sensor="smoothed")
