@@ -79,7 +79,7 @@ def fitted(data: Experiments, near: Fit, full_duty: float, options: Options) -> 
     richer += [(second, z.with_second_lag(s * z.time_constant)) for s in SECOND]
     for structure, begin in richer:
         other = _Problem(data, replace(near, structure=structure), full_duty)
-        p = other.start(begin, np.log(driver.size), driver.emf_share, found.x)
+        p = other.start(begin, np.log(driver.size), driver.emf_share)
         one = other.joint(other.descend(p, MANY), options)
         best = min((j for j in (best, one) if j), key=lambda j: j.cost, default=None)
     return best
@@ -138,8 +138,8 @@ class _Problem:
         self.owner = np.repeat(np.arange(segments), np.diff(data.starts))[self.there]
         self.weight = 1 / np.sqrt(near.noise[0, 0])
 
-    def start(self, z: Coordinates, size: float, share: float, like: Array | None = None) -> Array:
-        """Return parameters: a motor and a driver, with the initial states of others."""
+    def start(self, z: Coordinates, size: float, share: float) -> Array:
+        """Return parameters: a motor, the logarithm of its driver's size and the share."""
         initial = initial_of(self.data, self.near)
         z = self.structure.complete(z)
         motor = [z.value(n) for n in self.structure.free]
