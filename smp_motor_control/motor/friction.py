@@ -10,8 +10,6 @@ rotor stops, sticks, reverses or breaks loose are located inside the step, so th
 of a step is rounding, whatever its length.
 """
 
-from __future__ import annotations
-
 import math
 
 from smp_motor_control.errors import ParameterError

@@ -5,8 +5,6 @@ effect when they arrive or, latched, at the next sample; a sample integrates ove
 happened since the one before.
 """
 
-from __future__ import annotations
-
 import math
 import random
 from collections import deque

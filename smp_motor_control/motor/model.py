@@ -6,8 +6,6 @@ with ``K = dc_gain``, ``tau = time_constant``, ``tp = time_constant_product`` an
 ``Vs = static_voltage``, at the motor shaft; d is what the load takes, as a voltage.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from smp_motor_control.errors import check_range

@@ -19,8 +19,6 @@ K. J. Astrom, B. Wittenmark, *Computer-Controlled Systems*, 3rd ed. (1997), sect
 sampling with a zero-order hold.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -5,8 +5,6 @@ motor, as the hardware shows it: the voltage acts one sample late, and the speed
 a sample.  First without clamps, where an unstable loop grows; then as it would drive.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

@@ -3,8 +3,6 @@
 It knows no clock and no ROS.  ``now`` is seconds on a clock that never jumps.
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from dataclasses import dataclass, field, replace

@@ -3,8 +3,6 @@
 Pure logic on numbers; times are seconds on a steady clock.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from enum import Enum

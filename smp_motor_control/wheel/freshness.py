@@ -3,8 +3,6 @@
 Pure logic on numbers; times are seconds on a steady clock unless they are stamps.
 """
 
-from __future__ import annotations
-
 import math
 from enum import Enum
 

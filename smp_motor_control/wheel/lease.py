@@ -1,7 +1,5 @@
 """Who may drive a wheel: the writer that drove it last, until it has rested for a while."""
 
-from __future__ import annotations
-
 import math
 
 from smp_motor_control.wheel.freshness import FeedbackClock, Verdict

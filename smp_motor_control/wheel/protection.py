@@ -1,7 +1,5 @@
 """What ends a test of a motor: too fast, too much current."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 PERSISTENCE = 0.05

@@ -16,8 +16,6 @@ L. Ljung, System Identification, 2nd ed., section 16.6; C. Bester, T. Conley, C.
 Inference with dependent data using cluster covariance estimators, J. Econometrics 165 (2011).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """What is found about a result, and what to record or measure to know more."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

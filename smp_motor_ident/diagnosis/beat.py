@@ -7,8 +7,6 @@ beat is the lower envelope of the arrivals, whatever the distribution of the lat
 repeated stamps, which round a regular time down, lie above such a line, too.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Stamps that stand in bunches: one sample of each bunch is what they tell."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -17,8 +17,6 @@ T. Breusch, A. Pagan, A simple test for heteroscedasticity, Econometrica 47 (197
 H. White, Econometrica 48 (1980), 817.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

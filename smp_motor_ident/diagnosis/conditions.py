@@ -16,8 +16,6 @@ J. Hausman, Specification tests in econometrics, Econometrica 46 (1978), 1251; H
 likelihood estimation of misspecified models, Econometrica 50 (1982), 1, section 4.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import fdtrc

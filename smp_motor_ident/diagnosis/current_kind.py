@@ -5,8 +5,6 @@ the size of that, at the supply of a bridge its product with the duty cycle (pow
 is a regression of two coefficients and an offset; the kind is what explains the current best.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Bad data named for what it is, before any number is made of it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -11,8 +11,6 @@ References
 L. Ljung, System Identification, 2nd ed. (1999), section 13.4 (noise that a loop feeds back).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

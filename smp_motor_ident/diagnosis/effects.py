@@ -5,8 +5,6 @@ would show it), to the measured output, or to the measured current.  The ``s_j``
 model's own free run, so they know nothing of the noise.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal

@@ -5,8 +5,6 @@ anything is recorded, what an excitation would teach.
 Derivation: docs/derivations.md, section 11.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 

@@ -5,8 +5,6 @@ Those about recordings, gains and fleets stand beside their readers (`smp_motor_
 A reason is a significance level, a cost or a physical limit; that a record came out right is none.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

@@ -1,7 +1,5 @@
 """Rows that a log lost: what the command was in between is not its value in the next row."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

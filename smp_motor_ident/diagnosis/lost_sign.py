@@ -1,7 +1,5 @@
 """A command or a speed that has lost its sign: a size beside a motion, or a voltage, of both."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

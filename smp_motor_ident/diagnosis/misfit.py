@@ -1,7 +1,5 @@
 """What the intervals take up of a model that is not all of the motor, beside what is named."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

@@ -4,8 +4,6 @@ The columns of effects are carried through a pass over the data beside the motor
 sensitivities are: they stick, are delayed and are corrected by the measurements as the model is.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise

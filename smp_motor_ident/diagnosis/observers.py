@@ -17,8 +17,6 @@ J. Hausman, Specification tests in econometrics, Econometrica 46 (1978), 1251; L
 Identification, 2nd ed. (1999), section 8.5, on the bias that a noise model distributes.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

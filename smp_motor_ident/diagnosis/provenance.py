@@ -1,7 +1,5 @@
 """What an estimate says of its records, and of the noise that was in them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Estimates that are refused after the fit: the model does not explain the data, or too little."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

@@ -4,8 +4,6 @@ The report draws what this returns, so that the picture and the verdict are of o
 under one band.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri

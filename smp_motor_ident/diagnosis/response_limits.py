@@ -1,7 +1,5 @@
 """Thresholds of what a recording tells about the motor's response, frequency by frequency."""
 
-from __future__ import annotations
-
 from smp_motor_ident.diagnosis.limits import Limit
 
 BAND_LEVEL = Limit(

@@ -1,7 +1,5 @@
 """What stated values cover: structures that are alike, a single level, a motor that changes."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 

@@ -1,7 +1,5 @@
 """What a fit says of command and sensors: when they are, offset and misfit, how they average."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from smp_motor_ident.diagnosis.limits import FIT_EXPLAINS, LONG_DELAY, SHARP

@@ -4,8 +4,6 @@ A motor answers late: by its lag, at most a quarter of a period, and by what sam
 take.  Where that comes to half a period, a late answer is a reversed one, and nothing tells them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """A sensor that falls silent: dead, or of a motion too small for it to show."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

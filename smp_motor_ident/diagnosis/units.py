@@ -1,7 +1,5 @@
 """A column that is called a voltage and is none that a robot runs on."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -20,8 +20,6 @@ References
    robust identification, Automatica 38 (2002), 787-803.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from itertools import pairwise
 

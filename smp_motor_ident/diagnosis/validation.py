@@ -1,7 +1,5 @@
 """Validation: fit on held-out data, comparison of wheels."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """A run that no fit has seen: does the model explain it as well as its own noise allows?"""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ What stops a commissioning is ``refused``: another hand must mend it, or say tha
 purpose.  Each check is a function of all wheels, and :data:`CHECKS` lists them.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field

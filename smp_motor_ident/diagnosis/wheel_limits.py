@@ -1,7 +1,5 @@
 """Every threshold of a decision about wheels on blocks, before and behind their excitation."""
 
-from __future__ import annotations
-
 from smp_motor_ident.diagnosis.limits import Limit
 
 FEEDBACK_RATE = Limit(

@@ -15,8 +15,6 @@ References
 L. Ljung, *System Identification*, 2nd ed. (1999), section 7.6 for the instruments.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import NamedTuple

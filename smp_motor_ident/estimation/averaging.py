@@ -10,8 +10,6 @@ Yao, Vehtari, Simpson and Gelman, Bayesian Analysis 13 (2018), 917, section 3.4 
 Burnham and Anderson, Model Selection and Multimodel Inference, 2nd ed., section 4.3.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 

@@ -8,8 +8,6 @@ Derivation: docs/derivations.md, section 9; Leeb and Poetscher, Econometric Theo
 (intervals after a selection).
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Refits under what the user holds fixed or bounded, and what physics forbids."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

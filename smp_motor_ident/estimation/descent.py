@@ -1,7 +1,5 @@
 """Around one descent: data to look at first, the noise guessed, where to begin."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -3,8 +3,6 @@
 Derivation: docs/derivations.md, section 8.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

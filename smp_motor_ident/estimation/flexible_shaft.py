@@ -18,8 +18,6 @@ G. Golub and V. Pereyra, "Separable nonlinear least squares", Inverse Problems 1
 L. Ljung, *System Identification*, 2nd ed. (1999), section 7.4 for the whitened residuals.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

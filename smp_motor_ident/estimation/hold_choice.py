@@ -1,8 +1,6 @@
 """How the command ran between the samples: held, switched inside the interval, in its middle, or
 straight from row to row."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 

@@ -3,8 +3,6 @@
 Derivation: docs/derivations.md, sections 8 and 10.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -3,8 +3,6 @@
 Derivation: docs/derivations.md, section 11.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Whether a running motor's recent past shows enough to identify the motor from."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Answers about the same data that several ask for: each is found once."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import TypeVar, cast
 from weakref import WeakKeyDictionary

@@ -15,8 +15,6 @@ References
 L. Ljung, System Identification, 2nd ed., section 11.2 (recursive least squares as Kalman filter).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -3,8 +3,6 @@
 Derivation: docs/derivations.md, section 10.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Order selection: the simplest candidate structure that the data do not reject, with reasons."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

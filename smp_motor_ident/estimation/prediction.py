@@ -3,8 +3,6 @@
 Derivation: docs/derivations.md, sections 6 to 9.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 

@@ -11,8 +11,6 @@ Venzon and Moolgavkar, Applied Statistics 37 (1988), 87; Self and Liang, JASA 82
 (at a bound).
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -6,8 +6,6 @@ the Gauss-Newton step from each replay is the estimate's error on this very moti
 Derivation: docs/derivations.md, section 9.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -3,8 +3,6 @@
 Derivation: docs/derivations.md, sections 9 and 11.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 

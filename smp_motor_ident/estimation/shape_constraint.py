@@ -10,8 +10,6 @@ References
 Nocedal and Wright, Numerical Optimization, 2nd ed., section 16.5.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """An estimated motor, driven by a recorded voltage: what it would have done."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """The parts of recordings that tell of a motor: rest before and after the excitation removed."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

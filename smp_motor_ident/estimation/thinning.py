@@ -3,8 +3,6 @@
 Derivation: docs/derivations.md, section 10.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

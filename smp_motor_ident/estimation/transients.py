@@ -6,8 +6,6 @@ pieces of equal leverage, however short, instead, and their errors count by that
 Derivation: docs/derivations.md, section 9.
 """
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

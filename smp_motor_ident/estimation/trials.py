@@ -7,8 +7,6 @@ a descent is held at one place only.
 Derivation: docs/derivations.md, section 10.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 
 import numpy as np

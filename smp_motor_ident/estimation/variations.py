@@ -1,7 +1,5 @@
 """What a chosen structure may be added to, and friction that it may lose: as the data ask."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """One motor, one loop, one method: prepared, solved, and backed off where it has to be."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Methods side by side, and one of them recommended."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any

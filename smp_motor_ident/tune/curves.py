@@ -1,7 +1,5 @@
 """A design as curves: responses and frequency responses with the band of the estimate."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

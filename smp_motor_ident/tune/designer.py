@@ -3,8 +3,6 @@
 Methods work at the motor shaft; the gains that come out are per wheel rad/s.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """Gains that hold for the motors that the data allow, not for the estimate alone."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

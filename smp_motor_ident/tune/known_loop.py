@@ -5,8 +5,6 @@ state that is known, it gives the commands that it gave.  At rest with a set-poi
 is known.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace

@@ -3,8 +3,6 @@
 Printed with the others in ``docs/limits.md``.
 """
 
-from __future__ import annotations
-
 from smp_motor_ident.diagnosis.limits import Limit
 
 # What may be designed on, and how far gains may go.

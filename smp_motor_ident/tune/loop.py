@@ -1,7 +1,5 @@
 """Loop: the sampled loop that will run, as far as the design must know it."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, fields
 from typing import Literal

@@ -8,8 +8,6 @@ References
 .. [1] K. J. Astrom, T. Hagglund, Advanced PID Control (2006), section 4.6.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -13,8 +13,6 @@ References
 R. F. Stengel, Optimal Control and Estimation (1994), section 4.3: the steady-state Kalman filter.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """What every tuning method is given: the sampled plant, its reductions and its noise."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field

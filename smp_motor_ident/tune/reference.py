@@ -12,8 +12,6 @@ References
 .. [2] T. Flash, N. Hogan, The coordination of arm movements, J. Neuroscience 5 (1985), 1688-1703.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

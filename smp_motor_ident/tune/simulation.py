@@ -5,8 +5,6 @@ motor, everything at the motor shaft.  Coulomb friction acts as the voltage that
 sign that it keeps for a sample, and holds a motor at rest that is given less.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ lag, the observer makes little of both while its model is right.  All are design
 gains that reject a load best within the same margins and the same control noise tell which to take.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 

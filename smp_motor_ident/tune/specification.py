@@ -1,7 +1,5 @@
 """How a design performs in simulation: figures of the nominal loop, and bands over the ensemble."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

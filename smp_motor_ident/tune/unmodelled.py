@@ -14,8 +14,6 @@ References
    and 7.5.1.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

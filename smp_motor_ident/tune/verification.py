@@ -4,8 +4,6 @@ The prediction is the running loop itself on simulated motors: the nominal one a
 that the estimate leaves open, seen through the same encoder and read in the same way.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields

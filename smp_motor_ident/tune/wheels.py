@@ -1,7 +1,5 @@
 """One robot's wheels together: gains each or for all, and one reference for all of them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace

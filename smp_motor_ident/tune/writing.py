@@ -1,7 +1,5 @@
 """Designs as files: the parameter file of the wheel nodes, and ``gains.json``."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

@@ -1,7 +1,5 @@
 """Gains for loops that others run: one file a target, in its own units and arithmetic."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Any

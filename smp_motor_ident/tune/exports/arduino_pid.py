@@ -7,8 +7,6 @@ github.com/br3ttb/Arduino-PID-Library 1.2.1, PID_v1.cpp, ``Compute``, ``SetTunin
 error (``P_ON_E``), ``Kd`` on the measurement; ``T`` is ``SampleTime``, whole milliseconds.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 

@@ -10,8 +10,6 @@ limit, emptied where set-point and error are both 0; the output is kept within `
 ``PWM_MAX`` (``2^PWM_BITS - 1``) and cut to a whole number.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 

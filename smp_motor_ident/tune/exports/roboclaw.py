@@ -13,8 +13,6 @@ trusting the margins. Since the set-point is fed forward, P and I are lowered un
 does not overshoot by more than 2 %.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 from smp_motor_ident.errors import DesignError

@@ -9,8 +9,6 @@ running loop of this package; back-calculation adds ``T / tracking_time_constant
 took.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 

@@ -15,8 +15,6 @@ integrates, ``Kd`` is proportional action on the measurement, ``Ki`` would integ
 0.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 

@@ -1,7 +1,5 @@
 """What an export is: numbers for another loop, what they do in it, and what it cannot express."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace

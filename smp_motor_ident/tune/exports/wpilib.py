@@ -8,8 +8,6 @@ Flywheel Velocity Controller: feed-forward and kP, no integral.  wpimath,
 SimpleMotorFeedforward.hpp: of a constant set-point ``Calculate`` is ``kS sgn(v) + kV v``.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 

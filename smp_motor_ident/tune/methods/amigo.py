@@ -7,8 +7,6 @@ References
 .. [2] K. J. Astrom, T. Hagglund, Advanced PID Control (2006), section 7.5.
 """
 
-from __future__ import annotations
-
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.problem import Method, Problem, RequiredMargins
 

@@ -10,8 +10,6 @@ References
 .. [2] K. J. Astrom, T. Hagglund, Advanced PID Control (2006), sections 4.6 and 6.7.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

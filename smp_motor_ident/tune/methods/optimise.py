@@ -11,8 +11,6 @@ References
 .. [2] R. Y. Rubinstein, D. P. Kroese, The Cross-Entropy Method (2004), chapter 5.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any, cast
 

@@ -8,8 +8,6 @@ References
 .. [1] K. J. Astrom, T. Hagglund, Advanced PID Control (2006), section 6.4.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -12,8 +12,6 @@ References
    phase and amplitude margins, Automatica 20 (1984), 645-651.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

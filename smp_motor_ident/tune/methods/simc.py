@@ -9,8 +9,6 @@ References
    Ind. Eng. Chem. Process Des. Dev. 25 (1986), 252-265.
 """
 
-from __future__ import annotations
-
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.problem import Method, Problem, RequiredMargins
 

@@ -11,8 +11,6 @@ References
    Essentials of Process Control (1997), p. 97.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from smp_motor_ident.tune.feedback import Feedback
