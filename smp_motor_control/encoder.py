@@ -5,8 +5,9 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from smp_motor_control.arrays import Integers
 from smp_motor_control.errors import ParameterError, check_range
 
 MAX_BITS = 63
@@ -53,7 +54,7 @@ def wrap(count: int, bits: int) -> int:
     return ((count + half) & ((1 << bits) - 1)) - half
 
 
-def unwrap(counts: ArrayLike, bits: int) -> NDArray[np.int64]:
+def unwrap(counts: ArrayLike, bits: int) -> Integers:
     """Return total counts from what a wrapping counter showed."""
     _check_bits(bits)
     shown = np.asarray(counts, dtype=np.int64)

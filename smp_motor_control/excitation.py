@@ -12,11 +12,9 @@ from functools import lru_cache
 from typing import overload
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array
 from smp_motor_control.errors import ParameterError, check_positive
-
-Array = NDArray[np.float64]
 
 DETUNING = math.sqrt(1.05)
 """Irrational factor between a nominal frequency and the one that is sent."""

@@ -24,15 +24,13 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array
 from smp_motor_control.encoder import DifferencedSpeed, Encoder, Unwrapper
 from smp_motor_control.errors import ParameterError, check_range
 from smp_motor_control.fields import described
 from smp_motor_control.motor.model import MotorModel
 from smp_motor_control.motor.response import FreeResponse, zero_order_hold
-
-Array = NDArray[np.float64]
 
 _STEPS_PER_OCTAVE = 2
 _OCTAVES = 2

@@ -5,9 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
-
+from smp_motor_control.arrays import Array
 from smp_motor_control.errors import check_range
 
 _UNITS = {
@@ -25,7 +23,7 @@ COMBINATIONS = ("dc_gain", "time_constant", "time_constant_product", "static_vol
 """Names of what voltage and speed tell of a motor."""
 
 _MAY_BE_ZERO = ("inductance", "viscous_friction", "coulomb_friction")
-Motion = TypeVar("Motion", float, NDArray[np.float64])
+Motion = TypeVar("Motion", float, Array)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,9 +23,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from smp_motor_control.arrays import Array
 
 NEGLIGIBLE = 1e-14
 """``tp / tau^2`` up to which a motor is of first order: its response is the same to 1e-14."""

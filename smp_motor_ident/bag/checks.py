@@ -1,9 +1,9 @@
 """What signals cannot be: values that jump impossibly, currents without sign."""
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
+from smp_motor_control.arrays import Flags
 from smp_motor_ident.bag.axis import Series
 from smp_motor_ident.bag.limits import JUMP_SPAN, JUMP_STEP, UNSIGNED_CURRENT
 from smp_motor_ident.bag.storage import Array
@@ -14,7 +14,7 @@ _SAMPLED = 5000
 """Values that quantiles and means are taken of."""
 
 
-def impossible(value: Array, *, steps_allowed: bool) -> NDArray[np.bool_]:
+def impossible(value: Array, *, steps_allowed: bool) -> Flags:
     """Return which values jump away and back by more than the signal's own range allows.
 
     A value is impossible that lies many spans of the signal away from its neighbours; where steps

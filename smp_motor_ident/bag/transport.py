@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident.bag.clock import SAME_CLOCK, fit_clock, mean_held
 from smp_motor_ident.bag.decode import collect
 from smp_motor_ident.bag.read import STATE
@@ -104,9 +104,7 @@ def _delay(state: Table, command: Table) -> TransportDelay | None:
     return TransportDelay(max(usual, 0.0), max(longest, 0.0), latched, int(stamp.size))
 
 
-def _until_applied(
-    state: Table, stamp: NDArray[np.int64], voltage: NDArray[np.float64], period: float
-) -> float | None:
+def _until_applied(state: Table, stamp: Integers, voltage: Array, period: float) -> float | None:
     """Return the delay that explains the voltages that the hardware reports, or None."""
     assert state.stamp is not None
     order = np.argsort(stamp, kind="stable")

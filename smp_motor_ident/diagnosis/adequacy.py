@@ -20,9 +20,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import fdtrc
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident.diagnosis.effects import EFFECTS, Effect
 from smp_motor_ident.diagnosis.limits import (
     EFFECT_BLOCKS,
@@ -40,7 +40,6 @@ from smp_motor_ident.finding import Finding
 from smp_motor_ident.model.physical import physical_gradients
 from smp_motor_ident.result import Estimate, Quantity, ResidualTests
 
-Array = NDArray[np.float64]
 Stated = tuple[str, Quantity, Array]
 """Name, value and gradient by the free coordinates of a number that is stated."""
 

@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from smp_motor_control.motor.parameters import PHYSICAL
 from smp_motor_ident.diagnosis.limits import (
@@ -33,8 +32,6 @@ from smp_motor_ident.likelihood.passes import evaluate
 from smp_motor_ident.model.coordinates import Coordinates, direction
 from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.result import FitPercent, ResidualTests
-
-Array = NDArray[np.float64]
 
 
 def assess(data: Experiments, fit: Fit, percent: FitPercent, tests: ResidualTests) -> list[Finding]:

@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter1d
 
+from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident._compile import compiled
 from smp_motor_ident.diagnosis.limits import (
     BEAT_FLOOR,
@@ -25,9 +25,6 @@ from smp_motor_ident.diagnosis.limits import (
 )
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.record import Record
-
-Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 _PAUSE = 20_000_000
 """Shortest silence [ns] that divides arrivals."""

@@ -20,7 +20,6 @@ H. White, Econometrica 48 (1980), 817.
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import erfc
 
 from smp_motor_ident.diagnosis.limits import CONDITION_LEVEL
@@ -29,8 +28,6 @@ from smp_motor_ident.estimation.consider_covariance import consider_late
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import Experiments
-
-Array = NDArray[np.float64]
 
 PATTERNS = 8  # of random signs, whose mean square is the sum over the changes
 MOST = 4.0  # deviations at which a residual is cut off: outliers are no scatter

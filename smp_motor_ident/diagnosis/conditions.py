@@ -17,17 +17,15 @@ likelihood estimation of misspecified models, Econometrica 50 (1982), 1, section
 """
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import fdtrc
 
+from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident.diagnosis.limits import CONDITION_LEVEL, CONDITION_WEIGHT
 from smp_motor_ident.diagnosis.model_error import Regression
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.prediction import inverse
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.model.coordinates import STANDS_FOR
-
-Array = NDArray[np.float64]
 
 
 def dependent(fit: Fit, errors: Regression | None) -> tuple[Fit, list[Finding]]:
@@ -84,7 +82,7 @@ def _moved(errors: Regression, unweighted: Array, weight: Array) -> tuple[Array,
     return move, np.asarray(fdtrc(1, np.maximum(stretches - 1, 1.0), ratio))
 
 
-def _by_block(x: Array, block: NDArray[np.int64]) -> Array:
+def _by_block(x: Array, block: Integers) -> Array:
     """Return the sums of columns over the rows of each block."""
     begins = np.flatnonzero(np.diff(block, prepend=-1))
     sums = np.zeros((int(block.max()) + 1, x.shape[1]))

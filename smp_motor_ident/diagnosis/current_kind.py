@@ -8,13 +8,11 @@ is a regression of two coefficients and an offset; the kind is what explains the
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident.diagnosis.data_quality import averaged_runs, measured_speed
 from smp_motor_ident.diagnosis.limits import CURRENT_KIND, FEWEST, METER, REST
 from smp_motor_ident.record import Record
-
-Array = NDArray[np.float64]
 
 ARMATURE, UNSIGNED, SUPPLY = "armature", "current_unsigned", "current_of_supply"
 ROUNDS = 6

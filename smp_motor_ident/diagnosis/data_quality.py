@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array, Flags
 from smp_motor_ident.diagnosis.limits import (
     AT_LIMIT,
     FEWEST,
@@ -26,8 +26,6 @@ from smp_motor_ident.diagnosis.units import cause_of_ratio, implausible_voltage
 from smp_motor_ident.errors import InsufficientExcitationError, SignalError
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.record import Record
-
-Array = NDArray[np.float64]
 
 RUNS = 2_000  # runs of samples in which signals are averaged before they are compared
 INSTRUMENTS = 8  # lags of the voltage, of which what the motor makes of it is a sum
@@ -270,7 +268,7 @@ def _one_level(v: Array) -> bool:
     return not driven.size or bool(np.ptp(driven) < 10 * METER.value * np.abs(driven).max())
 
 
-def _abrupt(x: Array, at: NDArray[np.bool_]) -> bool:
+def _abrupt(x: Array, at: Flags) -> bool:
     """Tell a clipped signal from one that settles: it jumps to its limit, scatters elsewhere."""
     enters = np.flatnonzero(at[1:] & ~at[:-1]) + 1
     rest = x[(x != x.max()) & (x != x.min())]

@@ -15,8 +15,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident.diagnosis.limits import NEIGHBOURS, ONE_COUNT
 from smp_motor_ident.estimation.fit import Options
 from smp_motor_ident.estimation.initialisation import initial_fit
@@ -24,8 +24,6 @@ from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import prepare, speed_quantum
 from smp_motor_ident.model.structures import SecondOrder
 from smp_motor_ident.record import Record
-
-Array = NDArray[np.float64]
 
 SMOOTH = 9  # samples of which a mean leaves the motion and hardly the rounding
 EVEN = 0.5  # of the usual interval: stamps that are off by more may hide a lost sample

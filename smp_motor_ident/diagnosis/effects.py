@@ -10,12 +10,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident.model.measurement import ANGLE, Measurement
 
-Array = NDArray[np.float64]
 Place = Literal["voltage", "torque", "output", "current"]
 
 

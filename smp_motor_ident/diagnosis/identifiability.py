@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from smp_motor_control.motor.parameters import PHYSICAL
 from smp_motor_ident.errors import ParameterError
@@ -23,8 +22,6 @@ from smp_motor_ident.model.physical import physical_gradients
 from smp_motor_ident.model.structures import Electromechanical
 from smp_motor_ident.record import Hardware, Record
 from smp_motor_ident.result import Estimate
-
-Array = NDArray[np.float64]
 
 AMPLITUDES = (0.4, 0.7, 1.0)
 SHARES = (0.97, 0.7, 0.3, 0.03)  # of a0 that K may be, where the current was not measured

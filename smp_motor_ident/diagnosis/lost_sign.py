@@ -3,14 +3,12 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident.diagnosis.limits import BACKWARD, HALF_EXPLAINED
 from smp_motor_ident.diagnosis.signs import lagged
 from smp_motor_ident.errors import SignalError
 from smp_motor_ident.record import Record
-
-Array = NDArray[np.float64]
 
 RUNS = 50  # of a record
 LAGS = 8  # between a sample and a tenth of the record, of what the motor makes of the voltage

@@ -3,9 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 
-import numpy as np
-from numpy.typing import NDArray
-
+from smp_motor_control.arrays import Array
 from smp_motor_ident.diagnosis.command_jitter import jittered
 from smp_motor_ident.diagnosis.observers import slower
 from smp_motor_ident.estimation.fit import Fit
@@ -20,7 +18,7 @@ Said = tuple[Answer, dict[str, float]]
 def widened_by_misfit(
     data: Experiments,
     fit: Fit,
-    possible: NDArray[np.float64] | None,
+    possible: Array | None,
     said: Callable[[Fit], Said],
 ) -> tuple[Said, list[Finding]]:
     """Return what is stated with an effect that is possible and what two tests show, and say so.

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident.diagnosis.effects import EFFECTS, Effect, Motion, slope
 from smp_motor_ident.diagnosis.limits import EFFECT_OWN
 from smp_motor_ident.diagnosis.residuals import voltage_at_samples
@@ -20,8 +20,6 @@ from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.passes import answers, own_columns, row_starts
 from smp_motor_ident.likelihood.sensitivities import LANES
 from smp_motor_ident.model.measurement import ANGLE
-
-Array = NDArray[np.float64]
 
 BLOCKS = 40  # whose sums of scores give the covariance
 ROWS = 6_000  # of each output that the regression has at most
@@ -39,7 +37,7 @@ class Regression:
     regressors: Array
     whole: Array  # shape (n, r): the same as they are
     shifts: Array  # shape (f, r): change of the free coordinates for a unit of each
-    block: NDArray[np.int64]  # shape (n,): which stretch of time a row belongs to
+    block: Integers  # shape (n,): which stretch of time a row belongs to
     members: Sequence[tuple[Effect, tuple[int, ...]]]  # which columns are whose
     own: Array  # shape (n, p): sensitivities to the free coordinates and initial states
     n_free: int
@@ -100,7 +98,7 @@ def _halves(size: Array) -> Array:
 def _projected(
     table: Array,
     n_own: int,
-    block: NDArray[np.int64],
+    block: Integers,
     members: Sequence[tuple[Effect, tuple[int, ...]]],
     n_free: int,
 ) -> Regression:
@@ -156,7 +154,7 @@ def together(data: Experiments) -> int:
     return max(1, data.size // ROWS)
 
 
-def _blocks(data: Experiments) -> NDArray[np.int64]:
+def _blocks(data: Experiments) -> Integers:
     begins = row_starts(data, together(data))
     block = begins * BLOCKS // data.size
     return np.tile(block, 2 if data.current.size else 1)

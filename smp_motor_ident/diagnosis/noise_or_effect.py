@@ -20,8 +20,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident.diagnosis.adequacy import Evidence, Stated, as_finding
 from smp_motor_ident.diagnosis.effects import EFFECTS, Effect
 from smp_motor_ident.diagnosis.limits import EFFECT_LEVEL
@@ -43,8 +43,6 @@ from smp_motor_ident.estimation.selection import sandwich_factor
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.coordinates import LOGARITHMS
-
-Array = NDArray[np.float64]
 
 COST = 20_000  # samples of all runs in which effects are tried beyond their linear ranking
 STEPS = 12  # of Levenberg and Marquardt at most

@@ -20,9 +20,9 @@ Identification, 2nd ed. (1999), section 8.5, on the bias that a noise model dist
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import erfc
 
+from smp_motor_control.arrays import Array, Flags
 from smp_motor_ident._compile import compiled
 from smp_motor_ident.diagnosis.limits import CONDITION_LEVEL
 from smp_motor_ident.diagnosis.model_error import measured, own_responses, predicted
@@ -33,9 +33,6 @@ from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.noise import gain_for, transition, whitening
 from smp_motor_ident.model.coordinates import STANDS_FOR
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 SLOWER = (0.5, 0.25, 0.1)
 """Bandwidths of the other observers, of the fitted one's."""

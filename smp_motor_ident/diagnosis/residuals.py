@@ -5,17 +5,15 @@ under one band.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtri
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident.diagnosis.limits import RESIDUAL_LEVEL
 from smp_motor_ident.diagnosis.unmodelled import unmodelled_dynamics
 from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.result import Correlation, ResidualTests
-
-Array = NDArray[np.float64]
 
 MOST = 200_000  # samples; the band then is a fiftieth of a percent
 

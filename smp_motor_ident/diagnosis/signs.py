@@ -8,14 +8,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
 from scipy.signal import lfilter
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident.diagnosis.limits import SIGN_LATE, SIGN_LEAST
 from smp_motor_ident.record import Record
-
-Array = NDArray[np.float64]
 
 LAGS = 16  # between a sampling interval and a quarter of the record: each 1.5 to 2 times the last
 FINE = 16  # samples that are enough of a lag

@@ -3,16 +3,14 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.signal import lfilter
 
+from smp_motor_control.arrays import Array, Flags
 from smp_motor_ident._compile import compiled
 from smp_motor_ident.diagnosis.limits import FEWEST, FLICKER, SILENT_SWING
 from smp_motor_ident.errors import SignalError
 from smp_motor_ident.record import Record
-
-Array = NDArray[np.float64]
 
 LAGS = 12  # between a sampling interval and a quarter of the record, from which a descent starts
 FRICTIONS = (0.0, 0.1, 0.2, 0.35, 0.5, 0.7)  # of the largest voltage: to what hardly turns
@@ -72,7 +70,7 @@ def _swing(record: Record, name: str, a: int, b: int) -> float:
     return float(np.abs(np.add.reduceat(expected[a:b] * step[a:b], turns)).max() / least)
 
 
-def _answer(record: Record, speed: Array, known: NDArray[np.bool_]) -> Array:
+def _answer(record: Record, speed: Array, known: Flags) -> Array:
     """Return the speed that the voltage lets expect, by what is known of it."""
     step, volts = float(np.median(np.diff(record.time))), record.voltage
     top, y = float(np.abs(volts).max()), speed[known]

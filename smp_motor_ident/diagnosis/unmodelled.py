@@ -24,18 +24,15 @@ from collections.abc import Iterator
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import fdtri
 
+from smp_motor_control.arrays import Array, Complex
 from smp_motor_ident.diagnosis.response_limits import BAND_LEVEL, BAND_LINES, BAND_WIDTH
 from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.result import ModelError
-
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 HANN = 1 + 2 * (2 / 3) ** 2 + 2 * (1 / 6) ** 2
 """Lines under a Hann window that tell as much as one of independent ones: neighbours correlate by

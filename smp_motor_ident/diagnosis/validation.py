@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident.diagnosis.limits import LEAST_FIT, UNEXPLAINED
 from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.candidate_starts import of_kind
@@ -18,8 +18,6 @@ from smp_motor_ident.likelihood.experiments import Experiments, prepare
 from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import Candidate, Estimate
-
-Array = NDArray[np.float64]
 
 SMOOTH = 0.1  # of an angle's own roughness: what the motion may have of it
 COARSE = 0.02  # of the speed's scatter: what a counter's resolution may add to it

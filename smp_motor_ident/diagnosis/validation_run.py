@@ -5,13 +5,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident.diagnosis.wheel_limits import VALIDATION_LEVEL, VALIDATION_SHARE
 from smp_motor_ident.finding import Finding
-
-Array = NDArray[np.float64]
 
 BLOCK = 0.5
 """Errors of a simulation last: so much of a run [s] counts as one independent error."""

@@ -9,8 +9,9 @@ from dataclasses import dataclass, fields
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from smp_motor_control.arrays import Array, Flags
 from smp_motor_ident.diagnosis.wheel_limits import (
     ANSWER_COUNTS,
     BREAKAWAY_COUNTS,
@@ -18,8 +19,6 @@ from smp_motor_ident.diagnosis.wheel_limits import (
     SUPPLY_SHORTFALL,
 )
 from smp_motor_ident.record import Hardware
-
-Array = NDArray[np.float64]
 
 HOLD = 0.4
 """A voltage is held for so long [s] at least."""
@@ -55,7 +54,7 @@ class Trace:
         """Return the samples from an index on."""
         return self._take(slice(begin, None))
 
-    def _take(self, kept: slice | NDArray[np.bool_]) -> Trace:
+    def _take(self, kept: slice | Flags) -> Trace:
         return Trace(*(getattr(self, f.name)[kept] for f in fields(self)))
 
 

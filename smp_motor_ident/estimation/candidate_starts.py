@@ -4,15 +4,12 @@ Derivation: docs/derivations.md, section 10.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from smp_motor_ident.estimation import descent
 from smp_motor_ident.estimation.fit import Fit, Options
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.coordinates import Coordinates
 from smp_motor_ident.model.structures import Structure
-
-Array = NDArray[np.float64]
 
 
 def of_kind(data: Experiments, fit: Fit) -> Experiments:

@@ -12,9 +12,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import erfcx
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.current_lag import LITTLE, with_lag
 from smp_motor_ident.estimation.fit import Fit
@@ -22,8 +22,6 @@ from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.coordinates import direction
 from smp_motor_ident.model.physical import physical_gradients
 from smp_motor_ident.model.structures import Electromechanical, Structure
-
-Array = NDArray[np.float64]
 
 POINTS = 64  # at which a lag may be
 FAR = 1e3  # deviations beyond which what is left of a normal variable is exponential

@@ -6,7 +6,6 @@ Derivation: docs/derivations.md, sections 7 and 10.
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from smp_motor_ident.diagnosis.limits import TORQUE_NOISE
 from smp_motor_ident.estimation.descent import (
@@ -23,8 +22,6 @@ from smp_motor_ident.estimation.trials import RIDGE
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.model.structures import Structure
-
-Array = NDArray[np.float64]
 
 FLOOR = 1.3  # residual variance over that of quantisation, below which there is no more
 WALK = 0.6  # step of the logarithm of the bandwidth while its best is not bracketed

@@ -3,16 +3,14 @@
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident.estimation.fit import Fit, Options, solve
 from smp_motor_ident.estimation.memory import remembered
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.coordinates import Coordinates
 from smp_motor_ident.model.measurement import Measurement
 from smp_motor_ident.model.structures import Structure
-
-Array = NDArray[np.float64]
 
 ROUGHLY = 0.3  # standard deviations of where a descent ends: its deviance is known to a tenth
 SCREENING_SAMPLES = 12_000  # samples on which candidates and noise levels are compared

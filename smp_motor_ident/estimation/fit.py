@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident.diagnosis.limits import MOST_FRICTION, SUBSET_HOPELESS
 from smp_motor_ident.estimation import shape_constraint
 from smp_motor_ident.estimation.fitted import Fit, Options, Prior, Start
@@ -24,7 +24,6 @@ from smp_motor_ident.model.structures import Structure
 
 __all__ = ["Fit", "Options", "Prior", "Start", "solve"]
 
-Array = NDArray[np.float64]
 
 STALL = 4, 0.02  # passes that together gain less deviance than this end a descent
 PACE = 4  # passes by which it is judged how fast a descent goes

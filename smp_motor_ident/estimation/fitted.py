@@ -10,14 +10,12 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident.likelihood.noise import NoiseModel
 from smp_motor_ident.model.coordinates import PLAUSIBLE, Coordinates
 from smp_motor_ident.model.measurement import Measurement
 from smp_motor_ident.model.structures import Structure
-
-Array = NDArray[np.float64]
 
 NORMAL_95 = 1.96
 """Half a 95 % interval of a normal variable, in its standard deviations."""

@@ -24,9 +24,9 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from smp_motor_control.arrays import Array, Complex
 from smp_motor_ident._compile import compiled
 from smp_motor_ident.diagnosis.limits import LOOSE_QUANTITY
 from smp_motor_ident.errors import InsufficientExcitationError
@@ -36,9 +36,6 @@ from smp_motor_ident.likelihood.experiments import output_of
 from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import UNITS, Candidate, Estimate, FitPercent, Quantity
-
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 NAME = "flexible_shaft"
 NONLINEAR = (

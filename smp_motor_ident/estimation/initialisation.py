@@ -6,8 +6,8 @@ Derivation: docs/derivations.md, sections 8 and 10.
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident.estimation.data_window import grow
 from smp_motor_ident.estimation.descent import (
     SCREENING_SAMPLES,
@@ -25,8 +25,6 @@ from smp_motor_ident.likelihood.noise import NoiseModel, deviance, kalman_gain
 from smp_motor_ident.likelihood.passes import gather
 from smp_motor_ident.model.coordinates import Coordinates, direction
 from smp_motor_ident.model.structures import Structure
-
-Array = NDArray[np.float64]
 
 ALIKE = 0.05  # e-folds or volts by which starts differ that end alike
 SHAPES = 6  # of the same linear response that are refined

@@ -6,13 +6,12 @@ Derivation: docs/derivations.md, section 11.
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array
 from smp_motor_control.motor.parameters import PHYSICAL
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.model.coordinates import direction
 
-Array = NDArray[np.float64]
 RESPONSE = ("ln_a0", "ln_a1", "ln_a2")
 
 

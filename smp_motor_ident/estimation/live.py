@@ -3,11 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident.record import Record
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,8 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident.diagnosis.limits import (
     FRICTION_BAND,
     HALF_WIDTH,
@@ -34,7 +34,6 @@ from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.result import Estimate
 
-Array = NDArray[np.float64]
 Validity = Literal["unestimated", "estimated", "invalid"]
 
 BLOCK = 0.25

@@ -7,8 +7,8 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident.estimation.fit import Fit, solve
 from smp_motor_ident.estimation.memory import remembered
 from smp_motor_ident.likelihood.experiments import Experiments
@@ -16,8 +16,6 @@ from smp_motor_ident.likelihood.noise import NO_GAIN, NoiseModel, whitening
 from smp_motor_ident.likelihood.passes import Pass, answers, evaluate, gather, own_columns
 from smp_motor_ident.likelihood.sensitivities import LANES
 from smp_motor_ident.model.structures import Structure
-
-Array = NDArray[np.float64]
 
 RANK = 1e-13  # of the largest eigenvalue, below which one is rounding
 PASSES = 8  # normal equations that are kept of each data

@@ -14,9 +14,9 @@ Venzon and Moolgavkar, Applied Statistics 37 (1988), 87; Self and Liang, JASA 82
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident.diagnosis.limits import MOST_FRICTION, PROFILE_FROM, REST, SAME_LEVEL
 from smp_motor_ident.estimation.descent import initial_of
 from smp_motor_ident.estimation.fit import Fit, Options, solve
@@ -27,8 +27,6 @@ from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.passes import own_columns
 from smp_motor_ident.model.coordinates import Coordinates, direction
 from smp_motor_ident.model.second_order import internal
-
-Array = NDArray[np.float64]
 
 RISE = float(chdtri(1, 0.05))  # of the deviance at the end of a 95 % interval
 NONLINEAR = ("vc_plus", "ln_a1", "ln_a2", "delay", "window", "current_lag")

@@ -9,14 +9,12 @@ Derivation: docs/derivations.md, section 9.
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.measurement import ANGLE, MEAN_SPEED
-
-Array = NDArray[np.float64]
 
 REPLAYS = 8, 32  # fewest and most
 MOST = 500_000  # samples in all replays

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array
 from smp_motor_control.motor.parameters import PHYSICAL
 from smp_motor_ident.diagnosis.limits import (
     HIDDEN_LAG,
@@ -25,8 +25,6 @@ from smp_motor_ident.model.physical import physical, physical_gradients
 from smp_motor_ident.model.structure import Gradients
 from smp_motor_ident.model.structures import Structure
 from smp_motor_ident.result import UNITS, Quantity
-
-Array = NDArray[np.float64]
 
 TRADED = ("dc_gain", "static_voltage", "static_voltage_reverse", "load_voltage")
 """Of a steady speed at one level of voltage only ``dc_gain (level - static_voltage)`` is known."""

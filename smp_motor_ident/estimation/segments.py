@@ -18,9 +18,9 @@ from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri, fdtri, stdtrit
 
+from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident.diagnosis.limits import HOMOGENEITY, SEGMENT_INFORMATION, SEGMENTS
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.fitted import NORMAL_95
@@ -31,8 +31,6 @@ from smp_motor_ident.likelihood.passes import gather
 from smp_motor_ident.model.coordinates import LOGARITHMS, PLAUSIBLE
 from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.model.structures import sensor_of
-
-Array = NDArray[np.float64]
 
 FEWEST = 4  # parts of which a scatter can be taken
 ORDERED = 6  # parts of which a drift is distinguishable from scatter
@@ -58,7 +56,7 @@ class Steps:
     step: Array
     cov: Array
     known: Array  # variances where residuals are white, and what is in the intervals beside
-    owner: NDArray[np.int64]  # which segment a part is of
+    owner: Integers  # which segment a part is of
     free: list[int]  # which of the coordinates
 
     def without(self, segment: int) -> Steps:

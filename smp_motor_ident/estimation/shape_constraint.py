@@ -13,13 +13,11 @@ Nocedal and Wright, Numerical Optimization, 2nd ed., section 16.5.
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident.diagnosis.limits import MOST_FRICTION
 from smp_motor_ident.model.coordinates import Coordinates
 from smp_motor_ident.model.structures import Structure
-
-Array = NDArray[np.float64]
 
 HAIR = 1e-9  # of a0 by which rounding may pass an edge
 SLOWEST = 10.0  # a winding, times ``R J / K``: those of motors are faster than that itself

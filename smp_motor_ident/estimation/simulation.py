@@ -1,8 +1,8 @@
 """An estimated motor, driven by a recorded voltage: what it would have done."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident.diagnosis.validation import percent
 from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.fit import Fit
@@ -13,8 +13,6 @@ from smp_motor_ident.model.static_gain import INSTANTLY
 from smp_motor_ident.model.structures import FirstOrder, SecondOrder, StaticGain
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import Estimate
-
-Array = NDArray[np.float64]
 
 
 def simulate(estimate: Estimate, record: Record) -> tuple[Array, Array]:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident.diagnosis.limits import METER
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.regression import (
@@ -21,8 +21,6 @@ from smp_motor_ident.likelihood.regression import (
 from smp_motor_ident.model.coordinates import Coordinates
 from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.model.physical import from_physical
-
-Array = NDArray[np.float64]
 
 GRIDS = 8  # segments that are looked at, those that moved most
 

@@ -1,12 +1,10 @@
 """The parts of recordings that tell of a motor: rest before and after the excitation removed."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident.diagnosis.limits import REST
 from smp_motor_ident.record import Record
-
-Array = NDArray[np.float64]
 
 LONG = 2_000  # samples of rest: a quarter of what the start looks at (`start.resample`)
 MARGIN = 10  # samples of rest kept on either side

@@ -6,12 +6,10 @@ Derivation: docs/derivations.md, section 10.
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.measurement import ANGLE
-
-Array = NDArray[np.float64]
 
 FINER = 8  # samples to keep in the longest interval over which the speed hardly changes
 LEAST = 2_000  # samples of each segment, or so, that stay
@@ -49,7 +47,7 @@ def _idle(data: Experiments) -> int:
 
 
 def _every(data: Experiments, k: int) -> Experiments:
-    keep: list[NDArray[np.int64]] = []
+    keep: list[Integers] = []
     ends: list[Array] = []
     values: list[Array] = []
     starts, first = [0], []

@@ -9,9 +9,9 @@ Derivation: docs/derivations.md, section 9.
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident.diagnosis.limits import CONDITION_LEVEL, FEW_TRANSIENTS
 from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.fit import Fit
@@ -20,8 +20,6 @@ from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.noise import whitening
 from smp_motor_ident.likelihood.passes import answers, own_columns
 from smp_motor_ident.model.coordinates import PLAUSIBLE
-
-Array = NDArray[np.float64]
 
 PIECES = 24
 MOST = 1_000_000  # samples whose sensitivities are held in memory at once

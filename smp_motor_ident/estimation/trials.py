@@ -10,14 +10,13 @@ Derivation: docs/derivations.md, section 10.
 from collections.abc import Callable, Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident.estimation.fit import Fit, Options, Start, solve
 from smp_motor_ident.estimation.multistart import Trial
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.coordinates import Coordinates, direction
 
-Array = NDArray[np.float64]
 Applies = Callable[[Experiments, Fit], bool]
 Starts = Callable[[Experiments, Fit, Options], Iterator[Start]]
 

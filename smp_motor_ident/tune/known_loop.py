@@ -11,14 +11,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident.errors import SignalError
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.record import Record
 from smp_motor_ident.tune.limits import COMMAND_RESOLUTION, LOOP_RATE, TICK_FIT
-
-Array = NDArray[np.float64]
 
 Step = Callable[[float, float], float]
 """From set-point, in the target's unit, and speed of the wheel [rad/s] to the command [V]."""
