@@ -1,6 +1,6 @@
 """What is found about a result, and what to record or measure to know more."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -86,123 +86,105 @@ def unsettled_rival(
     return []
 
 
-def _descent(data: Experiments, fit: Fit) -> list[Finding]:
+def _descent(data: Experiments, fit: Fit) -> Iterator[Finding]:
     if fit.converged or not _unsettled(data, fit):
-        return []
-    return [
-        Finding(
-            "not_converged",
-            "unreliable",
-            "the fit did not settle",
-            advice="record a longer or stronger excitation",
-        )
-    ]
+        return
+    yield Finding(
+        "not_converged",
+        "unreliable",
+        "the fit did not settle",
+        advice="record a longer or stronger excitation",
+    )
 
 
-def _fit(percent: FitPercent, tests: ResidualTests, closely: bool) -> list[Finding]:
-    out = []
+def _fit(percent: FitPercent, tests: ResidualTests, closely: bool) -> Iterator[Finding]:
     estimation, validation = percent.estimation or 0.0, percent.validation
     if estimation < FIT_EXPLAINS.value and not closely:
-        out.append(
-            Finding(
-                "poor_fit",
-                "unreliable",
-                f"the model explains only {estimation:.0f} % of the speed",
-                {"fit_percent": estimation, "limit": FIT_EXPLAINS.value},
-                "look for what else drives the motor; record what the driver really puts out",
-            )
+        yield Finding(
+            "poor_fit",
+            "unreliable",
+            f"the model explains only {estimation:.0f} % of the speed",
+            {"fit_percent": estimation, "limit": FIT_EXPLAINS.value},
+            "look for what else drives the motor; record what the driver really puts out",
         )
     if validation is not None and validation < estimation - FIT_HOLDS.value:
-        out.append(
-            Finding(
-                "validation",
-                "unreliable",
-                f"held-out data are left unexplained by {100 - validation:.0f} % of the motion, "
-                f"the fitted ones by {100 - estimation:.0f} %; the "
-                "motor or its load changed, or the excitation was too poor",
-                {"estimation": estimation, "validation": validation},
-                "record 20 s or more of one excitation under one load",
-            )
+        yield Finding(
+            "validation",
+            "unreliable",
+            f"held-out data are left unexplained by {100 - validation:.0f} % of the motion, "
+            f"the fitted ones by {100 - estimation:.0f} %; the "
+            "motor or its load changed, or the excitation was too poor",
+            {"estimation": estimation, "validation": validation},
+            "record 20 s or more of one excitation under one load",
         )
     if tests.independent_of_input is False and estimation < FIT_INDEPENDENT.value:
-        out.append(
-            Finding(
-                "residual_follows_voltage",
-                "warning",
-                "the residuals still follow the voltage: the motor does what the model does not",
-                {"fit_percent": estimation},
-            )
+        yield Finding(
+            "residual_follows_voltage",
+            "warning",
+            "the residuals still follow the voltage: the motor does what the model does not",
+            {"fit_percent": estimation},
         )
-    return out
 
 
-def _resolution(data: Experiments, fit: Fit, tests: ResidualTests) -> list[Finding]:
-    out = []
+def _resolution(data: Experiments, fit: Fit, tests: ResidualTests) -> Iterator[Finding]:
     own = data.quantum**2 / 12
     beyond = own > 0 and fit.noise_ratio == 0 and not within_resolution(data, fit)
     if data.kind == ANGLE and beyond and tests.white is False:
         times = float(np.sqrt(fit.noise[0, 0] / own))
-        out.append(
-            Finding(
-                "beyond_resolution",
-                "unreliable",
-                f"the motion leaves the model by {times:.0f} times the counter's resolution, and "
-                "not at random",
-                {"times": times, "limit": float(np.sqrt(UNEXPLAINED.value))},
-                "sample faster, or look for what else drives it",
-            )
+        yield Finding(
+            "beyond_resolution",
+            "unreliable",
+            f"the motion leaves the model by {times:.0f} times the counter's resolution, and "
+            "not at random",
+            {"times": times, "limit": float(np.sqrt(UNEXPLAINED.value))},
+            "sample faster, or look for what else drives it",
         )
     ring = _ring(fit)
     if ring * data.step > RINGING.value:
-        out.append(
-            Finding(
-                "ringing",
-                "unreliable",
-                f"the answer rings at {ring / (2 * np.pi):.3g} Hz, which sampling at "
-                f"{1 / data.step:.4g} Hz hardly shows",
-                {"radians_a_sample": ring * data.step, "limit": RINGING.value},
-                "sample faster",
-            )
+        yield Finding(
+            "ringing",
+            "unreliable",
+            f"the answer rings at {ring / (2 * np.pi):.3g} Hz, which sampling at "
+            f"{1 / data.step:.4g} Hz hardly shows",
+            {"radians_a_sample": ring * data.step, "limit": RINGING.value},
+            "sample faster",
         )
-    return out
 
 
-def _second_lag(data: Experiments, fit: Fit) -> list[Finding]:
+def _second_lag(data: Experiments, fit: Fit) -> Iterator[Finding]:
     """Say of a speed whose second lag is long for a winding's that it may be the sensor's.
 
     With time constants T and cT, ``a2 a0 / a1^2 = c / (1 + c)^2``, and the sensor's lag is
     ``c / (1 + c)`` of what is stated as the motor's.
     """
     if fit.structure.order != 2 or fit.structure.current or data.kind == ANGLE:
-        return []
+        return
     row = direction(ln_a0=1.0, ln_a1=-2.0, ln_a2=1.0)
     free = row @ fit.structure.matrix
     ratio, spread = float(row @ fit.z.array), float(np.sqrt(free @ fit.covariance() @ free))
     if ratio - HALF_WIDTH.value * spread > np.log(0.25):  # it rings, which no lag does
-        return []
+        return
     share, least = (_lag_share(ratio - k * spread) for k in (0.0, HALF_WIDTH.value))
     long = share >= WINDING_LAG.value
     if not long and least < RELEVANT_BIAS.value:
-        return []
+        return
     may_be = "long for a winding's, it may be" if long else "a winding's, or"
-    return [
-        Finding(
-            "second_lag",
-            "warning" if long else "note",
-            f"the speed follows by two lags, the second {share:.2g} of the first: {may_be} a "
-            "filter of the speed, which is no part of the motor's time constant",
-            {
-                "share": share,
-                "limit": WINDING_LAG.value,
-                "quantity": "time_constant",
-                "shift_share": share / (1 + share),
-            },
-            "switch the filter of the firmware off, or record encoder counts or the current",
-        )
-    ]
+    yield Finding(
+        "second_lag",
+        "warning" if long else "note",
+        f"the speed follows by two lags, the second {share:.2g} of the first: {may_be} a "
+        "filter of the speed, which is no part of the motor's time constant",
+        {
+            "share": share,
+            "limit": WINDING_LAG.value,
+            "quantity": "time_constant",
+            "shift_share": share / (1 + share),
+        },
+        "switch the filter of the firmware off, or record encoder counts or the current",
+    )
 
 
-def _implausible(fit: Fit) -> list[Finding]:
+def _implausible(fit: Fit) -> Iterator[Finding]:
     """Say of a motor that cannot be that a unit may be another."""
     lag, gain = fit.z.time_constant, fit.z.dc_gain
     odd = {
@@ -210,16 +192,14 @@ def _implausible(fit: Fit) -> list[Finding]:
         f"a gain of {gain:.3g} rad/s per volt": gain > HIGHEST_GAIN.value,
     }
     if not any(odd.values()):
-        return []
-    return [
-        Finding(
-            "implausible_motor",
-            "warning",
-            f"no motor has {' and '.join(word for word, there in odd.items() if there)}",
-            {"time_constant": lag, "dc_gain": gain},
-            "check the units of time (ms taken for s?), speed and voltage (PWM taken for volts?)",
-        )
-    ]
+        return
+    yield Finding(
+        "implausible_motor",
+        "warning",
+        f"no motor has {' and '.join(word for word, there in odd.items() if there)}",
+        {"time_constant": lag, "dc_gain": gain},
+        "check the units of time (ms taken for s?), speed and voltage (PWM taken for volts?)",
+    )
 
 
 def _lag_share(log_ratio: float) -> float:
@@ -228,31 +208,25 @@ def _lag_share(log_ratio: float) -> float:
     return float((1 - root) / (1 + root))
 
 
-def _torque_noise(data: Experiments, fit: Fit) -> list[Finding]:
+def _torque_noise(data: Experiments, fit: Fit) -> Iterator[Finding]:
     if fit.noise_ratio <= 0 or data.kind != ANGLE:
-        return []
-    out = []
+        return
     if not fit.structure.current and _plain_square(data, fit):
-        out.append(
-            Finding(
-                "plain_square",
-                "unreliable",
-                "a plain square tells friction from gain at its reversals alone, and a load that "
-                "fluctuates hides them",
-                {},
-                "add a sine, a Fourier wave, or the current",
-            )
+        yield Finding(
+            "plain_square",
+            "unreliable",
+            "a plain square tells friction from gain at its reversals alone, and a load that "
+            "fluctuates hides them",
+            {},
+            "add a sine, a Fourier wave, or the current",
         )
-    out.append(
-        Finding(
-            "torque_noise",
-            "warning",
-            "the motion scatters beyond the counter's resolution (a load that fluctuates, or a "
-            "command that switches between samples)",
-            {"intensity": float(fit.noise_ratio)},
-        )
+    yield Finding(
+        "torque_noise",
+        "warning",
+        "the motion scatters beyond the counter's resolution (a load that fluctuates, or a "
+        "command that switches between samples)",
+        {"intensity": float(fit.noise_ratio)},
     )
-    return out
 
 
 def _plain_square(data: Experiments, fit: Fit) -> bool:
@@ -312,63 +286,50 @@ def _least_squares(data: Experiments, fit: Fit, z: Coordinates) -> float:
     return float(there.objective - there.local_decrease)
 
 
-def advise(fit: Fit, result: Answer, known: Mapping[str, float]) -> list[Finding]:
-    """Return what to record or measure to know what is not known."""
+def advise(fit: Fit, result: Answer, known: Mapping[str, float]) -> Iterator[Finding]:
+    """Yield what to record or measure to know what is not known."""
     missing = [n for n in PHYSICAL if result.parameters[n].status == "unidentifiable"]
-    out = []
-    s = fit.structure
-    if missing and not s.current:
-        out.append(
-            _note(
-                "not_separable",
-                f"voltage and speed alone cannot separate {', '.join(missing)}: any of a family "
-                "of motors answers the same",
-                "record the motor current too; the combinations are what is known"
-                + (
-                    ""
-                    if "resistance" in known
-                    else "; with the resistance measured by ohmmeter one unknown less remains, yet "
-                    "not all can be separated without current"
-                ),
-            )
+    others = ", ".join(n for n in missing if n != "inductance")
+    current = fit.structure.current
+    if missing and not current:
+        remedy = "record the motor current too; the combinations are what is known"
+        if "resistance" not in known:
+            remedy += "; with the resistance measured by ohmmeter one unknown less remains, yet "
+            remedy += "not all can be separated without current"
+        yield _note(
+            "not_separable",
+            f"voltage and speed alone cannot separate {', '.join(missing)}: any of a family "
+            "of motors answers the same",
+            remedy,
         )
-    if missing and s.current:
-        if "inductance" in missing:
-            out.append(
-                _note(
-                    "inductance_hidden",
-                    "inductance does not show at this rate",
-                    "sample faster or excite at higher frequency",
-                )
-            )
-        others = ", ".join(n for n in missing if n != "inductance")
-        if others:
-            out.append(
-                _note(
-                    "weak_excitation",
-                    f"{others} cannot be identified from these data",
-                    f"{others}: excite harder, longer, over more frequencies and in both "
-                    "directions",
-                )
-            )
-    return [*out, *_friction(fit)]
+    if current and "inductance" in missing:
+        yield _note(
+            "inductance_hidden",
+            "inductance does not show at this rate",
+            "sample faster or excite at higher frequency",
+        )
+    if current and others:
+        yield _note(
+            "weak_excitation",
+            f"{others} cannot be identified from these data",
+            f"{others}: excite harder, longer, over more frequencies and in both directions",
+        )
+    yield from _friction(fit)
 
 
-def _friction(fit: Fit) -> list[Finding]:
+def _friction(fit: Fit) -> Iterator[Finding]:
     free = fit.structure.free
     if "vc_plus" not in free or fit.structure.friction == "none":
-        return []
+        return
     i = free.index("vc_plus")
     std = float(np.sqrt(fit.covariance()[i, i]))
     if std <= FRICTION_SHOWN.value * abs(fit.z.vc_plus) or std <= 0.05:
-        return []
-    return [
-        _note(
-            "friction_hidden",
-            "static friction hardly shows",
-            "drive both directions, slowly through zero",
-        )
-    ]
+        return
+    yield _note(
+        "friction_hidden",
+        "static friction hardly shows",
+        "drive both directions, slowly through zero",
+    )
 
 
 def _note(code: str, message: str, advice: str) -> Finding:

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from smp_motor_control.arrays import Array
-from smp_motor_ident.diagnosis.data_quality import averaged_runs, measured_speed
+from smp_motor_ident.diagnosis.data_quality import of_the_winding
 from smp_motor_ident.diagnosis.limits import CURRENT_KIND, FEWEST, METER, REST
 from smp_motor_ident.record import Record
 
@@ -21,7 +21,7 @@ ROUNDS = 6
 
 def current_kind(group: Sequence[Record]) -> str:
     """Return the kind of current of all records together."""
-    parts = [_signals(r) for r in group if r.current is not None]
+    parts = [of_the_winding(r, r.current) for r in group if r.current is not None]
     v, w, i = (np.concatenate(x) for x in zip(*parts, strict=True)) if parts else ([], [], [])
     if len(i) < FEWEST.value:
         return ARMATURE
@@ -45,16 +45,6 @@ def _one_sign(v: Array, i: Array) -> bool:
     if back.size < FEWEST.value or low < -METER.value * high:
         return False
     return float(np.median(back)) > REST.value * float(high)
-
-
-def _signals(record: Record) -> tuple[Array, Array, Array]:
-    """Return voltage, speed and current as means over short runs."""
-    speed = measured_speed(record)
-    assert record.current is not None
-    there = np.isfinite(record.current) & np.isfinite(speed)
-    v, i = averaged_runs(record, np.where(there, record.current, np.nan))
-    _, w = averaged_runs(record, np.where(there, speed, np.nan))
-    return v, w, i
 
 
 def _rest(columns: Array, values: Array) -> tuple[Array, float]:

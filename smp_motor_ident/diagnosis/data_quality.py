@@ -1,6 +1,6 @@
 """Bad data named for what it is, before any number is made of it."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -35,7 +35,7 @@ RUN_CORRELATION = 20.0  # by which neighbouring runs' errors hang together, at m
 def screen(records: Sequence[Record]) -> list[Finding]:
     """Refuse records that cannot lead to a right answer; name the reason and the remedy."""
     warnings = implausible_voltage(records)
-    where = _where(records)
+    where = where_of(records)
     _length(records, where)
     for record in records:
         warnings += _lost(record)
@@ -47,11 +47,11 @@ def screen(records: Sequence[Record]) -> list[Finding]:
         _ratio(record)
     _standing(records, where)
     for record in records:
-        silent(record, _where([record]))
+        silent(record, where_of([record]))
     _motion(records, where)
     _signs(records, where)
     for record in records:
-        _signs([record], _where([record]), late=False)  # the many do not hide the one
+        _signs([record], where_of([record]), late=False)  # the many do not hide the one
         _offset(record)
     read = [finding for record in records for finding in record.findings]
     return [*warnings, *(f for k, f in enumerate(read) if f not in read[:k])]
@@ -66,7 +66,8 @@ def _resolution(records: Sequence[Record], where: str) -> None:
         )
 
 
-def _where(records: Sequence[Record]) -> str:
+def where_of(records: Sequence[Record]) -> str:
+    """Return files and wheel in words."""
     sources = ", ".join(dict.fromkeys(r.source for r in records if r.source))
     return f"{sources or 'record'}: {records[0].wheel}"
 
@@ -81,9 +82,8 @@ def _length(records: Sequence[Record], where: str) -> None:
         )
 
 
-def _lost(record: Record) -> list[Finding]:
-    where = _where([record])
-    out = []
+def _lost(record: Record) -> Iterator[Finding]:
+    where = where_of([record])
     for name in ("velocity", "position"):
         values = getattr(record, name)
         if values is None or (record.count is not None and record.hardware.counts_per_revolution):
@@ -95,12 +95,11 @@ def _lost(record: Record) -> list[Finding]:
                 "repair the sensor or its connection and record again"
             )
         if lost > 0:
-            out.append(_left_out(name, lost))
+            yield _left_out(name, lost)
     if record.current is not None:
         lost = float(np.mean(~np.isfinite(record.current)))
         if 0 < lost < 1:
-            out.append(_left_out("current", lost))
-    return out
+            yield _left_out("current", lost)
 
 
 def _left_out(name: str, lost: float) -> Finding:
@@ -192,7 +191,7 @@ def _ratio(record: Record) -> None:
 
 
 def _compare(record: Record, angle: Array, what: str, other_values: Array, other: str) -> None:
-    where = _where([record])
+    where = where_of([record])
     lag = max(1, min(10, len(record) // 10))
     dt = record.time[lag:] - record.time[:-lag]
     a, b = (angle[lag:] - angle[:-lag]) / dt, (other_values[lag:] - other_values[:-lag]) / dt
@@ -227,7 +226,7 @@ def _compare(record: Record, angle: Array, what: str, other_values: Array, other
 
 def _saturation(record: Record) -> None:
     """Refuse a speed or current that rests at its limit while the voltage moves."""
-    where = _where([record])
+    where = where_of([record])
     for name, unit in (("velocity", "rad/s"), ("current", "A")):
         values = getattr(record, name)
         if values is None:
@@ -334,14 +333,18 @@ def _period(records: Sequence[Record]) -> float:
     return 2 * sum(len(r) for r in records) / max(changes, 1)
 
 
-def averaged_runs(record: Record, values: Array) -> tuple[Array, Array]:
-    """Return voltage and a signal as means over short runs, in which a counter's noise is small."""
+def of_the_winding(record: Record, current: Array) -> tuple[Array, Array, Array]:
+    """Return voltage, speed and current as means over short runs, in which a counter's noise is
+    small.
+    """
     k = max(1, len(record) // RUNS)
     n = len(record) // k * k
-    ok = np.isfinite(values[:n]).reshape(-1, k)
-    y = np.where(ok, values[:n].reshape(-1, k), 0.0).sum(axis=1) / np.maximum(ok.sum(axis=1), 1)
-    keep = ok.any(axis=1)
-    return record.voltage[:n].reshape(-1, k).mean(axis=1)[keep], y[keep]
+    v, w, i = (x[:n].reshape(-1, k) for x in (record.voltage, measured_speed(record), current))
+    known = np.isfinite(i) & np.isfinite(w)
+    keep = known.any(axis=1)
+    samples = np.maximum(known.sum(axis=1), 1)
+    w, i = (np.where(known, x, 0.0).sum(axis=1) / samples for x in (w, i))
+    return v.mean(axis=1)[keep], w[keep], i[keep]
 
 
 def _offset(record: Record) -> None:
@@ -351,10 +354,7 @@ def _offset(record: Record) -> None:
     """
     if record.current is None or np.isfinite(record.current).sum() < FEWEST.value:
         return
-    speed = measured_speed(record)
-    there = np.isfinite(record.current) & np.isfinite(speed)
-    v, i = averaged_runs(record, np.where(there, record.current, np.nan))
-    _, w = averaged_runs(record, np.where(there, speed, np.nan))
+    v, w, i = of_the_winding(record, record.current)
     if len(v) < 20:
         return
     answer, variance = _winding(v, w, i)
@@ -366,7 +366,7 @@ def _offset(record: Record) -> None:
         OFFSET_SURE.value * std, LARGEST_OFFSET.value * max(largest - abs(offset), 1e-12)
     ):
         raise SignalError(
-            f"{_where([record])}: current has an offset of {offset:.2g} A where it reaches "
+            f"{where_of([record])}: current has an offset of {offset:.2g} A where it reaches "
             f"{largest:.3g} A; zero the current sensor at rest and record again"
         )
 

@@ -1,9 +1,10 @@
 """Estimates that are refused after the fit: the model does not explain the data, or too little."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
+from smp_motor_ident.diagnosis.data_quality import where_of
 from smp_motor_ident.diagnosis.limits import LARGEST_OFFSET, LOOSE_QUANTITY, WORST_FIT
 from smp_motor_ident.diagnosis.validation import speed_fit, stands, within_resolution
 from smp_motor_ident.errors import (
@@ -21,16 +22,10 @@ from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.record import Record
 
 
-def where(group: Sequence[Record]) -> str:
-    """Return files and wheel in words."""
-    sources = ", ".join(dict.fromkeys(r.source for r in group if r.source))
-    return f"{sources or 'record'}: {group[0].wheel}"
-
-
 def no_candidate(group: Sequence[Record]) -> InsufficientExcitationError:
     """Return the refusal of data that no structure could be started on."""
     return InsufficientExcitationError(
-        f"{where(group)}: no motor model explains these data; record 20 s or more of a "
+        f"{where_of(group)}: no motor model explains these data; record 20 s or more of a "
         "square or Fourier voltage that turns the motor in both directions"
     )
 
@@ -39,7 +34,7 @@ def of_which(
     group: Sequence[Record], refusal: SmpError, alone: Callable[[Record], object]
 ) -> SmpError:
     """Return the refusal of several records, with those by name of which ``alone`` is refused."""
-    if len(group) < 2 or not str(refusal).startswith(where(group)):
+    if len(group) < 2 or not str(refusal).startswith(where_of(group)):
         return refusal
     refused: dict[str, str] = {}
     names = [r.source or f"record {n + 1}" for n, r in enumerate(group)]
@@ -65,14 +60,15 @@ def refuse(
     explained = np.isfinite(fitted) and fitted >= WORST_FIT.value
     if not explained and stands(data, fit):
         raise InsufficientExcitationError(
-            f"{where(group)}: the motor stands: what its angle moves is the sensor's scatter, "
+            f"{where_of(group)}: the motor stands: what its angle moves is the sensor's scatter, "
             f"while the voltage reaches {np.abs(data.hold_value).max():.3g} V; drive harder"
         )
     if not explained and not within_resolution(data, fit) and not _follows(group, data, fit):
         raise SignalError(
-            f"{where(group)}: the voltage does not explain the motion (fit {fitted:.0f} %); check "
-            "that voltage and encoder belong to the same motor, that the driver puts out what is "
-            "commanded (no clip at the supply, no coasting), and that nothing else drives it"
+            f"{where_of(group)}: the voltage does not explain the motion (fit {fitted:.0f} %); "
+            "check that voltage and encoder belong to the same motor, that the driver puts out "
+            "what is commanded (no clip at the supply, no coasting), and that nothing else drives "
+            "it"
         )
     _refuse_offset(group, fit)
     loose = [
@@ -85,29 +81,27 @@ def refuse(
         _refuse_integral(group, fit)
         refusal = UnknownLagError if loose == ["time_constant"] else InsufficientExcitationError
         raise refusal(
-            f"{where(group)}: the data do not tell {' and '.join(loose)}; record a longer "
+            f"{where_of(group)}: the data do not tell {' and '.join(loose)}; record a longer "
             "excitation with several frequencies, in both directions and well above the friction"
         )
 
 
-def lag_unknown(result: Answer, refusal: UnknownLagError | None, step: float) -> list[Finding]:
+def lag_unknown(result: Answer, refusal: UnknownLagError | None, step: float) -> Iterator[Finding]:
     """Say that an answer leaves open how slow the motor is, at this sampling interval [s]."""
     if refusal is None:
-        return []
+        return
     low, high = result.combinations["time_constant"].ci95 or (0.0, np.inf)
     quick = high < step
     cause = "a load that fluctuates, or what the model lacks, takes its place"
     advice = "record longer, with several frequencies, in both directions and well above friction"
-    return [
-        Finding(
-            "lag_unknown",
-            "warning" if quick else "unreliable",
-            f"the data do not tell time_constant: it may be anything from {low:.3g} to {high:.3g} "
-            f"s; {f'it is over within the {step:.3g} s between samples' if quick else cause}",
-            {"low": float(low), "high": float(high), "sample_time": step},
-            "sample faster" if quick else advice,
-        )
-    ]
+    yield Finding(
+        "lag_unknown",
+        "warning" if quick else "unreliable",
+        f"the data do not tell time_constant: it may be anything from {low:.3g} to {high:.3g} "
+        f"s; {f'it is over within the {step:.3g} s between samples' if quick else cause}",
+        {"low": float(low), "high": float(high), "sample_time": step},
+        "sample faster" if quick else advice,
+    )
 
 
 def _follows(group: Sequence[Record], data: Experiments, fit: Fit) -> bool:
@@ -126,9 +120,9 @@ def _refuse_integral(group: Sequence[Record], fit: Fit) -> None:
     if fit.z.time_constant < longest or any(r.velocity is None for r in group):
         return
     raise SignalError(
-        f"{where(group)}: velocity changes for as long as there is a voltage and is never steady "
-        f"within {longest:.3g} s, as an angle does; if it is an angle, map it as position, else "
-        "record until the speed is steady"
+        f"{where_of(group)}: velocity changes for as long as there is a voltage and is never "
+        f"steady within {longest:.3g} s, as an angle does; if it is an angle, map it as position, "
+        "else record until the speed is steady"
     )
 
 
@@ -139,6 +133,6 @@ def _refuse_offset(group: Sequence[Record], fit: Fit) -> None:
     largest = max(float(np.nanmax(np.abs(r.current))) for r in group if r.current is not None)
     if offset > LARGEST_OFFSET.value * max(largest - offset, 1e-12):
         raise CurrentError(
-            f"{where(group)}: current has an offset of {fit.z.current_offset:.3g} A where it "
+            f"{where_of(group)}: current has an offset of {fit.z.current_offset:.3g} A where it "
             f"reaches {largest:.3g} A; zero the current sensor at rest and record again"
         )

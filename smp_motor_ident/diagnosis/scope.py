@@ -1,7 +1,7 @@
 """What stated values cover: structures that are alike, a single level, a motor that changes."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -30,19 +30,18 @@ def scope(
     change: Change,
     alike: Mapping[str, float],
     group: Sequence[Record],
-) -> list[Finding]:
-    """Return what a reader must know of the values' meaning."""
-    size = _one_size(data)
-    top = one_size_or_swing(data)
-    out = [*_one_size_of_voltage(top), *([] if result.level else _one_direction(data, result))]
+) -> Iterator[Finding]:
+    """Yield what a reader must know of the values' meaning."""
+    yield from _one_size_of_voltage(one_size_or_swing(data))
+    if not result.level:
+        yield from _one_direction(data, result)
     if alike:
-        out.append(_alike(alike))
+        yield _alike(alike)
     if result.level:
-        out.append(_one_level(result))
-    out += _current_scale(result, group[0].hardware.resistance, size > 0)
+        yield _one_level(result)
+    yield from _current_scale(result, group[0].hardware.resistance, _one_size(data) > 0)
     if change.std:
-        out.append(_motor_changes(change, group, float(np.abs(data.voltage).max())))
-    return out
+        yield _motor_changes(change, group, float(np.abs(data.voltage).max()))
 
 
 def _motor_changes(change: Change, group: Sequence[Record], top: float) -> Finding:
@@ -129,7 +128,7 @@ def _one_swing(data: Experiments) -> float:
     return peak if float(alike.mean()) > 1 - SAME_LEVEL.value else 0.0
 
 
-def _one_size_of_voltage(top: float) -> list[Finding]:
+def _one_size_of_voltage(top: float) -> Iterator[Finding]:
     """Say what a voltage of one size both ways, or of one swing, cannot show.
 
     With a size U a driver that takes a share of it (a dead zone, a drop, a clip, pulses) is the
@@ -138,40 +137,37 @@ def _one_size_of_voltage(top: float) -> list[Finding]:
     gain of the fundamental (its describing function), and the motor hides the harmonics.
     """
     if not top:
-        return []
-    return [
-        Finding(
-            "one_size_of_voltage",
-            "warning",
-            f"the voltage has one size, {top:.3g} V: a driver that puts out less of it (a dead "
-            "zone, a drop, a clip at the supply, coasting between its pulses) or lets it rise "
-            "slowly, and a drag by the square of the speed, look like a motor of another gain or "
-            "lag; the numbers hold for the voltage as it was recorded",
-            {"voltage": top},
-            "record the voltage at the motor's terminals, or add levels of other sizes",
-        )
-    ]
+        return
+    yield Finding(
+        "one_size_of_voltage",
+        "warning",
+        f"the voltage has one size, {top:.3g} V: a driver that puts out less of it (a dead "
+        "zone, a drop, a clip at the supply, coasting between its pulses) or lets it rise "
+        "slowly, and a drag by the square of the speed, look like a motor of another gain or "
+        "lag; the numbers hold for the voltage as it was recorded",
+        {"voltage": top},
+        "record the voltage at the motor's terminals, or add levels of other sizes",
+    )
 
 
-def _one_direction(data: Experiments, result: Answer) -> list[Finding]:
+def _one_direction(data: Experiments, result: Answer) -> Iterator[Finding]:
     """Say that friction and a constant load are one voltage where the motor turns one way only."""
     if data.hold_value.min() < 0 < data.hold_value.max():
-        return []
+        return
     if "load_voltage" in result.combinations:
-        return _driving_load(data, result)
-    return [
-        Finding(
-            "one_direction",
-            "warning",
-            "the motor was driven one way only: static_voltage is friction and a constant load "
-            "together, and the other way may have its own",
-            {"voltage": float(data.hold_value[np.argmax(np.abs(data.hold_value))])},
-            "drive both directions",
-        )
-    ]
+        yield from _driving_load(data, result)
+        return
+    yield Finding(
+        "one_direction",
+        "warning",
+        "the motor was driven one way only: static_voltage is friction and a constant load "
+        "together, and the other way may have its own",
+        {"voltage": float(data.hold_value[np.argmax(np.abs(data.hold_value))])},
+        "drive both directions",
+    )
 
 
-def _driving_load(data: Experiments, result: Answer) -> list[Finding]:
+def _driving_load(data: Experiments, result: Answer) -> Iterator[Finding]:
     """Say it where, turning one way only, a motor seems to be driven by its load.
 
     Under ``v = K w + friction + load`` the gain is then more than speed over voltage: what says
@@ -183,17 +179,15 @@ def _driving_load(data: Experiments, result: Answer) -> list[Finding]:
     row = np.array([{names[0]: 1.0, names[1]: sign}.get(n, 0.0) for n in result.names])
     std = float(np.sqrt(row @ result.covariance @ row))
     if value + HALF_WIDTH.value * std >= 0.0:
-        return []
-    return [
-        Finding(
-            "driving_load",
-            "unreliable",
-            f"the motor would be driven by its load, by {-value:.3g} V more than friction takes, "
-            "one way only: the steady speeds and the changes of speed ask for different gains",
-            {"voltage": value, "std": std},
-            "drive both directions, at several steady levels of voltage",
-        )
-    ]
+        return
+    yield Finding(
+        "driving_load",
+        "unreliable",
+        f"the motor would be driven by its load, by {-value:.3g} V more than friction takes, "
+        "one way only: the steady speeds and the changes of speed ask for different gains",
+        {"voltage": value, "std": std},
+        "drive both directions, at several steady levels of voltage",
+    )
 
 
 OF_SCALE = ("resistance", "inductance", "inertia", "viscous_friction", "coulomb_friction")
@@ -201,7 +195,7 @@ OF_SCALE = ("resistance", "inductance", "inertia", "viscous_friction", "coulomb_
 large the same motion and voltage are those of R/s, L/s, s J, s b and s Tc, and of the same K."""
 
 
-def _current_scale(result: Answer, ohmmeter: float | None, one_size: bool) -> list[Finding]:
+def _current_scale(result: Answer, ohmmeter: float | None, one_size: bool) -> Iterator[Finding]:
     """Say what only the current's own scale determines, held against an ohmmeter if there is one.
 
     No record of voltage, current and motion shows that scale; under a voltage of one size the
@@ -209,32 +203,32 @@ def _current_scale(result: Answer, ohmmeter: float | None, one_size: bool) -> li
     """
     known = {n: q for n in OF_SCALE if (q := result.parameters[n]).status == "estimated"}
     if not known:
-        return []
+        return
     words = f"the scale of the current's sensor, which no record shows, is in {', '.join(known)}"
     found = known.get("resistance")
     if found is None or found.value is None or not ohmmeter:
         advice = "state the resistance by ohmmeter (`resistance`), which shows the scale"
         evidence: dict[str, float | str | None] = {"of_the_scale": ", ".join(known)}
-        if not one_size:
-            return [Finding("current_scale", "note", words, evidence, advice)]
-        words += "; under a voltage of one size the current of the supply looks like such a scale"
-        return [Finding("current_scale", "warning", words, evidence, advice)]
+        if one_size:
+            words += (
+                "; under a voltage of one size the current of the supply looks like such a scale"
+            )
+        yield Finding("current_scale", "warning" if one_size else "note", words, evidence, advice)
+        return
     scale = ohmmeter / found.value
     off = (
         abs(scale - 1) > RESISTANCE_BAND.value + HALF_WIDTH.value * (found.std or 0.0) / found.value
     )
-    return [
-        Finding(
-            "current_scale",
-            "unreliable" if off else "note",
-            f"{words}: by the ohmmeter's {ohmmeter:.4g} ohm it is {scale:.3g}",
-            {"scale": scale, "ohmmeter": ohmmeter, "of_the_scale": ", ".join(known)},
-            "calibrate the current's sensor, or measure the resistance warm, at the current that "
-            "drives"
-            if off
-            else "",
-        )
-    ]
+    remedy = (
+        "calibrate the current's sensor, or measure the resistance warm, at the current that drives"
+    )
+    yield Finding(
+        "current_scale",
+        "unreliable" if off else "note",
+        f"{words}: by the ohmmeter's {ohmmeter:.4g} ohm it is {scale:.3g}",
+        {"scale": scale, "ohmmeter": ohmmeter, "of_the_scale": ", ".join(known)},
+        f"{remedy}drives" if off else "",
+    )
 
 
 def _one_level(result: Answer) -> Finding:

@@ -1,5 +1,7 @@
 """What a fit says of command and sensors: when they are, offset and misfit, how they average."""
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from smp_motor_ident.diagnosis.limits import FIT_EXPLAINS, LONG_DELAY, SHARP
@@ -11,45 +13,44 @@ from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.structures import Electromechanical
 
 
-def sensors(data: Experiments, fit: Fit) -> list[Finding]:
-    """Return what was found of the sensors."""
-    out = _fit_of_current(data, fit)
+def sensors(data: Experiments, fit: Fit) -> Iterator[Finding]:
+    """Yield what was found of the sensors."""
+    yield from _fit_of_current(data, fit)
     s = fit.structure
     if isinstance(s, Electromechanical) and s.offset:
         offset = fit.z.current_offset
-        out.append(
-            Finding(
-                "current_offset",
-                "warning",
-                f"current has an offset of {1e3 * offset:.3g} mA, removed",
-                {"offset": offset},
-                "zero the current sensor at rest",
-            )
+        yield Finding(
+            "current_offset",
+            "warning",
+            f"current has an offset of {1e3 * offset:.3g} mA, removed",
+            {"offset": offset},
+            "zero the current sensor at rest",
         )
     if isinstance(s, Electromechanical) and s.lags:
-        out.append(_current_lag(s.current_sensor, fit.z.current_lag))
-    out += [_filtered_speed(fit)] * s.has("window") + [_late_command(s.shift)] * (s.shift > 0)
-    return out + _long_delay(data, fit)
+        yield _current_lag(s.current_sensor, fit.z.current_lag)
+    if s.has("window"):
+        yield _filtered_speed(fit)
+    if s.shift > 0:
+        yield _late_command(s.shift)
+    yield from _long_delay(data, fit)
 
 
-def _long_delay(data: Experiments, fit: Fit) -> list[Finding]:
+def _long_delay(data: Experiments, fit: Fit) -> Iterator[Finding]:
     """Question a delay far beyond the motor's lag, which friction makes of a slow command."""
     delay, lag = fit.z.delay, fit.z.time_constant
     if delay <= LONG_DELAY.value * lag or "delay" not in fit.structure.free:
-        return []
+        return
     change = np.abs(np.diff(data.hold_value))
     seen = data.hold_end[:-1] + delay + lag < data.time[-1]
     sharp = bool(np.any(change[seen] > SHARP.value * np.ptp(data.hold_value)))
-    return [
-        Finding(
-            "long_delay",
-            "warning" if sharp else "unreliable",
-            f"the delay of {delay:.3g} s is {delay / lag:.2g} times the time constant"
-            + ("" if sharp else ": a slow command that overcomes static friction late looks so"),
-            {"delay": delay, "time_constant": lag},
-            "" if sharp else "record steps: what is late after a step is delay",
-        )
-    ]
+    yield Finding(
+        "long_delay",
+        "warning" if sharp else "unreliable",
+        f"the delay of {delay:.3g} s is {delay / lag:.2g} times the time constant"
+        + ("" if sharp else ": a slow command that overcomes static friction late looks so"),
+        {"delay": delay, "time_constant": lag},
+        "" if sharp else "record steps: what is late after a step is delay",
+    )
 
 
 def _late_command(shift: float) -> Finding:
@@ -83,25 +84,23 @@ def _filtered_speed(fit: Fit) -> Finding:
     )
 
 
-def _fit_of_current(data: Experiments, fit: Fit) -> list[Finding]:
+def _fit_of_current(data: Experiments, fit: Fit) -> Iterator[Finding]:
     """Say that a current was given up for the speed: each has a noise of its own, as large as it
     takes.
     """
     if not data.current.size:
-        return []
+        return
     error = data.current - prediction.simulate(data, fit, gain=True)[:, 2]
     explained = 100 * (1 - float(np.nanstd(error)) / max(float(np.nanstd(data.current)), 1e-300))
     if explained >= FIT_EXPLAINS.value or not coloured(error):
-        return []
-    return [
-        Finding(
-            "poor_fit_of_current",
-            "unreliable",
-            f"the model explains only {explained:.0f} % of the current, and the rest is no noise",
-            {"fit_percent": explained, "limit": FIT_EXPLAINS.value},
-            "check that speed and current are of this motor, and that neither is filtered",
-        )
-    ]
+        return
+    yield Finding(
+        "poor_fit_of_current",
+        "unreliable",
+        f"the model explains only {explained:.0f} % of the current, and the rest is no noise",
+        {"fit_percent": explained, "limit": FIT_EXPLAINS.value},
+        "check that speed and current are of this motor, and that neither is filtered",
+    )
 
 
 def _current_lag(sensor: str, lag: float) -> Finding:

@@ -5,7 +5,7 @@ purpose.  Each check is a function of all wheels, and :data:`CHECKS` lists them.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -39,73 +39,69 @@ class Robot:
     battery: float = math.nan  # voltage that the battery reports [V]; NaN where it does not
 
 
-Check = Callable[[Robot], list[Finding]]
+Check = Callable[[Robot], Iterator[Finding]]
 
 
-def feedback(robot: Robot) -> list[Finding]:
+def feedback(robot: Robot) -> Iterator[Finding]:
     """Samples come often enough, with stamps of this clock that grow."""
-    found = []
     for wheel, one in robot.figures.items():
         if not one.rate >= FEEDBACK_RATE.value:
-            found.append(Finding(
+            yield Finding(
                 "feedback_rate", "refused",
                 f"{wheel}: motor_state comes {one.rate:.3g} times a second",
                 {"wheel": wheel, "rate": one.rate, "least": FEEDBACK_RATE.value},
                 "publish motor_state 100 times a second or more, stamped when it was sampled",
-            ))  # fmt: skip
+            )  # fmt: skip
         if abs(one.age) > FEEDBACK_AGE.value:
-            found.append(Finding(
+            yield Finding(
                 "feedback_age", "refused",
                 f"{wheel}: stamps of motor_state are {abs(one.age):.3g} s "
                 f"{'old on arrival' if one.age > 0 else 'ahead of this clock'}",
                 {"wheel": wheel, "age": one.age, "limit": FEEDBACK_AGE.value},
                 "stamp when it is sampled, on a clock that is synchronised with this one (chrony), "
                 "or run this tool with use_sim_time where the robot does",
-            ))  # fmt: skip
+            )  # fmt: skip
         if one.repeated:
-            found.append(Finding(
+            yield Finding(
                 "repeated_stamps", "warning",
                 f"{wheel}: {one.repeated} stamps do not grow",
                 {"wheel": wheel, "stamps": one.repeated},
                 "stamp every sample with the instant at which it was taken",
-            ))  # fmt: skip
-    return found
+            )  # fmt: skip
 
 
-def motion(robot: Robot) -> list[Finding]:
+def motion(robot: Robot) -> Iterator[Finding]:
     """Every wheel turns when it is asked to, it alone, and not before."""
-    found = []
     for wheel, one in robot.figures.items():
         if one.at_rest > BREAKAWAY_COUNTS.value:
-            found.append(Finding(
+            yield Finding(
                 "turns_at_rest", "refused",
                 f"{wheel}: turned by {one.at_rest:.0f} counts under zero voltage",
                 {"wheel": wheel, "counts": one.at_rest, "limit": BREAKAWAY_COUNTS.value},
                 "see that nothing else drives or turns the wheel, and that the encoder counts "
                 "only motion",
-            ))  # fmt: skip
+            )  # fmt: skip
         moved = robot.moved.get(wheel, {})
         others = [w for w, n in moved.items() if w != wheel and n > BREAKAWAY_COUNTS.value]
         own = moved.get(wheel, math.inf) > BREAKAWAY_COUNTS.value
         if others and not own:
-            found.append(Finding(
+            yield Finding(
                 "crossed_wheels", "refused",
                 f"{wheel}: commanding it turns {', '.join(others)} instead",
                 {"wheel": wheel, "counts": max(moved[w] for w in others)},
                 "motors or encoders of these wheels are exchanged: swap their plugs, or their "
                 "names in the driver",
-            ))  # fmt: skip
+            )  # fmt: skip
         elif not own or math.isnan(one.breakaway):
-            found.append(_motionless(wheel, one))
+            yield _motionless(wheel, one)
         elif others:
-            found.append(Finding(
+            yield Finding(
                 "coupled_wheels", "warning",
                 f"{wheel}: {', '.join(others)} turned with it",
                 {"wheel": wheel, "counts": max(moved[w] for w in others)},
                 "lift the robot so that every wheel is free; wheels that a belt couples are one "
                 "motor's load, commission one of them with --wheel",
-            ))  # fmt: skip
-    return found
+            )  # fmt: skip
 
 
 def _motionless(wheel: str, one: Figures) -> Finding:
@@ -124,19 +120,18 @@ def _motionless(wheel: str, one: Figures) -> Finding:
     )  # fmt: skip
 
 
-def signs(robot: Robot) -> list[Finding]:
+def signs(robot: Robot) -> Iterator[Finding]:
     """Positive voltage makes counts, position and speed grow, and is reported as positive."""
-    found = []
     for wheel, one in robot.figures.items():
         if one.applied < 0:
-            found.append(Finding(
+            yield Finding(
                 "reported_voltage_sign", "refused",
                 f"{wheel}: the driver reports {one.applied:.2f} times the commanded voltage",
                 {"wheel": wheel, "applied": one.applied},
                 "change the sign of the command or of the reported voltage in the driver",
-            ))  # fmt: skip
+            )  # fmt: skip
         if one.direction < 0:
-            found.append(Finding(
+            yield Finding(
                 "reversed", "refused",
                 f"{wheel}: positive voltage makes its counts shrink: the encoder's channels A and "
                 "B are swapped, or the motor's leads; these look alike from here",
@@ -145,71 +140,68 @@ def signs(robot: Robot) -> list[Finding]:
                 "channels (or change the sign of counts, position and velocity in the driver); if "
                 "it turns backward, swap the motor's leads (or change the sign of its command "
                 "and voltage)",
-            ))  # fmt: skip
+            )  # fmt: skip
         if one.velocity_ratio < 0:
-            found.append(Finding(
+            yield Finding(
                 "velocity_sign", "refused",
                 f"{wheel}: velocity has the opposite sign of what encoder_count shows",
                 {"wheel": wheel, "ratio": one.velocity_ratio},
                 "give both the same sign in the driver",
-            ))  # fmt: skip
-    return found
+            )  # fmt: skip
 
 
-def gear_ratio(robot: Robot) -> list[Finding]:
+def gear_ratio(robot: Robot) -> Iterator[Finding]:
     """What can show a wrong gear ratio or count per revolution does not."""
-    found, blind = [], []
+    blind = []
     for wheel, one in robot.figures.items():
         described, known = robot.hardware[wheel], robot.ratios.get(wheel, math.nan)
         ratio = abs(one.velocity_ratio)
         gain = one.gain / robot.gains.get(wheel, math.nan)
         said = f"gear_ratio {described.gear_ratio:g}"
         if abs(ratio - 1.0) > VELOCITY_RATIO.value:
-            found.append(Finding(
+            yield Finding(
                 "gear_ratio", "refused",
                 f"{wheel}: reported velocity is {ratio:.3g} times what counts show with {said} "
                 f"and {described.counts_per_revolution or 0:g} counts per revolution",
                 {"wheel": wheel, "ratio": ratio, "described": described.gear_ratio},
                 f"one of these numbers is wrong in motor_description or in the driver; with the "
                 f"driver's a gear ratio of {described.gear_ratio / ratio:.4g} would fit",
-            ))  # fmt: skip
+            )  # fmt: skip
         if abs(known / described.gear_ratio - 1.0) > VELOCITY_RATIO.value:
-            found.append(Finding(
+            yield Finding(
                 "gear_ratio", "refused",
                 f"{wheel}: describes itself with {said}, the motor file has {known:g}",
                 {"wheel": wheel, "described": described.gear_ratio, "known": known},
                 "correct the one that is wrong",
-            ))  # fmt: skip
+            )  # fmt: skip
         if abs(math.log(gain)) > math.log(EXPECTED_GAIN.value) if gain > 0 else False:
-            found.append(Finding(
+            yield Finding(
                 "unexpected_gain", "refused",
                 f"{wheel}: turns at {gain:.3g} times the speed per volt that the motor file has",
                 {"wheel": wheel, "gain": one.gain, "expected": robot.gains[wheel]},
                 "it is another motor, or counts_per_revolution is wrong (at the motor shaft, four "
                 "counts a line); --accept unexpected_gain where it is meant to differ",
-            ))  # fmt: skip
+            )  # fmt: skip
         if math.isnan(known):
             blind.append(wheel)
     if blind:
-        found.append(Finding(
+        yield Finding(
             "gear_ratio_unknown", "note",
             f"{', '.join(blind)}: nothing here shows whether the gear ratio is right: motors are "
             "identified at their own shaft, and every speed of a wheel scales with it",
             {},
             "turn a wheel once by hand and see whether position grows by 6.28 rad; or give the "
             "motors' data sheet with --motors",
-        ))  # fmt: skip
-    return found
+        )  # fmt: skip
 
 
-def dead_zone(robot: Robot) -> list[Finding]:
+def dead_zone(robot: Robot) -> Iterator[Finding]:
     """What starts a wheel is not much more than what keeps it turning."""
-    found = []
     for wheel, one in robot.figures.items():
         supply = robot.hardware[wheel].supply_voltage or 12.0
         beyond = one.breakaway - max(one.friction, 0.0)
         if beyond > DEAD_ZONE.value * supply:
-            found.append(Finding(
+            yield Finding(
                 "dead_zone", "warning",
                 f"{wheel}: starts to turn at {one.breakaway:.2f} V and keeps turning at "
                 f"{max(one.friction, 0.0):.2f} V: a dead zone of its driver, or a gearbox that "
@@ -217,43 +209,40 @@ def dead_zone(robot: Robot) -> list[Finding]:
                 {"wheel": wheel, "breakaway": one.breakaway, "friction": one.friction},
                 "a wheel will hesitate wherever it starts or reverses: switch the driver to "
                 "another PWM frequency or mode, or oil the gearbox",
-            ))  # fmt: skip
-    return found
+            )  # fmt: skip
 
 
-def supply(robot: Robot) -> list[Finding]:
+def supply(robot: Robot) -> Iterator[Finding]:
     """The motors get the voltage that was commanded."""
-    found = []
     for wheel, one in robot.figures.items():
         nominal = robot.hardware[wheel].supply_voltage or math.nan
         if one.applied == 0.0 and one.direction:
-            found.append(Finding(
+            yield Finding(
                 "voltage_not_reported", "refused",
                 f"{wheel}: turns, but motor_state reports no voltage",
                 {"wheel": wheel, "applied": one.applied},
                 "publish the mean voltage of the interval before the stamp, duty cycle times "
                 "supply where nothing measures it",
-            ))  # fmt: skip
+            )  # fmt: skip
         if 0 < one.applied < 1.0 - SUPPLY_SHORTFALL.value:
-            found.append(Finding(
+            yield Finding(
                 "supply_low", "refused",
                 f"{wheel}: gets {one.applied:.0%} of the commanded voltage, as from a battery of "
                 f"{one.applied * nominal:.3g} V in place of {nominal:g} V",
                 {"wheel": wheel, "applied": one.applied, "nominal": _known(nominal)},
                 "charge or change the battery, or correct supply_voltage in motor_description",
-            ))  # fmt: skip
+            )  # fmt: skip
     rated = max((h.supply_voltage or math.nan for h in robot.hardware.values()), default=math.nan)
     if robot.battery < (1.0 - SUPPLY_SHORTFALL.value) * rated:
-        found.append(Finding(
+        yield Finding(
             "supply_low", "refused",
             f"battery_state says {robot.battery:.3g} V, motor_description {rated:g} V",
             {"battery": robot.battery, "nominal": rated},
             "charge or change the battery, or correct supply_voltage in motor_description",
-        ))  # fmt: skip
-    return found
+        )  # fmt: skip
 
 
-def sisters(robot: Robot) -> list[Finding]:
+def sisters(robot: Robot) -> Iterator[Finding]:
     """No wheel is held back far more than its sisters; coasting far longer is a warning.
 
     What drags heats its motor and tears at the robot.  A motor of another time constant is
@@ -262,27 +251,24 @@ def sisters(robot: Robot) -> list[Finding]:
     figures = robot.figures
     # Friction is below what starts the wheel, where nothing else is known.
     drag = {w: one.friction if one.friction > 0 else one.breakaway for w, one in figures.items()}
-    return [
-        *_beside_sisters(
-            drag, ("unlike_sisters", "refused"),
-            "friction", "it drags, brakes, or is another motor",
-            "turn it by hand beside the others: free what rubs, lift what touches the ground; "
-            "--accept unlike_sisters where it is meant to differ",
-        ),
-        *_beside_sisters(
-            {w: one.coast for w, one in figures.items()}, ("coasts_longer", "warning"),
-            "time to come to rest", "it carries something, touches the ground, or is another motor",
-            "look whether it is off the ground and bare",
-        ),
-    ]  # fmt: skip
+    yield from _beside_sisters(
+        drag, ("unlike_sisters", "refused"),
+        "friction", "it drags, brakes, or is another motor",
+        "turn it by hand beside the others: free what rubs, lift what touches the ground; "
+        "--accept unlike_sisters where it is meant to differ",
+    )  # fmt: skip
+    yield from _beside_sisters(
+        {w: one.coast for w, one in figures.items()}, ("coasts_longer", "warning"),
+        "time to come to rest", "it carries something, touches the ground, or is another motor",
+        "look whether it is off the ground and bare",
+    )  # fmt: skip
 
 
 def _beside_sisters(
     values: Mapping[str, float], code: tuple[str, Severity], what: str, why: str, advice: str
-) -> list[Finding]:
+) -> Iterator[Finding]:
     """Return a finding for each wheel that exceeds the median of the others too far."""
     known = {w: v for w, v in values.items() if v > 0}
-    out = []
     for wheel, value in known.items():
         others = [v for w, v in known.items() if w != wheel]
         usual = float(np.median(others)) if len(others) > 1 else math.nan
@@ -291,8 +277,7 @@ def _beside_sisters(
             evidence: dict[str, float | str | None] = {
                 "wheel": wheel, "value": value, "sisters": usual
             }  # fmt: skip
-            out.append(Finding(*code, text, evidence, advice))
-    return out
+            yield Finding(*code, text, evidence, advice)
 
 
 CHECKS: tuple[Check, ...] = (feedback, motion, signs, gear_ratio, dead_zone, supply, sisters)
