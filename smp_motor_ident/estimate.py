@@ -12,14 +12,11 @@ from numpy.typing import NDArray
 from smp_motor_ident.diagnosis import validation as validate
 from smp_motor_ident.diagnosis.adequacy import adequacy, lacks_something, stated
 from smp_motor_ident.diagnosis.advice import advise, assess, unsettled_rival
-from smp_motor_ident.diagnosis.beat import clock_share, on_beat
-from smp_motor_ident.diagnosis.bunched import merge_bunches
 from smp_motor_ident.diagnosis.conditions import dependent
 from smp_motor_ident.diagnosis.current_kind import ARMATURE, current_kind
 from smp_motor_ident.diagnosis.data_quality import screen
 from smp_motor_ident.diagnosis.differenced import counts_again
 from smp_motor_ident.diagnosis.limits import PROFILED
-from smp_motor_ident.diagnosis.lost_rows import bridged
 from smp_motor_ident.diagnosis.misfit import widened_by_misfit
 from smp_motor_ident.diagnosis.model_error import regression
 from smp_motor_ident.diagnosis.noise_or_effect import in_place_of_noise
@@ -34,6 +31,7 @@ from smp_motor_ident.diagnosis.scope import (
     one_size_or_swing,
     scope,
 )
+from smp_motor_ident.diagnosis.stamps import bridged, clock_share, merge_bunches, on_beat
 from smp_motor_ident.diagnosis.unmodelled import unmodelled_dynamics
 from smp_motor_ident.errors import (
     CurrentError,

@@ -15,7 +15,7 @@ from smp_motor_ident.bag.mapping import MotorMap, Signal
 from smp_motor_ident.bag.runs import one_after_another, pause_between
 from smp_motor_ident.bag.storage import Array, Integers, Table
 from smp_motor_ident.bag.units import FACTORS, check_unit, factor
-from smp_motor_ident.diagnosis.beat import find_beat, moves_on
+from smp_motor_ident.diagnosis.stamps import find_beat, moves_on
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.record import Hardware, Record
 

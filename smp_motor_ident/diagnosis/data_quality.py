@@ -19,8 +19,7 @@ from smp_motor_ident.diagnosis.limits import (
     SIGN_NEARER,
     SIGN_SURE,
 )
-from smp_motor_ident.diagnosis.lost_sign import lost_sign
-from smp_motor_ident.diagnosis.signs import lagged, likeness
+from smp_motor_ident.diagnosis.signs import lagged, likeness, lost_sign
 from smp_motor_ident.diagnosis.silence import silent
 from smp_motor_ident.diagnosis.units import cause_of_ratio, implausible_voltage
 from smp_motor_ident.errors import InsufficientExcitationError, SignalError

@@ -1,11 +1,35 @@
-"""What the intervals take up of a model that is not all of the motor, beside what is named."""
+"""What the intervals take up of a model that is not all of the motor, beside what is named.
 
+That are numbers which hang on how closely an observer follows, and commands that took effect at
+instants that scatter, which the variance of the residuals tests.  A driver on its own clock, a bus
+or arrival stamps put every change of the command off by a time of its own.  With independent times
+of mean zero and variance s2, residuals ``e`` of variance one have the variance
+
+    1 + s2 x,   x_t = sum_k (d yhat_t / d t_k)^2,
+
+over the changes ``k`` of the command, where no other noise knows when it changed.  The regression
+of ``e^2`` on ``x`` gives s2, with a standard deviation that allows for any other variance (White).
+Times that are never negative have a mean beside their scatter: where they are uniform from nothing
+to a period, the square of the mean is three times the variance.
+
+References
+----------
+T. Breusch, A. Pagan, A simple test for heteroscedasticity, Econometrica 47 (1979), 1287;
+H. White, Econometrica 48 (1980), 817.
+"""
+
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
+from scipy.special import erfc
+
 from smp_motor_control.arrays import Array
-from smp_motor_ident.diagnosis.command_jitter import jittered
+from smp_motor_ident.diagnosis.limits import CONDITION_LEVEL
+from smp_motor_ident.diagnosis.model_error import answered, carried, measured, predicted
 from smp_motor_ident.diagnosis.observers import slower
+from smp_motor_ident.estimation.consider_covariance import consider_late
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.quantities import Answer
 from smp_motor_ident.finding import Finding
@@ -44,3 +68,58 @@ def widened_by_misfit(
         replace(f, severity="unreliable", message=f.message.partition(":")[0] + words)
         for f in (*slow, *late)
     ]
+
+
+PATTERNS = 8  # of random signs, whose mean square is the sum over the changes
+MOST = 4.0  # deviations at which a residual is cut off: outliers are no scatter
+
+
+def jittered(data: Experiments, fit: Fit) -> tuple[Fit, list[Finding]]:
+    """Return the fit with its covariance widened by instants that scatter, and say so."""
+    scatter = _scatter(data, fit) if fit.structure.free else 0.0
+    if scatter <= 0.0:
+        return fit, []
+    late = math.sqrt(3.0 * scatter)
+    wider = consider_late(data, fit, late)
+    return wider, [
+        Finding(
+            "command_jitter",
+            "note",
+            f"right after changes of the command the residuals scatter as if it took effect up to "
+            f"{2e3 * late:.2g} ms late, each time by another: the intervals cover that",
+            {"delay": late, "scatter": math.sqrt(scatter)},
+            "record the voltage at the motor's terminals, with the stamps of one clock",
+        )
+    ]
+
+
+def _scatter(data: Experiments, fit: Fit) -> float:
+    """Return the variance [s^2] of the instants, nothing where chance may be it."""
+    rng = np.random.default_rng(0)
+    voltage, values = data.hold_value, measured(data)
+    base, deviation = predicted(data, fit), np.sqrt(np.diag(fit.noise))[: values.shape[1]]
+    change = np.diff(voltage, prepend=voltage[0])
+    change[data.hold_start[:-1]] = 0.0
+    length = np.maximum(np.diff(data.hold_end, prepend=data.hold_end[0] - data.step), 0.0)
+    length[data.hold_start[:-1]] = data.step
+    moved = np.divide(change, length, out=np.zeros_like(change), where=length > 1e-3 * data.step)
+    x = np.zeros_like(base)
+    several = carried(data, PATTERNS)
+    for n in range(0, PATTERNS, several):
+        shape = voltage.size, min(several, PATTERNS - n)
+        made = (2.0 * rng.integers(0, 2, shape, np.int8) - 1.0) * moved[:, None]
+        moves = answered(data, fit, (made, np.zeros((0, 0, 0))), 1)
+        x += np.einsum("noc,noc->no", moves, moves) / PATTERNS
+    x /= np.square(deviation)
+    known = np.isfinite(values)
+    square = np.minimum(np.square((values - base) / deviation)[known], MOST**2)
+    away = x[known] - x[known].mean()
+    spread = float(away @ away)
+    if not spread > 0.0:
+        return 0.0
+    found = float(away @ square) / spread
+    left = square - square.mean() - found * away
+    robust = math.sqrt(float(np.square(away * left).sum())) / spread
+    plain = float(square.std()) / math.sqrt(spread)
+    surprise = found / max(robust, plain, 1e-300)
+    return found if 0.5 * erfc(surprise / math.sqrt(2)) < CONDITION_LEVEL.value else 0.0

@@ -1,4 +1,4 @@
-"""How well a signal follows the voltage, and how well the reversed voltage: apart from mere lag.
+"""Whether a signal follows the voltage or the reversed voltage, apart from mere lag; lost signs.
 
 A motor answers late: by its lag, at most a quarter of a period, and by what sampling and transport
 take.  Where that comes to half a period, a late answer is a reversed one, and nothing tells them.
@@ -12,12 +12,15 @@ from scipy.fft import irfft, next_fast_len, rfft
 from scipy.signal import lfilter
 
 from smp_motor_control.arrays import Array
-from smp_motor_ident.diagnosis.limits import SIGN_LATE, SIGN_LEAST
+from smp_motor_ident.diagnosis.limits import BACKWARD, HALF_EXPLAINED, SIGN_LATE, SIGN_LEAST
+from smp_motor_ident.errors import SignalError
 from smp_motor_ident.record import Record
 
 LAGS = 16  # between a sampling interval and a quarter of the record: each 1.5 to 2 times the last
+ANSWERS = 8  # of them to a tenth of the record, for what the motor makes of a voltage without sign
 FINE = 16  # samples that are enough of a lag
 RUNS = 2_000  # stretches over which signals are averaged: in them a counter's noise is small
+WAYS = 50  # runs of a record over which its way is summed
 
 
 @dataclass(frozen=True)
@@ -113,3 +116,50 @@ def _chance(v: Array, y: Array) -> float:
         return 1.0
     product = (own[0] / own[0][0]) * (own[1] / own[1][0])
     return float(np.sqrt(max(1.0, 2 * product.sum() - 1) / len(v)))
+
+
+def lost_sign(records: Sequence[Record], speeds: Sequence[Array], where: str) -> None:
+    """Refuse sizes that stand where a sign decides."""
+    lowest = min(float(np.nanmin(r.voltage)) for r in records)
+    ways = np.concatenate([_ways(w) for w in speeds])
+    way, back = float(np.abs(ways).sum()), -float(np.minimum(ways, 0.0).sum())
+    if lowest >= 0 and back > BACKWARD.value * way and way - back > BACKWARD.value * way:
+        raise SignalError(
+            f"{where}: the voltage is never negative, though {back / way:.0%} of the way is "
+            "backwards: it has no sign; map its direction with direction=COLUMN, or record a "
+            "signed command"
+        )
+    if all(_size_of(r) for r in records):
+        raise SignalError(
+            f"{where}: velocity is never negative although the voltage is, and follows its size: "
+            "it has no sign; record a signed speed, the encoder's counts or a direction"
+        )
+
+
+def _ways(speed: Array) -> Array:
+    """Return the ways of runs of samples, in which a sensor's noise is next to nothing."""
+    starts = np.unique(np.linspace(0, speed.size, WAYS, endpoint=False).astype(int))
+    return np.asarray(np.add.reduceat(np.nan_to_num(speed), starts))
+
+
+def _size_of(record: Record) -> bool:
+    """Tell whether a speed is the size of what the motor makes of its voltage."""
+    speed, volts = record.velocity, record.voltage
+    if speed is None or record.count is not None or record.position is not None:
+        return False
+    if np.nanmin(speed) < 0 or not volts.min() < 0 < volts.max():
+        return False
+    known = np.isfinite(speed)
+    found = []
+    for lag in np.geomspace(1.0, max(len(record) / 10, 2.0), ANSWERS):
+        made = lagged(volts, float(lag))[known]
+        found.append([_share(x, speed[known]) for x in (made, np.abs(made))])
+    signed, size = np.max(found, axis=0)
+    return bool(size > HALF_EXPLAINED.value and signed < HALF_EXPLAINED.value * size)
+
+
+def _share(x: Array, y: Array) -> float:
+    """Return which share of a variance a line explains."""
+    x, y = x - x.mean(), y - y.mean()
+    both = float((x @ x) * (y @ y))
+    return float(x @ y) ** 2 / both if both > 0 else 0.0

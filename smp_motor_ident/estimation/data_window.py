@@ -16,9 +16,8 @@ from smp_motor_ident.estimation.descent import (
     noise_ratio_of,
 )
 from smp_motor_ident.estimation.fit import Fit, Options, solve
-from smp_motor_ident.estimation.multistart import tried
 from smp_motor_ident.estimation.selection import POLICY
-from smp_motor_ident.estimation.trials import RIDGE
+from smp_motor_ident.estimation.trials import RIDGE, tried
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.model.structures import Structure

@@ -18,11 +18,10 @@ from smp_motor_ident.estimation.data_window import extend, grow
 from smp_motor_ident.estimation.descent import ROUGHLY, refine, restate, screening_subset
 from smp_motor_ident.estimation.fit import Fit, Options
 from smp_motor_ident.estimation.initialisation import initial_fit
-from smp_motor_ident.estimation.multistart import tried
 from smp_motor_ident.estimation.request import Request
 from smp_motor_ident.estimation.selection import POLICY, FittedCandidate
 from smp_motor_ident.estimation.thinning import thinned
-from smp_motor_ident.estimation.trials import LAGS
+from smp_motor_ident.estimation.trials import LAGS, tried
 from smp_motor_ident.likelihood.experiments import Experiments, prepare
 from smp_motor_ident.likelihood.hold import between_samples
 from smp_motor_ident.model.coordinates import direction

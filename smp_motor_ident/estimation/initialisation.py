@@ -17,9 +17,8 @@ from smp_motor_ident.estimation.descent import (
 )
 from smp_motor_ident.estimation.fit import Fit, Options, Start, solve
 from smp_motor_ident.estimation.memory import remembered
-from smp_motor_ident.estimation.multistart import better, tried
 from smp_motor_ident.estimation.start import FilteredData, speed_candidates
-from smp_motor_ident.estimation.trials import WINDINGS, shapes
+from smp_motor_ident.estimation.trials import WINDINGS, better, shapes, tried
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.noise import NoiseModel, deviance, kalman_gain
 from smp_motor_ident.likelihood.passes import gather

@@ -25,10 +25,10 @@ from smp_motor_ident.estimation.fit import Fit, Options, solve
 from smp_motor_ident.estimation.fitted import NORMAL_95
 from smp_motor_ident.estimation.initialisation import beginning, first_fit, initial_fit, ranked_on
 from smp_motor_ident.estimation.memory import remembered
-from smp_motor_ident.estimation.multistart import tried as other_starts
 from smp_motor_ident.estimation.selection import POLICY, FittedCandidate, sandwich_factor
 from smp_motor_ident.estimation.thinning import thinned
 from smp_motor_ident.estimation.trials import LAGS, RANDOM, slower_winding
+from smp_motor_ident.estimation.trials import tried as other_starts
 from smp_motor_ident.estimation.variations import friction_shows, may_rub, varied
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.measurement import ANGLE, SPEED

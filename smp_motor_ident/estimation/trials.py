@@ -1,4 +1,4 @@
-"""The table of other starts: where a descent that ended may have left a better place behind.
+"""Descents from several starts: a table says which, one loop tries them, one rule keeps the best.
 
 Without current, friction and gain trade along a long curved ridge of the likelihood, and L/R shows
 by the shape of stick and slip alone; with it, an L/R of less than a sample leaves a surface so flat
@@ -7,19 +7,19 @@ a descent is held at one place only.
 Derivation: docs/derivations.md, section 10.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from smp_motor_control.arrays import Array
 from smp_motor_ident.estimation.fit import Fit, Options, Start, solve
-from smp_motor_ident.estimation.multistart import Trial
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.coordinates import Coordinates, direction
 
-Applies = Callable[[Experiments, Fit], bool]
 Starts = Callable[[Experiments, Fit, Options], Iterator[Start]]
 
+ALIKE = 0.5  # deviance by which two fits explain the data alike
 SHARES = (0.97, 0.7, 0.1)  # of a0 that K is
 FRICTIONS = (0.01, 0.025, 0.06)  # of the largest voltage that friction takes
 SECOND_LAGS = (0.05, 0.2, 0.6)  # of the first
@@ -30,6 +30,15 @@ RESTART_LENGTHS = (1.0, 0.3, 3.0)  # standard deviations (or e-folds, where thes
 OPEN = 0.3  # standard deviation of ln a2 above which other starts are tried
 LOOSE = 0.02  # standard deviation of ln L/R or ln R above which other starts are tried
 WINDING = 0.2  # of a sample: a shorter L/R has settled to a hundredth when the current is read
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Other starts of a fit: what they are, whether it is their turn, and where they lie."""
+
+    about: str
+    applies: Callable[[Experiments, Fit], bool]
+    starts: Callable[[Experiments, Fit, Options], Iterable[Start]]
 
 
 def shapes(z: Coordinates) -> list[Coordinates]:
@@ -218,3 +227,39 @@ WINDINGS = (
     Trial("a slower winding", _hidden, _slower_windings),
 )  # fmt: skip
 """Of other L and R where the current leaves them open."""
+
+
+def tried(
+    data: Experiments,
+    best: Fit,
+    trials: Sequence[Trial],
+    options: Options,
+    passes: int = 30,
+    tolerance: float = 1e-2,
+) -> Fit:
+    """Return the best of a fit and of the descents from other starts, one trial after the other."""
+    structure = best.structure
+    # A current may leave L and R so open that any place is near where a descent began.
+    near = not structure.current
+    for trial in trials:
+        if not trial.applies(data, best):
+            continue
+        for start in trial.starts(data, best, options):
+            begun = start.at(structure.complete(start.z))
+            other = solve(
+                data, structure, begun, options, passes, tolerance, best if near else None
+            )
+            best = other if better(other, best) else best
+    return best
+
+
+def better(one: Fit, other: Fit) -> bool:
+    """Tell which of two fits to keep: the likelier; of two alike the one that claims less."""
+    if one.deviance < other.deviance - ALIKE:
+        return True
+    free = one.structure.free
+    if one.deviance > other.deviance + ALIKE or "vc_plus" not in free:
+        return one.deviance < other.deviance
+    i = free.index("vc_plus")
+    mine, theirs = one.covariance()[i, i], other.covariance()[i, i]
+    return bool(mine > 4 * theirs or (mine > theirs / 4 and one.deviance < other.deviance))

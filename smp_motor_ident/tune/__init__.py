@@ -1,7 +1,6 @@
 """From an identified motor to gains that hold on the sampled loop that will run."""
 
-from smp_motor_ident.tune.comparison import compare, recommend
-from smp_motor_ident.tune.designer import Design, design
+from smp_motor_ident.tune.designer import Design, compare, design, recommend
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.margins import Margins
 from smp_motor_ident.tune.methods import METHODS

@@ -1,22 +1,24 @@
-"""design: from an estimate and a loop to gains, with their margins and the reason.
+"""design: from an estimate and a loop to gains, with their margins and the reason; by all methods.
 
 Methods work at the motor shaft; the gains that come out are per wheel rad/s.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 from smp_motor_control.pid import PidGains
+from smp_motor_ident.errors import DesignError
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.result import Estimate
-from smp_motor_ident.tune.case import Case, prepare, solve
+from smp_motor_ident.tune.case import COMMON, Case, prepare, solve
 from smp_motor_ident.tune.ensemble import Robustness
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.limits import DELAY_BORNE, HELD_BACK
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.margins import Margins, loop_margins
+from smp_motor_ident.tune.methods import METHODS
 from smp_motor_ident.tune.plant import Plant, sample
 from smp_motor_ident.tune.problem import checked, control_noise
 from smp_motor_ident.tune.reference import Reference, Wanted, controller_for, plan_reference
@@ -28,51 +30,21 @@ from smp_motor_ident.tune.unmodelled import words as known_words
 
 @dataclass(frozen=True)
 class Design:
-    """Gains for one wheel, what they keep, and why they are as they are.
+    """Gains for one wheel, what they keep, and why they are as they are."""
 
-    Attributes
-    ----------
-    gains : PidGains
-        Of the running controller, per wheel rad/s.
-    margins : Margins
-        Of the nominal sampled loop.
-    reason : str
-        In words for the user.
-    method : str
-        Name of the method.
-    loop : Loop
-        What it was designed for.
-    robustness : Robustness
-        Over the distribution of the estimate.
-    performance : Performance
-        Of the simulated loop.
-    specification : Specification
-        What the loop does over the distribution, in bands.
-    reference : Reference
-        Limits and duration of set-point changes, at the motor shaft.
-    motor : mapping of str to float
-        Combinations that it was designed from, at the motor shaft.
-    sensor : mapping of str to float
-        What the reported speed was identified to go through [s].
-    wheel : str
-        Whose gains these are.
-    findings : tuple of Finding
-        What the user should know beside.
-    """
-
-    gains: PidGains
-    margins: Margins
-    reason: str
-    method: str
-    loop: Loop
-    robustness: Robustness
-    performance: Performance
-    specification: Specification
-    reference: Reference
-    motor: dict[str, float]
-    sensor: dict[str, float]
-    wheel: str = ""
-    findings: tuple[Finding, ...] = ()
+    gains: PidGains  # of the running controller, per wheel rad/s
+    margins: Margins  # of the nominal sampled loop
+    reason: str  # in words for the user
+    method: str  # name of it
+    loop: Loop  # what it was designed for
+    robustness: Robustness  # over the distribution of the estimate
+    performance: Performance  # of the simulated loop
+    specification: Specification  # what the loop does over the distribution, in bands
+    reference: Reference  # limits and duration of set-point changes, at the motor shaft
+    motor: dict[str, float]  # combinations that it was designed from, at the motor shaft
+    sensor: dict[str, float]  # what the reported speed was identified to go through [s]
+    wheel: str = ""  # whose gains these are
+    findings: tuple[Finding, ...] = ()  # what the user should know beside
     feedback: Feedback = field(default_factory=lambda: Feedback(0.0, 0.0))
 
     @property
@@ -272,3 +244,47 @@ def _sensor(case: Case) -> str:
     if plant.motors.sensor_lag[0] > 0:
         words += f", a sensor lag of {1e3 * plant.motors.sensor_lag[0]:.3g} ms"
     return words
+
+
+def compare(
+    estimate: Estimate, loop: Loop, methods: Sequence[str] | None = None, **targets: Any
+) -> dict[str, Design | DesignError]:
+    """Design by every method, or those named, each with the targets that it understands.
+
+    A method that cannot meet the demand is there as its error.
+    """
+    results: dict[str, Design | DesignError] = {}
+    for name in METHODS if methods is None else methods:
+        known = (*COMMON, *METHODS[name].targets)
+        own = {key: value for key, value in targets.items() if key in known}
+        try:
+            results[name] = design(estimate, loop, name, **own)
+        except DesignError as error:
+            results[name] = error
+    return results
+
+
+def recommend(results: dict[str, Design | DesignError]) -> tuple[str, str]:
+    """Return the best of what :func:`compare` gave, and why; DesignError where none is sound."""
+    sound = {
+        name: r
+        for name, r in results.items()
+        if isinstance(r, Design)
+        and r.margins.stable
+        and r.margins.sensitivity <= 1.6
+        and r.performance.control_noise <= 1.05 * r.loop.noise_limit
+        and math.isfinite(r.performance.settling)
+    }
+    if not sound:
+        raise DesignError(
+            "no method keeps Ms below 1.6 within the control noise that the loop allows"
+        )
+    name = min(sound, key=lambda n: sound[n].performance.load_integral)
+    others = sorted(r.performance.load_integral for n, r in sound.items() if n != name)
+    best = sound[name]
+    better = f", {others[0] / best.performance.load_integral:.2f} times the next" if others else ""
+    return name, (
+        f"{METHODS[name].title}: of the methods that keep Ms below 1.6 and the control noise below "
+        f"{best.loop.noise_limit:.2g} V it rejects a load best{better}, with a phase margin of "
+        f"{best.margins.phase:.0f} deg"
+    )

@@ -8,7 +8,7 @@ import motors
 import numpy as np
 import pytest
 
-from smp_motor_ident.diagnosis.bunched import merge_bunches
+from smp_motor_ident.diagnosis.stamps import merge_bunches
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.record import Record
 

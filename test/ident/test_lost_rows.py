@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from smp_motor_ident.diagnosis.lost_rows import bridged
+from smp_motor_ident.diagnosis.stamps import bridged
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.record import Record

@@ -9,7 +9,7 @@ import pytest
 from independent import simulate
 
 from smp_motor_ident.bag import read_records
-from smp_motor_ident.diagnosis.beat import find_beat, on_beat
+from smp_motor_ident.diagnosis.stamps import find_beat, on_beat
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.record import Hardware, Record
 

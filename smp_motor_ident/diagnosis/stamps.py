@@ -1,4 +1,4 @@
-"""Arrival stamps put back on the beat of their sender.
+"""Stamps put right: back on the beat of their sender, merged where alike, rows lost between them.
 
 Sample k of a regular sender arrives at ``a + T n_k + latency_k`` with a latency that is never
 negative, and ``n_k - k`` samples lost before it.  The line of least latencies under all arrivals is
@@ -10,6 +10,7 @@ repeated stamps, which round a regular time down, lie above such a line, too.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import minimum_filter1d
@@ -21,6 +22,7 @@ from smp_motor_ident.diagnosis.limits import (
     BEAT_JITTER,
     BEAT_LOST,
     BUNCHED,
+    ROWS_LOST,
     SMOOTHER,
 )
 from smp_motor_ident.finding import Finding
@@ -221,3 +223,75 @@ def clock_share(records: Sequence[Record]) -> float:
     beats = [f.evidence for r in records for f in r.findings if f.code == "arrival_beat"]
     shares = [float(b["deviation"] or 0.0) / float(b["period"] or 1.0) for b in beats]
     return max(shares, default=0.0)
+
+
+def merge_bunches(record: Record) -> Record:
+    """Merge samples with (nearly) equal stamps where most of a record's samples are such.
+
+    A clock too coarse for the rate, or a transport that delivers many messages at once, stamps
+    several samples alike.  The last of a bunch was measured next to its stamp; the voltage is
+    the mean of the bunch's, for the bunch spans the time since the one before.
+    """
+    starts = np.array(record.starts)
+    step = np.diff(record.time)
+    within = np.ones(step.size, dtype=bool)
+    within[starts[1:] - 1] = False
+    if not within.any():
+        return record
+    near = BUNCHED.value * float(step[within].mean())
+    if float(np.median(step[within])) >= near:
+        return record
+    last = np.append((step >= near) | ~within, True)
+    kept = np.flatnonzero(last)
+    first = np.append(0, kept[:-1] + 1)
+    if kept.size < 2:
+        return record
+    share = 1.0 - kept.size / len(record)
+    arrays: dict[str, Any] = {
+        name: None if (values := getattr(record, name)) is None else values[kept]
+        for name in ("time", "current", "velocity", "position", "count")
+    }
+    finding = Finding(
+        "stamps_equal",
+        "warning",
+        f"{share:.0%} of the samples have the stamp of the sample before; of samples that are "
+        "stamped alike the last was used",
+        {"share": share, "samples": float(kept.size)},
+        "stamp each sample where it is measured, with a clock finer than the sampling interval",
+    )
+    return replace(
+        record,
+        voltage=np.add.reduceat(record.voltage, first) / np.diff(np.append(first, len(record))),
+        starts=tuple(int(k) for k in np.searchsorted(kept, starts)),
+        findings=(*record.findings, finding),
+        **arrays,
+    )
+
+
+REGULAR = 0.1  # of an interval by which intervals differ from whole ones
+
+
+def bridged(record: Record) -> Record:
+    """Return a record with the mean of a linearly changing voltage where rows were lost.
+
+    Of ``m`` intervals the last is held at the next row's voltage: their mean is
+    ``v1 + (v2 - v1) (m + 1) / (2 m)``.  Readers of bags have done so.
+    """
+    step = np.diff(record.time)
+    if step.size < 2 or any(f.code == "samples_missing" for f in record.findings):
+        return record
+    share = step / float(np.median(step))
+    whole = np.rint(share)
+    regular = np.abs(share - whole) < REGULAR
+    few = (whole > 1) & (whole <= 1 + ROWS_LOST.value)
+    few[np.array(record.starts[1:], dtype=np.int64) - 1] = False
+    if not few.any() or not regular.all(where=whole <= 1 + ROWS_LOST.value):
+        return record
+    k = np.flatnonzero(few)
+    voltage, m = record.voltage.copy(), whole[k]
+    before = record.voltage[k]
+    voltage[k + 1] = before + (record.voltage[k + 1] - before) * (m + 1) / (2 * m)
+    lost = int((m - 1).sum())
+    words = f"{lost} rows missing in {k.size} places; their voltage was interpolated"
+    found = Finding("samples_missing", "note", words, {"samples": float(lost)})
+    return replace(record, voltage=voltage, findings=(*record.findings, found))
