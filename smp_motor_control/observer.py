@@ -131,31 +131,12 @@ def _steady_covariance(F: Array, Q: Array, R: float) -> Array:
 
 
 class SpeedObserver:
-    """Speed, acceleration and load of one motor.
+    """Speed, acceleration [rad/s^2] and load of one motor, at its shaft.
 
-    Parameters
-    ----------
-    model : MotorModel
-        The identified motor.
-    sample_time : float
-        Usual interval between samples [s]; steps from a quarter to four times as long are filtered.
-    encoder : Encoder
-        Counts per revolution of the motor shaft, and width of the counter.
-    noise : ObserverNoise
-        What to expect of load, voltage and encoder.
-    window : int
-        Samples that the speed is differenced over while the model is not trusted.
-    max_load : float
-        Loads beyond this voltage contradict the model; such as 1.5 times the supply [V].
-
-    Attributes
-    ----------
-    speed, acceleration : float
-        Of the motor shaft [rad/s], NaN before the second sample, and [rad/s^2].
-    load : float
-        Voltage that the load takes beyond the model, positive against forward turning [V].
-    trusted : bool
-        Whether counts and model agree; the speed is differenced while they do not.
+    Steps from a quarter to four times the usual interval are filtered.  The ``load`` is the voltage
+    [V] that it takes beyond the model, positive against forward turning; beyond ``max_load``, such
+    as 1.5 times the supply, it contradicts the model.  While model and counts do not agree the
+    speed is not ``trusted``, and is differenced over ``window`` samples.
     """
 
     def __init__(
@@ -198,7 +179,7 @@ class SpeedObserver:
         self._theta = self._speed = self.acceleration = self.load = 0.0
         self._surprise = 1.0
         self.trusted = True
-        self.speed = math.nan
+        self.speed = math.nan  # [rad/s], before the second sample
 
     def step(self, count: int, voltage: float, dt: float) -> float:
         """Take in one sample."""

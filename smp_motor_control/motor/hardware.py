@@ -32,13 +32,7 @@ class Sample(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class DriveSettings:
-    """What is between a command and a motor, and between a motor and its report.
-
-    Raises
-    ------
-    ParameterError
-        When a value is negative or not finite.
-    """
+    """What is between a command and a motor, and between a motor and its report."""
 
     pwm_steps: int = described(0, "Steps of the duty cycle from 0 to 1; 0 for a continuous one.")
     command_timeout: float = described(
@@ -67,19 +61,11 @@ class DriveSettings:
 
 
 class Supply:
-    """A battery with an inner resistance that several motors share.
-
-    Parameters
-    ----------
-    voltage : float
-        Without load [V].
-    resistance : float
-        Inner resistance [ohm]; 0 for a stiff supply.
-    """
+    """A battery with an inner resistance that several motors share."""
 
     def __init__(self, voltage: float, resistance: float = 0.0) -> None:
-        self.open_voltage = voltage
-        self.resistance = resistance
+        self.open_voltage = voltage  # without load [V]
+        self.resistance = resistance  # inner one [ohm]; 0 for a stiff supply
         self.motors: list[DrivenMotor] = []
 
     def terminal_voltage(self) -> float:
@@ -91,29 +77,9 @@ class Supply:
 
 
 class DrivenMotor:
-    """One motor with its driver, gearbox, encoder and sensors.
+    """One motor with its driver, gearbox, encoder and sensors, from an instant [s] on.
 
-    Parameters
-    ----------
-    entry : MotorEntry
-        Motor and hardware.
-    settings : DriveSettings
-        Of the driver and the sensors.
-    supply : Supply, optional
-        Shared with other motors; its own stiff one without.
-    start : float
-        Instant at which time begins [s].
-    seed : int
-        Of the noise.
-
-    Attributes
-    ----------
-    motor : Motor
-        The true state.
-    duty : float
-        Duty cycle in force.
-    timed_out : bool
-        Whether the last command has expired.
+    It shares a supply with other motors, or has a stiff one of its own.
     """
 
     def __init__(
@@ -128,9 +94,9 @@ class DrivenMotor:
         self.settings = settings
         self.supply = supply or Supply(entry.supply_voltage)
         self.supply.motors.append(self)
-        self.motor = Motor(entry.parameters)
-        self.duty = 0.0
-        self.timed_out = True
+        self.motor = Motor(entry.parameters)  # the true state
+        self.duty = 0.0  # in force
+        self.timed_out = True  # whether the last command has expired
         self._random = random.Random(seed)
         self._speed = DifferencedSpeed(entry.encoder, max(1, settings.velocity_window))
         self._pending: deque[tuple[float, float]] = deque()

@@ -45,23 +45,9 @@ class Coefficients(NamedTuple):
 class FreeResponse:
     """How the speed of one motor decays to its steady value; scalar, for loops that run live.
 
-    Parameters
-    ----------
-    time_constant : float
-        Sum of the time constants [s], positive.
-    product : float
-        Product of the time constants [s^2]; 0 for a motor of first order.
-
-    Attributes
-    ----------
-    first_order : bool
-        Whether there is no inductance worth the name.
-    time_constant, product : float
-        As given; the product is 0 where the motor counts as one of first order.
-    slow, fast : float
-        Real parts of the roots [1/s].
-    frequency : float
-        Imaginary part of a complex pair [rad/s]; 0 for real roots.
+    Of the sum of its time constants [s] and their product [s^2], 0 for a motor of first order, come
+    the real parts ``slow`` and ``fast`` of its roots [1/s] and the ``frequency`` of a complex pair
+    [rad/s], 0 for real roots.
     """
 
     def __init__(self, time_constant: float, product: float) -> None:
@@ -138,20 +124,10 @@ class HeldResponse(NamedTuple):
 def zero_order_hold(
     dc_gain: ArrayLike, time_constant: ArrayLike, product: ArrayLike, interval: ArrayLike
 ) -> HeldResponse:
-    """Return the exact sampled response of a batch of motors.
+    """Return the exact sampled response of a batch of motors, arguments of shape (n,) or ().
 
-    Parameters
-    ----------
-    dc_gain, time_constant, product : array_like, shape (n,) or ()
-        K [rad/s/V], sum [s] and product [s^2] of the time constants; a product of 0 is a motor
-        of first order, whose acceleration follows its speed and the voltage.
-    interval : array_like, shape (n,) or ()
-        [s].
-
-    Returns
-    -------
-    HeldResponse
-        Of the broadcast arguments.
+    A product of the time constants [s^2] of 0 is a motor of first order, whose acceleration follows
+    its speed and the voltage.
 
     Examples
     --------

@@ -65,45 +65,21 @@ class WheelSettings:
 
 
 class WheelController:
-    """Decides the voltage of one wheel.
-
-    Attributes
-    ----------
-    state : State
-        What it is doing.
-    active : bool
-        Whether it answers feedback.
-    output : float
-        Voltage that was last asked for [V].
-    setpoint : float or None
-        As it holds now [rad/s]; None where there is none.
-    answer : PidOutput or None
-        Parts of the last answer; None where that was not the loop's.
-    target, measurement : float
-        Set-point and speed of that answer [rad/s, wheel].
-    refused : Counter of str
-        What was left out, and how often.
-    owner : str
-        Another node that owns the wheel by its lease; empty where nobody else does.
-    advice : str
-        Why the gains do not suit the interval of the feedback; empty where they do.
-    loop, clock, recovery : WheelLoop, FeedbackClock, Recovery
-        Its parts.
-    """
+    """Decides the voltage of one wheel: ``output`` [V] is what was last asked for."""
 
     def __init__(self, settings: WheelSettings) -> None:
         self.loop = WheelLoop(settings.loop)
         self.recovery = Recovery()
         self.clock = FeedbackClock(math.inf, math.inf)
-        self.refused: Counter[str] = Counter()
+        self.refused: Counter[str] = Counter()  # what was left out, and how often
         self.state = State.INACTIVE
-        self.active = False
-        self.answer: PidOutput | None = None
-        self.owner = ""
+        self.active = False  # whether it answers feedback
+        self.answer: PidOutput | None = None  # the last one's parts, where it was the loop's
+        self.owner = ""  # another node that owns the wheel by its lease
         self.steps = 0
         self._wheel = Circumstances()
         self._intervals: list[float] = []
-        self.target = self.measurement = 0.0
+        self.target = self.measurement = 0.0  # of that answer [rad/s, wheel]
         self.supply = math.inf
         self._detector = FaultDetector(settings.faults)
         self.configure(settings)
@@ -120,7 +96,7 @@ class WheelController:
         """Change the settings while running, without a jump of the voltage."""
         self.loop.configure(settings.loop.within(self.supply))
         self.settings = settings
-        self.advice = ""
+        self.advice = ""  # why the gains do not suit the interval of the feedback
         self._detector.limits = settings.faults
         gains = settings.loop.gains
         self._detector.volts_per_speed = gains.feedforward_velocity
@@ -163,7 +139,7 @@ class WheelController:
         self.recovery.reset()
 
     def _forget(self, now: float) -> None:
-        self.setpoint: float | None = None
+        self.setpoint: float | None = None  # as it holds now [rad/s]
         self._setpoint_at = -math.inf
         self._feedback_at = now
         self._late_at = self._bad_at = -math.inf

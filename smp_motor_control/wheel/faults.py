@@ -81,17 +81,12 @@ class FaultLimits:
 
 
 class FaultDetector:
-    """Watches voltage, speed and current of a driven motor.
-
-    Attributes
-    ----------
-    volts_per_speed, static_voltage : float
-        Of the wheel [V s/rad], [V], where a model says; NaN and 0 where it is to be learnt.
-    """
+    """Watches voltage, speed and current of a driven motor."""
 
     def __init__(self, limits: FaultLimits, resistance: float = math.nan) -> None:
         self.limits = limits
         self.resistance = resistance
+        # Of the wheel [V s/rad], [V], where a model says; NaN and 0 where it is to be learnt.
         self.volts_per_speed, self.static_voltage = math.nan, 0.0
         self._learnt = math.nan
         self.reset()
@@ -194,15 +189,6 @@ class Recovery:
     no counts is seen to turn, or after a pause that doubles every time.  It is limited to a
     small voltage until the wheel has turned as driven for :data:`TRUSTED_AFTER`, and drives
     nothing at a set-point of zero.  After :data:`MOST_TRIES` the wheel is latched.
-
-    Attributes
-    ----------
-    fault : Fault or None
-        What holds the wheel.
-    cautious : bool
-        Whether the voltage is limited, as the fault may still be there.
-    failures : int
-        Faults since the wheel was last proven sound.
     """
 
     def __init__(self, first_pause: float = 2.0) -> None:
@@ -211,9 +197,9 @@ class Recovery:
 
     def reset(self) -> None:
         """Begin anew, as after a person has looked at the wheel."""
-        self.fault: Fault | None = None
-        self.cautious = False
-        self.failures = 0
+        self.fault: Fault | None = None  # what holds the wheel
+        self.cautious = False  # whether the voltage is limited, as the fault may still be there
+        self.failures = 0  # since the wheel was last proven sound
         self._since = self._good = 0.0
 
     @property

@@ -30,29 +30,16 @@ class FeedbackClock:
     The stamps' clock and the computer's may differ by a constant: an offset beyond
     :data:`CLOCK_JUMP` is learnt at the start and after every jump, and ages are counted
     from there.
-
-    Attributes
-    ----------
-    dt : float
-        Interval that ends with the last fresh sample [s].
-    age : float
-        From stamp to arrival of the last sample, less the offset of the clocks [s].
-    counts : dict of Verdict to int
-        How many samples were what.
-    jumps : int
-        How often the stamps' clock jumped.
-    offset : float
-        Learnt difference of the clocks [s].
     """
 
     def __init__(self, max_age: float, max_gap: float) -> None:
         self.max_age = max_age
         self.max_gap = max_gap
         self.counts = dict.fromkeys(Verdict, 0)
-        self.jumps = 0
-        self.offset = 0.0
-        self.dt = 0.0
-        self.age = 0.0
+        self.jumps = 0  # of the stamps' clock
+        self.offset = 0.0  # learnt difference of the clocks [s]
+        self.dt = 0.0  # interval that ends with the last fresh sample [s]
+        self.age = 0.0  # from stamp to arrival of the last sample, less the offset [s]
         self._last: int | None = None
         self._heard = -math.inf
 

@@ -20,13 +20,6 @@ class Lease:
     late by ``timeout``, by its stamp, was meant for another moment: it is refused unless it is 0 V.
     Drivers that stood still find such in their queues.
 
-    Attributes
-    ----------
-    refused : dict of str to int
-        How many commands of each writer were refused.
-    late : int
-        How many commands came late.
-
     Examples
     --------
     >>> lease = Lease(0.2)
@@ -38,8 +31,8 @@ class Lease:
 
     def __init__(self, timeout: float) -> None:
         self.set_timeout(timeout)
-        self.refused: dict[str, int] = {}
-        self.late = 0
+        self.refused: dict[str, int] = {}  # how many commands of each writer were refused
+        self.late = 0  # how many commands came late
         self._owner = ""
         self._until = -math.inf
         self._clocks: dict[str, FeedbackClock] = {}

@@ -85,16 +85,7 @@ class LoopSettings:
 class WheelLoop:
     """Speed loop of one wheel, one step per feedback sample.
 
-    Attributes
-    ----------
-    pid : Pid
-        The controller.
-    profile : Profile
-        Source of the reference.
-    reference : Reference
-        Of the last step.
-    source : str
-        Where the speed came from in the last step.
+    ``reference`` and ``source`` (of the speed) are those of the last step.
     """
 
     def __init__(

@@ -128,22 +128,7 @@ def _arrived(held: Trace) -> bool:
 
 
 def figures(trace: Trace, phases: Sequence[Phase], hardware: Hardware) -> Figures:
-    """Read the test of one wheel.
-
-    Parameters
-    ----------
-    trace : Trace
-        Of the wheel.
-    phases : sequence of Phase
-        Those in which this wheel was driven.
-    hardware : Hardware
-        As described.
-
-    Returns
-    -------
-    Figures
-        Of speeds from counts.
-    """
+    """Read the test of one wheel, by its speeds from counts in the phases that drove it."""
     steps = np.diff(trace.time)
     holds = [trace.during(p.number) for p in phases if p.kind == "hold"]
     levels = [p.level for p in phases if p.kind == "hold"]

@@ -79,13 +79,7 @@ class Commissioned:
 
 
 def commissioned_of(found: Estimate) -> Commissioned:
-    """Return what a motor was commissioned as.
-
-    Raises
-    ------
-    ParameterError
-        Where its recording did not tell all that a monitor needs.
-    """
+    """Return what a motor was commissioned as, where its recording told all that is needed."""
     names = ("resistance", "inductance", "motor_constant", "inertia", "viscous_friction",
              "coulomb_friction")  # fmt: skip
     held = {name: found.parameters.get(name) for name in names}
@@ -146,13 +140,7 @@ class _Block:
 
 
 class Monitor:
-    """Follows one motor from the values that it was commissioned with.
-
-    Parameters
-    ----------
-    commissioned : Commissioned
-        Values around which the bands lie.
-    """
+    """Follows one motor from the values that it was commissioned with: its bands lie around."""
 
     def __init__(self, commissioned: Commissioned) -> None:
         self.commissioned = c = commissioned
@@ -177,18 +165,10 @@ class Monitor:
         self._outside: dict[str, float] = {}
 
     def add(self, time: float, voltage: float, current: float, turned: float) -> None:
-        """Take one sample.
+        """Take one sample: its stamp [s], of any epoch, and what is known then, NaN where not.
 
-        Parameters
-        ----------
-        time : float
-            Stamp [s], of any epoch.
-        voltage : float
-            Mean since the sample before [V].
-        current : float
-            At the stamp [A]; NaN where it is not measured.
-        turned : float
-            Since the sample before [rad, motor shaft]; NaN where it is not known.
+        Voltage [V] is the mean since the sample before, and ``turned`` the motor's way since then
+        [rad]; the current [A] is that at the stamp.
         """
         before, self._last = self._last, None
         if not all(map(math.isfinite, (time, voltage, current, turned))):

@@ -49,27 +49,10 @@ class KnownLoop:
 
 
 def reconstruct(record: Record, loop: KnownLoop, numbers: Mapping[str, float]) -> Record:
-    """Return a record with the voltages that the loop commanded.
+    """Return a record whose ``voltage`` held set-points with the voltages that the loop commanded.
 
-    Parameters
-    ----------
-    record : Record
-        Whose ``voltage`` holds the set-points, in the target's unit.
-    loop : KnownLoop
-        That ran.
-    numbers : mapping of str to float
-        Its gains.
-
-    Returns
-    -------
-    Record
-        Up to the first lost sample, with a finding that says where its voltages are from.
-
-    Raises
-    ------
-    SignalError
-        When the commands cannot be known: no speed or supply, another rate than the loop's, a
-        start that is not at rest, speeds that were rounded too coarsely.
+    It is that up to the first lost sample, and a SignalError where the commands cannot be known: no
+    speed or supply, another rate than the loop's, a start that is not at rest, coarse speeds.
     """
     where = f"{record.source}: {record.wheel}"
     supply, velocity = record.hardware.supply_voltage, record.velocity

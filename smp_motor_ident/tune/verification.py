@@ -129,22 +129,11 @@ def arrival_delays(
     """Return how long each answer took from its sample until the motor had it.
 
     A computer that is busy keeps commands in queues, which their ages do not show; the voltages
-    that the driver reports do.
-
-    Parameters
-    ----------
-    answers : (ndarray, ndarray, ndarray), each of shape (m,)
-        Times of the answered samples [s], how old these were when answered [s], commands [V].
-    applied : (ndarray, ndarray), each of shape (n,)
-        Times of the samples [s], mean voltages over the intervals that end there [V].
-    loop : mapping
-        Of the wheel in ``gains.json``.
-
-    Returns
-    -------
-    ndarray, shape (m,), [s]
-        The ages, and the loop's usual delay at least, where the voltages are not the commands'
-        (measured ones, say, or none inside a driver's dead zone).
+    that the driver reports do.  ``answers`` are times of the answered samples [s], how old these
+    were when answered [s] and commands [V], each of shape (m,); ``applied`` times of the samples
+    [s] and mean voltages over the intervals that end there [V], each of shape (n,).  Where the
+    voltages are not the commands' (measured ones, say, or none inside a driver's dead zone) it is
+    the ages, and the loop's usual delay at least.
     """
     (asked, ages, commands), (time, voltage) = answers, applied
     sent = asked + ages
@@ -177,26 +166,11 @@ def predicted(
     answers: tuple[Array, Array],
     time: Array,
 ) -> Array:
-    """Return the wheel's speed in a drive from rest, a row for each motor, nominal first.
+    """Return the wheel's speed [rad/s] in a drive from rest, shape (1 + DRAWS, k), nominal first.
 
-    Parameters
-    ----------
-    estimate : Estimate
-        Of the motor.
-    parameters, loop : mapping
-        Of the wheel in ``gains.yaml``, and in ``gains.json``.
-    setpoints : ndarray, shape (n,), [rad/s, wheel]
-        At every sample.
-    answers : (ndarray, ndarray), each of shape (n,), [s]
-        When the recorded drive took its samples, and how long after each the motor had its answer;
-        NaN where there was none.  Rest before the first change lets the loop begin.
-    time : ndarray, shape (k,), [s]
-        At which the speed is wanted.
-
-    Returns
-    -------
-    ndarray, shape (1 + DRAWS, k), [rad/s, wheel]
-        As the recorded encoder would have shown it.
+    ``parameters`` and ``loop`` are the wheel's in ``gains.yaml`` and ``gains.json``; ``answers``
+    when the recorded drive took its samples and how long after each the motor had its answer, NaN
+    where there was none.  Rest before the first change lets the loop begin.
     """
     instants, delays = answers
     step = float(loop["sample_time"])
