@@ -253,19 +253,6 @@ class Pid:
             self._previous = self._weight_d * self._seen[0] - self._seen[1]
         self._store_integral(self.i_term + before - self._without_integral())
 
-    def track(
-        self, output: float, reference: float, measurement: float, acceleration: float = 0.0
-    ) -> None:
-        """Take over from a manual command or another controller without a jump.
-
-        The next step with these inputs gives ``output``, as far as integral action and its
-        clamps allow.
-        """
-        self.reset()
-        self._previous = self._weight_d * reference - measurement
-        self._seen = (reference, measurement, acceleration)
-        self._store_integral(output - self._without_integral())
-
     def _without_integral(self) -> float:
         """Return the command at the last inputs less its integral term."""
         if self._seen is None:

@@ -23,16 +23,8 @@ import numpy as np
 from scipy.special import fdtrc
 
 from smp_motor_control.arrays import Array
+from smp_motor_ident.diagnosis import limits
 from smp_motor_ident.diagnosis.effects import EFFECTS, Effect
-from smp_motor_ident.diagnosis.limits import (
-    EFFECT_BLOCKS,
-    EFFECT_COVERED,
-    EFFECT_LEVEL,
-    EFFECT_OWN,
-    HALF_WIDTH,
-    NEGLIGIBLE_FRICTION,
-    RELEVANT_BIAS,
-)
 from smp_motor_ident.diagnosis.model_error import Regression
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.quantities import Answer
@@ -70,10 +62,10 @@ def adequacy(
     for _ in range(ROUNDS if errors is not None else 0):
         assert errors is not None
         evidence = _tried(_without(errors, named), tests.white is True)
-        level = EFFECT_LEVEL.value / max(len(evidence), 1)
+        level = limits.EFFECT_LEVEL.value / max(len(evidence), 1)
         shown = [e for e in evidence if e.p_value < level]
         if not shown:
-            level = EFFECT_COVERED.value / max(len(evidence), 1)
+            level = limits.EFFECT_COVERED.value / max(len(evidence), 1)
             return _covered([e for e in evidence if e.p_value < level], out, numbers, step)
         first = max(shown, key=lambda e: e.gain - 2 * len(e.columns))
         out.append(as_finding(first, shown, numbers, step))
@@ -87,7 +79,7 @@ def _covered(
     """Return with the findings the move by the effect that moves a number farthest, if any."""
     moves = [(_farthest(e, numbers, step), e) for e in possible]
     (name, times, share), far = max(moves, key=lambda m: m[0][1], default=(("", 0.0, 0.0), None))
-    if far is None or times < HALF_WIDTH.value:
+    if far is None or times < limits.HALF_WIDTH.value:
         return out, None
     found = Finding(
         far.effect.code,
@@ -118,7 +110,7 @@ def _test(
         return _test(errors, effect, columns[:1], white) if len(columns) > 1 else None
     size = np.linalg.solve(normal, z.T @ e)
     own, whole = np.square(z @ size).sum(), np.square(errors.whole[:, columns] @ size).sum()
-    if own <= EFFECT_OWN.value * whole:  # nothing of nothing where no error is in its rows
+    if own <= limits.EFFECT_OWN.value * whole:  # nothing of nothing where no error is in its rows
         return None  # what is left of it is smaller than what is not known of its shape
     left = e - z @ size
     n, q = int(np.count_nonzero(e)), len(columns)  # rows without a measurement are zero
@@ -127,7 +119,7 @@ def _test(
     scores = np.stack([np.bincount(errors.block, z[:, j] * left, blocks) for j in range(q)], axis=1)
     weights = np.stack([np.bincount(errors.block, z[:, j] ** 2, blocks) for j in range(q)])
     stretches = float(np.min(weights.sum(axis=1) ** 2 / np.square(weights).sum(axis=1)))
-    if stretches - q < EFFECT_BLOCKS.value and not white:
+    if stretches - q < limits.EFFECT_BLOCKS.value and not white:
         return None  # what shows it lies in a few stretches: chance cannot be excluded
     middle = scores.T @ scores * blocks / (blocks - 1)
     least = variance * normal
@@ -137,7 +129,7 @@ def _test(
     freedom = max(stretches - q, 1.0)
     p_robust = float(fdtrc(q, freedom, robust * freedom / (freedom + q - 1)))
     p_plain = float(fdtrc(q, max(n - q, 1), plain))
-    p = p_plain if stretches - q < EFFECT_BLOCKS.value else max(p_robust, p_plain)
+    p = p_plain if stretches - q < limits.EFFECT_BLOCKS.value else max(p_robust, p_plain)
     return Evidence(effect, p, plain * q, errors.shifts[:, columns] @ size, columns)
 
 
@@ -148,7 +140,7 @@ def _without(errors: Regression, named: Sequence[int]) -> Regression:
     q, _ = np.linalg.qr(errors.regressors[:, named])
     rest = errors.regressors - q @ (q.T @ errors.regressors)
     before = np.square(errors.regressors).sum(axis=0)
-    kept = np.square(rest).sum(axis=0) > EFFECT_OWN.value * before
+    kept = np.square(rest).sum(axis=0) > limits.EFFECT_OWN.value * before
     members = [
         (effect, columns)
         for effect, columns in errors.members
@@ -173,7 +165,7 @@ def as_finding(
         "shift_share": share,
         "alternatives": ", ".join(e.effect.code for e in shown if e is not first) or None,
     }
-    if times < HALF_WIDTH.value:
+    if times < limits.HALF_WIDTH.value:
         message = f"the model's error shows {words}; it moves no stated number by what matters"
         return Finding(first.effect.code, "note", message, evidence)
     return Finding(
@@ -194,13 +186,13 @@ def _farthest(shown: Evidence, numbers: Sequence[Stated], step: float) -> tuple[
     # interval, however small they are, a load beside the friction that it adds to, and a friction
     # beside one that is next to none.
     least = {**dict.fromkeys(INTERFACE, step), "load_voltage": friction}
-    least["static_voltage"] = NEGLIGIBLE_FRICTION.value
+    least["static_voltage"] = limits.NEGLIGIBLE_FRICTION.value
     for name, quantity, row in numbers:
         if quantity.value is None or not quantity.std:
             continue
         shift = abs(float(row @ shown.shift))
         size = max(abs(quantity.value), least.get(name, 0.0), 1e-300)
-        if shift > RELEVANT_BIAS.value * size and shift / quantity.std > times:
+        if shift > limits.RELEVANT_BIAS.value * size and shift / quantity.std > times:
             worst, times, share = name, shift / quantity.std, shift / size
     return worst, times, share
 

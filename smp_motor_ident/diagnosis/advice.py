@@ -5,21 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from smp_motor_control.motor.parameters import PHYSICAL
-from smp_motor_ident.diagnosis.limits import (
-    FIT_EXPLAINS,
-    FIT_HOLDS,
-    FIT_INDEPENDENT,
-    FRICTION_SHOWN,
-    HALF_WIDTH,
-    HIGHEST_GAIN,
-    LONGEST_LAG,
-    RELEVANT_BIAS,
-    RINGING,
-    SQUARE_LEVEL,
-    STEADY,
-    UNEXPLAINED,
-    WINDING_LAG,
-)
+from smp_motor_ident.diagnosis import limits
 from smp_motor_ident.diagnosis.sensors import sensors
 from smp_motor_ident.diagnosis.validation import within_resolution
 from smp_motor_ident.estimation import prediction, shape_constraint
@@ -70,7 +56,7 @@ def unsettled_rival(
             name
             for name, q in result.combinations.items()
             if q.value is not None and q.std and name in values
-            and abs((values[name].value or 0.0) - q.value) > HALF_WIDTH.value * q.std
+            and abs((values[name].value or 0.0) - q.value) > limits.HALF_WIDTH.value * q.std
         ]  # fmt: skip
         if moved:
             return [
@@ -99,15 +85,15 @@ def _descent(data: Experiments, fit: Fit) -> Iterator[Finding]:
 
 def _fit(percent: FitPercent, tests: ResidualTests, closely: bool) -> Iterator[Finding]:
     estimation, validation = percent.estimation or 0.0, percent.validation
-    if estimation < FIT_EXPLAINS.value and not closely:
+    if estimation < limits.FIT_EXPLAINS.value and not closely:
         yield Finding(
             "poor_fit",
             "unreliable",
             f"the model explains only {estimation:.0f} % of the speed",
-            {"fit_percent": estimation, "limit": FIT_EXPLAINS.value},
+            {"fit_percent": estimation, "limit": limits.FIT_EXPLAINS.value},
             "look for what else drives the motor; record what the driver really puts out",
         )
-    if validation is not None and validation < estimation - FIT_HOLDS.value:
+    if validation is not None and validation < estimation - limits.FIT_HOLDS.value:
         yield Finding(
             "validation",
             "unreliable",
@@ -117,7 +103,7 @@ def _fit(percent: FitPercent, tests: ResidualTests, closely: bool) -> Iterator[F
             {"estimation": estimation, "validation": validation},
             "record 20 s or more of one excitation under one load",
         )
-    if tests.independent_of_input is False and estimation < FIT_INDEPENDENT.value:
+    if tests.independent_of_input is False and estimation < limits.FIT_INDEPENDENT.value:
         yield Finding(
             "residual_follows_voltage",
             "warning",
@@ -136,17 +122,17 @@ def _resolution(data: Experiments, fit: Fit, tests: ResidualTests) -> Iterator[F
             "unreliable",
             f"the motion leaves the model by {times:.0f} times the counter's resolution, and "
             "not at random",
-            {"times": times, "limit": float(np.sqrt(UNEXPLAINED.value))},
+            {"times": times, "limit": float(np.sqrt(limits.UNEXPLAINED.value))},
             "sample faster, or look for what else drives it",
         )
     ring = _ring(fit)
-    if ring * data.step > RINGING.value:
+    if ring * data.step > limits.RINGING.value:
         yield Finding(
             "ringing",
             "unreliable",
             f"the answer rings at {ring / (2 * np.pi):.3g} Hz, which sampling at "
             f"{1 / data.step:.4g} Hz hardly shows",
-            {"radians_a_sample": ring * data.step, "limit": RINGING.value},
+            {"radians_a_sample": ring * data.step, "limit": limits.RINGING.value},
             "sample faster",
         )
 
@@ -162,11 +148,11 @@ def _second_lag(data: Experiments, fit: Fit) -> Iterator[Finding]:
     row = direction(ln_a0=1.0, ln_a1=-2.0, ln_a2=1.0)
     free = row @ fit.structure.matrix
     ratio, spread = float(row @ fit.z.array), float(np.sqrt(free @ fit.covariance() @ free))
-    if ratio - HALF_WIDTH.value * spread > np.log(0.25):  # it rings, which no lag does
+    if ratio - limits.HALF_WIDTH.value * spread > np.log(0.25):  # it rings, which no lag does
         return
-    share, least = (_lag_share(ratio - k * spread) for k in (0.0, HALF_WIDTH.value))
-    long = share >= WINDING_LAG.value
-    if not long and least < RELEVANT_BIAS.value:
+    share, least = (_lag_share(ratio - k * spread) for k in (0.0, limits.HALF_WIDTH.value))
+    long = share >= limits.WINDING_LAG.value
+    if not long and least < limits.RELEVANT_BIAS.value:
         return
     may_be = "long for a winding's, it may be" if long else "a winding's, or"
     yield Finding(
@@ -176,7 +162,7 @@ def _second_lag(data: Experiments, fit: Fit) -> Iterator[Finding]:
         "filter of the speed, which is no part of the motor's time constant",
         {
             "share": share,
-            "limit": WINDING_LAG.value,
+            "limit": limits.WINDING_LAG.value,
             "quantity": "time_constant",
             "shift_share": share / (1 + share),
         },
@@ -188,8 +174,8 @@ def _implausible(fit: Fit) -> Iterator[Finding]:
     """Say of a motor that cannot be that a unit may be another."""
     lag, gain = fit.z.time_constant, fit.z.dc_gain
     odd = {
-        f"a time constant of {lag:.3g} s": lag > LONGEST_LAG.value,
-        f"a gain of {gain:.3g} rad/s per volt": gain > HIGHEST_GAIN.value,
+        f"a time constant of {lag:.3g} s": lag > limits.LONGEST_LAG.value,
+        f"a gain of {gain:.3g} rad/s per volt": gain > limits.HIGHEST_GAIN.value,
     }
     if not any(odd.values()):
         return
@@ -242,9 +228,9 @@ def _plain_square(data: Experiments, fit: Fit) -> bool:
     level = np.where(driven > 0, np.median(there), np.median(back))
     turns = data.hold_end[:-1][np.diff(np.sign(value)) != 0]
     return bool(
-        np.mean(np.abs(np.abs(driven) - level) < SQUARE_LEVEL.value * level) > 0.95
+        np.mean(np.abs(np.abs(driven) - level) < limits.SQUARE_LEVEL.value * level) > 0.95
         and turns.size > 1
-        and np.median(np.diff(turns)) > STEADY.value * fit.z.time_constant
+        and np.median(np.diff(turns)) > limits.STEADY.value * fit.z.time_constant
     )
 
 
@@ -266,12 +252,12 @@ def _unsettled(data: Experiments, fit: Fit) -> bool:
     _, step, _ = prediction.predicted_decrease(data, fit, fit.structure)
     reported = [n != "ln_te" or fit.structure.current for n in fit.structure.free]
     deviation = np.sqrt(np.diag(fit.covariance()))
-    if not np.any(np.abs(step) > HALF_WIDTH.value * deviation, where=reported):
+    if not np.any(np.abs(step) > limits.HALF_WIDTH.value * deviation, where=reported):
         return False
     here = _least_squares(data, fit, fit.z)
     return any(
         _least_squares(data, fit, fit.z.moved(share * fit.structure.matrix @ step))
-        < here - HALF_WIDTH.value**2
+        < here - limits.HALF_WIDTH.value**2
         for share in (1.0, 0.3, 0.1)
     )
 
@@ -323,7 +309,7 @@ def _friction(fit: Fit) -> Iterator[Finding]:
         return
     i = free.index("vc_plus")
     std = float(np.sqrt(fit.covariance()[i, i]))
-    if std <= FRICTION_SHOWN.value * abs(fit.z.vc_plus) or std <= 0.05:
+    if std <= limits.FRICTION_SHOWN.value * abs(fit.z.vc_plus) or std <= 0.05:
         return
     yield _note(
         "friction_hidden",

@@ -5,20 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from smp_motor_control.arrays import Array, Flags
-from smp_motor_ident.diagnosis.limits import (
-    AT_LIMIT,
-    FEWEST,
-    LARGEST_OFFSET,
-    LATE_ROWS,
-    METER,
-    MOST_LOST,
-    OFFSET_SURE,
-    REST,
-    SIGN_ALIKE,
-    SIGN_LEAST,
-    SIGN_NEARER,
-    SIGN_SURE,
-)
+from smp_motor_ident.diagnosis import limits
 from smp_motor_ident.diagnosis.signs import lagged, likeness, lost_sign
 from smp_motor_ident.diagnosis.silence import silent
 from smp_motor_ident.diagnosis.units import cause_of_ratio, implausible_voltage
@@ -73,11 +60,11 @@ def where_of(records: Sequence[Record]) -> str:
 
 def _length(records: Sequence[Record], where: str) -> None:
     samples = sum(len(r) for r in records)
-    if samples < FEWEST.value:
+    if samples < limits.FEWEST.value:
         duration = sum(r.duration for r in records)
         raise InsufficientExcitationError(
             f"{where}: too short, {samples} samples in {duration:.3g} s; record at least "
-            f"{FEWEST.value:.0f} samples, better 20 s or more with a changing voltage"
+            f"{limits.FEWEST.value:.0f} samples, better 20 s or more with a changing voltage"
         )
 
 
@@ -88,7 +75,7 @@ def _lost(record: Record) -> Iterator[Finding]:
         if values is None or (record.count is not None and record.hardware.counts_per_revolution):
             continue
         lost = float(np.mean(~np.isfinite(values)))
-        if lost > MOST_LOST.value and (name == "velocity" or record.velocity is None):
+        if lost > limits.MOST_LOST.value and (name == "velocity" or record.velocity is None):
             raise SignalError(
                 f"{where}: {name} is NaN in {lost:.0%} of the samples; "
                 "repair the sensor or its connection and record again"
@@ -109,7 +96,7 @@ def _left_out(name: str, lost: float) -> Finding:
 def _excitation(records: Sequence[Record], where: str) -> None:
     largest = max(float(np.abs(r.voltage).max()) for r in records)
     supply = max(r.hardware.supply_voltage or 0.0 for r in records)
-    if largest <= METER.value * supply:
+    if largest <= limits.METER.value * supply:
         raise InsufficientExcitationError(
             f"{where}: no excitation, the voltage stays within {largest:.3g} V of 0 V; drive the "
             "motor with a sine, square or Fourier voltage while recording"
@@ -117,13 +104,13 @@ def _excitation(records: Sequence[Record], where: str) -> None:
     # What a voltmeter scatters around a level is no excitation; a step is, for it is no scatter.
     levels = [float(np.mean(r.voltage)) for r in records]
     still = [
-        float(np.std(r.voltage)) < METER.value * abs(level)
-        and float(np.ptp(r.voltage)) < 10 * METER.value * abs(level)
+        float(np.std(r.voltage)) < limits.METER.value * abs(level)
+        and float(np.ptp(r.voltage)) < 10 * limits.METER.value * abs(level)
         for r, level in zip(records, levels, strict=True)
     ]
     if (
         all(still)
-        and float(np.ptp(levels)) < METER.value * abs(levels[0])
+        and float(np.ptp(levels)) < limits.METER.value * abs(levels[0])
         and not any(_starts(r) for r in records)
     ):
         raise InsufficientExcitationError(
@@ -144,7 +131,7 @@ def _starts(record: Record) -> bool:
     """
     speed = measured_speed(record)
     speed = speed[np.isfinite(speed)]
-    if speed.size < FEWEST.value:
+    if speed.size < limits.FEWEST.value:
         return False
     length = 1
     while speed.size // length >= LEAST_MEANS:
@@ -246,12 +233,12 @@ def _saturation(record: Record) -> None:
             if share < 0.01 or at.sum() < 5 * next_times or runs.sum() < 0.5 * at.sum():
                 continue
             # The last samples of a rest may be late, of a voltage that has moved since.
-            late = int(LATE_ROWS.value)
+            late = int(limits.LATE_ROWS.value)
             early = at & np.append(at[late:], [False] * late)
-            if early.sum() < AT_LIMIT.value:
+            if early.sum() < limits.AT_LIMIT.value:
                 continue
             low, high = np.percentile(v[early], [5, 95])
-            if high - low < 10 * METER.value * np.ptp(v) and not _abrupt(x, at):
+            if high - low < 10 * limits.METER.value * np.ptp(v) and not _abrupt(x, at):
                 continue
             raise SignalError(
                 f"{where}: saturated sensor, {name} rests at {limit:.4g} {unit} in "
@@ -262,8 +249,8 @@ def _saturation(record: Record) -> None:
 
 def _one_level(v: Array) -> bool:
     """Tell whether the motor is driven by one level of voltage, at which it may come to rest."""
-    driven = v[np.abs(v) > REST.value * np.abs(v).max()]
-    return not driven.size or bool(np.ptp(driven) < 10 * METER.value * np.abs(driven).max())
+    driven = v[np.abs(v) > limits.REST.value * np.abs(v).max()]
+    return not driven.size or bool(np.ptp(driven) < 10 * limits.METER.value * np.abs(driven).max())
 
 
 def _abrupt(x: Array, at: Flags) -> bool:
@@ -311,14 +298,19 @@ def _signs(records: Sequence[Record], where: str, late: bool = True) -> None:
         found = likeness(kept, [s for s in signals if s is not None], lags=what == "speed")
         if found is None:
             continue
-        sure, least = SIGN_SURE.value * found.chance, SIGN_LEAST.value
-        if found.wrong - found.right > max(least, min(sure, SIGN_ALIKE.value * found.wrong)):
+        sure, least = limits.SIGN_SURE.value * found.chance, limits.SIGN_LEAST.value
+        if found.wrong - found.right > max(least, min(sure, limits.SIGN_ALIKE.value * found.wrong)):
             raise SignalError(
                 f"{where}: swapped sign, {what} runs against the voltage "
                 f"(correlation {-found.wrong:.2f}); {remedy}"
             )
-        follows = found.wrong > max(least, min(sure, SIGN_ALIKE.value))
-        if late and what == "speed" and follows and found.wrong > SIGN_NEARER.value * found.right:
+        follows = found.wrong > max(least, min(sure, limits.SIGN_ALIKE.value))
+        if (
+            late
+            and what == "speed"
+            and follows
+            and found.wrong > limits.SIGN_NEARER.value * found.right
+        ):
             raise InsufficientExcitationError(
                 f"{where}: the voltage changes too fast for its sampling, {_period(records):.2g} "
                 "samples a period: a speed that comes late looks like one of the other sign; "
@@ -351,7 +343,7 @@ def _offset(record: Record) -> None:
 
     Friction and load have no part in this: the electric equation does not know them.
     """
-    if record.current is None or np.isfinite(record.current).sum() < FEWEST.value:
+    if record.current is None or np.isfinite(record.current).sum() < limits.FEWEST.value:
         return
     v, w, i = of_the_winding(record, record.current)
     if len(v) < 20:
@@ -362,7 +354,8 @@ def _offset(record: Record) -> None:
     std = float(np.sqrt(variance * RUN_CORRELATION))
     offset, largest = float(answer[2]), float(np.nanmax(np.abs(record.current)))
     if abs(offset) > max(
-        OFFSET_SURE.value * std, LARGEST_OFFSET.value * max(largest - abs(offset), 1e-12)
+        limits.OFFSET_SURE.value * std,
+        limits.LARGEST_OFFSET.value * max(largest - abs(offset), 1e-12),
     ):
         raise SignalError(
             f"{where_of([record])}: current has an offset of {offset:.2g} A where it reaches "

@@ -6,12 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from smp_motor_ident.diagnosis.limits import (
-    HOLD_COST,
-    HOLD_EVIDENCE,
-    HOLD_HOPELESS,
-    INSTANT,
-)
+from smp_motor_ident.diagnosis import limits
 from smp_motor_ident.estimation import order_selection
 from smp_motor_ident.estimation.candidate_starts import of_kind
 from smp_motor_ident.estimation.data_window import extend, grow
@@ -42,7 +37,7 @@ def chosen_hold(
 ) -> tuple[str, Fit | None]:
     """Choose how the command ran inside the intervals, by what explains the outputs best."""
     samples = sum(len(r) for r in group)
-    if base.order != 2 or "window" in base.fixed or samples > HOLD_COST.value:
+    if base.order != 2 or "window" in base.fixed or samples > limits.HOLD_COST.value:
         return "held", None
     plain = prepare(group, base.current)
     if plain.kind != ANGLE or thinned(plain) is not plain:
@@ -64,14 +59,14 @@ def chosen_hold(
     near = refine(part, best.structure, best, best.z, options) if part is not plain else best
     for other, data in others.items():
         part = screening_subset(data)
-        short = HOLD_HOPELESS.value if part is not data else -HOLD_EVIDENCE.value
+        short = limits.HOLD_HOPELESS.value if part is not data else -limits.HOLD_EVIDENCE.value
         # From the torque noise that was found it shows soon whether this is worth a full search.
         soon = grow(part, best.structure, near, options, near)
         if soon.converged and soon.deviance > near.deviance + short:
             continue
         fitted = grow(part, best.structure, near, options)
         fitted = extend(data, best.structure, fitted, options)
-        if fitted.deviance < best.deviance - HOLD_EVIDENCE.value:
+        if fitted.deviance < best.deviance - limits.HOLD_EVIDENCE.value:
             hold, best = other, fitted
     return hold, best
 
@@ -134,7 +129,7 @@ def _worth_a_search(
     from a comparison without them.
     """
     s = best.structure
-    if best.samples > HOLD_COST.value or "delay" in s.fixed or not np.ptp(data.hold_value):
+    if best.samples > limits.HOLD_COST.value or "delay" in s.fixed or not np.ptp(data.hold_value):
         return []
     looks: dict[float, Fit] = {}
     for duration in (samples * data.step for samples in LOOKS):
@@ -205,7 +200,7 @@ def instant_deviation(group: Sequence[Record], hold: str) -> float:
     A command on a clock of its own, or jittered stamps, leave a part of an interval open; how
     the stamps scatter, of the mean over all changes of the command.
     """
-    most = int(HOLD_COST.value)
+    most = int(limits.HOLD_COST.value)
     steps = np.concatenate([np.diff(r.time[:most]) for r in group])
     squares = np.concatenate([np.square(np.diff(r.voltage[:most])) for r in group])
     step = float(np.median(steps))
@@ -214,4 +209,4 @@ def instant_deviation(group: Sequence[Record], hold: str) -> float:
     near = steps[steps < 2.5 * step]  # no gaps
     changes = max(float(squares.sum()) / max(float(squares.max(initial=0.0)), 1e-300), 1.0)
     scatter = float(near.std()) / np.sqrt(2 * changes)  # each stamp is in two intervals
-    return max(INSTANT.value * step, scatter) if loose else 0.0
+    return max(limits.INSTANT.value * step, scatter) if loose else 0.0

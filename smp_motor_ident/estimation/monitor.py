@@ -23,13 +23,7 @@ from typing import Literal
 import numpy as np
 
 from smp_motor_control.arrays import Array
-from smp_motor_ident.diagnosis.limits import (
-    FRICTION_BAND,
-    HALF_WIDTH,
-    LEFT_BAND,
-    MOTOR_CONSTANT_BAND,
-    RESISTANCE_BAND,
-)
+from smp_motor_ident.diagnosis import limits
 from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.result import Estimate
@@ -225,8 +219,8 @@ class Monitor:
         """Return by name the change as a share of the commissioned, its deviation, its band."""
         c, now = self.commissioned, self.values()
         usual = {"resistance": c.resistance, "motor_constant": c.motor_constant, "friction": 1.0}
-        band = {"resistance": RESISTANCE_BAND, "motor_constant": MOTOR_CONSTANT_BAND,
-                "friction": FRICTION_BAND}  # fmt: skip
+        band = {"resistance": limits.RESISTANCE_BAND, "motor_constant": limits.MOTOR_CONSTANT_BAND,
+                "friction": limits.FRICTION_BAND}  # fmt: skip
         return {
             name: (value / usual[name] - 1.0, std / usual[name], band[name].value)
             for name, (value, std) in now.items()
@@ -249,7 +243,7 @@ class Monitor:
     def _judge(self) -> None:
         """Note since when, in time of motion, each value has been out of its band for sure."""
         for name, (share, std, band) in self._shares().items():
-            if abs(share) - band > HALF_WIDTH.value * std:
+            if abs(share) - band > limits.HALF_WIDTH.value * std:
                 self._outside.setdefault(name, self._clock)
             elif abs(share) < band:
                 self._outside.pop(name, None)
@@ -261,7 +255,7 @@ class Monitor:
         out = {
             name: shares[name][0]
             for name, since in self._outside.items()
-            if self._clock - since >= LEFT_BAND.value and known[name][0] == "estimated"
+            if self._clock - since >= limits.LEFT_BAND.value and known[name][0] == "estimated"
         }
         return [_finding(name, share, out) for name, share in out.items()]
 

@@ -10,12 +10,7 @@ import numpy as np
 
 from smp_motor_control.arrays import Array
 from smp_motor_control.motor.parameters import PHYSICAL
-from smp_motor_ident.diagnosis.limits import (
-    HIDDEN_LAG,
-    INSTANT,
-    LOOSE_QUANTITY,
-    NEGLIGIBLE_FRICTION,
-)
+from smp_motor_ident.diagnosis import limits
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.fitted import NORMAL_95
 from smp_motor_ident.likelihood.experiments import Experiments
@@ -88,9 +83,9 @@ def answer(
         joint += np.diag(np.square([_friction(n, fit) * friction_std for n in values.value]))
     if "delay" in values.value:  # whole intervals are known no better than instants are
         at = list(values.value).index("delay")
-        joint[at, at] += (INSTANT.value * structure.shift) ** 2
+        joint[at, at] += (limits.INSTANT.value * structure.shift) ** 2
     spread = dict(zip(values.value, np.sqrt(np.maximum(np.diag(joint), 0.0)), strict=True))
-    one_level = spread["dc_gain"] > LOOSE_QUANTITY.value * values.value["dc_gain"]
+    one_level = spread["dc_gain"] > limits.LOOSE_QUANTITY.value * values.value["dc_gain"]
     combinations = {}
     for name in reported:
         if name in FILTERS and "window" in structure.fixed:
@@ -206,9 +201,9 @@ def _hidden(name: str, value: float, std: float, fit: Fit) -> bool:
     The logarithm of a second lag of next to nothing ends where the descent stopped, far below all
     that the data could tell.
     """
-    if name != "time_constant_product" or not std > LOOSE_QUANTITY.value * abs(value):
+    if name != "time_constant_product" or not std > limits.LOOSE_QUANTITY.value * abs(value):
         return False
-    return fit.structure.current or value < HIDDEN_LAG.value * fit.z.time_constant**2
+    return fit.structure.current or value < limits.HIDDEN_LAG.value * fit.z.time_constant**2
 
 
 def _friction(name: str, fit: Fit) -> float:
@@ -239,12 +234,12 @@ def _too_loose(name: str, value: float, std: float, fit: Fit) -> bool:
     """Decide from the certainty; friction near nothing, known to be so, is an answer."""
     if not np.isfinite(std) or not np.isfinite(value):
         return True
-    if std < LOOSE_QUANTITY.value * abs(value):
+    if std < limits.LOOSE_QUANTITY.value * abs(value):
         return False
     values = physical(fit.z)
     per = values["motor_constant"] / values["resistance"]
     if name.startswith("coulomb_friction"):
-        return std > NEGLIGIBLE_FRICTION.value * per
+        return std > limits.NEGLIGIBLE_FRICTION.value * per
     if name == "viscous_friction":
         return std > 0.02 * per * fit.z.a0
     return True

@@ -133,12 +133,6 @@ def test_integral_goes_when_integral_action_is_taken_away() -> None:
     assert pid.step(5.0, 4.0, 0.01).output == pytest.approx(1.0, abs=ROUNDING)
 
 
-def test_enabling_takes_over_the_command_in_force() -> None:
-    pid = Pid(PidGains(p=1.0, i=4.0, d=0.3, setpoint_weight_d=1.0, **VOLTS))
-    pid.track(7.5, 5.0, 4.0)
-    assert pid.step(5.0, 4.0, 0.01).output == pytest.approx(7.5, abs=ROUNDING)
-
-
 def test_integral_clamp_holds_and_lets_go_at_once() -> None:
     pid = Pid(PidGains(p=0.0, i=1.0, i_clamp_min=-2.0, i_clamp_max=3.0))
     assert settle(pid, 10.0, 0.0, 1000).i_term == 3.0
