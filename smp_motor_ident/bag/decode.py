@@ -167,7 +167,8 @@ class _Collector:
             candidates = self.types.candidates(channel)
             paths = list(self.paths)
             first = next(candidates)
-            if _has_stamp(first, channel.type):
+            header = dict(first[channel.type]).get("header")
+            if header is not None and header[1] == "std_msgs/msg/Header":
                 paths += [name for name in STAMP if name not in paths]
             self._decoders[key] = Decoder(channel, chain((first,), candidates), paths)
         return self._decoders[key]
@@ -205,12 +206,6 @@ class _Collector:
             text = f"{self.topic}: {self.packed} messages could not be decompressed"
             table.findings.append(damaged(text))
         return table
-
-
-def _has_stamp(definitions: Definitions, name: str) -> bool:
-    fields = dict(definitions[name])
-    header = fields.get("header")
-    return header is not None and header[1] == "std_msgs/msg/Header"
 
 
 def _stamps(columns: dict[str, NDArray[Any]]) -> Integers | None:

@@ -106,7 +106,9 @@ def parse(items: Iterable[str], msg_files: Iterable[str] = ()) -> SignalMap:
         items = [items]
     document: dict[str, Any] = {}
     motors: dict[str, dict[str, Any]] = {}
-    for item in (part for whole in items for part in _separate(whole)):
+    # ``a=b c=d`` is split at the blanks that stand before another ``KEY=``.
+    parts = (part for whole in items for part in re.split(r"\s+(?=[\w.]+=[^=])", whole.strip()))
+    for item in filter(None, parts):
         key, equals, value = item.partition("=")
         if not equals or not value.strip():
             raise BagError(f"mapping {item!r}: write KEY=VALUE, such as voltage=/pwm.data*12/255")
@@ -118,11 +120,6 @@ def parse(items: Iterable[str], msg_files: Iterable[str] = ()) -> SignalMap:
     document["motors"] = motors
     document["types"] = list(msg_files)
     return from_document(document, "mapping")
-
-
-def _separate(text: str) -> list[str]:
-    """Split ``a=b c=d`` at the blanks that stand before another ``KEY=``."""
-    return [part for part in re.split(r"\s+(?=[\w.]+=[^=])", text.strip()) if part]
 
 
 def load(path: str | os.PathLike[str]) -> SignalMap:

@@ -47,7 +47,11 @@ def work(
     left = [path for path, file in files.items() if not file.exists()]
     if not arguments.quiet:
         print(f"{len(files) - len(left)} of {len(files)} recordings are known already")
-    results = {p: _known(f) for p, f in files.items() if f.exists()}
+    results = {
+        p: msgspec.json.decode(f.read_bytes(), type=list[fleet.Row])
+        for p, f in files.items()
+        if f.exists()
+    }
     settings = (mapping, arguments.model, dict(fixed))
     for path, found in _results(left, settings, arguments.scheduler):
         results[path] = found
@@ -80,10 +84,6 @@ def _key(path: Path, options: str) -> str:
         ["rows", str(path.resolve()), seen, options, metadata.version("smp_motor_control")]
     )
     return hashlib.sha256(text.encode()).hexdigest()[:32]
-
-
-def _known(file: Path) -> list[fleet.Row]:
-    return msgspec.json.decode(file.read_bytes(), type=list[fleet.Row])
 
 
 def identify_one(path: str, settings: tuple[Any, ...]) -> list[fleet.Row]:

@@ -61,7 +61,9 @@ def adequacy(
     named: list[int] = []
     for _ in range(ROUNDS if errors is not None else 0):
         assert errors is not None
-        evidence = _tried(_without(errors, named), tests.white is True)
+        left, white = _without(errors, named), tests.white is True
+        tried = (_test(left, effect, columns, white) for effect, columns in left.members)
+        evidence = [e for e in tried if e is not None]
         level = limits.EFFECT_LEVEL.value / max(len(evidence), 1)
         shown = [e for e in evidence if e.p_value < level]
         if not shown:
@@ -90,11 +92,6 @@ def _covered(
         far.effect.advice,
     )
     return [*out, found], far.shift
-
-
-def _tried(errors: Regression, white: bool) -> list[Evidence]:
-    found = (_test(errors, effect, columns, white) for effect, columns in errors.members)
-    return [e for e in found if e is not None]
 
 
 def _test(

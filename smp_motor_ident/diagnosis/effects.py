@@ -67,14 +67,9 @@ def slope(values: Array, step: Array) -> Array:
     return out
 
 
-def _late(m: Motion) -> list[Array]:
-    first = slope(m.output, m.step)
-    return [first, slope(first, m.step)]
-
-
-def _current_late(m: Motion) -> list[Array]:
-    first = slope(m.current, m.step)
-    return [first, slope(first, m.step)]
+def _late(values: Array, step: Array) -> list[Array]:
+    first = slope(values, step)
+    return [first, slope(first, step)]
 
 
 def _once_a_turn(m: Motion, gear: float = 1.0) -> list[Array]:
@@ -82,14 +77,6 @@ def _once_a_turn(m: Motion, gear: float = 1.0) -> list[Array]:
     if m.kind != ANGLE or np.ptp(m.angle) < 2 * np.pi * gear:
         return []
     return [np.sin(m.angle / gear), np.cos(m.angle / gear)]
-
-
-def _angles(m: Motion) -> list[Array]:
-    return _once_a_turn(m) + (_once_a_turn(m, m.gear) if m.gear > 1.5 else [])
-
-
-def _play(m: Motion) -> list[Array]:
-    return [np.tanh(50 * m.speed / m.fastest)] if m.kind == ANGLE else []
 
 
 def _missed(m: Motion) -> list[Array]:
@@ -173,7 +160,7 @@ EFFECTS = (
     Effect(
         "position", "torque", "a torque that depends on the angle (cogging, an unbalanced wheel)",
         "lift the wheel, or record at higher speed and for more turns",
-        _angles,
+        lambda m: _once_a_turn(m) + (_once_a_turn(m, m.gear) if m.gear > 1.5 else []),
     ),
     Effect(
         "dynamics", "voltage", "linear dynamics that the model lacks (compliance, a filter)",
@@ -187,7 +174,8 @@ EFFECTS = (
     ),
     Effect(
         "lag", "output", "a speed or angle that is filtered, or comes late",
-        "declare the filter of the firmware, or record encoder counts with their stamps", _late,
+        "declare the filter of the firmware, or record encoder counts with their stamps",
+        lambda m: _late(m.output, m.step),
     ),
     Effect(
         "encoder_error", "output", "an encoder that is off once a turn",
@@ -195,7 +183,8 @@ EFFECTS = (
     ),
     Effect(
         "backlash", "output", "backlash between motor and encoder",
-        "measure at the motor's shaft, or keep one direction under load", _play,
+        "measure at the motor's shaft, or keep one direction under load",
+        lambda m: [np.tanh(50 * m.speed / m.fastest)] if m.kind == ANGLE else [],
     ),
     Effect(
         "missed_counts", "output", "counts that are lost at speed",
@@ -203,7 +192,8 @@ EFFECTS = (
     ),
     Effect(
         "current_lag", "current", "a current that is filtered, averaged, or late",
-        "declare the filter, or estimate without the current", _current_late,
+        "declare the filter, or estimate without the current",
+        lambda m: _late(m.current, m.step),
     ),
     Effect(
         "current_unsigned", "current", "a current without sign, or of another scale each way",

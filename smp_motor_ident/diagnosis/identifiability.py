@@ -5,7 +5,7 @@ anything is recorded, what an excitation would teach.
 Derivation: docs/derivations.md, section 11.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -71,7 +71,8 @@ def what_next(
         for spread in SPREADS:
             band = (max(0.05, 0.1 * corner), min(corner * spread, 0.4 / step))
             record = _trial(share * limit, band, step, estimate.hardware)
-            relative = _least_certain(record, family)
+            each = [_relative_std(record, fit) for fit in family]
+            relative = {n: max(one[n] for one in each) for n in each[0]}  # the least certain
             length = TRIAL * (max(relative.values()) / accuracy) ** 2
             duration = float(np.clip(length, 5.0, longest))
             after = {n: v * float(np.sqrt(TRIAL / duration)) for n, v in relative.items()}
@@ -132,12 +133,6 @@ def _trial(amplitude: float, band: tuple[float, float], step: float, hardware: H
     v = np.cos(2 * np.pi * np.outer(t, tones) + phases).sum(axis=1)
     v *= amplitude / np.abs(v).max()
     return Record("trial", t, v, np.zeros(len(t)), None, np.zeros(len(t)), hardware=hardware)
-
-
-def _least_certain(record: Record, family: Sequence[Fit]) -> dict[str, float]:
-    """Return the largest relative standard deviation of each parameter over a family."""
-    each = [_relative_std(record, fit) for fit in family]
-    return {n: max(one[n] for one in each) for n in each[0]}
 
 
 def _relative_std(record: Record, fit: Fit) -> dict[str, float]:

@@ -67,7 +67,9 @@ def regression(data: Experiments, fit: Fit, gear: float) -> Regression | None:
     table = np.array(columns).T  # columns stay together in memory
     if np.count_nonzero(columns[0]) < 4 * BLOCKS or not np.isfinite(table).all():
         return None
-    whole = _projected(table, len(own), _blocks(data), members, len(fit.structure.free))
+    block = row_starts(data, together(data)) * BLOCKS // data.size
+    block = np.tile(block, 2 if data.current.size else 1)
+    whole = _projected(table, len(own), block, members, len(fit.structure.free))
     return replace(whole, conditions=_conditions(data, samples))
 
 
@@ -152,12 +154,6 @@ def whitened(data: Experiments, fit: Fit, sums: Array) -> list[Array]:
 def together(data: Experiments) -> int:
     """Return how many samples make a row."""
     return max(1, data.size // ROWS)
-
-
-def _blocks(data: Experiments) -> Integers:
-    begins = row_starts(data, together(data))
-    block = begins * BLOCKS // data.size
-    return np.tile(block, 2 if data.current.size else 1)
 
 
 def own_responses(data: Experiments, fit: Fit, together: int = 1) -> Array:

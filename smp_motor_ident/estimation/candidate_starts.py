@@ -56,7 +56,8 @@ def from_rivals(data: Experiments, tried: list[Fit], options: Options) -> list[F
     """Start the likeliest from every rival's answer: what is late in one way may be in another."""
     if len(tried) < 2:
         return tried
-    best = min(range(len(tried)), key=lambda i: tried[i].deviance + _price(tried[i]))
+    prices = [f.structure.size * float(np.log(f.samples)) for f in tried]
+    best = min(range(len(tried)), key=lambda i: tried[i].deviance + prices[i])
     out = list(tried)
     for rival in tried:
         winner = out[best]
@@ -68,10 +69,6 @@ def from_rivals(data: Experiments, tried: list[Fit], options: Options) -> list[F
         if again.deviance < winner.deviance:
             out[best] = again
     return out
-
-
-def _price(fit: Fit) -> float:
-    return fit.structure.size * float(np.log(fit.samples))
 
 
 def _translated(rival: Fit, structure: Structure, step: float) -> Coordinates:

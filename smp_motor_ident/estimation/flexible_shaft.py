@@ -75,7 +75,8 @@ class _Segment:
 def flexible_shaft(records: Sequence[Record], rigid: Estimate) -> Estimate:
     """Estimate a motor with a flexible shaft, from what a rigid one explains."""
     segments = [s for r in records for s in _segments(r, rigid)]
-    stiff = _rigid_start(rigid)
+    tau, tp = rigid.value("time_constant"), rigid.value("time_constant_product")
+    stiff = np.array([math.log(tau), math.log(max(tp, 1e-4 * tau * tau)), rigid.value("delay")])
     stiff, ar, _ = _fit(segments, [stiff], np.ones(1))
     theta, _, _ = _fit(segments, _starts(segments, stiff, ar), ar)
     for _ in range(2):
@@ -107,11 +108,6 @@ def _segments(record: Record, rigid: Estimate) -> list[_Segment]:
             y = np.interp(time, time[there], y[there])
             found.append(_Segment(time, record.voltage[a:b], sign[a:b], y, kind == ANGLE))
     return found
-
-
-def _rigid_start(rigid: Estimate) -> Array:
-    tau, tp = rigid.value("time_constant"), rigid.value("time_constant_product")
-    return np.array([math.log(tau), math.log(max(tp, 1e-4 * tau * tau)), rigid.value("delay")])
 
 
 def _poles(theta: Array) -> Complex:

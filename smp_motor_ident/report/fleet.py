@@ -139,9 +139,10 @@ def page(rows: Sequence[Row], marks: Sequence[Mark]) -> str:
     """Return the table as a page that stands alone."""
     robots = len({r.robot for r in rows})
     return templates.page(
-        "fleet.html.jinja", rows=rows, marks=marks, quantities=QUANTITIES, robots=robots, day=_day
+        "fleet.html.jinja",
+        rows=rows,
+        marks=marks,
+        quantities=QUANTITIES,
+        robots=robots,
+        day=lambda date: str(np.datetime64(round(date), "s")).replace("T", " "),
     )
-
-
-def _day(date: float) -> str:
-    return str(np.datetime64(round(date), "s")).replace("T", " ")

@@ -81,9 +81,9 @@ def _motor(
         "findings": found,
         "verdict": _verdict(estimate, found),
         "headline": [
-            _headline(name, words.scaled(estimate.combinations[name]))
+            (words.label(name), words.number(q.value), q.unit, _share(q))
             for name in ("dc_gain", "time_constant", "static_voltage", "delay")
-            if name in estimate.combinations
+            if (one := estimate.combinations.get(name)) and (q := words.scaled(one))
         ],
         "combinations": [_row(name, q) for name, q in estimate.combinations.items()],
         "parameters": [
@@ -158,11 +158,6 @@ def _row(name: str, quantity: Quantity) -> dict[str, str]:
         kind=quantity.status,
         share=_share(quantity),
     )
-
-
-def _headline(name: str, quantity: Quantity) -> tuple[str, str, str, str]:
-    """Return name, value, unit and relative deviation, short enough for a card."""
-    return words.label(name), words.number(quantity.value), quantity.unit, _share(quantity)
 
 
 def _share(quantity: Quantity) -> str:

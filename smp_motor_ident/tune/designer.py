@@ -20,8 +20,8 @@ from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.margins import Margins, loop_margins
 from smp_motor_ident.tune.methods import METHODS
 from smp_motor_ident.tune.plant import Plant, sample
-from smp_motor_ident.tune.problem import checked, control_noise
-from smp_motor_ident.tune.reference import Reference, Wanted, controller_for, plan_reference
+from smp_motor_ident.tune.problem import control_noise
+from smp_motor_ident.tune.reference import Reference, controller_for, plan_reference
 from smp_motor_ident.tune.simulation import Controller
 from smp_motor_ident.tune.specification import Performance, Specification, figures_of
 from smp_motor_ident.tune.unmodelled import UnmodelledDynamics
@@ -167,18 +167,10 @@ def wheel_gains(case: Case, controller: Controller) -> PidGains:
 def _plan(
     plant: Plant, loop: Loop, controller: Controller, margins: Margins, targets: Mapping[str, Any]
 ) -> Reference:
-    ratio = loop.gear_ratio
-    speed, rate = checked(targets, "max_velocity"), checked(targets, "max_acceleration")
-    wanted = Wanted(
-        None if speed is None else speed * ratio,
-        None if rate is None else rate * ratio,
-        checked(targets, "transition_time"),
-        bool(targets.get("together")),
-    )
     # Of a delay that may be longer than usual no more is asked than the loop bears.
     borne = replace(loop, delay_doubt=min(loop.delay_doubt, DELAY_BORNE.value * margins.delay))
     least = 0.4 / margins.crossover if margins.crossover > 0 else 0.0
-    return plan_reference(plant, borne, controller, wanted, least)
+    return plan_reference(plant, borne, controller, targets, least)
 
 
 def _explain(

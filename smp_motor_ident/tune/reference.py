@@ -13,7 +13,9 @@ References
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -25,7 +27,7 @@ from smp_motor_ident.tune.arrays import Array
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.plant import Plant, sample
-from smp_motor_ident.tune.problem import measured_lag
+from smp_motor_ident.tune.problem import checked, measured_lag
 from smp_motor_ident.tune.simulation import Controller, Inputs, simulate, step_figures
 
 HEADROOM = 0.92
@@ -116,39 +118,31 @@ def top_speed(plant: Plant, supply: float) -> float:
     return float((HEADROOM * supply - m.static_voltage[0]) / m.a0[0])
 
 
-@dataclass(frozen=True)
-class Wanted:
-    """What a user asks of the reference, at the motor shaft; None: as fast as can be."""
-
-    max_velocity: float | None = None  # [rad/s]
-    max_acceleration: float | None = None  # [rad/s^2]
-    transition_time: float | None = None  # [s]
-    together: bool = False  # whether all wheels change their speed in one time
-
-
 def plan_reference(
-    plant: Plant, loop: Loop, controller: Controller, wanted: Wanted, least: float = 0.0
+    plant: Plant, loop: Loop, controller: Controller, targets: Mapping[str, Any], least: float
 ) -> Reference:
     """Return the fastest reference, of ``least`` seconds, that is followed without overshoot."""
     ratio = loop.gear_ratio
-    speed = _reachable(plant, loop, wanted.max_velocity)
+    speed, rate = checked(targets, "max_velocity"), checked(targets, "max_acceleration")
+    duration = checked(targets, "transition_time")
+    speed = _reachable(plant, loop, None if speed is None else speed * ratio)
     m = plant.motors
-    drive = Drive(
-        top_speed=(PEAK * loop.supply_voltage - float(m.static_voltage[0])) / float(m.a0[0]),
-        time_constant=float(m.a1[0] / m.a0[0]),
-        time_constant_product=float(m.a2[0] / m.a0[0]),
-    )
     plan = Reference(
         max_velocity=speed,
         max_acceleration=math.inf,
         transition_time=0.0,
         lag=measured_lag(plant, loop.expected_delay),
-        doubt=0.0 if wanted.together else loop.delay_doubt,
-        drive=drive,
+        doubt=0.0 if targets.get("together") else loop.delay_doubt,
+        drive=Drive(
+            top_speed=(PEAK * loop.supply_voltage - float(m.static_voltage[0])) / float(m.a0[0]),
+            time_constant=float(m.a1[0] / m.a0[0]),
+            time_constant_product=float(m.a2[0] / m.a0[0]),
+        ),
     )
     plan = _quickest(plant, loop, controller, plan, least)
     quickest = plan.transition_time
-    if (rate := wanted.max_acceleration) is not None:
+    if rate is not None:
+        rate *= ratio
         steepest = _steepest(plant, loop, speed, quickest)
         if rate > steepest:
             raise DesignError(
@@ -158,7 +152,7 @@ def plan_reference(
                 "or less"
             )
         plan = replace(plan, max_acceleration=rate)
-    if (duration := wanted.transition_time) is not None:
+    if duration is not None:
         if duration < quickest - 1e-9:
             raise DesignError(
                 f"transition_time {duration:.4g} s is too short for the loop: without "
