@@ -15,13 +15,14 @@ from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.result import Correlation, ResidualTests
 
+LAGS = 25  # samples up to which correlations are looked at
 MOST = 200_000  # samples; the band then is a fiftieth of a percent
 
 
-def residual_tests(data: Experiments, fit: Fit, lags: int = 25) -> ResidualTests:
+def residual_tests(data: Experiments, fit: Fit) -> ResidualTests:
     """Test the innovations for whiteness and for independence from the input.
 
-    Autocorrelations (cross-correlations with the voltage) at up to ``lags`` lags stay, with
+    Autocorrelations (cross-correlations with the voltage) at up to :data:`LAGS` lags stay, with
     95 % confidence for all of them together, inside the band.
 
     References
@@ -30,21 +31,17 @@ def residual_tests(data: Experiments, fit: Fit, lags: int = 25) -> ResidualTests
     """
     residual = data.output - prediction.simulate(data, fit, gain=True)[:, 1]
     voltage = voltage_at_samples(data)
-    ok = np.isfinite(residual)
-    e = np.where(ok, residual - residual[ok].mean(), 0.0)[:MOST]
+    e, band = _centred(residual)
     u = (voltage - voltage.mean())[:MOST]
-    n = int(ok[:MOST].sum())
-    if n < 4 * lags or e.std() == 0 or u.std() == 0:
+    if e.std() == 0 or u.std() == 0:
         return ResidualTests(model_error=unmodelled_dynamics(data, fit))
-    band = float(ndtri(1 - RESIDUAL_LEVEL.value / 2 / lags) / np.sqrt(n))
-    auto = _lagged(e, e, lags)
-    own = _lagged(u, u, lags)
+    auto, own = _lagged(e, e), _lagged(u, u)
     # Two independent coloured signals correlate by chance with the sum of the product of their
     # autocorrelations (Ljung, equation 16.68).
-    cross = _lagged(e, u, lags) / np.sqrt(auto[0] * own[0])
+    cross = _lagged(e, u) / np.sqrt(auto[0] * own[0])
     auto, own = auto / auto[0], own / own[0]
     wide = band * float(np.sqrt(max(1.0, 1 + 2 * float((auto[1:] * own[1:]).sum()))))
-    lag = np.arange(lags + 1, dtype=np.float64)
+    lag = np.arange(LAGS + 1, dtype=np.float64)
     return ResidualTests(
         white=bool(np.abs(auto[1:]).max() < band),
         independent_of_input=bool(np.abs(cross).max() < wide),
@@ -54,16 +51,21 @@ def residual_tests(data: Experiments, fit: Fit, lags: int = 25) -> ResidualTests
     )
 
 
-def coloured(error: Array, lags: int = 25) -> bool:
+def coloured(error: Array) -> bool:
     """Tell whether neighbouring errors hang together, by the same band; errors may be NaN."""
+    e, band = _centred(error)
+    auto = _lagged(e, e)
+    return bool(auto[0] > 0 and np.abs(auto[1:]).max() >= band * auto[0])
+
+
+def _centred(error: Array) -> tuple[Array, float]:
+    """Return errors without their mean, nothing where there is none or few are, and their band."""
     ok = np.isfinite(error)
-    e = np.where(ok, error - error[ok].mean(), 0.0)[:MOST] if ok.any() else np.zeros(0)
     n = int(ok[:MOST].sum())
-    if n < 4 * lags or e.std() == 0:
-        return False
-    auto = _lagged(e, e, lags)
-    band = float(ndtri(1 - RESIDUAL_LEVEL.value / 2 / lags) / np.sqrt(n))
-    return bool(np.abs(auto[1:]).max() >= band * auto[0])
+    if n < 4 * LAGS:
+        return np.zeros(LAGS + 1), np.inf
+    e = np.where(ok, error - error[ok].mean(), 0.0)[:MOST]
+    return e, float(ndtri(1 - RESIDUAL_LEVEL.value / 2 / LAGS) / np.sqrt(n))
 
 
 def voltage_at_samples(data: Experiments) -> Array:
@@ -79,7 +81,7 @@ def voltage_at_samples(data: Experiments) -> Array:
     return out
 
 
-def _lagged(a: Array, b: Array, lags: int) -> Array:
-    """Return the inner products of a and b, b delayed by 0 to ``lags`` samples."""
+def _lagged(a: Array, b: Array) -> Array:
+    """Return the inner products of a and b, b delayed by 0 to :data:`LAGS` samples."""
     n = len(a)
-    return np.array([np.einsum("i,i->", a[k:], b[: n - k]) for k in range(lags + 1)])
+    return np.array([np.einsum("i,i->", a[k:], b[: n - k]) for k in range(LAGS + 1)])

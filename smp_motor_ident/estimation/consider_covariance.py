@@ -77,12 +77,12 @@ def consider_drop(data: Experiments, fit: Fit) -> Fit:
     return fit.along(s.of_free(direction(vc_plus=drop, vc_minus=drop)))
 
 
-def consider_bound(free: Fit, bound: Fit, name: str) -> Fit:
-    """Return a fit whose parameter is held at zero, widened by what that may be above it.
+def consider_bound(free: Fit, bound: Fit) -> Fit:
+    """Return a fit whose viscous friction is held at zero, widened by what that may be above it.
 
-    ``free`` is the same fit without the bound, where the parameter is negative.
+    ``free`` is the same fit without the bound, where it is negative.
     """
-    value, row = physical_gradients(free.z)[name]
+    value, row = physical_gradients(free.z)["viscous_friction"]
     row = row @ free.structure.matrix
     covariance = free.conditional()
     variance = float(row @ covariance @ row)

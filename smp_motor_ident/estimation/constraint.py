@@ -38,4 +38,4 @@ def constrained(data: Experiments, fit: Fit, request: Request) -> Fit:
         return fit
     bound = replace(request.options, priors=tuple(priors))
     held = refine(data, fit.structure, fit, fit.z, bound)
-    return consider_bound(fit, held, "viscous_friction") if negative else held
+    return consider_bound(fit, held) if negative else held

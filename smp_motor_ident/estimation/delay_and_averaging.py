@@ -19,12 +19,10 @@ WINDOWS = (1.0, 4.0)  # samples at which a low-pass is begun
 DELAYS = (0.3, 1.5, 3.5)  # samples at which a delay is begun that torque noise may have hidden
 
 
-def with_delay(
-    data: Experiments, delayed: Structure, options: Options, plain: Fit | None
-) -> Fit | None:
+def with_delay(data: Experiments, delayed: Structure, options: Options) -> Fit | None:
     """Fit with a delay, and with a whole number of samples of it."""
-    first = first_with_delay(data, delayed, options, plain)
-    return first and settled(data, first, options, plain)
+    first = first_with_delay(data, delayed, options, None)
+    return first and settled(data, first, options, None)
 
 
 def settled(

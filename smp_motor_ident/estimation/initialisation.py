@@ -70,12 +70,10 @@ def initial_fit(
     structure: Structure,
     options: Options,
     extra: Sequence[Coordinates] = (),
-    keep: int = 3,
-    own: bool = True,
     near: Fit | None = None,
 ) -> Fit | None:
     """Fit a structure without any guess."""
-    first = first_fit(data, structure, options, extra, keep, own)
+    first = first_fit(data, structure, options, extra)
     return first and grow(data, structure, first, options, near)
 
 

@@ -77,7 +77,7 @@ def explore(
 def _initial_fit(data: Experiments, s: Structure, options: Options, say: Say) -> Fit | None:
     say(f"fitting {s.label}")
     if s.delay:
-        return with_delay(data, s, options, None)
+        return with_delay(data, s, options)
     return initial_fit(data, s, options)
 
 
