@@ -1,7 +1,5 @@
 """What a DC motor and its gearbox are: validated numbers, and the one conversion between shafts."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 from typing import TypeVar
 
@@ -74,7 +72,7 @@ class MotorParameters:
         time_constant_product: float = 0.0,
         static_voltage: float = 0.0,
         resistance: float = 1.0,
-    ) -> MotorParameters:
+    ) -> "MotorParameters":
         """Return a motor that answers a voltage like the one with these combinations.
 
         Voltage and speed do not tell the physical parameters apart; of all motors with the

@@ -3,8 +3,6 @@
 Set-point and speeds are the wheel's; counts and the model are the motor's.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -72,7 +70,7 @@ class LoopSettings:
                 "speed_source is 'observer', which needs model.dc_gain and model.time_constant"
             )
 
-    def within(self, supply_voltage: float) -> LoopSettings:
+    def within(self, supply_voltage: float) -> "LoopSettings":
         """Return the same with the output limited to what a supply can give."""
         gains = replace(
             self.gains,

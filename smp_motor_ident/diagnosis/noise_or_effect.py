@@ -13,8 +13,6 @@ References
 G. Schwarz, Annals of Statistics 6 (1978), 461; R. Kass, A. Raftery, Bayes factors, JASA 90 (1995).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -121,7 +119,7 @@ class _Point:
             left = np.maximum(left, 1e-14 * squares)
         return size / self.length[columns], _deviance(left, self.error)
 
-    def only(self, effect: Effect) -> _Point:
+    def only(self, effect: Effect) -> "_Point":
         """Return the same run with the responses to one effect alone."""
         own = [k for k, (e, _) in enumerate(self.signals) if e is effect]
         keep = [*range(self.own), *(self.own + k for k in own)]
@@ -138,7 +136,7 @@ class _Point:
         tried.sort(key=lambda t: t[0])
         return [effect for _, effect in tried[: max(2, COST // self.data.size)]]
 
-    def moved(self, damping: float, effect: Effect, gear: float) -> _Point | None:
+    def moved(self, damping: float, effect: Effect, gear: float) -> "_Point | None":
         """Return the free run after a Levenberg-Marquardt step; None where it leaves all bounds."""
         step = self.fitted(list(range(self.length.size)), damping)[0]
         structure = self.fit.structure

@@ -1,7 +1,5 @@
 """What a small test of a wheel shows: when it starts to turn, which way, how fast, how surely."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Mapping, Sequence
@@ -41,20 +39,20 @@ class Trace:
     phase: Array  # number of the phase
 
     @classmethod
-    def of(cls, rows: ArrayLike) -> Trace:
+    def of(cls, rows: ArrayLike) -> "Trace":
         """Return the trace of rows with these columns."""
         columns = np.asarray(rows, dtype=np.float64).reshape(-1, len(fields(cls))).T
         return cls(*columns)
 
-    def during(self, *numbers: int) -> Trace:
+    def during(self, *numbers: int) -> "Trace":
         """Return the part in some phases."""
         return self._take(np.isin(self.phase, numbers))
 
-    def since(self, begin: int) -> Trace:
+    def since(self, begin: int) -> "Trace":
         """Return the samples from an index on."""
         return self._take(slice(begin, None))
 
-    def _take(self, kept: slice | Flags) -> Trace:
+    def _take(self, kept: slice | Flags) -> "Trace":
         return Trace(*(getattr(self, f.name)[kept] for f in fields(self)))
 
 
@@ -182,7 +180,7 @@ class _Steady:
     reported: float
 
     @classmethod
-    def of(cls, hold: Trace, hardware: Hardware) -> _Steady:
+    def of(cls, hold: Trace, hardware: Hardware) -> "_Steady":
         hold = _held(hold)
         middle = 0.5 * (hold.time[0] + hold.time[-1]) if hold.time.size else 0.0
         late = hold.since(int(np.searchsorted(hold.time, middle)))

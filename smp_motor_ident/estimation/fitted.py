@@ -3,8 +3,6 @@
 Derivation: docs/derivations.md, section 9.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -83,7 +81,7 @@ class Start:
 
     def at(
         self, z: Coordinates, initial: Array | None = None, noise_ratio: float | None = None
-    ) -> Start:
+    ) -> "Start":
         """Return the same start at other coordinates."""
         return Start(
             z,
@@ -116,11 +114,11 @@ class Fit(Start):
     # Coordinates whose interval was followed, not extrapolated, see `profile`
     profiles: tuple[Profile, ...] = ()
 
-    def wider(self, added: Array) -> Fit:
+    def wider(self, added: Array) -> "Fit":
         """Return the fit with a covariance added that the likelihood does not see."""
         return replace(self, added=added if self.added is None else self.added + added)
 
-    def along(self, move: Array) -> Fit:
+    def along(self, move: Array) -> "Fit":
         """Return the fit with its covariance widened by a move of the free coordinates."""
         return self.wider(np.outer(move, move).astype(np.float64))
 
@@ -150,7 +148,7 @@ class Fit(Start):
     @cached_property
     def _conditional(self) -> Array:
         cov = self.white()
-        widen = np.sqrt(self._widening(long_run))
+        widen = np.sqrt(self.factors(long_run))
         cov = cov * np.outer(widen, widen)
         if self.widen is not None:
             cov = cov * np.outer(self.widen, self.widen)
@@ -166,9 +164,10 @@ class Fit(Start):
 
         For choices between structures: an error that outlasts a run of samples is in all of them.
         """
-        return self._widening(lambda sums: np.square(sums).sum(axis=0))
+        return self.factors(lambda sums: np.square(sums).sum(axis=0))
 
-    def _widening(self, variance: Callable[[Array], Array]) -> Array:
+    def factors(self, variance: Callable[[Array], Array]) -> Array:
+        """Return by how much a variance of sums of scores exceeds that of white residuals."""
         cov = self.white()
         n = len(self.scores)
         if n <= 2 * cov.shape[0]:

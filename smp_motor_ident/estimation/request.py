@@ -1,7 +1,5 @@
 """What a user asks of an estimate, held against what can be asked; the structure to begin with."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -51,7 +49,7 @@ class Request:
         """Whether an answer without the current is an answer to what was asked."""
         return self.use_current and self.model == "auto" and not self.bounds
 
-    def without_current(self, group: Sequence[Record]) -> tuple[list[Record], Request]:
+    def without_current(self, group: Sequence[Record]) -> "tuple[list[Record], Request]":
         """Return the records without their current, and the request for them."""
         bare = [replace(r, current=None) for r in group]
         known = _with_ohmmeter(self.known, bare)

@@ -11,8 +11,6 @@ DerSimonian and Laird, Controlled Clinical Trials 7 (1986), 177 (the excess by m
 Higgins, Thompson and Spiegelhalter, J. R. Stat. Soc. A 172 (2009), 137 (interval of a new one).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -59,7 +57,7 @@ class Steps:
     owner: Integers  # which segment a part is of
     free: list[int]  # which of the coordinates
 
-    def without(self, segment: int) -> Steps:
+    def without(self, segment: int) -> "Steps":
         """Return the steps of all other segments."""
         kept = self.owner != segment
         when = self.middle[kept]
@@ -198,7 +196,9 @@ def _steps(data: Experiments, fit: Fit, count: int) -> Steps | None:
     fewest = FEWEST if count > WHOLE else 2
     sums = gather(cut, structure, fit.z, cut.initial, fit.noise_model())
     common = [i for i, c in enumerate(structure.free) if c != "ln_te"]
-    factors = np.sqrt(_fast_factors(fit))
+    # Of residuals that hang together for less than a part: differences between neighbouring
+    # blocks (von Neumann) leave out what drifts.
+    factors = np.sqrt(fit.factors(lambda sums: 0.5 * np.square(np.diff(sums, axis=0)).sum(axis=0)))
     plausible = np.diag(structure.of_free(PLAUSIBLE))
     middle, steps, covs = [], [], []
     for b, (normal, gradient) in enumerate(zip(sums.normal, sums.gradient, strict=True)):
@@ -244,20 +244,6 @@ def _bounded_inverse(information: Array) -> Array:
     values, vectors = np.linalg.eigh(information / np.outer(unit, unit))
     values = np.maximum(values, ROUNDING * values[-1])
     return np.asarray((vectors / values) @ vectors.T / np.outer(unit, unit))
-
-
-def _fast_factors(fit: Fit) -> Array:
-    """Return the sandwich factors of residuals that hang together for less than a part.
-
-    Differences between neighbouring blocks (von Neumann) leave out what drifts.
-    """
-    cov = fit.white()
-    n = len(fit.scores)
-    if n <= 2 * cov.shape[0]:
-        return np.ones(cov.shape[0])
-    moved = np.diff(fit.scores, axis=0) @ cov
-    sandwich = 0.5 * np.square(moved).sum(axis=0) * (n / (n - 1))
-    return np.asarray(np.maximum(1.0, sandwich / np.maximum(np.diag(cov), 1e-300)))
 
 
 def _edges(data: Experiments, parts: int) -> list[int]:

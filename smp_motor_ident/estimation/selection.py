@@ -1,7 +1,5 @@
 """The rule of choice: richer only where the data reject the simpler, with the reason in words."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -38,7 +36,7 @@ class FittedCandidate:
         """Bayesian information criterion: deviance + parameters x ln(samples)."""
         return self.fit.deviance + self.fit.structure.size * float(np.log(self.fit.samples))
 
-    def contains(self, other: FittedCandidate) -> bool:
+    def contains(self, other: "FittedCandidate") -> bool:
         """Tell whether another, fitted to all data, is this one with fewer free coordinates."""
         free = set(self.fit.structure.free)
         settled = other.whole and other.fit.converged and other.fit.kind == self.fit.kind

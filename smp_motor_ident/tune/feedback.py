@@ -4,8 +4,6 @@ All at the motor shaft: volts per motor rad/s.  The integral is forward Euler an
 step later, the derivative is backward Euler behind its filter, exactly as the running PID does.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,7 +22,7 @@ class Feedback:
     d: float = 0.0  # [V s^2/rad]
     filter_time: float = 0.0  # time constant of the derivative's filter [s]
 
-    def scaled(self, factor: float) -> Feedback:
+    def scaled(self, factor: float) -> "Feedback":
         """Return the same controller with every gain multiplied by ``factor``."""
         return replace(self, p=self.p * factor, i=self.i * factor, d=self.d * factor)
 

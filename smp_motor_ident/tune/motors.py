@@ -1,7 +1,5 @@
 """Motors as the design takes them: what fixes the response of a drive, and draws of it."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field, fields, replace
 
@@ -49,7 +47,7 @@ class Motors:
         """Return the number of motors."""
         return int(self.a0.size)
 
-    def first(self, n: int) -> Motors:
+    def first(self, n: int) -> "Motors":
         """Return the first ``n`` motors of the batch."""
         return Motors(**{each.name: getattr(self, each.name)[:n] for each in fields(self)})
 

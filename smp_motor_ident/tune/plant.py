@@ -11,8 +11,6 @@ References
    sampling of systems with time delay.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -66,7 +64,7 @@ class Plant:
         """Which state is reported as the speed."""
         return self.phi.shape[1] - 1 if np.any(self.motors.sensor_lag > 0) else 0
 
-    def repeated(self, n: int) -> Plant:
+    def repeated(self, n: int) -> "Plant":
         """Return a batch of ``n`` copies of a batch of one, for ``n`` controllers."""
         return replace(
             self,

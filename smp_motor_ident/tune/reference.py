@@ -123,12 +123,12 @@ def plan_reference(
 ) -> Reference:
     """Return the fastest reference, of ``least`` seconds, that is followed without overshoot."""
     ratio = loop.gear_ratio
-    speed, rate = checked(targets, "max_velocity"), checked(targets, "max_acceleration")
+    asked = (checked(targets, name) for name in ("max_velocity", "max_acceleration"))
+    speed, rate = (None if one is None else one * ratio for one in asked)
     duration = checked(targets, "transition_time")
-    speed = _reachable(plant, loop, None if speed is None else speed * ratio)
     m = plant.motors
     plan = Reference(
-        max_velocity=speed,
+        max_velocity=_reachable(plant, loop, speed),
         max_acceleration=math.inf,
         transition_time=0.0,
         lag=measured_lag(plant, loop.expected_delay),
@@ -142,12 +142,11 @@ def plan_reference(
     plan = _quickest(plant, loop, controller, plan, least)
     quickest = plan.transition_time
     if rate is not None:
-        rate *= ratio
-        steepest = _steepest(plant, loop, speed, quickest)
+        steepest = _steepest(plant, loop, plan.max_velocity, quickest)
         if rate > steepest:
             raise DesignError(
                 f"max_acceleration {rate / ratio:.4g} rad/s^2 is beyond the motor: a "
-                f"change by {speed / ratio:.3g} rad/s within {PEAK:.0%} of "
+                f"change by {plan.max_velocity / ratio:.3g} rad/s within {PEAK:.0%} of "
                 f"{loop.supply_voltage:g} V reaches {steepest / ratio:.4g} rad/s^2; ask for that "
                 "or less"
             )
