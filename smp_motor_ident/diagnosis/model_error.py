@@ -13,7 +13,6 @@ import numpy as np
 from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident.diagnosis.effects import EFFECTS, Effect, Motion, slope
 from smp_motor_ident.diagnosis.limits import EFFECT_OWN
-from smp_motor_ident.diagnosis.residuals import voltage_at_samples
 from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.likelihood.experiments import Experiments
@@ -320,7 +319,7 @@ def motions(data: Experiments, fit: Fit, gear: float) -> tuple[Motion, Motion]:
     if np.isnan(angle).any():
         known = np.flatnonzero(np.isfinite(angle))
         angle = np.interp(np.arange(data.size), known, angle[known])
-    voltage = voltage_at_samples(data)
+    voltage = prediction.voltage_at_samples(data)
     at_samples = _motion(data, gear, (data.time, voltage, speed, angle), back, np.diff(data.starts))
     at_samples = replace(
         at_samples,

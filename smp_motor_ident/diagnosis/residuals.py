@@ -30,7 +30,7 @@ def residual_tests(data: Experiments, fit: Fit) -> ResidualTests:
     L. Ljung, *System Identification: Theory for the User*, 2nd ed., section 16.6.
     """
     residual = data.output - prediction.simulate(data, fit, gain=True)[:, 1]
-    voltage = voltage_at_samples(data)
+    voltage = prediction.voltage_at_samples(data)
     e, band = _centred(residual)
     u = (voltage - voltage.mean())[:MOST]
     if e.std() == 0 or u.std() == 0:
@@ -66,19 +66,6 @@ def _centred(error: Array) -> tuple[Array, float]:
         return np.zeros(LAGS + 1), np.inf
     e = np.where(ok, error - error[ok].mean(), 0.0)[:MOST]
     return e, float(ndtri(1 - RESIDUAL_LEVEL.value / 2 / LAGS) / np.sqrt(n))
-
-
-def voltage_at_samples(data: Experiments) -> Array:
-    """Return the voltage at the samples' instants, segment by segment."""
-    if data.plain:
-        return data.hold_value
-    out = np.empty(data.size)
-    for g, (a, b) in enumerate(zip(data.starts[:-1], data.starts[1:])):
-        first = int(data.hold_start[g])
-        last = int(data.hold_start[g + 1]) if g + 2 < len(data.starts) else len(data.hold_end)
-        at = np.searchsorted(data.hold_end[first:last], data.time[a:b])
-        out[a:b] = data.hold_value[first + np.minimum(at, last - first - 1)]
-    return out
 
 
 def _lagged(a: Array, b: Array) -> Array:

@@ -36,6 +36,19 @@ def once(data: Experiments, fit: Fit, gain: bool = False) -> Array:
     return predicted
 
 
+def voltage_at_samples(data: Experiments) -> Array:
+    """Return the voltage at the samples' instants, segment by segment."""
+    if data.plain:
+        return data.hold_value
+    out = np.empty(data.size)
+    for g, (a, b) in enumerate(zip(data.starts[:-1], data.starts[1:])):
+        first = int(data.hold_start[g])
+        last = int(data.hold_start[g + 1]) if g + 2 < len(data.starts) else len(data.hold_end)
+        at = np.searchsorted(data.hold_end[first:last], data.time[a:b] - 1e-9)
+        out[a:b] = data.hold_value[first + np.minimum(at, last - first - 1)]
+    return out
+
+
 def again(data: Experiments, structure: Structure, fit: Fit) -> Pass:
     """Return normal equations of experiments at a fit, with the coordinates of a structure.
 

@@ -21,7 +21,7 @@ from smp_motor_ident.diagnosis.limits import MOST_FRICTION, PROFILE_FROM, REST, 
 from smp_motor_ident.estimation.descent import initial_of
 from smp_motor_ident.estimation.fit import Fit, Options, solve
 from smp_motor_ident.estimation.fitted import NORMAL_95, Profile
-from smp_motor_ident.estimation.prediction import simulate
+from smp_motor_ident.estimation.prediction import simulate, voltage_at_samples
 from smp_motor_ident.estimation.trials import slower_winding
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.passes import own_columns
@@ -88,16 +88,8 @@ def one_level(data: Experiments, fit: Fit) -> bool:
     """
     settled = fit if len(fit.initial) == len(data.initial) else replace(fit, initial=data.initial)
     speed = simulate(data, settled)[:, 0]
-    index = np.zeros(data.size, dtype=np.int64)
-    for g, (a, b) in enumerate(zip(data.starts[:-1], data.starts[1:], strict=True)):
-        first = int(data.hold_start[g])
-        last = data.hold_end.size
-        last = int(data.hold_start[g + 1]) if g + 2 < data.starts.size else last
-        ends = data.hold_end[first:last]
-        within = np.searchsorted(ends, data.time[a:b] - 1e-9)
-        index[a:b] = first + np.minimum(within, last - first - 1)
     moving = np.abs(speed) > REST.value * np.abs(speed).max()
-    driven = (data.hold_value[index] * np.sign(speed))[moving]  # braking is another level
+    driven = (voltage_at_samples(data) * np.sign(speed))[moving]  # braking is another level
     level = float(np.median(driven)) if driven.size else 0.0
     other = int(np.count_nonzero(np.abs(driven - level) > SAME_LEVEL.value * level))
     # As many samples as a segment's own state has coordinates tell that state, and no more.
