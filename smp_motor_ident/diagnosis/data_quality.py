@@ -325,9 +325,7 @@ def _period(records: Sequence[Record]) -> float:
 
 
 def of_the_winding(record: Record, current: Array) -> tuple[Array, Array, Array]:
-    """Return voltage, speed and current as means over short runs, in which a counter's noise is
-    small.
-    """
+    """Return voltage, speed and current as means over runs in which a counter's noise is small."""
     k = max(1, len(record) // RUNS)
     n = len(record) // k * k
     v, w, i = (x[:n].reshape(-1, k) for x in (record.voltage, measured_speed(record), current))

@@ -85,9 +85,7 @@ def _filtered_speed(fit: Fit) -> Finding:
 
 
 def _fit_of_current(data: Experiments, fit: Fit) -> Iterator[Finding]:
-    """Say that a current was given up for the speed: each has a noise of its own, as large as it
-    takes.
-    """
+    """Say that a current was given up for the speed: each has as large a noise as it takes."""
     if not data.current.size:
         return
     error = data.current - prediction.simulate(data, fit, gain=True)[:, 2]
