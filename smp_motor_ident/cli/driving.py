@@ -13,7 +13,7 @@ from smp_motor_ident.record import Hardware
 from smp_motor_ident.report.chart import Chart, Curve
 from smp_motor_ident.report.drawing import document
 from smp_motor_ident.tune.arrays import Array
-from smp_motor_ident.tune.simulation import step_figures
+from smp_motor_ident.tune.simulation import StepFigures, step_figures
 from smp_motor_ident.tune.verification import smoothed
 
 LEAST_CHANGE = 0.8
@@ -28,10 +28,7 @@ class Answer:
     # before, after: speed before, and set-point [rad/s, wheel]
     before: float
     after: float
-    # rise, settling: 10 to 90 %, and until within 2 % of the change [s]; NaN where it did not
-    rise: float
-    settling: float
-    overshoot: float  # beyond the set-point [% of the change]
+    figures: StepFigures  # of the change
 
 
 Drive = Mapping[str, Columns]
@@ -124,4 +121,4 @@ def _answer(
     figures = step_figures(
         time[inside] - begin, speed[inside] - start, np.zeros(inside.sum()), final - start
     )
-    return Answer(name, start, final, figures.rise, figures.settling, figures.overshoot)
+    return Answer(name, start, final, figures)

@@ -77,8 +77,9 @@ def show(
         text = ", ".join(f"{n} {mine[n]:.4g}" for n in GAINS if mine.get(n))
         driven = table("", "manoeuvre", "from", "to", "rise", "settling", "overshoot")
         for one in answers[wheel]:
-            times = (f"{1e3 * seconds:.0f} ms" for seconds in (one.rise, one.settling))
-            overshoot = f"{one.overshoot:.2f} %"
+            figures = one.figures
+            times = (f"{1e3 * seconds:.0f} ms" for seconds in (figures.rise, figures.settling))
+            overshoot = f"{figures.overshoot:.2f} %"
             driven.add_row(
                 one.segment, f"{one.before:+.2f}", f"{one.after:+.2f} rad/s", *times, overshoot
             )
@@ -113,8 +114,8 @@ def check_estimates(
 def check_drive(answers: Mapping[str, Sequence[Answer]]) -> list[Check]:
     """Hold what the wheels did against the limits."""
     every = [(f"{wheel} {one.segment}", one) for wheel, given in answers.items() for one in given]
-    over = [(one.overshoot, where) for where, one in every]
-    settled = [(one.settling, where) for where, one in every]
+    over = [(one.figures.overshoot, where) for where, one in every]
+    settled = [(one.figures.settling, where) for where, one in every]
     return [
         _worst("overshoot", over, MOST_OVERSHOOT, "%"),
         _worst("settling time", settled, MOST_SETTLING, "s"),

@@ -58,20 +58,11 @@ SIGMAS = 3.0
 
 @dataclass(frozen=True)
 class Reading:
-    """One change of set-point as its record shows it."""
+    """One change of set-point: as its record shows it, or as it may be at most by its design."""
 
     settling: float  # until it stays within a tolerance [s]; infinite where it does not
     overshoot: float  # beyond the set-point [% of the change]
     error: float  # mean distance from the set-point at the end [% of the change]
-
-
-@dataclass(frozen=True)
-class Bands:
-    """What a change may be at most, with what its record cannot resolve."""
-
-    settling: float  # [s]
-    overshoot: float  # [% of the change]
-    error: float  # [% of the change]
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +78,7 @@ class Change:
     nominal: Array  # as predicted for the motor as identified [rad/s]
     high: Array  # largest of the predictions [rad/s]
     reading: Reading  # of the measured speed
-    bands: Bands  # of the design
+    bands: Reading  # what it may be at most, with what its record cannot resolve
     excess: float  # overshoot of the nominal motor beyond the design's [% of the change]
 
 
@@ -212,7 +203,7 @@ def _run(
 
 def bands_of(
     rows: Array, time: Array, setpoint: float, specification: Mapping[str, Any], unsure: float
-) -> Bands:
+) -> Reading:
     """Return the widest that the design and the motors that may be allow.
 
     Simulations (as :func:`predicted` returns them) count as prediction limits; what sampling and
@@ -223,7 +214,7 @@ def bands_of(
     settling = [one.settling for one in simulated] + [_high(specification, "settling")]
     overshoot = [one.overshoot for one in simulated] + [_high(specification, "overshoot")]
     step = float(np.median(np.diff(time)))
-    return Bands(
+    return Reading(
         settling=max(*settling, _limit(settling[:-1])) + 2 * step,
         overshoot=max(*overshoot, _limit(overshoot[:-1])) + 100 * (OVERSHOOT.value + margin),
         error=_limit([one.error for one in simulated]) + 100 * (STEADY_ERROR.value + margin),

@@ -17,7 +17,7 @@ from smp_motor_ident.report import commissioning, fleet, tuning_page
 from smp_motor_ident.report.figures import Comparison
 from smp_motor_ident.report.html import Report, render
 from smp_motor_ident.tune import Loop
-from smp_motor_ident.tune.verification import Bands, Change, Reading
+from smp_motor_ident.tune.verification import Change, Reading
 
 AXE = find_spec("axe_core_python")
 FRAME = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
@@ -60,7 +60,7 @@ def commissioning_page(_: pytest.MonkeyPatch) -> str:
     speed = 2.0 * (1 - np.exp(-time / 0.1))
     change = Change(
         "front_left", "forward", 2.0, time, speed + 0.01, speed - 0.1, speed, speed + 0.1,
-        Reading(0.4, 1.0, 0.5), Bands(0.5, 2.0, 1.0), 0.0,
+        Reading(0.4, 1.0, 0.5), Reading(0.5, 2.0, 1.0), 0.0,
     )  # fmt: skip
     steps = [("checks", "warning"), ("validation", "note"), ("verification", "refused")]
     findings = [
