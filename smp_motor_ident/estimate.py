@@ -6,9 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import cast
 
-import numpy as np
-from numpy.typing import NDArray
-
 from smp_motor_ident.diagnosis import validation as validate
 from smp_motor_ident.diagnosis.adequacy import adequacy, lacks_something, stated
 from smp_motor_ident.diagnosis.advice import advise, assess, unsettled_rival
@@ -74,8 +71,6 @@ from smp_motor_ident.likelihood.experiments import Experiments, prepare
 from smp_motor_ident.model.structures import Structure
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import Estimate, FitPercent
-
-Array = NDArray[np.float64]
 
 
 def estimate(

@@ -10,12 +10,10 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident.errors import SignalError
 from smp_motor_ident.finding import Finding
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -89,7 +87,7 @@ class Record:
     current: Array | None = None
     velocity: Array | None = None
     position: Array | None = None
-    count: NDArray[np.int64] | None = None
+    count: Integers | None = None
     starts: tuple[int, ...] = (0,)
     hardware: Hardware = field(default_factory=Hardware)
     source: str = ""

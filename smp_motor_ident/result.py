@@ -11,12 +11,11 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident.finding import Finding, gravest
 from smp_motor_ident.record import Hardware
 
-Array = NDArray[np.float64]
 Status = Literal["estimated", "fixed", "unidentifiable"]
 
 UNITS: Mapping[str, str] = {

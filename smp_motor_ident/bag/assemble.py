@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array, Integers
 from smp_motor_control.motor.friction import Gearbox
 from smp_motor_ident.bag.axis import Motor, Series, on_one_axis, unwrapped
 from smp_motor_ident.bag.checks import impossible, is_unsigned, signed
@@ -13,7 +14,7 @@ from smp_motor_ident.bag.clock import SAME_CLOCK, ClockFit, epochs, fit_clock, j
 from smp_motor_ident.bag.counter import unwrap_angle
 from smp_motor_ident.bag.mapping import MotorMap, Signal
 from smp_motor_ident.bag.runs import one_after_another, pause_between
-from smp_motor_ident.bag.storage import Array, Integers, Table
+from smp_motor_ident.bag.storage import Table
 from smp_motor_ident.bag.units import FACTORS, check_unit, factor
 from smp_motor_ident.diagnosis.stamps import find_beat, moves_on
 from smp_motor_ident.errors import BagError

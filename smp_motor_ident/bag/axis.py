@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_control.arrays import Flags
+from smp_motor_control.arrays import Array, Flags, Integers
 from smp_motor_ident.bag.clock import mean_held, rhythm
 from smp_motor_ident.bag.counter import Unwrapped, unwrap
 from smp_motor_ident.bag.drives import answers_in_its_row
 from smp_motor_ident.bag.mapping import MotorMap
-from smp_motor_ident.bag.storage import Array, Integers, Table, found
+from smp_motor_ident.bag.storage import Table, found
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.finding import Finding, Severity
 from smp_motor_ident.record import Hardware, Record

@@ -3,10 +3,9 @@
 import numpy as np
 from scipy.ndimage import median_filter
 
-from smp_motor_control.arrays import Flags
+from smp_motor_control.arrays import Array, Flags
 from smp_motor_ident.bag.axis import Series
 from smp_motor_ident.bag.limits import JUMP_SPAN, JUMP_STEP, UNSIGNED_CURRENT
-from smp_motor_ident.bag.storage import Array
 from smp_motor_ident.errors import BagError
 
 _LEAST = 50

@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from smp_motor_ident.bag.storage import Array, Integers
+from smp_motor_control.arrays import Array, Integers
 
 _SECOND = 1_000_000_000
 _BEATS = 32

@@ -4,7 +4,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from smp_motor_ident.bag.storage import Array, Integers, found
+from smp_motor_control.arrays import Array, Integers
+from smp_motor_ident.bag.storage import found
 from smp_motor_ident.finding import Finding
 
 _WIDTHS = (32, 24, 20, 18, 17, 16, 15, 14, 13, 12, 11, 10, 8)

@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Integers
 from smp_motor_ident.bag.source import Recording, recordings
-from smp_motor_ident.bag.storage import Batch, Channel, Integers, Table, damaged, gather
+from smp_motor_ident.bag.storage import Batch, Channel, Table, damaged, gather
 from smp_motor_ident.bag.template import DecodeError, Number, Text, locate, parse_path, take_apart
 from smp_motor_ident.bag.types import Definitions, Types
 from smp_motor_ident.bag.unpack import Budget, decompress_messages

@@ -3,8 +3,8 @@
 import numpy as np
 from scipy.special import fdtrc, ndtri
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident.bag.limits import EXPLAINS
-from smp_motor_ident.bag.storage import Array
 from smp_motor_ident.diagnosis.limits import HALF_EXPLAINED
 from smp_motor_ident.diagnosis.signs import lagged
 

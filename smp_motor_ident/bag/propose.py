@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident.bag.axis import Series
 from smp_motor_ident.bag.checks import signed
 from smp_motor_ident.bag.decode import collect
@@ -30,7 +31,7 @@ from smp_motor_ident.bag.offers import Listing, Offer, offers_of
 from smp_motor_ident.bag.read import STATE, one_line, read_recording
 from smp_motor_ident.bag.runs import runs
 from smp_motor_ident.bag.source import Recording, recordings
-from smp_motor_ident.bag.storage import Array, found
+from smp_motor_ident.bag.storage import found
 from smp_motor_ident.bag.tables import EPOCHS, TIME_NAMES, self_described
 from smp_motor_ident.bag.types import Types
 from smp_motor_ident.bag.units import of_the_rim, unit_of

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Integers
 from smp_motor_ident.bag.clock import rhythm
 from smp_motor_ident.bag.limits import SET_BACK
-from smp_motor_ident.bag.storage import Integers, Table, found
+from smp_motor_ident.bag.storage import Table, found
 from smp_motor_ident.errors import BagError
 
 Parts = list[tuple[int, int]]

@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Flags, Integers
 from smp_motor_ident.finding import Finding, Severity
 
-Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
-Integers = NDArray[np.int64]
 
 TABLE = "table"
 """Encoding of a channel whose file holds columns of numbers instead of messages."""
@@ -93,7 +92,7 @@ class Table:
     stamp: Integers | None  # shape (n,), [ns]: what their header says
     columns: dict[str, NDArray[Any]]  # shape (n,): by field path, in the type of the message
     # For columns that some messages lacked
-    present: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
+    present: dict[str, Flags] = field(default_factory=dict)
     # shape (n,): the publisher's own count, where the recorder kept it for every message
     number: Integers | None = None
     findings: list[Finding] = field(default_factory=list)  # what was found amiss

@@ -7,11 +7,12 @@ from itertools import product
 
 import numpy as np
 
+from smp_motor_control.arrays import Integers
 from smp_motor_ident.bag.mapping import DEFAULT_MOTOR, MotorMap, Signal, SignalMap
 from smp_motor_ident.bag.readers.grid import without_unit
 from smp_motor_ident.bag.runs import laid_out
 from smp_motor_ident.bag.source import Recording
-from smp_motor_ident.bag.storage import TABLE, Channel, Integers, Table, found
+from smp_motor_ident.bag.storage import TABLE, Channel, Table, found
 from smp_motor_ident.bag.units import FACTORS, unit_of
 from smp_motor_ident.errors import BagError
 

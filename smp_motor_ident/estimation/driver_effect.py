@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident.diagnosis.limits import HALF_EXPLAINED
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.fitted import NORMAL_95
@@ -21,8 +21,6 @@ from smp_motor_ident.finding import Finding
 from smp_motor_ident.model.driver import DECLARABLE, EFFECTS, Driver, DriverEffect, Rows
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import UNITS, Estimate, Quantity
-
-Array = NDArray[np.float64]
 
 
 class Search(Protocol):

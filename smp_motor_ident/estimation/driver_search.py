@@ -14,10 +14,10 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 from scipy.optimize import fminbound
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident.estimation import fast_decay, prediction
 from smp_motor_ident.estimation.candidate_starts import of_kind
 from smp_motor_ident.estimation.descent import (
@@ -35,8 +35,6 @@ from smp_motor_ident.model.driver import COAST, EFFECTS, SLEW, Driver, DriverEff
 from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.model.structures import FirstOrder
 from smp_motor_ident.record import Record
-
-Array = NDArray[np.float64]
 
 TURNS = 3  # of a motion that the effect asks for, and that follows from it
 SMOOTHED, MOST_SMOOTHED = 0.2, 1_000  # of the motor's lag, and rows: a measured speed is its mean

@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import optimize
 
+from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.descent import initial_of
 from smp_motor_ident.estimation.fit import Fit, Options, solve
@@ -27,8 +27,6 @@ from smp_motor_ident.model.coordinates import Coordinates
 from smp_motor_ident.model.driver import COAST, Driver
 from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.model.structures import FirstOrder, SecondOrder, Structure
-
-Array = NDArray[np.float64]
 
 NUMBERS = 2  # of the driver, beside the motor's
 SIZES = (0.1, 1.0, 10.0, 100.0)  # of L/R in PWM periods, at which a descent begins
@@ -169,7 +167,7 @@ class _Problem:
         return np.asarray(np.nan_to_num(miss, nan=1e100, posinf=1e100, neginf=-1e100))
 
     @cached_property
-    def _groups(self) -> list[tuple[NDArray[np.int64], float]]:
+    def _groups(self) -> list[tuple[Integers, float]]:
         """Which parameters are moved at once for a derivative, and by how much."""
         top = float(np.abs(self.data.hold_value).max()) or 1.0
         fastest, lag = top * self.near.z.dc_gain, self.near.z.time_constant

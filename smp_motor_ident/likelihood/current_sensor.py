@@ -11,9 +11,7 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
+from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident._compile import compiled, inlined
 from smp_motor_ident.likelihood.propagator import BE, TE, TM, K
 from smp_motor_ident.likelihood.sensitivities import (
@@ -30,9 +28,6 @@ from smp_motor_ident.likelihood.sensitivities import (
     SW,
 )
 from smp_motor_ident.model.columns import CURRENT_LAG, LN_R, OFFSET
-
-Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 DIRECT, AVERAGED, LOW_PASSED, SMOOTHED = range(4)
 # The state and what the sensor keeps (the charge R int i, or R times the low-passed current); the

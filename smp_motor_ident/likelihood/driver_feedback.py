@@ -7,8 +7,8 @@ Derivation: docs/derivations.md, section 13.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array, Flags
 from smp_motor_ident._compile import compiled
 from smp_motor_ident.likelihood.current_sensor import STATE
 from smp_motor_ident.likelihood.events import STUCK
@@ -19,8 +19,6 @@ from smp_motor_ident.model.columns import LOAD
 from smp_motor_ident.model.coordinates import Coordinates
 from smp_motor_ident.model.driver import Driver, terminal_voltage
 from smp_motor_ident.model.structures import Structure
-
-Array = NDArray[np.float64]
 
 TURNS = 4  # in which the mean speed of a section and its voltage agree
 
@@ -40,7 +38,7 @@ def terminal_voltages(
 
 @compiled
 def _follow(
-    driver: Driver, end: Array, command: Array, first: NDArray[np.bool_], par: Array, a0: float,
+    driver: Driver, end: Array, command: Array, first: Flags, par: Array, a0: float,
     initial: Array, friction: bool, usual: float,
 ) -> Array:  # fmt: skip
     m, cache, marks, scratch = begin(np.zeros((12, 0)), np.zeros(0, dtype=np.int64), friction)

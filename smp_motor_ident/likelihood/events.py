@@ -8,9 +8,7 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
+from smp_motor_control.arrays import Array
 from smp_motor_ident._compile import compiled, inlined
 from smp_motor_ident.likelihood.current_sensor import after_move, before_move
 from smp_motor_ident.likelihood.propagator import BE, ROW, TE, TM, K, speed_at
@@ -30,8 +28,6 @@ from smp_motor_ident.likelihood.sensitivities import (
     turn,
 )
 from smp_motor_ident.model.columns import VC_MINUS, VC_PLUS
-
-Array = NDArray[np.float64]
 
 STUCK = 0.0  # direction of motion of a motor at rest
 EVENTS = 32  # most in one interval

@@ -7,16 +7,13 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array, Flags, Integers
 from smp_motor_ident.likelihood.hold import held_intervals, rerun
 from smp_motor_ident.likelihood.standstill import stands
 from smp_motor_ident.model.measurement import ANGLE, MEAN_SPEED, SPEED, Measurement
 from smp_motor_ident.record import Record
 
-Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Flags = NDArray[np.bool_]
 HELD = 0.1
 """Of the largest voltage, what the friction of a geared motor holds as a rule."""
 REST = 10
@@ -183,7 +180,7 @@ def output_of(record: Record, kind: str = "auto") -> tuple[Array, Measurement, f
     return record.velocity, mean, speed_quantum(record.velocity)
 
 
-def _repeats(count: Integers, starts: Sequence[int]) -> NDArray[np.bool_]:
+def _repeats(count: Integers, starts: Sequence[int]) -> Flags:
     """Mark what a standing encoder only says again: its error is the same every time.
 
     Taken for so many independent readings, a standstill would fix the angle far better than

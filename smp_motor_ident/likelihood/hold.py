@@ -6,12 +6,10 @@ Derivation: docs/derivations.md, section 4.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident.record import Record
 
-Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
 EDGE = 0.02
 """Part of an interval next to its ends in which a switch counts as one at the sample."""
 

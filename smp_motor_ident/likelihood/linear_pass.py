@@ -11,8 +11,8 @@ Derivation: docs/derivations.md, section 6.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident._compile import compiled
 from smp_motor_ident.likelihood.propagator import (
     BE,
@@ -30,9 +30,6 @@ from smp_motor_ident.likelihood.propagator import (
     second_order,
 )
 from smp_motor_ident.model.columns import LOAD
-
-Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 TILE = 128
 # Rows of the basis: for a speed W, Q, D; for an angle the angle of the copy, W, Q.

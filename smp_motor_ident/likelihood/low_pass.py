@@ -10,13 +10,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident._compile import compiled
 from smp_motor_ident.likelihood.sensitivities import D0, LANES, SLOPE, ST, SW
 from smp_motor_ident.model.columns import WINDOW
-
-Array = NDArray[np.float64]
 
 # Interval [s]; weights of the output before, of the speed before and now and of the mean speed
 # between, and the derivatives of these four by the lag [1/s].

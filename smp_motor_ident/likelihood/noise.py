@@ -12,15 +12,13 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident._compile import compiled
 from smp_motor_ident.likelihood.propagator import BE, TE, TM, WIDTH, K, first_order, second_order
 from smp_motor_ident.model.coordinates import Coordinates
 from smp_motor_ident.model.measurement import ANGLE, Measurement
 from smp_motor_ident.model.structure import Structure
-
-Array = NDArray[np.float64]
 
 NO_GAIN = np.zeros((3, 2))
 

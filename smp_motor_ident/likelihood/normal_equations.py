@@ -9,14 +9,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident._compile import compiled, inlined
 from smp_motor_ident.likelihood.sensitivities import LANES
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
-Integers = NDArray[np.int64]
 
 TILE = 64  # rows that are gathered before they are summed
 ROOM = LANES + 1  # of each: columns and residual

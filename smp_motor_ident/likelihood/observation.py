@@ -5,16 +5,12 @@ Derivation: docs/derivations.md, sections 4 and 6.
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
+from smp_motor_control.arrays import Array
 from smp_motor_ident._compile import compiled, inlined
 from smp_motor_ident.likelihood.low_pass import low_passed
 from smp_motor_ident.likelihood.sensitivities import D0, D1, LANES, SLOPE, SQ, ST, SW
 from smp_motor_ident.model import measurement
 from smp_motor_ident.model.columns import LN_R, OFFSET, WINDOW
-
-Array = NDArray[np.float64]
 
 
 @compiled

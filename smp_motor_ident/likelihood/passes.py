@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident.likelihood import recursion
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.linear_pass import run_sliding, squares_sliding
@@ -24,8 +24,6 @@ from smp_motor_ident.model.columns import CURRENT_LAG, WINDOW
 from smp_motor_ident.model.coordinates import Coordinates
 from smp_motor_ident.model.measurement import ANGLE, LOW_PASSED, MEAN_SPEED, SPEED
 from smp_motor_ident.model.structures import SENSORS, Structure, sensor_of
-
-Array = NDArray[np.float64]
 
 LEAST_LAG = 1e-3  # of a sample: of a sensor that shows the current as good as at once
 BLOCKS = 60  # runs of samples whose scores are summed, for the covariance of coloured residuals
@@ -44,7 +42,7 @@ class Sums:
     # scores, owner: shapes (blocks, p) and (blocks,): scores summed over runs of samples, and the
     # segments of these
     scores: Array
-    owner: NDArray[np.int64]
+    owner: Integers
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +91,7 @@ class Beside:
 NOTHING = Beside(np.zeros((0, 0)), np.zeros((0, 0, 0)), np.zeros((0, 0, 0)), 1)
 
 
-def row_starts(data: Experiments, together: int) -> NDArray[np.int64]:
+def row_starts(data: Experiments, together: int) -> Integers:
     """Return where rows of so many samples begin, each in one segment."""
     parts = [np.arange(a, b, together) for a, b in itertools.pairwise(data.starts)]
     return np.concatenate(parts)

@@ -24,11 +24,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident._compile import compiled
-
-Array = NDArray[np.float64]
 
 # Internal parameters of the recursion; those after the first four are the coordinates' own.
 TE, TM, K, BE = range(4)

@@ -11,8 +11,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident._compile import compiled, inlined
 from smp_motor_ident.likelihood.current_sensor import (
     AVERAGED,
@@ -57,9 +57,6 @@ from smp_motor_ident.likelihood.sensitivities import (
     turn,
 )
 from smp_motor_ident.model.columns import CURRENT_LAG, DELAY, LOAD, VC_MINUS, VC_PLUS
-
-Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 ON_DELAY = SLOPE + DELAY * LANES
 

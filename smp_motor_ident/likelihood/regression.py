@@ -10,13 +10,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident._compile import compiled
 from smp_motor_ident.likelihood.propagator import WIDTH, first_order, second_order
-
-Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 LITTLE = 1e-10  # of a scaled pivot, below which a column is left out
 KNEE = 0.02  # of the largest speed, below which friction counts in part

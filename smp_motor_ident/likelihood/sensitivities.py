@@ -11,8 +11,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident._compile import compiled, inlined
 from smp_motor_ident.likelihood.propagator import (
     BE,
@@ -30,8 +30,6 @@ from smp_motor_ident.likelihood.propagator import (
     second_order,
 )
 from smp_motor_ident.model.columns import LOAD, VC_MINUS, VC_PLUS
-
-Array = NDArray[np.float64]
 
 LANES = 16
 # Rows: sensitivity of q, w, angle; of the output and of the current; of friction and load in
@@ -257,9 +255,7 @@ def turn(m: Array, direction: float) -> None:
 
 
 @compiled
-def begin(
-    slope: Array, local: NDArray[np.int64], friction: bool
-) -> tuple[Array, Array, Array, Array]:
+def begin(slope: Array, local: Integers, friction: bool) -> tuple[Array, Array, Array, Array]:
     """Return the lanes, cache, marks and scratch of a run."""
     m, cache, marks = _aligned(SIZE), _aligned(CACHE), np.full(MARKS, -1.0)
     n_common = slope.shape[1]

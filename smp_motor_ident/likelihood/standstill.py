@@ -10,13 +10,9 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array, Flags, Integers
 from smp_motor_ident.model.measurement import ANGLE, Measurement
-
-Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Flags = NDArray[np.bool_]
 
 SLOW = 0.02  # of the fastest speed: what stands
 SLIGHT = 1e-3  # of all that it turned: the same of an angle

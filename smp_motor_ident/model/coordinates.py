@@ -21,9 +21,8 @@ from dataclasses import dataclass, field, fields
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from smp_motor_control.arrays import Array
 
 
 def _coordinate(unit: str, far: float) -> float:

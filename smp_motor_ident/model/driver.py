@@ -16,12 +16,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array, Flags
 from smp_motor_ident._compile import compiled, inlined
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 NOTHING, DEAD_ZONE, CLIP, SLEW, SAG, DROP, COAST = range(7)
 

@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident._compile import compiled
 from smp_motor_ident.model.columns import A0, A1, LN_R
 from smp_motor_ident.model.coordinates import Coordinates
-from smp_motor_ident.model.structure import Array, Regressions, Structure
+from smp_motor_ident.model.structure import Regressions, Structure
 
 
 @dataclass(frozen=True)

@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident._compile import compiled
 from smp_motor_ident.model.columns import A0, A1, A2, LN_R, LN_TE
 from smp_motor_ident.model.coordinates import Coordinates, direction, place
-from smp_motor_ident.model.structure import Array, Gradients, Regressions, Structure
+from smp_motor_ident.model.structure import Gradients, Regressions, Structure
 
 SHORT = 1 / 20
 """Second lag that is tried where only a first was found, of that one."""

@@ -13,12 +13,11 @@ from functools import cached_property
 from typing import Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident.model.coordinates import NAMES, Coordinates, direction, place
 from smp_motor_ident.model.measurement import LOW_PASSED, MEAN_SPEED, SPEED, Measurement
 
-Array = NDArray[np.float64]
 S = TypeVar("S", bound="Structure")
 Gradients = dict[str, tuple[float, Array]]
 """Values of quantities, each with its gradient by the coordinates, shape (12,)."""

@@ -20,8 +20,9 @@ from mcap.exceptions import McapError
 from mcap.reader import SeekingReader
 from mcap.summary import Summary
 
+from smp_motor_control.arrays import Integers
 from smp_motor_ident.bag.readers.format import Format, Messages
-from smp_motor_ident.bag.storage import Batch, Bytes, Channel, Integers, gather, message_type
+from smp_motor_ident.bag.storage import Batch, Bytes, Channel, gather, message_type
 from smp_motor_ident.bag.unpack import Budget, decompress
 from smp_motor_ident.errors import BagError
 

@@ -10,9 +10,10 @@ from urllib.parse import quote
 
 import numpy as np
 
+from smp_motor_control.arrays import Integers
 from smp_motor_ident.bag.readers.format import Format, Messages
 from smp_motor_ident.bag.salvage import salvage
-from smp_motor_ident.bag.storage import Batch, Bytes, Channel, Integers, join, message_type
+from smp_motor_ident.bag.storage import Batch, Bytes, Channel, join, message_type
 from smp_motor_ident.bag.unpack import Budget
 from smp_motor_ident.errors import BagError
 
