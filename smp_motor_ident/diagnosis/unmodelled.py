@@ -1,17 +1,27 @@
 r"""How far the motor's response may be from the model's, frequency by frequency.
 
-The error of the simulated output is regressed on that output, band by band,
+The error of the simulated output is regressed on what the voltage moves, band by band,
 
     E(j w) = D Y(j w) + V(j w),    D = sum E Y* / sum |Y|^2,
 
-of the discrete Fourier transforms of segments under a Hann window: ``D`` is the relative error of
-the model's response, which is alike within a band.  Its confidence region is a circle in the
-complex plane of the radius
+of the discrete Fourier transforms of segments under a Hann window.  ``Y`` is the output that the
+voltage moves: of the fitted motor without friction, or with it where that moves less.  The kinks
+that friction makes of slow changes fill all frequencies, and tell nothing of what a voltage does
+there.  ``D`` is the relative error of the model's response, which is alike within a band.  Its
+confidence region is a circle in the complex plane of the radius
 
     r^2 = F_{2, 2(m-1)} s^2 / sum |Y|^2,    s^2 = sum |E - D Y|^2 / (m - 1),
 
 with m the lines of the band, as many as are independent.  Where the voltage does not move the motor
 the circle is wide.
+
+A resonance narrower than its band, whose phase turns by 180 degrees, leaves little of itself in
+that mean.  The same regression on the output behind a resonance of peak 1,
+
+    M(j w) = 2 j z w w_r / (w_r^2 - w^2 + 2 j z w w_r),
+
+finds its peak (a matched filter), for each w_r of the band that differs by a resonance's width.  Of
+mean and peaks, the one that is shown with the largest lower limit is stated.
 
 References
 ----------
@@ -21,13 +31,20 @@ References
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from scipy.special import fdtri
 
 from smp_motor_control.arrays import Array, Complex
-from smp_motor_ident.diagnosis.response_limits import BAND_LEVEL, BAND_LINES, BAND_WIDTH
+from smp_motor_ident.diagnosis.response_limits import (
+    BAND_LEVEL,
+    BAND_LINES,
+    BAND_WIDTH,
+    RESONANCE_DAMPING,
+)
 from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.likelihood.experiments import Experiments
@@ -48,47 +65,82 @@ def unmodelled_dynamics(data: Experiments, fit: Fit) -> ModelError | None:
     Where nothing was measured, as between two edges of a count, the error is taken to run straight.
     """
     output = prediction.simulate(data, fit)[:, 1]
-    error = data.output - output
+    error, free = data.output - output, _without_friction(data, fit)
     lines = [
-        _spectra(data, error[a:b], output[a:b])
+        _spectra(data, error[a:b], output[a:b], free[a:b])
         for a, b in pairwise(data.starts)
         if np.isfinite(error[a:b]).sum() > 2 * BAND_LINES.value + FIRST
     ]
     if not lines:
         return None
-    return relative_error(*map(np.concatenate, zip(*lines, strict=True)))
+    omega, of_error, *outputs = (np.concatenate(x) for x in zip(*lines, strict=True))
+    return relative_error(omega, of_error, np.array(outputs))
 
 
-def _spectra(data: Experiments, error: Array, output: Array) -> tuple[Array, Complex, Complex]:
-    """Return frequencies, and the spectra of error and output of one segment."""
+def _without_friction(data: Experiments, fit: Fit) -> Array:
+    """Return the output of a fitted motor that nothing but the voltage moves."""
+    z = fit.z.with_(vc_plus=0.0, vc_minus=0.0)
+    return prediction.once(data, replace(fit, z=z))[:, 1]
+
+
+def _spectra(data: Experiments, error: Array, *outputs: Array) -> tuple[Any, ...]:
+    """Return frequencies, and the spectra of error and outputs of one segment."""
     known = np.flatnonzero(np.isfinite(error))
-    error = np.interp(np.arange(error.size), known, error[known])
+    signals = np.array([np.interp(np.arange(error.size), known, error[known]), *outputs])
     if data.kind == ANGLE:
-        error, output = np.diff(error), np.diff(output)
-    window = np.hanning(error.size + 2)[1:-1]
-    of_error, of_output = (np.fft.rfft(window * (x - x.mean()))[FIRST:] for x in (error, output))
-    omega = 2 * np.pi * np.arange(FIRST, FIRST + of_error.size) / (error.size * data.step)
-    return omega.astype(np.float64), of_error, of_output
+        signals = np.diff(signals)
+    window = np.hanning(signals.shape[1] + 2)[1:-1]
+    spectra = np.fft.rfft(window * (signals - signals.mean(axis=1, keepdims=True)))[:, FIRST:]
+    omega = 2 * np.pi * np.arange(FIRST, FIRST + spectra.shape[1]) / (signals.shape[1] * data.step)
+    return omega, *spectra
 
 
 def relative_error(omega: Array, error: Complex, output: Complex) -> ModelError | None:
-    """Return the relative error of a response from lines of spectra, in any order."""
+    """Return the relative error of a response from lines of spectra, in any order.
+
+    Of several outputs, rows of ``output``, each band takes the one that is moved least.
+    """
     order = np.argsort(omega, kind="stable")
-    omega, error, output = omega[order], error[order], output[order]
+    omega, error, outputs = omega[order], error[order], np.atleast_2d(output)[:, order]
     found = []
     for a, b in _bands(omega):
-        e, y = error[a:b], output[a:b]
-        power, m = float(np.square(np.abs(y)).sum()), (b - a) / HANN
-        if not power > 0:
-            continue
-        size = complex(np.sum(e * y.conj())) / power
-        rest = float(np.square(np.abs(e - size * y)).sum()) / HANN / (m - 1)
-        radius = np.sqrt(fdtri(2, 2 * (m - 1), 1 - BAND_LEVEL.value) * rest * HANN / power)
-        found.append((float(np.sqrt(omega[a] * omega[b - 1])), abs(size), float(radius)))
+        moved = min(outputs[:, a:b], key=lambda one: float(np.square(np.abs(one)).sum()))
+        if np.abs(moved).max() > 0:
+            middle = float(np.sqrt(omega[a] * omega[b - 1]))
+            found.append((middle, *_most_shown(omega[a:b], error[a:b], moved)))
     if not found:
         return None
     frequency, shown, radius = zip(*found, strict=True)
     return ModelError(frequency, shown, tuple(s + r for s, r in zip(shown, radius, strict=True)))
+
+
+def _most_shown(omega: Array, error: Complex, output: Complex) -> tuple[float, float]:
+    """Return size and radius of a band's error: of its mean, or of a resonance's peak."""
+    mean = _circle(error, output, BAND_LEVEL.value)
+    width, span = 2 * RESONANCE_DAMPING.value, float(np.log(omega[-1] / omega[0]))
+    n = max(round(span / width), 1)
+    peaks = [
+        _circle(error, output * _resonance(omega, at), BAND_LEVEL.value / n)
+        for at in omega[0] * np.exp(span * (np.arange(n) + 0.5) / n)
+    ]
+    peak = max(peaks, key=lambda one: one[0] - one[1])
+    return peak if peak[0] - peak[1] > max(mean[0] - mean[1], 0.0) else mean
+
+
+def _circle(error: Complex, output: Complex, level: float) -> tuple[float, float]:
+    """Return the size of an error relative to an output, and the radius of its circle."""
+    power, m = float(np.square(np.abs(output)).sum()), error.size / HANN
+    size = complex(np.sum(error * output.conj())) / power
+    rest = float(np.square(np.abs(error - size * output)).sum()) / HANN / (m - 1)
+    radius = np.sqrt(fdtri(2, 2 * (m - 1), 1 - level) * rest * HANN / power)
+    return abs(size), float(radius)
+
+
+def _resonance(omega: Array, at: float) -> Complex:
+    """Return the response of a resonance, 1 at its peak."""
+    width = 2j * RESONANCE_DAMPING.value * at * omega
+    response: Complex = width / (at**2 - omega**2 + width)
+    return response
 
 
 def _bands(omega: Array) -> Iterator[tuple[int, int]]:

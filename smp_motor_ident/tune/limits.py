@@ -4,6 +4,7 @@ Printed with the others in ``docs/limits.md``.
 """
 
 from smp_motor_ident.diagnosis.limits import Limit
+from smp_motor_ident.diagnosis.response_limits import RESONANCE_DAMPING
 
 # What may be designed on, and how far gains may go.
 FRICTION_KNOWN = Limit(
@@ -50,7 +51,7 @@ UNKNOWN_RESPONSE = Limit(
     "test_tune_unmodelled.py: loop does not reach beyond what the recording shows",
 )
 RESONANCE = Limit(
-    10.0,
+    1 / (2 * RESONANCE_DAMPING.value),
     "of the model's response",
     "physical: 1/(2 zeta) of a shaft with the damping ratio 0.05 of steel in its bearings",
     "test_tune_unmodelled.py: error that is shown counts for a resonance",
