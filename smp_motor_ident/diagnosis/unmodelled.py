@@ -98,16 +98,19 @@ def _spectra(data: Experiments, error: Array, *outputs: Array) -> tuple[Any, ...
 def relative_error(omega: Array, error: Complex, output: Complex) -> ModelError | None:
     """Return the relative error of a response from lines of spectra, in any order.
 
-    Of several outputs, rows of ``output``, each band takes the one that is moved least.
+    Of several outputs, rows of ``output``, each band takes the one that is moved least, but where
+    another one shows more of an error than the response itself.
     """
     order = np.argsort(omega, kind="stable")
     omega, error, outputs = omega[order], error[order], np.atleast_2d(output)[:, order]
     found = []
     for a, b in _bands(omega):
-        moved = min(outputs[:, a:b], key=lambda one: float(np.square(np.abs(one)).sum()))
-        if np.abs(moved).max() > 0:
+        moved = sorted(outputs[:, a:b], key=lambda one: float(np.square(np.abs(one)).sum()))
+        if np.abs(moved[0]).max() > 0:
             middle = float(np.sqrt(omega[a] * omega[b - 1]))
-            found.append((middle, *_most_shown(omega[a:b], error[a:b], moved)))
+            stated = [_most_shown(omega[a:b], error[a:b], one) for one in moved]
+            most = max(stated, key=_surely)
+            found.append((middle, *(most if _surely(most) > 1 else stated[0])))
     if not found:
         return None
     frequency, shown, radius = zip(*found, strict=True)
@@ -123,8 +126,13 @@ def _most_shown(omega: Array, error: Complex, output: Complex) -> tuple[float, f
         _circle(error, output * _resonance(omega, at), BAND_LEVEL.value / n)
         for at in omega[0] * np.exp(span * (np.arange(n) + 0.5) / n)
     ]
-    peak = max(peaks, key=lambda one: one[0] - one[1])
-    return peak if peak[0] - peak[1] > max(mean[0] - mean[1], 0.0) else mean
+    peak = max(peaks, key=_surely)
+    return peak if _surely(peak) > max(_surely(mean), 0.0) else mean
+
+
+def _surely(stated: tuple[float, float]) -> float:
+    """Return the lower limit of an error from its size and radius."""
+    return stated[0] - stated[1]
 
 
 def _circle(error: Complex, output: Complex, level: float) -> tuple[float, float]:

@@ -79,6 +79,10 @@ def test_of_several_outputs_the_one_that_is_moved_least_tells():
     faint = output / (1 + (omega / 10) ** 2)
     alone, both = (relative_error(omega, error, x) for x in (faint, np.array([output, faint])))
     assert both == alone
+    # An error beyond the response itself counts, whatever moved the motor.
+    _, _, other = lines(rng)
+    both = relative_error(omega, error + 3.0 * output, np.array([output, 1e-2 * other]))
+    assert both.shown == pytest.approx([3.0] * len(both.shown), rel=0.05)
 
 
 def two_inertias_under_ramps(seed: int) -> tuple[Record, Callable[[np.ndarray], np.ndarray]]:
