@@ -103,11 +103,18 @@ def one_size_or_swing(data: Experiments) -> float:
 
 
 def _one_size(data: Experiments) -> float:
-    """Return the size of a voltage that is only switched between one size both ways, else 0."""
-    size = np.abs(data.levels)
-    top = float(size.max())
-    driven = size[size > REST.value * top]
-    return 0.0 if np.any(np.abs(driven - top) > SAME_LEVEL.value * top) else top
+    """Return the size of a voltage that is only switched between one size both ways, else 0.
+
+    A single row between two levels is no third: the voltage is the mean over a row in which it
+    was switched, or was interpolated over rows that were lost there.
+    """
+    levels = data.levels
+    top = float(np.abs(levels).max())
+    other = (top - np.abs(levels) > SAME_LEVEL.value * top) & (np.abs(levels) > REST.value * top)
+    change = np.diff(levels)
+    between = (change[:-1] * change[1:] > 0) & ~other[:-2] & ~other[2:]
+    other[1:-1] &= ~between
+    return 0.0 if other.any() else top
 
 
 def _one_swing(data: Experiments) -> float:

@@ -251,6 +251,39 @@ def test_one_size_is_seen_however_the_command_ran(how):
     assert scope._one_size(data) == 8.0
 
 
+def test_a_row_in_which_the_voltage_was_switched_is_no_other_size():
+    voltage = np.repeat([0.0, 8.0, -8.0, 8.0], 30)
+    voltage[[30, 60, 90]] = 4.0, 5.6, -4.0  # means over a switch, or over rows that were lost
+    t = np.arange(voltage.size) / 200.0
+    one = Record("motor", t, voltage, velocity=voltage)
+    assert scope._one_size(prepare([one], False)) == 8.0
+    voltage[75] = 4.0  # between rows of one level it is a level of its own
+    other = Record("motor", t, voltage.copy(), velocity=voltage)
+    assert scope._one_size(prepare([other], False)) == 0.0
+
+
+def test_rows_lost_at_a_switch_of_one_size_make_no_drop_of_the_driver():
+    rng = np.random.default_rng(13)
+    gain, tau, friction = TRUTH.values()
+    begins = np.cumsum(rng.integers(25, 45, 60))
+    voltage = np.repeat([9.0, -9.0] * 30, np.diff(begins, prepend=0))
+    rate, fine, w = 50.0, 50, np.zeros(voltage.size)
+    keep = np.exp(-1 / rate / fine / tau)
+    for k in range(1, w.size):
+        w[k] = w[k - 1]
+        for _ in range(fine):  # 9 V are far above friction: the motor never rests
+            ahead = gain * (voltage[k] - friction * np.sign(w[k] or voltage[k]))
+            w[k] = keep * w[k] + (1 - keep) * ahead
+    t = np.arange(w.size) / rate
+    kept = rng.random(w.size) > 0.02
+    kept[begins[:-1:9]] = False  # first rows of a level among them
+    noisy = w + 0.5 * rng.standard_normal(w.size)
+    found = estimate(Record("motor", t[kept], voltage[kept], velocity=noisy[kept]))
+    codes = [f.code for f in found.findings]
+    assert "one_size_of_voltage" in codes
+    assert "brush_drop" not in codes
+
+
 def test_the_rounding_of_counts_hides_no_step():
     # 64 counts a turn at 5 kHz: between two samples there is a count or none.
     t = np.arange(15000) / 5000.0
