@@ -56,7 +56,7 @@ class Record:
     current : ndarray, shape (n,), [A], or None
         Armature current at the sampling instants; NaN at instants where it was lost.
     velocity : ndarray, shape (n,), [rad/s], or None
-        Motor speed as the hardware reports it; NaN where lost.
+        Motor speed as the hardware reports it; NaN where lost, which infinite values become, too.
     position : ndarray, shape (n,), [rad], or None
         Motor angle; NaN where lost.
     count : ndarray of int64, shape (n,), or None
@@ -111,6 +111,8 @@ class Record:
             values = np.ascontiguousarray(values, dtype=np.float64)
             if values.shape != time.shape:
                 raise SignalError(f"{where}: {name} has {values.size} samples, time {time.size}")
+            if name != "voltage" and np.isinf(values).any():
+                values = np.where(np.isinf(values), np.nan, values)
             object.__setattr__(self, name, values)
         if not np.all(np.isfinite(self.voltage)):
             k = int(np.argmin(np.isfinite(self.voltage)))

@@ -18,6 +18,7 @@ from scipy import optimize
 from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.descent import initial_of
+from smp_motor_ident.estimation.fit import FASTEST as SHORTEST_LAG
 from smp_motor_ident.estimation.fit import Fit, Options, solve
 from smp_motor_ident.estimation.selection import POLICY, sandwich_factor
 from smp_motor_ident.likelihood.driver_feedback import terminal_voltages
@@ -115,7 +116,9 @@ def _motors(data: Experiments, near: Fit) -> Iterator[Coordinates]:
     there = np.isfinite(data.output)
     speed = data.output[there]
     if data.kind == ANGLE:
-        speed = np.diff(speed) / np.diff(data.time[there])
+        segment = np.searchsorted(data.starts, np.flatnonzero(there), side="right")
+        within = np.diff(segment) == 0  # each record has a time of its own
+        speed = np.diff(speed)[within] / np.diff(data.time[there])[within]
     gain = np.quantile(np.abs(speed), FASTEST) / np.quantile(np.abs(data.hold_value), FASTEST)
     if gain > 0:
         ln_a0 = -float(np.log(gain))
@@ -196,6 +199,8 @@ class _Problem:
             low[j], high[j] = ALLOWED.get(name, (-np.inf, np.inf))
             if name in ("vc_plus", "vc_minus", "delay", "window"):
                 low[j] = SHORTEST if name == "window" else 0.0
+            if name == "ln_a2":  # a shorter second lag shows in nothing, and friction chatters
+                low[j] = self.unpacked(p)[0].ln_a1 + np.log(SHORTEST_LAG * self.data.step)
         inside = np.nextafter(low, high), np.nextafter(high, low)
         found: optimize.OptimizeResult = optimize.least_squares(  # type: ignore[operator]
 

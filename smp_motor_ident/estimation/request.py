@@ -82,6 +82,7 @@ def checked(
     wheels = {r.wheel for r in group}
     if len(wheels) > 1:
         raise ParameterError(f"records of one motor are needed, got {', '.join(sorted(wheels))}")
+    _check_outputs(group)
     _check_bounds(bounds or {}, model, group)
     use_current = has_current(group) and model in ("auto", "electromechanical")
     return Request(
@@ -95,6 +96,17 @@ def _with_ohmmeter(known: Mapping[str, float], group: Sequence[Record]) -> dict[
     if "resistance" not in known and ohmmeter and np.isfinite(ohmmeter) and not has_current(group):
         return {**known, "resistance": float(ohmmeter)}
     return dict(known)
+
+
+def _check_outputs(group: Sequence[Record]) -> None:
+    speed_alone = next((r for r in group if r.count is None and r.position is None), None)
+    no_speed = next((r for r in group if r.velocity is None), None)
+    if speed_alone and no_speed:
+        raise ParameterError(
+            f"{no_speed.source or 'a record'} has no speed and {speed_alone.source or 'another'} "
+            "neither angle nor counts: records that are estimated together need one of them in "
+            "common; estimate these apart"
+        )
 
 
 def _check_bounds(

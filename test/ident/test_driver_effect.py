@@ -8,11 +8,16 @@ import pytest
 
 from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.estimate import estimate
+from smp_motor_ident.estimation import fast_decay
 from smp_motor_ident.estimation.driver_effect import driver_of
 from smp_motor_ident.estimation.driver_search import _measured
+from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.model import driver
+from smp_motor_ident.model.coordinates import Coordinates
 from smp_motor_ident.model.driver import Driver, terminal_voltage
+from smp_motor_ident.model.measurement import SPEED
+from smp_motor_ident.model.structures import SecondOrder
 from smp_motor_ident.record import Record
 from smp_motor_ident.tune.designer import design
 from smp_motor_ident.tune.loop import Loop
@@ -249,3 +254,35 @@ def test_a_coasting_bridge_is_fitted_together_with_its_motor(seed, viscous):
     constant = 0.05 / (0.05 + 2.0 * viscous / 0.05)
     assert (behind.kind, behind.full_duty) == (driver.COAST, 12.0)
     assert behind.emf_share == pytest.approx(constant, abs=0.03)
+
+
+def test_a_bridge_that_coasts_is_sought_from_two_motors_in_records_of_counts_too():
+    t = np.arange(200) * STEP
+    angle = 3.0 * np.arange(200.0)
+    record = Record("motor", t, np.full(200, 5.0), position=angle)
+    one = prepare([record, record], False)  # the second begins at the instant 0 again
+    at_once = prepare([replace(record, time=t + t[-1]), record], False)
+    near = SimpleNamespace(z=Coordinates(ln_a0=-3.0, ln_a1=-5.0))
+    for data in (one, at_once):
+        first, second = fast_decay._motors(data, near)
+        assert second.dc_gain == pytest.approx(3.0 / STEP / 5.0, rel=1e-4)  # counts are dithered
+
+
+def test_a_second_lag_that_nothing_shows_ends_at_a_thousandth_of_a_row():
+    # Far below it friction chatters at every stop: one estimate took minutes.
+    command = commands(0)
+    speed = run(command, 0)
+    data = prepare(
+        [Record("motor", np.arange(command.size) * STEP, command, velocity=speed)], False
+    )
+    motor = Coordinates(np.log(1 / GAIN), np.log(TAU / GAIN)).with_friction(STATIC)
+    motor = motor.with_second_lag(1e-20)
+    near = Fit(
+        motor, np.zeros((1, 5)), NOISE**2 * np.eye(2), structure=SecondOrder(friction="symmetric"),
+        gain=np.zeros((3, 2)), objective=1.0, deviance=0.0, information=np.eye(2),
+        scores=np.zeros((0, 2)), passes=1, converged=True, samples=command.size, kind=SPEED,
+    )  # fmt: skip
+    problem = fast_decay._Problem(data, near, 12.0)
+    found = problem.descend(problem.start(motor, 0.0, 0.9), 3)
+    z, _, _ = problem.unpacked(found.x)
+    assert z.a2 / z.a1 > 0.9e-3 * STEP

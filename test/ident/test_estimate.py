@@ -208,6 +208,13 @@ def test_what_next_asks_for_current_where_there_was_none():
     assert max(proposal.relative_std.values()) <= 0.0101
 
 
+def test_records_without_a_signal_in_common_are_refused():
+    counts = replace(motors.record(seconds=1.0), velocity=None)
+    speed = replace(motors.record(seconds=1.0), count=None, source="tacho.csv")
+    with pytest.raises(ParameterError, match=r"bag has no speed and tacho\.csv neither"):
+        estimate([counts, speed])
+
+
 def test_unknown_names_are_refused_by_name():
     recording = motors.record(seconds=1.0)
     with pytest.raises(ParameterError, match="third_order"):

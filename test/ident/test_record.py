@@ -47,6 +47,16 @@ def test_contradictory_signals_are_refused_by_name(changes, named):
         a_record(source="bench.mcap", **changes)
 
 
+@pytest.mark.parametrize("name", ["current", "velocity", "position"])
+def test_an_infinite_measurement_is_none(name):
+    # Firmware that divides by the time between pulses sends them.
+    measured = np.array([0.0, 1.0, np.inf, -np.inf, np.nan, 5.0])
+    record = a_record(**{"velocity": np.ones(6), name: measured})
+    lost = [False, False, True, True, True, False]
+    np.testing.assert_array_equal(np.isnan(getattr(record, name)), lost)
+    assert np.isinf(measured[2])  # the caller's array is as it was
+
+
 def test_a_slice_is_a_record_with_its_own_zero_and_inner_segments():
     part = a_record(starts=(0, 2, 4), count=np.arange(6)).slice(1, 5)
     assert part.starts == (0, 1, 3)
