@@ -115,6 +115,7 @@ def _test(
     blocks = int(errors.block[-1]) + 1 if errors.block.size else 0
     scores = np.stack([np.bincount(errors.block, z[:, j] * left, blocks) for j in range(q)], axis=1)
     weights = np.stack([np.bincount(errors.block, z[:, j] ** 2, blocks) for j in range(q)])
+    weights = weights / weights.max(axis=1, keepdims=True)  # squares of the smallest are no numbers
     stretches = float(np.min(weights.sum(axis=1) ** 2 / np.square(weights).sum(axis=1)))
     if stretches - q < limits.EFFECT_BLOCKS.value and not white:
         return None  # what shows it lies in a few stretches: chance cannot be excluded

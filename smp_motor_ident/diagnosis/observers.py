@@ -83,7 +83,8 @@ def moved_by_slower(data: Experiments, fit: Fit) -> Array:
         move = np.einsum("tof,to->f", weights, errors) - step
         rows = _on_innovations(data, fit, gain, weights) - here
         deviation = np.sqrt(np.square(rows).sum(axis=(0, 1)) + np.square(LEAST * own_deviation))
-        surprise = np.abs(np.einsum("tof,to->f", rows, innovations)) / deviation
+        surprise = np.abs(np.einsum("tof,to->f", rows, innovations))
+        surprise /= np.where(deviation > 0, deviation, 1.0)  # what no row shows does not surprise
         move = ways @ np.where(erfc(surprise / np.sqrt(2)) > level, 0.0, move)
         farthest = np.where(np.abs(move) > np.abs(farthest), move, farthest)
     return farthest

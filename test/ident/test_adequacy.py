@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import motors
 import numpy as np
+import pytest
 
 from smp_motor_ident.diagnosis import adequacy, model_error
 from smp_motor_ident.diagnosis.conditions import dependent
@@ -198,3 +199,11 @@ def test_an_effect_is_held_against_the_intervals_that_are_stated(monkeypatch) ->
     narrow = unreliable()
     monkeypatch.setattr("smp_motor_ident.diagnosis.misfit.jittered", late)
     assert narrow and not unreliable()
+
+
+def test_an_effect_counts_in_no_unit():
+    # The squares of squares of the smallest responses are no floating-point numbers.
+    errors = error_with(4.0, 5)
+    small = replace(errors, regressors=1e-100 * errors.regressors, whole=1e-100 * errors.whole)
+    usual, tiny = (adequacy._test(e, EFFECTS[0], (0,), False) for e in (errors, small))
+    assert tiny.p_value == pytest.approx(usual.p_value, rel=1e-6)
