@@ -73,7 +73,7 @@ class Commissioned:
 
 
 def commissioned_of(found: Estimate) -> Commissioned:
-    """Return what a motor was commissioned as, where its recording told all that is needed."""
+    """Return what a motor was commissioned as, where its recording gave all that is needed."""
     names = ("resistance", "inductance", "motor_constant", "inertia", "viscous_friction",
              "coulomb_friction")  # fmt: skip
     held = {name: found.parameters.get(name) for name in names}
