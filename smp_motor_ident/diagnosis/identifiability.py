@@ -85,7 +85,9 @@ def what_next(
 
 
 def _cost(p: Proposal, accuracy: float) -> tuple[float, float, float]:
-    return (max(0.0, max(p.relative_std.values()) / accuracy - 1.0), p.duration, p.amplitude)
+    # What is long enough misses nothing but by rounding, which must not choose.
+    excess = round(max(0.0, max(p.relative_std.values()) / accuracy - 1.0), 9)
+    return (excess, p.duration, p.amplitude)
 
 
 def _family(estimate: Estimate, current_noise: float) -> tuple[list[Fit], bool]:
