@@ -185,6 +185,7 @@ class _Profile:
         self.data, self.near = _prepared(group, hold, fit), fit
         self.turns = TURNS if effect.follows_motion else 1
         self.size = math.nan  # logarithm of the likeliest
+        self.driver = Driver()
         self.beside: list[Record] = []  # with the voltage for a size one standard deviation greater
 
     def at(self, size: float, passes: int = 30) -> tuple[Fit, Experiments, list[Record]]:
@@ -261,9 +262,10 @@ class _Profile:
             x += float(np.clip(move, -2 * away, 2 * away))
             away = min(max(std, 0.1 * NEAR), 1.0)
         self.size, size = x, float(np.exp(x))
-        driver = Driver(self.effect.kind, size, rows_of(self.data, self.group, fit).full_duty)
+        full_duty = rows_of(self.data, self.group, fit).full_duty
+        self.driver = Driver(self.effect.kind, size, full_duty)
         self.beside = self.at(size * float(np.exp(std)))[2]
-        return DriverFit(self.effect, driver, size * std, self.group, records, self, fit)
+        return DriverFit(self.effect, self.driver, size * std, self.group, records, self, fit)
 
     def moves(self, fit: Fit) -> list[Array]:
         """Return the move of a motor with the size, one standard deviation of it."""
@@ -274,8 +276,7 @@ class _Profile:
         """Return other records of the motor with the voltage at the terminals."""
         data = of_kind(prepare(records, False, hold=self.hold), fit)
         rows = rows_of(data, records, prediction.settle(data, fit))
-        driver = Driver(self.effect.kind, float(np.exp(self.size)), rows.full_duty)
-        return with_voltages(records, rows.through(driver))
+        return with_voltages(records, rows.through(self.driver))
 
     def _beside(self, x: float, away: float) -> tuple[float, float]:
         """Return the deviances so many e-folds of the size below and above."""
