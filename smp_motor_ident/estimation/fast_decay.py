@@ -38,6 +38,7 @@ ALLOWED = {"size": (np.log(1e-3), np.log(1e4)), "share": (0.3, 1.0)}
 SHORTEST = 1e-9  # s, of a window
 DIFFERENCE = 1e-5  # of each parameter's scale, over which a derivative is taken
 FEW, MANY = 10, 40  # steps after which starts are ranked, and at most
+FINALISTS = 3  # starts that go on to the end
 SETTLED = 3  # turns of initial states and the voltage of other data
 SECOND = (0.02, 0.2)  # second lags that are tried, of the first
 
@@ -69,8 +70,9 @@ def fitted(data: Experiments, near: Fit, full_duty: float, options: Options) -> 
     first = FirstOrder.like(first, friction="symmetric")
     problem = _Problem(data, replace(near, structure=first), full_duty)
     starts = [problem.start(z, np.log(size), SHARE) for z in _motors(data, near) for size in SIZES]
-    ahead = min((problem.descend(p, FEW) for p in starts), key=lambda r: float(r.cost))
-    found = problem.descend(ahead.x, MANY)
+    ahead = sorted((problem.descend(p, FEW) for p in starts), key=lambda r: float(r.cost))
+    ends = [problem.descend(r.x, MANY) for r in ahead[:FINALISTS]]
+    found = min(ends, key=lambda r: float(r.cost))
     best = problem.joint(found, options)
     z, _, driver = problem.unpacked(found.x)
     richer: list[tuple[Structure, Coordinates]] = [(first.with_(delay=True), z)]
