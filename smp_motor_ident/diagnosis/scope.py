@@ -234,7 +234,7 @@ def _current_scale(result: Answer, ohmmeter: float | None, one_size: bool) -> It
         "unreliable" if off else "note",
         f"{words}: by the ohmmeter's {ohmmeter:.4g} ohm it is {scale:.3g}",
         {"scale": scale, "ohmmeter": ohmmeter, "of_the_scale": ", ".join(known)},
-        f"{remedy}drives" if off else "",
+        remedy if off else "",
     )
 
 

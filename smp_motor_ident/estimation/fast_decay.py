@@ -205,7 +205,6 @@ class _Problem:
                 low[j] = self.unpacked(p)[0].ln_a1 + np.log(SHORTEST_LAG * self.data.step)
         inside = np.nextafter(low, high), np.nextafter(high, low)
         found: optimize.OptimizeResult = optimize.least_squares(  # type: ignore[operator]
-
             self._misses, np.clip(p, *inside), self._slopes, (low, high),
             x_scale="jac", max_nfev=steps,
         )  # fmt: skip

@@ -122,6 +122,7 @@ def test_a_current_whose_scale_an_ohmmeter_shows(scale: float, severity: str) ->
     found = estimate(measured)
     about = next(f for f in found.findings if f.code == "current_scale")
     assert about.severity == severity
+    assert about.advice.endswith("at the current that drives") is (severity == "unreliable")
     # R/s: of s the intervals of R at hand leave far less than a hundredth open.
     assert abs(about.evidence["scale"] - scale) < 0.01
     assert "resistance" in about.evidence["of_the_scale"]
