@@ -17,6 +17,9 @@ from typing import IO
 import hypothesis
 import pytest
 
+# Imported before numpy: as the executables do, tests leave linear algebra one thread.
+import smp_motor_control.entry  # noqa: F401
+
 # Examples are drawn alike in every run, and may take their time on a busy machine.
 hypothesis.settings.register_profile("suite", derandomize=True, deadline=None)
 hypothesis.settings.load_profile("suite")
@@ -26,6 +29,13 @@ for _prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
     _bin = Path(_prefix, "lib", "smp_motor_control")
     if _prefix and _bin.is_dir() and str(_bin) not in os.environ["PATH"].split(os.pathsep):
         os.environ["PATH"] = f"{_bin}{os.pathsep}{os.environ['PATH']}"
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Add the filter whose name imports numpy, once it has one thread."""
+    numpy_1 = "error::numpy.exceptions.VisibleDeprecationWarning"
+    config.addinivalue_line("filterwarnings", numpy_1)
+
 
 # DDS derives UDP ports from the domain; up to 101 they stay below those that Linux hands out.
 DOMAINS = range(1, 102)
