@@ -51,6 +51,7 @@ from smp_motor_ident.estimation.constraint import constrained
 from smp_motor_ident.estimation.driver_effect import (
     DriverFit,
     declared,
+    leaves_torque_noise,
     suspecting,
     through,
 )
@@ -246,6 +247,7 @@ def _through_driver(
     emptied = {"implausible_motor", "one_level", "one_size_of_voltage"}
     hollow = any(f.code in emptied for f in e.findings)  # little is left of what was recorded
     fails = any(f.severity == "unreliable" and not blames_current(f) for f in e.findings)
+    fails = fails or leaves_torque_noise(e, fit)
     return (None if fails or hollow else through(e, driver)), driver
 
 

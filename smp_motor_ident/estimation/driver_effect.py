@@ -92,6 +92,15 @@ def suspecting(estimate: Estimate, found: DriverFit | None, fit: Fit) -> Estimat
     return replace(estimate, findings=(finding, *estimate.findings))
 
 
+def leaves_torque_noise(estimate: Estimate, fit: Fit) -> bool:
+    """Tell whether a motor behind a driver needs most of the torque noise of one without it.
+
+    That would stand for what the driver does not explain.
+    """
+    noise = [f for f in estimate.findings if f.code == "torque_noise"]
+    return any(f.evidence["intensity"] > HALF_EXPLAINED.value * fit.noise_ratio for f in noise)
+
+
 def declared(
     estimate: Callable[[list[Record], Sequence[Record] | None], Estimate],
     group: list[Record],

@@ -18,6 +18,7 @@ from scipy.ndimage import uniform_filter1d
 from scipy.optimize import fminbound
 
 from smp_motor_control.arrays import Array
+from smp_motor_ident.diagnosis.limits import COLOURED
 from smp_motor_ident.estimation import fast_decay, prediction
 from smp_motor_ident.estimation.candidate_starts import of_kind
 from smp_motor_ident.estimation.descent import (
@@ -52,7 +53,8 @@ FEW = 12  # passes of a descent while the size is sought
 def likeliest(group: Sequence[Record], fit: Fit, hold: str, options: Options) -> DriverFit | None:
     """Return the effect that explains the records best; None where none is worth its number.
 
-    All run free: torque noise would stand for the effect.
+    All run free: torque noise would stand for the effect.  Where one number leaves the residuals
+    white, the two of a driver that coasts are not asked for.
     """
     if fit.noise_ratio > 0:
         fit = replace(fit, noise_ratio=0.0)
@@ -65,18 +67,19 @@ def likeliest(group: Sequence[Record], fit: Fit, hold: str, options: Options) ->
         return one.cost(price, factor)
 
     plain = fit.deviance / factor + price * fit.structure.size
+    without = refine(_prepared(few, hold, fit), fit.structure, fit, fit.z, options, ROUGHLY)
+    behind = POLICY.hopeless * factor
+    most = without.deviance + behind
     searches: list[_Profile | _Joint] = [
         _Profile(few, how, start, options, effect)
         for effect in EFFECTS
         if effect.kind != COAST
         for start, how in _starts(few, fit, hold, options, effect)
     ]
-    searches += [
-        _Joint(few, list(group), fit, options, effect) for effect in EFFECTS if effect.kind == COAST
-    ]
-    without = refine(_prepared(few, hold, fit), fit.structure, fit, fit.z, options, ROUGHLY)
-    behind = POLICY.hopeless * factor
-    found = [d for s in searches if (d := s.best(without.deviance + behind)) is not None]
+    found = [d for s in searches if (d := s.best(most)) is not None]
+    if all(sandwich_factor(d.fit) > COLOURED.value for d in found):
+        searches = [_Joint(few, list(group), fit, options, e) for e in EFFECTS if e.kind == COAST]
+        found += [d for s in searches if (d := s.best(most)) is not None]
     found.sort(key=cost)
     if sum(map(len, few)) < sum(map(len, group)):
         most = fit.deviance + behind
