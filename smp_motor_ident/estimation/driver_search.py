@@ -220,11 +220,10 @@ class _Profile:
         grid = np.log(self.effect.scale(rows) * np.array(self.effect.shares))
         values = [self.deviance(x) for x in grid]
         k = int(np.argmin(values))
-        if not values[k] < none:
-            return None
         low = float(grid[k - 1] if k else 2 * grid[0] - grid[1])
         high = float(grid[k + 1] if k + 1 < grid.size else 2 * grid[-1] - grid[-2])
-        return self._polished(self._between(low, high), most)
+        likeliest = self._between(low, high)  # also where it begins, between it and none
+        return self._polished(likeliest, most) if self.near.deviance < none - RISE else None
 
     def on(self, group: list[Record], most: float, behind: float) -> DriverFit | None:
         """Go on from the size that was found, with more records.

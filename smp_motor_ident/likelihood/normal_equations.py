@@ -16,6 +16,8 @@ from smp_motor_ident.likelihood.sensitivities import LANES
 
 TILE = 64  # rows that are gathered before they are summed
 ROOM = LANES + 1  # of each: columns and residual
+SHAPE = 4  # coordinates that come first, all logarithms
+FARTHEST = 1.5  # e-folds of one step
 
 
 @compiled
@@ -196,14 +198,19 @@ def damped_step(  # noqa: C901 - plain loops
         if not more:
             break
     longest = size = 0.0
-    for m in range(4):
+    for i in range(f):  # what shows in nothing, however far it goes, holds nothing else back
+        for m in range(SHAPE):
+            move = abs(matrix[m, i] * step[i])
+            if move > FARTHEST and normal[i, i] * FARTHEST * FARTHEST < 1.0:
+                step[i] *= FARTHEST / move
+    for m in range(SHAPE):
         move = 0.0
         for i in range(f):
             move += matrix[m, i] * step[i]
         longest = max(longest, abs(move))
-    if longest > 1.5:
+    if longest > FARTHEST:
         for i in range(f):
-            step[i] *= 1.5 / longest
+            step[i] *= FARTHEST / longest
     for i in range(f):
         for j in range(f):
             size += step[i] * normal[i, j] * step[j]
