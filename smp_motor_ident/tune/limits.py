@@ -56,6 +56,12 @@ RESONANCE = Limit(
     "physical: 1/(2 zeta) of a shaft with the damping ratio 0.05 of steel in its bearings",
     "test_tune_unmodelled.py: error that is shown counts for a resonance",
 )
+RESONANCE_DAMPED = Limit(
+    0.5,
+    "damping ratio",
+    "physical: the largest of a shaft; with more, one swing is left of a step's, by 16 % at most",
+    "test_tune_unmodelled.py: what a resonance adds is that of a simulated one",
+)
 HELD_BACK = Limit(
     0.97,
     "of what a loop bears",

@@ -9,6 +9,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from smp_motor_ident._compile import compiled
 from smp_motor_ident.model.driver import Driver, terminal_voltage
@@ -242,7 +243,7 @@ class StepFigures:
     peak_voltage: float  # largest magnitude [V]
 
 
-def settled(time: Array, outside: Array) -> float:
+def settled(time: Array, outside: NDArray[np.bool_]) -> float:
     """Return when a signal is outside of its band no more; NaN where it is at the end."""
     last = int(np.flatnonzero(outside)[-1]) if np.any(outside) else -1
     return float(time[last + 1]) if last + 1 < time.size else math.nan

@@ -12,6 +12,7 @@ from smp_motor_ident.tune.margins import Margins
 from smp_motor_ident.tune.plant import Plant, sample
 from smp_motor_ident.tune.problem import Problem
 from smp_motor_ident.tune.reference import CHANGE, Reference, planned_change
+from smp_motor_ident.tune.resonance import added_by_resonance
 from smp_motor_ident.tune.simulation import (
     Controller,
     Inputs,
@@ -21,7 +22,6 @@ from smp_motor_ident.tune.simulation import (
     step_figures,
     white,
 )
-from smp_motor_ident.tune.unmodelled import resonance_beyond
 
 
 @dataclass(frozen=True)
@@ -92,6 +92,7 @@ def figures_of(
     plan = planned_change(usual, reference, change, time)
     run = simulate(usual, controller, plan.inputs)
     planned = step_figures(time, run.speed[0], run.voltage[0], change)
+    answer = run.speed[0] / change
     figures = _performance(problem, controller.feedback, time, planned, control_noise)
     drawn = case.ensemble.plant.motors.first(max(int(min(DRAWS, WORK / time.size)), FEWEST))
     plant = sample(drawn, loop, believed=nominal) if case.drawn else usual
@@ -117,10 +118,10 @@ def figures_of(
         for speed, volts in zip(run.speed, run.voltage, strict=True)
     ]
     found = case.ensemble.margins(controller.feedback)
-    left, longer = resonance_beyond(problem.unmodelled, plan.reference, problem.loop.sample_time)
+    more, longer = added_by_resonance(problem.unmodelled, usual, controller.feedback, answer)
     overshoot = np.array([one.overshoot for one in each] + [figures.overshoot])
     settling = np.array([one.settling for one in each] + [figures.settling])
-    overshoot = np.append(overshoot, overshoot.max() + 100 * left)
+    overshoot = np.append(overshoot, overshoot.max() + 100 * more)
     settling = np.append(settling, settling.max() + longer)
     return figures, Specification(
         samples=len(each) if case.drawn else 0,

@@ -21,7 +21,7 @@ import numpy as np
 
 from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune.arrays import Array
-from smp_motor_ident.tune.limits import RESONANCE, SETTLED, UNKNOWN_RESPONSE
+from smp_motor_ident.tune.limits import RESONANCE, UNKNOWN_RESPONSE
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,31 +64,6 @@ def unmodelled_dynamics(estimate: Estimate) -> UnmodelledDynamics | None:
     slower = (np.arange(taken.size) < lowest) & ~(least > 0)
     taken = np.where(slower, taken[lowest], taken)
     return UnmodelledDynamics(np.array(error.frequency), taken)
-
-
-def resonance_beyond(
-    unmodelled: UnmodelledDynamics | None, reference: Array, sample_time: float
-) -> tuple[float, float]:
-    """Return what a change of set-point may leave where the response is not known.
-
-    A resonance behind the motor, of next to no damping and at w, is left oscillating by a change
-    r(t) of the set-point with the amplitude ``|integral r'(t) exp(-j w t) dt|``.  Returned are the
-    largest share of the change over all w at which the response may be off by as much as it is, and
-    the time until 2 % of it are left [s], with the damping of `RESONANCE`.
-    """
-    moved = np.diff(reference)
-    when = np.flatnonzero(moved)
-    if unmodelled is None or not when.size:
-        return 0.0, 0.0
-    omega = np.geomspace(unmodelled.known, max(np.pi / sample_time, unmodelled.known), 200)
-    omega = omega[unmodelled.weight(omega) >= 1]
-    turned = np.exp(-1j * np.outer(omega, when * sample_time))
-    left = np.abs(turned @ moved[when]) / abs(float(reference[-1] - reference[0]))
-    if not left.size:
-        return 0.0, 0.0
-    decay = omega / (2 * RESONANCE.value)
-    longest = np.log(np.maximum(left / SETTLED.value, 1.0)) / decay
-    return float(left.max()), float(longest.max())
 
 
 def words(unmodelled: UnmodelledDynamics | None, before: str = "; ") -> str:

@@ -15,11 +15,8 @@ from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.motors import motors_of
 from smp_motor_ident.tune.plant import sample
 from smp_motor_ident.tune.problem import Problem
-from smp_motor_ident.tune.unmodelled import (
-    UnmodelledDynamics,
-    resonance_beyond,
-    unmodelled_dynamics,
-)
+from smp_motor_ident.tune.resonance import added_by_resonance
+from smp_motor_ident.tune.unmodelled import UnmodelledDynamics, unmodelled_dynamics
 from smp_motor_ident.tune.writing import gains_document
 
 LOOP = Loop(sample_time=0.005, delay=0.005, gear_ratio=1.0, counts_per_revolution=None)
@@ -167,28 +164,81 @@ def resonant(reference, omega, T, damping=0.0):
     return np.array(out)
 
 
-def test_what_a_resonance_is_left_with_is_that_of_a_simulated_one():
-    T, omega = 0.002, 40.0
-    s = np.clip(np.arange(1500) * T / 0.2, 0, 1)
-    reference = 3.0 * (10 * s**3 - 15 * s**4 + 6 * s**5)
-    frequency = np.array([1.0, 20.0, 40.0, 1000.0])
-    only = UnmodelledDynamics(frequency, np.array([0.0, 0.0, 1.0, 0.0]))
-    left, _ = resonance_beyond(only, reference, T)
-    ringing = resonant(reference, omega, T)[300:]
-    assert left == pytest.approx(np.ptp(ringing) / 2 / 3.0, rel=0.05)
-    beyond = UnmodelledDynamics(frequency, np.array([0.0, 0.0, 2.0, 2.0]))
-    left, longer = resonance_beyond(beyond, reference, T)
-    known = beyond.known
-    damped = np.abs(resonant(reference, known, T, 0.05) / 3.0 - 1)
-    last = T * (np.flatnonzero(damped > 0.02)[-1] + 1)
-    assert 0.2 + longer >= last
-    assert 0.2 + longer < 2 * last
+def minimum_jerk(T, duration, samples):
+    s = np.clip(np.arange(samples) * T / duration, 0, 1)
+    return 10 * s**3 - 15 * s**4 + 6 * s**5
 
 
-def test_nothing_is_left_where_all_is_known():
-    assert resonance_beyond(None, np.linspace(0, 1, 50), 0.01) == (0.0, 0.0)
-    known = UnmodelledDynamics(np.array([1.0, 400.0]), np.array([0.01, 0.1]))
-    assert resonance_beyond(known, np.minimum(np.linspace(0, 5, 500), 1), 0.01)[0] < 0.01
+def end(y, T):
+    return T * (np.flatnonzero(np.abs(y - 1) > 0.02)[-1] + 1)
+
+
+def test_what_a_resonance_adds_is_that_of_a_simulated_one():
+    """Without feedback, of resonances from 20 rad/s on that nothing but their mass bounds."""
+    T = 0.002
+    reference = minimum_jerk(T, 0.2, 2500)
+    unknown = UnmodelledDynamics(np.array([20.0, 1000.0]), np.array([1e3, 1e3]))
+    plant = sample(motors_of(known_up_to(20.0)), replace(LOOP, sample_time=T, difference_window=0))
+    more, longer = added_by_resonance(unknown, plant, Feedback(0.0, 0.0), reference)
+    behind = [resonant(reference, w, T, 0.05) for w in (20.0, 23.0, 27.0, 32.0, 40.0, 60.0)]
+    all_of_them = [*behind, *(2 * reference - y for y in behind)]
+    # A fiftieth: between the frequencies and dampings that are tried.
+    assert more == pytest.approx(max(y.max() for y in all_of_them) - 1, rel=0.02)
+    slowest = max(end(y, T) for y in all_of_them) - end(reference, T)
+    assert longer == pytest.approx(slowest, abs=np.pi / 20)  # half a swing
+
+
+def looped(D, feedback, volts, T):
+    """Speed of a motor G (1 + D) in a loop that compares it with that of G; one step of delay."""
+    s = control.tf([1, 0], [1])
+    G = 25.0 / (1e-4 * s**2 + 0.05 * s + 1)
+    expected, real = (control.ss(control.sample_system(g, T, "zoh")) for g in (G, G * (1 + D)))
+    x0, x, integral, before = np.zeros(expected.nstates), np.zeros(real.nstates), 0.0, (0.0, 0.0)
+    out = []
+    for u in volts:
+        y0, y = (expected.C @ x0).item(), (real.C @ x).item()
+        out.append((y0, y))
+        x0, x = (
+            expected.A @ x0 + expected.B[:, 0] * before[0],
+            (real.A @ x + real.B[:, 0] * (before[0] + before[1])),
+        )
+        before = u, feedback.p * (y0 - y) + integral
+        integral += T * feedback.i * (y0 - y)
+    return np.array(out).T
+
+
+def test_every_resonance_within_the_bound_stays_within_what_it_is_said_to_add():
+    loop, feedback = replace(LOOP, difference_window=0), Feedback(0.02, 0.3)
+    T, s = loop.sample_time, control.tf([1, 0], [1])
+    one = known_up_to(20.0)
+    volts = minimum_jerk(T, 0.08, 400) / 25.0
+    usual = looped(0 * s, feedback, volts, T)[0]
+    plant = sample(motors_of(one), loop)
+    more, longer = added_by_resonance(unmodelled_dynamics(one), plant, feedback, usual)
+    omega = np.geomspace(0.5, np.pi / T, 2000)
+    weight = np.interp(np.log(omega), np.log(FREQUENCY), [0.05] * 5 + [2.0] * 4, right=2.0)
+    added, ends = [], []
+    for at, damping in ((40.0, 0.05), (60.0, 0.05), (60.0, 0.2), (100.0, 0.05), (100.0, 0.2)):
+        shape = s**2 / (s**2 + 2 * damping * at * s + at**2)
+        m = np.min(weight / np.abs(control.frequency_response(shape, omega).frdata[0, 0]))
+        for sign in (-1, 1):
+            y = looped(sign * min(m, 1.0) * shape, feedback, volts, T)[1]
+            added.append(y.max() - usual.max())
+            ends.append(end(y, T) - end(usual, T))
+    assert max(added) <= 1.02 * more
+    assert max(added) > 0.7 * more
+    assert max(ends) <= longer + np.pi / 40
+    # Half of what it would be of one without damping that is all of the motor, where W is 2.
+    turned = np.exp(-50j * T * np.arange(399))
+    assert more < 0.5 * np.abs(turned @ np.diff(25.0 * volts))
+
+
+def test_nothing_is_added_where_all_is_known():
+    plant, feedback = sample(motors_of(known_up_to(600.0)), LOOP), Feedback(0.02, 0.3)
+    answer = minimum_jerk(0.005, 0.1, 100)
+    assert added_by_resonance(None, plant, feedback, answer) == (0.0, 0.0)
+    known = UnmodelledDynamics(np.array([1.0, 700.0]), np.array([0.01, 0.01]))
+    assert added_by_resonance(known, plant, feedback, answer)[0] < 0.01
 
 
 def test_bands_hold_a_resonance_that_the_recording_does_not_show():

@@ -1,0 +1,105 @@
+r"""What a resonance that the recording does not exclude does to a change of set-point.
+
+A mass on a spring makes of a motor's response G the response ``G (1 + D)`` with
+
+    D(s) = m s^2 / (s^2 + 2 z w s + w^2),
+
+m being -1 where the speed is the mass's, and the ratio of its inertia to the rotor's where it is
+the rotor's.  For every w, and the dampings z of shafts, the largest m of either sign up to 1 is
+taken with which ``|D|`` is nowhere above the bound of what the model may lack.  A loop that answers
+with y where the motor is G is off by
+
+    E = D S Y / (1 + D T),
+
+S and T being its sensitivity and its complementary sensitivity; ``|D T| < 1`` at all frequencies.
+
+References
+----------
+.. [1] S. Skogestad, I. Postlethwaite, Multivariable Feedback Control, 2nd ed. (2005), section 7.6.
+.. [2] G. Ellis, Control System Design Guide, 4th ed. (2012), chapter 16.
+"""
+
+import math
+
+import numpy as np
+
+from smp_motor_ident.diagnosis.response_limits import RESONANCE_DAMPING
+from smp_motor_ident.tune.arrays import Array, Complex
+from smp_motor_ident.tune.feedback import Feedback
+from smp_motor_ident.tune.limits import RESONANCE_DAMPED, SETTLED
+from smp_motor_ident.tune.plant import Plant
+from smp_motor_ident.tune.simulation import settled
+from smp_motor_ident.tune.unmodelled import UnmodelledDynamics
+
+COUNT = 40
+"""Frequencies of resonances, from the lowest of which the bound speaks up to Nyquist."""
+
+DAMPINGS = np.geomspace(RESONANCE_DAMPING.value, RESONANCE_DAMPED.value, 4)
+"""Of resonances, evenly spread over those of shafts."""
+
+LONGEST = 2**14
+"""Samples over which a resonance is followed."""
+
+
+def added_by_resonance(
+    unmodelled: UnmodelledDynamics | None, plant: Plant, feedback: Feedback, answer: Array
+) -> tuple[float, float]:
+    """Return the most that a resonance adds to overshoot and settling of a change of set-point.
+
+    ``answer``, shape (k,), is the motor's without one, as a share of the change from rest.
+    Returned are a share of the change, and a time [s]: NaN where it does not settle.
+    """
+    if unmodelled is None:
+        return 0.0, 0.0
+    T = plant.sample_time
+    nyquist = math.pi / T
+    at = np.geomspace(min(float(unmodelled.frequency[0]), 0.5 * nyquist), 0.98 * nyquist, COUNT)
+    ringing = -math.log(SETTLED.value) / (RESONANCE_DAMPING.value * at[0] * T)
+    n = 2 ** math.ceil(math.log2(max(answer.size, min(answer.size + ringing, LONGEST))))
+    usual, time = np.pad(answer, (0, n - answer.size), mode="edge"), T * np.arange(n)
+    omega = 2 * np.pi * np.fft.rfftfreq(n, T)[1:]
+    complementary, moved = _loop(plant, feedback, omega, usual)
+    ends, highest = [_settled(time, usual)], usual.max()
+    for damping in DAMPINGS:
+        error = mode(omega, at, damping, T) * largest(unmodelled, at, damping, T)[:, None]
+        for D in (error, -error):
+            spectrum = np.pad(D * moved / (1 + D * complementary), ((0, 0), (1, 0)))
+            rows = usual + np.fft.irfft(spectrum, n)
+            highest = max(highest, rows.max())
+            ends += [_settled(time, row) for row in rows]
+    return float(highest - usual.max()), float(np.max(ends) - ends[0])
+
+
+def mode(omega: Array, at: Array, damping: float, sample_time: float) -> Complex:
+    """Return ``s^2 / (s^2 + 2 z w s + w^2)`` over frequencies, a row for each w [rad/s].
+
+    Sampled by Tustin's rule prewarped at w, so that it is causal.
+    """
+    ratio = np.tan(0.5 * omega * sample_time) / np.tan(0.5 * at * sample_time)[:, None]
+    response: Complex = 1 / (1 - 1 / ratio**2 - 2j * damping / ratio)
+    return response
+
+
+def largest(unmodelled: UnmodelledDynamics, at: Array, damping: float, sample_time: float) -> Array:
+    """Return the largest m, up to 1, of modes of which the bound allows all of the response."""
+    ends = unmodelled.frequency[0], np.pi / sample_time
+    omega = np.union1d(np.geomspace(*ends, 10 * COUNT), at)
+    size = np.abs(mode(omega, at, damping, sample_time))
+    m: Array = np.minimum((unmodelled.weight(omega) / size).min(axis=1), 1.0)
+    return m
+
+
+def _loop(plant: Plant, feedback: Feedback, omega: Array, answer: Array) -> tuple[Complex, Complex]:
+    """Return T of what goes through the motor, and S Y: what of an error reaches the speed."""
+    z = np.exp(1j * omega * plant.sample_time)
+    control = feedback.response(omega, plant.sample_time)
+    response, through = plant.response(omega)[0], plant.through_motor(omega)[0]
+    # What an observer predicts of the voltage itself is no loop around the motor.
+    own = 1 + control * (response - through)
+    spectrum = np.fft.rfft(np.diff(answer, prepend=0.0))[1:] / (1 - 1 / z)
+    whole = 1 + control * response
+    return control * through / whole, own / whole * spectrum
+
+
+def _settled(time: Array, answer: Array) -> float:
+    return settled(time, np.abs(answer - 1) > SETTLED.value)
