@@ -7,11 +7,13 @@ import numpy as np
 
 from smp_motor_ident.tune.arrays import Array
 from smp_motor_ident.tune.case import Case
+from smp_motor_ident.tune.ensemble import SHARE
 from smp_motor_ident.tune.feedback import Feedback
+from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.margins import Margins
 from smp_motor_ident.tune.plant import Plant, sample
 from smp_motor_ident.tune.problem import Problem
-from smp_motor_ident.tune.reference import CHANGE, Reference, planned_change
+from smp_motor_ident.tune.reference import CHANGE, Change, Reference, planned_change
 from smp_motor_ident.tune.resonance import added_by_resonance
 from smp_motor_ident.tune.simulation import (
     Controller,
@@ -45,7 +47,7 @@ class Performance:
 
 @dataclass(frozen=True)
 class Band:
-    """A figure of the nominal loop, and the least and largest over the motors that may be."""
+    """A figure of the nominal loop, and what 99 % of the motors that may be keep to either side."""
 
     # value, low, high: NaN where there is none, such as a settling time of a loop that does not
     # settle
@@ -59,8 +61,8 @@ class Specification:
     """What the loop does to a change of set-point from rest, and its margins, in bands.
 
     Simulated with counts, dry friction and the usual delay, over draws of all that the estimate
-    leaves open, and with what a resonance adds where the recording does not show the response; the
-    margins bear the longest delay.
+    leaves open, and with what a resonance adds that the recording does not exclude; the margins
+    bear the longest delay.
     """
 
     samples: int  # motors that the bands are over; 0 where the estimate has no uncertainty
@@ -85,8 +87,8 @@ def figures_of(
     control_noise: float,
 ) -> tuple[Performance, Specification]:  # fmt: skip
     """Simulate a design: the nominal motor, ``usual`` as it is sampled, and those that may be."""
-    problem, known = case.problem, case.friction.known
-    nominal, loop = problem.plant.motors, replace(problem.loop, delay=problem.loop.expected_delay)
+    problem = case.problem
+    loop = replace(problem.loop, delay=problem.loop.expected_delay)
     change = CHANGE * reference.max_velocity
     time = _instants(problem, controller.feedback, reference)
     plan = planned_change(usual, reference, change, time)
@@ -94,44 +96,48 @@ def figures_of(
     planned = step_figures(time, run.speed[0], run.voltage[0], change)
     answer = run.speed[0] / change
     figures = _performance(problem, controller.feedback, time, planned, control_noise)
+    each = _runs(case, controller, loop, plan, change, time)
+    found = case.ensemble.margins(controller.feedback)
+    more, longer = added_by_resonance(problem.unmodelled, usual, controller.feedback, answer)
+    return figures, Specification(
+        samples=len(each) if case.drawn else 0,
+        change=change,
+        overshoot=band(figures.overshoot, [one.overshoot for one in each], 100 * more),
+        settling=band(figures.settling, [one.settling for one in each], longer),
+        phase_margin=band(margins.phase, found.phase),
+        gain_margin=band(margins.gain, found.gain),
+        sensitivity=band(margins.sensitivity, found.sensitivity),
+    )
+
+
+def _runs(
+    case: Case, controller: Controller, loop: Loop, plan: Change, change: float, time: Array
+) -> list[StepFigures]:
+    """Simulate a change with every motor that may be, with counts, noise, friction and driver."""
+    nominal = case.problem.plant.motors
     drawn = case.ensemble.plant.motors.first(max(int(min(DRAWS, WORK / time.size)), FEWEST))
-    plant = sample(drawn, loop, believed=nominal) if case.drawn else usual
+    motors = drawn if case.drawn else nominal
+    plant = sample(motors, loop, believed=nominal)
     shape = (len(plant), time.size)
     filtered = bool(np.any(plant.motors.sensor_lag > 0))
-    forward = plan.forward + case.swallowed * plan.friction
     run = simulate(
         plant,
         controller,
         replace(
             plan.inputs,
-            forward=forward,
+            forward=plan.forward + case.swallowed * plan.friction,
             noise=white(loop.reported_noise, shape),
             angle_noise=white(0.0 if filtered else loop.angle_noise, shape),
         ),
         count_angle=0.0 if filtered else loop.count_angle,
-        friction=drawn.static_voltage if case.drawn else np.array([known]),
+        friction=motors.static_voltage if case.drawn else np.array([case.friction.known]),
         modelled=case.swallowed,
         driver=case.driver,
     )
-    each = [
+    return [
         step_figures(time, speed, volts, change)
         for speed, volts in zip(run.speed, run.voltage, strict=True)
     ]
-    found = case.ensemble.margins(controller.feedback)
-    more, longer = added_by_resonance(problem.unmodelled, usual, controller.feedback, answer)
-    overshoot = np.array([one.overshoot for one in each] + [figures.overshoot])
-    settling = np.array([one.settling for one in each] + [figures.settling])
-    overshoot = np.append(overshoot, overshoot.max() + 100 * more)
-    settling = np.append(settling, settling.max() + longer)
-    return figures, Specification(
-        samples=len(each) if case.drawn else 0,
-        change=change,
-        overshoot=_band(figures.overshoot, overshoot),
-        settling=_band(figures.settling, settling),
-        phase_margin=_band(margins.phase, found.phase),
-        gain_margin=_band(margins.gain, found.gain),
-        sensitivity=_band(margins.sensitivity, found.sensitivity),
-    )
 
 
 def _performance(
@@ -157,9 +163,12 @@ def _performance(
     )
 
 
-def _band(value: float, over: Sequence[float] | Array) -> Band:
-    both = np.append(np.asarray(over, dtype=np.float64), value)
-    return Band(value, float(both.min()), float(both.max()))
+def band(value: float, over: Sequence[float] | Array, added: float = 0.0) -> Band:
+    """Return a figure's band, whose high end is raised by ``added``."""
+    rising = np.sort(np.asarray(over, dtype=np.float64))  # NaN last
+    beyond = int((1 - SHARE) * (rising.size - 1))
+    low, high = np.fmin(rising[beyond], value), np.maximum(rising[-1 - beyond], value)
+    return Band(value, float(low), float(high) + added)
 
 
 def _instants(problem: Problem, fb: Feedback, reference: Reference) -> Array:

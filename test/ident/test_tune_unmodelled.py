@@ -16,6 +16,7 @@ from smp_motor_ident.tune.motors import motors_of
 from smp_motor_ident.tune.plant import sample
 from smp_motor_ident.tune.problem import Problem
 from smp_motor_ident.tune.resonance import added_by_resonance
+from smp_motor_ident.tune.specification import band
 from smp_motor_ident.tune.unmodelled import UnmodelledDynamics, unmodelled_dynamics
 from smp_motor_ident.tune.writing import gains_document
 
@@ -246,6 +247,22 @@ def test_bands_hold_a_resonance_that_the_recording_does_not_show():
     free, held = (design(known_up_to(f), loop).specification for f in (600.0, 20.0))
     assert held.overshoot.high > free.overshoot.high + 2
     assert held.settling.high > free.settling.high
+
+
+def test_band_is_what_99_percent_keep_on_either_side():
+    figures = np.random.default_rng(1).permutation(np.arange(1.0, 301.0))
+    found = band(150.0, figures)
+    for beyond in (figures > found.high, figures < found.low):
+        assert 0 < np.mean(beyond) < 0.01
+    assert band(500.0, figures).high == 500.0
+    # A motor that never settles is later than all others; three of them are more than 1 %.
+    later = figures.copy()
+    later[figures > 298] = np.nan
+    assert band(150.0, later).high == 298.0
+    assert band(150.0, later, 7.0).high == 305.0
+    later[figures > 297] = np.nan
+    assert np.isnan(band(150.0, later).high)
+    assert np.isnan(band(np.nan, figures).high)
 
 
 def test_settling_that_is_not_stated_is_said():
