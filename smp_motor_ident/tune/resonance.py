@@ -37,8 +37,8 @@ COUNT = 40
 DAMPINGS = np.geomspace(RESONANCE_DAMPING.value, RESONANCE_DAMPED.value, 4)
 """Of resonances, evenly spread over those of shafts."""
 
-LONGEST = 2**14
-"""Samples over which a resonance is followed."""
+SHORTEST, LONGEST = 2**13, 2**16
+"""Samples over which a resonance is followed, of which feedback may take damping."""
 
 
 def added_by_resonance(
@@ -54,8 +54,8 @@ def added_by_resonance(
     T = plant.sample_time
     nyquist = math.pi / T
     at = np.geomspace(min(float(unmodelled.frequency[0]), 0.5 * nyquist), 0.98 * nyquist, COUNT)
-    ringing = -math.log(SETTLED.value) / (RESONANCE_DAMPING.value * at[0] * T)
-    n = 2 ** math.ceil(math.log2(max(answer.size, min(answer.size + ringing, LONGEST))))
+    ringing = -math.log(SETTLED.value) / (RESONANCE_DAMPING.value * unmodelled.known * T)
+    n = 2 ** math.ceil(math.log2(min(max(answer.size + ringing, SHORTEST), LONGEST)))
     usual, time = np.pad(answer, (0, n - answer.size), mode="edge"), T * np.arange(n)
     omega = 2 * np.pi * np.fft.rfftfreq(n, T)[1:]
     complementary, moved = _loop(plant, feedback, omega, usual)
