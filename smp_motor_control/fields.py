@@ -1,9 +1,131 @@
-"""Fields of settings that say what they are, to people and as parameters of nodes."""
+"""Settings that say of every field what it is, to people and as parameters of nodes.
 
-from dataclasses import field
-from typing import Any
+Settings are frozen dataclasses, and may hold others; a parameter's name is its field's, or
+another, behind the prefixes of what it is in::
+
+    @dataclass(frozen=True, kw_only=True)
+    class Settings:
+        timeout: float = described(0.5, "Silence after which the wheel stops [s].", minimum=0.0)
+        noise: ObserverNoise = nested(ObserverNoise(), prefix="observer.")
+"""
+
+import dataclasses
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple, TypeVar
+
+from smp_motor_control.errors import ParameterError, check_range
+
+S = TypeVar("S")
+
+
+class Described(NamedTuple):
+    """What is to be known of one parameter."""
+
+    default: Any
+    text: str
+    minimum: float = -math.inf
+    maximum: float = math.inf
+    read_only: bool = False
+    name: str = ""
+    endless: bool = False  # whether 0 stands for no limit
+
+    @property
+    def limited(self) -> bool:
+        """Whether it is a number with a limit."""
+        return math.isfinite(self.minimum) or math.isfinite(self.maximum)
+
+
+class _Nested(NamedTuple):
+    kind: type
+    prefix: str
+    texts: Mapping[str, str]
+    needs: Sequence[str]
 
 
 def described(default: Any, description: str, **more: Any) -> Any:
-    """Return a field of a dataclass with a description, and what else is to be known of it."""
-    return field(default=default, metadata={"description": description, **more})
+    """Return a field with a description, and what else is to be known of it."""
+    return dataclasses.field(
+        default=default, metadata={"": Described(default, description, **more)}
+    )
+
+
+def fixed(default: Any, description: str, **more: Any) -> Any:
+    """Return a field as :func:`described` does, of a parameter that only the start can set."""
+    return described(default, description, read_only=True, **more)
+
+
+def nested(default: Any, texts: Mapping[str, str] | None = None, *, prefix: str = "") -> Any:
+    """Return a field of settings in settings; ``texts`` describe them where they do not."""
+    inside = _Nested(type(default), prefix, texts or {}, ())
+    return dataclasses.field(default=default, metadata={"": inside})
+
+
+def optional(kind: type, *needs: str, prefix: str) -> Any:
+    """Return a field of settings that are not there where what they need is 0, as it is first."""
+    return dataclasses.field(default=None, metadata={"": _Nested(kind, prefix, {}, needs)})
+
+
+def parameters_in(settings: type, default: Any = None, prefix: str = "") -> dict[str, Described]:
+    """Return the parameters of settings by their names, with the defaults of one of them."""
+    found = {}
+    for field, known in _known(settings):
+        value = field.default if default is None else getattr(default, field.name)
+        if isinstance(known, Described):
+            value = 0.0 if known.endless and math.isinf(value) else value
+            found[prefix + (known.name or field.name)] = known._replace(default=value)
+            continue
+        inside = prefix + known.prefix
+        for name, text in known.texts.items():
+            found[inside + name] = Described(getattr(value, name), text)
+        for name, one in parameters_in(known.kind, value, inside).items():
+            found[name] = one._replace(default=0.0, minimum=0.0) if known.needs else one
+    return found
+
+
+def settings_of(settings: type[S], values: Mapping[str, Any], prefix: str = "") -> S:
+    """Return settings from the values of their parameters; what is refused names its prefix."""
+    given: dict[str, Any] = {}
+    for field, known in _known(settings):
+        if isinstance(known, Described):
+            value = values[prefix + (known.name or field.name)]
+            given[field.name] = value or math.inf if known.endless else value
+            continue
+        inside = prefix + known.prefix
+        there = [bool(values[inside + name]) for name in known.needs]
+        if any(there) and not all(there):
+            needed = " and ".join(inside + name for name in known.needs)
+            raise ParameterError(f"{needed} must be given together")
+        if all(there):
+            given[field.name] = _inner(known, values, inside)
+    return settings(**given)
+
+
+def fields_for(kind: type, settings: Any, prefix: str = "") -> dict[str, Any]:
+    """Return the settings that are named, behind a prefix, as the fields of another dataclass."""
+    names = [field.name for field in dataclasses.fields(kind)]
+    return {n: getattr(settings, prefix + n) for n in names if hasattr(settings, prefix + n)}
+
+
+def check_limits(settings: Any) -> None:
+    """Refuse a number beyond the limits that its description has."""
+    for field, known in _known(settings):
+        if isinstance(known, Described) and known.limited:
+            check_range(field.name, getattr(settings, field.name), known.minimum, known.maximum)
+
+
+def _inner(known: _Nested, values: Mapping[str, Any], prefix: str) -> Any:
+    if known.texts:
+        return known.kind(**{name: values[prefix + name] for name in known.texts})
+    try:
+        return settings_of(known.kind, values, prefix)
+    except ParameterError as error:
+        if not known.prefix or known.needs:
+            raise
+        raise ParameterError(f"{prefix.rstrip('.')}: {error}") from None
+
+
+def _known(settings: Any) -> Iterator[tuple[Any, Described | _Nested]]:
+    for field in dataclasses.fields(settings):
+        if "" in field.metadata:
+            yield field, field.metadata[""]

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 from smp_motor_control import WHEELS
 from smp_motor_control.errors import check_positive
+from smp_motor_control.fields import described
 
 ARROWS: Mapping[str, str] = {"A": "up", "B": "down", "C": "right", "D": "left"}
 
@@ -56,12 +57,14 @@ def keys_of(text: str) -> list[str]:
 class Speeds:
     """What a held key asks for."""
 
-    # linear, angular, wheel: [m/s], [rad/s] of the body, [rad/s] of a wheel
-    linear: float = 0.2
-    angular: float = 0.6
-    wheel: float = 1.5
-    step: float = 0.1  # share by which + and - change them all
-    timeout: float = 0.6  # time without a repeat after which the key counts as released [s]
+    linear: float = described(0.2, "Of the body [m/s].", name="linear_speed")
+    angular: float = described(0.6, "Of the body [rad/s].", name="angular_speed")
+    wheel: float = described(1.5, "Of a wheel [rad/s].", name="wheel_speed")
+    step: float = described(0.1, "Share by which + and - change the speeds.", name="speed_step")
+    timeout: float = described(
+        0.6, "Time without a repeat after which a key counts as released [s].", maximum=5.0,
+        name="key_timeout",
+    )  # fmt: skip
 
     def __post_init__(self) -> None:
         for name in ("linear", "angular", "wheel", "step", "timeout"):

@@ -1,10 +1,10 @@
 """Settings of the PID controller, validated before they are used."""
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 from smp_motor_control.errors import ParameterError, check_range
-from smp_motor_control.fields import described
+from smp_motor_control.fields import described, parameters_in
 
 EPSILON = 2.220446049250313e-16
 """Smallest number that counts as other than zero: of an error, a gain or a time step."""
@@ -87,17 +87,12 @@ class PidGains:
     feedforward_acceleration: float = described(0.0, "Voltage per acceleration [V s^2/rad].")
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if field.name == "antiwindup_strategy":
-                _check_strategy(value)
-            elif isinstance(value, (bool, str)) or not hasattr(value, "__float__"):
-                raise ParameterError(f"{field.name} is {value!r}: must be a number")
-            else:
-                value = float(value)
-                if not (math.isinf(value) and "_clamp_" in field.name):
-                    check_range(field.name, value, field.metadata.get("minimum", -LARGEST), LARGEST)
-                object.__setattr__(self, field.name, value)
+        _check_strategy(self.antiwindup_strategy)
+        for name, least in _LEAST.items():
+            value = getattr(self, name)
+            if not ("_clamp_" in name and value in (-math.inf, math.inf)):
+                value = check_range(name, value, least, LARGEST)
+            object.__setattr__(self, name, value)
         if not self.u_clamp_min < self.u_clamp_max:
             raise ParameterError(
                 f"u_clamp_min is {self.u_clamp_min} and u_clamp_max {self.u_clamp_max}: "
@@ -121,6 +116,13 @@ class PidGains:
         if abs(self.d) > EPSILON:
             return math.sqrt(abs(self.d / self.i))
         return abs(self.p / self.i)
+
+
+_LEAST = {
+    name: max(one.minimum, -LARGEST)
+    for name, one in parameters_in(PidGains).items()
+    if name != "antiwindup_strategy"
+}
 
 
 def _check_strategy(value: object) -> None:

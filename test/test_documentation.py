@@ -126,10 +126,11 @@ def known(node: str) -> set[str]:
     """Return the parameters that a node declares."""
     import importlib
 
-    from smp_motor_control.nodes.settings import _entries
+    from smp_motor_control.fields import parameters_in
 
     package = "smp_motor_ident" if node == "identifier" else "smp_motor_control"
-    return {*_entries(importlib.import_module(f"{package}.nodes.{node}").Settings), "use_sim_time"}
+    module = importlib.import_module(f"{package}.nodes.{node}")
+    return {*parameters_in(module.Settings), "use_sim_time"}
 
 
 # The recordings that the pages speak of.

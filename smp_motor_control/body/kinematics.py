@@ -5,10 +5,11 @@ separation ``B = wheel_separation * wheel_separation_multiplier``; angles counte
 """
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import MISSING, dataclass, fields
 from typing import NamedTuple
 
 from smp_motor_control.errors import ParameterError
+from smp_motor_control.fields import described
 
 
 class SideSpeeds(NamedTuple):
@@ -47,12 +48,17 @@ class SkidSteer:
     SideSpeeds(left=-2.0, right=2.0)
     """
 
-    wheel_separation: float
-    wheel_radius: float
-    wheel_separation_multiplier: float = 1.0
-    left_wheel_radius_multiplier: float = 1.0
-    right_wheel_radius_multiplier: float = 1.0
-    max_wheel_speed: float = math.inf
+    wheel_separation: float = described(MISSING, "Between left and right wheels [m].")
+    wheel_radius: float = described(MISSING, "Radius of the wheels [m].")
+    wheel_separation_multiplier: float = described(
+        1.0, "Above 1 for a body that turns less than its wheels would roll it."
+    )
+    left_wheel_radius_multiplier: float = described(1.0, "Correction of the left radius.")
+    right_wheel_radius_multiplier: float = described(1.0, "Correction of the right radius.")
+    max_wheel_speed: float = described(
+        math.inf, "What every wheel reaches [rad/s]; commands beyond are scaled. 0: no limit.",
+        minimum=0.0, name="max_wheel_velocity", endless=True,
+    )  # fmt: skip
 
     def __post_init__(self) -> None:
         for field in fields(self):

@@ -6,9 +6,10 @@ with ``K = dc_gain``, ``tau = time_constant``, ``tp = time_constant_product`` an
 ``Vs = static_voltage``, at the motor shaft; d is what the load takes, as a voltage.
 """
 
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass
 
 from smp_motor_control.errors import check_range
+from smp_motor_control.fields import described
 
 LONGEST_DELAY = 2.0
 """From a voltage to its effect [s]; the observer keeps the voltages of that long."""
@@ -16,19 +17,13 @@ LONGEST_DELAY = 2.0
 
 @dataclass(frozen=True, kw_only=True)
 class MotorModel:
-    """The combinations of motor parameters that fix the response from voltage to speed.
+    """The combinations of motor parameters that fix the response from voltage to speed."""
 
-    Raises
-    ------
-    ParameterError
-        When a value is not finite, or is one that no motor has.
-    """
-
-    dc_gain: float  # [rad/s/V], positive
-    time_constant: float  # [s], positive
-    time_constant_product: float = 0.0  # [s^2]; 0 for a motor of first order
-    static_voltage: float = 0.0  # what dry friction takes [V]
-    delay: float = 0.0  # from the voltage to its effect [s]
+    dc_gain: float = described(MISSING, "Speed per volt [rad/s/V, motor]; 0: no model.")
+    time_constant: float = described(MISSING, "Sum of the time constants [s].")
+    time_constant_product: float = described(0.0, "Their product [s^2].")
+    static_voltage: float = described(0.0, "What dry friction takes [V].")
+    delay: float = described(0.0, "From voltage to effect [s].")
 
     def __post_init__(self) -> None:
         check_range("dc_gain of the model", self.dc_gain, 1e-9, 1e9, "rad/s/V")

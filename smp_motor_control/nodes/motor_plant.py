@@ -22,11 +22,12 @@ from std_msgs.msg import Float64
 
 from smp_interfaces.msg import MotorDescription
 from smp_motor_control.errors import ParameterError
+from smp_motor_control.fields import described, fixed, nested
 from smp_motor_control.motor.file import MotorEntry, load_motors, nest, paper_motors, parse_motors
 from smp_motor_control.motor.hardware import DrivenMotor, DriveSettings, Supply
 from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.motor_writer import MotorDriver
-from smp_motor_control.nodes.settings import Parameters, described, fixed, given_parameters, nested
+from smp_motor_control.nodes.settings import Parameters, given_parameters
 
 _FIXED = ParameterDescriptor(description="As in a motor file.", read_only=True)
 

@@ -20,10 +20,11 @@ from smp_interfaces.msg import MotorDescription
 from smp_motor_control import WHEELS
 from smp_motor_control.encoder import Encoder, wrap
 from smp_motor_control.errors import ParameterError
+from smp_motor_control.fields import described, fixed
 from smp_motor_control.motor.parameters import Gearbox
 from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.motor_writer import MotorDriver
-from smp_motor_control.nodes.settings import Parameters, described, fixed
+from smp_motor_control.nodes.settings import Parameters
 from smp_motor_control.serial_protocol import (
     CLOCK,
     BoardState,

@@ -1,24 +1,16 @@
 """ROS parameters as a frozen dataclass that is replaced as a whole, or not at all.
 
-A node describes its parameters once::
-
-    @dataclass(frozen=True, kw_only=True)
-    class Settings:
-        timeout: float = described(0.5, "Silence after which the wheel stops [s].", minimum=0.0)
-
-        def __post_init__(self) -> None:  # relations between values; raises ParameterError
-            ...
+A node describes its parameters once, as :mod:`smp_motor_control.fields` says::
 
     parameters = Parameters(node, Settings)
     parameters.settings.timeout
 
 A change is validated, as one with all that is set in the same call, before it takes effect;
-a refused one leaves the node as it was and the service call says why.
+a refused one leaves the node as it was and the service call says why.  Relations between values
+are checked by ``__post_init__`` of the settings, which raises ParameterError.
 """
 
-import dataclasses
 import difflib
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Generic, TypeVar
 
@@ -31,78 +23,12 @@ from rcl_interfaces.msg import (
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from smp_motor_control import fields
 from smp_motor_control.errors import ParameterError
+from smp_motor_control.fields import Described, parameters_in, settings_of
 
 S = TypeVar("S")
 
 _OF_EVERY_NODE = ("use_sim_time", "start_type_description_service")
-
-
-def described(
-    default: Any,
-    description: str,
-    *,
-    minimum: float = -math.inf,
-    maximum: float = math.inf,
-    read_only: bool = False,
-    name: str = "",
-) -> Any:
-    """Return a dataclass field that becomes a ROS parameter."""
-    limits = {"minimum": minimum, "maximum": maximum}
-    return fields.described(default, description, read_only=read_only, name=name, **limits)
-
-
-def fixed(default: Any, description: str, **limits: float) -> Any:
-    """Return a field as :func:`described` does, of a parameter that only the start can set."""
-    return described(default, description, read_only=True, **limits)
-
-
-def nested(default: Any, descriptions: Mapping[str, str] | None = None, *, prefix: str = "") -> Any:
-    """Return a dataclass field whose own fields become ROS parameters; they may be described."""
-    if descriptions is None:
-        inner = dataclasses.fields(default)
-        descriptions = {field.name: field.metadata["description"] for field in inner}
-    metadata = {"descriptions": descriptions, "prefix": prefix}
-    return dataclasses.field(default=default, metadata=metadata)
-
-
-def fields_for(kind: type, settings: Any, prefix: str = "") -> dict[str, Any]:
-    """Return the settings that are named, behind a prefix, as the fields of another dataclass."""
-    names = [field.name for field in dataclasses.fields(kind)]
-    return {n: getattr(settings, prefix + n) for n in names if hasattr(settings, prefix + n)}
-
-
-@dataclasses.dataclass(frozen=True)
-class _Entry:
-    """One ROS parameter and the place in the settings it belongs to."""
-
-    path: tuple[str, ...]
-    default: Any
-    description: str
-    minimum: float = -math.inf
-    maximum: float = math.inf
-    read_only: bool = False
-
-    @property
-    def limited(self) -> bool:
-        """Whether it is a number with a limit."""
-        return math.isfinite(self.minimum) or math.isfinite(self.maximum)
-
-
-def _entries(settings: type) -> dict[str, _Entry]:
-    found = {}
-    for field in dataclasses.fields(settings):
-        data = field.metadata
-        if "descriptions" in data:
-            for name, description in data["descriptions"].items():
-                default = getattr(field.default, name)
-                found[data["prefix"] + name] = _Entry((field.name, name), default, description)
-        elif "description" in data:
-            limits = {key: data[key] for key in ("minimum", "maximum", "read_only")}
-            name = data["name"] or field.name
-            found[name] = _Entry((field.name,), field.default, data["description"], **limits)
-    return found
 
 
 def coerce(name: str, value: Any, default: Any) -> Any:
@@ -121,7 +47,7 @@ def coerce(name: str, value: Any, default: Any) -> Any:
     return value
 
 
-def _check_range(name: str, value: Any, entry: _Entry) -> None:
+def _check_range(name: str, value: Any, entry: Described) -> None:
     low, high = entry.minimum, entry.maximum
     if entry.limited and not low <= value <= high:
         raise ParameterError(f"{name} is {value!r}; it must be in [{low:g}, {high:g}]")
@@ -139,7 +65,7 @@ class Parameters(Generic[S]):
         check: Callable[[S], None] = lambda settings: None,
     ) -> None:
         self._type = settings
-        self._entries = _entries(settings)
+        self._entries = parameters_in(settings)
         self._changed = changed
         self._node = node
         given = given_parameters(node)
@@ -174,18 +100,10 @@ class Parameters(Generic[S]):
                 self._node.get_logger().warning(f"unknown parameter {name!r} is ignored{hint}")
 
     def _build(self, values: Mapping[str, Any]) -> S:
-        top: dict[str, Any] = {}
-        inner: dict[str, dict[str, Any]] = {}
         for name, entry in self._entries.items():
             _check_range(name, values[name], entry)
-            if len(entry.path) == 1:
-                top[entry.path[0]] = values[name]
-            else:
-                inner.setdefault(entry.path[0], {})[entry.path[1]] = values[name]
         try:
-            for field in (f for f in dataclasses.fields(self._type) if f.name in inner):  # type: ignore[arg-type]
-                top[field.name] = _replaced(field, inner[field.name])
-            return self._type(**top)
+            return settings_of(self._type, values)
         except ArithmeticError as error:
             raise ParameterError(f"the values cannot be computed with: {error}") from error
 
@@ -211,23 +129,14 @@ class Parameters(Generic[S]):
             self._changed(self.settings)
 
 
-def _replaced(field: dataclasses.Field[Any], parts: Mapping[str, Any]) -> Any:
-    """Return nested settings with new values; what is refused is named as the parameters are."""
-    try:
-        return dataclasses.replace(field.default, **parts)
-    except ParameterError as error:
-        place = field.metadata["prefix"].rstrip(".")
-        raise ParameterError(f"{place}: {error}" if place else str(error)) from None
-
-
 def given_parameters(node: Node) -> dict[str, Any]:
     """Return what the command line, launch and parameter files set for a node."""
     return {name: parameter.value for name, parameter in node._parameter_overrides.items()}
 
 
-def _descriptor(entry: _Entry) -> ParameterDescriptor:
+def _descriptor(entry: Described) -> ParameterDescriptor:
     descriptor = ParameterDescriptor(
-        description=entry.description,
+        description=entry.text,
         read_only=entry.read_only,
         # Types are checked by `coerce`, which takes 1 for 1.0 and says what it wants.
         dynamic_typing=True,

@@ -39,7 +39,7 @@ class SkidSteerNode(Node):
         super().__init__("skid_steer")
         self._current = Parameters(self, Settings, self._configure)
         settings = self._current.settings
-        robot = settings.robot()
+        robot = settings.robot
         self._command = BodyCommand()
         self._left, self._right = settings.left_wheel_names, settings.right_wheel_names
         window = settings.velocity_rolling_window_size / settings.publish_rate
@@ -101,7 +101,7 @@ class SkidSteerNode(Node):
         self._unheard = others.pop().__name__ if others else ""
 
     def _configure(self, settings: Settings) -> None:
-        robot = settings.robot()
+        robot = settings.robot
         self._robot = robot
         self._linear, self._angular = settings.linear, settings.angular
         self._command.configure(settings.cmd_vel_timeout)

@@ -1,6 +1,5 @@
 """Parameters of skid_steer, named as those of diff_drive_controller where they mean the same."""
 
-import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,7 +9,7 @@ from smp_motor_control.body.heading import HeadingHold
 from smp_motor_control.body.kinematics import SkidSteer
 from smp_motor_control.body.speed_limiter import SpeedLimiter
 from smp_motor_control.errors import ParameterError
-from smp_motor_control.nodes.settings import described, fields_for, fixed, nested
+from smp_motor_control.fields import described, fixed, nested
 
 
 def check_wheels(left: Sequence[str], right: Sequence[str]) -> None:
@@ -32,15 +31,8 @@ class Settings:
 
     left_wheel_names: tuple[str, ...] = fixed(LEFT, "Wheels of the left side: their namespaces.")
     right_wheel_names: tuple[str, ...] = fixed(RIGHT, "Wheels of the right side: their namespaces.")
-    wheel_separation: float = described(0.4, "Between left and right wheels [m].")
-    wheel_radius: float = described(0.1, "Radius of the wheels [m].")
-    wheel_separation_multiplier: float = described(
-        1.0, "Above 1 for a body that turns less than its wheels would roll it."
-    )
-    left_wheel_radius_multiplier: float = described(1.0, "Correction of the left radius.")
-    right_wheel_radius_multiplier: float = described(1.0, "Correction of the right radius.")
-    max_wheel_velocity: float = described(
-        2.9, "What every wheel reaches [rad/s]; commands beyond are scaled. 0: no limit.", minimum=0
+    robot: SkidSteer = nested(
+        SkidSteer(wheel_separation=0.4, wheel_radius=0.1, max_wheel_speed=2.9)
     )
     publish_rate: float = fixed(
         50.0, "Set-points and odometry per second [Hz].", minimum=1.0, maximum=1000.0
@@ -84,13 +76,7 @@ class Settings:
 
     def __post_init__(self) -> None:
         check_wheels(self.left_wheel_names, self.right_wheel_names)
-        self.robot()
         self.hold()
-
-    def robot(self) -> SkidSteer:
-        """Return the geometry."""
-        most = self.max_wheel_velocity or math.inf
-        return SkidSteer(**fields_for(SkidSteer, self), max_wheel_speed=most)
 
     def hold(self) -> HeadingHold:
         """Return a heading controller."""

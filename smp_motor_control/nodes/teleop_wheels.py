@@ -20,9 +20,10 @@ from sensor_msgs.msg import JointState
 
 from smp_motor_control import WHEELS, joint_of
 from smp_motor_control.errors import ParameterError, SmpError
+from smp_motor_control.fields import fixed, nested
 from smp_motor_control.keyboard import Keyboard, Speeds, keys_of
 from smp_motor_control.nodes import runtime
-from smp_motor_control.nodes.settings import Parameters, described, fixed
+from smp_motor_control.nodes.settings import Parameters
 
 _HIDE_CURSOR, _SHOW_CURSOR = "\x1b[?25l", "\x1b[?25h"
 
@@ -130,13 +131,7 @@ ZEROS_AFTER_RELEASE = 1.0
 class Settings:
     """Parameters of the node."""
 
-    linear_speed: float = described(0.2, "Of the body [m/s].")
-    angular_speed: float = described(0.6, "Of the body [rad/s].")
-    wheel_speed: float = described(1.5, "Of a wheel [rad/s].")
-    speed_step: float = described(0.1, "Share by which + and - change the speeds.")
-    key_timeout: float = described(
-        0.6, "Time without a repeat after which a key counts as released [s].", maximum=5.0
-    )
+    speeds: Speeds = nested(Speeds())
     rate: float = fixed(20.0, "Commands per second [Hz].", minimum=5.0, maximum=100.0)
     use_stamped_vel: bool = fixed(True, "Publish TwistStamped (true) or Twist (false).")
     frame_id: str = fixed("base_link", "Frame of a stamped command.")
@@ -144,19 +139,8 @@ class Settings:
     wheel_names: tuple[str, ...] = fixed(WHEELS, "Wheels that the keys 1, 2, ... select.")
 
     def __post_init__(self) -> None:
-        self.speeds()
         if not 1 <= len(self.wheel_names) <= 9:
             raise ParameterError(f"wheel_names has {len(self.wheel_names)} names; 1 to 9 have keys")
-
-    def speeds(self) -> Speeds:
-        """Return what held keys ask for."""
-        return Speeds(
-            linear=self.linear_speed,
-            angular=self.angular_speed,
-            wheel=self.wheel_speed,
-            step=self.speed_step,
-            timeout=self.key_timeout,
-        )
 
 
 class TeleopWheels(Node):
@@ -167,7 +151,7 @@ class TeleopWheels(Node):
         parameters = Parameters(self, Settings, self._configure)
         self._settings = parameters.settings
         self._wheels = self._settings.wheel_names
-        self._keyboard = Keyboard(self._settings.speeds(), self._wheels)
+        self._keyboard = Keyboard(self._settings.speeds, self._wheels)
         stamped = self._settings.use_stamped_vel
         self._twist = TwistStamped() if stamped else Twist()
         if stamped:
@@ -183,11 +167,11 @@ class TeleopWheels(Node):
 
     def _configure(self, settings: Settings) -> None:
         self._settings = settings
-        self._keyboard.speeds = settings.speeds()
+        self._keyboard.speeds = settings.speeds
 
     def _show_help(self) -> None:
         wheels = "  ".join(f"{k} {wheel}" for k, wheel in enumerate(self._wheels, start=1))
-        self._terminal.write(HELP.format(timeout=self._settings.key_timeout, wheels=wheels))
+        self._terminal.write(HELP.format(timeout=self._settings.speeds.timeout, wheels=wheels))
 
     def _tick(self) -> None:
         keyboard, now = self._keyboard, time.monotonic()

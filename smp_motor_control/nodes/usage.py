@@ -5,7 +5,7 @@ import importlib
 import os
 import sys
 
-from smp_motor_control.nodes.settings import _entries
+from smp_motor_control.fields import parameters_in
 
 
 def main() -> int:
@@ -19,10 +19,10 @@ def main() -> int:
         "",
         "parameters:",
     ]
-    for parameter, entry in _entries(module.Settings).items():
+    for parameter, entry in parameters_in(module.Settings).items():
         default = list(entry.default) if isinstance(entry.default, tuple) else entry.default
         fixed = " (at the start only)" if entry.read_only else ""
-        lines += [f"  {parameter} = {default!r}{fixed}", f"      {entry.description}"]
+        lines += [f"  {parameter} = {default!r}{fixed}", f"      {entry.text}"]
     with contextlib.suppress(BrokenPipeError):
         print("\n".join(lines), flush=True)
         return 0

@@ -18,9 +18,10 @@ whatever their own step.
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from smp_motor_control.errors import check_positive, check_range
+from smp_motor_control.fields import described
 
 PEAK_ACCELERATION = 15.0 / 8.0
 """Peak acceleration of the minimum-jerk transition from rest, in units of ``|D|/T``."""
@@ -37,14 +38,18 @@ class Reference(NamedTuple):
     jerk: float  # [rad/s^3]
 
 
+def _limit(name: str, unit: str) -> Any:
+    text = f"Of the reference [{unit}]; 0 for none."
+    return described(math.inf, text, minimum=0.0, name=f"max_{name}", endless=True)
+
+
 @dataclass(frozen=True, kw_only=True)
 class ProfileLimits:
     """What a reference must keep to; infinite where there is no limit."""
 
-    # velocity, acceleration, jerk: [rad/s], [rad/s^2], [rad/s^3], all positive
-    velocity: float = math.inf
-    acceleration: float = math.inf
-    jerk: float = math.inf
+    velocity: float = _limit("velocity", "rad/s")
+    acceleration: float = _limit("acceleration", "rad/s^2")
+    jerk: float = _limit("jerk", "rad/s^3")
 
     def __post_init__(self) -> None:
         for name, unit in (("velocity", ""), ("acceleration", "^2"), ("jerk", "^3")):

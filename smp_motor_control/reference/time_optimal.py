@@ -12,9 +12,10 @@ K. J. Astrom, B. Wittenmark, *Computer-Controlled Systems* (1997), section 4.3 o
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass
 
 from smp_motor_control.errors import check_range
+from smp_motor_control.fields import described
 from smp_motor_control.motor.response import FreeResponse
 from smp_motor_control.reference.minimum_jerk import Reference
 
@@ -28,9 +29,14 @@ _FIRST_ORDER = 1e-6
 class Drive:
     """What a motor can do with the voltage that a change of speed may use."""
 
-    top_speed: float  # that this voltage, less what dry friction takes, would hold for ever [rad/s]
-    time_constant: float  # sum of the motor's time constants [s]
-    time_constant_product: float = 0.0  # their product [s^2]; 0 for a motor of first order
+    # What this voltage, less what dry friction takes, would hold for ever
+    top_speed: float = described(
+        MISSING, "Speed at which the voltage for changes is used up [rad/s]; 0: no limit."
+    )
+    time_constant: float = described(
+        MISSING, "Sum of the time constants that changes are made for [s]."
+    )
+    time_constant_product: float = described(0.0, "Their product [s^2].")
 
     def __post_init__(self) -> None:
         tau = check_range("time_constant of the drive", self.time_constant, 1e-7, 1e5, "s")

@@ -5,13 +5,14 @@ It knows no clock and no ROS.  ``now`` is seconds on a clock that never jumps.
 
 import math
 from collections import Counter
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from enum import Enum
 from statistics import median
 from typing import Protocol
 
 from smp_motor_control.encoder import Encoder
 from smp_motor_control.errors import ParameterError, check_positive
+from smp_motor_control.fields import described, nested
 from smp_motor_control.motor.parameters import Gearbox
 from smp_motor_control.pid import PidOutput
 from smp_motor_control.wheel.acceptance import Circumstances, check
@@ -56,12 +57,24 @@ class Sample(Protocol):
 class WheelSettings:
     """Everything that shapes a wheel's controller."""
 
-    loop: LoopSettings = field(default_factory=LoopSettings)  # of the speed loop
-    faults: FaultLimits = field(default_factory=FaultLimits)  # when the wheel misbehaves
-    setpoint_timeout: float = 0.5  # silence of set-points after which the wheel is braked [s]
-    feedback_timeout: float = 0.2  # silence or age of feedback after which the voltage is zero [s]
-    fault_retry: float = 2.0  # pause before the first try of a wheel at fault [s]
-    implausible_velocity: float = 1000.0  # feedback beyond it is left out [rad/s, wheel]
+    setpoint_timeout: float = described(
+        0.5, "Silence of set-points after which the wheel is braked [s].", minimum=0.01,
+        maximum=60.0,
+    )  # fmt: skip
+    feedback_timeout: float = described(
+        0.2, "Silence or age of feedback after which the voltage is zero [s].",
+        minimum=0.005, maximum=10.0,
+    )  # fmt: skip
+    loop: LoopSettings = nested(LoopSettings())
+    faults: FaultLimits = nested(FaultLimits())
+    fault_retry: float = described(
+        2.0, "Pause before a wheel at fault is tried again under a set-point that is not zero "
+        "[s], doubled every time, three times at most; 0: only after a zero set-point.",
+        minimum=0.0, maximum=3600.0,
+    )  # fmt: skip
+    implausible_velocity: float = described(
+        1000.0, "Feedback beyond this speed is left out [rad/s, wheel].", minimum=0.0
+    )
 
 
 class WheelController:

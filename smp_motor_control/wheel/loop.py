@@ -5,10 +5,11 @@ Set-point and speeds are the wheel's; counts and the model are the motor's.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 from smp_motor_control.encoder import DifferencedSpeed, Encoder
-from smp_motor_control.errors import ParameterError, check_range
+from smp_motor_control.errors import ParameterError
+from smp_motor_control.fields import check_limits, described, nested, optional
 from smp_motor_control.motor.friction import Gearbox
 from smp_motor_control.motor.model import MotorModel
 from smp_motor_control.observer import ObserverNoise, SpeedObserver
@@ -29,42 +30,38 @@ _LEARNING = 20
 class LoopSettings:
     """Everything that shapes the loop."""
 
-    gains: PidGains = field(default_factory=PidGains)  # volts of wheel speeds
-    limits: ProfileLimits = field(default_factory=ProfileLimits)  # of the reference, at the wheel
-    # Duration of every change of set-point [s]; 0: as fast as the limits allow
-    transition_time: float = 0.0
-    # What is fed back: the speed that the hardware reports, counts differenced, or the observer's
-    speed_source: str = "measured"
-    difference_window: int = 4  # samples to difference over
-    # Of the motor, for the observer, and for the jerk in the feed-forward
-    model: MotorModel | None = None
-    noise: ObserverNoise = field(default_factory=ObserverNoise)  # what the observer expects
-    # How much later than the reference the measured speed can show it [s]: delay and averaging of
-    # the loop.  The error is taken from the reference of that long ago, so that a wheel that does
-    # what its model says is left alone; 0: from the present one.
-    reference_delay: float = 0.0
-    # By which that delay may be wrong [s]: there is no error while the measurement is what the
-    # reference was within so much of it
-    reference_doubt: float = 0.0
+    gains: PidGains = nested(PidGains())  # volts of wheel speeds
+    limits: ProfileLimits = nested(ProfileLimits())  # of the reference, at the wheel
+    transition_time: float = described(
+        0.0, "Duration of every change of set-point [s]; 0: as fast as limits allow.",
+        minimum=0.0, maximum=LONGEST_TRANSITION,
+    )  # fmt: skip
+    # The error is taken from the reference of that long ago, so that a wheel that does what its
+    # model says is left alone; 0: from the present one.
+    reference_delay: float = described(
+        0.0, "Lag of the measured speed behind the reference: delay and averaging [s].",
+        minimum=0.0, maximum=10.0,
+    )  # fmt: skip
+    # There is no error while the measurement is what the reference was within so much of the delay.
+    reference_doubt: float = described(
+        0.0, "By which that lag may be wrong [s].", minimum=0.0, maximum=1.0
+    )
     # Motor and voltage that changes of set-point keep to, in wheel rad/s; see
     # :class:`~smp_motor_control.reference.profile.Profile`
-    drive: Drive | None = None
+    drive: Drive | None = optional(Drive, "top_speed", prefix="drive.")
+    speed_source: str = described("measured", f"{', '.join(SPEED_SOURCES[:2])} or observer.")
+    difference_window: int = described(
+        4, "Samples to difference counts over.", minimum=1, maximum=1000
+    )
+    # Of the motor, for the observer, and for the jerk in the feed-forward
+    model: MotorModel | None = optional(MotorModel, "dc_gain", "time_constant", prefix="model.")
+    noise: ObserverNoise = nested(ObserverNoise(), prefix="observer.")
 
     def __post_init__(self) -> None:
-        longest = {
-            "reference_delay": 10.0,
-            "reference_doubt": 1.0,
-            "transition_time": LONGEST_TRANSITION,
-        }
-        for name, most in longest.items():
-            check_range(name, getattr(self, name), 0.0, most, "s")
+        check_limits(self)
         if self.speed_source not in SPEED_SOURCES:
             known = ", ".join(SPEED_SOURCES)
             raise ParameterError(f"speed_source is {self.speed_source!r}; known are {known}")
-        if self.difference_window < 1:
-            raise ParameterError(
-                f"difference_window is {self.difference_window!r}; it must be at least 1"
-            )
         if self.speed_source == "observer" and self.model is None:
             raise ParameterError(
                 "speed_source is 'observer', which needs model.dc_gain and model.time_constant"

@@ -28,9 +28,10 @@ from smp_interfaces.msg import MotorDescription, MotorParameters, MotorState
 from smp_motor_control import WHEELS, joint_of
 from smp_motor_control.encoder import wrap
 from smp_motor_control.errors import ParameterError, SmpError
+from smp_motor_control.fields import described, fixed, nested
 from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.executor import Untouched
-from smp_motor_control.nodes.settings import Parameters, described, fixed, nested
+from smp_motor_control.nodes.settings import Parameters
 from smp_motor_ident.bag import read
 from smp_motor_ident.bag.window import Window
 from smp_motor_ident.estimate import estimate

@@ -20,9 +20,10 @@ from std_msgs.msg import Float64, String
 from std_srvs.srv import Trigger
 
 from smp_motor_control.errors import ParameterError
+from smp_motor_control.fields import described
 from smp_motor_control.nodes.executor import LeanExecutor, Untouched, _WaitSet
 from smp_motor_control.nodes.runtime import STREAM_PUBLISHER, STREAM_SUBSCRIBER, steady_timer
-from smp_motor_control.nodes.settings import Parameters, described
+from smp_motor_control.nodes.settings import Parameters
 
 PROGRAM = """
 import sys
