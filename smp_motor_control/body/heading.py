@@ -1,8 +1,10 @@
 """Holding the heading of the body against uneven ground, with a yaw from outside."""
 
 import math
+from dataclasses import dataclass
 
 from smp_motor_control.errors import check_positive
+from smp_motor_control.fields import described
 
 
 def wrapped(angle: float) -> float:
@@ -10,12 +12,12 @@ def wrapped(angle: float) -> float:
     return math.remainder(angle, 2.0 * math.pi)
 
 
+@dataclass(eq=False)
 class HeadingHold:
     """PI controller of the yaw whose reference is the integral of the commanded yaw rate.
 
-    ``w_out = w_cmd + clamp(p e + i integral(e))`` with ``e = wrap(integral(w_cmd) - yaw)``, p [1/s]
-    and i [1/s^2].  Beyond ``max_error`` [rad] the body was turned by something stronger: the
-    present yaw is the new reference.
+    ``w_out = w_cmd + clamp(p e + i integral(e))`` with ``e = wrap(integral(w_cmd) - yaw)``.  Beyond
+    ``max_error`` the body was turned by something stronger: the present yaw is the new reference.
 
     Examples
     --------
@@ -24,15 +26,25 @@ class HeadingHold:
     (0.0, 0.2)
     """
 
-    def __init__(
-        self, p: float = 2.0, i: float = 0.5, max_correction: float = 0.5, max_error: float = 0.7
-    ) -> None:
-        check_positive("heading p", p, "1/s", or_zero=True)
-        check_positive("heading i", i, "1/s^2", or_zero=True)
-        check_positive("heading max_correction", max_correction, "rad/s")
-        check_positive("heading max_error", max_error, "rad")
-        self._p, self._i = p, i
-        self._max_correction, self._max_error = max_correction, max_error
+    p: float = described(
+        2.0, "Proportional gain of the heading [1/s].", minimum=0.0, name="heading_p"
+    )
+    i: float = described(
+        0.5, "Integral gain of the heading [1/s^2].", minimum=0.0, name="heading_i"
+    )
+    max_correction: float = described(
+        0.5, "Largest yaw rate that is added [rad/s].", name="heading_max_correction"
+    )
+    max_error: float = described(
+        0.7, "Beyond this the present heading is taken for the wanted one [rad].",
+        name="heading_max_error",
+    )  # fmt: skip
+
+    def __post_init__(self) -> None:
+        check_positive("heading p", self.p, "1/s", or_zero=True)
+        check_positive("heading i", self.i, "1/s^2", or_zero=True)
+        check_positive("heading max_correction", self.max_correction, "rad/s")
+        check_positive("heading max_error", self.max_error, "rad")
         self.reset()
 
     def reset(self) -> None:
@@ -50,11 +62,11 @@ class HeadingHold:
             return angular
         self._reference = wrapped(self._reference + angular * dt)
         error = wrapped(self._reference - yaw)
-        if abs(error) > self._max_error:
+        if abs(error) > self.max_error:
             self._reference, self._integral = yaw, 0.0
             return angular
-        correction = self._p * error + self._integral
-        limit = self._max_correction
+        correction = self.p * error + self._integral
+        limit = self.max_correction
         if abs(correction) < limit or correction * error < 0.0:
-            self._integral += self._i * error * dt
+            self._integral += self.i * error * dt
         return angular + min(max(correction, -limit), limit)

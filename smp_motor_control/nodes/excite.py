@@ -10,6 +10,7 @@ import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 
 from rclpy.node import Node
 
@@ -183,6 +184,4 @@ class Excite(Node):
             writer.stop()
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the node until the signal ends."""
-    return runtime.run("excite", Excite, argv)
+main = partial(runtime.run, "excite", Excite)

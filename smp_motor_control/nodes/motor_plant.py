@@ -14,6 +14,7 @@ import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from rcl_interfaces.msg import ParameterDescriptor
@@ -205,6 +206,4 @@ class MotorPlant(Node):
         return runtime.WARN if rejected or late or rivals else runtime.OK, message, values
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the node until a signal."""
-    return runtime.run("motor_plant", MotorPlant, argv)
+main = partial(runtime.run, "motor_plant", MotorPlant)

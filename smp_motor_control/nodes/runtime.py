@@ -1,6 +1,6 @@
 """What all nodes share: start, spin, stop with a zero command; QoS, timers, stamps and health.
 
-A node's ``main`` is ``return run("name", lambda: TheNode(), argv)``.  The node may define
+A node's ``main`` is ``partial(run, "name", TheNode)``.  The node may define
 ``on_stop()``, which :func:`run` calls before it destroys the node whatever the reason of
 leaving: SIGINT, SIGTERM, SIGQUIT, SIGHUP (a closed terminal), :func:`finish`, or an exception in
 a callback.
@@ -106,7 +106,7 @@ def finish(exit_code: int = 0) -> None:
 
 
 def run(name: str, make: Callable[[], Node], argv: list[str] | None = None) -> int:
-    """Start a node, spin it until a signal, and stop it cleanly."""
+    """Start a node, spin it until a signal, and stop it cleanly; return the exit code."""
     global _stop
     _stop = stop = _Stop()
     # rclpy's own handlers would shut the context down, and with it the way to send a zero.

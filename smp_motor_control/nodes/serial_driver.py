@@ -12,6 +12,7 @@ import termios
 import time
 import tty
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from rclpy.node import Node
@@ -250,6 +251,4 @@ class SerialDriver(Node):
             self._close("")
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the node until a signal; return its exit code."""
-    return runtime.run("serial_driver", SerialDriver, argv)
+main = partial(runtime.run, "serial_driver", SerialDriver)

@@ -106,7 +106,7 @@ class SkidSteerNode(Node):
         self._linear, self._angular = settings.linear, settings.angular
         self._command.configure(settings.cmd_vel_timeout)
         self._feedback.max_speed = IMPLAUSIBLE * min(robot.max_wheel_speed, FASTEST)
-        self._hold = settings.hold()
+        self._hold = settings.hold
         self._odometry.configure(
             robot.effective_separation,
             robot.left_radius,
@@ -262,6 +262,4 @@ class SkidSteerNode(Node):
             runtime.send_last(self._setpoints, self._setpoint)
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the node until a signal; return its exit code."""
-    return runtime.run("skid_steer", SkidSteerNode, argv)
+main = partial(runtime.run, "skid_steer", SkidSteerNode)

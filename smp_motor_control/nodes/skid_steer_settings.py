@@ -64,22 +64,10 @@ class Settings:
         1e-2, "Variance of the heading that one radian of turning adds [rad^2/rad].", minimum=0.0
     )
     heading_hold: bool = described(False, "Correct the heading by the yaw of the topic imu.")
-    heading_p: float = described(2.0, "Proportional gain of the heading [1/s].", minimum=0.0)
-    heading_i: float = described(0.5, "Integral gain of the heading [1/s^2].", minimum=0.0)
-    heading_max_correction: float = described(0.5, "Largest yaw rate that is added [rad/s].")
-    heading_max_error: float = described(
-        0.7, "Beyond this the present heading is taken for the wanted one [rad]."
-    )
+    hold: HeadingHold = nested(HeadingHold())
     imu_timeout: float = described(0.2, "Age at which a yaw is not used [s].", minimum=0.01)
     linear: SpeedLimiter = nested(SpeedLimiter(), prefix="linear.x.")
     angular: SpeedLimiter = nested(SpeedLimiter(), prefix="angular.z.")
 
     def __post_init__(self) -> None:
         check_wheels(self.left_wheel_names, self.right_wheel_names)
-        self.hold()
-
-    def hold(self) -> HeadingHold:
-        """Return a heading controller."""
-        return HeadingHold(
-            self.heading_p, self.heading_i, self.heading_max_correction, self.heading_max_error
-        )

@@ -12,6 +12,7 @@ import time
 import tty
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from types import FrameType
 
 from geometry_msgs.msg import Twist, TwistStamped
@@ -248,6 +249,4 @@ class TeleopWheels(Node):
         self._halt()
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the node until x, Ctrl-C or a signal; return its exit code."""
-    return runtime.run("teleop_wheels", TeleopWheels, argv)
+main = partial(runtime.run, "teleop_wheels", TeleopWheels)

@@ -11,6 +11,7 @@ import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
@@ -231,6 +232,4 @@ def _make() -> WheelPid:
     return node
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the node until a signal; the exit code is that of the process."""
-    return runtime.run("wheel_pid", _make, argv)
+main = partial(runtime.run, "wheel_pid", _make)

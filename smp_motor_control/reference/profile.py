@@ -75,11 +75,6 @@ class Profile:
         self._elapsed = 0.0
 
     @property
-    def moving(self) -> bool:
-        """Whether the reference is still under way to its target."""
-        return self._transition is not None
-
-    @property
     def duration(self) -> float:
         """Of the transition that is under way [s]; 0 at rest."""
         return 0.0 if self._transition is None else self._transition.duration

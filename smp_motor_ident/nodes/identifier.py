@@ -286,6 +286,4 @@ def _identify(record: Record, model: str) -> tuple[Estimate | Exception, float]:
     return found, time.thread_time() - begun
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the node."""
-    return runtime.run("identifier", Identifier, argv)
+main = partial(runtime.run, "identifier", Identifier)

@@ -5,7 +5,7 @@ import sys
 import threading
 import time
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,21 +31,12 @@ FIND_AT_MOST = 5.0
 """Longest wait [s] until everybody whom the graph shows is connected."""
 
 
-@dataclass(frozen=True)
-class Options:
-    """How to play."""
-
-    rate: float = 1.0
-    start_offset: float = 0.0
-    loop: bool = False
-    clock_rate: float = 0.0
-    wait: float = FIND_EACH_OTHER
-
-
 class Player(Node):
     """Publishes the messages of a bag from a thread of its own."""
 
-    def __init__(self, replay: Replay, channels: list[Channel], options: Options) -> None:
+    def __init__(
+        self, replay: Replay, channels: list[Channel], options: argparse.Namespace
+    ) -> None:
         super().__init__("play")
         self._replay, self._options = replay, options
         self._outputs: dict[str, tuple[str, Publisher]] = {}
@@ -54,7 +45,7 @@ class Player(Node):
         if not self._outputs:
             raise SmpError("no topic of the bag can be played")
         self._clock: Publisher | None = None
-        if options.clock_rate:
+        if options.clock:
             self._clock = self.create_publisher(Clock, "/clock", 10)
         self._clock_due = 0.0
         self.sent: Counter[str] = Counter()
@@ -116,7 +107,7 @@ class Player(Node):
             enough = FIND_ANYBODY if not any(known) else 0.0
             if any(link < count for link, count in zip(linked, known)):
                 enough = FIND_AT_MOST
-            if waited >= max(enough, self._options.wait):
+            if waited >= max(enough, self._options.delay):
                 return
 
     def _play_once(self) -> bool:
@@ -152,7 +143,7 @@ class Player(Node):
             if self._clock is not None and now >= self._clock_due:
                 elapsed = (min(now, due) - begin) * self._options.rate
                 self._send_clock(first + round(elapsed * 1e9))
-                self._clock_due = now + 1.0 / self._options.clock_rate
+                self._clock_due = now + 1.0 / self._options.clock
             if now >= due:
                 return True
             until = due if self._clock is None else min(due, self._clock_due)
@@ -200,7 +191,7 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
-def _options(arguments: argparse.Namespace) -> Options:
+def _check(arguments: argparse.Namespace) -> None:
     for name, low in (("rate", 1e-6), ("start_offset", 0.0), ("clock", 0.0), ("delay", 0.0)):
         value = getattr(arguments, name)
         if not low <= value < float("inf"):
@@ -208,9 +199,6 @@ def _options(arguments: argparse.Namespace) -> Options:
             raise SmpError(
                 f"{option} is {value:g}; it must be {'positive' if low else '0 or more'}"
             )
-    return Options(
-        arguments.rate, arguments.start_offset, arguments.loop, arguments.clock, arguments.delay
-    )
 
 
 def _chosen(replay: Replay, arguments: argparse.Namespace) -> list[Channel]:
@@ -235,8 +223,8 @@ def main(argv: list[str] | None = None) -> int:
     arguments = parser().parse_args(own)
 
     def make() -> Any:
-        options = _options(arguments)
+        _check(arguments)
         replay = Replay(Path(arguments.bag))
-        return Player(replay, _chosen(replay, arguments), options)
+        return Player(replay, _chosen(replay, arguments), arguments)
 
     return runtime.run("play", make, ros)

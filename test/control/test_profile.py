@@ -49,7 +49,7 @@ def test_wheels_with_different_steps_arrive_at_the_same_instant() -> None:
     for _ in range(149):
         for profile in profiles:
             profile.step(0.001)
-    assert all(profile.moving for profile in profiles)
+    assert all(profile.duration for profile in profiles)
     shares = [profile.now.velocity / profile.target for profile in profiles]
     assert shares == pytest.approx([shares[0]] * 3, abs=1e-12)
     for profile in profiles:
@@ -64,7 +64,7 @@ def test_limit_stretches_the_transition_just_enough() -> None:
     expected = minimum_jerk_duration(4.0, limits, 0.15)
     assert expected == pytest.approx(15.0 / 8.0 * 4.0 / 10.0)
     elapsed = 0.0
-    while profile.moving:
+    while profile.duration:
         assert abs(profile.step(0.001).acceleration) <= 10.0 * (1 + 1e-9)
         elapsed += 0.001
     assert elapsed == pytest.approx(expected, abs=0.0011)  # one step
@@ -101,7 +101,7 @@ def test_fastest_transition_within_limits_is_as_fast_as_the_formula() -> None:
     profile = Profile(ProfileLimits(acceleration=10.0, jerk=100.0))
     profile.set_target(4.0)
     elapsed = 0.0
-    while profile.moving:
+    while profile.duration:
         profile.step(0.001)
         elapsed += 0.001
     assert elapsed == pytest.approx(4.0 / 10.0 + 10.0 / 100.0, abs=0.0011)  # D/a + a/j, one step
@@ -257,7 +257,7 @@ def test_a_limit_lowered_on_the_way_lets_the_acceleration_only_fall() -> None:
     profile.set_target(4.0)
     largest = abs(profile.now.acceleration)
     assert largest > 5.0
-    while profile.moving:
+    while profile.duration:
         # A fall that starts without jerk overshoots nothing; rounding alone.
         assert abs(profile.step(0.002).acceleration) <= largest * (1 + 1e-6)
     assert profile.now == Reference(4.0, 0.0, 0.0)
