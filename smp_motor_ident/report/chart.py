@@ -42,31 +42,6 @@ class Chart:
     height: int = 260
     summary: str = ""  # what the chart shows, for those who cannot see it
 
-    def to_document(self) -> dict[str, Any]:
-        """Return what the page's script draws."""
-        return {
-            "name": self.name,
-            "labels": [self.x_label, self.y_label],
-            "x": packed(self.x),
-            "curves": [
-                {
-                    "name": c.name,
-                    "color": c.color,
-                    "kind": c.kind,
-                    "y": packed(c.y),
-                    "band": None
-                    if c.low is None or c.high is None
-                    else [packed(c.low), packed(c.high)],
-                }
-                for c in self.curves
-            ],
-            "log": self.log,
-            "lines": self.lines,
-            "spans": self.spans,
-            "group": self.group,
-            "height": self.height,
-        }
-
 
 def packed(values: Array) -> str:
     """Return numbers as base64 of little-endian float32: 5 bytes each, and quick to read."""

@@ -38,7 +38,7 @@
   });
 
   function options(chart, width) {
-    const series = [{label: chart.labels[0], value: (u, v) => shown(v)}];
+    const series = [{label: chart.x_label, value: (u, v) => shown(v)}];
     const bands = [];
     for (const curve of chart.curves) {
       const stroke = () => color(curve.color);
@@ -46,7 +46,7 @@
       if (curve.kind === "points") Object.assign(one, {width: 0, paths: () => null, points: {show: true, size: 5, stroke, fill: stroke}});
       if (curve.kind === "bars") Object.assign(one, {paths: uPlot.paths.bars({size: [0.4, 6]}), fill: stroke});
       series.push(one);
-      if (curve.band) {
+      if (curve.low) {
         const hidden = {class: "edge", stroke: "transparent", points: {show: false}};
         series.push({...hidden}, {...hidden});
         bands.push({series: [series.length - 1, series.length - 2], fill: () => color(curve.color) + "30"});
@@ -65,7 +65,7 @@
     return {
       width, height: chart.height, series, bands,
       scales: {x: {time: false, ...scale("x")}, y},
-      axes: [{...axis, label: chart.labels[0], labelSize: 20, size: 30}, {...axis, label: chart.labels[1], labelSize: 20, size: 54, space: 18}],
+      axes: [{...axis, label: chart.x_label, labelSize: 20, size: 30}, {...axis, label: chart.y_label, labelSize: 20, size: 54, space: 18}],
       cursor: chart.group ? {sync: {key: chart.group, setSeries: false}} : {},
       hooks: {drawClear: [marks(chart).drawClear], draw: [marks(chart).draw]},
     };
@@ -91,7 +91,7 @@
     const data = [unpack(chart.x)];
     for (const curve of chart.curves) {
       data.push(unpack(curve.y));
-      if (curve.band) data.push(...curve.band.map(unpack));
+      if (curve.low) data.push(unpack(curve.low), unpack(curve.high));
     }
     const plot = {name: chart.name, group: chart.group, figure, place};
     plot.u = new uPlot(options(chart, place.clientWidth), data, place);

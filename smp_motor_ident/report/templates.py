@@ -1,15 +1,16 @@
 """Pages that stand alone: a template, with all that it needs in itself."""
 
-import json
 from collections.abc import Sequence
 from importlib import resources
 from typing import Any
 
 import jinja2
+import msgspec
+import numpy as np
 from markupsafe import Markup
 
 from smp_motor_ident.report import words
-from smp_motor_ident.report.chart import Chart
+from smp_motor_ident.report.chart import Chart, packed
 from smp_motor_ident.report.drawing import svg
 
 
@@ -28,7 +29,7 @@ def page(name: str, charts: Sequence[Chart] | None = None, **content: Any) -> st
         style = text("uplot/uPlot.min.css") + style
         content |= {
             "charts": charts,
-            "data": script_data([chart.to_document() for chart in charts]),
+            "data": script_data(charts),
             "draw": lambda chart: Markup(svg(chart)),
             "library": Markup(text("uplot/uPlot.iife.min.js")),
             "script": Markup(text("plots.js")),
@@ -43,4 +44,8 @@ def text(name: str) -> str:
 
 def script_data(content: Any) -> Markup:
     """Return data for a script element, which nothing in it may end."""
-    return Markup(json.dumps(content, separators=(",", ":")).replace("<", "\\u003c"))
+    return Markup(msgspec.json.encode(content, enc_hook=_plain).decode().replace("<", "\\u003c"))
+
+
+def _plain(value: Any) -> str | float:
+    return packed(value) if isinstance(value, np.ndarray) else float(value)

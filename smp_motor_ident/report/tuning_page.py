@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from smp_motor_ident.errors import SmpError
-from smp_motor_ident.report.chart import Chart, Curve, packed
+from smp_motor_ident.report.chart import Chart, Curve
 from smp_motor_ident.report.drawing import document
 from smp_motor_ident.report.words import label, number
 from smp_motor_ident.result import Estimate
@@ -123,8 +123,10 @@ def _document(one: Choice) -> dict[str, Any]:
         "rows": _rows(found),
         "yaml": gains_yaml({found.wheel: found}, head),
         "charts": {
-            chart.name: [packed(chart.x)]
-            + [packed(y) for c in chart.curves for y in (c.y, c.low, c.high) if y is not None]
+            chart.name: [
+                chart.x,
+                *(y for c in chart.curves for y in (c.y, c.low, c.high) if y is not None),
+            ]
             for chart in charts
         },
     }
