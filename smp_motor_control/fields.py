@@ -28,12 +28,17 @@ class Described(NamedTuple):
     maximum: float = math.inf
     read_only: bool = False
     name: str = ""
-    endless: bool = False  # whether 0 stands for no limit
+    endless: bool = False  # whether a parameter of 0 stands for infinity
 
     @property
     def limited(self) -> bool:
         """Whether it is a number with a limit."""
         return math.isfinite(self.minimum) or math.isfinite(self.maximum)
+
+    def with_zero(self) -> "Described":
+        """Return the parameter of what may be infinite."""
+        default = 0.0 if math.isinf(self.default) else self.default
+        return self._replace(default=default, text=f"{self.text.rstrip('.')}; 0 for none.")
 
 
 class _Nested(NamedTuple):
@@ -66,14 +71,26 @@ def optional(kind: type, *needs: str, prefix: str) -> Any:
     return dataclasses.field(default=None, metadata={"": _Nested(kind, prefix, {}, needs)})
 
 
+def documented(settings: type[S]) -> type[S]:
+    """Add the descriptions of its fields to a class's docstring."""
+    lines = [settings.__doc__ or "", "    Attributes", "    ----------"]
+    for field, known in _known(settings):
+        if isinstance(known, Described):
+            lines += [f"    {field.name}", f"        {known.text}"]
+    settings.__doc__ = "\n".join(lines)
+    return settings
+
+
 def parameters_in(settings: type, default: Any = None, prefix: str = "") -> dict[str, Described]:
     """Return the parameters of settings by their names, with the defaults of one of them."""
     found = {}
     for field, known in _known(settings):
         value = field.default if default is None else getattr(default, field.name)
         if isinstance(known, Described):
-            value = 0.0 if known.endless and math.isinf(value) else value
-            found[prefix + (known.name or field.name)] = known._replace(default=value)
+            known = known._replace(default=value)
+            found[prefix + (known.name or field.name)] = (
+                known.with_zero() if known.endless else known
+            )
             continue
         inside = prefix + known.prefix
         for name, text in known.texts.items():
@@ -101,10 +118,10 @@ def settings_of(settings: type[S], values: Mapping[str, Any], prefix: str = "") 
     return settings(**given)
 
 
-def fields_for(kind: type, settings: Any, prefix: str = "") -> dict[str, Any]:
-    """Return the settings that are named, behind a prefix, as the fields of another dataclass."""
+def fields_for(kind: type, settings: Any) -> dict[str, Any]:
+    """Return the settings that are named as the fields of another dataclass."""
     names = [field.name for field in dataclasses.fields(kind)]
-    return {n: getattr(settings, prefix + n) for n in names if hasattr(settings, prefix + n)}
+    return {n: getattr(settings, n) for n in names if hasattr(settings, n)}
 
 
 def check_limits(settings: Any) -> None:

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 
 from smp_motor_control.errors import ParameterError, check_range
-from smp_motor_control.fields import described, parameters_in
+from smp_motor_control.fields import described, documented, parameters_in
 
 EPSILON = 2.220446049250313e-16
 """Smallest number that counts as other than zero: of an error, a gain or a time step."""
@@ -19,36 +19,10 @@ STRATEGIES = ("none", "back_calculation", "conditional_integration")
 _CLAMP = "limit of the output [V]; the supply limits it too."
 
 
+@documented
 @dataclass(frozen=True, kw_only=True, slots=True)
 class PidGains:
     """Validated settings of a PID controller; names as in control_toolbox.
-
-    Attributes
-    ----------
-    p, i, d : float
-        Proportional, integral and derivative gain: [V s/rad], [V/rad] and [V s^2/rad] where
-        the controller makes volts of wheel speeds.
-    u_clamp_min, u_clamp_max : float
-        Limits of the output; infinite where there is none.
-    i_clamp_min, i_clamp_max : float
-        Limits of the integral term, on either side of zero.
-    antiwindup_strategy : {'none', 'back_calculation', 'conditional_integration'}
-        What the integral does while the output is clamped: go on, be driven back with
-        ``tracking_time_constant``, or stand still while the error would wind it up further.
-    tracking_time_constant : float
-        [s]; 0 takes ``sqrt(d/i)``, or ``p/i`` without derivative action.
-    error_deadband : float
-        The integral rests while ``|r - y|`` is not above this.
-    setpoint_weight_p, setpoint_weight_d : float
-        Share of the reference that the proportional and the derivative action see.
-    derivative_filter_time_constant : float
-        [s]; 0 differentiates unfiltered.
-    feedforward_static : float
-        Output [V] that overcomes dry friction, in the direction of the reference.
-    feedforward_velocity : float
-        Output per unit of the reference.
-    feedforward_acceleration : float
-        Output per unit of the acceleration of the reference.
 
     Raises
     ------
@@ -68,21 +42,31 @@ class PidGains:
     d: float = described(0.0, "Derivative gain [V s^2/rad].")
     u_clamp_min: float = described(-math.inf, f"Lower {_CLAMP}")
     u_clamp_max: float = described(math.inf, f"Upper {_CLAMP}")
-    i_clamp_min: float = described(-math.inf, "Lower limit of the integral term [V].")
-    i_clamp_max: float = described(math.inf, "Upper limit of the integral term [V].")
-    antiwindup_strategy: str = described("none", f"{', '.join(STRATEGIES[:2])} or {STRATEGIES[2]}.")
+    i_clamp_min: float = described(
+        -math.inf, "Lower limit of the integral term [V], not above zero."
+    )
+    i_clamp_max: float = described(
+        math.inf, "Upper limit of the integral term [V], not below zero."
+    )
+    antiwindup_strategy: str = described(
+        "none",
+        "What the integral does while the output is clamped: none (it goes on), back_calculation "
+        "(it is driven back) or conditional_integration (it does not wind up further).",
+    )
     tracking_time_constant: float = described(
-        0.0, "Of back-calculation [s]; 0 for its default.", minimum=0.0
+        0.0, "Of back-calculation [s]; 0: sqrt(d/i), or p/i without derivative action.", minimum=0.0
     )
     error_deadband: float = described(
-        EPSILON, "Error within which the integral rests [rad/s].", minimum=0.0
+        EPSILON, "Error up to which the integral rests [rad/s].", minimum=0.0
     )
     setpoint_weight_p: float = described(1.0, "Share of the reference in the proportional term.")
     setpoint_weight_d: float = described(0.0, "Share of the reference in the derivative term.")
     derivative_filter_time_constant: float = described(
-        0.0, "Of the first-order filter [s]; 0 for none.", minimum=0.0
+        0.0, "Of the derivative's filter, of first order [s]; 0: unfiltered.", minimum=0.0
     )
-    feedforward_static: float = described(0.0, "Voltage against dry friction [V].", minimum=0.0)
+    feedforward_static: float = described(
+        0.0, "Voltage against dry friction, in the direction of the reference [V].", minimum=0.0
+    )
     feedforward_velocity: float = described(0.0, "Voltage per speed [V s/rad].")
     feedforward_acceleration: float = described(0.0, "Voltage per acceleration [V s^2/rad].")
 

@@ -9,7 +9,7 @@ from dataclasses import MISSING, dataclass, fields
 from typing import NamedTuple
 
 from smp_motor_control.errors import ParameterError
-from smp_motor_control.fields import described
+from smp_motor_control.fields import described, documented
 
 
 class SideSpeeds(NamedTuple):
@@ -20,22 +20,10 @@ class SideSpeeds(NamedTuple):
     right: float
 
 
+@documented
 @dataclass(frozen=True, kw_only=True)
 class SkidSteer:
     """Geometry of the body, and what its wheels can do.
-
-    Attributes
-    ----------
-    wheel_separation : float
-        Between the middles of left and right wheels [m].
-    wheel_radius : float
-        [m].
-    wheel_separation_multiplier : float
-        Above 1 for a body that skids: it turns less than its wheels would roll it.
-    left_wheel_radius_multiplier, right_wheel_radius_multiplier : float
-        Correction of the radius of a side.
-    max_wheel_speed : float
-        What every wheel reaches [rad/s].
 
     Raises
     ------
@@ -56,7 +44,7 @@ class SkidSteer:
     left_wheel_radius_multiplier: float = described(1.0, "Correction of the left radius.")
     right_wheel_radius_multiplier: float = described(1.0, "Correction of the right radius.")
     max_wheel_speed: float = described(
-        math.inf, "What every wheel reaches [rad/s]; commands beyond are scaled. 0: no limit.",
+        math.inf, "What every wheel reaches [rad/s]; commands beyond are scaled.",
         minimum=0.0, name="max_wheel_velocity", endless=True,
     )  # fmt: skip
 

@@ -39,7 +39,7 @@ class Reference(NamedTuple):
 
 
 def _limit(name: str, unit: str) -> Any:
-    text = f"Of the reference [{unit}]; 0 for none."
+    text = f"Of the reference [{unit}]."
     return described(math.inf, text, minimum=0.0, name=f"max_{name}", endless=True)
 
 
