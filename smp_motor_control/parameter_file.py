@@ -1,7 +1,7 @@
 """YAML files that people write: ROS parameters and mappings, bounded before anything walks them."""
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -70,13 +70,20 @@ def read_parameters(path: str | Path) -> dict[str, dict[str, Any]]:
     document = read_yaml(path)
     if not isinstance(document, Mapping) or not document:
         raise ParameterError(f"{path}: is no ROS parameter file: expected node names with values")
-    found = {}
-    for node, entry in document.items():
-        parameters = entry.get("ros__parameters") if isinstance(entry, Mapping) else None
-        if not isinstance(parameters, Mapping):
+    return dict(_nodes(document, "", path))
+
+
+def _nodes(level: Mapping[Any, Any], place: str, path: str | Path) -> Iterator[tuple[str, Any]]:
+    """Yield the nodes of a level; namespaces may be levels."""
+    for name, entry in level.items():
+        node = f"{place}/{str(name).strip('/')}"
+        inside = entry if isinstance(entry, Mapping) else {}
+        if isinstance(parameters := inside.get("ros__parameters"), Mapping):
+            yield node, flat(parameters)
+        elif inside and "ros__parameters" not in inside:
+            yield from _nodes(inside, node, path)
+        else:
             raise ParameterError(f"{path}: {node}: is no ROS parameter file: no ros__parameters")
-        found["/" + str(node).strip("/")] = flat(parameters)
-    return found
 
 
 def parameters_of(path: str | Path, node: str) -> dict[str, Any]:

@@ -15,7 +15,7 @@ import math
 import os
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from smp_motor_control.encoder import Encoder
 from smp_motor_control.errors import ParameterError, check_positive
 from smp_motor_control.motor.friction import Gearbox, MotorParameters
 from smp_motor_control.motor.parameters import COMBINATIONS, PHYSICAL
-from smp_motor_control.parameter_file import read_yaml
+from smp_motor_control.parameter_file import read_parameters
 
 HARDWARE = {
     "gear_ratio": 1.0,
@@ -33,9 +33,6 @@ HARDWARE = {
     "delay": 0.0,
 }
 """What may stand beside the motor's parameters, and what holds where it does not."""
-
-FAULTS = {"leads": 1, "encoder": 1, "dead_zone": 0.0, "described_gear_ratio": 0.0}
-"""What may be wrong with a motor that is simulated; see :class:`Wiring`."""
 
 _OPTIONAL = ("coulomb_friction", "time_constant_product", "static_voltage")
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*\Z")
@@ -58,6 +55,9 @@ class Wiring:
                 )
         for name in ("dead_zone", "described_gear_ratio"):
             check_positive(name, getattr(self, name), or_zero=True)
+
+
+FAULTS = tuple(field.name for field in fields(Wiring))
 
 
 @dataclass(frozen=True)
@@ -91,30 +91,19 @@ def paper_motors() -> Path:
 
 
 def load_motors(path: str | Path, wheels: Iterable[str] | None = None) -> dict[str, MotorEntry]:
-    """Read the motors of a ROS parameter file."""
-    motors = _find_motors(read_yaml(path), str(path))
-    return parse_motors(motors, str(path), wheels)
-
-
-def _find_motors(document: Any, source: str) -> Mapping[str, Any]:
-    """Return the ``motors`` of the first node in a parameter file that has them."""
-    pending = [document]
-    while pending:
-        level = pending.pop(0)
-        if not isinstance(level, Mapping):
-            continue
-        parameters = level.get("ros__parameters")
-        if isinstance(parameters, Mapping):
-            motors = parameters.get("motors")
-            dotted = {str(k)[7:]: v for k, v in parameters.items() if str(k).startswith("motors.")}
-            if dotted:
-                return nest(dotted)
-            if isinstance(motors, Mapping):
-                return motors
-        pending.extend(level.values())
+    """Read the motors of a ROS parameter file: those of the first node that has some."""
+    for parameters in read_parameters(path).values():
+        if motors := motors_among(parameters):
+            return parse_motors(motors, str(path), wheels)
     raise ParameterError(
-        f"{source}: has no motors; expected NODE: ros__parameters: motors: front_left: ..."
+        f"{path}: has no motors; expected NODE: ros__parameters: motors: front_left: ..."
     )
+
+
+def motors_among(parameters: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what the parameters of a node say of motors, by their names."""
+    start = "motors."
+    return nest({n.removeprefix(start): v for n, v in parameters.items() if n.startswith(start)})
 
 
 def nest(dotted: Mapping[str, Any]) -> dict[str, Any]:
@@ -156,37 +145,30 @@ def _entry(values: Any, where: str) -> MotorEntry:
     for key in values:
         if key not in known:
             raise ParameterError(f"{where}: unknown key {key!r}; known are {', '.join(known)}")
-    required = [n for n in names if n not in _OPTIONAL and not (combined and n == "resistance")]
-    for name in required:
-        if name not in values:
+    for name in names:
+        if name not in (*values, *_OPTIONAL) and not (combined and name == "resistance"):
             raise ParameterError(f"{where}: {name} is missing")
     numbers = {key: _number(value, f"{where}: {key}") for key, value in values.items()}
-    hardware = {key: numbers.pop(key, default) for key, default in HARDWARE.items()}
-    faults = {key: numbers.pop(key) for key in FAULTS if key in numbers}
     try:
-        if combined:
-            parameters = MotorParameters.from_combinations(**numbers)
-        else:
-            parameters = MotorParameters(**numbers)
-        entry = _with_hardware(parameters, numbers.get("resistance", math.nan), hardware)
-        return replace(entry, wiring=Wiring(**faults))  # type: ignore[arg-type]
+        return _motor(combined, numbers)
     except ParameterError as error:
         raise ParameterError(f"{where}: {error}") from None
 
 
-def _with_hardware(
-    parameters: MotorParameters, resistance: float, hardware: Mapping[str, float]
-) -> MotorEntry:
+def _motor(combined: bool, numbers: dict[str, float]) -> MotorEntry:
+    hardware = {key: numbers.pop(key, default) for key, default in HARDWARE.items()}
+    faults: dict[str, Any] = {key: numbers.pop(key) for key in FAULTS if key in numbers}
     check_positive("supply_voltage", hardware["supply_voltage"], "V")
     check_positive("delay", hardware["delay"], "s", or_zero=True)
     bits = hardware["encoder_bits"]
     return MotorEntry(
-        parameters=parameters,
+        parameters=(MotorParameters.from_combinations if combined else MotorParameters)(**numbers),
         gearbox=Gearbox(hardware["gear_ratio"]),
         encoder=Encoder(hardware["counts_per_revolution"], int(bits) if bits == int(bits) else -1),
         supply_voltage=hardware["supply_voltage"],
         delay=hardware["delay"],
-        resistance=resistance,
+        resistance=numbers.get("resistance", math.nan),
+        wiring=Wiring(**faults),
     )
 
 

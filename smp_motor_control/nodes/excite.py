@@ -18,7 +18,7 @@ from smp_interfaces.msg import MotorState
 from smp_motor_control import WHEELS
 from smp_motor_control.errors import ParameterError, SmpError
 from smp_motor_control.excitation import SIGNALS, Bounded, Excitation
-from smp_motor_control.fields import fields_for, fixed
+from smp_motor_control.fields import fixed
 from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.motor_writer import MotorWriter
 from smp_motor_control.nodes.settings import Parameters

@@ -24,7 +24,13 @@ from std_msgs.msg import Float64
 from smp_interfaces.msg import MotorDescription
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.fields import described, fixed, nested
-from smp_motor_control.motor.file import MotorEntry, load_motors, nest, paper_motors, parse_motors
+from smp_motor_control.motor.file import (
+    MotorEntry,
+    load_motors,
+    motors_among,
+    paper_motors,
+    parse_motors,
+)
 from smp_motor_control.motor.hardware import DrivenMotor, DriveSettings, Supply
 from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.motor_writer import MotorDriver
@@ -139,13 +145,13 @@ class MotorPlant(Node):
 
     def _motors(self, settings: Settings) -> dict[str, MotorEntry]:
         given = given_parameters(self)
-        motors = {k[len("motors.") :]: v for k, v in given.items() if k.startswith("motors.")}
+        motors = motors_among(given)
         if motors and settings.motors_file:
             raise ParameterError("give either motors_file or motors.<wheel>.<key>, not both")
         if motors:
-            for key, value in motors.items():
-                self.declare_parameter(f"motors.{key}", value, _FIXED, ignore_override=True)
-            return parse_motors(nest(motors), "parameters")
+            for name in (name for name in given if name.startswith("motors.")):
+                self.declare_parameter(name, given[name], _FIXED, ignore_override=True)
+            return parse_motors(motors, "parameters")
         return load_motors(settings.motors_file or paper_motors())
 
     def _change(self, settings: Settings) -> None:
