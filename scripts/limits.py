@@ -8,6 +8,7 @@ from smp_motor_ident.bag import limits as recordings
 from smp_motor_ident.diagnosis import limits as estimates
 from smp_motor_ident.diagnosis import response_limits as responses
 from smp_motor_ident.diagnosis import wheel_limits as wheels
+from smp_motor_ident.report import limits as fleets
 from smp_motor_ident.tune import limits as gains
 
 TABLES = {
@@ -16,6 +17,7 @@ TABLES = {
     "Response over frequency": responses,
     "Wheels on blocks": wheels,
     "Gains and loops": gains,
+    "Many robots": fleets,
 }
 
 

@@ -118,12 +118,6 @@ def settings_of(settings: type[S], values: Mapping[str, Any], prefix: str = "") 
     return settings(**given)
 
 
-def fields_for(kind: type, settings: Any) -> dict[str, Any]:
-    """Return the settings that are named as the fields of another dataclass."""
-    names = [field.name for field in dataclasses.fields(kind)]
-    return {n: getattr(settings, n) for n in names if hasattr(settings, n)}
-
-
 def check_limits(settings: Any) -> None:
     """Refuse a number beyond the limits that its description has."""
     for field, known in _known(settings):

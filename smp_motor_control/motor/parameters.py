@@ -139,11 +139,6 @@ class MotorParameters:
 class Gearbox:
     """The one place that converts between motor shaft and wheel.
 
-    Raises
-    ------
-    ParameterError
-        When the ratio is not a number from 1e-6 to 1e6.
-
     Examples
     --------
     >>> Gearbox(65.5).to_motor(2.0)

@@ -9,7 +9,7 @@ all, with exit code 1.
 import math
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 
 from rclpy.node import Node
@@ -80,7 +80,7 @@ class Settings:
     def signal_of(self, wheel: int) -> Excitation:
         """Return the bounded signal of the n-th wheel."""
         kind = SIGNALS[self.signal]
-        given = fields_for(kind, self)
+        given = {f.name: getattr(self, f.name) for f in fields(kind) if hasattr(self, f.name)}
         if not given.get("hold", 1.0):
             del given["hold"]
         if "seed" in given and self.independent:

@@ -31,16 +31,10 @@ _LOOKS = tuple(k / 32.0 for k in range(32))
 class Profile:
     """The reference of one wheel, led from target to target without a jump.
 
-    Parameters
-    ----------
-    limits : ProfileLimits
-        What the reference keeps to; targets beyond the velocity limit are clipped.
-    transition_time : float
-        Duration [s] of every change of the target along a minimum-jerk polynomial, stretched
-        where a limit asks for it; 0 takes the fastest transition within the limits.
-    drive : Drive or None
-        The motor and its voltage, where changes shall keep to that: one for which the voltage
-        does not do in ``transition_time`` is made as fast as the voltage allows.
+    Every change of the target takes ``transition_time`` [s] along a minimum-jerk polynomial,
+    stretched where a limit asks for it; 0 takes the fastest transition within the limits.  With a
+    ``drive``, a change for which its voltage does not do is made as fast as the voltage allows.
+    Targets beyond the limit of the velocity are clipped.
 
     Examples
     --------

@@ -57,14 +57,11 @@ def drifts(rows: Sequence[Row]) -> list[Mark]:
         value, std = np.array([r.values[name] for r in held]).T
         if len(held) < 3 or np.ptp(day) == 0 or not np.all(std > 0):
             continue
-        weight = 1 / std**2
-        middle = np.average(day, weights=weight)
-        moment = float(np.sum(weight * (day - middle) ** 2))
-        mean = float(np.average(value, weights=weight))
-        slope = float(np.sum(weight * (day - middle) * (value - mean))) / moment
-        rest = value - mean - slope * (day - middle)
-        scatter = max(1.0, float(np.sum(weight * rest**2)) / (len(held) - 2))
-        if abs(slope) > FLEET_DRIFT.value * math.sqrt(scatter / moment):
+        middle = np.average(day, weights=std**-2.0)  # there the line is at the mean
+        (slope, mean), stated = np.polyfit(day - middle, value, 1, w=1 / std, cov="unscaled")
+        rest = (value - mean - slope * (day - middle)) / std
+        scatter = max(1.0, float(np.sum(rest**2)) / (len(held) - 2))
+        if abs(slope) > FLEET_DRIFT.value * math.sqrt(scatter * stated[0, 0]):
             share = 100 * slope * 30 / mean
             text = f"{share:+.2g} % in 30 days, over {len(held)} recordings"
             marks.append(Mark("drift", robot, wheel, name, text))
