@@ -40,8 +40,6 @@ class LimitError(SmpError):
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """Parameters of the node."""
-
     signal: str = fixed("fourier", f"One of {', '.join(SIGNALS)}.")
     wheel_names: tuple[str, ...] = fixed(WHEELS, "Wheels of the robot.")
     wheels: tuple[str, ...] = fixed(("all",), "Wheels to excite, or all of wheel_names.")
@@ -74,7 +72,6 @@ class Settings:
         self.signal_of(0)
 
     def chosen(self) -> tuple[str, ...]:
-        """Return the wheels to excite."""
         return self.wheel_names if "all" in self.wheels else tuple(dict.fromkeys(self.wheels))
 
     def signal_of(self, wheel: int) -> Excitation:
@@ -89,8 +86,6 @@ class Settings:
 
 
 class Excite(Node):
-    """Sends the signal."""
-
     def __init__(self) -> None:
         super().__init__("excite")
         settings = Parameters(self, Settings).settings

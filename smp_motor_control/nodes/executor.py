@@ -86,12 +86,10 @@ class _WaitSet:
         waits.wait(timeout)
 
     def ready(self, kind: str) -> list[Any]:
-        """Return the entities of a kind that are ready."""
         find = self.by_pointer
         return [find[p] for p in self._waits.get_ready_entities(kind) if p in find]
 
     def ready_waitables(self) -> list[Any]:
-        """Return the waitables that are ready."""
         return [w for w in self.waitables if w.is_ready(self._waits)]
 
 
@@ -102,12 +100,7 @@ class Untouched(CallbackGroup):
         """Never."""
         return False
 
-    def beginning_execution(self, entity: Any) -> bool:
-        """Never."""
-        return False
-
-    def ending_execution(self, entity: Any) -> None:
-        """Nothing to end."""
+    beginning_execution = ending_execution = can_execute
 
 
 class LeanExecutor(SingleThreadedExecutor):
@@ -120,7 +113,6 @@ class LeanExecutor(SingleThreadedExecutor):
         self._plain: dict[Any, bool] = {}
 
     def entities(self) -> tuple[tuple[Any, ...], ...]:
-        """Return what to wait for."""
         nodes = self.get_nodes()
         kinds = ("subscriptions", "timers", "clients", "services", "guards", "waitables")
         return tuple(

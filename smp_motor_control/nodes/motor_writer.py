@@ -59,7 +59,6 @@ class MotorWriter:
         send_last(self.publisher, self._message)
 
     def destroy(self) -> None:
-        """Give the topics back."""
         self._node.destroy_publisher(self.publisher)
         self._node.destroy_subscription(self._owners)
 

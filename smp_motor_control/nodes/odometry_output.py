@@ -60,7 +60,6 @@ class OdometryOutput:
         self._transforms = TFMessage(transforms=[self._transform])
 
     def publish(self, odometry: Odometry, stamp: float) -> None:
-        """Publish pose and velocity."""
         message = self._odometry
         message.header.stamp = Time(nanoseconds=round(stamp * 1e9)).to_msg()
         pose, twist = message.pose, message.twist

@@ -107,7 +107,6 @@ class RobotClient:
         return True
 
     def spin(self, duration: float) -> None:
-        """Spin for so long [s]."""
         self.until(lambda: False, duration)
 
     @contextlib.contextmanager

@@ -263,7 +263,6 @@ class Diagnostics:
         self._node.destroy_publisher(self._publisher)
 
     def publish(self) -> None:
-        """Publish the present health now."""
         level, message, values = self._assess()
         clock = self._node.get_clock()
         if clock.ros_time_is_active and clock.now().nanoseconds == 0:

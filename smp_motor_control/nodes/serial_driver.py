@@ -49,8 +49,6 @@ RESET = 1.0
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """Parameters of the node."""
-
     device: str = fixed("/dev/ttyACM0", "Serial device of the board.")
     baud: int = fixed(115200, "Speed of the line [1/s].")
     wheel_names: tuple[str, ...] = fixed(WHEELS, "Wheels in the order of the board's motors.")

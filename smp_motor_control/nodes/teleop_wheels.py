@@ -84,7 +84,6 @@ class Terminal:
             return ""
 
     def write(self, text: str) -> None:
-        """Write at once."""
         with contextlib.suppress(OSError, ValueError):
             sys.stdout.write(text)
             sys.stdout.flush()
@@ -130,8 +129,6 @@ ZEROS_AFTER_RELEASE = 1.0
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """Parameters of the node."""
-
     speeds: Speeds = nested(Speeds())
     rate: float = fixed(20.0, "Commands per second [Hz].", minimum=5.0, maximum=100.0)
     use_stamped_vel: bool = fixed(True, "Publish TwistStamped (true) or Twist (false).")

@@ -27,15 +27,13 @@ from smp_motor_control.fields import fixed, nested
 from smp_motor_control.motor.parameters import Gearbox
 from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.motor_writer import MotorWriter
-from smp_motor_control.nodes.settings import Parameters, given_parameters
+from smp_motor_control.nodes.settings import Parameters
 from smp_motor_control.nodes.wheel_report import WheelReport, pid_state
 from smp_motor_control.wheel.controller import WheelController, WheelSettings
 
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """Parameters of the node."""
-
     joint_name: str = fixed("", "Joint to control; empty for <namespace>_wheel_joint.")
     autostart: bool = fixed(True, "Configure and activate without being asked to.")
     wheel: WheelSettings = nested(WheelSettings())
@@ -51,8 +49,6 @@ _DONE = TransitionCallbackReturn.SUCCESS
 
 
 class WheelPid(LifecycleNode):
-    """One wheel's controller."""
-
     def __init__(self) -> None:
         super().__init__("wheel_pid")
         runtime.refuse_impossible_transitions(self)
@@ -65,11 +61,6 @@ class WheelPid(LifecycleNode):
         if self._joint == joint_of(""):
             raise ParameterError(
                 "wheel_pid needs joint_name, or a wheel's namespace: -r __ns:=/front_left"
-            )
-        if not {"p", "i", "feedforward_velocity"} & given_parameters(self).keys():
-            self.get_logger().warning(
-                f"no gains were given: p is {settings.wheel.loop.gains.p:g} V s/rad, the rest 0; "
-                "start it with --params-file gains.yaml, which tune writes"
             )
         self._change(settings)
         self._entities: list[Any] = []

@@ -21,7 +21,10 @@ _LEVELS = {
 }
 
 
-UNTUNED = "p, i and d are the defaults, made for no motor: load a parameter file that tune wrote"
+UNTUNED = (
+    "no gains were given: p is 1 V s/rad, i and d are 0, made for no motor; start it with "
+    "--params-file gains.yaml, which tune writes"
+)
 
 
 def untuned(gains: PidGains) -> bool:
@@ -43,7 +46,6 @@ class WheelReport:
             self._log.warning(UNTUNED)
 
     def close(self) -> None:
-        """Fall silent."""
         self._diagnostics.destroy()
 
     def update(self) -> None:

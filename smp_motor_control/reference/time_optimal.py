@@ -63,7 +63,6 @@ class _Motor:
         self.tau, self.tp = tau, self.free.product
 
     def after(self, state: _State, u: float, t: float) -> _State:
-        """Return the state after a time."""
         w, a = state
         off = w - u
         g, h, g_rate, h_rate = self.free.after(t)

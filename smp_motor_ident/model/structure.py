@@ -91,7 +91,6 @@ class Structure(ABC):
         """Return the coordinates of the response."""
 
     def _added(self) -> Iterator[str]:
-        """Return the coordinates of what is added."""
         yield from {"none": (), "symmetric": ("vc_plus",)}.get(
             self.friction, ("vc_plus", "vc_minus")
         )

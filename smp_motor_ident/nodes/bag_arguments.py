@@ -31,7 +31,6 @@ class Choice:
     hidden: bool = False
 
     def wants(self, topic: str) -> bool:
-        """Return whether the topic is to be recorded."""
         if not self.hidden and any(part.startswith("_") for part in topic.split("/")):
             return topic in self.names
         if self.exclude and self.exclude.fullmatch(topic):
@@ -42,7 +41,6 @@ class Choice:
 
 
 def chosen(arguments: argparse.Namespace, hidden: bool) -> Choice:
-    """Return what the arguments ask for."""
     wanted = _pattern("--regex", arguments.regex)
     unwanted = _pattern("--exclude", arguments.exclude)
     return Choice(frozenset(arguments.topics), wanted, unwanted, hidden)

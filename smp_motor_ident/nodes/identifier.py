@@ -54,8 +54,6 @@ MINUTE = 60.0
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """Parameters of the node."""
-
     wheels: tuple[str, ...] = fixed(WHEELS, "Wheels to identify.")
     window: float = fixed(60.0, "How much of the past is used [s].", minimum=2.0, maximum=600.0)
     period: float = fixed(5.0, "Least interval between two estimates of a wheel [s].", minimum=0.5)
@@ -144,7 +142,6 @@ class Wheel:
         self.window.hardware = read.described(message)
 
     def tell(self, status: str, found: Estimate | None = None) -> None:
-        """Publish an answer."""
         self.status = status
         message = MotorParameters(joint_name=self.joint_name, status=status)
         message.header.stamp = self.stamp

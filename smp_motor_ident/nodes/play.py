@@ -172,7 +172,6 @@ class Player(Node):
 
 
 def parser() -> argparse.ArgumentParser:
-    """Return the parser of the command line."""
     made = argparse.ArgumentParser(
         prog="play",
         description="Publish the messages of a bag (MCAP or SQLite) again, as they were.",
@@ -202,7 +201,6 @@ def _check(arguments: argparse.Namespace) -> None:
 
 
 def _chosen(replay: Replay, arguments: argparse.Namespace) -> list[Channel]:
-    """Return the channels that the arguments ask for."""
     choice = chosen(arguments, hidden=True)
     names = {name if name.startswith("/") else f"/{name}" for name in choice.names}
     there = {channel.topic for channel in replay.channels}
@@ -218,7 +216,6 @@ def _chosen(replay: Replay, arguments: argparse.Namespace) -> list[Channel]:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the player."""
     own, ros = split_arguments(sys.argv[1:] if argv is None else argv)
     arguments = parser().parse_args(own)
 

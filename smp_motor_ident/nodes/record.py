@@ -33,8 +33,6 @@ DEPTH = 2000
 
 @dataclass
 class Topic:
-    """One topic that is recorded."""
-
     type: str
     subscription: Subscription
     publishers: int
@@ -180,7 +178,6 @@ class Recorder(Node):
 
 
 def parser() -> argparse.ArgumentParser:
-    """Return the parser of the command line."""
     made = argparse.ArgumentParser(
         prog="record",
         description="Record topics into a bag (MCAP, readable by ros2 bag). Ctrl-C ends it; "
@@ -211,7 +208,6 @@ def _make_room(path: Path, force: bool) -> None:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the recorder."""
     own, ros = split_arguments(sys.argv[1:] if argv is None else argv)
     arguments = parser().parse_args(own)
     output = Path(arguments.output or f"rosbag2_{datetime.now():%Y_%m_%d-%H_%M_%S}")

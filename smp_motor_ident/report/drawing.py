@@ -78,15 +78,12 @@ class _Plane:
         self._y_range = _range(values, "y" in chart.log, 0.05)
 
     def x(self, values: Array) -> Array:
-        """Return horizontal places."""
         return _place(values, self._x_range, "x" in self.chart.log, LEFT, WIDTH - RIGHT)
 
     def y(self, values: Array) -> Array:
-        """Return vertical places."""
         return _place(values, self._y_range, "y" in self.chart.log, self.bottom, TOP)
 
     def axes(self) -> list[str]:
-        """Return grid, numbers and labels."""
         parts = []
         for tick in ticks(*self._x_range, "x" in self.chart.log):
             x = self.x(np.array([tick]))[0]
@@ -103,7 +100,6 @@ class _Plane:
         return parts
 
     def curve(self, curve: Curve) -> list[str]:
-        """Return one curve with its band."""
         parts = []
         if curve.low is not None and curve.high is not None:
             ok = np.isfinite(curve.low) & np.isfinite(curve.high)
