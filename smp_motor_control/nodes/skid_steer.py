@@ -127,16 +127,12 @@ class SkidSteerNode(Node):
 
     def _on_command(self, twist: Twist, age: float | None) -> None:
         verdict = self._command.receive(twist.linear.x, twist.angular.z, age, time.monotonic())
-        if verdict in (Verdict.STALE, Verdict.NOT_FINITE):
-            self._refused, self._refused_at = verdict.value, time.monotonic()
         if verdict is Verdict.ZERO_STAMP:
             self.get_logger().warning(f"cmd_vel {verdict.value}", once=True)
-        elif verdict is Verdict.STALE:
-            self.get_logger().warning(
-                f"cmd_vel {verdict.value} ({age:.3f} s)", throttle_duration_sec=1.0
-            )
-        elif verdict is Verdict.NOT_FINITE:
-            self.get_logger().warning(f"cmd_vel {verdict.value}", throttle_duration_sec=1.0)
+        elif verdict is not Verdict.ACCEPTED:
+            self._refused, self._refused_at = verdict.value, time.monotonic()
+            old = f" ({age:.3f} s)" if verdict is Verdict.STALE else ""
+            self.get_logger().warning(f"cmd_vel {verdict.value}{old}", throttle_duration_sec=1.0)
 
     def _on_state(self, wheel: str, message: MotorState) -> None:
         sample = WheelSample(
@@ -195,7 +191,9 @@ class SkidSteerNode(Node):
         corrected = self._hold_heading(linear, angular, dt, now)
         left, right = self._robot.reachable_wheel_speeds(linear, corrected)
         self._share = share
-        self._set_wheels(left, right)
+        self._setpoint.header.stamp = self.get_clock().now().to_msg()
+        self._setpoint.velocity = [left] * len(self._left) + [right] * len(self._right)
+        self._setpoints.publish(self._setpoint)
 
     def _hold_heading(self, linear: float, angular: float, dt: float, now: float) -> float:
         settings = self._current.settings
@@ -204,11 +202,6 @@ class SkidSteerNode(Node):
             self._hold.reset()
             return angular
         return self._hold.step(angular, self._yaw, dt)
-
-    def _set_wheels(self, left: float, right: float) -> None:
-        self._setpoint.header.stamp = self.get_clock().now().to_msg()
-        self._setpoint.velocity = [left] * len(self._left) + [right] * len(self._right)
-        self._setpoints.publish(self._setpoint)
 
     def _assess(self) -> tuple[bytes, str, dict[str, object]]:
         settings, now = self._current.settings, time.monotonic()
