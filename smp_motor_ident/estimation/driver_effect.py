@@ -97,8 +97,9 @@ def leaves_torque_noise(estimate: Estimate, fit: Fit) -> bool:
 
     That would stand for what the driver does not explain.
     """
-    noise = [f for f in estimate.findings if f.code == "torque_noise"]
-    return any(f.evidence["intensity"] > HALF_EXPLAINED.value * fit.noise_ratio for f in noise)
+    intensity = [f.evidence["intensity"] for f in estimate.findings if f.code == "torque_noise"]
+    most = HALF_EXPLAINED.value * fit.noise_ratio
+    return any(isinstance(left, float) and left > most for left in intensity)
 
 
 def declared(

@@ -204,10 +204,11 @@ class _Problem:
             if name == "ln_a2":  # a shorter second lag shows in nothing, and friction chatters
                 low[j] = self.unpacked(p)[0].ln_a1 + np.log(SHORTEST_LAG * self.data.step)
         inside = np.nextafter(low, high), np.nextafter(high, low)
-        found: optimize.OptimizeResult = optimize.least_squares(  # type: ignore[operator]
-            self._misses, np.clip(p, *inside), self._slopes, (low, high),
-            x_scale="jac", max_nfev=steps,
-        )  # fmt: skip
+        with np.errstate(all="ignore"):  # what runs away has a cost that says so
+            found: optimize.OptimizeResult = optimize.least_squares(  # type: ignore[operator]
+                self._misses, np.clip(p, *inside), self._slopes, (low, high),
+                x_scale="jac", max_nfev=steps,
+            )  # fmt: skip
         return found
 
     def joint(self, found: optimize.OptimizeResult, options: Options) -> Joint | None:

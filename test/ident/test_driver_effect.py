@@ -9,9 +9,10 @@ import pytest
 from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.estimation import fast_decay
-from smp_motor_ident.estimation.driver_effect import driver_of
+from smp_motor_ident.estimation.driver_effect import driver_of, leaves_torque_noise
 from smp_motor_ident.estimation.driver_search import _measured
 from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.model import driver
 from smp_motor_ident.model.coordinates import Coordinates
@@ -91,6 +92,27 @@ def test_motor_and_driver_are_both_found(name):
     errors = np.array(errors)
     assert np.abs(errors).max() < 4.0
     assert 0.4 < np.sqrt(np.square(errors).mean()) < 1.6  # neither too narrow nor too wide
+
+
+def test_a_clip_just_below_the_largest_command_is_found():
+    command = commands(0)
+    limit = 0.97 * np.abs(command).max()
+    time = np.arange(command.size) * STEP
+    speed = run(np.clip(command, -limit, limit), 0)
+    found = estimate(Record("motor", time, command, velocity=speed))
+    clip, gain = (found.combinations[n] for n in ("clip_voltage", "dc_gain"))
+    assert abs(clip.value - limit) < 4 * clip.std < 0.02 * limit
+    assert abs(gain.value - GAIN) < 4 * gain.std
+
+
+@pytest.mark.parametrize(
+    "before, behind, leaves", [(100.0, 10.0, False), (100.0, 90.0, True), (0.0, 1.0, True)]
+)
+def test_what_leaves_most_of_the_torque_noise_is_no_driver(before, behind, leaves):
+    noise = Finding("torque_noise", "warning", "", {"intensity": behind})
+    found, fit = SimpleNamespace(findings=(noise,)), SimpleNamespace(noise_ratio=before)
+    assert leaves_torque_noise(found, fit) is leaves
+    assert not leaves_torque_noise(SimpleNamespace(findings=()), fit)
 
 
 def test_the_motion_of_each_record_is_its_own():

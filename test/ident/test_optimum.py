@@ -149,6 +149,14 @@ def test_a_column_of_which_only_rounding_is_left_counts_as_unknown():
     assert np.all(np.isfinite(step))
 
 
+def test_what_shows_in_nothing_holds_no_step_back():
+    normal, wanted = np.diag([4.0, 1e-8]), np.array([0.5, 1000.0])
+    step, _ = damped_step(normal, normal @ wanted, 1e-9, np.eye(12, 2), np.zeros(12),
+                          np.full(12, -np.inf), np.full(12, np.inf))  # fmt: skip
+    assert step[0] == pytest.approx(0.5)
+    assert 1.0 < step[1] < 10.0  # of e-folds
+
+
 def test_a_singular_system_is_solved_without_what_it_does_not_tell():
     a, b = np.ones((2, 2)), np.ones((2, 1))
     cholesky_solve(a, b)
