@@ -244,7 +244,7 @@ class _Profile:
     def _polished(self, x: float, most: float) -> DriverFit | None:
         """Go on to the bottom by parabolas through three deviances, whose curvature is its std.
 
-        None where a parabola's bottom is beyond a deviance.
+        None where a parabola's bottom is beyond a deviance, or the size cannot be.
         """
         away = NEAR
         for _ in range(PARABOLAS):
@@ -264,8 +264,10 @@ class _Profile:
             x += float(np.clip(move, -2 * away, 2 * away))
             away = min(max(std, 0.1 * NEAR), 1.0)
         self.size, size = x, float(np.exp(x))
-        full_duty = rows_of(self.data, self.group, fit).full_duty
-        self.driver = Driver(self.effect.kind, size, full_duty)
+        rows = rows_of(self.data, self.group, fit)
+        if not self.effect.may_be(size, rows):
+            return None
+        self.driver = Driver(self.effect.kind, size, rows.full_duty)
         self.beside = self.at(size * float(np.exp(std)))[2]
         return DriverFit(self.effect, self.driver, size * std, self.group, records, self, fit)
 

@@ -156,6 +156,10 @@ class DriverEffect:
             return rows.top / rows.time_constant
         return 1.0 if self.kind in (SAG, COAST) else rows.top
 
+    def may_be(self, size: float, rows: Rows) -> bool:
+        """Tell whether there is anything of it, and anything left of the command."""
+        return self.kind not in (DEAD_ZONE, CLIP, DROP) or size < rows.top
+
     @property
     def numbers(self) -> int:
         """How many numbers describe it: the size, and of one that coasts the back-EMF's share."""

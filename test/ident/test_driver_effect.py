@@ -105,6 +105,14 @@ def test_a_clip_just_below_the_largest_command_is_found():
     assert abs(gain.value - GAIN) < 4 * gain.std
 
 
+def test_an_effect_in_volts_is_smaller_than_the_command():
+    rows = driver.Rows(np.array([-6.0, 4.0]), np.zeros(2), np.ones(2), np.zeros(2, bool), 0.1)
+    for effect in driver.EFFECTS:
+        volts = effect.quantity in ("dead_zone", "clip_voltage", "brush_drop")
+        assert effect.may_be(5.9, rows)
+        assert effect.may_be(6.1, rows) is not volts
+
+
 @pytest.mark.parametrize(
     "before, behind, leaves", [(100.0, 10.0, False), (100.0, 90.0, True), (0.0, 1.0, True)]
 )
