@@ -2,35 +2,53 @@
 
 import re
 
-WORDS_OF_VOLTS = r"volt|spannung|tension|napi[eę]cie|напряж|电压|電圧"
+WORDS_OF_VOLTS = (
+    r"volt|spannung|spanning|sp[äæ]nning|(?<!in)tens(?:i[oóu]|[ãa]o)|napi[eę]cie|nap[eěaä]t[ií]"
+    r"|gerilim|feszülts|напряж|电压|電圧|전압"
+)
 ROLES = {
     # What a field or its topic is called, the most telling first.
     "direction": r"(?:^|\W|_)dir(?:ection)?(?:$|\W|_)|richtung|sentido|direcci",
     "voltage": WORDS_OF_VOLTS + r"|pwm|duty|throttle|entrada|eingang|^in$"
-    r"|(?:^|\W|_)(?:cmd|command|effort|u|input)(?:$|\W|_)",
-    "current": r"current|strom|courant|corriente|corrente|(?:^|\W)ток|电流|電流"
-    r"|amp(?:s|ere)?(?:$|\W|_)",
+    r"|(?:^|\W|_)(?:cmd|command|effort|u|input|v_?in)(?:$|\W|_)",
+    "current": r"current|strom|courant|corriente|corrente|curent|intensi[dt]|proud|akım|(?:^|\W)ток"
+    r"|电流|電流|전류|amp(?:s|ere)?(?:$|\W|_)",
     "count": r"tick|count|encoder|impuls|(?:^|\W|_)enc(?:$|\W|_)",
-    "velocity": r"rpm|velo(?:$|\W|_|[cz]i)|speed|omega|drehzahl|geschwindigkeit|vitesse"
-    r"|pr[eę]dko|скорост|速度|(?:^|\W|_)(?:vel|w|y)(?:$|\W|_)",
-    "position": r"position|posici|posizi|angle|winkel|theta|угол|角度|(?:^|\W|_)pos(?:$|\W|_)",
+    "velocity": r"rpm|velo(?:$|\W|_|[cz]i)|speed|omega|drehzahl|geschwindigkeit|vitesse|vitez"
+    r"|pr[eę]dko|obroty|rychlos|ot[aá][cč]k|snelheid|toerental|hastighe[dt]|varvtal|hız|sebess"
+    r"|fordulat|скорост|速度|속도|(?:^|\W|_)(?:vel|w|y|tach|tacho|taco|output_data)(?:$|\W|_|met|g[eé]n)",
+    "position": r"position|posici|posizi|posi[cç]|angle|winkel|theta|konum|угол|角度|각도"
+    r"|(?:^|\W|_)(?:pos|pot|pote)(?:$|\W|_|nt|nci)",
 }
 MOTIONS = ("velocity", "position", "count")
-NO_VOLTAGE = r"twist|cmd_vel|linear|angular|batter|supply|vbat|vin(?:$|\W|_)"
+NO_VOLTAGE = r"twist|cmd_vel|linear|angular|batter|supply|vbat"
+MAY_BE_SUPPLY = r"(?:^|\W|_)v_?in(?:$|\W|_)"
 NO_MOTION = r"set_?point|target|desired|reference|soll|cmd|command|[\W_]m?v$"
 _HINTS = {
     "velocity": ((r"rpm|drehzahl", ":rpm"), (r"deg", ":deg/s")),
     "position": ((r"deg", ":deg"),),
     "voltage": ((r"duty", ":duty"), (r"pwm|throttle", ":pwm")),
 }
-_SIDES = ("front", "rear", "back", "left", "right", "fl", "fr", "rl", "rr", "bl", "br")
+_SIDES = (
+    *("front", "rear", "back", "left", "right", "fl", "fr", "rl", "rr", "bl", "br"),
+    *("links", "rechts", "gauche", "droite", "izquierda", "derecha", "izquierdo", "derecho"),
+    *("izq", "esquerda", "direita", "esquerdo", "direito", "sinistra", "destra"),
+)
+_LETTER = re.compile(r"(.*?)[\W_]*([abclrABCLR]|\d)(?:[\W_]*[\[(].*)?")
+"""A name that ends in the letter or digit of one motor of several, but for a unit behind it."""
+_LETTERS = {"l": "left", "r": "right"}
+
+
+def worded(name: str) -> str:
+    """Return a name whose words are apart: ``velLeft`` is ``vel_Left``, ``u2`` is ``u_2``."""
+    return re.sub(r"(?<=[a-z\d])(?=[A-Z])|(?<=[A-Za-z])(?=\d+$)", "_", name)
 
 
 def role_of(topic: str, path: str) -> str:
-    """Return what a field is by its own name, or else by its topic's."""
-    for text in (path.partition("[")[0], topic):
+    """Return what a field is by its own name, or else by what it is a part of, or its topic."""
+    for text in (*reversed(re.sub(r"\[[^\]]*\]", "", path).split(".")), topic):
         for role, pattern in ROLES.items():
-            if re.search(pattern, text, re.IGNORECASE):
+            if re.search(pattern, worded(text), re.IGNORECASE):
                 return role
     return ""
 
@@ -43,5 +61,21 @@ def hint_of(role: str, source: str) -> str:
 
 def wheel_of(source: str) -> str:
     """Return the side of the robot that a name tells."""
-    words = re.split(r"[^a-z]+", source.lower())
+    words = re.split(r"[^a-z]+", worded(source).lower())
     return "_".join(side for side in _SIDES if side in words)
+
+
+def motor_of(name: str) -> str:
+    """Return the motor whose letter or digit a signal's name ends in: ``velL``, ``pwm_2``."""
+    match = _LETTER.fullmatch(name)
+    if match is None or not role_of("", match[1]):
+        return ""
+    letter = match[2].lower()
+    return _LETTERS.get(letter, f"motor_{letter}")
+
+
+def is_barred(role: str, text: str) -> bool:
+    """Return whether a type, a topic or a name says that a field is none of its role."""
+    if role in ("current", "direction"):
+        return False
+    return re.search(NO_VOLTAGE if role == "voltage" else NO_MOTION, text, re.I) is not None

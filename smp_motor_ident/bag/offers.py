@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from smp_motor_ident.bag.source import Recording
+from smp_motor_ident.bag.storage import Channel
 from smp_motor_ident.bag.template import DecodeError, Number, names_beside, take_apart
 from smp_motor_ident.bag.types import Types
 from smp_motor_ident.bag.unpack import decompress_messages
@@ -20,12 +21,13 @@ _LISTED = 12
 
 @dataclass
 class Offer:
-    """One topic, or the columns of a table."""
+    """One topic, or the columns of a table that have one length."""
 
     # topic, type: empty for the only table of a file
     topic: str
     type: str
-    count: int = 0  # messages that can be read; rows of a table are not counted (0)
+    # Messages that can be read; rows of a table where its columns differ in length, else 0
+    count: int = 0
     rate: float = 0.0  # [Hz], mean over the recording; 0 for less than two messages
     fields: list[str] = field(default_factory=list)  # paths of its numbers, as a mapping takes them
     remark: str = ""  # why its fields are unknown
@@ -52,8 +54,9 @@ def offers_of(recording: Recording, types: Types) -> list[Offer]:
     """Return the topics of a recording with their fields, by its first messages."""
     if recording.is_table:
         return [
-            Offer(c.topic, c.type, fields=list(c.fields), table=True, units=c.units)
+            Offer(c.topic, c.type, count, fields=fields, table=True, units=c.units)
             for c in recording.channels()
+            for count, fields in _by_length(c)
         ]
     found: dict[str, Offer] = {}
     spans: dict[str, tuple[int, int]] = {}
@@ -73,6 +76,16 @@ def offers_of(recording: Recording, types: Types) -> list[Offer]:
         if last > first:
             found[topic].rate = (found[topic].count - 1) / ((last - first) * 1e-9)
     return [found[topic] for topic in sorted(found)]
+
+
+def _by_length(channel: Channel) -> list[tuple[int, list[str]]]:
+    """Return the columns of a table by their length, the longest first; 0 where all have one."""
+    if not channel.lengths:
+        return [(0, list(channel.fields))]
+    groups: dict[int, list[str]] = {}
+    for name, length in zip(channel.fields, channel.lengths):
+        groups.setdefault(length, []).append(name)
+    return sorted(groups.items(), reverse=True)
 
 
 def _fields(types: Types, batch: Any) -> tuple[list[str], str]:

@@ -19,20 +19,22 @@ from smp_motor_ident.bag.decode import collect
 from smp_motor_ident.bag.drives import LAGS, clock_of, follows, unexplained
 from smp_motor_ident.bag.mapping import DEFAULT_MOTOR, SignalMap, parse
 from smp_motor_ident.bag.names import (
+    MAY_BE_SUPPLY,
     MOTIONS,
-    NO_MOTION,
-    NO_VOLTAGE,
     WORDS_OF_VOLTS,
     hint_of,
+    is_barred,
+    motor_of,
     role_of,
     wheel_of,
+    worded,
 )
 from smp_motor_ident.bag.offers import Listing, Offer, offers_of
 from smp_motor_ident.bag.read import STATE, one_line, read_recording
 from smp_motor_ident.bag.runs import runs
 from smp_motor_ident.bag.source import Recording, recordings
 from smp_motor_ident.bag.storage import found
-from smp_motor_ident.bag.tables import EPOCHS, TIME_NAMES, self_described
+from smp_motor_ident.bag.tables import EPOCHS, TIME_NAMES, is_time_of_part, self_described
 from smp_motor_ident.bag.types import Types
 from smp_motor_ident.bag.units import of_the_rim, unit_of
 from smp_motor_ident.errors import BagError
@@ -112,6 +114,13 @@ def propose(recording: Recording, offers: list[Offer], types: Types) -> Proposal
     """Return what the file says itself, or a mapping by names that the data confirm if they can."""
     if own := _of_the_file(recording):
         return own
+    apart = [[offer] for offer in offers] if any(o.table and o.count for o in offers) else [offers]
+    proposals = [_of_names_and_data(recording, group, types) for group in apart]
+    return next((p for p in proposals if p.items), proposals[0])
+
+
+def _of_names_and_data(recording: Recording, offers: list[Offer], types: Types) -> Proposal:
+    """Return what names and data tell of fields that belong together."""
     time = _time(offers)
     every = list(_candidates(recording, offers, types, time))
     alone = recording.is_table and len(offers) == 1
@@ -135,7 +144,7 @@ def propose(recording: Recording, offers: list[Offer], types: Types) -> Proposal
 def _by_names(every: Sequence[_Candidate]) -> tuple[list[tuple[str, list[_Candidate]]], list[str]]:
     """Return by wheel what is called a voltage and a motion, and what no data could confirm."""
     wheels: dict[str, list[_Candidate]] = {}
-    for candidate in every:
+    for candidate in _of_motors(every):
         wheels.setdefault(candidate.wheel, []).append(candidate)
     shared = [c for c in wheels.get("", []) if c.role == "voltage"]
     found_by_wheel, remarks = [], []
@@ -157,6 +166,26 @@ def _by_names(every: Sequence[_Candidate]) -> tuple[list[tuple[str, list[_Candid
             current = [c for c in fields if c.role == "current"][:1]
             found_by_wheel.append((f"{wheel}." if wheel else "", [*chosen, *used, *current]))
     return found_by_wheel, remarks
+
+
+def _of_motors(every: Sequence[_Candidate]) -> list[_Candidate]:
+    """Return fields with the motor or the run that their names tell apart.
+
+    What a name ends in tells motors (``velL``), what a field is a part of runs (``run_2.u``).
+    """
+    for tell in (motor_of, _whole_of):
+        named = [c if c.wheel else replace(c, wheel=tell(c.path)) for c in every]
+        driven = {c.wheel for c in named if c.role == "voltage"}
+        moved = {c.wheel for c in named if c.role in MOTIONS and c.wheel}
+        apart = moved if "" in driven else moved & driven
+        if len(apart) > 1:
+            return [mine if mine.wheel in apart else c for mine, c in zip(named, every)]
+    return list(every)
+
+
+def _whole_of(path: str) -> str:
+    whole, dot, _ = path.partition(".")
+    return whole if dot and whole.isidentifier() else ""
 
 
 def _directed(voltage: _Candidate, way: _Candidate) -> _Candidate:
@@ -182,11 +211,16 @@ def _by_data(every: list[_Candidate]) -> list[_Candidate]:
     best, pair = 0.0, []
     for u, y in product(voltages, motions) if unnamed else ():
         share, summed = (0.0, False) if u is y else follows(u.value[:_MOST], y.value[:_MOST])
-        if share > best:
+        if share > best and _explains(u.value[:_MOST], y.value[:_MOST], summed=summed):
             way = "count" if np.array_equal(y.value, np.rint(y.value)) else "position"
             way = y.role or (way if summed else "velocity")
             best, pair = share, [replace(u, role="voltage"), replace(y, role=way)]
     return pair
+
+
+def _explains(u: Array, y: Array, *, summed: bool) -> bool:
+    """Return whether a signal explains another, or its increments, more than chance lets it."""
+    return unexplained(u, np.diff(y, prepend=y[:1]) if summed else y) is not None
 
 
 def _asked(chosen: list[_Candidate], time: _Candidate | None, table: bool) -> dict[str, str]:
@@ -288,12 +322,10 @@ def _candidates(
     named: list[tuple[str, Offer, str]] = []
     for offer in offers:
         for path in offer.fields:
-            if time is not None and path == time.path:
+            if (time is not None and path == time.path) or is_time_of_part(path):
                 continue
-            role, text = role_of(offer.topic, path), f"{offer.type} {offer.topic} {path}"
-            barred = NO_VOLTAGE if role == "voltage" else NO_MOTION
-            barred = "^$" if role in ("current", "direction") else barred
-            if (role or offer.table) and not re.search(barred, text, re.IGNORECASE):
+            role = role_of(offer.topic, path)
+            if (role or offer.table) and not is_barred(role, f"{offer.type} {offer.topic} {path}"):
                 named.append((role, offer, path))
     wanted: dict[str, list[str]] = {}
     for _, offer, path in named:
@@ -315,9 +347,24 @@ def _candidates(
         there = table.present.get(path)
         kept = np.isfinite(value) & (True if there is None else there)
         wheel = wheel_of(f"{offer.topic}.{path}")
-        if role == "count" and not np.array_equal(value[kept], np.rint(value[kept])):
-            role = "position"
-        yield _Candidate(role, wheel, offer, path, at.astype(np.float64)[kept], value[kept])
+        if not (role == "voltage" and _is_supply(path, value[kept])):
+            role = _counted(role, value[kept])
+            yield _Candidate(role, wheel, offer, path, at.astype(np.float64)[kept], value[kept])
+
+
+def _counted(role: str, value: Array) -> str:
+    """Return the role of a field that its name may call a count: only whole numbers are one."""
+    return "position" if role == "count" and not np.array_equal(value, np.rint(value)) else role
+
+
+def _is_supply(name: str, value: Array) -> bool:
+    """Return whether a voltage may be the supply's by its name, and never falls to half of it."""
+    size = np.abs(value)
+    return bool(
+        re.search(MAY_BE_SUPPLY, worded(name), re.IGNORECASE)
+        and size.size
+        and 0 < size.max() < 2 * size.min()
+    )
 
 
 def _explained(voltages: list[_Candidate], motions: list[_Candidate]) -> list[_Candidate]:

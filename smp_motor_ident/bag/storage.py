@@ -44,6 +44,8 @@ class Channel:
     """Names of the columns of a table."""
     units: Mapping[str, str] = field(default_factory=dict, hash=False)
     """What the file says of its columns' units."""
+    lengths: tuple[int, ...] = ()
+    """How many values each column of a table has, where they differ."""
 
 
 @dataclass(frozen=True, eq=False)

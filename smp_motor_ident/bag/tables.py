@@ -18,7 +18,8 @@ from smp_motor_ident.errors import BagError
 
 TIME_NAMES = (
     r"time|stamp|^t(?:[\W_]*(?:s|sec|ms|us|µs|ns))?[\W_]*$|^(?:ms|us|sec(?:onds)?)$|millis|micros|zeit"
-    r"|temps|tiempo|tempo|(?:^|\W|_)tid(?:$|\W|_)|czas|čas|время|时间|時間"
+    r"|temps|tiempo|tempo|(?:^|\W|_)tid(?:$|\W|_)|czas|čas|zaman|aika|(?:^|\W|_)(?:timp|idő|tijd)"
+    r"|время|时间|時間|시간"
 )
 """What a column of time is called, in the languages of those who log motors."""
 
@@ -27,6 +28,12 @@ EPOCHS = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
 
 _MOTIONS = ("velocity", "position", "count")
 _WHEELS = ((DEFAULT_MOTOR, ""), ("left", "left_"), ("right", "right_"))
+
+
+def is_time_of_part(path: str) -> bool:
+    """Return whether a field is the time of a part of a structure: ``speed.time``."""
+    whole, _, last = path.rpartition(".")
+    return bool(whole and re.search(TIME_NAMES, last, re.IGNORECASE))
 
 
 def resolved(plan: MotorMap, channels: list[Channel]) -> MotorMap:

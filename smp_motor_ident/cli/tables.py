@@ -61,6 +61,12 @@ def estimate_table(estimate: Estimate) -> Table:
     return made
 
 
+_UNTOLD = (
+    "where one of the above is, say which: --map voltage=… velocity=… (or position=…, count=…); "
+    "without a voltage or a command no motor can be told; see docs/mapping.md"
+)
+
+
 def list_topics(paths: Sequence[str], msg_files: Sequence[str], program: str) -> int:
     """Print what recordings offer, and a mapping that may fit."""
     out = console()
@@ -83,7 +89,7 @@ def list_topics(paths: Sequence[str], msg_files: Sequence[str], program: str) ->
             if listing.remark:
                 out.print(f"  note: {listing.remark}", soft_wrap=True)
         else:
-            out.print(f"{listing.remark}; see docs/mapping.md", soft_wrap=True)
+            out.print(f"{listing.remark}; {_UNTOLD}", soft_wrap=True)
     return 0
 
 
@@ -92,6 +98,8 @@ def _print_offer(out: Console, offer: bag.Offer) -> None:
     if len(offer.fields) > MOST_FIELDS:
         fields += f", ... ({len(offer.fields)} fields)"
     indent = ""
+    if offer.table and offer.count:
+        fields = f"of {offer.count} rows: {fields}"
     if offer.topic:  # a CSV file has none
         rate = f", {offer.rate:.4g} Hz" if offer.rate else ""
         out.print(f"  {offer.topic}  {offer.type}  {offer.count} messages{rate}", soft_wrap=True)

@@ -56,10 +56,11 @@ class _CsvFile(Tables):
         if above and not self._grid.named:
             self._grid = grid.head([*above, *rows[self._grid.first :]], str(path))
         self.problems += self._grid.findings
+        self._numeric = grid.numeric(self._grid.names, rows[self._grid.first :])
 
     def channels(self) -> list[Channel]:
-        """Return the one table."""
-        return [Channel(0, "", "", TABLE, fields=tuple(self._grid.names), units=self._grid.units)]
+        """Return the one table, without its columns of words."""
+        return [Channel(0, "", "", TABLE, fields=self._numeric, units=self._grid.units)]
 
     def table(self, topic: str, fields: Sequence[str]) -> Table:
         """Return columns; cells that are empty are NaN."""

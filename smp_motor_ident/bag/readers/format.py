@@ -91,7 +91,10 @@ class ColumnFile(Tables):
 
     def channels(self) -> list[Channel]:
         """Return the one table."""
-        return [Channel(0, "", "", TABLE, fields=tuple(self._columns), units=self._units)]
+        lengths = tuple(column.size for column in self._columns.values())
+        lengths = lengths if len(set(lengths)) > 1 else ()
+        fields = tuple(self._columns)
+        return [Channel(0, "", "", TABLE, fields=fields, units=self._units, lengths=lengths)]
 
     def table(self, topic: str, fields: Sequence[str]) -> Table:
         """Return columns; all must have the same length."""
@@ -100,7 +103,9 @@ class ColumnFile(Tables):
         sizes = {name: column.size for name, column in columns.items()}
         if len(set(sizes.values())) > 1:
             lengths = ", ".join(f"{name} {size}" for name, size in sizes.items())
-            raise BagError(f"{self.path}: its columns differ in length: {lengths}")
+            raise BagError(
+                f"{self.path}: its columns differ in length: {lengths}; map columns of one length"
+            )
         exact = frozenset(n for n in fields if n in self._dates)
         return Table(None, None, {n: np.asarray(c) for n, c in columns.items()}, exact=exact)
 

@@ -81,6 +81,15 @@ def head(rows: Sequence[Row], where: str) -> Grid:
     return Grid(names, units, first)
 
 
+def numeric(names: Sequence[str], rows: Sequence[Row]) -> tuple[str, ...]:
+    """Return the names of the columns that are not of words alone."""
+    filled = [[row[k] for row in rows if k < len(row)] for k in range(len(names))]
+    filled = [[cell for cell in column if not _empty(cell)] for column in filled]
+    return tuple(
+        name for name, cells in zip(names, filled) if not cells or any(map(_readable, cells))
+    )
+
+
 def without_unit(name: str) -> str:
     """Return a column's name without the unit in brackets behind it."""
     return _BRACKETS.sub("", name)
@@ -106,11 +115,15 @@ def share_of_numbers(row: Row) -> float:
 
 
 def _sound(cell: Any) -> bool:
+    return _readable(cell) and not (isinstance(cell, str) and cell.strip().lower() in _WORDS)
+
+
+def _readable(cell: Any) -> bool:
     try:
         number(cell)
     except ValueError:
         return False
-    return not isinstance(cell, str) or cell.strip().lower() not in _WORDS
+    return True
 
 
 def number(cell: Any) -> float:

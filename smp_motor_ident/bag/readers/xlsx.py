@@ -12,30 +12,35 @@ from smp_motor_ident.errors import BagError
 
 
 def _open(path: Path, name: str, budget: Budget) -> ColumnFile:
-    """Read the first sheet of a workbook that holds numbers."""
+    """Read the sheet of a workbook that has most rows of numbers, the first of several."""
     reason = f"{name}: holds no sheet"
+    tables: list[tuple[grid.Grid, list[tuple[Any, ...]]]] = []
     for rows in _sheets(path, name, budget):
         filled = [row for row in rows if any(cell is not None for cell in row)]
         try:
-            top = grid.head(filled, name)
+            tables.append((grid.head(filled, name), filled))
         except BagError as error:
             reason = str(error)
-            continue
-        body, first_row = filled[top.first :], top.first + 1
-        columns, dates, findings = {}, set(), list(top.findings)
-        for j, title in enumerate(top.names):
-            try:
-                values, more, timed = grid.columns(
-                    body, [j], [title], name, range(first_row, len(filled) + 1)
-                )
-            except BagError:
-                continue  # a column of words
-            if values[0].size == len(body):
-                columns[title] = values[0]
-                dates |= timed
-                findings += more
-        return ColumnFile(path, name, columns, top.units, dates, findings)
-    raise BagError(reason)
+    if not tables:
+        raise BagError(reason)
+    return _table(path, name, *max(tables, key=lambda one: len(one[1]) - one[0].first))
+
+
+def _table(path: Path, name: str, top: grid.Grid, rows: list[tuple[Any, ...]]) -> ColumnFile:
+    body = rows[top.first :]
+    columns, dates, findings = {}, set(), list(top.findings)
+    for j, title in enumerate(top.names):
+        try:
+            values, more, timed = grid.columns(
+                body, [j], [title], name, range(top.first + 1, len(rows) + 1)
+            )
+        except BagError:
+            continue  # a column of words
+        if values[0].size == len(body):
+            columns[title] = values[0]
+            dates |= timed
+            findings += more
+    return ColumnFile(path, name, columns, top.units, dates, findings)
 
 
 def _sheets(path: Path, name: str, budget: Budget) -> list[list[tuple[Any, ...]]]:

@@ -232,6 +232,21 @@ def test_empty_cells_are_missing_values(tmp_path: Path) -> None:
     assert "velocity: 10 values missing" in " ".join(f.message for f in record.findings)
 
 
+def test_columns_of_words_are_not_in_the_way(tmp_path: Path) -> None:
+    rng = np.random.default_rng(8)
+    pairs = zip(np.repeat(rng.uniform(-6, 6, 20), 10), np.cumsum(rng.normal(0, 1, 200)))
+    rows = [
+        f"{0.01 * k:.2f};'map';{u};{y};{'2.5A' if k % 7 else ''}" for k, (u, y) in enumerate(pairs)
+    ]
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join(["t;frame;u;y;remark", *rows]))
+    (offer,) = list_topics(path)[0].offers
+    assert offer.fields == ["t", "u", "y"]
+    assert len(read_records(path, ["voltage=u velocity=y time=t"])["motor"]) == len(rows)
+    with pytest.raises(BagError, match="line 2, column 'frame': \"'map'\" is no number"):
+        read_records(path, ["voltage=frame velocity=y time=t"])
+
+
 def test_quoted_cells_with_decimal_commas_are_no_quoted_rows(tmp_path: Path) -> None:
     (tmp_path / "u.csv").write_text('"u"\n' + "".join(f'"{x:g}"\n'.replace(".", ",") for x in U))
     assert list_topics(tmp_path / "u.csv")[0].offers[0].fields == ["u"]

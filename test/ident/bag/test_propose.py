@@ -8,8 +8,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import scipy.io
 
 from smp_motor_ident.bag import Listing, list_topics, read_records
+from smp_motor_ident.errors import BagError
 
 N = 600
 T = 0.01 * np.arange(N)
@@ -246,3 +248,78 @@ def test_what_is_no_whole_number_is_no_count(tmp_path: Path) -> None:
     assert list_topics(path)[0].suggestion == ["voltage=u", "position=encoder", "time=t"]
     path = write(tmp_path / "log.csv", t=T, u=voltage, encoder_V=np.cumsum(speed) * 0.01)
     assert list_topics(path)[0].suggestion == []
+
+
+@pytest.mark.parametrize(
+    ("names", "wheels"),
+    [
+        (("t", "pwmL", "pwmR", "velL", "velR"), ("left", "right")),
+        (("tiempo", "PWMA", "PWMB", "wA", "wB"), ("motor_a", "motor_b")),
+        (("t", "u1", "u2", "rpm_1", "rpm_2"), ("motor_1", "motor_2")),
+        (("t", "run_1.u", "run_2.u", "run_1.y", "run_2.y"), ("run_1", "run_2")),
+        (("t", "dutyIzquierda", "dutyDerecha", "velIzquierda", "velDerecha"), None),
+    ],
+)
+def test_motors_side_by_side_are_told_by_what_their_names_end_in(
+    tmp_path: Path, names: tuple[str, ...], wheels: tuple[str, str] | None
+) -> None:
+    (u, y), (v, z) = motor(21), motor(22)
+    path = write(tmp_path / "log.csv", **dict(zip(names, (T, u, v, y, z))))
+    a, b = wheels or ("izquierda", "derecha")
+    items = [item.partition(":")[0].replace('"', "") for item in list_topics(path)[0].suggestion]
+    pairs = ((a, names[1], names[3]), (b, names[2], names[4]))
+    expected = [
+        item
+        for wheel, drive, motion in pairs
+        for item in (f"{wheel}.voltage={drive}", f"{wheel}.velocity={motion}")
+    ]
+    assert sorted(items) == sorted([*expected, f"time={names[0]}"])
+
+
+def test_one_voltage_is_of_all_motors_that_stand_side_by_side(tmp_path: Path) -> None:
+    u, y = motor(23)
+    path = write(tmp_path / "log.csv", t=T, u=u, velL=y, velR=0.9 * y)
+    found = ["left.voltage=u", "left.velocity=velL", "right.voltage=u", "right.velocity=velR"]
+    assert list_topics(path)[0].suggestion == [*found, "time=t"]
+
+
+def test_a_vin_that_is_switched_drives_and_one_that_stays_supplies(tmp_path: Path) -> None:
+    voltage, speed = motor(24)
+    path = write(tmp_path / "lab.csv", time=T, Vin=voltage, taco=speed)
+    assert list_topics(path)[0].suggestion == ["voltage=Vin", "velocity=taco", "time=time"]
+    sagging = 12 - 0.01 * np.abs(speed)
+    path = write(tmp_path / "ina.csv", time=T, vin=sagging, taco=speed)
+    assert list_topics(path)[0].remark == "no field is called a voltage"
+
+
+def test_the_nearest_word_says_what_a_part_of_a_structure_is(tmp_path: Path) -> None:
+    voltage, speed = motor(25)
+    names = ("Vin_test.taco.time", "Vin_test.taco.values", "Vin_test.Vin.values")
+    path = write(tmp_path / "log.csv", **dict(zip(names, (T, speed, voltage))))
+    quoted = [f'"{name}"' for name in names]
+    items = [f"voltage={quoted[2]}", f"velocity={quoted[1]}", f"time={quoted[0]}"]
+    assert list_topics(path)[0].suggestion == items
+
+
+def test_what_follows_by_chance_is_not_proposed(tmp_path: Path) -> None:
+    rng = np.random.default_rng(26)
+    columns = {f"signal_{chr(97 + k)}": np.cumsum(rng.normal(0, 1, 32)) for k in range(16)}
+    listing = list_topics(write(tmp_path / "log.csv", **columns))[0]
+    assert listing.suggestion == []
+
+
+def test_columns_of_one_length_are_listed_and_proposed_together(tmp_path: Path) -> None:
+    voltage, speed = motor(27)
+    content = {"id": {"InputData": voltage, "OutputData": speed, "last": np.arange(6.0)}, "t": T}
+    scipy.io.savemat(tmp_path / "lab.mat", content | {"limits": np.array([-12.0, 12.0])})
+    listing = list_topics(tmp_path / "lab.mat")[0]
+    assert [(offer.count, offer.fields) for offer in listing.offers] == [
+        (N, ["id.InputData", "id.OutputData", "t"]),
+        (6, ["id.last"]),
+        (2, ["limits"]),
+    ]
+    items = ['voltage="id.InputData"', 'velocity="id.OutputData"', "time=t"]
+    assert listing.suggestion == items
+    assert len(read_records(tmp_path / "lab.mat", items)["motor"]) == N
+    with pytest.raises(BagError, match=r"differ in length: limits 2, .*map columns of one length"):
+        read_records(tmp_path / "lab.mat", ["voltage=limits", *items[1:]])

@@ -268,6 +268,17 @@ def test_a_workbook_is_read_with_names_and_units(tmp_path: Path) -> None:
     assert_motor(read_records(tmp_path / "log.xlsx", MAP)["motor"])
 
 
+def test_of_a_workbook_the_longest_sheet_is_read(tmp_path: Path) -> None:
+    book = openpyxl.Workbook()
+    for row in (["sensor", "Hz", "ms"], ["gyro", 8000, 0.125], ["compass", 200, 5]):
+        book.active.append(row)
+    sheet = book.create_sheet("measured")
+    for row in (["t", "u", "y"], *zip(TIME, VOLTAGE, SPEED)):
+        sheet.append(list(row))
+    book.save(tmp_path / "log.xlsx")
+    assert_motor(read_records(tmp_path / "log.xlsx", MAP)["motor"])
+
+
 def ros1_bag(path: Path, compression: Any = None) -> Path:
     """Write a bag of ROS 1 by rosbags."""
     store = get_typestore(Stores.ROS1_NOETIC)
