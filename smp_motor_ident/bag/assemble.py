@@ -11,7 +11,7 @@ from smp_motor_control.motor.friction import Gearbox
 from smp_motor_ident.bag.axis import Motor, Series, on_one_axis, unwrapped
 from smp_motor_ident.bag.checks import impossible, is_unsigned, signed
 from smp_motor_ident.bag.clock import SAME_CLOCK, ClockFit, epochs, fit_clock, judge_stamps, rhythm
-from smp_motor_ident.bag.counter import unwrap_angle
+from smp_motor_ident.bag.counter import is_full, unwrap_angle
 from smp_motor_ident.bag.mapping import MotorMap, Signal
 from smp_motor_ident.bag.runs import one_after_another, pause_between
 from smp_motor_ident.bag.storage import Table
@@ -88,6 +88,11 @@ def _check(motor: Motor, series: dict[str, Series]) -> None:
     for name in sorted(series, key=lambda name: name != "count"):
         value = series[name].value
         if name == "count":  # which wraps, and that is no jump
+            if last := is_full(value):
+                raise BagError(
+                    f"{motor.where}: the count stays at {last}, where a counter of its width ends: "
+                    "it is full; record a wider one, or one that wraps"
+                )
             value = unwrapped(motor, series).count.astype(np.float64)
         bad = impossible(value, steps_allowed=name in ("voltage", "supply", "current"))
         if bad.any():
@@ -291,9 +296,11 @@ def _converted(motor: Motor, name: str, signal: Signal, raw: NDArray[Any]) -> ND
     if unit.startswith("ticks"):
         shaft = signal.shaft or "motor"
     if name == "position" and not motor.plan.own:
-        values, wrapped = unwrap_angle(values)
-        if wrapped:
-            motor.tell("angle_wraps", "position: it wraps at one turn; wrap undone")
+        values, width = unwrap_angle(values)
+        if width:
+            turns = width / (2 * np.pi)
+            at = "one turn" if abs(turns - 1) < 1e-9 else f"{turns:.6g} turns"
+            motor.tell("angle_wraps", f"position: it wraps at {at}; wrap undone")
     if name in ("velocity", "position") and shaft == "wheel":
         values = Gearbox(motor.hardware.gear_ratio).to_motor(values)
     return values

@@ -5,7 +5,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from smp_motor_control.arrays import Array, Integers
+from smp_motor_ident.bag.limits import SATURATED
 from smp_motor_ident.bag.storage import found
+from smp_motor_ident.bag.wraps import angle_of, counts_of, undone, wrap_of
+from smp_motor_ident.errors import BagError
 from smp_motor_ident.finding import Finding
 
 _WIDTHS = (32, 24, 20, 18, 17, 16, 15, 14, 13, 12, 11, 10, 8)
@@ -32,8 +35,10 @@ def unwrap(count: Integers, bits: int | None, expected: Array | None = None) -> 
     findings = []
     steps = np.diff(count)  # modulo 2^64, as is right for a counter of that width
     guess = np.zeros(steps.size) if expected is None else np.nan_to_num(expected)
-    if bits is None and (width := _width(steps, guess)):
-        bits = width
+    if bits is None and (width := _width_shown(count, steps, guess)):
+        if width & (width - 1):
+            return _of_no_bits(count, width)
+        bits = width.bit_length() - 1
         text = f"the encoder wraps at 2^{bits} counts by what it shows; wrap undone"
         findings.append(found("counter_wraps", text, bits=bits))
     if bits:
@@ -50,6 +55,37 @@ def unwrap(count: Integers, bits: int | None, expected: Array | None = None) -> 
     for begin, end in zip(resets, [*resets[1:], count.size]):
         whole[begin:end] += count[begin] - whole[begin]
     return Unwrapped(whole, resets, findings)
+
+
+def _width_shown(count: Integers, steps: Integers, guess: Array) -> int:
+    """Return at how many counts a counter starts again by what it shows; 0 where it does not."""
+    bits = _width(steps, guess)
+    wrap = wrap_of(count.astype(np.float64))
+    if wrap is None or (bits and wrap.admits(2.0**bits)):
+        return 2**bits if bits else 0
+    if not wrap.is_known:
+        raise BagError(
+            f"the encoder's count starts again {wrap.times} times, at about {wrap.width:.4g}, and "
+            "no more is known of where; record faster, or a counter that goes on"
+        )
+    return counts_of(wrap, int(np.ptp(count)))
+
+
+def _of_no_bits(count: Integers, width: int) -> Unwrapped:
+    """Return a counter that starts again at a number that is no power of two."""
+    text = f"the encoder starts again at {width} counts by what it shows; that is undone"
+    whole = np.rint(undone(count.astype(np.float64), width)).astype(np.int64)
+    return Unwrapped(whole, np.zeros(0, np.int64), [found("counter_wraps", text, counts=width)])
+
+
+def is_full(count: Integers) -> int:
+    """Return the last number of a width where a counter stays at it, or 0."""
+    for last in (int(count.max()), int(count.min())) if count.size else ():
+        size = last + 1 if last > 0 else -last  # 2^k - 1 at the upper end, -2^k at the lower
+        stays = np.mean((count[1:] == last) & (count[:-1] == last)) > SATURATED.value
+        if size >= 2**7 and not size & (size - 1) and stays:
+            return last
+    return 0
 
 
 def _usual(steps: Integers, guess: Array) -> float:
@@ -88,14 +124,27 @@ def _resets(count: Integers, steps: Integers, guess: Array, measured: bool) -> I
     return found if found.size <= max(3, 0.01 * steps.size) else np.zeros(0, np.int64)
 
 
-def unwrap_angle(angle: Array) -> tuple[Array, bool]:
-    """Undo the wrap-around of an angle that stays within one turn."""
+def unwrap_angle(angle: Array) -> tuple[Array, float]:
+    """Undo the wrap-around of an angle; return the width of it, too, 0 where there is none.
+
+    Within one turn, jumps of more than half of it are wraps.
+    """
     sound = np.isfinite(angle)
     values = angle[sound]
-    if values.size < 2 or np.ptp(values) > 2 * np.pi * 1.001:
-        return angle, False
-    if np.max(np.abs(np.diff(values))) < np.pi:
-        return angle, False
+    turn = 2 * np.pi
+    if values.size < 2:
+        return angle, 0.0
+    width = turn
+    if np.ptp(values) > turn * 1.001 or np.max(np.abs(np.diff(values))) < np.pi:
+        wrap = wrap_of(values)
+        if wrap is None:
+            return angle, 0.0
+        width = angle_of(wrap)
+        if width == wrap.width and not wrap.is_known:
+            raise BagError(
+                f"the position starts again {wrap.times} times, at about {wrap.width:.4g} rad, "
+                "which is no turn or part of one; record faster, or an angle that goes on"
+            )
     result = angle.copy()
-    result[sound] = np.unwrap(values)
-    return result, True
+    result[sound] = undone(values, width)
+    return result, width

@@ -54,3 +54,17 @@ SET_BACK = Limit(
     "back by more, and as many rows go on from there",
     "test_runs.py",
 )
+WIDTH_KNOWN = Limit(
+    2e-3,
+    "1",
+    "physical: a width's error is that of the gain, and gains are stated to a few parts in a "
+    "thousand; a width that is less sure must be told",
+    "test_counter.py",
+)
+SATURATED = Limit(
+    0.02,
+    "1",
+    "physical: a counter that turns stands at the last number of its width for a sample, a full "
+    "one as long as the motor turns on",
+    "test_counter.py",
+)

@@ -11,7 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from smp_motor_ident.bag.counter import unwrap, unwrap_angle
+from smp_motor_ident.bag.counter import is_full, unwrap, unwrap_angle
+from smp_motor_ident.errors import BagError
 
 
 def turning(samples: int = 400, most: int = 90, seed: int = 3) -> np.ndarray:
@@ -128,7 +129,7 @@ def test_an_angle_within_one_turn_is_unwrapped_and_any_other_left() -> None:
         result, undone = unwrap_angle(raw)
         sound = np.isfinite(raw)
         # Angles of 2 pi and less, through a complex exponential: rounding alone.
-        assert undone and result[sound] - result[0] == pytest.approx(
+        assert undone == 2 * np.pi and result[sound] - result[0] == pytest.approx(
             (true - true[0])[sound], abs=1e-9
         )
         assert np.array_equal(np.isnan(result), ~sound)
@@ -235,9 +236,9 @@ def test_an_angle_that_leaves_one_turn_was_never_wrapped() -> None:
     for beyond, undone in ((0.0, True), (0.003, True), (0.2, False)):
         edge = np.pi + beyond
         raw = np.array([edge - 0.1, edge, -edge, -edge + 0.1])
-        assert unwrap_angle(raw)[1] is undone
-    assert unwrap_angle(np.array([2.0, -2.0]))[1] is True
-    assert unwrap_angle(np.array([1.5, -1.5]))[1] is False
+        assert bool(unwrap_angle(raw)[1]) is undone
+    assert unwrap_angle(np.array([2.0, -2.0]))[1] == 2 * np.pi
+    assert unwrap_angle(np.array([1.5, -1.5]))[1] == 0
 
 
 @settings(max_examples=25, deadline=None)
@@ -299,3 +300,53 @@ def test_a_reset_counter_begins_a_new_segment(tmp_path: Path, corpus: SimpleName
     assert record.starts == (0, 120)
     assert np.all(np.diff(record.count)[np.arange(299) != 119] == 50)
     assert "reset 1 times" in " ".join(f.message for f in record.findings)
+
+
+def with_inertia(samples: int, most: float, seed: int) -> np.ndarray:
+    """Return the way of a motor that goes both ways and changes its speed within 50 samples."""
+    rng = np.random.default_rng(seed)
+    aims = np.repeat(rng.uniform(-most, most, samples // 100 + 1), 100)[:samples]
+    speed = np.zeros(samples)
+    for k in range(1, samples):
+        speed[k] = speed[k - 1] + 0.05 * (aims[k] - speed[k - 1])
+    return np.cumsum(speed)
+
+
+@pytest.mark.parametrize("width", [360, 400, 1000, 1440, 2400, 3000])
+def test_a_counter_that_starts_again_each_turn_is_undone(width: int) -> None:
+    true = np.rint(with_inertia(4000, width / 15, seed=width)).astype(np.int64)
+    found = unwrap(true % width, None)
+    assert np.array_equal(found.count - found.count[0], true - true[0])
+    assert found.findings[0].evidence == {"counts": width}
+
+
+def test_a_width_that_is_not_known_well_enough_is_refused() -> None:
+    # Steps of a seventh of the width that scatter by a third of that: eight wraps tell it to 1 %.
+    steps = np.random.default_rng(5).integers(100, 200, 60)
+    with pytest.raises(BagError, match=r"starts again \d times, at about .* record faster"):
+        unwrap(np.cumsum(steps) % 1023, None)
+
+
+@pytest.mark.parametrize("turns", [0.5, 1.0, 2.0, 3.0])
+def test_an_angle_that_wraps_at_turns_or_a_part_of_one_is_unwrapped(turns: float) -> None:
+    true = with_inertia(2000, 0.5 * turns, seed=4)
+    result, width = unwrap_angle(true % (2 * np.pi * turns) - 1.0)
+    assert width == pytest.approx(2 * np.pi * turns, rel=1e-12)
+    assert result - result[0] == pytest.approx(true - true[0], abs=1e-8)
+
+
+def test_an_angle_that_is_thrown_to_and_fro_is_no_wrap() -> None:
+    # A position loop that reaches its target in a sample, overshoots and settles.
+    cycle = np.concatenate([np.zeros(20), [8.0, 7.3, 7.1], np.full(17, 7.0)])
+    angle = np.tile(cycle, 10) + np.random.default_rng(7).normal(0, 0.01, 400)
+    result, width = unwrap_angle(angle)
+    assert width == 0 and result is angle
+
+
+@pytest.mark.parametrize("last", [65535, 255, 32767, -32768])
+def test_a_counter_that_stays_at_the_end_of_its_width_is_full(last: int) -> None:
+    true = (np.arange(400) * last) // 300
+    clipped = np.minimum(true, last) if last > 0 else np.maximum(true, last)
+    assert is_full(clipped) == last
+    assert is_full(clipped[:302]) == 0, "it is there for two samples only"
+    assert is_full(clipped - 3) == 0, "no width ends there"
