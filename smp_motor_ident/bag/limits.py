@@ -68,3 +68,10 @@ SATURATED = Limit(
     "one as long as the motor turns on",
     "test_counter.py",
 )
+SECONDS_APART = Limit(
+    10.0,
+    "s",
+    "physical: no motor of a robot takes so long for a change of its speed; rows that are so far "
+    "apart are of milliseconds or microseconds",
+    "test_csv.py",
+)

@@ -91,7 +91,7 @@ def list_topics(paths: Any, msg_files: Iterable[str] = ()) -> list[Listing]:
             proposal = propose(recording, offers, types) if needed else Proposal()
             if proposal.items:
                 try:
-                    read_recording(recording, _filled(proposal.items), types)
+                    read_recording(recording, _filled(proposal), types)
                 except BagError as error:
                     text = f"a mapping was proposed by names and cannot be read: {error}"
                     recording.findings.append(found("proposal_failed", text))
@@ -294,9 +294,10 @@ def _reason(fields: list[_Candidate]) -> str:
     return "no field that is called a voltage explains one that is called a motion"
 
 
-def _filled(items: Sequence[str]) -> SignalMap:
+def _filled(proposal: Proposal) -> SignalMap:
     """Return the mapping of a proposal, with any value for what the user must add."""
-    given = parse(items)
+    unit = ":ms" * any(text.startswith("time=") for text in proposal.asked)
+    given = parse([i + unit if i.startswith("time=") else i for i in proposal.items])
     hardware = {"supply_voltage": 12.0, "counts_per_revolution": 1.0}
     ones: Any = dict.fromkeys(("pwm_full_scale", "wheel_radius", "sample_time"), 1.0)
     motors = {

@@ -8,6 +8,7 @@ from itertools import product
 import numpy as np
 
 from smp_motor_control.arrays import Integers
+from smp_motor_ident.bag.limits import SECONDS_APART
 from smp_motor_ident.bag.mapping import DEFAULT_MOTOR, MotorMap, Signal, SignalMap
 from smp_motor_ident.bag.readers.grid import without_unit
 from smp_motor_ident.bag.runs import laid_out
@@ -145,6 +146,8 @@ def timed(recording: Recording, plan: MotorMap, tables: Mapping[str, Table]) -> 
                 log = np.rint(np.arange(size) * (plan.sample_time * 1e9)).astype(np.int64)
             else:
                 log, unit = _nanoseconds(table, signal)
+                if not unit and signal.field not in table.exact:
+                    _check_seconds(log, signal, recording)
                 if unit and unit != signal.unit:
                     text = f"{recording.name}: {signal.field} is taken for {unit} since 1970"
                     findings.append(found("time_unit", text))
@@ -159,6 +162,17 @@ def timed(recording: Recording, plan: MotorMap, tables: Mapping[str, Table]) -> 
         result[topic] = Table(log, None, columns, findings=findings, clocked=True)
     rows = {topic: result[topic] for topic in written}
     return result | laid_out(rows, plan.gap, recording.name)
+
+
+def _check_seconds(log: Integers, signal: Signal, recording: Recording) -> None:
+    """Refuse a time without a unit that cannot be in seconds: no motor shows in such rows."""
+    steps = np.diff(log[log > _NEVER]) * 1e-9
+    step = float(np.median(steps)) if steps.size else 0.0
+    if step >= SECONDS_APART.value:
+        raise BagError(
+            f"{recording.files[0]}: {signal.field} rises by {step:g} a row, which are no seconds; "
+            f"tell its unit: time={signal.field}:ms (or us, ns; s where it is seconds)"
+        )
 
 
 _NEVER = -(2**62)

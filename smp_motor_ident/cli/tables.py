@@ -63,7 +63,8 @@ def estimate_table(estimate: Estimate) -> Table:
 
 _UNTOLD = (
     "where one of the above is, say which: --map voltage=… velocity=… (or position=…, count=…); "
-    "without a voltage or a command no motor can be told; see docs/mapping.md"
+    "where it is in another file, give both: voltage=/FILE.COLUMN; without a voltage or a command "
+    "no motor can be told; see docs/mapping.md"
 )
 
 

@@ -232,6 +232,19 @@ def test_empty_cells_are_missing_values(tmp_path: Path) -> None:
     assert "velocity: 10 values missing" in " ".join(f.message for f in record.findings)
 
 
+@pytest.mark.parametrize(("step", "unit"), [(20, "ms"), (5180, "us")])
+def test_a_time_without_unit_that_cannot_be_seconds_is_asked_for(
+    tmp_path: Path, step: int, unit: str
+) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join(["tiempo,u,y", *(f"{step * k},{k % 7},{k % 5}" for k in range(99))]))
+    with pytest.raises(BagError, match=f"rises by {step} a row.* time=tiempo:ms"):
+        read_records(path, ["voltage=u velocity=y time=tiempo"])
+    for told, factor in ((unit, 1e-3 if unit == "ms" else 1e-6), ("s", 1.0)):
+        record = read_records(path, [f"voltage=u velocity=y time=tiempo:{told} gap=1e6"])["motor"]
+        np.testing.assert_allclose(np.diff(record.time), step * factor)
+
+
 def test_columns_of_words_are_not_in_the_way(tmp_path: Path) -> None:
     rng = np.random.default_rng(8)
     pairs = zip(np.repeat(rng.uniform(-6, 6, 20), 10), np.cumsum(rng.normal(0, 1, 200)))
