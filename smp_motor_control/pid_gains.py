@@ -54,16 +54,18 @@ class PidGains:
         "(it is driven back) or conditional_integration (it does not wind up further).",
     )
     tracking_time_constant: float = described(
-        0.0, "Of back-calculation [s]; 0: sqrt(d/i), or p/i without derivative action."
+        0.0, "Of back-calculation [s]; 0: sqrt(d/i), or p/i without derivative action.", minimum=0.0
     )
-    error_deadband: float = described(EPSILON, "Error up to which the integral rests [rad/s].")
+    error_deadband: float = described(
+        EPSILON, "Error up to which the integral rests [rad/s].", minimum=0.0
+    )
     setpoint_weight_p: float = described(1.0, "Share of the reference in the proportional term.")
     setpoint_weight_d: float = described(0.0, "Share of the reference in the derivative term.")
     derivative_filter_time_constant: float = described(
-        0.0, "Of the derivative's filter, of first order [s]; 0: unfiltered."
+        0.0, "Of the derivative's filter, of first order [s]; 0: unfiltered.", minimum=0.0
     )
     feedforward_static: float = described(
-        0.0, "Voltage against dry friction, in the direction of the reference [V]."
+        0.0, "Voltage against dry friction, in the direction of the reference [V].", minimum=0.0
     )
     feedforward_velocity: float = described(0.0, "Voltage per speed [V s/rad].")
     feedforward_acceleration: float = described(0.0, "Voltage per acceleration [V s^2/rad].")
