@@ -31,7 +31,7 @@ FIRST = 1e-3  # damping at which a descent begins
 FREE = 0.1  # damping (relative to the diagonal) below which a step counts as undamped
 LARGEST = 80.0  # logarithm of a coordinate: 1e35
 CLOSE = 0.3  # of the tolerance, within which a step is not even tried where there are kinks
-FASTEST = 1e-3  # of a sample: L/R below it shows in nothing, and leaves the coordinates stiff
+FASTEST = 1e-3  # of a sample: a lag below it shows in nothing, and leaves the coordinates stiff
 SHORTEST = 1e-9  # s: a window, or a lag, that is as good as none
 ROUNDS = 12  # most times that the noise is estimated anew
 
@@ -65,8 +65,13 @@ class _Descent:
 
     def _allowed(self, z: Coordinates) -> Coordinates:
         """Return coordinates brought within the bounds and to a motor that can be."""
-        bounded = np.minimum(np.maximum(z.array, self.lower), self.upper)
-        z = self.structure.complete(Coordinates.of(bounded))
+        z = Coordinates.of(np.minimum(np.maximum(z.array, self.lower), self.upper))
+        free, shortest = self.structure.free, math.log(FASTEST * self.data.step)
+        if "ln_a1" in free:
+            z = z.with_(ln_a1=max(z.ln_a1, z.ln_a0 + shortest))
+        if "ln_a2" in free:
+            z = z.with_(ln_a2=max(z.ln_a2, z.ln_a1 + shortest))
+        z = self.structure.complete(z)
         return shape_constraint.within(z) if self.shaped else z
 
     def _pass(self, z: Coordinates, initial: Array) -> Pass:

@@ -149,6 +149,16 @@ def test_a_column_of_which_only_rounding_is_left_counts_as_unknown():
     assert np.all(np.isfinite(step))
 
 
+def test_a_descent_from_a_lag_that_shows_in_nothing_finds_the_one_that_there_is():
+    record, truth = random_record(0)
+    data = prepare([record], False)
+    fit = initial_fit(data, SecondOrder(friction="none"), Options())
+    far = fit.z.with_(ln_a0=fit.z.ln_a0 + 0.2).with_second_lag(1e-12)
+    again = solve(data, fit.structure, replace(fit, z=fit.structure.complete(far)), Options())
+    assert again.z.second_lag == pytest.approx(fit.z.second_lag, rel=1e-2)
+    assert again.deviance == pytest.approx(fit.deviance, abs=0.1)
+
+
 def test_what_shows_in_nothing_holds_no_step_back():
     normal, wanted = np.diag([4.0, 1e-8]), np.array([0.5, 1000.0])
     step, _ = damped_step(normal, normal @ wanted, 1e-9, np.eye(12, 2), np.zeros(12),
