@@ -255,11 +255,12 @@ def _unsettled(data: Experiments, fit: Fit) -> bool:
     if not np.any(np.abs(step) > limits.HALF_WIDTH.value * deviation, where=reported):
         return False
     here = _least_squares(data, fit, fit.z)
-    return any(
-        _least_squares(data, fit, fit.z.moved(share * fit.structure.matrix @ step))
-        < here - limits.HALF_WIDTH.value**2
-        for share in (1.0, 0.3, 0.1)
-    )
+    with np.errstate(all="ignore"):  # what runs away has no sum, and that is not lower
+        return any(
+            _least_squares(data, fit, fit.z.moved(share * fit.structure.matrix @ step))
+            < here - limits.HALF_WIDTH.value**2
+            for share in (1.0, 0.3, 0.1)
+        )
 
 
 def _least_squares(data: Experiments, fit: Fit, z: Coordinates) -> float:
