@@ -58,7 +58,7 @@ WIDTH_KNOWN = Limit(
     2e-3,
     "1",
     "physical: a width's error is that of the gain, and gains are stated to a few parts in a "
-    "thousand; a width that is less sure must be told",
+    "thousand; a width that is less sure must be given",
     "test_counter.py",
 )
 SATURATED = Limit(

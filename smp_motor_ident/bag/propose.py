@@ -296,7 +296,7 @@ def _reason(fields: list[_Candidate]) -> str:
 
 def _filled(proposal: Proposal) -> SignalMap:
     """Return the mapping of a proposal, with any value for what the user must add."""
-    unit = ":ms" * any(text.startswith("time=") for text in proposal.asked)
+    unit = ":ms" if any(text.startswith("time=") for text in proposal.asked) else ""
     given = parse([i + unit if i.startswith("time=") else i for i in proposal.items])
     hardware = {"supply_voltage": 12.0, "counts_per_revolution": 1.0}
     ones: Any = dict.fromkeys(("pwm_full_scale", "wheel_radius", "sample_time"), 1.0)

@@ -61,10 +61,10 @@ def estimate_table(estimate: Estimate) -> Table:
     return made
 
 
-_UNTOLD = (
+_WHAT_TO_MAP = (
     "where one of the above is, say which: --map voltage=… velocity=… (or position=…, count=…); "
     "where it is in another file, give both: voltage=/FILE.COLUMN; without a voltage or a command "
-    "no motor can be told; see docs/mapping.md"
+    "none can be identified; see docs/mapping.md"
 )
 
 
@@ -90,7 +90,7 @@ def list_topics(paths: Sequence[str], msg_files: Sequence[str], program: str) ->
             if listing.remark:
                 out.print(f"  note: {listing.remark}", soft_wrap=True)
         else:
-            out.print(f"{listing.remark}; {_UNTOLD}", soft_wrap=True)
+            out.print(f"{listing.remark}; {_WHAT_TO_MAP}", soft_wrap=True)
     return 0
 
 
