@@ -48,6 +48,7 @@ from smp_motor_ident.estimation.consider_covariance import (
     consider_timing,
 )
 from smp_motor_ident.estimation.constraint import constrained
+from smp_motor_ident.estimation.disturbance import disturbance
 from smp_motor_ident.estimation.driver_effect import (
     DriverFit,
     declared,
@@ -64,7 +65,7 @@ from smp_motor_ident.estimation.quantities import Answer, answer, driven_longest
 from smp_motor_ident.estimation.request import Request, base_structure, checked
 from smp_motor_ident.estimation.segments import Change, heterogeneous
 from smp_motor_ident.estimation.selection import FittedCandidate, in_turn
-from smp_motor_ident.estimation.subset import excited
+from smp_motor_ident.estimation.subset import excitation
 from smp_motor_ident.estimation.thinning import thinned
 from smp_motor_ident.estimation.transients import widened_by_pieces
 from smp_motor_ident.finding import Finding
@@ -153,7 +154,12 @@ def _checked(group: list[Record], request: Request) -> Estimate:
     if kind != ARMATURE:
         group, request = request.without_current(group)
     found = screen(group)
-    group = [excited(r) for r in group]
+    rows = [excitation(r) for r in group]
+    since = tuple(float(r.time[begin]) for r, (begin, _) in zip(group, rows, strict=True))
+    group, request = (
+        [r.slice(*of) for r, of in zip(group, rows, strict=True)],
+        replace(request, since=since),
+    )
     if kind != ARMATURE:
         return _estimated(group, request, [*found, current_left_out(kind)])
     return _answered(group, request, found)
@@ -208,9 +214,13 @@ def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) 
             plain = _stated(group, request, words, data, hold, [*left, one])
             if not lacks_something(plain):
                 return plain
+            if one is candidates[-1] and (rest := _undisturbed(group, request, found, one.fit)):
+                return rest
             behind, driver = _through_driver(group, request, found, data, hold, one.fit)
             return behind or suspecting(plain, driver, one.fit)
         except (SignalError, InsufficientExcitationError) as refusal:
+            if one is candidates[-1] and (rest := _undisturbed(group, request, found, one.fit)):
+                return rest
             refused = refused or refusal
             # What was refused, and what is richer, is no rival that another's answer must cover.
             most = one.fit.structure.size
@@ -221,6 +231,23 @@ def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) 
     if again:
         return again
     raise refused
+
+
+def _undisturbed(
+    group: list[Record], request: Request, found: Sequence[Finding], fit: Fit
+) -> Estimate | None:
+    """Return the estimate without what something else did to the motor, if it holds."""
+    if not request.since:
+        return None
+    request.say("what else moved the motor")
+    there = disturbance(group, request.since)
+    if there is None:
+        return None
+    try:
+        e = _estimated(there.records, replace(request, since=()), [*found, there.finding()])
+    except (SignalError, InsufficientExcitationError):
+        return None
+    return None if e.unreliable or leaves_torque_noise(e, fit) else e
 
 
 def _through_driver(

@@ -59,6 +59,16 @@ SEGMENT_INFORMATION = Limit(
     "a part whose interval is more than twice the others' adds its noise, not the motor's change",
     "test_segments.py: parts without excitation do not count",
 )  # fmt: skip
+DISTURBED = Limit(
+    1e-3, "significance level",
+    "one record in a thousand of a motor under a load that fluctuates may lose a part for nothing",
+    "test_disturbance.py: nothing is left out under torque noise or a drift",
+)  # fmt: skip
+LEFT_OUT = Limit(
+    0.2, "of the record",
+    "cost: what happens for longer than a fifth of the time is how the robot is, not an accident",
+    "test_disturbance.py: a motor that something holds half of the time is not mended",
+)  # fmt: skip
 FEW_TRANSIENTS = Limit(
     8.0, "runs of samples", "a variance of fewer sums is known to no better than its half",
     "test_transients.py: a step alone scatters as it says",
@@ -351,42 +361,35 @@ RELEVANT_BIAS = Limit(
     "test_adequacy.py",
 )  # fmt: skip
 CANDIDATE_WEIGHT = Limit(
-    0.05,
-    "probability",
+    0.05, "probability",
     "a structure that explains the data best less often than that is rejected at the 5 % level",
     "test_averaging.py: a lag that may be a delay",
-)
+)  # fmt: skip
 
 # A commissioned motor that is followed while it drives.
 RESISTANCE_BAND = Limit(
-    0.15,
-    "of the commissioned value",
+    0.15, "of the commissioned value",
     "38 K of copper: a motor at work warms by less, and its insulation bears twice that",
     "test_monitor.py: a winding that heats",
-)
+)  # fmt: skip
 MOTOR_CONSTANT_BAND = Limit(
-    0.03,
-    "of the commissioned value",
+    0.03, "of the commissioned value",
     "15 K of ferrite at 0.2 %/K, what magnets warm by beside a winding at the end of its band",
     "test_monitor.py: a magnet that weakens is separated from heat",
-)
+)  # fmt: skip
 FRICTION_BAND = Limit(
-    1.0,
-    "of the commissioned value",
+    1.0, "of the commissioned value",
     "a floor instead of blocks adds its rolling resistance, about as much again",
     "test_monitor.py: half an hour of ordinary driving",
-)
+)  # fmt: skip
 LEFT_BAND = Limit(
-    3.0,
-    "s of motion outside of a band",
+    3.0, "s of motion outside of a band",
     "a single load or a bad sample is over by then; a motor that burns takes longer",
     "test_monitor.py: half an hour of ordinary driving",
-)
+)  # fmt: skip
 
 # Stamps of arrival, put back on the beat of their sender.
-BEAT_FLOOR = Limit(
-    0.5, "sample", "physical: a later beat than half a sample is the next one", "test_beat.py"
-)
+BEAT_FLOOR = Limit(0.5, "sample", "physical: later than half a sample is the next", "test_beat.py")
 BEAT_JITTER = Limit(
     0.02, "sample", "cost: instants off by less matter less than their rounding", "test_beat.py"
 )

@@ -38,6 +38,8 @@ class Request:
     say: Callable[[str], None]  # receives in words what is being done
     use_current: bool  # whether the current is an output of the model
     driver: DriverFit | None = None  # what the driver is taken to make of its command
+    # Time at which the excitation of each record begins [s]; none where disturbances are left out
+    since: tuple[float, ...] = ()
 
     @property
     def options(self) -> Options:

@@ -18,8 +18,8 @@ def _scatter(values: Array) -> float:
     return float(np.median(np.abs(np.diff(values, n=4))) / 0.6745 / np.sqrt(70))
 
 
-def excited(record: Record) -> Record:
-    """Return a record without the rest before its first and after its last excitation."""
+def excitation(record: Record) -> tuple[int, int]:
+    """Return the rows from a record's first to its last excitation, as of `Record.slice`."""
     moves = np.abs(record.voltage) > REST.value * np.abs(record.voltage).max()
     for name in ("velocity", "position", "count"):
         values = getattr(record, name)
@@ -33,7 +33,6 @@ def excited(record: Record) -> Record:
     busy = np.flatnonzero(moves)
     # A rest shorter than the excitation does not hide it, and shows the sensor's noise.
     if not busy.size or (busy[0] < LONG and len(record) < 2 * (busy[-1] - busy[0])):
-        return record
+        return 0, len(record)
     # An offset of the sensor, seen long enough at rest, would speak against any friction.
-    begin, end = max(0, int(busy[0]) - MARGIN), min(len(record), int(busy[-1]) + MARGIN + 1)
-    return record if begin == 0 and end == len(record) else record.slice(begin, end)
+    return max(0, int(busy[0]) - MARGIN), min(len(record), int(busy[-1]) + MARGIN + 1)

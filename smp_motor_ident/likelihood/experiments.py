@@ -158,22 +158,27 @@ class Experiments:
         )
 
 
+def angle_of(record: Record) -> tuple[Array, float] | None:
+    """Return a record's angle from its first one [rad] and the step it comes in, if it has one."""
+    per_turn = record.hardware.counts_per_revolution
+    if record.count is not None and per_turn:
+        quantum = 2 * np.pi / per_turn
+        return (record.count - record.count[0]) * quantum, quantum
+    if record.position is not None and np.isfinite(record.position).sum() > 2:
+        angle = record.position - record.position[np.isfinite(record.position)][0]
+        return angle, angle_quantum(angle)
+    return None
+
+
 def output_of(record: Record, kind: str = "auto") -> tuple[Array, Measurement, float]:
     """Choose the mechanical output of a record: counts before angle before speed."""
-    per_turn = record.hardware.counts_per_revolution
-    if kind != "speed":
-        if record.count is not None and per_turn:
-            quantum = 2 * np.pi / per_turn
-            angle = (record.count - record.count[0]) * quantum
-            angle[_repeats(record.count, record.starts)] = np.nan
-            return angle, ANGLE, quantum
-        if record.position is not None and np.isfinite(record.position).sum() > 2:
-            angle = record.position - record.position[np.isfinite(record.position)][0]
-            quantum = angle_quantum(angle)
-            if quantum > 0 and np.all(np.isfinite(angle)):
-                count = np.rint(angle / quantum).astype(np.int64)
-                angle[_repeats(count, record.starts)] = np.nan
-            return angle, ANGLE, quantum
+    there = None if kind == "speed" else angle_of(record)
+    if there is not None:
+        angle, quantum = there
+        if quantum > 0 and np.all(np.isfinite(angle)):
+            count = np.rint(angle / quantum).astype(np.int64)
+            angle[_repeats(count, record.starts)] = np.nan
+        return angle, ANGLE, quantum
     if record.velocity is None:
         raise ValueError("record has no velocity")
     mean = MEAN_SPEED if record.velocity_window > 0 else SPEED

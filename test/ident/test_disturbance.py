@@ -1,0 +1,109 @@
+"""A hand on a wheel, an obstacle: the part that tells of no motor is left out, and said to be."""
+
+import math
+import re
+
+import numpy as np
+import pytest
+
+from smp_motor_ident.estimate import estimate
+from smp_motor_ident.estimation.disturbance import disturbance
+from smp_motor_ident.finding import Finding
+from smp_motor_ident.record import Hardware, Record
+
+GAIN, TAU, STATIC, STEP, COUNTS = 18.0, 0.09, 0.5, 0.005, 1024
+ROWS = 4_000
+
+
+def moved(speed: float, net: float, left: float) -> tuple[float, float, float]:
+    """Return speed, angle and time left after a motor ran under a voltage until it stood.
+
+    ``tau w' = gain (net - static sign w) - w``, in closed form.
+    """
+    if speed == 0.0 and abs(net) <= STATIC:
+        return 0.0, 0.0, 0.0
+    way = math.copysign(1.0, speed if speed else net)
+    steady = GAIN * (net - STATIC * way)
+    standing = TAU * math.log((steady - speed) / steady) if steady * speed < 0 else math.inf
+    time = min(standing, left)
+    after = 0.0 if standing <= left else steady + (speed - steady) * math.exp(-time / TAU)
+    return after, steady * time + TAU * (speed - after), left - time
+
+
+def recorded(seed: int, *, held=(), noise: float = 0.0, drift: float = 0.0) -> Record:
+    """Return counts of a motor of first order that stands still while it is held [s]."""
+    rng = np.random.default_rng(seed)
+    voltage = np.repeat(rng.uniform(-9.0, 9.0, ROWS // 40), 40)
+    load = noise * rng.standard_normal(ROWS) + drift * np.arange(ROWS) / ROWS
+    speed, angles = 0.0, np.zeros(ROWS)
+    for k in range(1, ROWS):
+        left, angle = STEP, angles[k - 1]
+        if any(a <= k * STEP < b for a, b in held):
+            left = speed = 0.0
+        while left > 0.0:
+            speed, turned, left = moved(speed, voltage[k] - load[k], left)
+            angle += turned
+        angles[k] = angle
+    count = np.floor(angles * COUNTS / (2 * math.pi)).astype(np.int64)
+    hardware = Hardware(counts_per_revolution=COUNTS)
+    return Record("motor", STEP * np.arange(ROWS), voltage, count=count, hardware=hardware)
+
+
+def rested(record: Record, seconds: float) -> Record:
+    """Return a record with a rest before it."""
+    rows = round(seconds / STEP)
+    return Record(
+        record.wheel,
+        STEP * np.arange(rows + len(record)),
+        np.pad(record.voltage[1:], (rows + 1, 0)),
+        count=np.pad(record.count, (rows, 0)),
+        hardware=record.hardware,
+    )
+
+
+def spans(words: Finding) -> list[tuple[float, float]]:
+    found = re.findall(r"from (\S+) s to (\S+) s", words.message)
+    return [(float(a), float(b)) for a, b in found]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_a_hand_did_is_left_out_and_the_rest_tells_the_motor(seed):
+    found = estimate(recorded(seed, held=[(8.0, 8.6)]))
+    (words,) = [f for f in found.findings if f.code == "disturbed"]
+    ((begin, end),) = spans(words)
+    assert begin <= 8.0 < 8.6 <= end < begin + 0.2 * ROWS * STEP
+    assert not found.unreliable
+    truth = {"dc_gain": GAIN, "time_constant": TAU, "static_voltage": STATIC}
+    for name, value in truth.items():
+        quantity = found.combinations[name]
+        assert abs(quantity.value - value) < 4 * quantity.std < 0.1 * value
+
+
+def test_the_time_is_the_records_own():
+    record = rested(recorded(4, held=[(8.0, 8.6)]), 15.0)
+    (words,) = [f for f in estimate(record).findings if f.code == "disturbed"]
+    ((begin, end),) = spans(words)
+    assert begin <= 23.0 < 23.6 <= end < begin + 4.0
+
+
+def test_each_of_two_accidents_is_left_out():
+    there = disturbance([recorded(5, held=[(4.0, 4.3), (14.0, 14.3)])], [0.0])
+    assert there is not None
+    (a, b), (c, d) = there.spans
+    assert a <= 4.0 < 4.3 <= b < c <= 14.0 < 14.3 <= d
+    (rest,) = there.records
+    assert rest.starts[0] == 0 and len(rest.starts) > 2
+    assert not np.any((rest.time >= a) & (rest.time <= b))
+
+
+@pytest.mark.parametrize(
+    "kind", [{}, {"noise": 0.5}, {"drift": 2.0}], ids=["in order", "torque noise", "drift"]
+)
+@pytest.mark.parametrize("seed", range(4))
+def test_nothing_is_left_out_under_torque_noise_or_a_drift(seed, kind):
+    assert disturbance([recorded(10 + seed, **kind)], [0.0]) is None
+
+
+def test_a_motor_that_something_holds_half_of_the_time_is_not_mended():
+    held = [(n, n + 0.5) for n in range(20)]
+    assert disturbance([recorded(20, held=held)], [0.0]) is None
