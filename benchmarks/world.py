@@ -109,6 +109,8 @@ def judge(job: tuple[int, int, int, bool]) -> tuple[int, str, str]:
         return number, "cause" if named else "other", words
     if wrong or effect.expect == "refuse":
         said = [f for f in e.findings if f.code in effect.causes and _speaks_of(f, wrong)]
+        if said and not wrong:  # what should be refused was left out, and said
+            return number, "right", words
         return number, "warned" if said else "silent", f"{words} {[f.code for f in said] or ''}"
     return number, "right", words
 

@@ -68,6 +68,11 @@ def disturbance(group: Sequence[Record], since: Sequence[float]) -> Disturbance 
         Of one motor.
     since : sequence of float
         Time of each record at which what is given here begins [s].
+
+    Returns
+    -------
+    Disturbance or None
+        None where there is none, or where it is no small part.
     """
     blocks = [_in_blocks(r, sum(map(len, group))) for r in group]
     kept = _alike(blocks)
