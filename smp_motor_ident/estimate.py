@@ -214,12 +214,13 @@ def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) 
             plain = _stated(group, request, words, data, hold, [*left, one])
             if not lacks_something(plain):
                 return plain
-            if one is candidates[-1] and (rest := _undisturbed(group, request, found, one.fit)):
+            noisy = refused is None and (plain.unreliable or one.fit.noise_ratio > 0)
+            if noisy and (rest := _undisturbed(group, request, found, one.fit)):
                 return rest
             behind, driver = _through_driver(group, request, found, data, hold, one.fit)
             return behind or suspecting(plain, driver, one.fit)
         except (SignalError, InsufficientExcitationError) as refusal:
-            if one is candidates[-1] and (rest := _undisturbed(group, request, found, one.fit)):
+            if refused is None and (rest := _undisturbed(group, request, found, one.fit)):
                 return rest
             refused = refused or refusal
             # What was refused, and what is richer, is no rival that another's answer must cover.

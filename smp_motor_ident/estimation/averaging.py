@@ -10,7 +10,7 @@ Yao, Vehtari, Simpson and Gelman, Bayesian Analysis 13 (2018), 917, section 3.4 
 Burnham and Anderson, Model Selection and Multimodel Inference, 2nd ed., section 4.3.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -35,11 +35,10 @@ ABSENT = (
 """Quantities that are nothing in a structure that does not have them."""
 
 
-def weights(data: Callable[[Fit], Experiments], fits: Sequence[Fit], seed: int = 0) -> Array:
+def weights(data: Sequence[Experiments], fits: Sequence[Fit], seed: int = 0) -> Array:
     """Return the weight of each candidate, by a Bayesian bootstrap of runs of samples."""
     rows = []
-    for fit in fits:
-        own = data(fit)
+    for own, fit in zip(data, fits, strict=True):
         predicted = prediction.simulate(own, fit, gain=True)
         edges = np.linspace(0, own.size, BLOCKS + 1).astype(np.int64)[:-1]
         run = np.zeros(BLOCKS)
@@ -96,14 +95,15 @@ def candidate_weights(data: Experiments, candidates: Sequence[FittedCandidate]) 
     One that has not settled explains them at least as well as that.
     """
     last = len(candidates) - 1
-    whole = [r.whole and bool(np.isfinite(r.fit.deviance)) for r in candidates[:last]]
-    places = [n for n, there in enumerate(whole) if there]
+    finite = [bool(np.isfinite(r.fit.deviance)) for r in candidates]
+    places = [n for n in range(last) if candidates[n].whole and finite[n]]
     if data.quantum > 0:  # a speed in coarse steps is a difference of counts, by its making
         places = [n for n in places if candidates[n].fit.kind == candidates[last].fit.kind]
     if not places:
         return {}
     places = [last, *places]
-    found = weights(lambda fit: of_kind(data, fit), [candidates[n].fit for n in places])
+    there = [candidates[n] for n in places]
+    found = weights([of_kind(r.on or data, r.fit) for r in there], [r.fit for r in there])
     return dict(zip(places, map(float, found), strict=True))
 
 

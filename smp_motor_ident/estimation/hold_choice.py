@@ -19,14 +19,21 @@ from smp_motor_ident.estimation.thinning import thinned
 from smp_motor_ident.estimation.trials import LAGS, tried
 from smp_motor_ident.likelihood.experiments import Experiments, prepare
 from smp_motor_ident.likelihood.hold import between_samples
-from smp_motor_ident.model.coordinates import direction
+from smp_motor_ident.model.coordinates import Coordinates, direction
 from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.model.structures import SecondOrder, Structure
 from smp_motor_ident.record import Record
 
+ALIKE = 0.1
+"""Samples by which the delays of two fits differ that may be the same."""
 LOOKS = (1_000, 4_000, np.inf)
 """Samples on which it is asked whether another hold is worth a search: few, where it comes near
 more, and all before the search."""
+HOLDS = {
+    "held": "held as recorded",
+    "switched": "switched inside its intervals",
+    "middle": "switched in the middle of its intervals",
+}
 EARLIER = {"before": -0.5, "after": 1.0, "interpolated": 0.5}
 """Samples of delay that a hold takes the place of: a command up to its row, with means that moved
 its switches before; one from its row on; one straight from row to row."""
@@ -96,8 +103,14 @@ def otherwise(
         better = rivals[-1].bic < candidates[-1].bic
         if other == hold:
             candidates = [*candidates, *rivals] if better else [*rivals, *candidates]
-        elif better:
+            continue
+        # Nobody knows the odds of two holds: the numbers cover both where they explain alike.
+        rest = (data, hold, candidates[-1]) if better else (again, other, rivals[-1])
+        if better:
             data, hold, candidates = again, other, rivals
+        beside = replace(rest[2], on=rest[0], hold=HOLDS[rest[1]])
+        candidates = [*(r for r in candidates[:-1] if r.hold != beside.hold), candidates[-1]]
+        candidates = [beside, *candidates]
     return data, hold, candidates
 
 
@@ -144,10 +157,11 @@ def _worth_a_search(
     for other, how in others:
         there = data if other == hold else prepare(group, s.current, hold=other)
         there, lag = of_kind(there, best), late - EARLIER[how]
-        found: Fit | None = None
+        fits: list[Fit] = []
         for duration, least in looks.items():
             part = there.data_window(duration).held(how)
-            found = _delayed(part, least, how, lag, options, found)
+            fits = _delayed(part, least, how, lag, options, fits)
+            found = min(fits, key=lambda f: f.deviance)
             # What has not settled, or saw little of the data, tells against a search only where
             # its residuals are of another size.
             near = part.size * (1.0 + (part.current.size > 0))
@@ -156,27 +170,27 @@ def _worth_a_search(
             if found.deviance >= least.deviance + near:
                 break
         else:
-            assert found is not None
             out.append((other, found))
     return out
 
 
 def _delayed(
-    part: Experiments, best: Fit, how: str, lag: float, options: Options, before: Fit | None
-) -> Fit:
-    """Return a fit from the choice's coordinates, as late as that many samples.
+    part: Experiments, best: Fit, how: str, lag: float, options: Options, before: list[Fit]
+) -> list[Fit]:
+    """Return fits from the choice's coordinates, as late as that many samples, the like as one.
 
     Earlier than no delay only a shorter second lag is.  What a shorter look found is gone on from.
     """
     starts = {max(lag, 0.0): best.z, float(max(round(lag), 0)): best.z}
-    if lag < 0 and best.structure.order == 2:
-        te = best.z.second_lag
-        shorter = np.log(max(te + lag * part.step, 0.1 * te) / te)
-        starts[-1.0] = best.z.moved(direction(ln_a2=shorter, ln_te=shorter))
-    if before is not None:
-        starts = {before.z.delay / part.step: before.z}
+    if best.structure.order == 2:
+        te = best.z.second_lag  # may stand for a delay beside another hold
+        starts[(best.z.delay + 0.5 * te) / part.step] = _shorter(best.z, 0.5)
+        if lag < 0:
+            starts[-1.0] = _shorter(best.z, max(1 + lag * part.step / te, 0.1))
+    if before:
+        starts = {f.z.delay / part.step: f.z for f in before}
     near = [best] if best.noise_ratio == 0 else [best, replace(best, noise_ratio=0.0)]
-    fits = []
+    found: list[Fit] = []
     for samples, start in starts.items():
         delay = max(samples, 0.0) * part.step
         shift = part.step if how == "after" else 0.0
@@ -184,14 +198,22 @@ def _delayed(
         z = start.with_(delay=delay)
         fixed = structure.with_(delay=False, fixed={**structure.fixed, "delay": delay})
         whole = [refine(part, fixed, n, fixed.complete(z), options, ROUGHLY) for n in near]
-        fits.append((min(whole, key=lambda f: f.deviance), structure))
-    fit, structure = min(fits, key=lambda f: f[0].deviance)
-    found = restate(part, structure, fit, options)
-    # Another hold may be another part of a sample late.
-    if structure.delay:
-        freed = refine(part, structure, found, found.z, options, ROUGHLY)
-        found = tried(part, min(found, freed, key=lambda f: f.deviance), LAGS, options)
-    return found
+        fit = restate(part, structure, min(whole, key=lambda f: f.deviance), options)
+        if structure.delay:  # another hold may be another part of a sample late
+            freed = refine(part, structure, fit, fit.z, options, ROUGHLY)
+            fit = tried(part, min(fit, freed, key=lambda f: f.deviance), LAGS, options)
+        found.append(fit)
+    found.sort(key=lambda f: f.deviance)
+    return [
+        fit
+        for n, fit in enumerate(found)
+        if all(abs(fit.z.delay - f.z.delay) > ALIKE * part.step for f in found[:n])
+    ]
+
+
+def _shorter(z: Coordinates, share: float) -> Coordinates:
+    """Return the coordinates of a motor with a share of its second lag."""
+    return z.moved(direction(ln_a2=1.0, ln_te=1.0) * np.log(share))
 
 
 def instant_deviation(group: Sequence[Record], hold: str) -> float:

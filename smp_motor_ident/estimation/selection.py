@@ -24,12 +24,14 @@ class FittedCandidate:
     fit: Fit
     reason: str = ""
     whole: bool = True  # fitted to all data, not to a subset
-    on: Experiments | None = None  # the part of the data that it was fitted to, if not all
+    # What it was fitted to, if not the data of the choice: a part of them, or under another hold
+    on: Experiments | None = None
+    hold: str = ""  # the other hold, in words
 
     @property
     def label(self) -> str:
         """Name of the structure with what was added to it."""
-        return self.fit.structure.label
+        return self.fit.structure.label + (f", command {self.hold}" if self.hold else "")
 
     @property
     def bic(self) -> float:
@@ -157,6 +159,6 @@ POLICY = SelectionPolicy()
 def in_turn(candidates: list[FittedCandidate]) -> list[FittedCandidate]:
     """Return the choice, then those that are no richer; whose descent did not settle come last."""
     most = candidates[-1].fit.structure.size
-    others = [r for r in candidates[:-1] if r.whole and r.fit.structure.size <= most]
+    others = [r for r in candidates[:-1] if r.whole and not r.hold and r.fit.structure.size <= most]
     others.sort(key=lambda r: (not r.fit.converged, r.bic))
     return [candidates[-1], *others]

@@ -54,8 +54,8 @@ def test_a_candidate_that_only_the_current_rejects_has_no_weight():
     fit = initial_fit(data, Electromechanical(), Options())
     # Of another resistance, and all torques with it, the motor turns just alike.
     other = replace(fit, z=fit.z.with_(ln_r=fit.z.ln_r + 0.02))
-    assert weights(lambda _: data, [fit, other])[1] < 1e-6
-    assert np.ptp(weights(lambda _: data, [fit, fit])) < 1e-9
+    assert weights([data, data], [fit, other])[1] < 1e-6
+    assert np.ptp(weights([data, data], [fit, fit])) < 1e-9
 
 
 def test_a_candidate_that_did_not_settle_is_covered_as_far_as_it_explains_the_data():

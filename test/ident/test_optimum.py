@@ -10,7 +10,7 @@ from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.estimation import prediction
+from smp_motor_ident.estimation import prediction, shape_constraint
 from smp_motor_ident.estimation.descent import first_noise
 from smp_motor_ident.estimation.fit import Options, Start, solve
 from smp_motor_ident.estimation.initialisation import initial_fit
@@ -244,3 +244,12 @@ def test_tabulated_propagators_of_jittered_stamps_are_the_exact_ones(order, fric
     # The polynomial is exact to 1e-13; sums cancel by some orders more.
     np.testing.assert_allclose(a.cost, b.cost, rtol=1e-9)
     np.testing.assert_allclose(a.normal, b.normal, rtol=1e-8, atol=1e-10 * np.abs(b.normal).max())
+
+
+@pytest.mark.parametrize("runaway", [{"ln_a1": 800.0}, {"ln_a2": -1600.0, "ln_a1": -790.0}])
+def test_a_step_that_runs_away_reaches_no_edge(runaway):
+    """A descent that is asked where one full step more would lead asks for lags beyond numbers."""
+    with np.errstate(all="ignore"):
+        z = Coordinates(ln_a0=-3.0, ln_a1=-5.0, ln_a2=-12.0, ln_te=-7.0).with_(**runaway)
+        assert shape_constraint.edge(z, 0.95) is None
+        assert shape_constraint.within(z).ln_a0 == -3.0
