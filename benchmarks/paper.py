@@ -28,7 +28,7 @@ from closed_loop import (
 )
 
 from smp_motor_control.excitation import Fourier, Sine, Square
-from smp_motor_control.motor.friction import MotorParameters
+from smp_motor_control.motor.parameters import MotorParameters
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.record import Hardware, Record
 from smp_motor_ident.tune import Loop, design_wheels

@@ -101,7 +101,7 @@ class Drive:
 def changed_speed(c: Case, design, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Return the instants [s] and the true speed [rad/s, motor] of a change of set-point."""
     from smp_motor_control.encoder import Encoder
-    from smp_motor_control.motor.friction import Gearbox
+    from smp_motor_control.motor.parameters import Gearbox
     from smp_motor_control.wheel.loop import WheelLoop
     from smp_motor_ident.tune.verification import loop_settings
     from smp_motor_ident.tune.writing import parameters

@@ -21,8 +21,7 @@ from typing import Any
 
 from smp_motor_control.encoder import Encoder
 from smp_motor_control.errors import ParameterError, check_positive
-from smp_motor_control.motor.friction import Gearbox, MotorParameters
-from smp_motor_control.motor.parameters import COMBINATIONS, PHYSICAL
+from smp_motor_control.motor.parameters import COMBINATIONS, PHYSICAL, Gearbox, MotorParameters
 from smp_motor_control.parameter_file import read_parameters
 
 HARDWARE = {

@@ -13,10 +13,8 @@ of a step is rounding, whatever its length.
 import math
 
 from smp_motor_control.errors import ParameterError
-from smp_motor_control.motor.parameters import Gearbox, MotorParameters
+from smp_motor_control.motor.parameters import MotorParameters
 from smp_motor_control.motor.response import Coefficients, FreeResponse
-
-__all__ = ["Gearbox", "Motor", "MotorParameters"]
 
 _MAX_CACHED_STEPS = 64
 _MAX_EVENTS_PER_STEP = 100_000

@@ -57,17 +57,6 @@ class ProfileLimits:
             if value != math.inf:
                 check_range(f"limit of {name}", value, 1e-6, 1e12, f"rad/s{unit}")
 
-    @classmethod
-    def from_parameters(
-        cls, max_velocity: float, max_acceleration: float, max_jerk: float
-    ) -> "ProfileLimits":
-        """Return the limits that ROS parameters mean, where 0 is no limit."""
-        return cls(
-            velocity=max_velocity or math.inf,
-            acceleration=max_acceleration or math.inf,
-            jerk=max_jerk or math.inf,
-        )
-
 
 class MinimumJerk:
     """Polynomial of fifth order from a moving start to a target at rest.

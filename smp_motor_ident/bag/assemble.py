@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_control.arrays import Array, Integers
-from smp_motor_control.motor.friction import Gearbox
+from smp_motor_control.motor.parameters import Gearbox
 from smp_motor_ident.bag.axis import Motor, Series, on_one_axis, unwrapped
 from smp_motor_ident.bag.checks import impossible, is_unsigned, signed
 from smp_motor_ident.bag.clock import SAME_CLOCK, ClockFit, epochs, fit_clock, judge_stamps, rhythm

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from smp_motor_control.encoder import unwrap
-from smp_motor_control.motor.friction import Gearbox
+from smp_motor_control.motor.parameters import Gearbox
 from smp_motor_ident.bag.decode import Columns, read_columns
 from smp_motor_ident.record import Hardware
 from smp_motor_ident.report.chart import Chart, Curve

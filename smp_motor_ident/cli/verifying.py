@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from smp_motor_control import controller_of
-from smp_motor_control.motor.file import nest
 from smp_motor_ident.bag.decode import Columns, read_columns
 from smp_motor_ident.cli import steps
 from smp_motor_ident.cli.driving import wheel_angle
@@ -166,9 +165,8 @@ def _changes(
     even, speed = verification.smoothed(
         instants, wheel_angle(state, estimate.hardware)[shown], step
     )
-    parameters = nest(designed.gains[wheel])
     rows = verification.predicted(
-        estimate, parameters, document["loop"], asked, (instants, waited), even
+        estimate, designed.gains[wheel], document["loop"], asked, (instants, waited), even
     )
     hardware = estimate.hardware
     count = 2 * np.pi / (hardware.counts_per_revolution or 1e6) / hardware.gear_ratio

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from smp_motor_control.reference import minimum_jerk
+from smp_motor_control.reference.minimum_jerk import PEAK_ACCELERATION
 from smp_motor_control.reference.profile import Drive, Profile, ProfileLimits
 from smp_motor_control.wheel.loop import LONGEST_TRANSITION
 from smp_motor_ident.errors import DesignError
@@ -38,9 +39,6 @@ PEAK = 0.95
 
 CHANGE = 0.5
 """Share of the largest speed that the figures of a design are about."""
-
-PEAK_RATE = 1.875
-"""Peak acceleration of a minimum-jerk change of unit distance in unit time."""
 
 
 @dataclass(frozen=True)
@@ -142,7 +140,7 @@ def plan_reference(
     plan = _quickest(plant, loop, controller, plan, least)
     quickest = plan.transition_time
     if rate is not None:
-        steepest = _steepest(plant, loop, plan.max_velocity, quickest)
+        steepest = _steepest(plan)
         if rate > steepest:
             raise DesignError(
                 f"max_acceleration {rate / ratio:.4g} rad/s^2 is beyond the motor: a "
@@ -212,19 +210,16 @@ def _overshoot(plant: Plant, controller: Controller, plan: Reference) -> float:
     return step_figures(time, run.speed[0], run.voltage[0], 1.0).overshoot
 
 
-def _steepest(plant: Plant, loop: Loop, speed: float, quickest: float) -> float:
-    """Return the largest acceleration that no change up to ``speed`` takes beyond the supply."""
-    room = PEAK * loop.supply_voltage - float(plant.motors.static_voltage[0])
-    highest = PEAK_RATE * speed / quickest
-    m, rest = plant.motors, minimum_jerk.Reference(0.0, 0.0, 0.0)
-    a0, a1, a2 = (float(a[0]) for a in (m.a0, m.a1, m.a2))
+def _steepest(plan: Reference) -> float:
+    """Return the largest acceleration that no change of speed takes beyond the voltage."""
+    quickest, drive, rest = plan.transition_time, plan.drive, minimum_jerk.Reference(0.0, 0.0, 0.0)
+    highest = PEAK_ACCELERATION * plan.max_velocity / quickest
     for rate in highest * np.geomspace(1.0, 0.01, 200):
         # A change that just takes the shortest time has the most jerk for its acceleration.
-        for change in np.geomspace(rate * quickest / PEAK_RATE, speed, 4):
-            duration = PEAK_RATE * change / rate
-            motion = minimum_jerk.MinimumJerk(rest, change, duration)
-            rows = [motion.at(t) for t in np.linspace(0.0, duration, 100).tolist()]
-            if max(a0 * r.velocity + a1 * r.acceleration + a2 * r.jerk for r in rows) > room:
+        for change in np.geomspace(rate * quickest / PEAK_ACCELERATION, plan.max_velocity, 4):
+            motion = minimum_jerk.MinimumJerk(rest, change, PEAK_ACCELERATION * change / rate)
+            instants = np.linspace(0.0, motion.duration, 100).tolist()
+            if max(drive.needed(motion.at(t)) for t in instants) > drive.top_speed:
                 break
         else:
             break

@@ -6,7 +6,7 @@ that the estimate leaves open, seen through the same encoder and read in the sam
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,12 +14,11 @@ from scipy.signal import savgol_filter
 from scipy.special import stdtrit
 
 from smp_motor_control.encoder import Encoder
+from smp_motor_control.fields import parameters_in, settings_of
 from smp_motor_control.motor.file import MotorEntry
-from smp_motor_control.motor.friction import Gearbox, MotorParameters
 from smp_motor_control.motor.hardware import DrivenMotor, DriveSettings
-from smp_motor_control.motor.model import MotorModel
-from smp_motor_control.pid import PidGains
-from smp_motor_control.reference.profile import Drive, ProfileLimits
+from smp_motor_control.motor.parameters import Gearbox, MotorParameters
+from smp_motor_control.parameter_file import flat
 from smp_motor_control.wheel.loop import LoopSettings, WheelLoop
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.result import Estimate
@@ -300,21 +299,8 @@ def disturbed(silence: float) -> list[Finding]:
 
 def loop_settings(parameters: Mapping[str, Any]) -> LoopSettings:
     """Return the running loop of a wheel's parameters, as ``tune`` writes them."""
-    gains = {f.name: parameters[f.name] for f in fields(PidGains) if f.name in parameters}
-    drive, model = parameters.get("drive"), parameters.get("model")
-    return LoopSettings(
-        gains=PidGains(**gains),
-        limits=ProfileLimits.from_parameters(
-            parameters.get("max_velocity", 0.0), parameters.get("max_acceleration", 0.0), 0.0
-        ),
-        transition_time=parameters.get("transition_time", 0.0),
-        reference_delay=parameters.get("reference_delay", 0.0),
-        reference_doubt=parameters.get("reference_doubt", 0.0),
-        drive=Drive(**drive) if drive and drive["top_speed"] else None,
-        speed_source=parameters.get("speed_source", "measured"),
-        difference_window=parameters.get("difference_window", 1),
-        model=MotorModel(**model) if model else None,
-    )
+    usual = {name: one.default for name, one in parameters_in(LoopSettings).items()}
+    return settings_of(LoopSettings, usual | flat(parameters))
 
 
 def _motors(estimate: Estimate, supply: float) -> list[MotorEntry]:

@@ -9,6 +9,7 @@ import pytest
 
 from smp_motor_control.encoder import Encoder
 from smp_motor_control.errors import ParameterError
+from smp_motor_control.fields import settings_of
 from smp_motor_control.motor import Gearbox, MotorParameters
 from smp_motor_control.motor.file import MotorEntry
 from smp_motor_control.motor.hardware import DrivenMotor, DriveSettings
@@ -142,7 +143,8 @@ def draw_settings(rng: np.random.Generator) -> LoopSettings:
         derivative_filter_time_constant=x(0.0, True), feedforward_static=x(0.5, True),
         feedforward_velocity=x(1.5, True), feedforward_acceleration=x(0.1, True),
     )  # fmt: skip
-    limits = ProfileLimits.from_parameters(x(0.0, True), x(0.0, True), x(0.0, True))
+    of_reference = ("max_velocity", "max_acceleration", "max_jerk")
+    limits = settings_of(ProfileLimits, {name: x(0.0, True) for name in of_reference})
     drive = None
     if rng.random() < 0.5:
         drive = Drive(top_speed=x(8.0), time_constant=x(0.05), time_constant_product=x(1e-4, True))

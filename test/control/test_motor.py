@@ -9,7 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from smp_motor_control.errors import ParameterError
-from smp_motor_control.motor.friction import Gearbox, Motor, MotorParameters
+from smp_motor_control.motor import Gearbox, Motor, MotorParameters
 
 PAPER = {  # Table 1 of the paper: J, K, L, R, b
     1: (1.13e-6, 0.011029, 0.30994, 12.919, 2.40e-5),

@@ -10,7 +10,7 @@ from scipy.linalg import expm
 
 from smp_motor_control.encoder import DifferencedSpeed, Encoder
 from smp_motor_control.errors import ParameterError
-from smp_motor_control.motor.friction import Motor, MotorParameters
+from smp_motor_control.motor import Motor, MotorParameters
 from smp_motor_control.motor.model import MotorModel
 from smp_motor_control.observer import ObserverNoise, SpeedObserver, prediction, steady_gain
 

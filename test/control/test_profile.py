@@ -13,6 +13,7 @@ from scipy.linalg import expm
 from scipy.optimize import linprog
 
 from smp_motor_control.errors import ParameterError
+from smp_motor_control.fields import settings_of
 from smp_motor_control.reference.minimum_jerk import (
     PEAK_ACCELERATION,
     PEAK_JERK,
@@ -161,7 +162,8 @@ def test_limit_that_stops_everything_is_refused(name: str, value: float) -> None
 
 
 def test_parameters_of_zero_mean_no_limit() -> None:
-    assert ProfileLimits.from_parameters(0.0, 0.0, 0.0) == ProfileLimits()
+    zeros = dict.fromkeys(("max_velocity", "max_acceleration", "max_jerk"), 0.0)
+    assert settings_of(ProfileLimits, zeros) == ProfileLimits()
 
 
 drives = st.builds(

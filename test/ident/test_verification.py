@@ -11,8 +11,8 @@ import pytest
 from wheel_simulation import Timing, simulate_closed_loop
 
 from smp_motor_control.motor.file import MotorEntry, load_motors
-from smp_motor_control.motor.friction import MotorParameters
 from smp_motor_control.motor.hardware import DriveSettings
+from smp_motor_control.motor.parameters import MotorParameters
 from smp_motor_ident.cli.tuning import read_estimates
 from smp_motor_ident.result import Quantity
 from smp_motor_ident.tune import Design, Loop, design
