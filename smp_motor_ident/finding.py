@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
 
 Severity = Literal["note", "warning", "unreliable", "refused"]
 SEVERITIES: tuple[Severity, ...] = ("note", "warning", "unreliable", "refused")
@@ -34,16 +34,6 @@ class Finding:
     message: str
     evidence: Mapping[str, float | str | None] = field(default_factory=dict)
     advice: str = ""
-
-    def to_document(self) -> dict[str, Any]:
-        """Return the entry of ``identification.json``."""
-        return {
-            "code": self.code,
-            "severity": self.severity,
-            "message": self.message,
-            "evidence": dict(self.evidence),
-            "advice": self.advice,
-        }
 
 
 def gravest(findings: Iterable[Finding]) -> Severity | None:

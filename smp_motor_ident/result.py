@@ -5,11 +5,12 @@ Plain data, written to and read from ``identification.json`` without loss.
 
 from __future__ import annotations
 
-import math
+import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
+import msgspec
 import numpy as np
 
 from smp_motor_control.arrays import Array
@@ -91,11 +92,6 @@ class Candidate:
     bic: float | None
     chosen: bool = False
     reason: str = ""
-
-    def to_document(self) -> dict[str, Any]:
-        """Return its entry of ``identification.json``."""
-        numbers = {"fit_percent": _number(self.fit_percent), "bic": _number(self.bic)}
-        return {"model": self.model, **numbers, "chosen": self.chosen, "reason": self.reason}
 
 
 @dataclass(frozen=True, eq=False)
@@ -264,50 +260,38 @@ class Estimate:
         dict
             Of plain types; numbers that do not exist are None.
         """
-        error = self.residuals.model_error
-        return {
+        residuals = ("white", "independent_of_input", "model_error")
+        document: dict[str, Any] = plain({
             "model": self.model,
-            "parameters": {n: _quantity_to_document(q) for n, q in self.parameters.items()},
+            "parameters": self.parameters,
             "identifiable": self.identifiable,
-            "unidentifiable": list(self.unidentifiable),
-            "combinations": {n: _quantity_to_document(q) for n, q in self.combinations.items()},
-            "covariance": {
-                "names": list(self.names),
-                "matrix": [[_number(x) for x in row] for row in self.covariance],
-            },
-            "fit_percent": {n: _number(x) for n, x in asdict(self.fit_percent).items()},
-            "candidates": [c.to_document() for c in self.candidates],
-            "residuals": {
-                "white": self.residuals.white,
-                "independent_of_input": self.residuals.independent_of_input,
-                "model_error": error and {n: list(x) for n, x in asdict(error).items()},
-            },
-            "findings": [f.to_document() for f in self.findings],
-            "warnings": list(self.warnings),
-            "advice": list(self.advice),
+            "unidentifiable": self.unidentifiable,
+            "combinations": self.combinations,
+            "covariance": {"names": self.names, "matrix": self.covariance},
+            "fit_percent": self.fit_percent,
+            "candidates": self.candidates,
+            "residuals": {name: getattr(self.residuals, name) for name in residuals},
+            "findings": self.findings,
+            "warnings": self.warnings,
+            "advice": self.advice,
             "samples": self.samples,
-            "duration": _number(self.duration),
-            "sample_time": _number(self.sample_time),
-            "speed_noise": _number(self.speed_noise),
-            "angle_noise": _number(self.angle_noise),
-            "largest_voltage": _number(self.largest_voltage),
-            "sources": list(self.sources),
-            "hardware": {n: _number(x) for n, x in asdict(self.hardware).items()},
-        }
+            "duration": self.duration,
+            "sample_time": self.sample_time,
+            "speed_noise": self.speed_noise,
+            "angle_noise": self.angle_noise,
+            "largest_voltage": self.largest_voltage,
+            "sources": self.sources,
+            "hardware": self.hardware,
+        })  # fmt: skip
+        return document
 
 
-def _number(value: float | None) -> float | None:
-    if value is None or isinstance(value, int):
-        return value
-    return float(value) if math.isfinite(value) else None
+def plain(value: Any) -> Any:
+    """Return data classes and arrays as JSON has them; a number that does not exist is None."""
+    text = msgspec.json.encode(value, enc_hook=lambda numbers: numbers.tolist())
+    return msgspec.json.decode(text)
 
 
-def _quantity_to_document(quantity: Quantity) -> dict[str, Any]:
-    interval = quantity.ci95
-    return {
-        "value": _number(quantity.value),
-        "std": _number(quantity.std),
-        "ci95": None if interval is None else [_number(interval[0]), _number(interval[1])],
-        "unit": quantity.unit,
-        "status": quantity.status,
-    }
+def to_json(document: Mapping[str, Any]) -> str:
+    """Return a document as the text of a file."""
+    return json.dumps(plain(document), indent=2) + "\n"

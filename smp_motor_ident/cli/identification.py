@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import re
 import sys
@@ -37,7 +36,7 @@ from smp_motor_ident.report.document import (
     write_together,
 )
 from smp_motor_ident.report.figures import Comparison, Role
-from smp_motor_ident.result import UNITS, Estimate
+from smp_motor_ident.result import UNITS, Estimate, to_json
 
 if TYPE_CHECKING:
     from smp_motor_ident.report.tuning_page import Tuning
@@ -223,10 +222,9 @@ def _contents(
         tunings,
         {wheel: history.history_charts(wheel, entries) for wheel, entries in since.items()},
     )
-    document = identification_document(estimates)
     head = [f"Identified {date} by {NAME} from {provenance['Recordings']}.", "SI, motor shaft."]
     return [
-        json.dumps(document, indent=2, allow_nan=False) + "\n",
+        to_json(identification_document(estimates)),
         motors_yaml(estimates, head),
         render(report),
     ]

@@ -1,9 +1,7 @@
 """What a commissioning has found so far: written after every step, and what it stops at."""
 
 import contextlib
-import dataclasses
 import json
-import math
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,6 +12,7 @@ from smp_motor_ident.diagnosis.wheel_test import Figures
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.report import commissioning as page
 from smp_motor_ident.report.document import now, write_together
+from smp_motor_ident.result import plain, to_json
 from smp_motor_ident.tune.verification import Change
 
 SCHEMA = 1
@@ -44,8 +43,7 @@ class Protocol:
 
     def checks(self, figures: Mapping[str, Figures], amplitude: float, speed: float) -> None:
         """Note what the test of the wheels showed, as :class:`~.checking.Checked` has it."""
-        shown = {wheel: _plain(dataclasses.asdict(one)) for wheel, one in figures.items()}
-        self.document |= {"checks": shown, "amplitude": amplitude, **_plain({"speed": speed})}
+        self.document |= plain({"checks": figures, "amplitude": amplitude, "speed": speed})
 
     def changes(self, changes: Sequence[Change]) -> None:
         """Note what a drive showed."""
@@ -55,8 +53,8 @@ class Protocol:
                 "wheel": one.wheel,
                 "name": one.name,
                 "setpoint": one.setpoint,
-                "reading": _plain(dataclasses.asdict(one.reading)),
-                "allowed": _plain(dataclasses.asdict(one.bands)),
+                "reading": plain(one.reading),
+                "allowed": plain(one.bands),
             }
             for one in changes
         ]
@@ -65,7 +63,7 @@ class Protocol:
         """Note and print findings; return those that a commissioning stops at."""
         new = list(findings)
         kept = [f for f in self.document.get("findings", []) if f["step"] != step]
-        self.document["findings"] = kept + [{"step": step, **f.to_document()} for f in new]
+        self.document["findings"] = kept + [{"step": step, **plain(f)} for f in new]
         for finding in new:
             print(f"{finding.severity}: {finding.message}", flush=True)
         return [f for f in new if f.severity == "refused" and f.code not in self._accepted]
@@ -105,11 +103,7 @@ class Protocol:
         """Write both files, or none."""
         self.document["date"] = now()
         files: dict[Path, str | bytes] = {
-            self._folder / NAME: json.dumps(self.document, indent=2, allow_nan=False) + "\n",
+            self._folder / NAME: to_json(self.document),
             self._folder / REPORT: page.render(self.document, self._changes),
         }
         write_together(files, force=True)
-
-
-def _plain(values: Mapping[str, float]) -> dict[str, float | None]:
-    return {name: value if math.isfinite(value) else None for name, value in values.items()}

@@ -15,14 +15,14 @@ from smp_motor_ident.errors import DesignError, ParameterError
 from smp_motor_ident.record import Hardware
 from smp_motor_ident.report.document import check_free, now, read_identification, write_together
 from smp_motor_ident.report.tuning_page import tuning_svg
-from smp_motor_ident.result import Estimate, Quantity
+from smp_motor_ident.result import Estimate, Quantity, to_json
 from smp_motor_ident.tune import METHODS, Design, Loop, compare, design_wheels, recommend
 from smp_motor_ident.tune.case import COMMON
 from smp_motor_ident.tune.curves import curves
 from smp_motor_ident.tune.exports import FORMATS, export
 from smp_motor_ident.tune.source import choose_source
 from smp_motor_ident.tune.wheels import WheelSet
-from smp_motor_ident.tune.writing import gains_document, gains_yaml, parameters, to_json
+from smp_motor_ident.tune.writing import gains_document, gains_yaml, parameters
 
 DEFAULT_RATE = 200.0
 """Steps per second where neither the user nor the identification says [Hz]."""

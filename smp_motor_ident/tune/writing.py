@@ -1,13 +1,13 @@
 """Designs as files: the parameter file of the wheel nodes, and ``gains.json``."""
 
 import dataclasses
-import json
 import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 import yaml
 
+from smp_motor_ident.result import plain
 from smp_motor_ident.tune.designer import Design
 
 SCHEMA = 1
@@ -60,45 +60,27 @@ def gains_document(
 
 
 def _entry(design: Design) -> dict[str, Any]:
-    entry = {
+    ratio, reference, bands = design.loop.gear_ratio, design.reference, design.specification
+    entry: dict[str, Any] = plain({
         "method": design.method,
         "reason": design.reason,
-        "warnings": list(design.warnings),
-        "gains": dataclasses.asdict(design.gains),
-        "margins": dataclasses.asdict(design.margins),
-        "robustness": dataclasses.asdict(design.robustness),
-        "findings": [one.to_document() for one in design.findings],
-        "performance": dataclasses.asdict(design.performance),
-        "specification": {
-            **dataclasses.asdict(design.specification),
-            "change": design.specification.change / design.loop.gear_ratio,
-        },
+        "warnings": design.warnings,
+        "gains": design.gains,
+        "margins": design.margins,
+        "robustness": design.robustness,
+        "findings": design.findings,
+        "performance": design.performance,
+        "specification": dataclasses.replace(bands, change=bands.change / ratio),
         "reference": {
-            "max_velocity": design.reference.max_velocity / design.loop.gear_ratio,
-            "max_acceleration": design.reference.max_acceleration / design.loop.gear_ratio,
-            "transition_time": design.reference.transition_time,
-            "lag": design.reference.lag,
-            "doubt": design.reference.doubt,
-            "top_speed": design.reference.drive.top_speed / design.loop.gear_ratio,
+            "max_velocity": reference.max_velocity / ratio,
+            "max_acceleration": reference.max_acceleration / ratio,
+            "transition_time": reference.transition_time,
+            "lag": reference.lag,
+            "doubt": reference.doubt,
+            "top_speed": reference.drive.top_speed / ratio,
         },
-        "loop": {**dataclasses.asdict(design.loop), "delay": design.loop.loop_delay},
-        "motor": dict(design.motor),
-        "sensor": dict(design.sensor),
-    }
-    plain: dict[str, Any] = _plain(entry)
-    return plain
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _plain(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(entry) for entry in value]
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return value
-
-
-def to_json(document: Mapping[str, Any]) -> str:
-    """Return a document as text."""
-    return json.dumps(document, indent=2, allow_nan=False) + "\n"
+        "loop": dataclasses.replace(design.loop, delay=design.loop.loop_delay),
+        "motor": design.motor,
+        "sensor": design.sensor,
+    })  # fmt: skip
+    return entry

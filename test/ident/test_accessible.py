@@ -16,6 +16,7 @@ from smp_motor_ident.finding import Finding
 from smp_motor_ident.report import commissioning, fleet, tuning_page
 from smp_motor_ident.report.figures import Comparison
 from smp_motor_ident.report.html import Report, render
+from smp_motor_ident.result import plain
 from smp_motor_ident.tune import Loop
 from smp_motor_ident.tune.verification import Change, Reading
 
@@ -64,7 +65,7 @@ def commissioning_page(_: pytest.MonkeyPatch) -> str:
     )  # fmt: skip
     steps = [("checks", "warning"), ("validation", "note"), ("verification", "refused")]
     findings = [
-        {"step": step, **Finding("code", severity, "what was seen", {}, "do this").to_document()}
+        {"step": step, **plain(Finding("code", severity, "what was seen", {}, "do this"))}
         for step, severity in steps
     ]
     names = [name for name, _ in commissioning.COLUMNS]
