@@ -7,13 +7,17 @@ start of the record.  Records know no files, no topics and no ROS.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
 
 from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident.errors import SignalError
 from smp_motor_ident.finding import Finding
+
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+"""A number of a file that must be so; what programs make is not checked."""
 
 
 @dataclass(frozen=True)
@@ -34,11 +38,11 @@ class Hardware:
         Armature resistance [ohm] as measured with an ohmmeter.
     """
 
-    gear_ratio: float = 1.0
-    counts_per_revolution: float | None = None
-    encoder_bits: int = 0
-    supply_voltage: float | None = None
-    resistance: float | None = None
+    gear_ratio: Positive = 1.0
+    counts_per_revolution: Positive | None = None
+    encoder_bits: Annotated[int, msgspec.Meta(ge=0, le=64)] = 0
+    supply_voltage: Positive | None = None
+    resistance: Positive | None = None
 
 
 @dataclass(frozen=True, eq=False)

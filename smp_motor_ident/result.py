@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -18,6 +18,8 @@ from smp_motor_ident.finding import Finding, gravest
 from smp_motor_ident.record import Hardware
 
 Status = Literal["estimated", "fixed", "unidentifiable"]
+NotNegative = Annotated[float, msgspec.Meta(ge=0)]
+"""A number of a file, where it must be so."""
 
 UNITS: Mapping[str, str] = {
     "resistance": "ohm",
@@ -69,7 +71,7 @@ class Quantity:
     """
 
     value: float | None
-    std: float | None = None
+    std: NotNegative | None = None
     ci95: tuple[float, float] | None = None
     unit: str = ""
     status: Status = "estimated"
@@ -165,9 +167,9 @@ class Estimate:
     findings: tuple[Finding, ...] = ()
     samples: int = 0
     duration: float = 0.0
-    sample_time: float = 0.0
-    speed_noise: float = 0.0
-    angle_noise: float = 0.0
+    sample_time: NotNegative = 0.0
+    speed_noise: NotNegative = 0.0
+    angle_noise: NotNegative = 0.0
     largest_voltage: float = 0.0
     sources: tuple[str, ...] = ()
     hardware: Hardware = Hardware()

@@ -88,22 +88,10 @@ def _check(estimate: Estimate) -> None:
     if size and (np.diag(estimate.covariance) < 0).any():
         raise ValueError("a variance is negative")
     for name, quantity in (*estimate.parameters.items(), *estimate.combinations.items()):
-        if quantity.std is not None and quantity.std < 0:
-            raise ValueError(f"{name}: its standard deviation is negative")
         if quantity.value is None and quantity.status != "unidentifiable":
             raise ValueError(f"{name}: it is {quantity.status} and has no value")
         if name in POSITIVE and quantity.value is not None and quantity.value <= 0:
             raise ValueError(f"{name} is {quantity.value}; it must be positive")
-    hardware = estimate.hardware
-    for name in ("gear_ratio", "counts_per_revolution", "supply_voltage", "resistance"):
-        value = getattr(hardware, name)
-        if value is not None and value <= 0:
-            raise ValueError(f"{name} is {value}; it must be positive")
-    if not 0 <= hardware.encoder_bits <= 64:
-        raise ValueError("encoder_bits is impossible")
-    for name in ("sample_time", "speed_noise", "angle_noise"):
-        if getattr(estimate, name) < 0:
-            raise ValueError(f"{name} is negative")
 
 
 def _known(quantity: Quantity | None) -> bool:
