@@ -1,7 +1,7 @@
 """``commission``: the whole way on the user's own running robot, wheels off the ground."""
 
 import argparse
-from collections.abc import Sequence
+from functools import partial
 
 from smp_motor_ident.cli.frame import OF_ROS, Parser, number, run
 
@@ -36,9 +36,7 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the tool; return its exit code."""
-    return run(parser(), "commissioning", argv)
+main = partial(run, parser, "commissioning")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """``demo``: a simulated robot from four unknown motors to four tuned wheels, checked at the end."""
 
 import argparse
-from collections.abc import Sequence
+from functools import partial
 
 from smp_motor_ident.cli.frame import Parser, number, run
 
@@ -22,9 +22,7 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the tool; return its exit code."""
-    return run(parser(), "demonstration", argv)
+main = partial(run, parser, "demonstration")
 
 
 if __name__ == "__main__":

@@ -65,9 +65,9 @@ class _Output:
         self._guarded(self._stream.flush)
 
 
-def run(parser: argparse.ArgumentParser, work: Work | str, argv: Sequence[str] | None) -> int:
+def run(made: Callable[[], Parser], work: Work | str, argv: Sequence[str] | None = None) -> int:
     """Parse, do the work, and turn whatever happens into a line and an exit code."""
-    before = sys.stdout
+    parser, before = made(), sys.stdout
     sys.stdout = _Output(before or open(os.devnull, "w"))  # noqa: SIM115  (closed by the shell: None)
     try:
         given = sys.argv[1:] if argv is None else argv

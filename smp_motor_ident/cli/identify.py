@@ -1,7 +1,7 @@
 """``identify``: from recordings to motors, each number with its certainty."""
 
 import argparse
-from collections.abc import Sequence
+from functools import partial
 
 from smp_motor_ident.cli.frame import Parser, number, run
 
@@ -63,9 +63,7 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the tool; return its exit code."""
-    return run(parser(), "identification", argv)
+main = partial(run, parser, "identification")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """``tune``: identification.json (or motors.yaml) in, gains for wheel nodes or other loops out."""
 
 import argparse
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -117,9 +117,7 @@ def _add_running(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--relay-seconds", type=float, default=4.0)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the tool; return its exit code."""
-    return frame.run(parser(), "tuning", argv)
+main = partial(frame.run, parser, "tuning")
 
 
 if __name__ == "__main__":

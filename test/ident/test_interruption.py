@@ -7,6 +7,7 @@ import contextlib
 import os
 import signal
 import weakref
+from functools import partial
 
 import pytest
 
@@ -75,5 +76,5 @@ def test_an_error_behind_an_interruption_that_was_dropped_is_that_interruption(c
             signal.raise_signal(signal.SIGTERM)
         raise RuntimeError("no compiled object yet")
 
-    assert frame.run(argparse.ArgumentParser("tool"), compiles, []) == 130
+    assert frame.run(partial(argparse.ArgumentParser, "tool"), compiles, []) == 130
     assert capsys.readouterr().err == "tool: interrupted\n"
