@@ -1,6 +1,5 @@
 """``commission``: the whole way on the user's own running robot, wheels off the ground."""
 
-import argparse
 from functools import partial
 
 from smp_motor_ident.cli.frame import OF_ROS, Parser, number, run
@@ -15,7 +14,7 @@ meanwhile and on again at the end.
 """
 
 
-def parser() -> argparse.ArgumentParser:
+def parser() -> Parser:
     """Return the parser of the command line."""
     made = Parser(prog=NAME, description=DESCRIPTION, epilog=OF_ROS)
     add = made.add_argument

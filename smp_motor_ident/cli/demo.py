@@ -1,6 +1,5 @@
 """``demo``: a simulated robot from four unknown motors to four tuned wheels, checked at the end."""
 
-import argparse
 from functools import partial
 
 from smp_motor_ident.cli.frame import Parser, number, run
@@ -8,7 +7,7 @@ from smp_motor_ident.cli.frame import Parser, number, run
 NAME = "demo"
 
 
-def parser() -> argparse.ArgumentParser:
+def parser() -> Parser:
     """Return the parser of the command line."""
     made = Parser(prog=NAME, description=(
         "Start a simulated robot as real processes, excite and record its wheels, identify and "

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
+from smp_motor_control.arrays import Array
 from smp_motor_control.encoder import unwrap
 from smp_motor_control.motor.parameters import Gearbox
 from smp_motor_ident.bag.decode import Columns, read_columns
 from smp_motor_ident.record import Hardware
 from smp_motor_ident.report.chart import Chart, Curve
 from smp_motor_ident.report.drawing import document
-from smp_motor_ident.tune.arrays import Array
 from smp_motor_ident.tune.simulation import StepFigures, step_figures
 from smp_motor_ident.tune.verification import smoothed
 

@@ -28,7 +28,7 @@ written).
 """
 
 
-def parser() -> argparse.ArgumentParser:
+def parser() -> Parser:
     """Return the parser of the command line."""
     made = Parser(
         prog=NAME,

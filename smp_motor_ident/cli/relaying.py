@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import yaml
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident.cli.processes import connect
 from smp_motor_ident.errors import DesignError, ParameterError
 from smp_motor_ident.report.document import check_free, write_together
-from smp_motor_ident.tune.arrays import Array
 from smp_motor_ident.tune.methods.relay import read_oscillation
 from smp_motor_ident.tune.methods.ziegler_nichols import by_rule
 

@@ -36,7 +36,7 @@ AIMS: dict[str, dict[str, Any]] = {
 TARGETS = (*AIMS, "relay_amplitude", "accept_unreliable")
 
 
-def parser() -> argparse.ArgumentParser:
+def parser() -> frame.Parser:
     """Return the parser of the tool's arguments."""
     p = frame.Parser(
         prog="tune",

@@ -2,12 +2,12 @@
 
 import base64
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.floating[Any]]
+from smp_motor_control.arrays import Array
 
 
 @dataclass(frozen=True, eq=False)

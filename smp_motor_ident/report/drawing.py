@@ -7,7 +7,8 @@ from importlib import resources
 
 import numpy as np
 
-from smp_motor_ident.report.chart import Array, Chart, Curve, thin
+from smp_motor_control.arrays import Array
+from smp_motor_ident.report.chart import Chart, Curve, thin
 from smp_motor_ident.report.words import label
 
 WIDTH = 720

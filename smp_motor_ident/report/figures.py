@@ -6,7 +6,8 @@ from typing import Literal
 
 import numpy as np
 
-from smp_motor_ident.report.chart import Array, Chart, Curve, thin
+from smp_motor_control.arrays import Array
+from smp_motor_ident.report.chart import Chart, Curve, thin
 from smp_motor_ident.report.words import label
 from smp_motor_ident.result import ResidualTests
 

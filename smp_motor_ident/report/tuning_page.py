@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident.errors import SmpError
 from smp_motor_ident.report.chart import Chart, Curve
 from smp_motor_ident.report.drawing import document
 from smp_motor_ident.report.words import label, number
 from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune import METHODS, Design, Loop, design
-from smp_motor_ident.tune.arrays import Array
 from smp_motor_ident.tune.curves import Curves, curves
 from smp_motor_ident.tune.specification import Band
 from smp_motor_ident.tune.writing import gains_yaml

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident.result import Estimate
-from smp_motor_ident.tune.arrays import Array
 from smp_motor_ident.tune.designer import Design
 from smp_motor_ident.tune.margins import frequencies
 from smp_motor_ident.tune.motors import draw_motors, motors_of
@@ -46,7 +46,9 @@ def curves(estimate: Estimate, design: Design) -> Curves:
     change = CHANGE * design.reference.max_velocity
     slow = float(nominal.a1[0] / nominal.a0[0])
     T = loop.sample_time
-    time = T * np.arange(int((design.reference.transition_time + 6 * slow) / T) + 2)
+    time = T * np.arange(
+        int((design.reference.transition_time + 6 * slow) / T) + 2, dtype=np.float64
+    )
     usual = replace(loop, delay=loop.expected_delay)
     plan = sample(nominal, usual)
     planned = planned_change(plan, design.reference, change, time)

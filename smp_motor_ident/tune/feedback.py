@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from smp_motor_ident.tune.arrays import Array, Complex
+from smp_motor_control.arrays import Array, Complex
 from smp_motor_ident.tune.observer_model import SPEED
 from smp_motor_ident.tune.plant import Plant
 

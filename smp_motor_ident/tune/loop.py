@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass, fields
 from typing import Literal
 
-from smp_motor_control.errors import ParameterError
+from smp_motor_control.errors import ParameterError, check_range
 
 SpeedSource = Literal["measured", "difference", "observer"]
 SPEED_SOURCES: tuple[SpeedSource, ...] = ("measured", "difference", "observer")
@@ -89,11 +89,7 @@ class Loop:
             value = getattr(self, entry.name)
             if entry.name in ("speed_source", "averaging_given") or value is None:
                 continue
-            bound = "positive" if entry.name in positive else "not negative"
-            number = isinstance(value, int | float) and not isinstance(value, bool)
-            good = number and (value > 0 if bound == "positive" else value >= 0)
-            if not (good and math.isfinite(value)):
-                raise ParameterError(f"{entry.name} is {value!r}; it must be finite and {bound}")
+            check_range(entry.name, value, 1e-12 if entry.name in positive else 0.0, 1e12)
         if self.difference_window != int(self.difference_window):
             raise ParameterError(
                 f"difference_window is {self.difference_window}; it must be a number of samples"

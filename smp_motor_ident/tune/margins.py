@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import control
 import numpy as np
 
-from smp_motor_ident.tune.arrays import Array, Complex
+from smp_motor_control.arrays import Array, Complex
 from smp_motor_ident.tune.feedback import Feedback, spectral_radius
 from smp_motor_ident.tune.plant import Plant
 
@@ -39,7 +39,8 @@ class Margins:
 def frequencies(sample_time: float, slowest: float, count: int = 500) -> Array:
     """Return a logarithmic grid from well below the loop's slowest corner to Nyquist."""
     nyquist = math.pi / sample_time
-    return np.geomspace(min(0.02 * slowest, 1e-3 * nyquist), nyquist, count)
+    lowest = min(0.02 * slowest, 1e-3 * nyquist)
+    return np.geomspace(lowest, nyquist, count, dtype=np.float64)
 
 
 def grid_for(plant: Plant, count: int = 500) -> Array:

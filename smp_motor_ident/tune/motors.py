@@ -5,11 +5,11 @@ from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
+from smp_motor_control.arrays import Array
 from smp_motor_control.motor.parameters import COMBINATIONS, PHYSICAL
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.result import Estimate, Quantity
-from smp_motor_ident.tune.arrays import Array
 from smp_motor_ident.tune.limits import (
     FRICTION_KNOWN,
     FRICTION_RANGE,

@@ -18,9 +18,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from smp_motor_control.arrays import Array, Complex
 from smp_motor_control.motor.model import MotorModel
 from smp_motor_control.observer import ObserverNoise, prediction, steady_gain
-from smp_motor_ident.tune.arrays import Array, Complex
 
 SPEED = 1
 """Where the speed is in the state."""
@@ -42,7 +42,8 @@ class ObserverModel:
         """Return the transfer from swept angle and from mean voltage to the observed speed."""
         eye = np.eye(self.by_angle.size)
         inputs = np.stack([self.by_angle, self.by_voltage], axis=1)
-        found = np.linalg.solve(z[:, None, None] * eye - self.advance, inputs[None])
+        solved = np.linalg.solve(z[:, None, None] * eye - self.advance, inputs[None])
+        found = np.asarray(solved, dtype=np.complex128)
         return found[:, SPEED, 0], found[:, SPEED, 1]
 
 

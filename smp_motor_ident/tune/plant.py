@@ -15,11 +15,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from smp_motor_control.arrays import Array, Complex
 from smp_motor_control.motor.model import MotorModel
 from smp_motor_control.motor.response import zero_order_hold
 from smp_motor_control.observer import ObserverNoise
 from smp_motor_ident.errors import DesignError
-from smp_motor_ident.tune.arrays import Array, Complex
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.motors import Motors
 from smp_motor_ident.tune.observer_model import ObserverModel, observer_model

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from smp_motor_control.arrays import Array, Complex
 from smp_motor_ident.errors import DesignError
-from smp_motor_ident.tune.arrays import Array, Complex
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.margins import grid_for

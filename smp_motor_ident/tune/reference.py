@@ -19,12 +19,12 @@ from typing import Any
 
 import numpy as np
 
+from smp_motor_control.arrays import Array
 from smp_motor_control.reference import minimum_jerk
 from smp_motor_control.reference.minimum_jerk import PEAK_ACCELERATION
 from smp_motor_control.reference.profile import Drive, Profile, ProfileLimits
 from smp_motor_control.wheel.loop import LONGEST_TRANSITION
 from smp_motor_ident.errors import DesignError
-from smp_motor_ident.tune.arrays import Array
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.plant import Plant, sample
@@ -203,7 +203,9 @@ def _quickest(
 def _overshoot(plant: Plant, controller: Controller, plan: Reference) -> float:
     """Return the overshoot of a small change [%]."""
     slow, T = plan.drive.time_constant, plant.sample_time
-    time = T * np.arange(int((plan.transition_time + plan.lag + 3 * slow) / T) + 2)
+    time = T * np.arange(
+        int((plan.transition_time + plan.lag + 3 * slow) / T) + 2, dtype=np.float64
+    )
     small = replace(plan, drive=replace(plan.drive, top_speed=1e9))
     change = planned_change(plant, small, 1.0, time)
     run = simulate(plant, controller, change.inputs)

@@ -23,8 +23,8 @@ import math
 
 import numpy as np
 
+from smp_motor_control.arrays import Array, Complex
 from smp_motor_ident.diagnosis.response_limits import RESONANCE_DAMPING
-from smp_motor_ident.tune.arrays import Array, Complex
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.limits import RESONANCE_DAMPED, SETTLED
 from smp_motor_ident.tune.plant import Plant
@@ -53,11 +53,13 @@ def added_by_resonance(
         return 0.0, 0.0
     T = plant.sample_time
     nyquist = math.pi / T
-    at = np.geomspace(min(float(unmodelled.frequency[0]), 0.5 * nyquist), 0.98 * nyquist, COUNT)
+    lowest = min(float(unmodelled.frequency[0]), 0.5 * nyquist)
+    at = np.geomspace(lowest, 0.98 * nyquist, COUNT, dtype=np.float64)
     ringing = -math.log(SETTLED.value) / (RESONANCE_DAMPING.value * unmodelled.known * T)
     n = 2 ** math.ceil(math.log2(min(max(answer.size + ringing, SHORTEST), LONGEST)))
-    usual, time = np.pad(answer, (0, n - answer.size), mode="edge"), T * np.arange(n)
-    omega = 2 * np.pi * np.fft.rfftfreq(n, T)[1:]
+    usual = np.pad(answer, (0, n - answer.size), mode="edge")
+    time = T * np.arange(n, dtype=np.float64)
+    omega = np.asarray(2 * np.pi * np.fft.rfftfreq(n, T)[1:], dtype=np.float64)
     complementary, moved = _loop(plant, feedback, omega, usual)
     ends, highest = [_settled(time, usual)], usual.max()
     for damping in DAMPINGS:

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident._compile import compiled
 from smp_motor_ident.model.driver import Driver, terminal_voltage
-from smp_motor_ident.tune.arrays import Array
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.observer_model import NO_OBSERVER, SPEED
 from smp_motor_ident.tune.plant import Plant
@@ -130,14 +130,6 @@ def _drag(speed: float, friction: float, past: Array, reach: Array, load: float)
 
 
 @compiled
-def _weighted(weights: Array, values: Array) -> float:
-    total = 0.0
-    for k in range(weights.size):
-        total += weights[k] * values[k]
-    return total
-
-
-@compiled
 def _observed(
     advance: Array, by_angle: Array, by_voltage: Array, state: Array, swept: float, voltage: float
 ) -> Array:
@@ -226,7 +218,7 @@ def _run(
             angle[0] = place + angle_noise[j, k]
             if observer.size:
                 swept = _turned(angle[0], before, count_angle)
-                delayed = _weighted(observer_taps, past)
+                delayed = np.sum(observer_taps * past[: observer_taps.size])
                 delayed -= modelled * np.sign(observer[SPEED])
                 observer[:] = _observed(advance, by_angle, by_voltage, observer, swept, delayed)
             x[:] = following

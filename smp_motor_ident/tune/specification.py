@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from smp_motor_ident.tune.arrays import Array
+from smp_motor_control.arrays import Array
 from smp_motor_ident.tune.case import Case
 from smp_motor_ident.tune.ensemble import SHARE
 from smp_motor_ident.tune.feedback import Feedback
@@ -177,4 +177,4 @@ def _instants(problem: Problem, fb: Feedback, reference: Reference) -> Array:
     span = reference.transition_time + 8 * problem.reduced.time_constant
     if fb.i > 0:
         span += 4 * (fb.p + 1 / problem.reduced.gain) / fb.i
-    return T * np.arange(min(max(int(span / T), 50), 20_000))
+    return T * np.arange(min(max(int(span / T), 50), 20_000), dtype=np.float64)

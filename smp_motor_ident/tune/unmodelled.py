@@ -19,8 +19,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident.result import Estimate
-from smp_motor_ident.tune.arrays import Array
 from smp_motor_ident.tune.limits import RESONANCE, UNKNOWN_RESPONSE
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.signal import savgol_filter
 from scipy.special import stdtrit
 
+from smp_motor_control.arrays import Array
 from smp_motor_control.encoder import Encoder
 from smp_motor_control.fields import parameters_in, settings_of
 from smp_motor_control.motor.file import MotorEntry
@@ -22,7 +23,6 @@ from smp_motor_control.parameter_file import flat
 from smp_motor_control.wheel.loop import LoopSettings, WheelLoop
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.result import Estimate
-from smp_motor_ident.tune.arrays import Array
 from smp_motor_ident.tune.limits import (
     COMMAND_RESOLUTION,
     DRIVE_LEVEL,
@@ -31,6 +31,7 @@ from smp_motor_ident.tune.limits import (
     SILENCE,
     STEADY_ERROR,
 )
+from smp_motor_ident.tune.simulation import settled
 
 SMOOTHING = 0.05
 """Length [s] of the parabola whose slope is taken as the speed."""
@@ -103,11 +104,10 @@ def resolution(quantum: float, step: float) -> float:
 def read(time: Array, speed: Array, setpoint: float, tolerance: float) -> Reading:
     """Read a change from rest at time zero; ``tolerance`` is a share of the set-point."""
     relative = speed / setpoint
-    outside = np.flatnonzero(np.abs(relative - 1.0) > tolerance)
-    last = int(outside[-1]) if outside.size else -1
+    settling = settled(time, np.abs(relative - 1.0) > tolerance)
     late = time > time[-1] - STEADY
     return Reading(
-        settling=float(time[last + 1]) if last + 1 < time.size else math.inf,
+        settling=math.inf if math.isnan(settling) else settling,
         overshoot=float(max(100 * (relative.max() - 1.0), 0.0)),
         error=float(100 * abs(relative[late].mean() - 1.0)),
     )

@@ -86,7 +86,8 @@ def check(design: Design, gains: Gains) -> Check:
     """Compute margins and step response of the loop that the target runs."""
     loop, plant = design.loop, plant_of(design)
     target = CHANGE * design.reference.max_velocity
-    time = loop.sample_time * np.arange(int(duration(design, gains) / loop.sample_time))
+    steps = int(duration(design, gains) / loop.sample_time)
+    time = loop.sample_time * np.arange(steps, dtype=np.float64)
     controller = Controller(
         gains.feedback, weight=gains.weight, limit=loop.supply_voltage, tracking=gains.tracking
     )

@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident.errors import DesignError
-from smp_motor_ident.tune.arrays import Array
 from smp_motor_ident.tune.feedback import Feedback, spectral_radius, terms
 from smp_motor_ident.tune.limits import SPEED_NOISE
 from smp_motor_ident.tune.margins import loop_margins
@@ -148,7 +148,7 @@ def _search(
         crossovers = np.geomspace(omega[0], 0.6 * omega[-1], 60)
     else:
         crossovers = np.array([bandwidth])
-    margins = np.linspace(margin, min(margin + 35, 95), 8)
+    margins = np.linspace(margin, min(margin + 35, 95), 8, dtype=np.float64)
     best: tuple[Feedback, float] | None = None
     for zoom in (1.0, 0.3, 0.08):
         found = _best(problem, crossovers, margins, shares, margin, peak, focus)

@@ -16,8 +16,8 @@ from typing import Any, cast
 
 import numpy as np
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident.errors import DesignError
-from smp_motor_ident.tune.arrays import Array
 from smp_motor_ident.tune.feedback import Feedback, spectral_radius
 from smp_motor_ident.tune.methods.simc import SIMC
 from smp_motor_ident.tune.problem import Method, Problem, RequiredMargins

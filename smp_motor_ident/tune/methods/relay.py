@@ -17,8 +17,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from smp_motor_control.arrays import Array
 from smp_motor_ident.errors import DesignError
-from smp_motor_ident.tune.arrays import Array
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.methods.ziegler_nichols import from_ultimate
 from smp_motor_ident.tune.problem import Method, Problem, RequiredMargins
