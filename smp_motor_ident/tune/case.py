@@ -25,7 +25,7 @@ from smp_motor_ident.tune.motors import (
     with_lag_of_sensor,
 )
 from smp_motor_ident.tune.plant import sample
-from smp_motor_ident.tune.problem import Method, Problem, RequiredMargins, checked, control_noise
+from smp_motor_ident.tune.problem import Method, Problem, RequiredMargins, checked
 from smp_motor_ident.tune.unmodelled import unmodelled_dynamics, words
 
 CLAMPED = 1 / 6
@@ -151,7 +151,7 @@ def solve(case: Case) -> tuple[Feedback, float, Robustness]:
 def _within_clamp(problem: Problem, feedback: Feedback) -> tuple[Feedback, float]:
     """Soften gains until the control noise leaves room within the clamp."""
     factor, trial = 1.0, feedback
-    while control_noise(problem, trial) > CLAMPED * problem.loop.supply_voltage and factor > 0.01:
+    while problem.control_noise(trial) > CLAMPED * problem.loop.supply_voltage and factor > 0.01:
         factor *= 0.95
         trial = softer(feedback, factor)
     return trial, factor

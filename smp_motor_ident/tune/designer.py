@@ -20,7 +20,6 @@ from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.margins import Margins, loop_margins
 from smp_motor_ident.tune.methods import METHODS
 from smp_motor_ident.tune.plant import Plant, sample
-from smp_motor_ident.tune.problem import control_noise
 from smp_motor_ident.tune.reference import Reference, controller_for, plan_reference
 from smp_motor_ident.tune.simulation import Controller
 from smp_motor_ident.tune.specification import Performance, Specification, figures_of
@@ -93,7 +92,7 @@ def finish(case: Case, feedback: Feedback, factor: float, robustness: Robustness
     usual = _usual(case)
     margins = loop_margins(plant, feedback)
     reference = _plan(usual, loop, controller, margins, problem.targets)
-    noise = control_noise(problem, feedback)
+    noise = problem.control_noise(feedback)
     figures, bands = figures_of(case, usual, controller, reference, margins, noise)
     reason, findings = _explain(case, margins, factor, robustness, (figures, bands))
     m = plant.motors

@@ -71,10 +71,20 @@ class Problem:
         through: Complex = self.plant.through_motor(self.omega)[0]
         return through * self.unmodelled.weight(self.omega)
 
+    def closed(self, feedback: Feedback) -> tuple[Complex, Complex]:
+        """Return the responses of the controller and of the sensitivity on the grid."""
+        control = feedback.response(self.omega, self.loop.sample_time)
+        return control, 1 / (1 + control * self.response)
+
     def unmodelled_gain(self, feedback: Feedback) -> float:
         """Return the largest ``|T| W``: below 1 what the model may lack cannot destabilise."""
-        control = feedback.response(self.omega, self.loop.sample_time)
-        return float(np.abs(control * self.uncertain / (1 + control * self.response)).max())
+        control, sensitivity = self.closed(feedback)
+        return float(np.abs(control * self.uncertain * sensitivity).max())
+
+    def control_noise(self, feedback: Feedback) -> float:
+        """Return the voltage that measurement noise causes at the controller's output."""
+        control, sensitivity = self.closed(feedback)
+        return float(self.noise_rms(control * sensitivity))
 
     @cached_property
     def noise(self) -> Array:
@@ -173,9 +183,3 @@ def noise_density(plant: Plant, loop: Loop, omega: Array) -> Array:
     angle = loop.count_angle**2 / 12 + loop.angle_noise**2
     density: Array = plant.angle_noise(omega) * angle
     return density + loop.reported_noise**2
-
-
-def control_noise(problem: Problem, feedback: Feedback) -> float:
-    """Return the voltage that measurement noise causes at the controller's output."""
-    control = feedback.response(problem.omega, problem.loop.sample_time)
-    return float(problem.noise_rms(control / (1 + problem.response * control)))

@@ -12,7 +12,6 @@ from smp_motor_ident.errors import DesignError
 from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune.case import prepare, solve
 from smp_motor_ident.tune.loop import Loop
-from smp_motor_ident.tune.problem import control_noise
 
 WINDOWS = (2, 4, 8, 16)
 """Samples to difference over that are tried beside what the hardware reports."""
@@ -119,4 +118,4 @@ def _trial(estimate: Estimate, loop: Loop, targets: dict[str, Any]) -> Trial | N
         feedback = solve(case)[0]
     except DesignError:
         return None
-    return Trial(loop, feedback.i * loop.gear_ratio, control_noise(case.problem, feedback))
+    return Trial(loop, feedback.i * loop.gear_ratio, case.problem.control_noise(feedback))

@@ -18,7 +18,6 @@ from smp_motor_ident.report.document import identification_document, read_identi
 from smp_motor_ident.tune import Loop, design
 from smp_motor_ident.tune.case import prepare
 from smp_motor_ident.tune.feedback import Feedback
-from smp_motor_ident.tune.problem import control_noise
 from smp_motor_ident.tune.simulation import Controller, Inputs, simulate, white
 from smp_motor_ident.tune.source import choose_source
 
@@ -114,7 +113,7 @@ def test_simulated_noise_of_an_angle_is_that_of_the_density(found, source, windo
     inputs = Inputs(np.zeros(steps), angle_noise=white(NOISE, (1, steps)))
     run = simulate(problem.plant, Controller(feedback), inputs)
     # The observer's noise is slow: some 2000 of the samples are independent, 3 % is two deviations.
-    assert run.voltage.std() == pytest.approx(control_noise(problem, feedback), rel=0.05)
+    assert run.voltage.std() == pytest.approx(problem.control_noise(feedback), rel=0.05)
 
 
 def test_the_choice_tells_what_a_longer_difference_would_allow(found):

@@ -19,7 +19,7 @@ from smp_motor_ident.tune.methods.relay import oscillate, read_oscillation
 from smp_motor_ident.tune.methods.ziegler_nichols import from_ultimate
 from smp_motor_ident.tune.motors import Motors
 from smp_motor_ident.tune.plant import sample
-from smp_motor_ident.tune.problem import FirstOrderDelay, Problem, control_noise
+from smp_motor_ident.tune.problem import FirstOrderDelay, Problem
 
 # The paper's Table 1 as a0, a1, a2 [V s/rad and its powers].
 PAPER = (
@@ -182,7 +182,7 @@ def test_margin_method_keeps_margin_sensitivity_and_ripple(coefficients, sample_
     # Search grid of 160 frequencies: half a percent.
     assert margins.phase >= 0.995 * 60
     assert margins.sensitivity <= 1.005 * 1.4
-    assert control_noise(one, feedback) <= 1.005 * one.loop.noise_limit
+    assert one.control_noise(feedback) <= 1.005 * one.loop.noise_limit
 
 
 @pytest.mark.parametrize("coefficients", PAPER)
@@ -227,7 +227,7 @@ def test_a_noisy_speed_does_not_leave_a_load_to_itself():
     assert shaking(strict, still) <= 1.0
     # What shakes a slow loop goes with the root of its bandwidth: 1.2^8 squared is 18.
     assert found.i > 10 * still.i
-    assert control_noise(strict, found) <= loop.noise_limit
+    assert strict.control_noise(found) <= loop.noise_limit
     margins = loop_margins(strict.plant, found)
     assert margins.phase >= 59.9 and margins.sensitivity <= 1.4
     assert shaking(strict, found) <= 1.2**8

@@ -20,7 +20,6 @@ from smp_motor_ident.report.document import identification_document
 from smp_motor_ident.result import Estimate, FitPercent, Quantity
 from smp_motor_ident.tune import Loop, design
 from smp_motor_ident.tune.case import prepare
-from smp_motor_ident.tune.problem import control_noise
 
 MOTOR = {"dc_gain": 25.0, "time_constant": 0.05, "time_constant_product": 6e-4}
 LOOP = Loop(sample_time=0.01, delay=0.01, gear_ratio=1.0, counts_per_revolution=2000.0)
@@ -217,7 +216,7 @@ def test_coarse_counts_cost_no_more_than_the_limits_ask_for():
     from smp_motor_ident.tune.margins import batch_margins
     from smp_motor_ident.tune.motors import motors_of
     from smp_motor_ident.tune.plant import sample
-    from smp_motor_ident.tune.problem import Problem, control_noise
+    from smp_motor_ident.tune.problem import Problem
 
     loop = replace(LOOP, counts_per_revolution=48.0, noise_voltage=0.48)
     one = design(estimate(), loop, structure="pi")
@@ -226,7 +225,7 @@ def test_coarse_counts_cost_no_more_than_the_limits_ask_for():
     for p in np.geomspace(0.002, 0.3, 40):
         for i in np.geomspace(0.05, 10.0, 40):
             feedback = Feedback(float(p), float(i))
-            if i > best and control_noise(problem, feedback) <= 0.48:
+            if i > best and problem.control_noise(feedback) <= 0.48:
                 omega, T = problem.omega, loop.sample_time
                 gain = problem.response * feedback.response(omega, T)
                 m, hump = batch_margins(gain[None], omega), np.abs(gain / (1 + gain)).max()
@@ -291,7 +290,7 @@ def test_noise_of_a_recorded_speed_limits_the_gains():
     one, deaf = design(found, loop), design(found, replace(loop, speed_noise=0.0))
     heard = prepare(found, loop, "margin", {}).problem
     assert not heard.plant.window
-    assert control_noise(heard, deaf.feedback) > 2 * loop.noise_limit
+    assert heard.control_noise(deaf.feedback) > 2 * loop.noise_limit
     assert one.performance.control_noise < 1.3 * loop.noise_limit
     assert one.specification.overshoot.high > deaf.specification.overshoot.high
 

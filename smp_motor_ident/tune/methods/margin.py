@@ -101,7 +101,8 @@ def _no_softer_than_simc(
     def better(trial: _Found | None) -> float:
         if trial is None:
             return 0.0
-        return trial[0].i / at_sensitivity(problem, rule, _peak(problem, trial[0])).i
+        sensitivity = float(np.abs(problem.closed(trial[0])[1]).max())
+        return trial[0].i / at_sensitivity(problem, rule, sensitivity).i
 
     best, most = found, better(found)
     steps = 1.2 ** np.arange(1, MORE_NOISE + 1)
@@ -120,11 +121,6 @@ def _no_softer_than_simc(
         if trial is not None and (best is None or trial[0].i > 1.02 * best[0].i):
             best, most = trial, better(trial)
     return best
-
-
-def _peak(problem: Problem, feedback: Feedback) -> float:
-    loop = problem.response * feedback.response(problem.omega, problem.loop.sample_time)
-    return float(1 / np.abs(1 + loop).min())
 
 
 def at_sensitivity(problem: Problem, shape: Feedback, peak: float) -> Feedback:

@@ -89,8 +89,7 @@ class _Cost:
         errors, over = self._errors(p, i, d, filter_time)
         column = [cast(Any, gain[:, None]) for gain in (p, i, d)]
         each = Feedback(column[0], column[1], column[2], filter_time)
-        control = each.response(problem.omega, problem.loop.sample_time)
-        back = 1 / (1 + control * problem.response)
+        control, back = problem.closed(each)
         peak = np.abs(back).max(axis=1)
         excess = np.maximum(peak - REQUIRED.sensitivity, 0) * 20
         excess += (
