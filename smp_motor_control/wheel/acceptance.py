@@ -9,12 +9,12 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import expm
 
 from smp_motor_control.encoder import Encoder
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.motor.model import MotorModel
 from smp_motor_control.motor.parameters import Gearbox
+from smp_motor_control.motor.response import zero_order_hold
 from smp_motor_control.pid import PidGains
 from smp_motor_control.reference.profile import UNLIMITED
 from smp_motor_control.wheel.loop import LoopSettings, WheelLoop
@@ -124,10 +124,10 @@ class _Plant:
         tau, tp = model.time_constant, model.time_constant_product
         # A motor of first order gets an electrical time constant a thousandth of its own.
         tp = max(tp, 1e-3 * tau * tau)
-        drift = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0],
-                          [0.0, -1.0 / tp, -tau / tp, self.final / tp], [0.0] * 4])  # fmt: skip
-        advance = expm(drift * dt)[:3]
-        self._advance = tuple(tuple(float(x) for x in row) for row in advance)
+        held = zero_order_hold(self.final, tau, tp, dt)
+        turned = np.concatenate((held.angle_transition[0], held.angle_forced))
+        moved = np.column_stack((held.transition[0], held.forced[0]))
+        self._advance: list[list[float]] = np.vstack((turned, moved)).tolist()
         self.samples = round(min(max(4.0 * (tau + model.delay) / dt, SAMPLES), MOST_SAMPLES))
         self._late = 1 + math.ceil(min(model.delay / dt, MOST_SAMPLES) - 1e-9)
 
@@ -141,13 +141,12 @@ class _Plant:
         drive = self._held.pop(0)
         if static:
             drive -= math.copysign(min(static, abs(drive)), self.speed or drive)
-        before = self.angle
-        state = (self.angle, self.speed, self.rate, drive)
-        self.angle, self.speed, self.rate = (
-            a * state[0] + b * state[1] + c * state[2] + d * state[3]
-            for a, b, c, d in self._advance
+        speed, rate = self.speed, self.rate
+        turned, self.speed, self.rate = (
+            a * speed + b * rate + c * drive for a, b, c in self._advance
         )
-        return (self.angle - before) / self.dt
+        self.angle += turned
+        return turned / self.dt
 
 
 def _is_stable(settings: LoopSettings, plant: _Plant) -> bool:
