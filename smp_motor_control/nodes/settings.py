@@ -23,7 +23,7 @@ from rcl_interfaces.msg import (
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from smp_motor_control.errors import ParameterError
+from smp_motor_control.errors import ParameterError, check_range
 from smp_motor_control.fields import Described, parameters_in, settings_of
 
 S = TypeVar("S")
@@ -45,12 +45,6 @@ def coerce(name: str, value: Any, default: Any) -> Any:
         word = {float: "a number", int: "a whole number", bool: "true or false", str: "text"}
         raise ParameterError(f"{name} is {value!r}; it must be {word[wanted]}")
     return value
-
-
-def _check_range(name: str, value: Any, entry: Described) -> None:
-    low, high = entry.minimum, entry.maximum
-    if entry.limited and not low <= value <= high:
-        raise ParameterError(f"{name} is {value!r}; it must be in [{low:g}, {high:g}]")
 
 
 class Parameters(Generic[S]):
@@ -101,7 +95,8 @@ class Parameters(Generic[S]):
 
     def _build(self, values: Mapping[str, Any]) -> S:
         for name, entry in self._entries.items():
-            _check_range(name, values[name], entry)
+            if entry.limited:
+                check_range(name, values[name], entry.minimum, entry.maximum)
         try:
             return settings_of(self._type, values)
         except ArithmeticError as error:

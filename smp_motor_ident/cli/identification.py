@@ -106,19 +106,27 @@ def work(arguments: argparse.Namespace) -> int:
 
 def fixed_parameters(items: Sequence[str]) -> dict[str, float]:
     """Read ``--fix`` arguments."""
-    fixed = {}
+    fixed = _numbers(items, "--fix", UNITS)
+    for name, value in fixed.items():
+        if not 0 <= value < float("inf"):
+            raise ParameterError(
+                f"--fix {name}={value:g}: must be zero or positive, in {UNITS[name]}"
+            )
+    return fixed
+
+
+def _numbers(items: Sequence[str], option: str, known: Mapping[str, object]) -> dict[str, float]:
+    """Read arguments ``NAME=VALUE``."""
+    numbers = {}
     for item in items:
         name, _, text = item.partition("=")
-        if name not in UNITS:
-            raise ParameterError(f"--fix {item}: {name!r} is none of {', '.join(UNITS)}")
+        if name not in known:
+            raise ParameterError(f"{option} {item}: it takes {', '.join(known)}")
         try:
-            value = float(text)
+            numbers[name] = float(text)
         except ValueError:
-            raise ParameterError(f"--fix {item}: {text!r} is not a number") from None
-        if not 0 <= value < float("inf"):
-            raise ParameterError(f"--fix {item}: must be zero or positive, in {UNITS[name]}")
-        fixed[name] = value
-    return fixed
+            raise ParameterError(f"{option} {item}: {text!r} is not a number") from None
+    return numbers
 
 
 def signal_map(arguments: argparse.Namespace) -> bag.SignalMap | None:
@@ -314,15 +322,7 @@ def reconstruction(arguments: argparse.Namespace) -> Reconstruct:
     loop = FORMATS[name].known
     if loop is None:
         raise ParameterError(f"--controller {name}: its arithmetic is not published; log the duty")
-    numbers = dict(loop.defaults)
-    for item in items:
-        key, _, text = item.partition("=")
-        if key not in numbers:
-            raise ParameterError(f"--controller {item}: {name} takes {', '.join(numbers)}")
-        try:
-            numbers[key] = float(text)
-        except ValueError:
-            raise ParameterError(f"--controller {item}: {text!r} is not a number") from None
+    numbers = {**loop.defaults, **_numbers(items, f"--controller {name}", loop.defaults)}
     missing = [key for key, value in numbers.items() if math.isnan(value)]
     if missing:
         raise ParameterError(f"--controller {name}: give {', '.join(f'{k}=...' for k in missing)}")

@@ -1,10 +1,12 @@
-"""What `record` and `play` share: a choice of topics, message classes by name."""
+"""What `record` and `play` share: a choice of topics, message classes by name, QoS."""
 
 import argparse
 import importlib
 import re
 from dataclasses import dataclass
 from typing import Any
+
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from smp_motor_control.errors import SmpError
 
@@ -19,6 +21,15 @@ def message_class(type_name: str) -> Any | None:
     except Exception:  # a package that was built for another ROS may fail in any way
         return None
     return found
+
+
+def quality(depth: int, reliable: bool, latched: bool) -> QoSProfile:
+    """Return the QoS of messages that are taken, or sent again, as they came."""
+    return QoSProfile(
+        depth=depth,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
 
 
 @dataclass(frozen=True)

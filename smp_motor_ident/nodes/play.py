@@ -12,7 +12,6 @@ from typing import Any
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 
 from smp_motor_control.errors import SmpError
@@ -20,7 +19,7 @@ from smp_motor_control.nodes import runtime
 from smp_motor_control.ros_arguments import split_arguments
 from smp_motor_ident.bag.replay import Replay, offered
 from smp_motor_ident.bag.storage import Channel
-from smp_motor_ident.nodes.bag_arguments import chosen, message_class
+from smp_motor_ident.nodes.bag_arguments import chosen, message_class, quality
 
 DEPTH = 1000
 FIND_EACH_OTHER = 1.0
@@ -68,12 +67,7 @@ class Player(Node):
                 why = f"its messages are encoded as {channel.encoding}"
             self.get_logger().warning(f"{channel.topic} is not played: {why}")
             return
-        reliable, latched = offered(channel)
-        qos = QoSProfile(
-            depth=DEPTH,
-            reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-            durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
-        )
+        qos = quality(DEPTH, *offered(channel))
         publisher = self.create_publisher(message, channel.topic, qos)
         self._outputs[channel.topic] = (channel.type, publisher)
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
@@ -23,7 +23,7 @@ from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.executor import Untouched
 from smp_motor_control.ros_arguments import split_arguments
 from smp_motor_ident.bag import BagWriter
-from smp_motor_ident.nodes.bag_arguments import Choice, chosen, message_class
+from smp_motor_ident.nodes.bag_arguments import Choice, chosen, message_class, quality
 
 TAKE_PERIOD = 0.004
 LOOK_PERIOD = 0.05
@@ -44,12 +44,7 @@ def subscription_qos(offered: list[QoSProfile]) -> QoSProfile:
     """Return the strongest QoS that every one of the publishers can serve."""
     reliable = all(q.reliability == ReliabilityPolicy.RELIABLE for q in offered)
     latched = all(q.durability == DurabilityPolicy.TRANSIENT_LOCAL for q in offered)
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
-        depth=DEPTH,
-        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
-    )
+    return quality(DEPTH, reliable, latched)
 
 
 def qos_document(qos: QoSProfile) -> dict[str, Any]:

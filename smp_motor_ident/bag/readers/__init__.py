@@ -37,6 +37,8 @@ def open_source(path: Path, folder: Path, budget: Budget) -> Messages | Tables:
         if form is None:
             raise BagError(f"{path}: {_what(path, head)}")
         source = form.open(plain, path.name, budget)
+    except OSError as error:
+        raise BagError(f"{path}: cannot be read ({error.strerror})") from None
     except BagError as error:
         raise BagError("; ".join(filter(None, [str(error), problem]))) from None
     if problem:

@@ -163,13 +163,11 @@ def _separator(lines: list[str]) -> str:
 
 def _text(path: Path) -> str:
     """Return a file's text in whatever spreadsheets and scopes write."""
+    data = path.read_bytes()
+    if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return data.decode("utf-16", "replace")
     try:
-        data = path.read_bytes()
-        if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
-            return data.decode("utf-16", "replace")
         return data.decode("utf-8-sig")
-    except OSError as error:
-        raise BagError(f"{path}: cannot be read ({error.strerror})") from None
     except UnicodeDecodeError:
         if b"\0" in data:
             raise BagError(f"{path}: is no text") from None

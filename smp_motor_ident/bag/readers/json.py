@@ -34,8 +34,6 @@ def _open(path: Path, name: str, budget: Budget) -> ColumnFile:
     """Read a ``.json`` or ``.jsonl`` file."""
     try:
         text = path.read_text("utf-8-sig")
-    except OSError as error:
-        raise BagError(f"{path}: cannot be read ({error.strerror})") from None
     except UnicodeDecodeError as error:
         raise BagError(f"{name}: no readable JSON ({_reason(error)})") from None
     document, problem = _parsed(text, name, whole=path.suffix.lower() == ".json")

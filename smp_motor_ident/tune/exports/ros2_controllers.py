@@ -14,6 +14,7 @@ from collections.abc import Mapping
 
 import yaml
 
+from smp_motor_control.pid import Pid, PidGains
 from smp_motor_ident.tune.designer import Design
 from smp_motor_ident.tune.exports.target import Format, Gains, rounded
 from smp_motor_ident.tune.feedback import Feedback
@@ -35,16 +36,12 @@ def _convert(design: Design) -> Gains:
 def _start(setting: Setting) -> Step:
     n, T = setting.numbers, setting.sample_time
     high, low = min(n["u_clamp_max"], setting.supply), max(n["u_clamp_min"], -setting.supply)
-    back = 1 / n["tracking_time_constant"] if n["tracking_time_constant"] else 0.0
-    integral = before = 0.0
+    of_pid = {name: value for name, value in n.items() if name != "feedforward_gain"}
+    strategy = "back_calculation" if n["tracking_time_constant"] else "none"
+    pid = Pid(PidGains(**of_pid, antiwindup_strategy=strategy, setpoint_weight_d=1.0))
 
     def step(setpoint: float, speed: float) -> float:
-        nonlocal integral, before
-        error = setpoint - speed
-        wanted = n["p"] * error + integral + n["d"] * (error - before) / T
-        command = min(max(wanted, n["u_clamp_min"]), n["u_clamp_max"])
-        integral += T * (n["i"] * error + back * (command - wanted))
-        before = error
+        command = pid.step(setpoint - speed, 0.0, T).output
         return min(max(command + n["feedforward_gain"] * setpoint, low), high)
 
     return step
