@@ -86,6 +86,12 @@ def _nodes(level: Mapping[Any, Any], place: str, path: str | Path) -> Iterator[t
             raise ParameterError(f"{path}: {node}: is no ROS parameter file: no ros__parameters")
 
 
+def written(nodes: Mapping[str, Mapping[str, Any]], head: Iterable[str] = ()) -> str:
+    """Return the text of a ROS parameter file, behind comments."""
+    tree = {node: {"ros__parameters": dict(parameters)} for node, parameters in nodes.items()}
+    return "".join(f"# {line}\n" for line in head) + yaml.safe_dump(tree, sort_keys=False)
+
+
 def parameters_of(path: str | Path, node: str) -> dict[str, Any]:
     """Return what a parameter file says to the nodes of a name, in whatever namespace."""
     found: dict[str, Any] = {}

@@ -29,7 +29,6 @@ OWN_FIELDS = {
     "position": "position",
     "count": "encoder_count",
 }
-_COLUMNS = ("voltage", "current", "velocity", "position", "count")
 BETWEEN = 1.0
 """Time [s] that a joined record leaves between two recordings."""
 
@@ -106,8 +105,8 @@ def join_records(records: list[Record]) -> Record:
     offsets = np.cumsum([0.0, *(r.duration + BETWEEN for r in records)])[:-1]
     lengths = np.cumsum([0, *(len(r) for r in records)])[:-1].tolist()
     findings = [replace(f, message=f"{r.source}: {f.message}") for r in records for f in r.findings]
-    columns: dict[str, Any] = dict.fromkeys(_COLUMNS)
-    for name in _COLUMNS:
+    columns: dict[str, Any] = dict.fromkeys(OWN_FIELDS)
+    for name in OWN_FIELDS:
         parts = [getattr(r, name) for r in records]
         if all(part is None for part in parts):
             continue

@@ -10,6 +10,7 @@ import numpy as np
 from smp_motor_control.arrays import Integers
 from smp_motor_ident.bag.limits import SECONDS_APART
 from smp_motor_ident.bag.mapping import DEFAULT_MOTOR, MotorMap, Signal, SignalMap
+from smp_motor_ident.bag.names import MOTIONS
 from smp_motor_ident.bag.readers.grid import without_unit
 from smp_motor_ident.bag.runs import laid_out
 from smp_motor_ident.bag.source import Recording
@@ -27,7 +28,6 @@ TIME_NAMES = (
 EPOCHS = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
 """A number of time beyond each is of today in that unit since 1970."""
 
-_MOTIONS = ("velocity", "position", "count")
 _WHEELS = ((DEFAULT_MOTOR, ""), ("left", "left_"), ("right", "right_"))
 
 
@@ -82,10 +82,10 @@ def self_described(recording: Recording, asked: SignalMap) -> dict[str, MotorMap
     for channel, (wheel, before) in product(channels, _WHEELS):
         named = {
             name: before + name
-            for name in ("voltage", *_MOTIONS)
+            for name in ("voltage", *MOTIONS)
             if before + name in channel.fields and wheel not in plans
         }
-        moves = any(column in channel.units for name, column in named.items() if name in _MOTIONS)
+        moves = any(column in channel.units for name, column in named.items() if name in MOTIONS)
         if "time" in channel.fields and "voltage" in named and moves:
             signals = {name: Signal(channel.topic, column) for name, column in named.items()}
             signals["time"] = Signal(channel.topic, "time")

@@ -77,7 +77,6 @@ def drive_figure(
                 y_label="wheel speed [rad/s]",
                 x=time - begin,
                 curves=tuple(curves),
-                height=220,
             )
         )
     return document(charts, wheels)

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from smp_motor_control.arrays import Array
+from smp_motor_control.parameter_file import written
 from smp_motor_ident.cli.processes import connect
 from smp_motor_ident.errors import DesignError, ParameterError
 from smp_motor_ident.report.document import check_free, write_together
@@ -62,8 +62,8 @@ def tune_by_relay(arguments: argparse.Namespace, files: Sequence[Path]) -> int:
             "u_clamp_max": float(supply),
             "antiwindup_strategy": "back_calculation",
         }
-        tree = {f"/**/{wheel}/wheel_pid": {"ros__parameters": parameters}}
-        text = f"# Tuned by relay feedback. {line}\n" + yaml.safe_dump(tree, sort_keys=False)
+        head = [f"Tuned by relay feedback. {line}"]
+        text = written({f"/**/{wheel}/wheel_pid": parameters}, head)
         write_together({files[0]: text}, arguments.force)
         print(f"written: {files[0]}")
     return 0

@@ -39,7 +39,7 @@ class Chart:
     # Stretches of x with the CSS variable that shades them
     spans: tuple[tuple[float, float, str], ...] = ()
     group: str = ""  # charts of one group share cursor and zoom in x
-    height: int = 260
+    height: int = 220
     summary: str = ""  # what the chart shows, for those who cannot see it
 
 

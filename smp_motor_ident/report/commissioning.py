@@ -40,7 +40,6 @@ def charts(changes: Sequence[Change]) -> list[Chart]:
             ),
             lines=(one.setpoint,),
             group=one.name,
-            height=220,
             summary=f"Settles after {1e3 * one.reading.settling:.0f} ms, overshoots by "
             f"{one.reading.overshoot:.2f} %.",
         )

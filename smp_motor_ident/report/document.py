@@ -11,9 +11,9 @@ from typing import Any
 
 import msgspec
 import numpy as np
-import yaml
 
 from smp_motor_control.motor.parameters import COMBINATIONS, PHYSICAL
+from smp_motor_control.parameter_file import written
 from smp_motor_ident.errors import BagError, ParameterError
 from smp_motor_ident.result import Estimate, Quantity
 
@@ -126,9 +126,7 @@ def motor_entry(estimate: Estimate) -> dict[str, float | int]:
 def motors_yaml(estimates: Mapping[str, Estimate], provenance: Iterable[str] = ()) -> str:
     """Return ``motors.yaml``: a ROS 2 parameter file that ``motor_plant`` loads as it is."""
     motors = {wheel: motor_entry(estimate) for wheel, estimate in estimates.items()}
-    tree = {"/**/motor_plant": {"ros__parameters": {"motors": motors}}}
-    head = "".join(f"# {line}\n" for line in provenance)
-    return head + yaml.safe_dump(tree, sort_keys=False)
+    return written({"/**/motor_plant": {"motors": motors}}, provenance)
 
 
 def check_free(paths: Iterable[Path], force: bool) -> None:

@@ -98,7 +98,6 @@ def residual_charts(wheel: str, tests: ResidualTests) -> list[Chart]:
                     Curve("outside", np.where(outside, found.value, np.nan), "bad", "bars"),
                 ),
                 lines=(-found.band, 0.0, found.band),
-                height=220,
                 summary=f"{np.sum(outside)} of {found.lag.size} lags lie outside "
                 f"±{found.band:.3g}.",
             )
@@ -137,7 +136,6 @@ def frequency_charts(wheel: str, parts: Sequence[Comparison]) -> list[Chart]:
                 ),
                 log="xy" if kind == "gain" else "x",
                 group=f"frequency-{wheel}",
-                height=220,
                 summary=f"{kind.capitalize()} of {name} from {frequency[0]:.2g} to "
                 f"{frequency[-1]:.3g} Hz.",
             )

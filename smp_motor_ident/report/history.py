@@ -87,7 +87,6 @@ def history_charts(wheel: str, entries: Sequence[Entry]) -> list[Chart]:
                     Curve("live, 95 % band", value, "measured", "line", value - wide, value + wide),
                 ),
                 group=f"history-{wheel}",
-                height=220,
                 summary=f"{title} of {label(wheel)} over {hours[-1]:.3g} hours.",
             )
         )

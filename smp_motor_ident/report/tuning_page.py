@@ -177,7 +177,7 @@ def tuning_charts(wheels: Mapping[str, Curves], limit: float, prefix: str = "") 
         return Chart(
             name=prefix + kind, title=title, y_label=y_label, log=log, lines=lines, curves=curves,
             x_label="time [ms]" if timed else "frequency [rad/s]",
-            x=1e3 * x if timed else x,
+            x=1e3 * x if timed else x, height=260,
             summary=f"{title}, of {', '.join(map(label, wheels))}",
         )  # fmt: skip
 

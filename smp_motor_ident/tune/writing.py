@@ -5,8 +5,7 @@ import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-import yaml
-
+from smp_motor_control.parameter_file import written
 from smp_motor_ident.result import plain
 from smp_motor_ident.tune.designer import Design
 
@@ -39,12 +38,8 @@ def parameters(design: Design) -> dict[str, Any]:
 
 def gains_yaml(designs: Mapping[str, Design], provenance: Iterable[str]) -> str:
     """Return the parameter file of all wheel nodes."""
-    tree = {
-        f"/**/{wheel}/wheel_pid": {"ros__parameters": parameters(design)}
-        for wheel, design in designs.items()
-    }
-    head = "".join(f"# {line}\n" for line in provenance)
-    return head + yaml.safe_dump(tree, sort_keys=False)
+    nodes = {f"/**/{wheel}/wheel_pid": parameters(design) for wheel, design in designs.items()}
+    return written(nodes, provenance)
 
 
 def gains_document(

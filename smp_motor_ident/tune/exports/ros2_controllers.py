@@ -12,8 +12,7 @@ took.
 import math
 from collections.abc import Mapping
 
-import yaml
-
+from smp_motor_control.parameter_file import written
 from smp_motor_control.pid import Pid, PidGains
 from smp_motor_ident.tune.designer import Design
 from smp_motor_ident.tune.exports.target import Format, Gains, rounded
@@ -61,11 +60,7 @@ def _render(designs: Mapping[str, Design], gains: Mapping[str, Gains]) -> str:
         },
     }
     manager = {"update_rate": rate, "pid_controller": {"type": "pid_controller/PidController"}}
-    tree = {
-        "controller_manager": {"ros__parameters": manager},
-        "pid_controller": {"ros__parameters": parameters},
-    }
-    return yaml.safe_dump(tree, sort_keys=False)
+    return written({"controller_manager": manager, "pid_controller": parameters})
 
 
 FORMAT = Format(
