@@ -262,30 +262,23 @@ class Estimate:
         dict
             Of plain types; numbers that do not exist are None.
         """
-        residuals = ("white", "independent_of_input", "model_error")
-        document: dict[str, Any] = plain({
-            "model": self.model,
-            "parameters": self.parameters,
-            "identifiable": self.identifiable,
-            "unidentifiable": self.unidentifiable,
-            "combinations": self.combinations,
-            "covariance": {"names": self.names, "matrix": self.covariance},
-            "fit_percent": self.fit_percent,
-            "candidates": self.candidates,
-            "residuals": {name: getattr(self.residuals, name) for name in residuals},
-            "findings": self.findings,
-            "warnings": self.warnings,
-            "advice": self.advice,
-            "samples": self.samples,
-            "duration": self.duration,
-            "sample_time": self.sample_time,
-            "speed_noise": self.speed_noise,
-            "angle_noise": self.angle_noise,
-            "largest_voltage": self.largest_voltage,
-            "sources": self.sources,
-            "hardware": self.hardware,
-        })  # fmt: skip
-        return document
+        document: dict[str, Any] = {name: getattr(self, name) for name in _WRITTEN}
+        document["covariance"] = {"names": self.names, "matrix": self.covariance}
+        document["residuals"] = {
+            "white": self.residuals.white,
+            "independent_of_input": self.residuals.independent_of_input,
+            "model_error": self.residuals.model_error,
+        }
+        return dict(plain(document))
+
+
+_WRITTEN = (
+    "model", "parameters", "identifiable", "unidentifiable", "combinations", "covariance",
+    "fit_percent", "candidates", "residuals", "findings", "warnings", "advice", "samples",
+    "duration", "sample_time", "speed_noise", "angle_noise", "largest_voltage", "sources",
+    "hardware",
+)  # fmt: skip
+"""What of an estimate stands in ``identification.json``."""
 
 
 def plain(value: Any) -> Any:

@@ -10,6 +10,7 @@ import shutil
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,9 @@ LOOKS, ALIKE = 15, 4
 
 UNRELIABLE = "unreliable_identification"
 """Code of the finding that an identification is not to be designed on."""
+
+
+_say = partial(print, flush=True)
 
 
 @dataclass
@@ -339,7 +343,3 @@ def _confirm(
     )
     if sys.stdin.readline().strip().lower() not in ("y", "yes"):
         raise ProcessError("nothing was moved")
-
-
-def _say(text: str) -> None:
-    print(text, flush=True)

@@ -56,26 +56,22 @@ def gains_document(
 
 def _entry(design: Design) -> dict[str, Any]:
     ratio, reference, bands = design.loop.gear_ratio, design.reference, design.specification
-    entry: dict[str, Any] = plain({
-        "method": design.method,
-        "reason": design.reason,
-        "warnings": design.warnings,
-        "gains": design.gains,
-        "margins": design.margins,
-        "robustness": design.robustness,
-        "findings": design.findings,
-        "performance": design.performance,
-        "specification": dataclasses.replace(bands, change=bands.change / ratio),
-        "reference": {
-            "max_velocity": reference.max_velocity / ratio,
-            "max_acceleration": reference.max_acceleration / ratio,
-            "transition_time": reference.transition_time,
-            "lag": reference.lag,
-            "doubt": reference.doubt,
-            "top_speed": reference.drive.top_speed / ratio,
-        },
-        "loop": dataclasses.replace(design.loop, delay=design.loop.loop_delay),
-        "motor": design.motor,
-        "sensor": design.sensor,
-    })  # fmt: skip
-    return entry
+    entry = {name: getattr(design, name) for name in _WRITTEN}
+    entry["specification"] = dataclasses.replace(bands, change=bands.change / ratio)
+    entry["reference"] = {
+        "max_velocity": reference.max_velocity / ratio,
+        "max_acceleration": reference.max_acceleration / ratio,
+        "transition_time": reference.transition_time,
+        "lag": reference.lag,
+        "doubt": reference.doubt,
+        "top_speed": reference.drive.top_speed / ratio,
+    }
+    entry["loop"] = dataclasses.replace(design.loop, delay=design.loop.loop_delay)
+    return dict(plain(entry))
+
+
+_WRITTEN = (
+    "method", "reason", "warnings", "gains", "margins", "robustness", "findings", "performance",
+    "specification", "reference", "loop", "motor", "sensor",
+)  # fmt: skip
+"""What of a design stands in ``gains.json``, wheel quantities at the wheel."""
