@@ -47,6 +47,11 @@ class Design:
     feedback: Feedback = field(default_factory=lambda: Feedback(0.0, 0.0))
 
     @property
+    def wheel_reference(self) -> Reference:
+        """The reference at the wheel."""
+        return self.reference.at_wheel(self.loop.gear_ratio)
+
+    @property
     def warnings(self) -> tuple[str, ...]:
         """The findings in words."""
         return tuple(one.message for one in self.findings)

@@ -53,6 +53,15 @@ class Reference:
     doubt: float  # by which that may be wrong without the feedback taking it for an error [s]
     drive: Drive  # motor and voltage that large changes keep to
 
+    def at_wheel(self, gear_ratio: float) -> "Reference":
+        """Return the same at the wheel."""
+        return replace(
+            self,
+            max_velocity=self.max_velocity / gear_ratio,
+            max_acceleration=self.max_acceleration / gear_ratio,
+            drive=replace(self.drive, top_speed=self.drive.top_speed / gear_ratio),
+        )
+
     def profile(self) -> Profile:
         """Return the reference as the running loop leads it, at rest at zero."""
         limits = ProfileLimits(acceleration=self.max_acceleration)

@@ -1,7 +1,7 @@
 """One robot's wheels together: gains each or for all, and one reference for all of them."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -70,16 +70,11 @@ def _together(
 ) -> tuple[dict[str, Design], str]:
     """Give all wheels the one reference that the weakest of them can follow."""
 
-    def least(value: Callable[[Design], float]) -> tuple[float, str]:
-        """Return the least of a value that is per wheel, and whose it is."""
-        found = {wheel: value(one) / one.loop.gear_ratio for wheel, one in own.items()}
-        wheel = min(found, key=lambda w: found[w])
-        return found[wheel], wheel
-
-    late = max(own, key=lambda w: own[w].reference.transition_time)
-    duration = own[late].reference.transition_time
-    speed, slow = least(lambda one: one.reference.max_velocity)
-    rate, _ = least(lambda one: one.reference.max_acceleration)
+    each = {wheel: one.wheel_reference for wheel, one in own.items()}
+    late = max(each, key=lambda w: each[w].transition_time)
+    slow = min(each, key=lambda w: each[w].max_velocity)
+    duration, speed = each[late].transition_time, each[slow].max_velocity
+    rate = min(one.max_acceleration for one in each.values())
     drive = common_drive(own)
     together = {}
     for wheel, one in own.items():
@@ -101,17 +96,15 @@ def _together(
 
 def common_drive(designs: Mapping[str, Design]) -> Drive:
     """Return the motor whose fastest changes are within what every one of these can do."""
-    drives = [
-        replace(one.reference.drive, top_speed=one.reference.drive.top_speed / one.loop.gear_ratio)
-        for one in designs.values()
-    ]
+    references = [one.wheel_reference for one in designs.values()]
+    drives = [one.drive for one in references]
     step = max(one.loop.sample_time for one in designs.values())
     common = Drive(
         top_speed=min(d.top_speed for d in drives),
         time_constant=max(d.time_constant for d in drives),
         time_constant_product=max(d.time_constant_product for d in drives),
     )
-    largest = min(one.reference.max_velocity / one.loop.gear_ratio for one in designs.values())
+    largest = min(one.max_velocity for one in references)
     for _ in range(100):
         changes = [
             VoltageLimited(Reference(begin * largest, 0.0, 0.0), end * largest, common, step)

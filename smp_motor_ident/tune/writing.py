@@ -16,20 +16,16 @@ def parameters(design: Design) -> dict[str, Any]:
     """Return the parameters of one wheel's ``wheel_pid`` node."""
     gains = dataclasses.asdict(design.gains)
     gains.pop("error_deadband")
-    ratio, reference = design.loop.gear_ratio, design.reference
+    reference = design.wheel_reference
     limit = reference.max_acceleration
     return {
         **gains,
-        "max_velocity": float(reference.max_velocity / ratio),
-        "max_acceleration": float(limit / ratio) if math.isfinite(limit) else 0.0,
+        "max_velocity": float(reference.max_velocity),
+        "max_acceleration": float(limit) if math.isfinite(limit) else 0.0,
         "transition_time": float(reference.transition_time),
         "reference_delay": float(reference.lag),
         "reference_doubt": float(reference.doubt),
-        "drive": {
-            "top_speed": float(reference.drive.top_speed / ratio),
-            "time_constant": float(reference.drive.time_constant),
-            "time_constant_product": float(reference.drive.time_constant_product),
-        },
+        "drive": {n: float(x) for n, x in dataclasses.asdict(reference.drive).items()},
         "speed_source": str(design.loop.speed_source),
         "difference_window": int(max(design.loop.difference_window, 1)),
         "model": {name: float(value) for name, value in design.motor.items()},
@@ -55,17 +51,12 @@ def gains_document(
 
 
 def _entry(design: Design) -> dict[str, Any]:
-    ratio, reference, bands = design.loop.gear_ratio, design.reference, design.specification
+    bands, reference = design.specification, dataclasses.asdict(design.wheel_reference)
+    drive = reference.pop("drive")
     entry = {name: getattr(design, name) for name in _WRITTEN}
-    entry["specification"] = dataclasses.replace(bands, change=bands.change / ratio)
-    entry["reference"] = {
-        "max_velocity": reference.max_velocity / ratio,
-        "max_acceleration": reference.max_acceleration / ratio,
-        "transition_time": reference.transition_time,
-        "lag": reference.lag,
-        "doubt": reference.doubt,
-        "top_speed": reference.drive.top_speed / ratio,
-    }
+    change = bands.change / design.loop.gear_ratio
+    entry["specification"] = dataclasses.replace(bands, change=change)
+    entry["reference"] = {**reference, "top_speed": drive["top_speed"]}
     entry["loop"] = dataclasses.replace(design.loop, delay=design.loop.loop_delay)
     return dict(plain(entry))
 
