@@ -13,6 +13,7 @@ from smp_motor_ident.diagnosis.conditions import dependent
 from smp_motor_ident.diagnosis.current_kind import ARMATURE, current_kind
 from smp_motor_ident.diagnosis.data_quality import screen
 from smp_motor_ident.diagnosis.differenced import counts_again
+from smp_motor_ident.diagnosis.glitches import without_glitches
 from smp_motor_ident.diagnosis.limits import PROFILED
 from smp_motor_ident.diagnosis.misfit import widened_by_misfit
 from smp_motor_ident.diagnosis.model_error import regression
@@ -134,7 +135,7 @@ def estimate(
         rigid = estimate(group, "second_order", fixed=fixed, loss=loss, progress=progress)
         return flexible_shaft.flexible_shaft(group, rigid)
     request = checked(group, model, fixed, bounds, loss, validation, progress)
-    group = counts_again([bridged(merge_bunches(on_beat(r))) for r in group])
+    group = counts_again([without_glitches(bridged(merge_bunches(on_beat(r)))) for r in group])
 
     def behind(records: list[Record], kept: Sequence[Record] | None) -> Estimate:
         try:

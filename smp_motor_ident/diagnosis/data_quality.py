@@ -80,7 +80,8 @@ def _lost(record: Record) -> Iterator[Finding]:
                 f"{where}: {name} is NaN in {lost:.0%} of the samples; "
                 "repair the sensor or its connection and record again"
             )
-        if lost > 0:
+        named = any(f.evidence.get("signal") == name for f in record.findings)
+        if lost > 0 and not named:
             yield _left_out(name, lost)
     if record.current is not None:
         lost = float(np.mean(~np.isfinite(record.current)))

@@ -387,13 +387,3 @@ LEFT_BAND = Limit(
     "a single load or a bad sample is over by then; a motor that burns takes longer",
     "test_monitor.py: half an hour of ordinary driving",
 )  # fmt: skip
-
-# Stamps of arrival, put back on the beat of their sender.
-BEAT_FLOOR = Limit(0.5, "sample", "physical: later than half a sample is the next", "test_beat.py")
-BEAT_JITTER = Limit(
-    0.02, "sample", "cost: instants off by less matter less than their rounding", "test_beat.py"
-)
-BEAT_LOST = Limit(0.02, "1", "cost: with more lost a sample's number is a guess", "test_beat.py")
-SMOOTHER = Limit(
-    3.1, "standard deviations", "sign test of size 1e-3, else stamps are kept", "test_beat.py"
-)

@@ -18,13 +18,10 @@ from scipy.ndimage import minimum_filter1d
 from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident._compile import compiled
 from smp_motor_ident.diagnosis.limits import (
-    BEAT_FLOOR,
-    BEAT_JITTER,
-    BEAT_LOST,
     BUNCHED,
     ROWS_LOST,
-    SMOOTHER,
 )
+from smp_motor_ident.diagnosis.sample_limits import BEAT_FLOOR, BEAT_JITTER, BEAT_LOST, SMOOTHER
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.record import Record
 

@@ -15,6 +15,7 @@ from scipy.signal import lfilter
 
 from smp_motor_ident.bag import limits as recordings
 from smp_motor_ident.diagnosis import limits
+from smp_motor_ident.diagnosis import sample_limits as samples
 from smp_motor_ident.diagnosis import wheel_limits as wheels
 from smp_motor_ident.diagnosis.advice import _fit
 from smp_motor_ident.estimate import estimate
@@ -24,7 +25,7 @@ from smp_motor_ident.result import FitPercent, ResidualTests
 from smp_motor_ident.tune import limits as gains
 
 ROOT = Path(__file__).resolve().parents[2]
-TABLES = (limits, recordings, gains, wheels)
+TABLES = (limits, samples, recordings, gains, wheels)
 
 
 def test_the_page_of_limits_is_the_table() -> None:

@@ -1,0 +1,25 @@
+"""Thresholds of what single samples are: their instants, their readings."""
+
+from smp_motor_ident.diagnosis.limits import Limit
+
+# Stamps of arrival, put back on the beat of their sender.
+BEAT_FLOOR = Limit(0.5, "sample", "physical: later than half a sample is the next", "test_beat.py")
+BEAT_JITTER = Limit(
+    0.02, "sample", "cost: instants off by less matter less than their rounding", "test_beat.py"
+)
+BEAT_LOST = Limit(0.02, "1", "cost: with more lost a sample's number is a guess", "test_beat.py")
+SMOOTHER = Limit(
+    3.1, "standard deviations", "sign test of size 1e-3, else stamps are kept", "test_beat.py"
+)
+
+# Readings that are none of the motor.
+GLITCH = Limit(
+    10.0, "upper quartiles of a reading's jump beyond both neighbours",
+    "nine deviations of white noise: chance reaches them in no record",
+    "test_glitches.py: what noise and a fast motor do is no glitch",
+)  # fmt: skip
+GLITCHES = Limit(
+    0.05, "of the readings",
+    "cost: a sensor that is wrong more often is to be mended, not corrected",
+    "test_glitches.py: a sensor that is wrong too often is left as it is",
+)  # fmt: skip

@@ -1,0 +1,87 @@
+"""Readings that jump away and back within a sample are left out; what a motor does is not."""
+
+import numpy as np
+import pytest
+
+from smp_motor_ident.diagnosis.glitches import without_glitches
+from smp_motor_ident.estimate import estimate
+from smp_motor_ident.record import Record
+
+GAIN, TAU, STEP = 25.0, 0.06, 0.01
+ROWS = 3_000
+
+
+def recorded(seed: int, noise: float = 0.3, hold: int = 25, tau: float = TAU) -> Record:
+    """Return the speed of a linear motor of first order under random levels of voltage."""
+    rng = np.random.default_rng(seed)
+    voltage = np.repeat(rng.uniform(-10.0, 10.0, ROWS // hold), hold)
+    speed, keep = np.zeros(ROWS), np.exp(-STEP / tau)
+    for k in range(1, ROWS):
+        speed[k] = keep * speed[k - 1] + (1 - keep) * GAIN * voltage[k]
+    speed += noise * rng.standard_normal(ROWS)
+    return Record("motor", STEP * np.arange(ROWS), voltage, velocity=speed)
+
+
+def glitched(record: Record, share: float, size: float, seed: int = 0) -> Record:
+    rng = np.random.default_rng(seed)
+    wrong = rng.random(len(record)) < share
+    speed = np.where(wrong, size * rng.uniform(-1.0, 1.0, len(record)), record.velocity)
+    return Record(record.wheel, record.time, record.voltage, velocity=speed)
+
+
+@pytest.mark.parametrize(("share", "size"), [(0.001, 700.0), (0.005, 700.0), (0.02, 1e4)])
+@pytest.mark.parametrize("seed", range(2))
+def test_numbers_are_right_without_the_glitches_that_are_named(seed, share, size):
+    found = estimate(glitched(recorded(seed), share, size, seed))
+    (words,) = [f for f in found.findings if f.code == "glitches"]
+    assert words.severity == "warning" and words.evidence["signal"] == "velocity"
+    assert not found.unreliable
+    for name, true in {"dc_gain": GAIN, "time_constant": TAU}.items():
+        quantity = found.combinations[name]
+        # Readings within a twentieth of the range of the speed stay, and cost certainty.
+        assert abs(quantity.value - true) < 4 * quantity.std < 0.04 * true
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [{}, {"noise": 0.0}, {"noise": 30.0}, {"hold": 1}, {"tau": 1e-3}, {"tau": 1e-3, "hold": 1}],
+    ids=["usual", "no noise", "noise", "a level a sample", "fast", "fast, a level a sample"],
+)
+@pytest.mark.parametrize("seed", range(5))
+def test_what_noise_and_a_fast_motor_do_is_no_glitch(seed, kind):
+    record = recorded(seed, **kind)
+    assert without_glitches(record) is record
+
+
+@pytest.mark.parametrize("quantum", [0.1, 2.0, 20.0])
+def test_a_speed_in_steps_has_no_glitches(quantum):
+    record = recorded(3)
+    coarse = Record(
+        "motor", record.time, record.voltage,
+        velocity=quantum * np.round(record.velocity / quantum),
+    )  # fmt: skip
+    assert without_glitches(coarse) is coarse
+
+
+def test_a_pulse_of_voltage_that_a_fast_motor_follows_is_no_glitch():
+    voltage = np.zeros(1_000)
+    voltage[50::100] = 10.0
+    speed = np.concatenate([[0.0], GAIN * voltage[:-1]])
+    record = Record("motor", STEP * np.arange(1_000), voltage, velocity=speed)
+    assert without_glitches(record) is record
+
+
+def test_several_in_a_row_are_all_left_out_of_an_angle():
+    record = recorded(1)
+    angle = np.cumsum(record.velocity) * STEP
+    wrong = angle.copy()
+    wrong[500], wrong[900:903], wrong[1500] = 900.0, (-700.0, 800.0, 650.0), 0.0
+    cleaned = without_glitches(Record("motor", record.time, record.voltage, position=wrong))
+    lost = np.flatnonzero(~np.isfinite(cleaned.position))
+    assert list(lost) == [500, 900, 901, 902, 1500]
+    np.testing.assert_array_equal(np.delete(cleaned.position, lost), np.delete(angle, lost))
+
+
+def test_a_sensor_that_is_wrong_too_often_is_left_as_it_is():
+    record = glitched(recorded(2), 0.15, 700.0)
+    assert without_glitches(record) is record
