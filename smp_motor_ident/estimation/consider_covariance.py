@@ -17,13 +17,15 @@ from scipy.special import erfcx
 from smp_motor_control.arrays import Array
 from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.current_lag import LITTLE, with_lag
-from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.estimation.descent import ROUGHLY, refine
+from smp_motor_ident.estimation.fit import Fit, Options
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.coordinates import direction
 from smp_motor_ident.model.physical import physical_gradients
-from smp_motor_ident.model.structures import Electromechanical, Structure
+from smp_motor_ident.model.structures import Electromechanical, SecondOrder, Structure
 
 POINTS = 64  # at which a lag may be
+SECOND_LAGS = (0.003, 0.03, 0.1, 0.3, 1.0)  # of the delay that may stand for them
 FAR = 1e3  # deviations beyond which what is left of a normal variable is exponential
 SEEN, ROUNDING = 1e-6, 1e-11
 """Shares of a coordinate's information below which kinks, or rounding, decide what is left."""
@@ -131,7 +133,7 @@ def consider_left_out(data: Experiments, fit: Fit) -> Fit:
     if isinstance(s, Electromechanical) and not s.lags:
         additions.append((s.with_(current_sensor="averaged"), "current_lag", 0.5 * data.step))
     factor = float(np.median(fit.sandwich_factors())) if s.free else 1.0
-    wider = fit
+    wider = _consider_second_lag(data, fit, factor) if s.order == 1 else fit
     for richer, coordinate, most in additions if s.free else []:
         little = LITTLE * data.step * (coordinate == "current_lag")
         beside = _beside(data, with_lag(fit, little) if little else fit, richer, coordinate)
@@ -144,6 +146,36 @@ def consider_left_out(data: Experiments, fit: Fit) -> Fit:
             left = max(left, min(found**2 - own, room**2))
         wider = wider.wider(beside.covariance(left)) if left > 0 else wider
     return wider
+
+
+def _consider_second_lag(data: Experiments, fit: Fit, factor: float) -> Fit:
+    """Return the fit with its covariance widened by a second lag for which its delay may stand.
+
+    Every motor has one: any part of the delay, or of the mean age of a speed that is averaged, is
+    as likely as another, as far as the shape of the response leaves it open.  Some are fitted,
+    each with a likelihood of its own.
+    """
+    s, tau = fit.structure, fit.z.time_constant
+    late = next((n for n in ("delay", "window") if n in s.free), None)
+    age = 0.0 if late is None else fit.z.value(late) * (1.0 if late == "delay" else 0.5)
+    if late is None or not age > 0:
+        return fit
+    lags, near = age * np.array(SECOND_LAGS), fit
+    richer = SecondOrder.like(s)
+    deviances, moves = [], []
+    for lag in lags:
+        slower = fit.z.with_(ln_a1=fit.z.ln_a1 + math.log1p(lag / tau)).with_second_lag(lag)
+        left = max(1 - lag / age, 0.0) * fit.z.value(late)
+        fixed = richer.with_(fixed={**s.fixed, "ln_a2": slower.ln_a2})
+        z = fixed.complete(slower.with_(**{late: left}))
+        near = refine(data, fixed, near, z, Options(), ROUGHLY)
+        deviances.append(near.deviance)
+        moves.append(s.of_free(near.z.array - fit.z.array))
+    likely = np.exp(-0.5 * (np.array(deviances) - min(deviances)) / factor)
+    edges = np.concatenate([[0.0], 0.5 * (lags[1:] + lags[:-1]), [age]])
+    weight = likely * np.diff(edges) / age
+    free = np.array(moves)
+    return fit.wider(np.asarray(free.T @ ((weight / weight.sum())[:, None] * free)))
 
 
 def _room(structure: Structure, coordinate: str, answer: Array) -> float:

@@ -152,3 +152,21 @@ def test_initial_states_of_held_out_data_are_found_from_wherever_they_begin():
     found = estimate(Record("motor", t, v, count=count, hardware=Hardware(1.0, 2000.0)))
     assert found.fit_percent.validation > 97
     assert "validation" not in [f.code for f in found.findings]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_delay_may_be_in_part_the_windings_lag(seed):
+    """Half a millisecond of L/R beside 3 ms of delay: rows of 10 ms show their sum alone."""
+    rng = np.random.default_rng(seed)
+    r, el, k, b, lag = 1.0, 5e-4, 0.5, 0.0125, 0.206
+    below = k * k + r * b
+    v = sum(
+        np.sin(2 * np.pi * f * np.arange(1100) / 100 + rng.uniform(0, 6))
+        for f in np.exp(rng.uniform(np.log(0.08), np.log(2.3), 7))
+    )
+    record = late_counts(rng, 2.5 * v, 100, 4758.0, 3, (r, el, k, lag * below / r, b, 0.18))
+    found = estimate(record).combinations
+    sum_of_both = lag + el * b / below
+    for true in (sum_of_both, sum_of_both - el / r):
+        assert abs(found["time_constant"].value - true) < 4 * found["time_constant"].std
+    assert found["time_constant"].std < 0.01 * lag  # a part of the delay, which is 1.7 % of it
