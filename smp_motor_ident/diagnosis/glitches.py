@@ -17,6 +17,7 @@ from smp_motor_ident.record import Record
 
 SHARE = 0.05  # of the signal's range, and of the voltage's: less is no glitch, and no pulse
 CHANGES = 4.0  # usual changes from one reading to the next: a counter dithers by one or two
+ENOUGH = 4_000  # readings that tell what is usual
 PASSES = 4  # each finds one of several in a row
 
 
@@ -53,11 +54,12 @@ def _glitches(values: Array, pulsed: Flags) -> Flags:
         beyond = _beyond(values[at])
         if beyond.size < 8 or not beyond.any():
             break
-        low, high = np.percentile(values[at], (1, 99))
-        moves = np.abs(np.diff(values[at]))
+        some = slice(None, None, 1 + at.size // ENOUGH)
+        low, high = np.percentile(values[at][some], (1, 99))
+        moves = np.abs(np.diff(values[at]))[some]
         least = max(
-            GLITCH.value * float(np.percentile(beyond, 75)),
-            CHANGES * float(np.median(moves[moves > 0])),
+            GLITCH.value * float(np.percentile(beyond[some], 75)),
+            CHANGES * float(np.median(moves[moves > 0])) if moves.any() else 0.0,
             SHARE * float(high - low),
         )
         found = at[1:-1][beyond > least]

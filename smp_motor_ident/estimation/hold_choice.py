@@ -181,16 +181,18 @@ def _delayed(
 
     Earlier than no delay only a shorter second lag is.  What a shorter look found is gone on from.
     """
+    apart = how == "before"  # under another hold; the others differ by their instants alone
     starts = {max(lag, 0.0): best.z, float(max(round(lag), 0)): best.z}
     if best.structure.order == 2:
-        te = best.z.second_lag  # may stand for a delay beside another hold
-        starts[(best.z.delay + 0.5 * te) / part.step] = _shorter(best.z, 0.5)
+        te = best.z.second_lag
+        if apart:  # for a delay beside the other hold it may stand
+            starts[(best.z.delay + 0.5 * te) / part.step] = _shorter(best.z, 0.5)
         if lag < 0:
             starts[-1.0] = _shorter(best.z, max(1 + lag * part.step / te, 0.1))
     if before:
         starts = {f.z.delay / part.step: f.z for f in before}
     near = [best] if best.noise_ratio == 0 else [best, replace(best, noise_ratio=0.0)]
-    found: list[Fit] = []
+    begun: list[tuple[Fit, Structure]] = []
     for samples, start in starts.items():
         delay = max(samples, 0.0) * part.step
         shift = part.step if how == "after" else 0.0
@@ -198,17 +200,24 @@ def _delayed(
         z = start.with_(delay=delay)
         fixed = structure.with_(delay=False, fixed={**structure.fixed, "delay": delay})
         whole = [refine(part, fixed, n, fixed.complete(z), options, ROUGHLY) for n in near]
-        fit = restate(part, structure, min(whole, key=lambda f: f.deviance), options)
-        if structure.delay:  # another hold may be another part of a sample late
-            freed = refine(part, structure, fit, fit.z, options, ROUGHLY)
-            fit = tried(part, min(fit, freed, key=lambda f: f.deviance), LAGS, options)
-        found.append(fit)
+        begun.append((min(whole, key=lambda f: f.deviance), structure))
+    begun.sort(key=lambda fit: fit[0].deviance)
+    found = [_freed(part, *fit, options) for fit in (begun if apart else begun[:1])]
     found.sort(key=lambda f: f.deviance)
     return [
         fit
         for n, fit in enumerate(found)
         if all(abs(fit.z.delay - f.z.delay) > ALIKE * part.step for f in found[:n])
     ]
+
+
+def _freed(part: Experiments, fit: Fit, structure: Structure, options: Options) -> Fit:
+    """Return a fit at a fixed delay with that set free: a hold may be a part of a sample late."""
+    fit = restate(part, structure, fit, options)
+    if not structure.delay:
+        return fit
+    freed = refine(part, structure, fit, fit.z, options, ROUGHLY)
+    return tried(part, min(fit, freed, key=lambda f: f.deviance), LAGS, options)
 
 
 def _shorter(z: Coordinates, share: float) -> Coordinates:
