@@ -82,7 +82,7 @@ def test_motor_and_driver_are_both_found(name):
     truth = {"dc_gain": GAIN, "time_constant": TAU, "static_voltage": STATIC}
     truth[name] = DRIVERS[name][1]
     errors = []
-    for seed in range(4):
+    for seed in range(3):
         found = estimate(recorded(name, seed))
         assert not found.unreliable
         errors.append(

@@ -48,6 +48,10 @@ def test_a_duty_in_counts_that_is_called_a_voltage_is_questioned(full):
     counts = np.rint(record.voltage / 10.0 * full)
     codes = [f.code for f in estimate(replace(record, voltage=counts)).findings]
     assert "whole_volts" in codes
+
+
+def test_a_voltage_in_whole_volts_is_not_questioned():
+    record = driven()
     volts = [f.code for f in estimate(replace(record, voltage=np.rint(record.voltage))).findings]
     assert "whole_volts" not in volts
 
