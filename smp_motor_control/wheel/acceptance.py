@@ -58,6 +58,10 @@ class Circumstances:
     encoder: Encoder | None = None  # none where unknown
 
 
+_UNKNOWN = Encoder(2.0**20)
+"""An encoder that is not known yet speaks against no gains: they may be for a fine one."""
+
+
 def check(settings: LoopSettings, wheel: Circumstances | None = None) -> None:
     """Refuse settings that no wheel should be driven with."""
     wheel = wheel or Circumstances()
@@ -189,7 +193,7 @@ def _unstable(settings: LoopSettings, plant: _Plant) -> str:
 
 def _swing(settings: LoopSettings, plant: _Plant, wheel: Circumstances) -> float:
     """Return the largest speed, in set-points, of the loop as it would drive the wheel."""
-    encoder = wheel.encoder or Encoder()
+    encoder = wheel.encoder or _UNKNOWN
     loop = WheelLoop(settings, Gearbox(plant.ratio), encoder, 1.5 * wheel.supply)
     plant.rest()
     dt = plant.dt

@@ -16,6 +16,7 @@ from smp_motor_control.observer import ObserverNoise, SpeedObserver
 from smp_motor_control.pid import Pid, PidGains, PidOutput
 from smp_motor_control.reference.path import ReferencePath
 from smp_motor_control.reference.profile import Drive, Profile, ProfileLimits, Reference
+from smp_motor_control.wheel.standstill import Standstill
 
 SPEED_SOURCES = ("measured", "difference", "observer")
 
@@ -96,6 +97,7 @@ class WheelLoop:
         self.reference = Reference(0.0, 0.0, 0.0)
         self._path = ReferencePath(self.profile)
         self.source = "measured"
+        self._standstill = Standstill()
         self.set_hardware(gearbox, encoder, max_load)
 
     def set_hardware(
@@ -120,6 +122,7 @@ class WheelLoop:
         """Make the speed's source anew from the settings."""
         self._observer: SpeedObserver | None = None
         self._differenced: DifferencedSpeed | None = None
+        self._count: int | None = None  # of the last sample, where the speed is made of counts
         self._intervals: list[float] = []
         self._time = 0.0
         self._speed_of: Callable[[float, float, int, float], float] = self._measured
@@ -149,6 +152,7 @@ class WheelLoop:
     def _difference(self, dt: float, velocity: float, count: int, voltage: float) -> float:
         assert self._differenced is not None and self._gearbox is not None
         self.source = "difference"
+        self._count = count
         self._time += dt
         return self._gearbox.to_wheel(self._differenced.step(self._time, count))
 
@@ -174,6 +178,7 @@ class WheelLoop:
     def _observe(self, dt: float, velocity: float, count: int, voltage: float) -> float:
         observer = self._observer
         assert observer is not None and self._gearbox is not None
+        self._count = count
         speed = observer.step(count, voltage, dt)
         self.source = "observer" if observer.trusted else "difference (observer not trusted)"
         return self._gearbox.to_wheel(speed)
@@ -182,9 +187,25 @@ class WheelLoop:
         """Close the loop on a wheel that turns at ``measurement``, without a jump."""
         self.pid.reset()
         self._path.start(measurement)
+        self._standstill.reset()
 
     def step(self, setpoint: float, measurement: float, dt: float) -> PidOutput:
-        """Advance reference and controller by one sample."""
+        """Advance reference and controller by one sample; a wheel that stands is left alone."""
+        count = self._count
+        if count is None or setpoint != 0.0:
+            self._standstill.reset()
+            return self._follow(setpoint, measurement, dt)
+        held = self._standstill.voltage(count)
+        if held is not None:
+            self.pid.reset()
+            self.pid.i_term = held  # with which it goes on when the wheel moves
+            return PidOutput(held, held, 0.0, held, 0.0, 0.0, False)
+        out = self._follow(setpoint, measurement, dt)
+        if self.reference.velocity == 0.0:
+            self._standstill.step(count, out.output, dt)
+        return out
+
+    def _follow(self, setpoint: float, measurement: float, dt: float) -> PidOutput:
         settings, profile = self.settings, self.profile
         if settings.reference_delay:
             path = self._path

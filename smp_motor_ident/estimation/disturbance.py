@@ -37,6 +37,7 @@ BLOCKS = 30  # of all records together, at most
 STRETCHES = 6  # of the same, each of which may be the one that nothing disturbed
 ROUNDS = 6  # most times that the rest is fitted
 FEWEST = 8  # samples of a block
+NEAR = 0.1  # of the largest voltage, by which levels may differ that do the same to a driver
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +91,16 @@ def disturbance(group: Sequence[Record], since: Sequence[float]) -> Disturbance 
             spans.append((begin + float(record.time[a]), begin + float(record.time[b - 1])))
         if rows.any():
             records.append(_of_rows(record, rows))
-    return Disturbance(records, spans)
+    return Disturbance(records, spans) if _as_far(records, blocks) else None
+
+
+def _as_far(records: Sequence[Record], whole: Sequence[Record]) -> bool:
+    """Tell whether what is left was driven as far, both ways: what a level does is no accident."""
+    left, every = (np.concatenate([r.voltage for r in part]) for part in (records, whole))
+    largest = float(np.abs(every).max())
+    return bool(
+        left.max() >= every.max() - NEAR * largest and left.min() <= every.min() + NEAR * largest
+    )
 
 
 def _in_blocks(record: Record, rows: int) -> Record:

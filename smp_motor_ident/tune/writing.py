@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from smp_motor_control.parameter_file import written
+from smp_motor_control.wheel.controller import WheelSettings
 from smp_motor_ident.result import plain
 from smp_motor_ident.tune.designer import Design
 
@@ -29,7 +30,14 @@ def parameters(design: Design) -> dict[str, Any]:
         "speed_source": str(design.loop.speed_source),
         "difference_window": int(max(design.loop.difference_window, 1)),
         "model": {name: float(value) for name, value in design.motor.items()},
+        **_plausible(reference.drive.top_speed),
     }
+
+
+def _plausible(top_speed: float) -> dict[str, float]:
+    """Return the limit of plausible feedback where a wheel may be faster than that by default."""
+    usual = WheelSettings().implausible_velocity
+    return {"implausible_velocity": 2 * top_speed} if 2 * top_speed > usual else {}
 
 
 def gains_yaml(designs: Mapping[str, Design], provenance: Iterable[str]) -> str:

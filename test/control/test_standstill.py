@@ -1,0 +1,103 @@
+"""A wheel that is asked to stand stands still, and is given what it stands with."""
+
+import math
+
+import numpy as np
+import pytest
+
+from smp_motor_control.encoder import Encoder
+from smp_motor_control.motor.model import MotorModel
+from smp_motor_control.motor.parameters import Gearbox
+from smp_motor_control.observer import ObserverNoise
+from smp_motor_control.pid import PidGains
+from smp_motor_control.wheel import standstill
+from smp_motor_control.wheel.loop import LoopSettings, WheelLoop
+from smp_motor_control.wheel.standstill import STANDS, Standstill
+
+STEP, GEAR, COUNTS = 1e-3, 30.0, 271
+GAIN, TAU, SECOND, STATIC = 55.0, 0.296, 2.8e-4, 0.081
+MODEL = MotorModel(
+    dc_gain=GAIN, time_constant=TAU, time_constant_product=SECOND, static_voltage=STATIC
+)
+GAINS = PidGains(
+    p=13.4, i=590.0, d=0.073, derivative_filter_time_constant=1.15e-3, u_clamp_min=-6.0,
+    u_clamp_max=6.0, i_clamp_min=-6.0, i_clamp_max=6.0, antiwindup_strategy="back_calculation",
+    tracking_time_constant=0.0111, feedforward_static=STATIC, feedforward_velocity=0.545,
+    feedforward_acceleration=0.1616,
+)  # fmt: skip
+
+
+class Motor:
+    """A geared motor with dry friction, by steps of a fiftieth of a sample, one sample late."""
+
+    def __init__(self, load: float = 0.0) -> None:
+        self.speed = self.rate = self.angle = self.late = 0.0
+        self.load = load  # [V]
+
+    def step(self, voltage: float) -> int:
+        voltage, self.late = self.late, voltage
+        h = STEP / 50
+        for _ in range(50):
+            net = voltage - self.load
+            if self.speed == 0.0 and abs(net) <= STATIC:
+                self.rate = 0.0
+                continue
+            net -= math.copysign(STATIC, self.speed or net)
+            self.rate += h * (GAIN * net - self.speed - TAU * self.rate) * 1.0 / SECOND
+            after = self.speed + h * self.rate
+            self.speed = 0.0 if after * self.speed < 0 else after
+            self.angle += h * self.speed
+        return math.floor(self.angle * COUNTS / (2 * math.pi))
+
+
+def driven(setpoints: np.ndarray, load: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Return voltages and counts of a wheel that an observer's loop drives."""
+    settings = LoopSettings(
+        gains=GAINS, speed_source="observer", difference_window=1, transition_time=0.01,
+        model=MODEL, noise=ObserverNoise(),
+    )  # fmt: skip
+    loop = WheelLoop(settings, Gearbox(GEAR), Encoder(COUNTS), 9.0)
+    motor, voltage = Motor(load), 0.0
+    out = np.zeros((setpoints.size, 2))
+    for k, setpoint in enumerate(setpoints):
+        count = motor.step(voltage)
+        speed = loop.speed(STEP, 0.0, count, voltage)
+        voltage = 0.0 if speed != speed else loop.step(float(setpoint), speed, STEP).output
+        out[k] = voltage, count
+    return out[:, 0], out[:, 1]
+
+
+def stops(seed: int) -> np.ndarray:
+    level = np.random.default_rng(seed).uniform(2.0, 8.0)
+    return np.concatenate([np.zeros(100), np.full(700, level), np.zeros(2_000)])
+
+
+def test_a_wheel_that_rocks_by_a_count_is_left_alone(monkeypatch):
+    ends = [driven(stops(seed))[0][-1_000:] for seed in range(6)]
+    assert max(np.ptp(end) for end in ends) < 1e-9  # from a second after the stop
+    monkeypatch.setattr(standstill, "STANDS", math.inf)
+    ends = [driven(stops(seed))[0][-1_000:] for seed in range(6)]
+    assert max(np.ptp(end) for end in ends) > 0.2  # [V] of what it would do else
+
+
+def test_it_stands_under_a_load_and_turns_again_when_asked():
+    again = np.concatenate([stops(1), np.full(1_000, -3.0), np.zeros(1_500)])
+    voltage, count = driven(again, load=0.5)
+    assert np.ptp(count[1_800:2_800]) <= 1 and np.ptp(voltage[1_800:2_800]) < 1e-9
+    assert abs(voltage[2_700] - 0.5) <= STATIC * 1.05
+    turned = (count[3_700] - count[3_200]) * 2 * math.pi / COUNTS / GEAR / 0.5
+    assert turned == pytest.approx(-3.0, rel=0.02)  # a count is 1.5 mrad at the wheel, of 1.5 rad
+    assert np.ptp(count[4_300:]) <= 1
+
+
+def test_one_count_is_standing_and_two_are_not():
+    still = Standstill()
+    for k in range(round(STANDS / STEP) - 1):
+        assert still.voltage(k % 2) is None
+        still.step(k % 2, 1.0 if k % 2 else 0.0, STEP)
+    still.step(0, 0.0, 2 * STEP)
+    assert still.voltage(0) == pytest.approx(0.5, abs=0.01)
+    assert still.voltage(1) is not None
+    assert still.voltage(2) is None
+    still.reset()
+    assert still.voltage(0) is None
