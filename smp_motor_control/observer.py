@@ -9,6 +9,7 @@ with the load ``d`` as a random walk, so that the speed has no bias under any co
 Each step predicts exactly over its own dt (voltage held constant) and corrects with the
 steady-state gain for that dt.  Where the counts contradict the model, by the mean of the
 normalised innovation squared, the speed falls back to differenced counts until they agree.
+Stamps that scatter with variance ``s^2`` add ``(w s)^2`` to the variance of an innovation.
 
 References
 ----------
@@ -20,7 +21,7 @@ J. B. Moore, *Optimal Filtering*, 1979, section 6.7 for the doubling of the Ricc
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -36,6 +37,9 @@ _STEPS_PER_OCTAVE = 2
 _OCTAVES = 2
 _AGREE, _DISAGREE = 3.0, 9.0
 _INNOVATION_MEMORY = 0.05
+_LEVELS = 10
+_REGULAR = 0.5
+"""Of the usual interval, by which stamps scatter; what is farther off is a sample lost."""
 _DOUBLINGS = 100
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(6)
 
@@ -156,12 +160,18 @@ class SpeedObserver:
         self._quantum = encoder.angle_per_count
         self._unwrap = Unwrapper(encoder.bits)
         self._differenced = DifferencedSpeed(Encoder(encoder.counts_per_revolution), window)
+        self._usual = sample_time
         self._shortest = sample_time / 2**_OCTAVES
         self._longest = sample_time * 2**_OCTAVES
         noise = noise or ObserverNoise()
-        self._gains = [
-            steady_gain(model, self._quantum, noise, self._shortest * 2 ** (k / _STEPS_PER_OCTAVE))
+        steps = [
+            self._shortest * 2 ** (k / _STEPS_PER_OCTAVE)
             for k in range(2 * _OCTAVES * _STEPS_PER_OCTAVE + 1)
+        ]
+        # One row for counts as they are, then for stamps that make them as much less certain.
+        self._gains = [
+            [steady_gain(model, self._quantum, counts, step) for step in steps]
+            for counts in (replace(noise, count=noise.count * 2.0**n) for n in range(_LEVELS))
         ]
         # Below this speed the motor may stick: less than a count in the shortest memory.
         self._slow = self._quantum / max(8.0 * sample_time, 0.02)
@@ -178,6 +188,7 @@ class SpeedObserver:
         self._voltages: deque[tuple[float, float]] = deque()
         self._theta = self._speed = self.acceleration = self.load = 0.0
         self._surprise = 1.0
+        self._jitter = 0.0  # variance of the stamps [s^2]
         self.trusted = True
         self.speed = math.nan  # [rad/s], before the second sample
 
@@ -195,18 +206,26 @@ class SpeedObserver:
         if dt != self._dt:
             self._prepare(dt)
         self._predict(self._delayed(voltage, dt) if self._model.delay else voltage, dt)
-        g_theta, g_speed, g_acceleration, g_load, variance = self._gain
+        variance = self._variance
+        off = dt - self._usual
+        if -_REGULAR * self._usual < off < _REGULAR * self._usual:
+            self._jitter += self._memory * (0.5 * off * off - self._jitter)
         innovation = angle - self._theta
+        # A stamp that is off by e moves a turning encoder's angle by its speed times e: so much of
+        # what surprises is no contradiction, and the counts are as much less certain.
+        scatter = 1.0 + self._speed * self._speed * self._jitter / variance
+        self._surprise += self._memory * (innovation * innovation / variance - self._surprise)
+        g_theta, g_speed, g_acceleration, g_load, _ = self._gain_under(scatter)
         self._theta += g_theta * innovation
         self._speed += g_speed * innovation
         self.acceleration += g_acceleration * innovation
         self.load += g_load * innovation
-        self._surprise += self._memory * (innovation * innovation / variance - self._surprise)
-        if self._surprise > _DISAGREE or abs(self.load) > self._max_load:
+        unlike = self._surprise / scatter
+        if unlike > _DISAGREE or abs(self.load) > self._max_load:
             if self.trusted:
                 self._restart(angle, differenced)
             self.trusted = False
-        elif self._surprise < _AGREE:
+        elif unlike < _AGREE:
             self.trusted = True
         self.speed = self._speed if self.trusted else differenced
         return self.speed
@@ -224,9 +243,16 @@ class SpeedObserver:
         """Compute what a step of this length needs; kept while the length stays the same."""
         self._dt = dt
         place = math.log2(max(dt / self._shortest, 1.0)) * _STEPS_PER_OCTAVE
-        self._gain = self._gains[min(round(place), len(self._gains) - 1)]
+        self._place = min(round(place), len(self._gains[0]) - 1)
+        self._variance = self._gains[0][self._place].variance
         self._memory = min(dt / _INNOVATION_MEMORY, 1.0)
         self._coefficients = self._free.after(dt)
+
+    def _gain_under(self, scatter: float) -> SteadyGain:
+        """Return the gain for counts as uncertain as they show themselves, up to a ratio."""
+        ratio = self._surprise if self._surprise < scatter else scatter
+        level = 0 if ratio < 2.0 else min(round(0.5 * math.log2(ratio)), _LEVELS - 1)
+        return self._gains[level][self._place]
 
     def _predict(self, voltage: float, dt: float) -> None:
         """Advance the state by the exact response to a constant voltage."""

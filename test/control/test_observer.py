@@ -116,6 +116,28 @@ def test_jitter_of_a_fifth_of_the_interval_does_not_matter() -> None:
     assert rms(seen) <= 1.2 * rms(steady)
 
 
+@pytest.mark.parametrize("late", [0.02, 0.05, 0.2])  # of a sample, either way
+def test_stamps_that_scatter_by_many_counts_are_no_contradiction(late: float) -> None:
+    """The counts are read on the beat, and stamped when they arrive."""
+    p, dt = MOTORS["motor 1"], 0.005
+    fine, rng, motor = Encoder(2_000.0), np.random.default_rng(6), Motor(p)
+    observer = SpeedObserver(model_of(p), dt, fine)
+    before, errors = 0.0, []
+    for k in range(1, 1_000):
+        voltage = volts(k * dt)
+        motor.step(voltage, dt, 0.0)
+        stamp = dt * (k + late * rng.uniform(-1.0, 1.0))
+        speed = observer.step(fine.count(motor.angle), voltage, stamp - before)
+        before = stamp
+        if k > 200:
+            assert observer.trusted
+            errors.append(speed - motor.speed)
+    usual = 6.0 * model_of(p).dc_gain
+    assert late * dt * usual > 4.0 * fine.angle_per_count
+    # A difference of two counts would be off by that share of the speed, and by the root of two.
+    assert rms(np.array(errors)) < 0.5 * late * math.sqrt(2.0 / 3.0) * usual
+
+
 def test_lost_samples_are_bridged_by_the_model() -> None:
     p, dt = MOTORS["motor 1"], 0.005
     motor, observer = Motor(p), SpeedObserver(model_of(p), dt, ENCODER)
