@@ -163,16 +163,14 @@ class SpeedObserver:
         self._usual = sample_time
         self._shortest = sample_time / 2**_OCTAVES
         self._longest = sample_time * 2**_OCTAVES
-        noise = noise or ObserverNoise()
-        steps = [
+        self._noise = noise or ObserverNoise()
+        self._steps = [
             self._shortest * 2 ** (k / _STEPS_PER_OCTAVE)
             for k in range(2 * _OCTAVES * _STEPS_PER_OCTAVE + 1)
         ]
-        # One row for counts as they are, then for stamps that make them as much less certain.
-        self._gains = [
-            [steady_gain(model, self._quantum, counts, step) for step in steps]
-            for counts in (replace(noise, count=noise.count * 2.0**n) for n in range(_LEVELS))
-        ]
+        # For counts as they are; for stamps that make them less certain as it is asked for, which
+        # is a fraction of a millisecond each.
+        self._gains = {(0, k): self._designed(0, k) for k in range(len(self._steps))}
         # Below this speed the motor may stick: less than a count in the shortest memory.
         self._slow = self._quantum / max(8.0 * sample_time, 0.02)
         self._dt = 0.0
@@ -243,8 +241,8 @@ class SpeedObserver:
         """Compute what a step of this length needs; kept while the length stays the same."""
         self._dt = dt
         place = math.log2(max(dt / self._shortest, 1.0)) * _STEPS_PER_OCTAVE
-        self._place = min(round(place), len(self._gains[0]) - 1)
-        self._variance = self._gains[0][self._place].variance
+        self._place = min(round(place), len(self._steps) - 1)
+        self._variance = self._gains[0, self._place].variance
         self._memory = min(dt / _INNOVATION_MEMORY, 1.0)
         self._coefficients = self._free.after(dt)
 
@@ -252,7 +250,15 @@ class SpeedObserver:
         """Return the gain for counts as uncertain as they show themselves, up to a ratio."""
         ratio = self._surprise if self._surprise < scatter else scatter
         level = 0 if ratio < 2.0 else min(round(0.5 * math.log2(ratio)), _LEVELS - 1)
-        return self._gains[level][self._place]
+        at = level, self._place
+        if at not in self._gains:
+            self._gains[at] = self._designed(*at)
+        return self._gains[at]
+
+    def _designed(self, level: int, place: int) -> SteadyGain:
+        """Return the gain for counts that are ``2^level`` times as uncertain as they come."""
+        noise = replace(self._noise, count=self._noise.count * 2.0**level)
+        return steady_gain(self._model, self._quantum, noise, self._steps[place])
 
     def _predict(self, voltage: float, dt: float) -> None:
         """Advance the state by the exact response to a constant voltage."""

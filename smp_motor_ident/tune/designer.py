@@ -204,7 +204,8 @@ def _explain(
             f"what the model may lack reaches {robustness.unmodelled:.0%} of what the loop bears"
             + known_words(unmodelled, ": ")
         )
-        if robustness.unmodelled > HELD_BACK.value:
+        # Beyond the crossover |T| is as large as the gains: so much of it the rule's had.
+        if robustness.unmodelled > HELD_BACK.value * min(factor, 1.0):
             findings.append(_held_back(unmodelled))
     if figures.control_noise > 1.05 * loop.noise_limit:
         noisy = (
