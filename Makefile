@@ -13,16 +13,15 @@ demo: setup
 	@$(IN) exec demo $(ARGS)
 
 # Everything runs on two cores but what is marked as alone: it tells less on a machine that is busy.
-# Nodes wait most of the time: three files of them at once.
-SHARED := python -m pytest --dist loadfile
+SHARED := python -m pytest -n 2 --dist loadfile
 test: setup
 ifdef ARGS
 	@$(IN) exec python -m pytest $(ARGS)
 else
 	@$(IN) failed=0; \
-	$(SHARED) -n 2 --durations=10 --ignore=test/nodes --ignore=test/system || failed=1; \
+	$(SHARED) --durations=10 --ignore=test/nodes --ignore=test/system || failed=1; \
 	python -m pytest --durations=5 -m alone test/system || failed=1; \
-	$(SHARED) -n 3 --no-loadscope-reorder --durations=20 -m 'not long and not alone' test/nodes test/system && exit $$failed
+	$(SHARED) --no-loadscope-reorder --durations=20 -m 'not long and not alone' test/nodes test/system && exit $$failed
 endif
 
 check: setup
