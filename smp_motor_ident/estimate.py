@@ -157,10 +157,8 @@ def _checked(group: list[Record], request: Request) -> Estimate:
     found = screen(group)
     rows = [excitation(r) for r in group]
     since = tuple(float(r.time[begin]) for r, (begin, _) in zip(group, rows, strict=True))
-    group, request = (
-        [r.slice(*of) for r, of in zip(group, rows, strict=True)],
-        replace(request, since=since),
-    )
+    group = [r.slice(*of) for r, of in zip(group, rows, strict=True)]
+    request = replace(request, since=since)
     if kind != ARMATURE:
         return _estimated(group, request, [*found, current_left_out(kind)])
     return _answered(group, request, found)
