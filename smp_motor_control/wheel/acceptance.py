@@ -32,6 +32,9 @@ thousandth of what any encoder resolves; of i, the same per millisecond."""
 GROSS = 2.0
 """Speed in set-points that no stable loop reaches: an undamped one of second order swings to 2."""
 
+_UNKNOWN = Encoder(2.0**20)
+"""An encoder that is not known yet speaks against no gains: they may be for a fine one."""
+
 _GROWING = 1.02
 _FAR = 1e3
 _NOMINAL = MotorModel(dc_gain=25.0, time_constant=0.05)
@@ -56,10 +59,6 @@ class Circumstances:
     supply: float = math.inf  # [V]; infinite where unknown
     gearbox: Gearbox | None = None  # none where unknown
     encoder: Encoder | None = None  # none where unknown
-
-
-_UNKNOWN = Encoder(2.0**20)
-"""An encoder that is not known yet speaks against no gains: they may be for a fine one."""
 
 
 def check(settings: LoopSettings, wheel: Circumstances | None = None) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 
 from smp_motor_control.arrays import Array, Flags
 from smp_motor_ident.diagnosis import limits
+from smp_motor_ident.diagnosis.glitches import glitches_of
 from smp_motor_ident.diagnosis.signs import lagged, likeness, lost_sign
 from smp_motor_ident.diagnosis.silence import silent
 from smp_motor_ident.diagnosis.units import cause_of_ratio, implausible_voltage
@@ -80,8 +81,8 @@ def _lost(record: Record) -> Iterator[Finding]:
                 f"{where}: {name} is NaN in {lost:.0%} of the samples; "
                 "repair the sensor or its connection and record again"
             )
-        named = any(f.evidence.get("signal") == name for f in record.findings)
-        if lost > 0 and not named:
+        lost -= glitches_of(record, name) / len(record)  # which are said already
+        if lost > 0:
             yield _left_out(name, lost)
     if record.current is not None:
         lost = float(np.mean(~np.isfinite(record.current)))

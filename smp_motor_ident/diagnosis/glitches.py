@@ -47,6 +47,12 @@ def without_glitches(record: Record) -> Record:
     return record
 
 
+def glitches_of(record: Record, name: str) -> int:
+    """Return how many readings of a signal were left out."""
+    said = [f.evidence for f in record.findings if f.code == "glitches"]
+    return sum(int(e["samples"] or 0) for e in said if e["signal"] == name)
+
+
 def _glitches(values: Array, pulsed: Flags) -> Flags:
     wrong = np.zeros(values.size, dtype=np.bool_)
     for _ in range(PASSES):

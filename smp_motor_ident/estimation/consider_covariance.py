@@ -173,7 +173,7 @@ def _consider_second_lag(data: Experiments, fit: Fit, factor: float) -> Fit:
         moves.append(s.of_free(near.z.array - fit.z.array))
     likely = np.exp(-0.5 * (np.array(deviances) - min(deviances)) / factor)
     edges = np.concatenate([[0.0], 0.5 * (lags[1:] + lags[:-1]), [age]])
-    weight = likely * np.diff(edges) / age
+    weight = likely * np.diff(edges)
     free = np.array(moves)
     return fit.wider(np.asarray(free.T @ ((weight / weight.sum())[:, None] * free)))
 

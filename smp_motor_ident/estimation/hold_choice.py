@@ -161,7 +161,7 @@ def _worth_a_search(
         for duration, least in looks.items():
             part = there.data_window(duration).held(how)
             fits = _delayed(part, least, how, lag, options, fits)
-            found = min(fits, key=lambda f: f.deviance)
+            found = fits[0]
             # What has not settled, or saw little of the data, tells against a search only where
             # its residuals are of another size.
             near = part.size * (1.0 + (part.current.size > 0))
@@ -177,9 +177,10 @@ def _worth_a_search(
 def _delayed(
     part: Experiments, best: Fit, how: str, lag: float, options: Options, before: list[Fit]
 ) -> list[Fit]:
-    """Return fits from the choice's coordinates, as late as that many samples, the like as one.
+    """Return fits from the choice's coordinates, as late as that many samples; the likeliest first.
 
-    Earlier than no delay only a shorter second lag is.  What a shorter look found is gone on from.
+    Earlier than no delay only a shorter second lag is.  What a shorter look found is gone on from;
+    of fits of the same delay the likeliest stays.
     """
     apart = how == "before"  # under another hold; the others differ by their instants alone
     starts = {max(lag, 0.0): best.z, float(max(round(lag), 0)): best.z}

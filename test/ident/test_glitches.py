@@ -85,3 +85,14 @@ def test_several_in_a_row_are_all_left_out_of_an_angle():
 def test_a_sensor_that_is_wrong_too_often_is_left_as_it_is():
     record = glitched(recorded(2), 0.15, 700.0)
     assert without_glitches(record) is record
+
+
+@pytest.mark.parametrize("lost", [0, 150])
+def test_readings_that_were_lost_are_said_beside_glitches(lost):
+    record = glitched(recorded(1), 0.005, 700.0)
+    speed = record.velocity.copy()
+    speed[1_000 : 1_000 + lost] = np.nan
+    found = estimate(Record("motor", record.time, record.voltage, velocity=speed)).findings
+    shares = [f.evidence["share"] for f in found if f.code == "samples_lost"]
+    assert shares == ([pytest.approx(lost / ROWS)] if lost else [])
+    assert "glitches" in [f.code for f in found]
