@@ -17,12 +17,13 @@ from smp_motor_ident.tune.methods import METHODS
 from smp_motor_ident.tune.motors import (
     Friction,
     draw_motors,
+    every_other,
     friction_of,
+    lag_in_sensor,
     lag_of_sensor,
     motors_of,
     one_size_of_voltage,
     unreliable_spread,
-    with_lag_of_sensor,
 )
 from smp_motor_ident.tune.plant import sample
 from smp_motor_ident.tune.problem import Method, Problem, RequiredMargins, checked
@@ -55,6 +56,7 @@ class Case:
     drawn: bool  # whether these were drawn; else the ensemble is the nominal motor alone
     friction: Friction  # what is known of it
     driver: Driver  # what its driver makes of a command
+    lag_in_doubt: bool  # whether the second lag may be the reported speed's filter
     findings: tuple[Finding, ...]  # what is to be said of the estimate
 
     @property
@@ -84,7 +86,7 @@ def prepare(estimate: Estimate, loop: Loop, method: str, targets: dict[str, Any]
     n = max(min(n, int(WORK / states**3)), FEWEST)
     motors = draw_motors(estimate, n, np.random.default_rng(seed), friction)
     if motors is not None and lag is not None:
-        motors = with_lag_of_sensor(motors)
+        motors = every_other(motors, lag_in_sensor(motors))
     draws = plant if motors is None else sample(motors, loop, believed=plant.motors)
     ensemble = UncertaintyEnsemble(draws, required, problem)
     if motors is None:
@@ -100,6 +102,7 @@ def prepare(estimate: Estimate, loop: Loop, method: str, targets: dict[str, Any]
         drawn,
         friction,
         driver,
+        lag is not None,
         tuple(findings),
     )
 

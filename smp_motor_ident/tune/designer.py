@@ -4,7 +4,7 @@ Methods work at the motor shaft; the gains that come out are per wheel rad/s.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -19,6 +19,7 @@ from smp_motor_ident.tune.limits import DELAY_BORNE, HELD_BACK
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.margins import Margins, loop_margins
 from smp_motor_ident.tune.methods import METHODS
+from smp_motor_ident.tune.motors import lag_in_sensor
 from smp_motor_ident.tune.plant import Plant, sample
 from smp_motor_ident.tune.reference import Reference, controller_for, plan_reference
 from smp_motor_ident.tune.simulation import Controller
@@ -96,7 +97,7 @@ def finish(case: Case, feedback: Feedback, factor: float, robustness: Robustness
     controller = controller_for(loop, feedback)
     usual = _usual(case)
     margins = loop_margins(plant, feedback)
-    reference = _plan(usual, loop, controller, margins, problem.targets)
+    reference = _plan(case, usual, controller, margins)
     noise = problem.control_noise(feedback)
     figures, bands = figures_of(case, usual, controller, reference, margins, noise)
     reason, findings = _explain(case, margins, factor, robustness, (figures, bands))
@@ -168,13 +169,15 @@ def wheel_gains(case: Case, controller: Controller) -> PidGains:
     )
 
 
-def _plan(
-    plant: Plant, loop: Loop, controller: Controller, margins: Margins, targets: Mapping[str, Any]
-) -> Reference:
+def _plan(case: Case, usual: Plant, controller: Controller, margins: Margins) -> Reference:
+    loop, plants = case.problem.loop, [usual]
+    if case.lag_in_doubt:
+        expected = replace(loop, delay=loop.expected_delay)
+        plants.append(sample(lag_in_sensor(usual.motors), expected, believed=usual.motors))
     # Of a delay that may be longer than usual no more is asked than the loop bears.
     borne = replace(loop, delay_doubt=min(loop.delay_doubt, DELAY_BORNE.value * margins.delay))
     least = 0.4 / margins.crossover if margins.crossover > 0 else 0.0
-    return plan_reference(plant, borne, controller, targets, least)
+    return plan_reference(plants, borne, controller, case.problem.targets, least)
 
 
 def _explain(

@@ -181,21 +181,27 @@ def lag_of_sensor(estimate: Estimate) -> Finding | None:
     )
 
 
-def with_lag_of_sensor(motors: Motors) -> Motors:
-    """Return the motors with every other one's second lag as the reported speed's filter.
+def lag_in_sensor(motors: Motors) -> Motors:
+    """Return motors with the second lag as the reported speed's filter.
 
     From voltage to what is reported they answer the same; two lags that would ring, by the error
     of an estimate, are taken for equal ones.
     """
     total, product = motors.a1 / motors.a0, motors.a2 / motors.a0
     short = 0.5 * (total - np.sqrt(np.maximum(np.square(total) - 4 * product, 0.0)))
-    other = np.arange(len(motors)) % 2 == 1
     return replace(
         motors,
-        a1=np.where(other, motors.a0 * (total - short), motors.a1),
-        a2=np.where(other, 0.0, motors.a2),
-        sensor_lag=motors.sensor_lag + np.where(other, short, 0.0),
+        a1=motors.a0 * (total - short),
+        a2=np.zeros_like(motors.a2),
+        sensor_lag=motors.sensor_lag + short,
     )
+
+
+def every_other(motors: Motors, others: Motors) -> Motors:
+    """Return a batch of which every other motor is one of ``others``."""
+    other = np.arange(len(motors)) % 2 == 1
+    pairs = ((f.name, getattr(motors, f.name), getattr(others, f.name)) for f in fields(motors))
+    return Motors(**{name: np.where(other, b, a) for name, a, b in pairs})
 
 
 def _covariance(estimate: Estimate, names: tuple[str, ...], mean: Array) -> Array:

@@ -13,7 +13,7 @@ References
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -126,9 +126,17 @@ def top_speed(plant: Plant, supply: float) -> float:
 
 
 def plan_reference(
-    plant: Plant, loop: Loop, controller: Controller, targets: Mapping[str, Any], least: float
+    plants: Sequence[Plant],
+    loop: Loop,
+    controller: Controller,
+    targets: Mapping[str, Any],
+    least: float,
 ) -> Reference:
-    """Return the fastest reference, of ``least`` seconds, that is followed without overshoot."""
+    """Return the fastest reference, of ``least`` seconds, that is followed without overshoot.
+
+    It leads the first of ``plants``, and the others follow it, too.
+    """
+    plant = plants[0]
     ratio = loop.gear_ratio
     asked = (checked(targets, name) for name in ("max_velocity", "max_acceleration"))
     speed, rate = (None if one is None else one * ratio for one in asked)
@@ -146,7 +154,7 @@ def plan_reference(
             time_constant_product=float(m.a2[0] / m.a0[0]),
         ),
     )
-    plan = _quickest(plant, loop, controller, plan, least)
+    plan = _quickest(plants, loop, controller, plan, least)
     quickest = plan.transition_time
     if rate is not None:
         steepest = _steepest(plan)
@@ -184,21 +192,23 @@ def _reachable(plant: Plant, loop: Loop, wished: float | None) -> float:
 
 
 def _quickest(
-    plant: Plant, loop: Loop, controller: Controller, plan: Reference, least: float
+    plants: Sequence[Plant], loop: Loop, controller: Controller, plan: Reference, least: float
 ) -> Reference:
     """Return the plan with the shortest change of speed, however small, that does not overshoot.
 
     By more than one percent when the loop's delay is as usual, or one and a half when it is longer
-    by the loop's doubt.
+    by the loop's doubt, or the motor another one than is taken.
     """
     late = replace(loop, delay=loop.expected_delay + loop.delay_doubt)
-    trials = ((plant, 1.0), (sample(plant.motors, late), 1.5))
+    first, *others = plants
+    trials = [(first, first, 1.0), (first, sample(first.motors, late), 1.5)]
+    trials += [(first, other, 1.5) for other in others]
     linear = replace(controller, limit=math.inf, tracking=math.inf)
     grain = max(0.002, loop.sample_time)
     grains = math.ceil(max(0.01, least) / grain)
     while True:
         plan = replace(plan, transition_time=round(grains * grain, 9))
-        if all(_overshoot(one, linear, plan) <= most for one, most in trials):
+        if all(_overshoot(led, one, linear, plan) <= most for led, one, most in trials):
             return plan
         grains += max(1, grains // 16)
         if grains * grain > LONGEST_TRANSITION:
@@ -209,14 +219,14 @@ def _quickest(
     )
 
 
-def _overshoot(plant: Plant, controller: Controller, plan: Reference) -> float:
-    """Return the overshoot of a small change [%]."""
+def _overshoot(led: Plant, plant: Plant, controller: Controller, plan: Reference) -> float:
+    """Return the overshoot of a small change [%], which is planned for a motor that it leads."""
     slow, T = plan.drive.time_constant, plant.sample_time
     time = T * np.arange(
         int((plan.transition_time + plan.lag + 3 * slow) / T) + 2, dtype=np.float64
     )
     small = replace(plan, drive=replace(plan.drive, top_speed=1e9))
-    change = planned_change(plant, small, 1.0, time)
+    change = planned_change(led, small, 1.0, time)
     run = simulate(plant, controller, change.inputs)
     return step_figures(time, run.speed[0], run.voltage[0], 1.0).overshoot
 
