@@ -19,6 +19,7 @@ from smp_motor_control.wheel.acceptance import Circumstances, check
 from smp_motor_control.wheel.faults import Fault, FaultDetector, FaultLimits, Recovery
 from smp_motor_control.wheel.freshness import FeedbackClock, Verdict
 from smp_motor_control.wheel.loop import LoopSettings, WheelLoop
+from smp_motor_control.wheel.plausibility import PlausibleSpeed
 
 _LARGEST_SETPOINT = 1e4
 _LEARNING = 20
@@ -84,6 +85,7 @@ class WheelController:
         self.loop = WheelLoop(settings.loop)
         self.recovery = Recovery()
         self.clock = FeedbackClock(math.inf, math.inf)
+        self._plausible = PlausibleSpeed()
         self.refused: Counter[str] = Counter()  # what was left out, and how often
         self.state = State.INACTIVE
         self.active = False  # whether it answers feedback
@@ -108,6 +110,7 @@ class WheelController:
     def configure(self, settings: WheelSettings) -> None:
         """Change the settings while running, without a jump of the voltage."""
         self.loop.configure(settings.loop.within(self.supply))
+        self._plausible.configure(settings.loop, self.supply)
         self.settings = settings
         self.advice = ""  # why the gains do not suit the interval of the feedback
         self._detector.limits = settings.faults
@@ -196,6 +199,11 @@ class WheelController:
                     self.refuse("feedback count that jumps")
                     self.loop.reset_speed()
                 return None
+            if not self._plausible.accepts(measurement, dt):
+                self._bad_at = now
+                self.refuse("feedback speed that jumps")
+                self.loop.reset_speed()
+                return None
             self._feedback_at = now
             if not self.active:
                 return None
@@ -242,6 +250,7 @@ class WheelController:
     def _not_fresh(self, verdict: Verdict, now: float) -> float | None:
         if verdict is _FIRST:
             self.loop.reset_speed()
+            self._plausible.reset()
         elif verdict is _LATE:
             self._late_at = now
         else:

@@ -30,7 +30,7 @@ _SLOWEST = 0.3
 """Error that is never a fault [rad/s]: one count at 1 kHz is 0.19 at the wheel of the paper."""
 
 _IMPROVING = 0.95
-"""Of its error a wheel that accelerates keeps less than this from one window to the next."""
+"""Of its way to the reference a wheel that accelerates has less than this left a window later."""
 
 _SATURATED = 0.7
 """Tolerated share of a set-point that the voltage may not suffice for, where that is unknown."""
@@ -146,8 +146,9 @@ class FaultDetector:
     ) -> Fault | None:
         """Compare speed and reference, each by its mean over a third of the tracking time.
 
-        Two windows in succession must be off, the second no less than the first, so that
-        neither noise nor a wheel that still accelerates is taken for a fault.
+        Two windows in succession must be off, and the speed of the second no nearer to its
+        reference than that of the first, so that neither noise nor a wheel that still accelerates
+        is taken for a fault.
         """
         self._reference += reference * dt
         self._speed += velocity * dt
@@ -166,9 +167,10 @@ class FaultDetector:
             self._learnt = abs(self._voltage / self._speed)
         error = abs(asked - speed)
         off = error > share * abs(asked) + _SLOWEST and self.limits.tracking_time > 0.0
-        self._begin_window(error if off else math.nan)
+        self._begin_window(speed if off else math.nan)
         stalled = self._still > 0.0 and self.limits.stall_time > 0.0
-        if stalled or not (off and error > _IMPROVING * before):  # NaN: the one before was good
+        way = abs(asked - before)  # NaN: the window before was good
+        if stalled or not (off and error > _IMPROVING * way):
             return None
         return Fault.WRONG_WAY if asked * speed < 0.0 else Fault.NOT_FOLLOWING
 

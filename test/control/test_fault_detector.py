@@ -151,6 +151,14 @@ def test_an_error_that_shrinks_by_a_twentieth_is_a_wheel_that_accelerates() -> N
     assert followed((2.0, 0.2, 6.0, False), (2.0, 0.30, 6.0, False))[0] == 0  # 1.8 to 1.70
 
 
+def test_a_wheel_that_turns_back_more_slowly_than_asked_is_no_fault() -> None:
+    """Its error grows while the reference goes over to the other direction, and it slows down."""
+    asked = (-0.3, -0.9, 6.0, False), (2.0, -0.6, 6.0, False), (2.0, -0.2, 6.0, False)
+    assert followed(*asked) == (0, None)
+    stuck = (-0.3, -0.9, 6.0, False), (2.0, -0.9, 6.0, False), (2.0, -0.9, 6.0, False)
+    assert followed(*stuck) == (2, Fault.WRONG_WAY)
+
+
 def test_means_are_compared_and_not_samples() -> None:
     swings = (2.0, lambda j: 1.9 + (-1) ** j, 6.0, False)
     assert followed(*[swings] * 9) == (0, None)

@@ -1,0 +1,48 @@
+"""Which readings of a speed no motor can have reached since the one before."""
+
+import math
+
+from smp_motor_control.wheel.loop import LoopSettings
+
+_SPARE = 2.0
+"""Times the acceleration of the motor at full voltage that something else may add to it."""
+
+_GROSS = 0.5
+"""Share of the top speed by which readings may differ for whatever reason."""
+
+
+class PlausibleSpeed:
+    """Leaves out a reading that jumps, unless the next one is there, too.
+
+    Examples
+    --------
+    >>> speed = PlausibleSpeed()
+    >>> speed.gross, speed.rate = 1.0, 10.0
+    >>> [speed.accepts(one, 0.01) for one in (0.0, 0.1, 5.0, 0.1, -4.0, -4.1)]
+    [True, True, False, True, False, True]
+    """
+
+    def __init__(self) -> None:
+        self.gross = self.rate = math.inf  # [rad/s], [rad/s^2]: what a change may be of
+        self.reset()
+
+    def configure(self, settings: LoopSettings, supply: float) -> None:
+        """Learn what the motor can do; nothing jumps where that is not known."""
+        inertia, drive = settings.gains.feedforward_acceleration, settings.drive
+        volts = min(supply, settings.gains.u_clamp_max)
+        known = drive is not None and inertia > 0.0 and math.isfinite(volts)
+        self.gross = _GROSS * drive.top_speed if drive is not None and known else math.inf
+        self.rate = _SPARE * 2.0 * volts / inertia if known else math.inf
+
+    def reset(self) -> None:
+        """Forget what was read, as after lost feedback."""
+        self._kept = self._last = math.nan
+
+    def accepts(self, speed: float, dt: float) -> bool:
+        """Tell whether a speed [rad/s] is to be believed."""
+        most = max(self.gross, self.rate * dt)
+        last, self._last = self._last, speed
+        if abs(speed - self._kept) > most and not abs(speed - last) <= most:  # NaN: the first
+            return False
+        self._kept = speed
+        return True
