@@ -17,7 +17,7 @@ from smp_motor_control.motor.parameters import Gearbox
 from smp_motor_control.motor.response import zero_order_hold
 from smp_motor_control.pid import PidGains
 from smp_motor_control.reference.profile import UNLIMITED
-from smp_motor_control.wheel.loop import LoopSettings, WheelLoop
+from smp_motor_control.wheel.loop import LEARNING, LoopSettings, WheelLoop
 
 RATES = (0.001, 0.002, 0.005, 0.01)
 """Sampling intervals of which one must do, where the hardware's is not known yet [s]."""
@@ -191,7 +191,10 @@ def _unstable(settings: LoopSettings, plant: _Plant) -> str:
 
 
 def _swing(settings: LoopSettings, plant: _Plant, wheel: Circumstances) -> float:
-    """Return the largest speed, in set-points, of the loop as it would drive the wheel."""
+    """Return the largest speed, in set-points, of the loop as it would drive the wheel.
+
+    It stands until an observer knows its interval, as it does before the first set-point.
+    """
     encoder = wheel.encoder or _UNKNOWN
     loop = WheelLoop(settings, Gearbox(plant.ratio), encoder, 1.5 * wheel.supply)
     plant.rest()
@@ -200,12 +203,12 @@ def _swing(settings: LoopSettings, plant: _Plant, wheel: Circumstances) -> float
     target = max(0.2 * plant.final * max(most - plant.static, 0.0), 1e-9)
     target = min(target, settings.limits.velocity or math.inf)
     speed = voltage = fastest = 0.0
-    for _ in range(plant.samples):
+    for k in range(LEARNING + plant.samples):
         count = math.floor(plant.angle * plant.ratio / encoder.angle_per_count)
         measured = loop.speed(dt, speed, count, voltage)
         out = 0.0
         if measured == measured:
-            out = loop.step(target, measured, dt).output
+            out = loop.step(target if k >= LEARNING else 0.0, measured, dt).output
             if out - out != 0.0:
                 return math.nan
         speed = plant.step(out, plant.static)

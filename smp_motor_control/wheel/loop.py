@@ -23,7 +23,7 @@ SPEED_SOURCES = ("measured", "difference", "observer")
 LONGEST_TRANSITION = 60.0
 """Largest duration of a change of set-point [s]."""
 
-_LEARNING = 20
+LEARNING = 20
 """Samples from which the observer learns the usual interval."""
 
 
@@ -159,7 +159,7 @@ class WheelLoop:
     def _learn(self, dt: float, velocity: float, count: int, voltage: float) -> float:
         """Difference until the usual interval is known, then start the observer."""
         self._intervals.append(dt)
-        if len(self._intervals) >= _LEARNING:
+        if len(self._intervals) >= LEARNING:
             usual = sorted(self._intervals)[len(self._intervals) // 2]
             settings = self.settings
             assert settings.model is not None and self._encoder is not None
