@@ -56,9 +56,15 @@ def weights(data: Sequence[Experiments], fits: Sequence[Fit], seed: int = 0) -> 
     # Of a choice between two holds nobody knows the odds: a second lag is as likely as the later.
     sizes = [f.structure.size + (f.structure.shift > 0) for f in fits]
     price = np.array([POLICY.price(n, f.samples) for n, f in zip(sizes, fits, strict=True)])
+    price += np.array([POLICY.second_lag * _slowly_filtered(f) for f in fits])
     total = shares @ runs.T + price
     each = np.exp(-0.5 * (total - total.min(axis=1, keepdims=True)))
     return np.asarray((each / each.sum(axis=1, keepdims=True)).mean(axis=0))
+
+
+def _slowly_filtered(fit: Fit) -> bool:
+    """Tell whether a speed's filter is slower than the motor, which few are."""
+    return fit.structure.low_pass and 0.5 * fit.z.window > fit.z.time_constant
 
 
 def averaged(result: Answer, weight: Array, others: Sequence[Answer]) -> Answer:

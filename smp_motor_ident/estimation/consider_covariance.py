@@ -15,6 +15,7 @@ import numpy as np
 from scipy.special import erfcx
 
 from smp_motor_control.arrays import Array
+from smp_motor_ident.diagnosis.limits import WINDING_LAG
 from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.current_lag import LITTLE, with_lag
 from smp_motor_ident.estimation.descent import ROUGHLY, refine
@@ -152,15 +153,16 @@ def _consider_second_lag(data: Experiments, fit: Fit, factor: float) -> Fit:
     """Return the fit with its covariance widened by a second lag for which its delay may stand.
 
     Every motor has one: any part of the delay, or of the mean age of a speed that is averaged, is
-    as likely as another, as far as the shape of the response leaves it open.  Some are fitted,
-    each with a likelihood of its own.
+    as likely as another, up to the longest of a winding, as far as the shape of the response
+    leaves it open.  Some are fitted, each with a likelihood of its own.
     """
     s, tau = fit.structure, fit.z.time_constant
     late = next((n for n in ("delay", "window") if n in s.free), None)
     age = 0.0 if late is None else fit.z.value(late) * (1.0 if late == "delay" else 0.5)
+    longest = min(age, WINDING_LAG.value * tau)
     if late is None or not age > 0:
         return fit
-    lags, near = age * np.array(SECOND_LAGS), fit
+    lags, near = longest * np.array(SECOND_LAGS), fit
     richer = SecondOrder.like(s)
     deviances, moves = [], []
     for lag in lags:
@@ -172,7 +174,7 @@ def _consider_second_lag(data: Experiments, fit: Fit, factor: float) -> Fit:
         deviances.append(near.deviance)
         moves.append(s.of_free(near.z.array - fit.z.array))
     likely = np.exp(-0.5 * (np.array(deviances) - min(deviances)) / factor)
-    edges = np.concatenate([[0.0], 0.5 * (lags[1:] + lags[:-1]), [age]])
+    edges = np.concatenate([[0.0], 0.5 * (lags[1:] + lags[:-1]), [longest]])
     weight = likely * np.diff(edges)
     free = np.array(moves)
     return fit.wider(np.asarray(free.T @ ((weight / weight.sum())[:, None] * free)))

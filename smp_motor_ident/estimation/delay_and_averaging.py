@@ -3,19 +3,24 @@
 Derivation: docs/derivations.md, section 10.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
+from smp_motor_ident.diagnosis.limits import RELEVANT_BIAS
 from smp_motor_ident.estimation import data_window, descent, start
 from smp_motor_ident.estimation.fit import Fit, Options
 from smp_motor_ident.estimation.initialisation import first_fit, initial_fit
 from smp_motor_ident.estimation.selection import POLICY, FittedCandidate
 from smp_motor_ident.likelihood.experiments import Experiments
+from smp_motor_ident.model.coordinates import Coordinates
 from smp_motor_ident.model.measurement import ANGLE
-from smp_motor_ident.model.structures import FirstOrder, Structure
+from smp_motor_ident.model.structures import FirstOrder, SecondOrder, Structure
 
 HARDLY = 0.01  # of a sample: a window that is as good as none, for the score
 WINDOWS = (1.0, 4.0)  # samples at which a low-pass is begun
+SHARES = (0.6, 0.2)  # of a time constant that are the motor's, beside a filter's of its speed
+WINDING = 0.05  # of a motor's time constant, as which a second lag is begun
 DELAYS = (0.3, 1.5, 3.5)  # samples at which a delay is begun that torque noise may have hidden
 
 
@@ -132,10 +137,12 @@ def with_low_pass(
             return best
     say(f"trying {richer.label}")
     starts = [near.z] if s.window else [near.z.with_(window=n * data.step) for n in WINDOWS]
-    if s.order == 2 and not s.window:
+    if s.order == 2 and not s.window and not s.current:
         lag = near.z.second_lag
         starts.append(near.z.with_second_lag(0.2 * lag).with_(window=1.6 * lag))
-    tried = [descent.refine(low, richer, near, richer.complete(z), options) for z in starts]
+    elif s.current:  # which tells how fast the motor is, however slow the filter
+        starts += [_quicker(near.z, share) for share in SHARES]
+    tried = [_filtered(low, richer, near, z, options) for z in starts]
     other = min(tried, key=lambda f: f.deviance)
     verdict, reason = POLICY.preferred(best, other)
     if verdict and other.noise_ratio > 0:  # what looked like torque noise may have been this
@@ -148,6 +155,58 @@ def with_low_pass(
         return other
     candidates.append(FittedCandidate(simple, f"as good as {other.structure.label}"))
     return simple
+
+
+def with_filter_for_lag(
+    data: Experiments,
+    best: Fit,
+    options: Options,
+    candidates: list[FittedCandidate],
+    say: Callable[[str], None],
+) -> Fit:
+    """Return the fit, or one of whose two lags either is the filter's of the speed.
+
+    From voltage to speed they answer the same, but where the motor rubs and turns back.  A filter
+    slower than the motor is another minimum, of which no score of a short one says anything.
+    """
+    s, slow = best.structure, best.z.time_constant
+    quick = best.z.second_lag * (s.order == 2) + 0.5 * best.z.window * s.window
+    rubs = s.friction != "none" and not s.current and data.quantum == 0 and data.kind != ANGLE
+    if not rubs or s.has("window") > s.window or quick < RELEVANT_BIAS.value * slow:
+        return best
+    lags = {"window": True, "low_pass": True}
+    first, second = FirstOrder.like(s).with_(**lags), SecondOrder.like(s).with_(**lags)
+    say(f"trying {first.label}")
+    part = descent.screening_subset(data)
+    there = best if part is data else descent.refine(part, s, best, best.z, options)
+    for motor, lag in ((quick, slow), (slow, quick)):
+        z = best.z.with_(ln_a1=best.z.ln_a0 + math.log(motor), window=2 * lag)
+        for structure in (first, second):
+            tried = _filtered(part, structure, there, z, options)
+            z = tried.z.with_second_lag(WINDING * tried.z.time_constant)
+            if not POLICY.replaces(there, tried)[0]:
+                continue
+            there = tried
+            if part is not data:
+                tried = _filtered(data, structure, best, tried.z, options)
+            verdict, reason = POLICY.preferred(best, tried)
+            candidates.append(FittedCandidate(tried, reason))
+            best = tried if verdict else best
+    return best
+
+
+def _filtered(
+    data: Experiments, structure: Structure, near: Fit, z: Coordinates, options: Options
+) -> Fit:
+    """Fit a low-passed speed from another's answer on the same data."""
+    data = data.measured_as(structure.speed)
+    return descent.refine(data, structure, near, structure.complete(z), options)
+
+
+def _quicker(z: Coordinates, share: float) -> Coordinates:
+    """Return a motor with a share of the time constant, whose rest is the filter's of the speed."""
+    less, rest = math.log(share), (1 - share) * z.time_constant
+    return z.with_(ln_a1=z.ln_a1 + less, ln_a2=z.ln_a2 + less, window=2 * rest)
 
 
 def _likelier_mean(best: Fit, candidates: list[FittedCandidate]) -> Fit:

@@ -8,7 +8,11 @@ from smp_motor_ident.diagnosis.limits import LITTLE_FRICTION
 from smp_motor_ident.estimation import data_window, descent, prediction
 from smp_motor_ident.estimation.candidate_starts import of_kind
 from smp_motor_ident.estimation.current_lag import with_current_lag
-from smp_motor_ident.estimation.delay_and_averaging import delay_without_noise, with_low_pass
+from smp_motor_ident.estimation.delay_and_averaging import (
+    delay_without_noise,
+    with_filter_for_lag,
+    with_low_pass,
+)
 from smp_motor_ident.estimation.fit import Fit, Options, solve
 from smp_motor_ident.estimation.initialisation import beginning, initial_fit
 from smp_motor_ident.estimation.profile import RISE, one_level, rubbing
@@ -25,6 +29,7 @@ def varied(
     data: Experiments, best: Fit, options: Options, candidates: list[FittedCandidate], say: Say
 ) -> Fit:
     """Add what the data ask for, take away what they do not show."""
+    best = with_filter_for_lag(data, best, options, candidates, say)
     best = with_low_pass(data, best, options, candidates, say)
     data = data.measured_as(best.kind)
     before = None

@@ -60,15 +60,16 @@ def weigh(h: float, lag: float, weights: Array) -> None:
 def low_passed(first: bool, t: float, lag: float, x: Array, m: Array, kept: Array, p: int) -> float:
     """Return the low-passed speed at a sample; put its derivative into D0.
 
-    It begins where the speed does.  Kept are, in rows, the sample before (time, angle, speed,
-    output and the sensitivities of the last three) and the weights of the interval.
+    It begins ahead of the speed by the number in the angle's place, of which only differences
+    count else.  Kept are, in rows, the sample before (time, angle, speed, output and the
+    sensitivities of the last three) and the weights of the interval.
     """
     before, c = kept[0], kept[1]
     speed, angle = x[1], x[2]
     if first:
-        y = speed
+        y = speed + angle
         for j in range(p):
-            m[D0 + j] = m[SW + j]
+            m[D0 + j] = m[SW + j] + m[ST + j]
     else:
         h = t - before[0]
         if c[0] != h:

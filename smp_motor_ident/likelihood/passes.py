@@ -117,8 +117,11 @@ def answers(
 
 
 def own_columns(data: Experiments, structure: Structure) -> tuple[int, ...]:
-    """Return which of (q, w, angle, load, earlier current) each segment has to itself."""
-    angle = (2,) if data.kind == ANGLE else ()
+    """Return which of (q, w, angle, load, earlier current) each segment has to itself.
+
+    In the angle's place a low-passed speed has what it is ahead of the speed at first.
+    """
+    angle = (2,) if data.kind in (ANGLE, LOW_PASSED) else ()
     own = (1,) if structure.order == 1 else (0, 1)
     earlier = (4,) if structure.lags else ()
     return own + angle + ((3,) if structure.own_load else ()) + earlier

@@ -87,6 +87,21 @@ def test_a_motor_with_current_is_found_behind_its_speed_s_low_pass(lag):
     assert tuned.motors_of(found).sensor_lag[0] == pytest.approx(lag, rel=0.05)
 
 
+@pytest.mark.parametrize("current", [False, True])
+def test_a_motor_is_found_behind_a_filter_that_is_slower_than_it(current):
+    """Which lag is whose shows where the motor rubs; where the filter begins is its own."""
+    lag = 30 * STEP
+    record = filtered(lag, 0.5, noise=0.1)
+    record = record.slice(137, len(record))
+    found = estimate(record if current else replace(record, current=None))
+    truth = motors.truth("rear_left", 0.5) | {"sensor_lag": lag}
+    assert lag > 2 * truth["time_constant"]
+    for name in ("sensor_lag", "dc_gain", "time_constant", "static_voltage"):
+        q = found.combinations[name]
+        assert abs(q.value - truth[name]) < max(4 * q.std, 5e-3 * truth[name]), name
+        assert q.std < 0.1 * truth[name]
+
+
 def test_a_low_pass_that_is_known_is_taken_as_given():
     lag = 2 * STEP
     record = replace(filtered(lag, 0.3, noise=0.1), current=None)
