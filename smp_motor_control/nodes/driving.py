@@ -13,14 +13,9 @@ from smp_motor_control import joint_of
 from smp_motor_control.nodes.robot_client import PATIENCE, RobotClient, RobotError
 from smp_motor_control.nodes.runtime import STREAM_PUBLISHER
 
-REPEAT = 0.02
-"""Interval at which a command is repeated [s]."""
-
-STANDSTILL = 1.0
-"""Standstill that is commanded before a drive at least [s]."""
-
-QUIET = 0.5
-"""Time in which nobody else may send set-points [s]."""
+REPEAT = 0.02  # interval at which a command is repeated [s]
+STANDSTILL = 1.0  # standstill that is commanded before a drive at least [s]
+QUIET = 0.5  # time in which nobody else may send set-points [s]
 
 Times = list[tuple[str, float, float]]
 """Name, begin and end of each segment, by the stamps [s]."""

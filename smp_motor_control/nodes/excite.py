@@ -24,9 +24,7 @@ from smp_motor_control.nodes.motor_writer import MotorWriter
 from smp_motor_control.nodes.settings import Parameters
 from smp_motor_control.wheel.protection import Bounds, Protection
 
-_OTHERS = 0.5
-"""Time [s] that other listeners than the driver are given to connect."""
-
+_OTHERS = 0.5  # time [s] that other listeners than the driver are given to connect
 _SILENCE = 1.0
 """A wheel that was heard is missed after commands of so long [s]; time in which this process did
 not run does not count."""

@@ -15,9 +15,7 @@ from smp_motor_control.errors import SmpError
 from smp_motor_control.nodes.robot_client import LOOK, PATIENCE, RobotClient, RobotError
 from smp_motor_control.nodes.runtime import seconds
 
-BASELINE = 0.5
-"""How long the old gains are watched first [s]."""
-
+BASELINE = 0.5  # how long the old gains are watched first [s]
 WINDOW = 0.4
 """Length of the stretch that is judged [s]; the first verdict comes that long after the change."""
 
@@ -25,11 +23,8 @@ SILENT_LOOKS = 25
 """A loop that reports nothing between so many looks has stopped: half a second, in which this
 process itself was awake."""
 
-STARVED = 10.0
-"""A step that comes so many usual steps late ran without control meanwhile."""
-
-RETURN = 60.0
-"""How long a wheel that does not answer is waited for, to set its old gains again [s]."""
+STARVED = 10.0  # a step that comes so many usual steps late ran without control meanwhile
+RETURN = 60.0  # how long a wheel that does not answer is waited for, to set its old gains again [s]
 
 
 class Watch:

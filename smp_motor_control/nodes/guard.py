@@ -14,8 +14,7 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-TRY_FOR = 20.0
-"""How long a robot is asked to take back what is its own [s]."""
+TRY_FOR = 20.0  # how long a robot is asked to take back what is its own [s]
 
 
 class Guard:

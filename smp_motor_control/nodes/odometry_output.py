@@ -15,14 +15,9 @@ from smp_motor_control.body.odometry import Odometry
 from smp_motor_control.body.wheel_travel import WheelSample
 from smp_motor_control.nodes.skid_steer_settings import Settings
 
-UNKNOWN = 1e6
-"""Variance of what wheels on a plane cannot tell: height, roll and pitch."""
-
-SIDEWAYS = 1e-3
-"""Variance of the sideways velocity of a body that skids [m^2/s^2]."""
-
-STILL = 1e-6
-"""Least variance of a velocity, for filters that divide by it."""
+UNKNOWN = 1e6  # variance of what wheels on a plane cannot tell: height, roll and pitch
+SIDEWAYS = 1e-3  # variance of the sideways velocity of a body that skids [m^2/s^2]
+STILL = 1e-6  # least variance of a velocity, for filters that divide by it
 
 
 def frame_prefix(enable: bool, prefix: str, namespace: str) -> str:

@@ -14,9 +14,7 @@ from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.motor_writer import MotorWriter
 from smp_motor_control.nodes.robot_client import PATIENCE, RobotClient, RobotError
 
-SETTLE = 1.5
-"""How long the constant voltage acts; its last half second tells the speed [s]."""
-
+SETTLE = 1.5  # how long the constant voltage acts; its last half second tells the speed [s]
 FOLLOWED = 0.1
 """Share of the relay's amplitude by which what acts may differ from what is asked for."""
 

@@ -37,12 +37,8 @@ AGAIN = 0.25
 """Time in which a service answers, or is asked again [s]: an answer is lost where the node has
 not yet discovered this client, so no request may do harm twice."""
 
-LOOK = 0.02
-"""Interval at which a condition is looked at [s]."""
-
-DISCOVERY = 1.0
-"""Time in which a free machine discovers what is there [s]."""
-
+LOOK = 0.02  # interval at which a condition is looked at [s]
+DISCOVERY = 1.0  # time in which a free machine discovers what is there [s]
 UNKNOWN = "_NODE_NAME_UNKNOWN_"
 """What the middleware calls the node of an endpoint that it discovered before the node."""
 

@@ -34,17 +34,10 @@ from smp_motor_control.serial_protocol import (
     encode_voltages,
 )
 
-POLL = 0.002
-"""Interval at which the line is read [s]."""
-
-SILENCE = 0.5
-"""Of a board, after which its line is opened again [s]."""
-
-COMMANDS = 0.02
-"""Longest interval between two lines to the board [s]; it stops after 0.2 s without."""
-
-RESET = 1.0
-"""A board's clock that jumps by more than this was reset, and its counts with it [s]."""
+POLL = 0.002  # interval at which the line is read [s]
+SILENCE = 0.5  # of a board, after which its line is opened again [s]
+COMMANDS = 0.02  # longest interval between two lines to the board [s]; it stops after 0.2 s without
+RESET = 1.0  # a board's clock that jumps by more than this was reset, and its counts with it [s]
 
 
 @dataclass(frozen=True, kw_only=True)

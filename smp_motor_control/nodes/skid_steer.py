@@ -20,12 +20,9 @@ from smp_motor_control.nodes.skid_steer_settings import Settings
 
 IMPLAUSIBLE = 4.0
 """Wheels that seem to turn this many times faster than they can have had their counter reset."""
-FASTEST = 250.0
-"""What is plausible without a limit [rad/s]."""
-REPORTED = 1.5
-"""A command that was refused is reported for so long [s], one report at least."""
-LOOK = 0.2
-"""Interval at which the publishers of cmd_vel are looked at [s]."""
+FASTEST = 250.0  # what is plausible without a limit [rad/s]
+REPORTED = 1.5  # a command that was refused is reported for so long [s], one report at least
+LOOK = 0.2  # interval at which the publishers of cmd_vel are looked at [s]
 STALL = 3.0
 """A step so many periods late comes before what was heard meanwhile: that is taken in first."""
 

@@ -17,8 +17,7 @@ from smp_motor_ident.errors import BagError
 from smp_motor_ident.finding import Finding, Severity
 from smp_motor_ident.record import Hardware, Record
 
-BRIDGED = 2
-"""Samples that may be lost in a row before a new segment begins."""
+BRIDGED = 2  # samples that may be lost in a row before a new segment begins
 
 
 @dataclass(eq=False)

@@ -9,8 +9,7 @@ from smp_motor_ident.bag.limits import JUMP_SPAN, JUMP_STEP, UNSIGNED_CURRENT
 from smp_motor_ident.errors import BagError
 
 _LEAST = 50
-_SAMPLED = 5000
-"""Values that quantiles and means are taken of."""
+_SAMPLED = 5000  # values that quantiles and means are taken of
 
 
 def impossible(value: Array, *, steps_allowed: bool) -> Flags:

@@ -9,8 +9,7 @@ from smp_motor_ident.diagnosis.limits import HALF_EXPLAINED
 from smp_motor_ident.diagnosis.signs import lagged
 
 LAGS, OWN = 6, 2
-BLOCKS = 200
-"""Stretches over which motions are averaged: in them a counter's noise is small."""
+BLOCKS = 200  # stretches over which motions are averaged: in them a counter's noise is small
 
 
 def unexplained(u: Array, y: Array) -> float | None:

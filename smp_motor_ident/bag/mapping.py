@@ -26,9 +26,7 @@ _CHOICES = {
 }
 _SECONDS = ("gap", "sample_time", "velocity_window")
 _SCALES = ("wheel_radius", "pwm_full_scale")
-DEFAULT_MOTOR = "motor"
-"""Name of the motor where a mapping has only one and does not name it."""
-
+DEFAULT_MOTOR = "motor"  # name of the motor where a mapping has only one and does not name it
 _NUMBER = r"(?:\d+\.?\d*(?:[eE][+-]?\d+)?|\.\d+(?:[eE][+-]?\d+)?)"
 _PRODUCT = rf"{_NUMBER}(?:\s*[*/]\s*{_NUMBER})*"
 _SPEC = re.compile(

@@ -15,8 +15,7 @@ from smp_motor_ident.bag.unpack import decompress_messages
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.finding import Finding
 
-_LISTED = 12
-"""Elements of an array without names that are listed."""
+_LISTED = 12  # elements of an array without names that are listed
 
 
 @dataclass

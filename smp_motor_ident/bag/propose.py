@@ -40,10 +40,8 @@ from smp_motor_ident.bag.units import of_the_rim, unit_of
 from smp_motor_ident.errors import BagError
 
 _RADIUS = "in metres: what is measured is the way of the rim"
-_MOST = 20_000
-"""Samples that are looked at."""
-_WIDEST = 16
-"""Columns that are tried where their names tell nothing."""
+_MOST = 20_000  # samples that are looked at
+_WIDEST = 16  # columns that are tried where their names tell nothing
 
 
 @dataclass

@@ -29,8 +29,7 @@ OWN_FIELDS = {
     "position": "position",
     "count": "encoder_count",
 }
-BETWEEN = 1.0
-"""Time [s] that a joined record leaves between two recordings."""
+BETWEEN = 1.0  # time [s] that a joined record leaves between two recordings
 
 
 def read_experiments(paths: Any, mapping: Any = None) -> dict[str, list[Record]]:

@@ -13,8 +13,7 @@ from smp_motor_ident.finding import Finding, Severity
 
 Bytes = NDArray[np.uint8]
 
-TABLE = "table"
-"""Encoding of a channel whose file holds columns of numbers instead of messages."""
+TABLE = "table"  # encoding of a channel whose file holds columns of numbers instead of messages
 
 
 def found(code: str, message: str, severity: Severity = "note", **evidence: float) -> Finding:

@@ -23,9 +23,7 @@ from smp_motor_ident.errors import BagError
 
 COMMAND = "smp_interfaces/msg/MotorCommand"
 
-LEAST_ANSWERS = 50
-"""Commands below which quantiles of their delay mean nothing."""
-
+LEAST_ANSWERS = 50  # commands below which quantiles of their delay mean nothing
 SHARE = 0.95
 """Share of the commands that the longest delay covers: margins are about a delay that stays,
 a single late command is a disturbance."""

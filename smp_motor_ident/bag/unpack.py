@@ -22,8 +22,7 @@ from smp_motor_ident.errors import BagError
 
 VARIABLE = "SMP_BAG_UNPACKED"
 MAGIC = {b"\x28\xb5\x2f\xfd": "zstd", b"\x04\x22\x4d\x18": "lz4"}
-_FED = 1024
-"""Bytes fed at once: the largest block of zstd, 128 KiB, may be packed in four bytes."""
+_FED = 1024  # bytes fed at once: the largest block of zstd, 128 KiB, may be packed in four bytes
 _PIECE = 1 << 20
 _DAMAGE = (zstandard.ZstdError, RuntimeError, EOFError, OSError, ValueError)
 _ZSTD = zstandard.ZstdDecompressor()

@@ -12,11 +12,8 @@ from smp_motor_ident.bag.read import OWN_FIELDS
 from smp_motor_ident.bag.storage import Table
 from smp_motor_ident.record import Hardware, Record
 
-CAPACITY = 200_000
-"""Samples that are kept at most."""
-
-LEAST = 10
-"""Samples below which there is no record."""
+CAPACITY = 200_000  # samples that are kept at most
+LEAST = 10  # samples below which there is no record
 
 
 class Window:

@@ -7,12 +7,10 @@ import numpy as np
 from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident.bag.limits import WIDTH_KNOWN
 
-_LEAST = 3
-"""Wraps that tell a width; fewer may be faults."""
+_LEAST = 3  # wraps that tell a width; fewer may be faults
 _ONWARD = 0.8
 """Share of the wraps before and after which it moves on; what is thrown to and fro stands."""
-_TURNS = 10
-"""Angles start again after up to so many turns, or at up to so many parts of one."""
+_TURNS = 10  # angles start again after up to so many turns, or at up to so many parts of one
 
 
 @dataclass(frozen=True)

@@ -21,26 +21,15 @@ from smp_motor_ident.diagnosis.wheel_test import (
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.record import Hardware
 
-REST, COAST = 0.3, 0.4
-"""Zero voltage before and behind [s]; a coast of a few time constants."""
-
-LONGEST_HOLD = 2.0
-"""A voltage is held for so long where the wheel is slow [s]."""
-
-RAMP = 0.15
-"""Growth of the voltage until the wheel turns [of the supply per second]."""
-
-GROWTH = 2.0
-"""Of the voltage from one level to the next."""
-
+REST, COAST = 0.3, 0.4  # zero voltage before and behind [s]; a coast of a few time constants
+LONGEST_HOLD = 2.0  # a voltage is held for so long where the wheel is slow [s]
+RAMP = 0.15  # growth of the voltage until the wheel turns [of the supply per second]
+GROWTH = 2.0  # of the voltage from one level to the next
 FIRST = (1.5, 0.05)
 """First level: so many times what started the wheel, and so much of the supply more."""
 
-PATIENCE = 5.0
-"""How long descriptions are waited for [s]."""
-
-TURNED = 12.0
-"""Counts after which a ramp ends: the wheel turns."""
+PATIENCE = 5.0  # how long descriptions are waited for [s]
+TURNED = 12.0  # counts after which a ramp ends: the wheel turns
 
 
 @dataclass(frozen=True)

@@ -34,9 +34,7 @@ from smp_motor_ident.result import Estimate
 AMPLITUDE, DURATION = 6.0, 15.0
 """Largest voltage [V] and length of a signal [s], unless the user or an earlier run says so."""
 
-DRAFT = "recording"
-"""Folder of a recording until it is whole."""
-
+DRAFT = "recording"  # folder of a recording until it is whole
 LOOKS, ALIKE = 15, 4
 """Wheels are looked for at most so often, until so many looks [1 s each] find the same."""
 

@@ -16,8 +16,7 @@ from smp_motor_ident.report.drawing import document
 from smp_motor_ident.tune.simulation import StepFigures, step_figures
 from smp_motor_ident.tune.verification import smoothed
 
-LEAST_CHANGE = 0.8
-"""A smaller change of the set-point [rad/s, wheel] is no step to judge."""
+LEAST_CHANGE = 0.8  # a smaller change of the set-point [rad/s, wheel] is no step to judge
 
 
 @dataclass(frozen=True)

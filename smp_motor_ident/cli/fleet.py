@@ -26,8 +26,7 @@ from smp_motor_ident.estimate import estimate
 from smp_motor_ident.report import fleet
 from smp_motor_ident.report.document import check_free, write_together
 
-TRIES = 2
-"""How often a recording is begun that takes its worker with it."""
+TRIES = 2  # how often a recording is begun that takes its worker with it
 
 Results = Iterator[tuple[str, list[fleet.Row]]]
 """Paths of recordings, each with its rows."""

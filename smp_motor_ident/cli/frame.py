@@ -17,11 +17,8 @@ from smp_motor_control.errors import SmpError
 from smp_motor_control.ros_arguments import split_arguments
 from smp_motor_ident.cli.interruption import check, interruptible
 
-INTERRUPTED = 130
-"""Exit code after Ctrl-C, as shells have it."""
-
-PATIENCE = 2.0
-"""Where progress goes to no terminal, a step is named when it has taken so long [s]."""
+INTERRUPTED = 130  # exit code after Ctrl-C, as shells have it
+PATIENCE = 2.0  # where progress goes to no terminal, a step is named when it has taken so long [s]
 
 
 OF_ROS = "A robot in a namespace: end the line with --ros-args -r __ns:=/robot1."

@@ -24,9 +24,7 @@ SIGNALS = (
 )
 """What moves the wheels: signal, shares of amplitude and duration, and whose recording."""
 
-FURTHER = "further"
-"""Name of the recording that an identification asks for."""
-
+FURTHER = "further"  # name of the recording that an identification asks for
 IDENTIFYING, AGAIN, TUNING, DRIVING = (
     "identifying",
     "identifying again",
@@ -35,9 +33,7 @@ IDENTIFYING, AGAIN, TUNING, DRIVING = (
 )
 """Parts behind the recordings."""
 
-LONGEST = 120.0
-"""Of such a recording [s]."""
-
+LONGEST = 120.0  # of such a recording [s]
 CHECK, START, COMPUTE, DRIVE = 8.0, 4.0, 4.0, 12.0
 """First guesses [s]: the test of one wheel, the start and end of processes around a signal, the
 identification or tuning of one wheel, the drive."""

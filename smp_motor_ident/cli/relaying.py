@@ -16,12 +16,8 @@ from smp_motor_ident.report.document import check_free, write_together
 from smp_motor_ident.tune.methods.relay import read_oscillation
 from smp_motor_ident.tune.methods.ziegler_nichols import by_rule
 
-BIAS = 0.4
-"""Share of the supply around which the relay switches, so that friction is not crossed."""
-
-GAP = 0.25
-"""Share of a cycle without a sample over which a record is not read."""
-
+BIAS = 0.4  # share of the supply around which the relay switches, so that friction is not crossed
+GAP = 0.25  # share of a cycle without a sample over which a record is not read
 SIGNALS = ("time", "voltage", "applied", "speed", "angle")
 
 

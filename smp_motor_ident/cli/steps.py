@@ -42,9 +42,7 @@ class Robot:
         self.client.change_states(self.wheel_nodes(), transition)
 
 
-PATIENCE = 60.0
-"""How long a busy machine may take to start or end a process [s]."""
-
+PATIENCE = 60.0  # how long a busy machine may take to start or end a process [s]
 TOPICS = "/(.*/)?(motor_.*|pid_state|wheel_setpoints|cmd_vel|odom|joint_states|diagnostics)"
 """What is worth keeping of a robot, for ``record``."""
 

@@ -14,9 +14,7 @@ from smp_motor_ident.cli.frame import progress
 from smp_motor_ident.report import words
 from smp_motor_ident.result import Estimate
 
-MOST_FIELDS = 12
-"""So many fields of a topic are printed."""
-
+MOST_FIELDS = 12  # so many fields of a topic are printed
 _COLOR = {"estimated": "green", "fixed": "cyan", "unidentifiable": "red"}
 
 

@@ -24,8 +24,7 @@ from smp_motor_ident.tune.source import choose_source
 from smp_motor_ident.tune.wheels import WheelSet
 from smp_motor_ident.tune.writing import gains_document, gains_yaml, parameters
 
-DEFAULT_RATE = 200.0
-"""Steps per second where neither the user nor the identification says [Hz]."""
+DEFAULT_RATE = 200.0  # steps per second where neither the user nor the identification says [Hz]
 
 
 def work(arguments: argparse.Namespace) -> int:

@@ -19,14 +19,9 @@ from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune import verification
 from smp_motor_ident.tune.verification import STEADY, Change
 
-LEAST = 1.0
-"""Of a change of set-point with its end [s]."""
-
-LEAD = 0.3
-"""Rest before a change that is simulated with it [s]."""
-
-ATTEMPTS = 3
-"""Drives; a drive that was disturbed is repeated, whatever it showed."""
+LEAST = 1.0  # of a change of set-point with its end [s]
+LEAD = 0.3  # rest before a change that is simulated with it [s]
+ATTEMPTS = 3  # drives; a drive that was disturbed is repeated, whatever it showed
 
 
 class NeverHeard(ProcessError):

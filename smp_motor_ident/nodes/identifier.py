@@ -48,8 +48,7 @@ UNHURRIED = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
 TAKE_PERIOD = 0.05
 """Between two batches of samples [s]: waking up for each would cost half as much again."""
 
-MINUTE = 60.0
-"""Between two lines of a history [s]."""
+MINUTE = 60.0  # between two lines of a history [s]
 
 
 @dataclass(frozen=True, kw_only=True)

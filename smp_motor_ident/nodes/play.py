@@ -24,10 +24,8 @@ from smp_motor_ident.nodes.bag_arguments import chosen, message_class, quality
 DEPTH = 1000
 FIND_EACH_OTHER = 1.0
 """Shortest wait [s] before the first message, so that subscribers find the publishers."""
-FIND_ANYBODY = 3.0
-"""Longest wait [s] for a first subscriber, where nobody listens yet."""
-FIND_AT_MOST = 5.0
-"""Longest wait [s] until everybody whom the graph shows is connected."""
+FIND_ANYBODY = 3.0  # longest wait [s] for a first subscriber, where nobody listens yet
+FIND_AT_MOST = 5.0  # longest wait [s] until everybody whom the graph shows is connected
 
 
 class Player(Node):

@@ -13,8 +13,7 @@ from smp_motor_ident.report.words import label
 
 WIDTH = 720
 LEFT, RIGHT, TOP, BOTTOM = 64, 12, 8, 40
-POINTS = 600
-"""More than one point a pixel shows nothing more."""
+POINTS = 600  # more than one point a pixel shows nothing more
 
 
 def svg(chart: Chart) -> str:

@@ -11,9 +11,7 @@ from smp_motor_ident.report.chart import Chart, Curve, thin
 from smp_motor_ident.report.words import label
 from smp_motor_ident.result import ResidualTests
 
-POINTS = 8000
-"""Of a curve over time; zoomed in tenfold that is still one a pixel."""
-
+POINTS = 8000  # of a curve over time; zoomed in tenfold that is still one a pixel
 COHERENT = 0.6
 """Below this coherence most of what a frequency shows is not the answer to the voltage."""
 

@@ -23,13 +23,10 @@ from smp_motor_ident.tune.writing import gains_yaml
 SHARES = (0.3, 0.45, 0.65, 0.85, 1.0)
 """Of the bandwidth that the method chooses by itself, which is the largest integral gain's."""
 
-MARGINS = (45.0, 60.0, 70.0)
-"""Phase margins that are offered [deg]: lively, usual, calm."""
-
+MARGINS = (45.0, 60.0, 70.0)  # phase margins that are offered [deg]: lively, usual, calm
 LIMIT = METHODS["margin"].required.sensitivity
 
-SAMPLES = 100
-"""Motors that the bands of a choice are over: their ends are the least and largest."""
+SAMPLES = 100  # motors that the bands of a choice are over: their ends are the least and largest
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,8 +26,7 @@ _ISO = re.compile(
     r"(?:(\d{4}-\d\d-\d\d)[T _.])?(\d\d?:\d\d:\d\d(?:[.,]\d{1,9})?) ?(Z|[+-]\d\d:?\d\d)?"
 )
 _BRACKETS = re.compile(r"\s*[\[(]([^\])]*)[\])]\s*$")
-_SEEN = 60
-"""Rows that are looked at to tell names from numbers."""
+_SEEN = 60  # rows that are looked at to tell names from numbers
 
 
 @dataclass

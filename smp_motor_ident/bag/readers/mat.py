@@ -23,15 +23,11 @@ from smp_motor_ident.bag.unpack import Budget
 from smp_motor_ident.errors import BagError
 
 _COMPRESSED, _MATRIX = 15, 14
-_OPAQUE = 17
-"""Class of a matrix that is an object of MATLAB."""
-_TOLD = 4
-"""Objects that are named in a message."""
+_OPAQUE = 17  # class of a matrix that is an object of MATLAB
+_TOLD = 4  # objects that are named in a message
 _TYPES_4 = ("<f8", "<f4", "<i4", "<i2", "<u2", "u1")
 _DEEPEST = 16
-_WIDEST = 64
-"""Columns of a matrix that are taken as signals; a wider one is something else."""
-
+_WIDEST = 64  # columns of a matrix that are taken as signals; a wider one is something else
 _PROBE = """
 import io, sys
 from scipy.io import loadmat

@@ -66,9 +66,7 @@ class Check:
     resting_error: float  # share of that change by which it may rest beside it [-]
 
 
-BAND = 0.02
-"""Within which a change of set-point counts as settled."""
-
+BAND = 0.02  # within which a change of set-point counts as settled
 MILLISECOND = 1e-3
 """By which an interval in milliseconds may miss a whole number, as rates of six digits do."""
 
