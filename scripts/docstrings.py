@@ -14,14 +14,8 @@ from pathlib import Path
 from numpydoc.hooks.validate_docstrings import parse_config, process_file
 
 PUBLIC = {
-    "estimate",
-    "design",
-    "read_records",
-    "Pid",
-    "PidGains",
-    "Motor",
-    "MotorParameters",
-    "SkidSteer",
+    *("estimate", "design", "read_records"),
+    *("Pid", "PidGains", "Motor", "MotorParameters", "SkidSteer"),
 }
 SECTIONS = ("Parameters\n", "Returns\n", "Yields\n")
 

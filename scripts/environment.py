@@ -31,7 +31,17 @@ STAMPS = VENV / "stamps.json"
 LOG = VENV / "setup.log"
 PYTHON = str(getattr(sys, "_base_executable", sys.executable))  # not that of a virtual environment
 LAYOUT = "1"  # to be raised when this file prepares something in another way
+CXX = ["c++", "g++", "clang++"]
 APT = ["numpy", "scipy", "matplotlib", "yaml"]  # left to apt where ROS is installed
+FOREIGN = {
+    *("PYTHONHOME", "VIRTUAL_ENV", "PIP_USER", "PIP_TARGET", "PIP_PREFIX", "PIP_CONSTRAINT"),
+    *("PIP_REQUIRE_VIRTUALENV", "PIP_NO_BINARY"),
+    *("COLCON_PREFIX_PATH", "COLCON_HOME", "COLCON_DEFAULTS_FILE"),
+}
+FOREIGN_TO_WHEELS = {
+    *("PYTHONPATH", "LD_LIBRARY_PATH", "AMENT_PREFIX_PATH", "CMAKE_PREFIX_PATH"),
+    "_ROS_WHEELS_BOOTSTRAP_COMPLETE",
+}
 NETWORK = re.compile(
     r"NewConnectionError|NameResolutionError|ConnectTimeout|ReadTimeout|ProxyError|Retrying \("
     r"|Temporary failure in name resolution|Network is unreachable|SSLError"
@@ -89,12 +99,7 @@ def check_machine(ros: str) -> None:
         raise SetupError("the ROS wheels need a Linux with glibc (Debian, Ubuntu, Fedora, ...)")
     wanted = {
         "a C compiler (cc, gcc or clang)": [os.environ.get("CC", ""), "cc", "gcc", "clang"],
-        "a C++ compiler (c++, g++ or clang++)": [
-            os.environ.get("CXX", ""),
-            "c++",
-            "g++",
-            "clang++",
-        ],
+        "a C++ compiler (c++, g++ or clang++)": [os.environ.get("CXX", ""), *CXX],
         "cmake": ["cmake"],
         "make": ["make"],
     }
@@ -149,27 +154,8 @@ def requirements(ros: str) -> Path:
 
 def environment(ros: str) -> dict[str, str]:
     """Return the environment for pip, CMake and colcon: nothing of another Python or ROS in it."""
-    env = dict(os.environ)
-    foreign = [
-        "PYTHONHOME",
-        "VIRTUAL_ENV",
-        "PIP_USER",
-        "PIP_TARGET",
-        "PIP_PREFIX",
-        "PIP_CONSTRAINT",
-    ]
-    foreign += [
-        "PIP_REQUIRE_VIRTUALENV",
-        "PIP_NO_BINARY",
-        "COLCON_PREFIX_PATH",
-        "COLCON_HOME",
-        "COLCON_DEFAULTS_FILE",
-    ]
-    if not ros:
-        foreign += ["PYTHONPATH", "LD_LIBRARY_PATH", "AMENT_PREFIX_PATH", "CMAKE_PREFIX_PATH"]
-        foreign += ["_ROS_WHEELS_BOOTSTRAP_COMPLETE"]
-    for name in foreign:
-        env.pop(name, None)
+    foreign = FOREIGN if ros else FOREIGN | FOREIGN_TO_WHEELS
+    env = {name: value for name, value in os.environ.items() if name not in foreign}
     env["PATH"] = f"{VENV}/bin{os.pathsep}{env['PATH']}"
     if not ros:
         env["AMENT_PREFIX_PATH"] = env["CMAKE_PREFIX_PATH"] = str(VENV)
@@ -209,9 +195,7 @@ def run(command: list[str], env: dict[str, str], lock: IO[str], count: str = "")
                 "the Python package index cannot be reached: connect to the network (or set"
                 f" PIP_INDEX_URL to a mirror) and run it again; details in {LOG}"
             )
-        reasons = [line.strip() for line in lines if re.search(r"(?i)\berror\b", line)] or lines[
-            -1:
-        ]
+        reasons = [line for line in lines if re.search(r"(?i)\berror\b", line)] or lines[-1:]
         reason = reasons[0].strip() if reasons else f"exit code {process.returncode}"
         raise SetupError(f"{Path(command[0]).name} failed: {reason}; details in {LOG}")
 
@@ -309,10 +293,7 @@ def prepare(lock: IO[str]) -> bool:
             f"the packages of {requirements(ros).relative_to(ROOT)} (about a minute)",
             lambda: install_packages(ros, lock),
         ),
-        "interfaces": (
-            "the messages of smp_interfaces",
-            lambda: build_interfaces(ros, lock),
-        ),
+        "interfaces": ("the messages of smp_interfaces", lambda: build_interfaces(ros, lock)),
         "package": (
             "smp_motor_control, compiled for this machine (half a minute)",
             lambda: build("smp_motor_control", ros, lock),

@@ -6,7 +6,6 @@ Each node is made as its executable makes it, and asked.
 from __future__ import annotations
 
 import inspect
-import math
 import sys
 from array import array
 from collections.abc import Callable
@@ -109,13 +108,11 @@ def topics(node: Node) -> list[str]:
 def limits(descriptor: ParameterDescriptor) -> str:
     """Return the range of a parameter."""
     for one in (*descriptor.floating_point_range, *descriptor.integer_range):
-        low, high = (
-            f"{end:g}" if math.isfinite(end) and abs(end) < 1e300 else ""
-            for end in (float(one.from_value), float(one.to_value))
-        )
-        return (
-            f"{low} to {high}" if low and high else f"at least {low}" if low else f"at most {high}"
-        )
+        ends = (float(one.from_value), float(one.to_value))
+        low, high = (f"{end:g}" if abs(end) < 1e300 else "" for end in ends)
+        if low and high:
+            return f"{low} to {high}"
+        return f"at least {low}" if low else f"at most {high}"
     return ""
 
 

@@ -122,7 +122,7 @@ class Excite(Node):
         elapsed = now - self._begin
         if elapsed >= settings.duration:
             self._timer.cancel()
-            runtime.finish(0)
+            runtime.finish()
             return
         stamp = self.get_clock().now().to_msg()
         for writer, signal in self._outputs:

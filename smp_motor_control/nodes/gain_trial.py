@@ -33,10 +33,8 @@ class Watch:
     def __init__(self, supply: float) -> None:
         self.supply = supply  # [V]
         self.seen: deque[tuple[float, PidState]] = deque()
-        self.usual_error = 0.0
-        self.usual_swing = 0.0
-        self.usual_dt = math.inf
-        self.since = math.inf
+        self.usual_error = self.usual_swing = 0.0
+        self.usual_dt = self.since = math.inf
         self.looks = 0
 
     def take(self, message: PidState) -> None:
@@ -67,7 +65,9 @@ class Watch:
         if any(not math.isfinite(s.output + s.measurement) for s in states):
             return "its output or measurement is not a number"
         # A few states that queued while this process slept tell of an instant, not of a loop.
-        if now - self.since < WINDOW or len(states) < 4 or _span(states) < 0.5 * WINDOW:
+        if now - self.since < WINDOW or len(states) < 4:
+            return None
+        if seconds(states[-1].header.stamp) - seconds(states[0].header.stamp) < 0.5 * WINDOW:
             return None
         return self._unstable(states)
 
@@ -87,11 +87,6 @@ class Watch:
         if error > max(0.3 * asked + moved, 3 * self.usual_error, 0.1):
             return f"its speed is {error:.2g} rad/s off at {asked:.2g} rad/s"
         return None
-
-
-def _span(states: list[PidState]) -> float:
-    """Return the time between the first and the last state [s]."""
-    return seconds(states[-1].header.stamp) - seconds(states[0].header.stamp)
 
 
 def _rms(values: list[float]) -> float:

@@ -100,13 +100,11 @@ class Wheel:
 
     def publish(self, now: float, stamp: Any) -> None:
         """Sample at an instant of the steady clock and publish it with its ROS time."""
-        state, sample = self._driver.state, self.motor.sample(now)
-        state.voltage = sample.voltage
-        state.current = sample.current
-        state.velocity = sample.velocity
-        state.position = sample.position
-        state.encoder_count = sample.encoder_count
-        state.duty_cycle = sample.duty
+        state = self._driver.state
+        (
+            state.voltage, state.current, state.velocity, state.position,
+            state.encoder_count, state.duty_cycle,
+        ) = self.motor.sample(now)  # fmt: skip
         self._driver.report(stamp)
         self._driver.tell_owner(now)
 
@@ -188,14 +186,15 @@ class MotorPlant(Node):
     def _assess(self) -> tuple[bytes, str, Mapping[str, object]]:
         values: dict[str, object] = {"samples": self._samples, "late samples": self._late}
         for wheel in self._wheels:
-            values[f"{wheel.name} duty cycle"] = wheel.motor.duty
-            values[f"{wheel.name} commands"] = (
-                "none or timed out" if wheel.motor.timed_out else "fresh"
-            )
-            values[f"{wheel.name} refused messages"] = wheel.rejected
-            values[f"{wheel.name} owner"] = wheel.lease.owner(time.monotonic()) or "none"
-            values[f"{wheel.name} refused writers"] = wheel.lease.refused or "none"
-            values[f"{wheel.name} late commands"] = wheel.lease.late
+            of_wheel = {
+                "duty cycle": wheel.motor.duty,
+                "commands": "none or timed out" if wheel.motor.timed_out else "fresh",
+                "refused messages": wheel.rejected,
+                "owner": wheel.lease.owner(time.monotonic()) or "none",
+                "refused writers": wheel.lease.refused or "none",
+                "late commands": wheel.lease.late,
+            }
+            values |= {f"{wheel.name} {key}": value for key, value in of_wheel.items()}
         rejected = [wheel.name for wheel in self._wheels if wheel.rejected]
         late = [wheel.name for wheel in self._wheels if wheel.lease.late > wheel.late]
         rivals = {w.name: sorted(w.lease.refused) for w in self._wheels if w.lease.refused}

@@ -113,10 +113,8 @@ class RobotClient:
         quality: QoSProfile = STREAM_SUBSCRIBER,
     ) -> Any:
         """Hand messages to callables, by topic, inside the block."""
-        made = [
-            self.node.create_subscription(kind, topic, take, quality)
-            for topic, take in topics.items()
-        ]
+        listen = self.node.create_subscription
+        made = [listen(kind, topic, take, quality) for topic, take in topics.items()]
         try:
             yield
         finally:

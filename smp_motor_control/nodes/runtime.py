@@ -135,14 +135,9 @@ def run(name: str, make: Callable[[], Node], argv: list[str] | None = None) -> i
 
 
 _USAGE_ERRORS = (
-    "RCLError",
-    "RCLInvalidROSArgsError",
-    "UnknownROSArgsError",
-    "InvalidParameterTypeException",
-    "InvalidParameterValueException",
-    "InvalidNodeNameException",
-    "InvalidNamespaceException",
-    "ParameterAlreadyDeclaredException",
+    *("RCLError", "RCLInvalidROSArgsError", "UnknownROSArgsError"),
+    *("InvalidParameterTypeException", "InvalidParameterValueException"),
+    *("InvalidNodeNameException", "InvalidNamespaceException", "ParameterAlreadyDeclaredException"),
 )
 
 
@@ -185,9 +180,7 @@ def _fail(name: str, message: str, exit_code: int) -> int:
 def _close(node: Node | None) -> None:
     try:
         if node is not None:
-            on_stop = getattr(node, "on_stop", None)
-            if on_stop is not None:
-                on_stop()
+            getattr(node, "on_stop", lambda: None)()
             node.destroy_node()
     finally:
         rclpy.try_shutdown()
@@ -268,17 +261,12 @@ class Diagnostics:
         if clock.ros_time_is_active and clock.now().nanoseconds == 0:
             level = max(level, WARN)
             message = f"use_sim_time is set, but nothing is heard on /clock; {message}"
-        array = DiagnosticArray()
+        status = DiagnosticStatus(
+            level=level, name=self._name, message=message, hardware_id=self._hardware_id
+        )
+        status.values = [KeyValue(key=key, value=_text(value)) for key, value in values.items()]
+        array = DiagnosticArray(status=[status])
         array.header.stamp = clock.now().to_msg()
-        array.status = [
-            DiagnosticStatus(
-                level=level,
-                name=self._name,
-                message=message,
-                hardware_id=self._hardware_id,
-                values=[KeyValue(key=key, value=_text(value)) for key, value in values.items()],
-            )
-        ]
         self._publisher.publish(array)
 
 

@@ -14,12 +14,7 @@ import difflib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Generic, TypeVar
 
-from rcl_interfaces.msg import (
-    FloatingPointRange,
-    IntegerRange,
-    ParameterDescriptor,
-    SetParametersResult,
-)
+from rcl_interfaces import msg
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
@@ -73,14 +68,9 @@ class Parameters(Generic[S]):
         self.settings = self._build(values)
         check(self.settings)
         for name, entry in self._entries.items():
-            value = values[name]
+            value = list(values[name]) if isinstance(values[name], tuple) else values[name]
             # Given values were validated above; the override would be checked again, worse.
-            node.declare_parameter(
-                name,
-                list(value) if isinstance(value, tuple) else value,
-                _descriptor(entry),
-                ignore_override=True,
-            )
+            node.declare_parameter(name, value, _descriptor(entry), ignore_override=True)
         node.add_on_set_parameters_callback(self._validate)
         node.add_post_set_parameters_callback(self._replace)
 
@@ -107,12 +97,12 @@ class Parameters(Generic[S]):
         new = {p.name: coerce(p.name, p.value, self._entries[p.name].default) for p in mine}
         return {**self._values, **new}
 
-    def _validate(self, parameters: list[Parameter]) -> SetParametersResult:
+    def _validate(self, parameters: list[Parameter]) -> msg.SetParametersResult:
         try:
             self._check(self._build(self._with(parameters)))
         except ParameterError as error:
-            return SetParametersResult(successful=False, reason=str(error))
-        return SetParametersResult(successful=True)
+            return msg.SetParametersResult(successful=False, reason=str(error))
+        return msg.SetParametersResult(successful=True)
 
     def _replace(self, parameters: list[Parameter]) -> None:
         values = self._with(parameters)
@@ -129,8 +119,8 @@ def given_parameters(node: Node) -> dict[str, Any]:
     return {name: parameter.value for name, parameter in node._parameter_overrides.items()}
 
 
-def _descriptor(entry: Described) -> ParameterDescriptor:
-    descriptor = ParameterDescriptor(
+def _descriptor(entry: Described) -> msg.ParameterDescriptor:
+    descriptor = msg.ParameterDescriptor(
         description=entry.text,
         read_only=entry.read_only,
         # Types are checked by `coerce`, which takes 1 for 1.0 and says what it wants.
@@ -138,8 +128,8 @@ def _descriptor(entry: Described) -> ParameterDescriptor:
     )
     if entry.limited and isinstance(entry.default, float):
         low, high = max(float(entry.minimum), -1.7e308), min(float(entry.maximum), 1.7e308)
-        descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
+        descriptor.floating_point_range = [msg.FloatingPointRange(from_value=low, to_value=high)]
     elif entry.limited:
         low, high = max(entry.minimum, -(2**31)), min(entry.maximum, 2**31 - 1)
-        descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
+        descriptor.integer_range = [msg.IntegerRange(from_value=int(low), to_value=int(high))]
     return descriptor

@@ -39,14 +39,11 @@ class SkidSteerNode(Node):
         robot = settings.robot
         self._command = BodyCommand()
         self._left, self._right = settings.left_wheel_names, settings.right_wheel_names
-        window = settings.velocity_rolling_window_size / settings.publish_rate
+        size = settings.velocity_rolling_window_size
+        window = size / settings.publish_rate
         self._feedback = WheelFeedback(self._left, self._right, window=window)
-        self._odometry = Odometry(
-            robot.effective_separation,
-            robot.left_radius,
-            robot.right_radius,
-            settings.velocity_rolling_window_size,
-        )
+        body = robot.effective_separation, robot.left_radius, robot.right_radius
+        self._odometry = Odometry(*body, size)
         self._configure(settings)
         self._given = [(0.0, 0.0), (0.0, 0.0)]  # (linear, angular) of the last two steps
         self._share = 1.0
@@ -104,13 +101,8 @@ class SkidSteerNode(Node):
         self._command.configure(settings.cmd_vel_timeout)
         self._feedback.max_speed = IMPLAUSIBLE * min(robot.max_wheel_speed, FASTEST)
         self._hold = settings.hold
-        self._odometry.configure(
-            robot.effective_separation,
-            robot.left_radius,
-            robot.right_radius,
-            settings.travel_noise,
-            settings.turn_noise,
-        )
+        body = robot.effective_separation, robot.left_radius, robot.right_radius
+        self._odometry.configure(*body, settings.travel_noise, settings.turn_noise)
 
     def _now(self) -> float:
         return self.get_clock().now().nanoseconds * 1e-9

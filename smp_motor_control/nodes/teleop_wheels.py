@@ -221,9 +221,8 @@ class TeleopWheels(Node):
             )
         else:
             takers = self._setpoints.get_subscription_count()
-            chosen = (
-                "all" if len(keyboard.selected) == len(self._wheels) else min(keyboard.selected)
-            )
+            every = len(keyboard.selected) == len(self._wheels)
+            chosen = "all" if every else min(keyboard.selected)
             line = f"wheel mode  {keyboard.scale * speeds.wheel:.2f} rad/s  {chosen}  | {state}"
             if takers and self.count_publishers(self._setpoints.topic_name) > 1:
                 line += "  (skid_steer commands the wheels too: use body mode)"

@@ -19,8 +19,6 @@ _LEVELS = {
     State.TIMED_OUT: runtime.WARN,
     State.NOT_OURS: runtime.WARN,
 }
-
-
 UNTUNED = (
     "no gains were given: p is 1 V s/rad, i and d are 0, made for no motor; start it with "
     "--params-file gains.yaml, which tune writes"

@@ -271,10 +271,8 @@ def _converted(motor: Motor, name: str, signal: Signal, raw: NDArray[Any]) -> ND
         return raw.astype(np.float64) * signal.scale + signal.offset
     unit = signal.unit or check_unit(name, "")
     values: Array = raw.astype(np.float64)
-    if signal.scale != 1:
-        values *= signal.scale
-    if signal.offset:
-        values += signal.offset
+    values *= signal.scale
+    values += signal.offset
     supply = motor.hardware.supply_voltage
     if "supply" in motor.plan.signals and name == "voltage":
         supply = 1.0  # the supply as it was measured comes in below
@@ -290,8 +288,7 @@ def _converted(motor: Motor, name: str, signal: Signal, raw: NDArray[Any]) -> ND
     except BagError as error:
         seen = f" (its largest value here is {np.nanmax(np.abs(raw)):g})" if raw.size else ""
         raise BagError(f"{motor.where}: {error}{seen if unit == 'pwm' else ''}") from None
-    if by != 1:
-        values *= by
+    values *= by
     shaft = signal.shaft or motor.plan.shaft
     if unit.startswith("ticks"):
         shaft = signal.shaft or "motor"
@@ -324,6 +321,5 @@ def _drop_lost(motor: Motor, series: dict[str, Series], axis_name: str) -> None:
         return
     text = f"{int((~sound).sum())} samples without a finite voltage were left out"
     motor.tell("no_voltage", text, "warning")
-    for name, signal in series.items():
-        if np.array_equal(signal.time, axis.time):
-            series[name] = signal.take(sound)
+    alike = [name for name, signal in series.items() if np.array_equal(signal.time, axis.time)]
+    series.update({name: series[name].take(sound) for name in alike})

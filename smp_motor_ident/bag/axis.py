@@ -74,7 +74,10 @@ def on_one_axis(motor: Motor, series: dict[str, Series], axis_name: str) -> Reco
     if keep.sum() < 2:
         raise BagError(f"{motor.where}: fewer than 2 samples have a voltage and an output")
     axis = axis[keep]
-    values = _mean_voltage(voltage, axis, held, alike)
+    # Of each interval that ends at an instant of the axis
+    values = voltage.value.copy() if alike else mean_held(voltage.time, voltage.value, held, axis)
+    if alike and held == "after":
+        values[1:] = voltage.value[:-1]
     starts = _count_starts(motor, series, keep, axis_name)
     starts |= _gaps(motor, axis, alike, held, voltage, values)
     columns: dict[str, Any] = {
@@ -110,16 +113,6 @@ def _held(motor: Motor, voltage: Series, series: Mapping[str, Series], name: str
     text = f"the {name} answers in the rows in which the voltage changes: it held up to its row"
     motor.tell("held_before", f"{text} (held=before; map held=after if it did not)")
     return "before"
-
-
-def _mean_voltage(voltage: Series, axis: Integers, held: str, alike: bool) -> Array:
-    """Return the voltage's mean over each interval that ends at an instant of the axis."""
-    if not alike:
-        return mean_held(voltage.time, voltage.value, held, axis)
-    values = voltage.value.copy()
-    if held == "after":
-        values[1:] = voltage.value[:-1]
-    return values
 
 
 def _finite(series: Series) -> Series:
@@ -208,17 +201,18 @@ def _gaps(
     if alike and not given:
         cut |= missing > BRIDGED
     bridged = (missing > 0) & ~cut
-    if alike and bridged.any():
-        _bridge(values, voltage.value, missing, bridged, held)
+    if alike and bridged.any():  # with the mean of a linearly changing voltage
+        k = np.flatnonzero(bridged)
+        lost = missing[k]
+        weight = (lost + 2 if held == "before" else lost) / (2 * (lost + 1))
+        values[k + 1] = voltage.value[k] + np.diff(voltage.value)[k] * weight
     if bridged.any():
         text = f"{int(missing[bridged].sum())} samples missing in {int(bridged.sum())} places"
         text += "; their voltage was interpolated" if alike else "; the voltage there is known"
         motor.tell("samples_missing", text, samples=int(missing[bridged].sum()))
     if cut.any():
-        lost = int(missing[cut].sum())
-        longest = steps[cut].max() * 1e-9
-        text = f"{int(cut.sum())} gaps of up to {longest:.3g} s"
-        text += f" ({lost} samples missing)" if beat.regular else ""
+        text = f"{int(cut.sum())} gaps of up to {steps[cut].max() * 1e-9:.3g} s"
+        text += f" ({int(missing[cut].sum())} samples missing)" if beat.regular else ""
         motor.tell("gaps", f"{text}; a new segment behind each", gaps=int(cut.sum()))
     if not beat.regular:
         text = (
@@ -227,14 +221,6 @@ def _gaps(
         )
         motor.tell("irregular_sampling", text)
     return np.concatenate([[True], cut])
-
-
-def _bridge(values: Array, voltage: Array, missing: Integers, which: Flags, held: str) -> None:
-    """Give intervals in which samples were lost the mean of a linearly changing voltage."""
-    k = np.flatnonzero(which)
-    lost = missing[k]
-    weight = (lost + 2 if held == "before" else lost) / (2 * (lost + 1))
-    values[k + 1] = voltage[k] + (voltage[k + 1] - voltage[k]) * weight
 
 
 def _on_axis(

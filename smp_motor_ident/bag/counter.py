@@ -37,7 +37,10 @@ def unwrap(count: Integers, bits: int | None, expected: Array | None = None) -> 
     guess = np.zeros(steps.size) if expected is None else np.nan_to_num(expected)
     if bits is None and (width := _width_shown(count, steps, guess)):
         if width & (width - 1):
-            return _of_no_bits(count, width)
+            text = f"the encoder starts again at {width} counts by what it shows; that is undone"
+            whole = np.rint(undone(count.astype(np.float64), width)).astype(np.int64)
+            findings.append(found("counter_wraps", text, counts=width))
+            return Unwrapped(whole, np.zeros(0, np.int64), findings)
         bits = width.bit_length() - 1
         text = f"the encoder wraps at 2^{bits} counts by what it shows; wrap undone"
         findings.append(found("counter_wraps", text, bits=bits))
@@ -69,13 +72,6 @@ def _width_shown(count: Integers, steps: Integers, guess: Array) -> int:
             "no more is known of where; record faster, or a counter that goes on"
         )
     return counts_of(wrap, int(np.ptp(count)))
-
-
-def _of_no_bits(count: Integers, width: int) -> Unwrapped:
-    """Return a counter that starts again at a number that is no power of two."""
-    text = f"the encoder starts again at {width} counts by what it shows; that is undone"
-    whole = np.rint(undone(count.astype(np.float64), width)).astype(np.int64)
-    return Unwrapped(whole, np.zeros(0, np.int64), [found("counter_wraps", text, counts=width)])
 
 
 def is_full(count: Integers) -> int:

@@ -146,18 +146,10 @@ def from_document(document: Any, where: str = "mapping") -> SignalMap:
     if signals := [name for name in rest if name in SIGNALS and name != "time"]:
         if motors:
             raise BagError(f"{where}: {signals[0]} needs its wheel: WHEEL.{signals[0]}=...")
-        motors = {
-            DEFAULT_MOTOR: {name: rest.pop(name) for name in (*signals, "time") if name in rest}
-        }
+        motors = {DEFAULT_MOTOR: {n: rest.pop(n) for n in (*signals, "time") if n in rest}}
     defaults = _motor(rest, where)
-    return SignalMap(
-        {
-            str(wheel): _motor(entry, f"{where}: {wheel}", defaults)
-            for wheel, entry in motors.items()
-        },
-        defaults,
-        tuple(types),
-    )
+    each = {str(w): _motor(entry, f"{where}: {w}", defaults) for w, entry in motors.items()}
+    return SignalMap(each, defaults, tuple(types))
 
 
 def of(mapping: Any) -> SignalMap:
@@ -242,14 +234,10 @@ def _signal(name: str, value: Any, place: str) -> Signal:
         source = value.get("field", value.get("column"))
         if not isinstance(source, str):
             raise BagError(f"{place}: needs topic and field, or a column")
-        signal = Signal(
-            str(value.get("topic", "")),
-            source,
-            _number(value.get("scale", 1.0), f"{place}: scale"),
-            _number(value.get("offset", 0.0), f"{place}: offset"),
-            str(value.get("unit", "")),
-            str(value.get("shaft", "")),
-        )
+        topic, unit, shaft = (str(value.get(key, "")) for key in ("topic", "unit", "shaft"))
+        scale = _number(value.get("scale", 1.0), f"{place}: scale")
+        offset = _number(value.get("offset", 0.0), f"{place}: offset")
+        signal = Signal(topic, source, scale, offset, unit, shaft)
     else:
         signal = _written(str(value), place)
     if signal.scale == 0 or not math.isfinite(signal.scale):

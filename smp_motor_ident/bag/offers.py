@@ -89,23 +89,19 @@ def _by_length(channel: Channel) -> list[tuple[int, list[str]]]:
 
 def _fields(types: Types, batch: Any) -> tuple[list[str], str]:
     """Return the numeric fields of a batch's first message, or why they are unknown."""
-    if batch.channel.encoding not in ("cdr", "ros1"):
-        return [], f"encoded as {batch.channel.encoding}"
-    reason = ""
+    channel, reason = batch.channel, ""
+    if channel.encoding not in ("cdr", "ros1"):
+        return [], f"encoded as {channel.encoding}"
     try:
-        for definitions in types.candidates(batch.channel):
+        for definitions in types.candidates(channel):
             try:
-                template = take_apart(
-                    batch.message(0), batch.channel.type, definitions, batch.channel.encoding
-                )
+                root = take_apart(
+                    batch.message(0), channel.type, definitions, channel.encoding
+                ).root
             except DecodeError as error:
                 reason = str(error)
                 continue
-            fields = (
-                _paths(name, value, template.root)
-                for name, value in template.root.items()
-                if name != "header"
-            )
+            fields = (_paths(name, value, root) for name, value in root.items() if name != "header")
             return list(chain.from_iterable(fields)), ""
     except BagError:
         return [], "unknown type: give its .msg files"

@@ -208,17 +208,14 @@ def _by_data(every: list[_Candidate]) -> list[_Candidate]:
     motions = [c for c in fields if c.role in MOTIONS] or unnamed
     best, pair = 0.0, []
     for u, y in product(voltages, motions) if unnamed else ():
-        share, summed = (0.0, False) if u is y else follows(u.value[:_MOST], y.value[:_MOST])
-        if share > best and _explains(u.value[:_MOST], y.value[:_MOST], summed=summed):
+        drive, moved = u.value[:_MOST], y.value[:_MOST]
+        share, summed = (0.0, False) if u is y else follows(drive, moved)
+        steps = np.diff(moved, prepend=moved[:1]) if summed else moved
+        if share > best and unexplained(drive, steps) is not None:
             way = "count" if np.array_equal(y.value, np.rint(y.value)) else "position"
             way = y.role or (way if summed else "velocity")
             best, pair = share, [replace(u, role="voltage"), replace(y, role=way)]
     return pair
-
-
-def _explains(u: Array, y: Array, *, summed: bool) -> bool:
-    """Return whether a signal explains another, or its increments, more than chance lets it."""
-    return unexplained(u, np.diff(y, prepend=y[:1]) if summed else y) is not None
 
 
 def _asked(chosen: list[_Candidate], time: _Candidate | None, table: bool) -> dict[str, str]:
@@ -371,8 +368,7 @@ def _explained(voltages: list[_Candidate], motions: list[_Candidate]) -> list[_C
     best: list[_Candidate] = []
     least = np.inf
     for voltage in voltages:
-        moved = [(c, _rest(voltage, c)) for c in motions]
-        explained = [(c, rest) for c, rest in moved if rest is not None]
+        explained = [(c, rest) for c in motions if (rest := _rest(voltage, c)) is not None]
         if explained and explained[0][1] < least:
             least = explained[0][1]
             first = {c.role: c for c, _ in reversed(explained)}

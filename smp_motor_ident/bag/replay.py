@@ -42,6 +42,11 @@ class Replay:
 
         Where chunks overlap by more than one, a late message comes late.
         """
+
+        def message(entry: Entry) -> tuple[Channel, int, bytes]:
+            time, _, batch, k = entry
+            return batch.channel, time, batch.message(k)
+
         waiting: list[Entry] = []
         number = count()
         self._recording.findings.clear()
@@ -56,16 +61,11 @@ class Replay:
                 continue
             begin = min(entry[0] for entry in fresh)
             while waiting and waiting[0][0] <= begin:
-                yield _message(heapq.heappop(waiting))
+                yield message(heapq.heappop(waiting))
             waiting += fresh
             heapq.heapify(waiting)
         while waiting:
-            yield _message(heapq.heappop(waiting))
-
-
-def _message(entry: Entry) -> tuple[Channel, int, bytes]:
-    time, _, batch, k = entry
-    return batch.channel, time, batch.message(k)
+            yield message(heapq.heappop(waiting))
 
 
 def offered(channel: Channel) -> tuple[bool, bool]:

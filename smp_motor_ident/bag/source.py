@@ -50,15 +50,11 @@ class Recording:
     @cached_property
     def budget(self) -> Budget:
         """Bytes that may be unpacked of it."""
-        return Budget(self.name, self.size())
+        return Budget(self.name, sum(file.stat().st_size for file in self.files))
 
     @cached_property
     def _folder(self) -> tempfile.TemporaryDirectory[str]:
         return tempfile.TemporaryDirectory(prefix="smp_bag_")
-
-    def size(self) -> int:
-        """Return the bytes of all files."""
-        return sum(file.stat().st_size for file in self.files)
 
     def channels(self) -> list[Channel]:
         """Return the channels of all files, one per topic, type and file."""

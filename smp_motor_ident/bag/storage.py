@@ -37,14 +37,12 @@ class Channel:
     definition: str = ""
     definition_format: str = ""
     qos: str = ""
+    # Whether the messages' sequence is the publisher's own count, so that a gap is a loss
     numbered: bool = False
-    """Whether the messages' sequence is the publisher's own count, so that a gap is a loss."""
-    fields: tuple[str, ...] = ()
-    """Names of the columns of a table."""
+    fields: tuple[str, ...] = ()  # names of the columns of a table
+    # What the file says of its columns' units
     units: Mapping[str, str] = field(default_factory=dict, hash=False)
-    """What the file says of its columns' units."""
-    lengths: tuple[int, ...] = ()
-    """How many values each column of a table has, where they differ."""
+    lengths: tuple[int, ...] = ()  # how many values each column has, where they differ
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,14 +71,9 @@ class Batch:
 
     def take(self, which: NDArray[Any]) -> "Batch":
         """Return the chosen messages (indices or a mask), sharing the data."""
-        return Batch(
-            self.channel,
-            self.data,
-            self.offset[which],
-            self.length[which],
-            self.log_time[which],
-            None if self.sequence is None else self.sequence[which],
-        )
+        sequence = None if self.sequence is None else self.sequence[which]
+        places = self.offset[which], self.length[which], self.log_time[which]
+        return Batch(self.channel, self.data, *places, sequence)
 
 
 @dataclass(eq=False)

@@ -57,9 +57,8 @@ def _resolved(name: str, signal: Signal, tables: list[Channel]) -> Signal:
     for topic, field in every + (bare if len(bare) == 1 and not signal.topic else []):
         for channel in tables:
             if channel.topic == topic and field in channel.fields:
-                return replace(
-                    signal, topic=topic, field=field, unit=_unit(name, signal, channel, field)
-                )
+                unit = _unit(name, signal, channel, field)
+                return replace(signal, topic=topic, field=field, unit=unit)
     if len(tables) == 1:  # the table says which columns it has
         return replace(signal, topic=tables[0].topic, field=whole)
     return signal
@@ -80,11 +79,8 @@ def self_described(recording: Recording, asked: SignalMap) -> dict[str, MotorMap
     plans: dict[str, MotorMap] = {}
     channels = recording.channels()
     for channel, (wheel, before) in product(channels, _WHEELS):
-        named = {
-            name: before + name
-            for name in ("voltage", *MOTIONS)
-            if before + name in channel.fields and wheel not in plans
-        }
+        there = [n for n in ("voltage", *MOTIONS) if before + n in channel.fields]
+        named = {name: before + name for name in there if wheel not in plans}
         moves = any(column in channel.units for name, column in named.items() if name in MOTIONS)
         if "time" in channel.fields and "voltage" in named and moves:
             signals = {name: Signal(channel.topic, column) for name, column in named.items()}

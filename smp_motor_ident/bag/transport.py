@@ -45,10 +45,8 @@ class TransportDelay:
         """Return usual and longest delay until the voltage is applied."""
         if not self.latched:
             return self.usual, self.longest
-        usual, longest = (
-            max(math.ceil(arrival / sample_time), 1) * sample_time
-            for arrival in (self.usual, self.longest)
-        )
+        samples = (max(math.ceil(t / sample_time), 1) for t in (self.usual, self.longest))
+        usual, longest = (sample_time * n for n in samples)
         return usual, longest
 
 
@@ -56,7 +54,7 @@ def measure_delay(path: Path) -> dict[str, TransportDelay]:
     """Measure the delay of every wheel's loop from a bag, of those with enough answers."""
     found: dict[str, TransportDelay] = {}
     for recording in recordings([path]):
-        found.update(_of_recording(recording))
+        found |= _of_recording(recording)
     if not found:
         raise BagError(
             f"{path}: no wheel with {LEAST_ANSWERS} motor_command that answer a motor_state; "
@@ -76,9 +74,7 @@ def _of_recording(recording: Recording) -> dict[str, TransportDelay]:
             pairs[place.rpartition("/")[2]] = topic, f"{place}/motor_command"
     wanted = {topic: ["voltage"] for pair in pairs.values() for topic in pair}
     tables = collect(recording, wanted, Types())
-    delays = {
-        wheel: _delay(tables[state], tables[command]) for wheel, (state, command) in pairs.items()
-    }
+    delays = {w: _delay(tables[state], tables[command]) for w, (state, command) in pairs.items()}
     return {wheel: delay for wheel, delay in delays.items() if delay is not None}
 
 

@@ -7,14 +7,9 @@ from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
+from rosbags import typesys
 from rosbags.interfaces import Nodetype
-from rosbags.typesys import (
-    Stores,
-    TypesysError,
-    get_types_from_idl,
-    get_types_from_msg,
-    get_typestore,
-)
+from rosbags.typesys import Stores, TypesysError, get_typestore
 
 from smp_motor_ident.bag.storage import Channel, first_line, message_type
 from smp_motor_ident.errors import BagError
@@ -37,9 +32,9 @@ def _parse(text: str, name: str, form: str) -> dict[str, Fields]:
         types: dict[str, Any] = {}
         parts = text.split(_LINE)[1:] if text.startswith(_LINE) else [f"IDL:\n{text}"]
         for part in parts:
-            types.update(get_types_from_idl(part.partition("\n")[2]))
+            types.update(typesys.get_types_from_idl(part.partition("\n")[2]))
     else:
-        types = dict(get_types_from_msg(text, name))
+        types = dict(typesys.get_types_from_msg(text, name))
     return {key: fields for key, (_, fields) in types.items()}
 
 
@@ -52,14 +47,11 @@ def _references(fields: Fields) -> Iterator[str]:
             yield detail
 
 
+@cache
 def _stored(which: Stores, name: str) -> Fields | None:
     """Return a type of a distribution, whose types are loaded when one is asked for."""
-    return _store(which).get(name)
-
-
-@cache
-def _store(which: Stores) -> dict[str, Fields]:
-    return {name: fields for name, (_, fields) in get_typestore(which).fielddefs.items()}
+    found = get_typestore(which).fielddefs.get(name)
+    return None if found is None else found[1]
 
 
 def _ament_file(name: str, suffix: str) -> Path | None:

@@ -8,16 +8,9 @@ from typing import Any
 from smp_motor_control.motor.file import MotorEntry
 from smp_motor_control.wheel.protection import Bounds
 from smp_motor_ident.bag.read import described
+from smp_motor_ident.diagnosis import wheel_test as judged
 from smp_motor_ident.diagnosis.wheel_checks import Robot, judge
-from smp_motor_ident.diagnosis.wheel_test import (
-    Figures,
-    Phase,
-    Trace,
-    answers_well,
-    figures,
-    moved_with,
-    settled,
-)
+from smp_motor_ident.diagnosis.wheel_test import Figures, Phase, Trace, answers_well, settled
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.record import Hardware
 
@@ -87,6 +80,10 @@ class _Way:
         return lambda: settled(Trace.of(tape.rows[since:]))
 
 
+def _constant(voltage: float) -> Callable[[float], float]:
+    return lambda t: voltage
+
+
 def check_wheels(
     client: Any,
     wheels: Sequence[str],
@@ -117,13 +114,15 @@ def check_wheels(
             phases += way.phases
     traces = {wheel: Trace.of(tape.rows) for wheel, tape in test.tapes.items()}
     found = {
-        wheel: figures(traces[wheel], [p for p in phases if p.wheel == wheel], hardware[wheel])
+        wheel: judged.figures(
+            traces[wheel], [p for p in phases if p.wheel == wheel], hardware[wheel]
+        )
         for wheel in wheels
     }
     robot = Robot(
         found,
         hardware,
-        moved_with(traces, phases),
+        judged.moved_with(traces, phases),
         {w: known[w].parameters.dc_gain for w in wheels if w in known},
         {w: known[w].gearbox.ratio for w in wheels if w in known},
         wheel_test.battery(client),
@@ -133,7 +132,3 @@ def check_wheels(
     speeds = [abs(found[w].gain) * amplitude / hardware[w].gear_ratio for w in wheels]
     fastest = max(filter(math.isfinite, speeds), default=math.nan)
     return Checked(tuple(judge(robot)), found, amplitude, fastest)
-
-
-def _constant(voltage: float) -> Callable[[float], float]:
-    return lambda t: voltage

@@ -86,10 +86,7 @@ def _as_begun(arguments: argparse.Namespace, document: dict[str, Any]) -> None:
 
 def _commission(arguments: argparse.Namespace, folder: Path, known: Mapping[str, Any]) -> int:
     ros = tuple(arguments.ros_arguments)
-    bounds: dict[str, object] = {
-        "max_speed": arguments.max_speed or 0.0,
-        "max_current": arguments.max_current,
-    }
+    bounds = {"max_speed": arguments.max_speed or 0.0, "max_current": arguments.max_current}
     # The client leaves last: who excites has ended when the controllers are given back.
     with connect(NAME, ros) as client, Processes(folder / "logs") as processes:
         wheels = tuple(dict.fromkeys(arguments.wheel or ())) or _found(client)
@@ -112,11 +109,8 @@ def _commission(arguments: argparse.Namespace, folder: Path, known: Mapping[str,
 def _begin(arguments: argparse.Namespace, robot: steps.Robot) -> Session:
     """Ask before anything moves; what was done at other voltages or of other wheels is not kept."""
     made = Protocol(robot.folder, arguments.accept)
-    asked = {
-        "wheels": list(robot.wheels),
-        "amplitude": arguments.amplitude,
-        "duration": arguments.duration,
-    }
+    asked = {name: getattr(arguments, name) for name in ("amplitude", "duration")}
+    asked["wheels"] = list(robot.wheels)
     same = made.document.get("asked") == asked
     left = [one for one in _recordings(arguments, made) if not (same and _is_kept(robot, one))]
     checked = same and made.checked
@@ -294,14 +288,11 @@ def validated(estimates: Mapping[str, Estimate], fitted: Path, held_out: Path) -
     found = []
     read = {path: bag.read_experiments([str(path)]) for path in (fitted, held_out)}
     for wheel, one in estimates.items():
-        parts = {
-            path: [
-                validation_run.Simulated(record.time, *simulate(one, record))
-                for record in records[wheel]
-            ]
-            for path, records in read.items()
-        }
-        found.append(validation_run.judge(wheel, parts[fitted], parts[held_out]))
+        parts = [
+            [validation_run.Simulated(r.time, *simulate(one, r)) for r in read[path][wheel]]
+            for path in (fitted, held_out)
+        ]
+        found.append(validation_run.judge(wheel, *parts))
     return found
 
 

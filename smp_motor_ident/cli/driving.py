@@ -68,16 +68,11 @@ def drive_figure(
         curves += [
             Curve(w, np.interp(time, *speeds[w]), f"wheel-{wheels.index(w) % 4 + 1}") for w in names
         ]
-        charts.append(
-            Chart(
-                name=side,
-                title=f"Wheels of the {side} side, and their set-point (grey)",
-                x_label="time [s]",
-                y_label="wheel speed [rad/s]",
-                x=time - begin,
-                curves=tuple(curves),
-            )
-        )
+        title = f"Wheels of the {side} side, and their set-point (grey)"
+        charts.append(Chart(
+            name=side, title=title, x_label="time [s]", y_label="wheel speed [rad/s]",
+            x=time - begin, curves=tuple(curves),
+        ))  # fmt: skip
     return document(charts, wheels)
 
 

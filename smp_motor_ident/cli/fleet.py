@@ -11,7 +11,7 @@ import json
 import multiprocessing
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from importlib import metadata
 from pathlib import Path
@@ -46,11 +46,8 @@ def work(
     left = [path for path, file in files.items() if not file.exists()]
     if not arguments.quiet:
         print(f"{len(files) - len(left)} of {len(files)} recordings are known already")
-    results = {
-        p: msgspec.json.decode(f.read_bytes(), type=list[fleet.Row])
-        for p, f in files.items()
-        if f.exists()
-    }
+    decode = msgspec.json.Decoder(list[fleet.Row]).decode
+    results = {p: decode(f.read_bytes()) for p, f in files.items() if f.exists()}
     settings = (mapping, arguments.model, dict(fixed))
     for path, found in _results(left, settings, arguments.scheduler):
         results[path] = found
@@ -79,9 +76,8 @@ def _key(path: Path, options: str) -> str:
         raise BagError(f"{path}: no such file or folder")
     parts = sorted(path.rglob("*")) if path.is_dir() else [path]
     seen = [(str(p), p.stat().st_size, p.stat().st_mtime_ns) for p in parts if p.is_file()]
-    text = json.dumps(
-        ["rows", str(path.resolve()), seen, options, metadata.version("smp_motor_control")]
-    )
+    version = metadata.version("smp_motor_control")
+    text = json.dumps(["rows", str(path.resolve()), seen, options, version])
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
@@ -102,10 +98,8 @@ def identify_one(path: str, settings: tuple[Any, ...]) -> list[fleet.Row]:
                 for name, q in held.items()
                 if name in fleet.QUANTITIES and q.value is not None
             }
-            fit, unreliable = found.fit_percent.validation, found.unreliable
-            rows.append(
-                _row(path, wheel=wheel, values=values, fit_percent=fit, unreliable=unreliable)
-            )
+            told = dict(fit_percent=found.fit_percent.validation, unreliable=found.unreliable)
+            rows.append(_row(path, wheel=wheel, values=values, **told))
     except SmpError as error:
         return [_row(path, failure=str(error))]
     except Exception as error:  # whatever is wrong with one recording, the others go on
@@ -116,10 +110,8 @@ def identify_one(path: str, settings: tuple[Any, ...]) -> list[fleet.Row]:
 def _row(path: str, **what: Any) -> fleet.Row:
     """Return a row of a recording; the robot is the folder that it lies in."""
     where = Path(path).resolve()
-    about = {"wheel": "", "values": {}, **what}
-    return fleet.Row(
-        robot=where.parent.name, source=where.name, date=where.stat().st_mtime, **about
-    )
+    about = {"wheel": "", "values": {}, "date": where.stat().st_mtime, **what}
+    return fleet.Row(robot=where.parent.name, source=where.name, **about)
 
 
 def _results(paths: Sequence[str], settings: tuple[Any, ...], scheduler: str | None) -> Results:
@@ -133,9 +125,11 @@ def _results(paths: Sequence[str], settings: tuple[Any, ...], scheduler: str | N
         cores = min(len(os.sched_getaffinity(0)), len(tries))
         with ProcessPoolExecutor(cores, mp_context=fork, initializer=end_with_parent) as pool:
             try:
-                for path, result in _gathered(pool, tries, settings):
-                    del tries[path]
-                    yield path, result
+                futures = {pool.submit(identify_one, path, settings): path for path in tries}
+                for future in as_completed(futures):
+                    result = future.result()
+                    del tries[futures[future]]
+                    yield futures[future], result
             except BrokenProcessPool:
                 # Which one it was is not known: those under way are tried again, one at a time.
                 for path in list(tries)[: 1 if cores == 1 else cores]:
@@ -144,16 +138,6 @@ def _results(paths: Sequence[str], settings: tuple[Any, ...], scheduler: str | N
             del tries[path]
             why = f"{path}: its worker was ended, perhaps for its memory"
             yield path, [_row(path, failure=why, lost=True)]
-
-
-def _gathered(
-    pool: Executor, paths: Sequence[str] | dict[str, int], settings: tuple[Any, ...]
-) -> Results:
-    futures: dict[Future[list[fleet.Row]], str] = {
-        pool.submit(identify_one, path, settings): path for path in paths
-    }
-    for future in as_completed(futures):
-        yield futures[future], future.result()
 
 
 def on_cluster(paths: Sequence[str], settings: tuple[Any, ...], address: str) -> Results:

@@ -152,14 +152,9 @@ def progress(program: str, quiet: bool = False) -> Iterator[Callable[..., None]]
         from rich import progress as bars
         from rich.console import Console
 
-        columns = (
-            bars.SpinnerColumn(),
-            bars.TextColumn("{task.description}"),
-            bars.TimeElapsedColumn(),
-            bars.TextColumn("left"),
-            bars.TimeRemainingColumn(),
-        )
-        with bars.Progress(*columns, console=Console(stderr=True), transient=True) as line:
+        columns = (bars.SpinnerColumn(), "{task.description}", bars.TimeElapsedColumn(), "left")
+        left = bars.TimeRemainingColumn()
+        with bars.Progress(*columns, left, console=Console(stderr=True), transient=True) as line:
             task = line.add_task("", total=1.0)
             yield lambda text, share=None: line.update(task, description=text, completed=share)
     else:

@@ -168,22 +168,20 @@ def identify_wheel(
         return Outcome(failure=error)
     except np.linalg.LinAlgError as error:
         # One wheel's numerics must not take the others' results with them.
-        return Outcome(
-            failure=InsufficientExcitationError(
-                f"{records[0].source}: {records[0].wheel}: the estimate broke down ({error}); "
-                "record a longer excitation with several frequencies, in both directions"
-            )
+        text = (
+            f"{records[0].source}: {records[0].wheel}: the estimate broke down ({error}); "
+            "record a longer excitation with several frequencies, in both directions"
         )
+        return Outcome(failure=InsufficientExcitationError(text))
     judged = found.fit_percent.validation is not None
     fitted, held_out = (records, kept) if kept or not judged else split(records)
-    curves: list[tuple[Record, Role]] = [(record, "estimation") for record in fitted]
-    curves += [(record, "validation") for record in held_out]
-    return Outcome(found, tuple(_compare(found, *curve) for curve in curves))
-
-
-def _compare(found: Estimate, record: Record, role: Role) -> Comparison:
-    measured, simulated = simulate(found, record)
-    return Comparison(role, record.source, record.time, record.voltage, measured, simulated)
+    parts: dict[Role, Sequence[Record]] = {"estimation": fitted, "validation": held_out}
+    compared = [
+        Comparison(role, one.source, one.time, one.voltage, *simulate(found, one))
+        for role, part in parts.items()
+        for one in part
+    ]
+    return Outcome(found, tuple(compared))
 
 
 def _tunings(outcomes: Mapping[str, Outcome], say: Callable[..., None]) -> dict[str, Tuning]:
@@ -231,11 +229,8 @@ def _contents(
         {wheel: history.history_charts(wheel, entries) for wheel, entries in since.items()},
     )
     head = [f"Identified {date} by {NAME} from {provenance['Recordings']}.", "SI, motor shaft."]
-    return [
-        to_json(identification_document(estimates)),
-        motors_yaml(estimates, head),
-        render(report),
-    ]
+    document = to_json(identification_document(estimates))
+    return [document, motors_yaml(estimates, head), render(report)]
 
 
 def _conclude(

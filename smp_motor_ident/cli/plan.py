@@ -25,13 +25,9 @@ SIGNALS = (
 """What moves the wheels: signal, shares of amplitude and duration, and whose recording."""
 
 FURTHER = "further"  # name of the recording that an identification asks for
-IDENTIFYING, AGAIN, TUNING, DRIVING = (
-    "identifying",
-    "identifying again",
-    "tuning",
-    "driving on the new gains",
-)
-"""Parts behind the recordings."""
+# Parts behind the recordings
+IDENTIFYING, AGAIN, TUNING = "identifying", "identifying again", "tuning"
+DRIVING = "driving on the new gains"
 
 LONGEST = 120.0  # of such a recording [s]
 CHECK, START, COMPUTE, DRIVE = 8.0, 4.0, 4.0, 12.0

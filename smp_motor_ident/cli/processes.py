@@ -1,7 +1,6 @@
 """Starting the nodes as processes of their own, and leaving none of them behind."""
 
 import contextlib
-import ctypes
 import fcntl
 import os
 import signal
@@ -17,11 +16,8 @@ from typing import IO, Any
 
 from smp_motor_control.entry import wrong_domain
 from smp_motor_control.errors import SmpError
-from smp_motor_ident.cli import interruption
+from smp_motor_ident.cli import interruption, workers
 from smp_motor_ident.errors import ParameterError
-
-_PR_SET_PDEATHSIG = 1
-_LIBC = ctypes.CDLL(None, use_errno=True)
 
 
 class ProcessError(SmpError):
@@ -189,7 +185,7 @@ def _command(node: str) -> list[str]:
 
 def _prepare(parent: int, priority: int) -> None:
     """Between fork and exec: let the kernel end this process when `parent` dies."""
-    _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    workers.die_with_parent(signal.SIGTERM)
     if os.getppid() != parent:
         os._exit(1)
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):

@@ -49,13 +49,8 @@ class Protocol:
         """Note what a drive showed."""
         self._changes = list(changes)
         self.document["changes"] = [
-            {
-                "wheel": one.wheel,
-                "name": one.name,
-                "setpoint": one.setpoint,
-                "reading": plain(one.reading),
-                "allowed": plain(one.bands),
-            }
+            dict(wheel=one.wheel, name=one.name, setpoint=one.setpoint)
+            | dict(reading=plain(one.reading), allowed=plain(one.bands))
             for one in changes
         ]
 
@@ -102,8 +97,6 @@ class Protocol:
     def write(self) -> None:
         """Write both files, or none."""
         self.document["date"] = now()
-        files: dict[Path, str | bytes] = {
-            self._folder / NAME: to_json(self.document),
-            self._folder / REPORT: page.render(self.document, self._changes),
-        }
+        shown = page.render(self.document, self._changes)
+        files = {self._folder / NAME: to_json(self.document), self._folder / REPORT: shown}
         write_together(files, force=True)

@@ -50,14 +50,11 @@ def tune_by_relay(arguments: argparse.Namespace, files: Sequence[Path]) -> int:
     print(line)
     if files:
         parameters = {
-            "p": ruled.p,
-            "i": ruled.i,
-            "d": ruled.d,
+            "p": ruled.p, "i": ruled.i, "d": ruled.d,
             "derivative_filter_time_constant": ruled.filter_time,
-            "u_clamp_min": -float(supply),
-            "u_clamp_max": float(supply),
+            "u_clamp_min": -float(supply), "u_clamp_max": float(supply),
             "antiwindup_strategy": "back_calculation",
-        }
+        }  # fmt: skip
         head = [f"Tuned by relay feedback. {line}"]
         text = written({f"/**/{wheel}/wheel_pid": parameters}, head)
         write_together({files[0]: text}, arguments.force)

@@ -61,12 +61,9 @@ def excite(robot: Robot, plan: Sequence[Excitation]) -> None:
     """Move all wheels by one signal after the other."""
     for part in plan:
         parameters: dict[str, object] = {
-            "signal": part.signal,
-            "wheels": f"[{', '.join(robot.wheels)}]",
-            "amplitude": float(part.amplitude),
-            "duration": float(part.duration),
-            **robot.bounds,
-        }
+            "signal": part.signal, "wheels": f"[{', '.join(robot.wheels)}]",
+            "amplitude": float(part.amplitude), "duration": float(part.duration), **robot.bounds,
+        }  # fmt: skip
         if part.band:
             parameters["lowest"], parameters["highest"] = part.band
         arguments = [a for n, v in parameters.items() for a in ("-p", f"{n}:={v}")]

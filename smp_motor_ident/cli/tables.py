@@ -25,13 +25,8 @@ def console() -> Console:
 
 def table(title: str, *columns: str) -> Table:
     """Return an empty table; its first column is of words."""
-    made = Table(
-        title=title or None,
-        title_justify="left",
-        title_style="bold",
-        box=box.SIMPLE_HEAD,
-        pad_edge=False,
-    )
+    made = Table(title=title or None, title_justify="left", title_style="bold")
+    made.box, made.pad_edge = box.SIMPLE_HEAD, False
     for k, column in enumerate(columns):
         made.add_column(column, justify="left" if k == 0 else "right", no_wrap=True)
     return made

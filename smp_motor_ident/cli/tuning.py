@@ -1,6 +1,7 @@
 """What ``tune`` does: loops as the arguments describe them, designs, and what it tells of them."""
 
 import argparse
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -58,7 +59,7 @@ def loop_for(
     estimate: Estimate, arguments: argparse.Namespace, measured: TransportDelay | None = None
 ) -> Loop:
     """Return the loop of one wheel: what the user says, else what the bag knew."""
-    hardware = estimate.hardware
+    hardware, counts = estimate.hardware, estimate.hardware.counts_per_revolution
     supply = _first(arguments.supply, hardware.supply_voltage)
     if supply is None:
         raise ParameterError(
@@ -66,10 +67,8 @@ def loop_for(
         )
     if arguments.rate is not None and not arguments.rate > 0:
         raise ParameterError(f"--rate is {arguments.rate}; it must be positive")
-    if arguments.rate is not None:
-        sample_time = 1.0 / arguments.rate
-    else:
-        sample_time = estimate.sample_time or 1.0 / DEFAULT_RATE
+    usual_time = estimate.sample_time or 1.0 / DEFAULT_RATE
+    sample_time = usual_time if arguments.rate is None else 1.0 / arguments.rate
     window = arguments.difference_window
     # Of a speed that was recorded what averaging there is was identified.
     usual_window = int(arguments.speed_source == "difference" or not estimate.speed_noise)
@@ -81,9 +80,7 @@ def loop_for(
         delay=_first(arguments.delay, longest),
         usual_delay=_first(arguments.usual_delay, usual),
         gear_ratio=_first(arguments.gear_ratio, hardware.gear_ratio) or 0.0,
-        counts_per_revolution=_first(
-            arguments.counts_per_revolution, hardware.counts_per_revolution
-        ),
+        counts_per_revolution=_first(arguments.counts_per_revolution, counts),
         supply_voltage=supply,
         speed_source="measured" if arguments.speed_source == "auto" else arguments.speed_source,
         difference_window=usual_window if window is None else window,
@@ -230,19 +227,18 @@ def _compare(
     estimates: Mapping[str, Estimate], loops: Mapping[str, Loop], targets: Mapping[str, Any]
 ) -> str:
     """Print the methods side by side for each wheel; return the one that most recommend."""
-    votes: dict[str, int] = {}
+    votes: Counter[str] = Counter()
     reason: dict[str, str] = {}
     for wheel, estimate in estimates.items():
         results = compare(estimate, loops[wheel], **targets)
         name, why = recommend(results)
-        votes[name] = votes.get(name, 0) + 1
+        votes[name] += 1
         reason.setdefault(name, why)
-        print(f"\n{wheel}")
-        print(HEAD)
+        print(f"\n{wheel}\n{HEAD}")
         for method, result in results.items():
             mark = "*" if method == name else " "
             print(f"{mark} {method:16s} {row(result)}")
-    chosen = max(votes, key=lambda n: votes[n])
+    chosen = votes.most_common(1)[0][0]
     print(f"\n* recommended: {chosen}. {reason[chosen]}\n")
     return chosen
 

@@ -57,8 +57,7 @@ def show(
 ) -> None:
     """Print one table per wheel."""
     out = console()
-    for wheel in estimates:
-        estimate = estimates[wheel]
+    for wheel, estimate in estimates.items():
         title = f"{words.label(wheel)}: {words.model(estimate.model)}"
         made = table(title, "", "true", "identified", "std", "error/std", "unit")
         made.columns[5].justify = "left"
@@ -80,9 +79,8 @@ def show(
             figures = one.figures
             times = (f"{1e3 * seconds:.0f} ms" for seconds in (figures.rise, figures.settling))
             overshoot = f"{figures.overshoot:.2f} %"
-            driven.add_row(
-                one.segment, f"{one.before:+.2f}", f"{one.after:+.2f} rad/s", *times, overshoot
-            )
+            speeds = f"{one.before:+.2f}", f"{one.after:+.2f} rad/s"
+            driven.add_row(one.segment, *speeds, *times, overshoot)
         out.print(made)
         out.print(f"gains (volts, wheel rad/s): {text}", soft_wrap=True)
         out.print(driven)

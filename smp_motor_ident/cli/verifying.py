@@ -65,13 +65,8 @@ class Designed:
         change = min(float(one["change"]) for one in specified)
         longest = max(float(one["settling"]["high"] or LEAST) for one in specified)
         lasts = max(LEAST, 2 * longest + STEADY)
-        return [
-            ("stand", 0.0, 2 * LEAD),
-            ("forward", change, lasts),
-            ("stop", 0.0, lasts),
-            ("reverse", -change, lasts),
-            ("stop", 0.0, lasts),
-        ]
+        driven = [("forward", change), ("stop", 0.0), ("reverse", -change), ("stop", 0.0)]
+        return [("stand", 0.0, 2 * LEAD), *((name, speed, lasts) for name, speed in driven)]
 
 
 def drive(robot: steps.Robot, plan: Sequence[tuple[str, float, float]]) -> Path:
@@ -144,11 +139,8 @@ def _changes(
     """Return the changes of one wheel; the prediction is of its whole drive."""
     estimate, document = designed.estimates[wheel], designed.document[wheel]
     setpoints = answers.fields["setpoint"]
-    begun = {
-        name: (_begin(wheel, setpoint, answers), setpoint, lasts)
-        for name, setpoint, lasts in plan
-        if setpoint
-    }
+    moves = [one for one in plan if one[1]]
+    begun = {name: (_begin(wheel, speed, answers), speed, lasts) for name, speed, lasts in moves}
     end = max(begin + lasts for begin, _, lasts in begun.values())
     shown = (state.time > answers.time[0] - LEAD) & (state.time < end)
     instants = state.time[shown]

@@ -14,7 +14,7 @@ from smp_motor_ident.errors import BagError
 Result = TypeVar("Result")
 Say = Callable[..., None]
 
-_PR_SET_PDEATHSIG = 1
+_LIBC, _PR_SET_PDEATHSIG = ctypes.CDLL(None), 1
 _JOBS: dict[str, Callable[[Say], Any]] = {}
 
 
@@ -22,7 +22,7 @@ def in_parallel(jobs: Mapping[str, Callable[[Say], Result]], say: Say) -> dict[s
     """Do every job, each in a process that is forked and so has what is loaded already."""
     cores = min(len(os.sched_getaffinity(0)), len(jobs))
     if cores < 2:
-        return {name: job(_named(say, name)) for name, job in jobs.items()}
+        return {n: job(lambda text, n=n: say(f"{n}: {text}")) for n, job in jobs.items()}
     say(f"estimating {', '.join(jobs)}")
     _JOBS.update(jobs)
     fork = multiprocessing.get_context("fork")
@@ -44,10 +44,6 @@ def in_parallel(jobs: Mapping[str, Callable[[Say], Result]], say: Say) -> dict[s
         pool.shutdown(cancel_futures=True)
 
 
-def _named(say: Say, name: str) -> Say:
-    return lambda text: say(f"{name}: {text}")
-
-
 def _do(name: str) -> Any:
     return _JOBS[name](lambda text: None)
 
@@ -57,4 +53,9 @@ def end_with_parent() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_DFL)
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    die_with_parent(signal.SIGKILL)
+
+
+def die_with_parent(number: int) -> None:
+    """Let the kernel send this process a signal when its parent dies."""
+    _LIBC.prctl(_PR_SET_PDEATHSIG, number)

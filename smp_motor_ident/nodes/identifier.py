@@ -145,7 +145,7 @@ class Wheel:
         message = MotorParameters(joint_name=self.joint_name, status=status)
         message.header.stamp = self.stamp
         message.header.frame_id = self.joint_name
-        message.fit_percent = float("nan")
+        message.fit_percent = math.nan
         if found is not None:
             held = {**found.combinations, **found.parameters}
             known = {name: q for name, q in held.items() if q.value is not None}
@@ -153,9 +153,8 @@ class Wheel:
             message.names = list(known)
             message.values = [float(q.value) for q in known.values() if q.value is not None]
             message.std_devs = [float(q.std or 0.0) for q in known.values()]
-            fit = found.fit_percent
-            best = fit.validation if fit.validation is not None else fit.estimation
-            message.fit_percent = float("nan") if best is None else float(best)
+            fits = (found.fit_percent.validation, found.fit_percent.estimation)
+            message.fit_percent = next((float(f) for f in fits if f is not None), math.nan)
         self.publisher.publish(message)
 
 

@@ -41,9 +41,7 @@ class Player(Node):
             self._offer(channel)
         if not self._outputs:
             raise SmpError("no topic of the bag can be played")
-        self._clock: Publisher | None = None
-        if options.clock:
-            self._clock = self.create_publisher(Clock, "/clock", 10)
+        self._clock = self.create_publisher(Clock, "/clock", 10) if options.clock else None
         self._clock_due = 0.0
         self.sent: Counter[str] = Counter()
         self._ended = threading.Event()
@@ -134,7 +132,10 @@ class Player(Node):
             now = time.monotonic()
             if self._clock is not None and now >= self._clock_due:
                 elapsed = (min(now, due) - begin) * self._options.rate
-                self._send_clock(first + round(elapsed * 1e9))
+                message = Clock()
+                shown = divmod(first + round(elapsed * 1e9), 1_000_000_000)
+                message.clock.sec, message.clock.nanosec = shown
+                self._clock.publish(message)
                 self._clock_due = now + 1.0 / self._options.clock
             if now >= due:
                 return True
@@ -146,18 +147,12 @@ class Player(Node):
                 time.sleep(max(until - now, 0.0))
         return False
 
-    def _send_clock(self, stamp: int) -> None:
-        message = Clock()
-        message.clock.sec, message.clock.nanosec = divmod(stamp, 1_000_000_000)
-        assert self._clock is not None
-        self._clock.publish(message)
-
     def on_stop(self) -> None:
         """Stop the thread and tell what was sent."""
         self._ended.set()
         self._thread.join(timeout=1.0)
-        for note in (f.message for f in self._replay.findings):
-            print(f"play: {note}", file=sys.stderr, flush=True)
+        for finding in self._replay.findings:
+            print(f"play: {finding.message}", file=sys.stderr, flush=True)
         for name, count in sorted(self.sent.items()):
             print(f"{count:9d}  {name}", flush=True)
         print(f"{sum(self.sent.values()):9d}  messages sent", flush=True)
@@ -186,10 +181,8 @@ def _check(arguments: argparse.Namespace) -> None:
     for name, low in (("rate", 1e-6), ("start_offset", 0.0), ("clock", 0.0), ("delay", 0.0)):
         value = getattr(arguments, name)
         if not low <= value < float("inf"):
-            option = "--" + name.replace("_", "-")
-            raise SmpError(
-                f"{option} is {value:g}; it must be {'positive' if low else '0 or more'}"
-            )
+            what = "positive" if low else "0 or more"
+            raise SmpError(f"--{name.replace('_', '-')} is {value:g}; it must be {what}")
 
 
 def _chosen(replay: Replay, arguments: argparse.Namespace) -> list[Channel]:
@@ -197,14 +190,11 @@ def _chosen(replay: Replay, arguments: argparse.Namespace) -> list[Channel]:
     names = {name if name.startswith("/") else f"/{name}" for name in choice.names}
     there = {channel.topic for channel in replay.channels}
     if missing := names - there:
-        raise SmpError(
-            f"{arguments.bag}: has no topic {sorted(missing)[0]}; it has "
-            f"{', '.join(sorted(there)) or 'none'}"
-        )
-
+        known = ", ".join(sorted(there)) or "none"
+        raise SmpError(f"{arguments.bag}: has no topic {sorted(missing)[0]}; it has {known}")
     choice = replace(choice, names=frozenset(names))
-    known = (c for c in replay.channels if not (arguments.clock and c.topic == "/clock"))
-    return [channel for channel in known if choice.wants(channel.topic)]
+    barred = "/clock" if arguments.clock else ""
+    return [c for c in replay.channels if c.topic != barred and choice.wants(c.topic)]
 
 
 def main(argv: list[str] | None = None) -> int:

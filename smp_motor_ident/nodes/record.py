@@ -13,6 +13,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
@@ -23,6 +24,7 @@ from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.executor import Untouched
 from smp_motor_control.ros_arguments import split_arguments
 from smp_motor_ident.bag import BagWriter
+from smp_motor_ident.bag.metadata import DEFAULT_QOS
 from smp_motor_ident.nodes.bag_arguments import Choice, chosen, message_class, quality
 
 TAKE_PERIOD = 0.004
@@ -49,22 +51,14 @@ def subscription_qos(offered: list[QoSProfile]) -> QoSProfile:
 
 def qos_document(qos: QoSProfile) -> dict[str, Any]:
     """Return a profile as the metadata of a bag write it."""
-
-    def split(duration: Any) -> dict[str, int]:
-        seconds, rest = divmod(duration.nanoseconds, 1_000_000_000)
-        return {"sec": seconds, "nsec": rest}
-
-    return {
-        "history": qos.history.name.lower(),
-        "depth": qos.depth,
-        "reliability": qos.reliability.name.lower(),
-        "durability": qos.durability.name.lower(),
-        "deadline": split(qos.deadline),
-        "lifespan": split(qos.lifespan),
-        "liveliness": qos.liveliness.name.lower(),
-        "liveliness_lease_duration": split(qos.liveliness_lease_duration),
-        "avoid_ros_namespace_conventions": qos.avoid_ros_namespace_conventions,
-    }
+    document = {}
+    for name in DEFAULT_QOS:
+        value = getattr(qos, name)
+        if isinstance(value, Duration):
+            seconds, rest = divmod(value.nanoseconds, 1_000_000_000)
+            value = {"sec": seconds, "nsec": rest}
+        document[name] = value.name.lower() if hasattr(value, "name") else value
+    return document
 
 
 class Recorder(Node):

@@ -54,20 +54,14 @@ def fit_charts(wheel: str, parts: Sequence[Comparison]) -> list[Chart]:
             summary=f"{kind.capitalize()} of {name} over {time[-1]:.1f} s.",
         )  # fmt: skip
 
+    speeds = (
+        Curve("measured", measured[keep], "measured"),
+        Curve("simulated", simulated[keep], "simulated"),
+    )
+    residual = Curve("measured − simulated", (measured - simulated)[keep], "ink")
     return [
-        chart(
-            "speed",
-            "motor speed [rad/s]",
-            300,
-            Curve("measured", measured[keep], "measured"),
-            Curve("simulated", simulated[keep], "simulated"),
-        ),
-        chart(
-            "residual",
-            "residual [rad/s]",
-            180,
-            Curve("measured − simulated", (measured - simulated)[keep], "ink"),
-        ),
+        chart("speed", "motor speed [rad/s]", 300, *speeds),
+        chart("residual", "residual [rad/s]", 180, residual),
         chart("voltage", "voltage [V]", 180, Curve("voltage", voltage[keep], "voltage")),
     ]
 
@@ -82,24 +76,17 @@ def residual_charts(wheel: str, tests: ResidualTests) -> list[Chart]:
         if found is None:
             continue
         outside = np.abs(found.value) > found.band
-        charts.append(
-            Chart(
-                name=f"{kind.split()[0]}-{wheel}",
-                title=f"Residual {kind}",
-                x_label="lag [samples]",
-                y_label="correlation",
-                x=found.lag,
-                curves=(
-                    Curve(
-                        "within the band", np.where(outside, np.nan, found.value), "good", "bars"
-                    ),
-                    Curve("outside", np.where(outside, found.value, np.nan), "bad", "bars"),
-                ),
-                lines=(-found.band, 0.0, found.band),
-                summary=f"{np.sum(outside)} of {found.lag.size} lags lie outside "
-                f"±{found.band:.3g}.",
-            )
+        within, beyond = (np.where(which, found.value, np.nan) for which in (~outside, outside))
+        curves = (
+            Curve("within the band", within, "good", "bars"),
+            Curve("outside", beyond, "bad", "bars"),
         )
+        charts.append(Chart(
+            name=f"{kind.split()[0]}-{wheel}", title=f"Residual {kind}",
+            x_label="lag [samples]", y_label="correlation", x=found.lag, curves=curves,
+            lines=(-found.band, 0.0, found.band),
+            summary=f"{np.sum(outside)} of {found.lag.size} lags lie outside ±{found.band:.3g}.",
+        ))  # fmt: skip
     return charts
 
 
@@ -121,23 +108,17 @@ def frequency_charts(wheel: str, parts: Sequence[Comparison]) -> list[Chart]:
     ):
         y = of(measured)
         around = (y * low, y * high) if kind == "gain" else (y + low, y + high)
-        charts.append(
-            Chart(
-                name=f"{kind}-{wheel}",
-                title=f"Frequency response: {kind}",
-                x_label="frequency [Hz]",
-                y_label=f"{kind} [{unit}]",
-                x=frequency,
-                curves=(
-                    Curve("data, 95 % band", y, "measured", "points", *around),
-                    Curve("model", of(simulated), "simulated"),
-                ),
-                log="xy" if kind == "gain" else "x",
-                group=f"frequency-{wheel}",
-                summary=f"{kind.capitalize()} of {name} from {frequency[0]:.2g} to "
-                f"{frequency[-1]:.3g} Hz.",
-            )
+        curves = (
+            Curve("data, 95 % band", y, "measured", "points", *around),
+            Curve("model", of(simulated), "simulated"),
         )
+        span = f"from {frequency[0]:.2g} to {frequency[-1]:.3g} Hz"
+        charts.append(Chart(
+            name=f"{kind}-{wheel}", title=f"Frequency response: {kind}", x_label="frequency [Hz]",
+            y_label=f"{kind} [{unit}]", x=frequency, curves=curves,
+            log="xy" if kind == "gain" else "x", group=f"frequency-{wheel}",
+            summary=f"{kind.capitalize()} of {name} {span}.",
+        ))  # fmt: skip
     return charts
 
 
@@ -166,10 +147,8 @@ def _response(parts: Sequence[Comparison]) -> tuple[Array, Array, Array, Array] 
         ok = np.isfinite(part.measured) & np.isfinite(part.simulated)
         if ok.sum() < size:
             continue
-        signals = [
-            np.interp(even, part.time[ok], y[ok])
-            for y in (part.voltage, part.measured, part.simulated)
-        ]
+        columns = (part.voltage, part.measured, part.simulated)
+        signals = [np.interp(even, part.time[ok], y[ok]) for y in columns]
         for first in range(0, even.size - size + 1, size // 2):
             cut = [s[first : first + size] for s in signals]
             u, y, z = (np.fft.rfft(window * (c - c.mean())) for c in cut)

@@ -76,18 +76,10 @@ def history_charts(wheel: str, entries: Sequence[Entry]) -> list[Chart]:
         if not np.isfinite(pairs[:, 0]).any():
             continue
         value, wide = pairs[:, 0], 1.96 * pairs[:, 1]
-        charts.append(
-            Chart(
-                name=f"history-{name}-{wheel}",
-                title=f"Since commissioning: {label(name).lower()}",
-                x_label="time [h]",
-                y_label=title,
-                x=hours,
-                curves=(
-                    Curve("live, 95 % band", value, "measured", "line", value - wide, value + wide),
-                ),
-                group=f"history-{wheel}",
-                summary=f"{title} of {label(wheel)} over {hours[-1]:.3g} hours.",
-            )
-        )
+        curve = Curve("live, 95 % band", value, "measured", "line", value - wide, value + wide)
+        charts.append(Chart(
+            name=f"history-{name}-{wheel}", title=f"Since commissioning: {label(name).lower()}",
+            x_label="time [h]", y_label=title, x=hours, curves=(curve,), group=f"history-{wheel}",
+            summary=f"{title} of {label(wheel)} over {hours[-1]:.3g} hours.",
+        ))  # fmt: skip
     return charts

@@ -87,9 +87,7 @@ def _motor(
         ],
         "combinations": [_row(name, q) for name, q in estimate.combinations.items()],
         "parameters": [
-            _row(name, quantity)
-            for name, quantity in estimate.parameters.items()
-            if name not in estimate.combinations
+            _row(n, q) for n, q in estimate.parameters.items() if n not in estimate.combinations
         ],
         "alike": _alike(estimate),
         # By their information criterion, those without one last
@@ -135,12 +133,9 @@ def _side_by_side(
 
 def _cell(q: Quantity, low: float, high: float) -> tuple[str, tuple[float, float, float]]:
     value = q.value or 0.0
-    ends = q.ci95 or (value, value)
-    wide = (high - low) or 1.0
-    return (
-        words.number(q.value, q.std),
-        ((ends[0] - low) / wide, (value - low) / wide, (ends[1] - low) / wide),
-    )
+    first, last = q.ci95 or (value, value)
+    begin, middle, end = ((x - low) / ((high - low) or 1.0) for x in (first, value, last))
+    return words.number(q.value, q.std), (begin, middle, end)
 
 
 def _row(name: str, quantity: Quantity) -> dict[str, str]:
@@ -173,9 +168,8 @@ def _alike(estimate: Estimate) -> list[tuple[str, str, str]]:
     for name, (low, high) in _same_response(estimate).items():
         symbol, title, _ = words.EXPLAINED[name]
         end = f"… {high:.3g}" if math.isfinite(high) else "or more"
-        rows.append(
-            (symbol, title, f"{low:.3g} {end} {words.typeset(estimate.parameters[name].unit)}")
-        )
+        unit = words.typeset(estimate.parameters[name].unit)
+        rows.append((symbol, title, f"{low:.3g} {end} {unit}"))
     return rows
 
 

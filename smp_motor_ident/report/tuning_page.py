@@ -71,9 +71,8 @@ def _choice(
     estimate: Estimate, loop: Loop, bandwidth: float, margin: float, made: Design | None
 ) -> Choice:
     try:
-        found = made or design(
-            estimate, loop, bandwidth=bandwidth, phase_margin=margin, samples=SAMPLES
-        )
+        asked: dict[str, Any] = dict(bandwidth=bandwidth, phase_margin=margin, samples=SAMPLES)
+        found = made or design(estimate, loop, **asked)
     except SmpError as error:
         return Choice(bandwidth, margin, reason=str(error))
     return Choice(bandwidth, margin, found, curves(estimate, found))
@@ -95,12 +94,8 @@ def page_data(tunings: Mapping[str, Tuning]) -> dict[str, Any]:
         "shares": SHARES,
         "margins": MARGINS,
         "wheels": {
-            wheel: {
-                "chosen": tuning.chosen,
-                "reason": tuning.reason,
-                "choices": [_document(one) for one in tuning.choices],
-            }
-            for wheel, tuning in tunings.items()
+            wheel: dict(chosen=t.chosen, reason=t.reason, choices=[*map(_document, t.choices)])
+            for wheel, t in tunings.items()
         },
     }
 

@@ -47,14 +47,8 @@ class Grid:
 def head(rows: Sequence[Row], where: str) -> Grid:
     """Tell the row of names, and of units, from those of numbers."""
     seen = rows[:_SEEN]
-    first = next(
-        (
-            k
-            for k, row in enumerate(seen)
-            if is_data(row) and all(map(is_data, seen[k + 1 : k + 2]))
-        ),
-        None,
-    )
+    data = [*map(is_data, seen), True]
+    first = next((k for k in range(len(seen)) if data[k] and data[k + 1]), None)
     if first is None:
         raise BagError(f"{where}: has no rows of numbers")
     width = len(seen[first])
@@ -152,11 +146,7 @@ def nanoseconds(cell: Any) -> int:
     match = _ISO.fullmatch(str(cell).strip())
     if match is None:
         raise ValueError(f"{cell!r} is neither number nor time")
-    day, clock, zone = (
-        match[1] or "1970-01-01",
-        match[2].replace(",", ".").zfill(8),
-        match[3] or "Z",
-    )
+    day, clock, zone = match[1] or "1970-01-01", match[2].replace(",", "."), match[3] or "Z"
     clock = clock if clock[2] == ":" else f"0{clock}"
     stamp = int(np.datetime64(f"{day}T{clock}", "ns").astype(np.int64))
     if zone != "Z":
@@ -196,22 +186,15 @@ def columns(
         text = f"{where}: {len(stray)} rows that are no numbers were left out, the first in line "
         findings.append(found("stray_rows", f"{text}{lines[stray[0][0]]}", "warning"))
     values = np.array(kept, np.float64).reshape(len(kept), len(use))
-    result, dates = [], set()
-    for n, j in enumerate(use):
-        column: NDArray[Any] = values[:, n]
-        whole = _whole(sound_rows, j, column)
-        if whole is not None:
-            column = whole[0]
-            if whole[1]:
-                dates.add(names[n])
-        result.append(column)
-    return result, findings, dates
+    exact = [_whole(sound_rows, j, values[:, n]) for n, j in enumerate(use)]
+    dates = {name for name, (_, timed) in zip(names, exact) if timed}
+    return [column for column, _ in exact], findings, dates
 
 
-def _whole(rows: Sequence[Row], j: int, column: NDArray[Any]) -> tuple[NDArray[Any], bool] | None:
-    """Return a column exactly, as integers, where float64 would round it; and whether of times."""
+def _whole(rows: Sequence[Row], j: int, column: NDArray[Any]) -> tuple[NDArray[Any], bool]:
+    """Return a column, as integers where float64 would round it; and whether it is of times."""
     if not column.size or not np.isfinite(column).all():
-        return None
+        return column, False
     first = rows[0][j]
     timed = not isinstance(first, (int, float)) and _ISO.fullmatch(str(first).strip())
     try:
@@ -221,7 +204,7 @@ def _whole(rows: Sequence[Row], j: int, column: NDArray[Any]) -> tuple[NDArray[A
             return np.array([int(row[j]) for row in rows], np.int64), False
     except (ValueError, OverflowError, TypeError):
         pass
-    return None
+    return column, False
 
 
 def _culprit(row: Row, use: Sequence[int], names: Sequence[str]) -> str:

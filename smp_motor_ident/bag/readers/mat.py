@@ -6,6 +6,7 @@ Format", section 1: elements of type and size, compressed ones by zlib.
 """
 
 import io
+import math
 import struct
 import subprocess
 import sys
@@ -142,11 +143,9 @@ def _unpacked(data: bytes, name: str, budget: Budget, objects: list[str]) -> byt
         kind, size = struct.unpack_from(order + "II", data, at)
         if at + 8 + size > len(data):
             raise BagError(f"{name}: is cut off at byte {at} of {len(data)}; save it again")
-        body = data[at + 8 : at + 8 + size]
+        body = data[at : at + 8 + size]
         if kind == _COMPRESSED:
-            body = _inflated(body, name, budget)
-        else:
-            body = data[at : at + 8] + body
+            body = _inflated(body[8:], name, budget)
         _check(body, order, name, 0, objects)
         parts.append(body)
         at += 8 + size
@@ -216,9 +215,8 @@ def _check_size(inside: bytes, order: str, name: str) -> None:
         return
     _, size = struct.unpack_from(order + "II", inside, 16)
     count = min(size // 4, (len(inside) - 24) // 4, 32)
-    product = 1.0
-    for dimension in struct.unpack_from(f"{order}{count}i", inside, 24):
-        product *= max(dimension, 0)
+    dimensions = struct.unpack_from(f"{order}{count}i", inside, 24)
+    product = math.prod(float(max(dimension, 0)) for dimension in dimensions)
     if product > len(inside):
         raise BagError(
             f"{name}: a variable is damaged ({product:g} elements in {len(inside)} bytes)"

@@ -101,16 +101,11 @@ class _McapFile(Messages):
                         break
                 elif op == _MESSAGE:
                     yield self._top_level(file, start, length, wanted)
+                elif op in (_SCHEMA, _CHANNEL):
+                    self._define(op, file.read(length))
                 else:
-                    self._pass(file, op, length)
+                    file.seek(length, io.SEEK_CUR)
         self._scanned = True
-
-    def _pass(self, file: BinaryIO, op: int, length: int) -> None:
-        """Take in a schema or a channel, go behind any other record."""
-        if op in (_SCHEMA, _CHANNEL):
-            self._define(op, file.read(length))
-        else:
-            file.seek(length, io.SEEK_CUR)
 
     def _top_level(
         self, file: BinaryIO, start: int, length: int, wanted: Callable[[Channel], bool]

@@ -85,28 +85,20 @@ class _SqliteFile(Messages):
         if self._database.execute("PRAGMA table_info(message_definitions)").fetchall():
             query = "SELECT topic_type, encoded_message_definition, encoding"
             try:
-                rows = self._database.execute(f"{query} FROM message_definitions").fetchall()
+                for kind, *given in self._database.execute(f"{query} FROM message_definitions"):
+                    definitions[message_type(kind)] = tuple(given)
             except sqlite3.DatabaseError as error:
-                rows = []
                 self._amiss(f"its definitions cannot be read ({error})")
-            for kind, text, encoding in rows:
-                definitions[message_type(kind)] = (text, encoding)
-        optional = [
-            name if name in columns else "''"
-            for name in ("serialization_format", "offered_qos_profiles")
-        ]
-        query = f"SELECT id, name, type, {', '.join(optional)} FROM topics ORDER BY id"
-        return [
-            Channel(
-                key,
-                topic,
-                message_type(kind),
-                encoding or "cdr",
-                *definitions.get(message_type(kind), ("", "")),
-                qos=qos,
+        names = ("serialization_format", "offered_qos_profiles")
+        optional = ", ".join(name if name in columns else "''" for name in names)
+        rows = self._database.execute(f"SELECT id, name, type, {optional} FROM topics ORDER BY id")
+        channels = []
+        for key, topic, kind, encoding, qos in rows:
+            own = definitions.get(message_type(kind), ("", ""))
+            channels.append(
+                Channel(key, topic, message_type(kind), encoding or "cdr", *own, qos=qos)
             )
-            for key, topic, kind, encoding, qos in self._database.execute(query)
-        ]
+        return channels
 
     def channels(self) -> list[Channel]:
         """Return the topics of the file."""
@@ -218,12 +210,8 @@ class _SqliteFile(Messages):
     @staticmethod
     def _by_topic(topic: Integers, batch: Batch, asked: dict[int, Channel]) -> list[Batch]:
         """Return the messages of each topic."""
-        parts = []
-        for key, channel in asked.items():
-            which = np.flatnonzero(topic == key)
-            if which.size:
-                parts.append(replace(batch.take(which), channel=channel))
-        return parts
+        which = {key: np.flatnonzero(topic == key) for key in asked}
+        return [replace(batch.take(k), channel=asked[key]) for key, k in which.items() if k.size]
 
 
 FORMAT = Format("SQLite bag", (".db3",), MAGIC, _SqliteFile, tables=False)

@@ -74,14 +74,9 @@ FORMAT = Format(
     counts=False,
     known=KnownLoop(
         {
-            "p": math.nan,
-            "i": math.nan,
-            "d": 0.0,
-            "u_clamp_max": math.inf,
-            "u_clamp_min": -math.inf,
-            "tracking_time_constant": 0.0,
-            "feedforward_gain": 0.0,
+            "p": math.nan, "i": math.nan, "d": 0.0, "u_clamp_max": math.inf,
+            "u_clamp_min": -math.inf, "tracking_time_constant": 0.0, "feedforward_gain": 0.0,
         },
         _start,
     ),
-)
+)  # fmt: skip
