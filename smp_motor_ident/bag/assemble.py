@@ -29,7 +29,7 @@ def assemble(
 ) -> Record:
     """Make one motor's record."""
     motor = Motor(wheel, plan, hardware, tables, source)
-    for topic in dict.fromkeys(s.topic for s in plan.signals.values()):
+    for topic in plan.topics:
         motor.findings += tables[topic].findings
         if not tables[topic].logged.size:
             raise BagError(f"{motor.where}: {topic or 'it'} has no messages")
@@ -116,11 +116,10 @@ def _check(motor: Motor, series: dict[str, Series]) -> None:
 
 def _clock(motor: Motor) -> dict[str, Integers]:
     """Return the time [ns] of every topic's messages, all on one clock."""
-    topics = list(dict.fromkeys(signal.topic for signal in motor.plan.signals.values()))
-    tables = {topic: motor.tables[topic] for topic in topics}
+    tables = {topic: motor.tables[topic] for topic in motor.plan.topics}
     if all(table.clocked for table in tables.values()):
         return {topic: table.logged for topic, table in tables.items()}
-    stamps = {topic: _stamp(motor, tables[topic]) for topic in topics}
+    stamps = {topic: _stamp(motor, table) for topic, table in tables.items()}
     if motor.plan.clock == "log":
         motor.tell("time_base", "time: log times, as asked")
         return {topic: table.logged for topic, table in tables.items()}
@@ -141,7 +140,7 @@ def _clock(motor: Motor) -> dict[str, Integers]:
     if not poor and max(offsets) - min(offsets) < SAME_CLOCK:
         text = "time: header stamps (the instants of sampling, free of transport delay)"
         motor.tell("time_base", text)
-        _tell_offset(motor, topics[0], fits)
+        _tell_offset(motor, next(iter(tables)), fits)
         if any(len(epochs(stamp)) > 1 for stamp in stamps.values() if stamp is not None):
             return _set_back(motor, tables, stamps)
         return {topic: stamp for topic, stamp in stamps.items() if stamp is not None}

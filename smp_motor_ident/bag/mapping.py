@@ -71,6 +71,11 @@ class MotorMap:
     pwm_full_scale: float = 0.0  # what a voltage in ``pwm`` is at 100 %; it is never guessed
     own: bool = False  # whether these are our own messages, of which nothing has to be guessed
 
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """Topics of the signals, each once."""
+        return tuple(dict.fromkeys(signal.topic for signal in self.signals.values()))
+
 
 @dataclass(frozen=True)
 class SignalMap:

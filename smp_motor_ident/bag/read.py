@@ -22,13 +22,8 @@ from smp_motor_ident.finding import Finding
 from smp_motor_ident.record import Hardware, Record
 
 STATE, DESCRIPTION = "smp_interfaces/msg/MotorState", "smp_interfaces/msg/MotorDescription"
-OWN_FIELDS = {
-    "voltage": "voltage",
-    "current": "current",
-    "velocity": "velocity",
-    "position": "position",
-    "count": "encoder_count",
-}
+OWN_FIELDS = {name: name for name in ("voltage", "current", "velocity", "position")}
+OWN_FIELDS["count"] = "encoder_count"
 BETWEEN = 1.0  # time [s] that a joined record leaves between two recordings
 
 
@@ -41,7 +36,7 @@ def read_experiments(paths: Any, mapping: Any = None) -> dict[str, list[Record]]
     types = Types(asked.msg_files)
     read: dict[str, list[Record]] = {}
     failures: list[BagError] = []
-    topics = {s.topic for motor in asked.motors.values() for s in motor.signals.values()}
+    topics = {topic for motor in asked.motors.values() for topic in motor.topics}
     for recording in recordings(paths, topics):
         try:
             for record in read_recording(recording, asked, types):
@@ -161,11 +156,9 @@ def _records(recording: Recording, asked: SignalMap, types: Types) -> list[Recor
     channels = recording.channels()
     plans = _plans(recording, asked, channels)
     wanted: dict[str, list[str]] = {}
-    for plan in plans.values():
-        for signal in plan.signals.values():
-            fields = wanted.setdefault(signal.topic, [])
-            if signal.field not in fields:
-                fields.append(signal.field)
+    signals = [signal for plan in plans.values() for signal in plan.signals.values()]
+    for topic, name in dict.fromkeys((signal.topic, signal.field) for signal in signals):
+        wanted.setdefault(topic, []).append(name)
     descriptions = [c.topic for c in channels if c.type == DESCRIPTION]
     wanted.update({topic: list(mappings.HARDWARE) for topic in descriptions})
     if recording.is_table:
@@ -185,8 +178,8 @@ def _records(recording: Recording, asked: SignalMap, types: Types) -> list[Recor
             if not plan.own:
                 raise
             failures.append(error)
-        used = {s.topic for other in plans.values() for s in other.signals.values()}
-        for topic in {s.topic for s in plan.signals.values()} - used:
+        used = {topic for other in plans.values() for topic in other.topics}
+        for topic in {*plan.topics} - used:
             del tables[topic]  # its memory is needed for the next
     if failures and not records:
         raise failures[0]
@@ -242,7 +235,7 @@ def _description(
     wheel: str, plan: MotorMap, topics: list[str], tables: Mapping[str, Table]
 ) -> tuple[dict[str, float], list[Finding]]:
     """Return the last description of a wheel, and what was found about it."""
-    spaces = {signal.topic.rpartition("/")[0] for signal in plan.signals.values()}
+    spaces = {topic.rpartition("/")[0] for topic in plan.topics}
     mine = [topic for topic in topics if topic.rpartition("/")[0] in spaces]
     for topic in mine:
         table = tables[topic]

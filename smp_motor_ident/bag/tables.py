@@ -100,7 +100,7 @@ def add_time_columns(
 ) -> None:
     """Ask for the column of time of every table that is wanted."""
     for plan in plans.values():
-        for topic in {signal.topic for signal in plan.signals.values()}:
+        for topic in plan.topics:
             signal = _time_signal(recording, plan, topic)
             if signal is not None and signal.field not in wanted[topic]:
                 wanted[topic].append(signal.field)
@@ -130,7 +130,7 @@ def timed(recording: Recording, plan: MotorMap, tables: Mapping[str, Table]) -> 
     """Return a plan's tables with their times in nanoseconds; rows without one are left out."""
     result = {}
     written = []
-    for topic in dict.fromkeys(signal.topic for signal in plan.signals.values()):
+    for topic in plan.topics:
         table = tables[topic]
         findings = list(table.findings)
         log = table.log

@@ -60,11 +60,10 @@ class BagWriter:
         path: str | os.PathLike[str],
         *,
         flush_period: float = FLUSH_PERIOD,
-        distribution: str = "",
     ) -> None:
         self.path = Path(path)
         self._file_name = f"{self.path.resolve().name}_0.mcap"
-        self._distribution = distribution or os.environ.get("ROS_DISTRO", "") or "jazzy"
+        self._distribution = os.environ.get("ROS_DISTRO", "") or "jazzy"
         self._flush_period = flush_period
         self._topics: dict[str, _Topic] = {}
         self._schemas: dict[str, tuple[records.Schema, str]] = {}

@@ -1,6 +1,5 @@
 """``tune``: identification.json (or motors.yaml) in, gains for wheel nodes or other loops out."""
 
-import argparse
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -33,88 +32,74 @@ AIMS: dict[str, dict[str, Any]] = {
 }
 """Arguments that say what to aim at, each a target of the design."""
 
+LOOP: dict[str, dict[str, Any]] = {
+    "rate": dict(type=float, help="steps per second [Hz]; else that of the bag"),
+    "delay": dict(type=float, help="measurement to voltage, beyond the hold [s]; else one sample"),
+    "bag": dict(
+        type=Path,
+        help="measure both delays: a bag with motor_state and motor_command of the driving wheels",
+    ),
+    "usual_delay": dict(type=float, help="what it usually is [s]; else --delay"),
+    "speed_source": dict(
+        choices=("auto", *SPEED_SOURCES), default="auto",
+        help="auto compares what each allows, and says why",
+    ),
+    "difference_window": dict(type=int, help="[samples]; else as identified"),
+    "speed_noise": dict(type=float, help="of the reported speed, standard deviation "
+                        "[rad/s, motor]; else as identified"),
+    "angle_noise": dict(type=float, help="of the angle that the speed is made from, beside counts, "
+                        "standard deviation [rad, motor]; else as identified"),
+    "gear_ratio": dict(type=float, help="else as identified"),
+    "counts_per_revolution": dict(type=float, help="else as identified"),
+    "supply": dict(type=float, help="[V]; else as identified"),
+}  # fmt: skip
+
+RUNNING: dict[str, dict[str, Any]] = {
+    "apply": dict(
+        action="store_true",
+        help="set the gains in the running wheels, watch, take them back if a loop misbehaves",
+    ),
+    "gains": dict(type=Path, help="with --apply and without a source: gains of this file"),
+    "watch": dict(type=float, default=3.0, help="trial after --apply [s]"),
+    "relay": dict(metavar="WHEEL", help="make it oscillate, and tune from that, without a model"),
+    "relay_amplitude": dict(type=float, help="[V]; a quarter of the supply"),
+    "relay_hysteresis": dict(type=float, default=0.05, help="[rad/s, wheel]"),
+    "relay_seconds": dict(type=float, default=4.0),
+}
+GROUPS = {"the loop that will run": LOOP, "what to aim at": AIMS, "wheels that run": RUNNING}
+
 TARGETS = (*AIMS, "relay_amplitude", "accept_unreliable")
 
 
 def parser() -> frame.Parser:
     """Return the parser of the tool's arguments."""
-    p = frame.Parser(
-        prog="tune",
-        description="Design gains that hold on the loop that will run.",
-        epilog=frame.OF_ROS,
-    )
-    p.add_argument(
-        "source", type=Path, nargs="?", help="identification.json, its folder, or motors.yaml"
-    )
-    p.add_argument(
-        "--output", type=Path, help="parameter file to write; gains.json and a figure go beside it"
-    )
-    p.add_argument(
+    about = "Design gains that hold on the loop that will run."
+    p = frame.Parser(prog="tune", description=about, epilog=frame.OF_ROS)
+    add = p.add_argument
+    add("source", type=Path, nargs="?", help="identification.json, its folder, or motors.yaml")
+    add("--output", type=Path, help="parameter file to write; gains.json and a figure beside it")
+    add(
         "--export", choices=FORMATS, metavar="FORMAT",
         help="gains for a loop that others run, at its usual rate: " + ", ".join(FORMATS),
     )  # fmt: skip
-    p.add_argument("--method", default="margin", help=", ".join(METHODS))
-    p.add_argument("--compare", action="store_true", help="show every method; take the recommended")
-    p.add_argument(
+    add("--method", default="margin", help=", ".join(METHODS))
+    add("--compare", action="store_true", help="show every method; take the recommended")
+    add(
         "--alone", action="store_true",
         help="each wheel as fast as its own voltage allows, instead of all together",
     )  # fmt: skip
-    p.add_argument("--sets", choices=("auto", "one", "each"), default="auto",
-                   help="one set of gains for all wheels, or one each")  # fmt: skip
-    p.add_argument(
+    add("--sets", choices=("auto", "one", "each"), default="auto",
+        help="one set of gains for all wheels, or one each")  # fmt: skip
+    add(
         "--accept-unreliable", action="store_true", default=None,
         help="design on an identification that calls itself unreliable, as wide as it leaves",
     )  # fmt: skip
-    p.add_argument("--force", action="store_true", help="replace files that exist")
-    _add_loop(p.add_argument_group("the loop that will run"))
-    aims = p.add_argument_group("what to aim at")
-    for name, options in AIMS.items():
-        aims.add_argument("--" + name.replace("_", "-"), **options)
-    _add_running(p.add_argument_group("wheels that run"))
+    add("--force", action="store_true", help="replace files that exist")
+    for title, arguments in GROUPS.items():
+        group = p.add_argument_group(title)
+        for name, options in arguments.items():
+            group.add_argument("--" + name.replace("_", "-"), **options)
     return p
-
-
-def _add_loop(group: argparse._ArgumentGroup) -> None:
-    group.add_argument("--rate", type=float, help="steps per second [Hz]; else that of the bag")
-    group.add_argument(
-        "--delay", type=float, help="measurement to voltage, beyond the hold [s]; else one sample"
-    )
-    group.add_argument(
-        "--bag", type=Path, help="measure both delays: a bag with motor_state and motor_command "
-        "of the driving wheels",
-    )  # fmt: skip
-    group.add_argument("--usual-delay", type=float, help="what it usually is [s]; else --delay")
-    group.add_argument(
-        "--speed-source", choices=("auto", *SPEED_SOURCES), default="auto",
-        help="auto compares what each allows, and says why",
-    )  # fmt: skip
-    group.add_argument("--difference-window", type=int, help="[samples]; else as identified")
-    group.add_argument("--speed-noise", type=float,
-                       help="of the reported speed, standard deviation [rad/s, motor]; "
-                       "else as identified")  # fmt: skip
-    group.add_argument("--angle-noise", type=float,
-                       help="of the angle that the speed is made from, beside counts, standard "
-                       "deviation [rad, motor]; else as identified")  # fmt: skip
-    group.add_argument("--gear-ratio", type=float, help="else as identified")
-    group.add_argument("--counts-per-revolution", type=float, help="else as identified")
-    group.add_argument("--supply", type=float, help="[V]; else as identified")
-
-
-def _add_running(group: argparse._ArgumentGroup) -> None:
-    group.add_argument(
-        "--apply",
-        action="store_true",
-        help="set the gains in the running wheels, watch, take them back if a loop misbehaves",
-    )
-    group.add_argument(
-        "--gains", type=Path, help="with --apply and without a source: gains of this file"
-    )
-    group.add_argument("--watch", type=float, default=3.0, help="trial after --apply [s]")
-    group.add_argument("--relay", metavar="WHEEL",
-                       help="make it oscillate, and tune from that, without a model")  # fmt: skip
-    group.add_argument("--relay-amplitude", type=float, help="[V]; a quarter of the supply")
-    group.add_argument("--relay-hysteresis", type=float, default=0.05, help="[rad/s, wheel]")
-    group.add_argument("--relay-seconds", type=float, default=4.0)
 
 
 main = partial(frame.run, parser, "tuning")

@@ -25,7 +25,7 @@ def float_bytes(corpus: SimpleNamespace, value: float) -> bytes:
 
 
 def test_metadata_are_those_of_version_nine(tmp_path: Path, corpus: SimpleNamespace) -> None:
-    with BagWriter(tmp_path / "bag", distribution="jazzy") as bag:
+    with BagWriter(tmp_path / "bag") as bag:
         bag.add_topic("/b", FLOAT, [{"reliability": "best_effort", "depth": 7}])
         bag.write("/a", FLOAT, float_bytes(corpus, 1.0), 1_000)
         bag.write("/b", FLOAT, float_bytes(corpus, 2.0), 3_000)
