@@ -24,16 +24,9 @@ from std_msgs.msg import Float64
 from smp_interfaces.msg import MotorDescription
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.fields import described, fixed, nested
-from smp_motor_control.motor.file import (
-    MotorEntry,
-    load_motors,
-    motors_among,
-    paper_motors,
-    parse_motors,
-)
+from smp_motor_control.motor import file as motor_file
 from smp_motor_control.motor.hardware import DrivenMotor, DriveSettings, Supply
-from smp_motor_control.nodes import runtime
-from smp_motor_control.nodes.motor_writer import MotorDriver
+from smp_motor_control.nodes import motor_writer, runtime
 from smp_motor_control.nodes.settings import Parameters, given_parameters
 
 _FIXED = ParameterDescriptor(description="As in a motor file.", read_only=True)
@@ -84,7 +77,7 @@ class Wheel:
             resistance=entry.resistance if ohmmeter else math.nan,
         )
         timeout = motor.settings.command_timeout
-        self._driver = MotorDriver(node, name, timeout, self._command, description)
+        self._driver = motor_writer.MotorDriver(node, name, timeout, self._command, description)
         self.lease = self._driver.lease
         node.create_subscription(
             Float64, f"{name}/load_torque", self._load, runtime.STREAM_SUBSCRIBER
@@ -141,16 +134,16 @@ class MotorPlant(Node):
         gc.collect()
         gc.freeze()
 
-    def _motors(self, settings: Settings) -> dict[str, MotorEntry]:
+    def _motors(self, settings: Settings) -> dict[str, motor_file.MotorEntry]:
         given = given_parameters(self)
-        motors = motors_among(given)
+        motors = motor_file.motors_among(given)
         if motors and settings.motors_file:
             raise ParameterError("give either motors_file or motors.<wheel>.<key>, not both")
         if motors:
             for name in (name for name in given if name.startswith("motors.")):
                 self.declare_parameter(name, given[name], _FIXED, ignore_override=True)
-            return parse_motors(motors, "parameters")
-        return load_motors(settings.motors_file or paper_motors())
+            return motor_file.parse_motors(motors, "parameters")
+        return motor_file.load_motors(settings.motors_file or motor_file.paper_motors())
 
     def _change(self, settings: Settings) -> None:
         self._supply.resistance = settings.supply_resistance

@@ -11,13 +11,7 @@ from std_msgs.msg import String
 
 from smp_interfaces.msg import MotorCommand, MotorDescription, MotorState
 from smp_motor_control import joint_of
-from smp_motor_control.nodes.runtime import (
-    LATCHED,
-    STREAM_PUBLISHER,
-    STREAM_SUBSCRIBER,
-    nanoseconds,
-    send_last,
-)
+from smp_motor_control.nodes import runtime
 from smp_motor_control.wheel.lease import Lease
 
 _ZEROS = 3
@@ -33,10 +27,10 @@ class MotorWriter:
         self._message = MotorCommand()
         self._message.header.frame_id = self._name
         self.publisher = node.create_publisher(
-            MotorCommand, f"{prefix}motor_command", STREAM_PUBLISHER
+            MotorCommand, f"{prefix}motor_command", runtime.STREAM_PUBLISHER
         )
         self._owners = node.create_subscription(
-            String, f"{prefix}motor_owner", self._heard, LATCHED
+            String, f"{prefix}motor_owner", self._heard, runtime.LATCHED
         )
         self.owner = ""  # another writer that owns the wheel, by what the driver says
 
@@ -56,7 +50,7 @@ class MotorWriter:
             self.send(0.0)
             time.sleep(0.005)
         self.send(0.0)
-        send_last(self.publisher, self._message)
+        runtime.send_last(self.publisher, self._message)
 
     def destroy(self) -> None:
         self._node.destroy_publisher(self.publisher)
@@ -83,20 +77,22 @@ class MotorDriver:
         self.state = MotorState(current=math.nan)
         self.state.header.frame_id = description.joint_name = joint_of(wheel)
         self._owner = "?"
-        self._owners = node.create_publisher(String, f"{wheel}/motor_owner", LATCHED)
-        self._states = node.create_publisher(MotorState, f"{wheel}/motor_state", STREAM_PUBLISHER)
+        self._owners = node.create_publisher(String, f"{wheel}/motor_owner", runtime.LATCHED)
+        self._states = node.create_publisher(
+            MotorState, f"{wheel}/motor_state", runtime.STREAM_PUBLISHER
+        )
         # A publisher that nothing holds would be destroyed, and what it latched with it.
         self._descriptions = node.create_publisher(
-            MotorDescription, f"{wheel}/motor_description", LATCHED
+            MotorDescription, f"{wheel}/motor_description", runtime.LATCHED
         )
         self._descriptions.publish(description)
         node.create_subscription(
-            MotorCommand, f"{wheel}/motor_command", self._heard, STREAM_SUBSCRIBER
+            MotorCommand, f"{wheel}/motor_command", self._heard, runtime.STREAM_SUBSCRIBER
         )
 
     def _heard(self, message: MotorCommand) -> None:
         now = time.monotonic()
-        stamps = nanoseconds(message.header.stamp), self._clock.now().nanoseconds
+        stamps = runtime.nanoseconds(message.header.stamp), self._clock.now().nanoseconds
         if self.lease.take(message.header.frame_id, message.voltage, now, *stamps):
             self._obey(now, message.voltage)
 

@@ -8,14 +8,9 @@ from numpy.typing import NDArray
 
 from smp_motor_control.arrays import Array, Integers
 from smp_motor_control.motor.parameters import Gearbox
+from smp_motor_ident.bag import checks, clock, counter, mapping, runs, units
 from smp_motor_ident.bag.axis import Motor, Series, on_one_axis, unwrapped
-from smp_motor_ident.bag.checks import impossible, is_unsigned, signed
-from smp_motor_ident.bag.clock import SAME_CLOCK, ClockFit, epochs, fit_clock, judge_stamps, rhythm
-from smp_motor_ident.bag.counter import is_full, unwrap_angle
-from smp_motor_ident.bag.mapping import MotorMap, Signal
-from smp_motor_ident.bag.runs import one_after_another, pause_between
 from smp_motor_ident.bag.storage import Table
-from smp_motor_ident.bag.units import FACTORS, check_unit, factor
 from smp_motor_ident.diagnosis.stamps import find_beat, moves_on
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.record import Hardware, Record
@@ -25,7 +20,7 @@ _MOTION = ("velocity", "position")
 
 
 def assemble(
-    wheel: str, plan: MotorMap, hardware: Hardware, tables: Mapping[str, Table], source: str
+    wheel: str, plan: mapping.MotorMap, hardware: Hardware, tables: Mapping[str, Table], source: str
 ) -> Record:
     """Make one motor's record."""
     motor = Motor(wheel, plan, hardware, tables, source)
@@ -67,7 +62,7 @@ def _on_beat(motor: Motor, topic: str, time: Integers) -> Integers:
     if table.clocked and not beat.repeated:
         # Stamps of one's own may be the samples' instants: the motion tells.
         signal = next((s for n, s in motor.plan.signals.items() if n in _MOTION), None)
-        if rhythm(time).regular or signal is None or signal.topic != topic:
+        if clock.rhythm(time).regular or signal is None or signal.topic != topic:
             return time
         motion = table.columns[signal.field].astype(np.float64)
         if not moves_on(beat, time, motion):
@@ -84,17 +79,17 @@ def _on_beat(motor: Motor, topic: str, time: Integers) -> Integers:
 def _check(motor: Motor, series: dict[str, Series]) -> None:
     """Leave out values that cannot be, and a current without sign; give a size its direction."""
     if "direction" in series:
-        series["voltage"] = signed(series["voltage"], series.pop("direction"), motor.where)
+        series["voltage"] = checks.signed(series["voltage"], series.pop("direction"), motor.where)
     for name in sorted(series, key=lambda name: name != "count"):
         value = series[name].value
         if name == "count":  # which wraps, and that is no jump
-            if last := is_full(value):
+            if last := counter.is_full(value):
                 raise BagError(
                     f"{motor.where}: the count stays at {last}, where a counter of its width ends: "
                     "it is full; record a wider one, or one that wraps"
                 )
             value = unwrapped(motor, series).count.astype(np.float64)
-        bad = impossible(value, steps_allowed=name in ("voltage", "supply", "current"))
+        bad = checks.impossible(value, steps_allowed=name in ("voltage", "supply", "current"))
         if bad.any():
             worst = float(np.abs(value[bad]).max())
             text = f"{name}: {int(bad.sum())} values that jump impossibly (up to {worst:.4g})"
@@ -105,7 +100,7 @@ def _check(motor: Motor, series: dict[str, Series]) -> None:
                 series.update({k: series[k].take(~bad) for k in alike})
             else:
                 series[name].value = np.where(bad, np.nan, value)
-    if "current" in series and is_unsigned(series["voltage"], series["current"]):
+    if "current" in series and checks.is_unsigned(series["voltage"], series["current"]):
         del series["current"]
         text = (
             "current: it is positive in both directions, so that it is the supply's or has lost "
@@ -126,22 +121,22 @@ def _clock(motor: Motor) -> dict[str, Integers]:
     poor = {
         topic: reason
         for topic, table in tables.items()
-        if (reason := judge_stamps(stamps[topic], table.logged))
+        if (reason := clock.judge_stamps(stamps[topic], table.logged))
     }
     if motor.plan.clock == "header" and poor:
         topic, reason = next(iter(poor.items()))
         raise BagError(f"{motor.where}: {topic} has no usable header time: {reason}")
     fits = {
-        t: fit_clock(stamp, tables[t].logged)
+        t: clock.fit_clock(stamp, tables[t].logged)
         for t, stamp in stamps.items()
         if t not in poor and stamp is not None
     }
     offsets = [fit.offset for fit in fits.values()]
-    if not poor and max(offsets) - min(offsets) < SAME_CLOCK:
+    if not poor and max(offsets) - min(offsets) < clock.SAME_CLOCK:
         text = "time: header stamps (the instants of sampling, free of transport delay)"
         motor.tell("time_base", text)
         _tell_offset(motor, next(iter(tables)), fits)
-        if any(len(epochs(stamp)) > 1 for stamp in stamps.values() if stamp is not None):
+        if any(len(clock.epochs(stamp)) > 1 for stamp in stamps.values() if stamp is not None):
             return _set_back(motor, tables, stamps)
         return {topic: stamp for topic, stamp in stamps.items() if stamp is not None}
     if not fits:
@@ -154,7 +149,7 @@ def _clock(motor: Motor) -> dict[str, Integers]:
 
 
 def _to_log(
-    motor: Motor, topic: str, stamp: Integers | None, fits: Mapping[str, ClockFit]
+    motor: Motor, topic: str, stamp: Integers | None, fits: Mapping[str, clock.ClockFit]
 ) -> Integers:
     """Return a topic's stamps on the recorder's clock; its log times where it has none."""
     if topic not in fits or stamp is None:
@@ -175,10 +170,10 @@ def _set_back(
     topic, table = next(iter(tables.items()))
     stamp = stamps[topic]
     assert stamp is not None
-    parts, log = epochs(stamp), table.logged
-    least = pause_between(stamp, parts, motor.plan.gap)
+    parts, log = clock.epochs(stamp), table.logged
+    least = runs.pause_between(stamp, parts, motor.plan.gap)
     pauses = [max(int(log[begin] - log[begin - 1]), least) for begin, _ in parts[1:]]
-    time = one_after_another([stamp], [parts], pauses)[0]
+    time = runs.one_after_another([stamp], [parts], pauses)[0]
     text = f"{topic}: the clock of the header stamps was set back {len(parts) - 1} times"
     motor.tell("clock_set_back", f"{text}; a new segment each", "warning")
     return {topic: time}
@@ -192,7 +187,7 @@ def _stamp(motor: Motor, table: Table) -> Integers | None:
     column = table.columns.get(signal.field)
     if column is None:
         return None
-    to_nanoseconds = FACTORS["time"][signal.unit or "s"] * 1e9
+    to_nanoseconds = units.FACTORS["time"][signal.unit or "s"] * 1e9
     if column.dtype.kind in "iu" and signal.scale == 1 and to_nanoseconds >= 1:
         # Whole nanoseconds since 1970 have no room in a float.
         whole: Integers = column.astype(np.int64) * round(to_nanoseconds)
@@ -203,7 +198,7 @@ def _stamp(motor: Motor, table: Table) -> Integers | None:
 
 
 def _tell_offset(
-    motor: Motor, topic: str, fits: Mapping[str, ClockFit], always: bool = False
+    motor: Motor, topic: str, fits: Mapping[str, clock.ClockFit], always: bool = False
 ) -> None:
     fit = fits[topic]
     if always or abs(fit.offset) > 1e9 or abs(fit.drift) > 1e-4:
@@ -214,7 +209,7 @@ def _tell_offset(
         motor.tell("clock_offset", text, offset=fit.offset * 1e-9, drift=fit.drift)
 
 
-def _series(motor: Motor, name: str, signal: Signal, time: Integers) -> Series:
+def _series(motor: Motor, name: str, signal: mapping.Signal, time: Integers) -> Series:
     """Return one signal in SI at the motor shaft, in order, without what is no sample."""
     table = motor.tables[signal.topic]
     column = table.columns.get(signal.field)
@@ -261,14 +256,14 @@ def _order(motor: Motor, time: Integers, table: Table, topic: str) -> Integers:
     return chosen
 
 
-def _converted(motor: Motor, name: str, signal: Signal, raw: NDArray[Any]) -> NDArray[Any]:
+def _converted(motor: Motor, name: str, signal: mapping.Signal, raw: NDArray[Any]) -> NDArray[Any]:
     """Return values in SI at the motor shaft; counts as int64."""
     if name == "count":
         exact = signal.scale == 1 and signal.offset == 0
         if raw.dtype.kind in "iu" and exact:
             return raw.astype(np.int64, copy=False)
         return raw.astype(np.float64) * signal.scale + signal.offset
-    unit = signal.unit or check_unit(name, "")
+    unit = signal.unit or units.check_unit(name, "")
     values: Array = raw.astype(np.float64)
     values *= signal.scale
     values += signal.offset
@@ -276,7 +271,7 @@ def _converted(motor: Motor, name: str, signal: Signal, raw: NDArray[Any]) -> ND
     if "supply" in motor.plan.signals and name == "voltage":
         supply = 1.0  # the supply as it was measured comes in below
     try:
-        by = factor(
+        by = units.factor(
             name,
             unit,
             counts_per_revolution=motor.hardware.counts_per_revolution,
@@ -292,7 +287,7 @@ def _converted(motor: Motor, name: str, signal: Signal, raw: NDArray[Any]) -> ND
     if unit.startswith("ticks"):
         shaft = signal.shaft or "motor"
     if name == "position" and not motor.plan.own:
-        values, width = unwrap_angle(values)
+        values, width = counter.unwrap_angle(values)
         if width:
             turns = width / (2 * np.pi)
             at = "one turn" if abs(turns - 1) < 1e-9 else f"{turns:.6g} turns"

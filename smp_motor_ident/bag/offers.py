@@ -7,11 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from smp_motor_ident.bag.source import Recording
-from smp_motor_ident.bag.storage import Channel
-from smp_motor_ident.bag.template import DecodeError, Number, names_beside, take_apart
+from smp_motor_ident.bag import source, storage, template, unpack
 from smp_motor_ident.bag.types import Types
-from smp_motor_ident.bag.unpack import decompress_messages
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.finding import Finding
 
@@ -49,7 +46,7 @@ class Listing:
     remark: str = ""  # why nothing is suggested, or what the data could not confirm
 
 
-def offers_of(recording: Recording, types: Types) -> list[Offer]:
+def offers_of(recording: source.Recording, types: Types) -> list[Offer]:
     """Return the topics of a recording with their fields, by its first messages."""
     if recording.is_table:
         return [
@@ -65,7 +62,7 @@ def offers_of(recording: Recording, types: Types) -> list[Offer]:
         topic = batch.channel.topic
         offer = found.setdefault(topic, Offer(topic, batch.channel.type))
         if not offer.count:
-            plain, _ = decompress_messages(batch.take(np.arange(1)), recording.budget)
+            plain, _ = unpack.decompress_messages(batch.take(np.arange(1)), recording.budget)
             offer.fields, offer.remark = _fields(types, plain) if len(plain) else ([], "damaged")
         offer.count += len(batch)
         first, last = spans.get(topic, (2**63 - 1, -(2**63)))
@@ -77,7 +74,7 @@ def offers_of(recording: Recording, types: Types) -> list[Offer]:
     return [found[topic] for topic in sorted(found)]
 
 
-def _by_length(channel: Channel) -> list[tuple[int, list[str]]]:
+def _by_length(channel: storage.Channel) -> list[tuple[int, list[str]]]:
     """Return the columns of a table by their length, the longest first; 0 where all have one."""
     if not channel.lengths:
         return [(0, list(channel.fields))]
@@ -95,10 +92,10 @@ def _fields(types: Types, batch: Any) -> tuple[list[str], str]:
     try:
         for definitions in types.candidates(channel):
             try:
-                root = take_apart(
+                root = template.take_apart(
                     batch.message(0), channel.type, definitions, channel.encoding
                 ).root
-            except DecodeError as error:
+            except template.DecodeError as error:
                 reason = str(error)
                 continue
             fields = (_paths(name, value, root) for name, value in root.items() if name != "header")
@@ -112,17 +109,17 @@ def _paths(path: str, value: Any, parent: dict[str, Any]) -> Iterator[str]:
     if isinstance(value, dict):
         for name, inner in value.items():
             yield from _paths(f"{path}.{name}", inner, value)
-    elif isinstance(value, Number) and value.count is None:
+    elif isinstance(value, template.Number) and value.count is None:
         yield path
-    elif isinstance(value, Number) or (
+    elif isinstance(value, template.Number) or (
         isinstance(value, list) and value and isinstance(value[0], dict)
     ):
-        count = (value.count or 0) if isinstance(value, Number) else len(value)
+        count = (value.count or 0) if isinstance(value, template.Number) else len(value)
         keys: list[Any] = list(range(min(count, _LISTED)))
-        for texts in names_beside(parent).values():
+        for texts in template.names_beside(parent).values():
             if len(texts) == count and len({text.value for text in texts}) == count:
                 keys = [text.value for text in texts]
                 break
         for k, key in enumerate(keys):
-            inner = value[k] if isinstance(value, list) else Number(0, "")
+            inner = value[k] if isinstance(value, list) else template.Number(0, "")
             yield from _paths(f"{path}[{key}]", inner, parent)

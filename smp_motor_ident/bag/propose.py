@@ -13,27 +13,10 @@ from typing import Any
 import numpy as np
 
 from smp_motor_control.arrays import Array
-from smp_motor_ident.bag.axis import Series
-from smp_motor_ident.bag.checks import signed
-from smp_motor_ident.bag.decode import collect
-from smp_motor_ident.bag.drives import LAGS, clock_of, follows, unexplained
-from smp_motor_ident.bag.mapping import DEFAULT_MOTOR, SignalMap, parse
-from smp_motor_ident.bag.names import (
-    MAY_BE_SUPPLY,
-    MOTIONS,
-    WORDS_OF_VOLTS,
-    hint_of,
-    is_barred,
-    motor_of,
-    role_of,
-    wheel_of,
-    worded,
-)
+from smp_motor_ident.bag import axis, checks, decode, drives, mapping, names, read, storage
 from smp_motor_ident.bag.offers import Listing, Offer, offers_of
-from smp_motor_ident.bag.read import STATE, one_line, read_recording
 from smp_motor_ident.bag.runs import runs
 from smp_motor_ident.bag.source import Recording, recordings
-from smp_motor_ident.bag.storage import found
 from smp_motor_ident.bag.tables import EPOCHS, TIME_NAMES, is_time_of_part, self_described
 from smp_motor_ident.bag.types import Types
 from smp_motor_ident.bag.units import of_the_rim, unit_of
@@ -68,11 +51,13 @@ class _Candidate:
         text = f"{self.offer.topic}.{self.path}"
         if unit := unit_of(self.role, self.offer.units.get(self.path, ""), text):
             return f":{unit}"
-        hint = hint_of(self.role, text)
+        hint = names.hint_of(self.role, text)
         whole = self.value[np.isfinite(self.value)]
         if self.role == "voltage" and not hint and whole.size:
             steps = np.array_equal(whole, np.rint(whole)) and np.abs(whole).max() > 48
-            hint = ":pwm" if steps and not re.search(WORDS_OF_VOLTS, text, re.IGNORECASE) else ""
+            hint = (
+                ":pwm" if steps and not re.search(names.WORDS_OF_VOLTS, text, re.IGNORECASE) else ""
+            )
         if hint == ":duty" and np.abs(whole).max(initial=0.0) > 1:
             hint = ":pwm"  # of a scale that is asked for
         return hint
@@ -83,16 +68,16 @@ def list_topics(paths: Any, msg_files: Iterable[str] = ()) -> list[Listing]:
     types = Types(msg_files)
     listings = []
     for recording in recordings(paths):
-        with one_line(recording):
+        with read.one_line(recording):
             offers = offers_of(recording, types)
-            needed = all(offer.type != STATE for offer in offers)
+            needed = all(offer.type != read.STATE for offer in offers)
             proposal = propose(recording, offers, types) if needed else Proposal()
             if proposal.items:
                 try:
-                    read_recording(recording, _filled(proposal), types)
+                    read.read_recording(recording, _filled(proposal), types)
                 except BagError as error:
                     text = f"a mapping was proposed by names and cannot be read: {error}"
-                    recording.findings.append(found("proposal_failed", text))
+                    recording.findings.append(storage.found("proposal_failed", text))
                     proposal = Proposal(remark="no mapping is suggested that can be read")
         made = (proposal.items, proposal.asked, needed, recording.findings, proposal.remark)
         listings.append(Listing(recording.name, offers, *made))
@@ -149,7 +134,7 @@ def _by_names(every: Sequence[_Candidate]) -> tuple[list[tuple[str, list[_Candid
     for wheel, fields in sorted(wheels.items()):
         ways = [c for c in fields if c.role == "direction"][:1]
         voltages = [c for c in fields if c.role == "voltage"] or shared
-        motions = [c for c in fields if c.role in MOTIONS]
+        motions = [c for c in fields if c.role in names.MOTIONS]
         sizes = [c for c in voltages if ways and c.value.size and c.value.min() >= 0]
         chosen = []
         try:
@@ -171,10 +156,10 @@ def _of_motors(every: Sequence[_Candidate]) -> list[_Candidate]:
 
     What a name ends in tells motors (``velL``), what a field is a part of runs (``run_2.u``).
     """
-    for tell in (motor_of, _whole_of):
+    for tell in (names.motor_of, _whole_of):
         named = [c if c.wheel else replace(c, wheel=tell(c.path)) for c in every]
         driven = {c.wheel for c in named if c.role == "voltage"}
-        moved = {c.wheel for c in named if c.role in MOTIONS and c.wheel}
+        moved = {c.wheel for c in named if c.role in names.MOTIONS and c.wheel}
         apart = moved if "" in driven else moved & driven
         if len(apart) > 1:
             return [mine if mine.wheel in apart else c for mine, c in zip(named, every)]
@@ -188,14 +173,14 @@ def _whole_of(path: str) -> str:
 
 def _directed(voltage: _Candidate, way: _Candidate) -> _Candidate:
     """Return a voltage that is a size with its direction; BagError where that tells no sign."""
-    size, direction = (Series(c.time.astype(np.int64), c.value) for c in (voltage, way))
-    return replace(voltage, value=signed(size, direction, way.source).value)
+    size, direction = (axis.Series(c.time.astype(np.int64), c.value) for c in (voltage, way))
+    return replace(voltage, value=checks.signed(size, direction, way.source).value)
 
 
 def _rising(every: list[_Candidate]) -> _Candidate | None:
     """Return the column without a telling name that rises as a time does."""
     unnamed = [c for c in every if not c.role]
-    k = clock_of([c.value for c in unnamed])
+    k = drives.clock_of([c.value for c in unnamed])
     return None if k is None else replace(unnamed[k], role="time")
 
 
@@ -205,13 +190,13 @@ def _by_data(every: list[_Candidate]) -> list[_Candidate]:
     fields = [c for c in every if c.value.size == size][:_WIDEST]
     unnamed = [c for c in fields if not c.role]
     voltages = [c for c in fields if c.role == "voltage"] or unnamed
-    motions = [c for c in fields if c.role in MOTIONS] or unnamed
+    motions = [c for c in fields if c.role in names.MOTIONS] or unnamed
     best, pair = 0.0, []
     for u, y in product(voltages, motions) if unnamed else ():
         drive, moved = u.value[:_MOST], y.value[:_MOST]
-        share, summed = (0.0, False) if u is y else follows(drive, moved)
+        share, summed = (0.0, False) if u is y else drives.follows(drive, moved)
         steps = np.diff(moved, prepend=moved[:1]) if summed else moved
-        if share > best and unexplained(drive, steps) is not None:
+        if share > best and drives.unexplained(drive, steps) is not None:
             way = "count" if np.array_equal(y.value, np.rint(y.value)) else "position"
             way = y.role or (way if summed else "velocity")
             best, pair = share, [replace(u, role="voltage"), replace(y, role=way)]
@@ -245,13 +230,13 @@ def _of_the_file(recording: Recording) -> Proposal | None:
     if not recording.is_table:
         return None
     try:
-        plans = self_described(recording, SignalMap())
+        plans = self_described(recording, mapping.SignalMap())
     except BagError:
         return None
     items, rim = [], False
     for wheel, plan in plans.items():
         for name, signal in plan.signals.items():
-            prefix = f"{wheel}." if name != "time" and wheel != DEFAULT_MOTOR else ""
+            prefix = f"{wheel}." if name != "time" and wheel != mapping.DEFAULT_MOTOR else ""
             source = f"{signal.topic}.{signal.field}" if signal.topic else signal.field
             items.append(f"{prefix}{name}={source}" + (f":{signal.unit}" if signal.unit else ""))
             rim |= of_the_rim(name, signal.unit)
@@ -262,8 +247,10 @@ def _of_the_file(recording: Recording) -> Proposal | None:
 
 def _untestable(voltages: list[_Candidate], motions: list[_Candidate]) -> list[_Candidate]:
     """Return a voltage that changes less often than a test needs, and a motion, by their names."""
-    seldom = [c for c in voltages if c.value.size and _changes(c) < LAGS]
-    moving = [c for role in MOTIONS for c in motions if c.role == role and np.ptp(c.value) > 0]
+    seldom = [c for c in voltages if c.value.size and _changes(c) < drives.LAGS]
+    moving = [
+        c for role in names.MOTIONS for c in motions if c.role == role and np.ptp(c.value) > 0
+    ]
     return [seldom[0], moving[0]] if seldom and moving else []
 
 
@@ -283,16 +270,16 @@ def _reason(fields: list[_Candidate]) -> str:
     """Return why nothing is proposed."""
     roles = {c.role for c in fields}
     missing = [] if "voltage" in roles else ["a voltage"]
-    missing += [] if roles & set(MOTIONS) else ["a motion"]
+    missing += [] if roles & set(names.MOTIONS) else ["a motion"]
     if missing:
         return f"no field is called {' or '.join(missing)}"
     return "no field that is called a voltage explains one that is called a motion"
 
 
-def _filled(proposal: Proposal) -> SignalMap:
+def _filled(proposal: Proposal) -> mapping.SignalMap:
     """Return the mapping of a proposal, with any value for what the user must add."""
     unit = ":ms" if any(text.startswith("time=") for text in proposal.asked) else ""
-    given = parse([i + unit if i.startswith("time=") else i for i in proposal.items])
+    given = mapping.parse([i + unit if i.startswith("time=") else i for i in proposal.items])
     hardware = {"supply_voltage": 12.0, "counts_per_revolution": 1.0}
     ones: Any = dict.fromkeys(("pwm_full_scale", "wheel_radius", "sample_time"), 1.0)
     motors = {
@@ -320,15 +307,17 @@ def _candidates(
         for path in offer.fields:
             if (time is not None and path == time.path) or is_time_of_part(path):
                 continue
-            role = role_of(offer.topic, path)
-            if (role or offer.table) and not is_barred(role, f"{offer.type} {offer.topic} {path}"):
+            role = names.role_of(offer.topic, path)
+            if (role or offer.table) and not names.is_barred(
+                role, f"{offer.type} {offer.topic} {path}"
+            ):
                 named.append((role, offer, path))
     wanted: dict[str, list[str]] = {}
     for _, offer, path in named:
         wanted.setdefault(offer.topic, []).append(path)
     if time is not None and time.offer.topic in wanted:
         wanted[time.offer.topic].append(time.path)
-    tables = collect(recording, wanted, types)
+    tables = decode.collect(recording, wanted, types)
     for role, offer, path in named:
         table = tables[offer.topic]
         if path not in table.columns:
@@ -342,7 +331,7 @@ def _candidates(
         at = np.arange(value.size) if clock is None else clock
         there = table.present.get(path)
         kept = np.isfinite(value) & (True if there is None else there)
-        wheel = wheel_of(f"{offer.topic}.{path}")
+        wheel = names.wheel_of(f"{offer.topic}.{path}")
         if not (role == "voltage" and _is_supply(path, value[kept])):
             role = _counted(role, value[kept])
             yield _Candidate(role, wheel, offer, path, at.astype(np.float64)[kept], value[kept])
@@ -357,7 +346,7 @@ def _is_supply(name: str, value: Array) -> bool:
     """Return whether a voltage may be the supply's by its name, and never falls to half of it."""
     size = np.abs(value)
     return bool(
-        re.search(MAY_BE_SUPPLY, worded(name), re.IGNORECASE)
+        re.search(names.MAY_BE_SUPPLY, names.worded(name), re.IGNORECASE)
         and size.size
         and 0 < size.max() < 2 * size.min()
     )
@@ -372,7 +361,7 @@ def _explained(voltages: list[_Candidate], motions: list[_Candidate]) -> list[_C
         if explained and explained[0][1] < least:
             least = explained[0][1]
             first = {c.role: c for c, _ in reversed(explained)}
-            best = [voltage, *(first[role] for role in MOTIONS[::-1] if role in first)]
+            best = [voltage, *(first[role] for role in names.MOTIONS[::-1] if role in first)]
     return best
 
 
@@ -386,4 +375,4 @@ def _rest(voltage: _Candidate, motion: _Candidate) -> float | None:
         return None
     ranked = np.argsort(voltage.time, kind="stable")
     index = np.searchsorted(voltage.time[ranked], motion.time[order], "right") - 1
-    return unexplained(voltage.value[ranked][np.maximum(index, 0)], y)
+    return drives.unexplained(voltage.value[ranked][np.maximum(index, 0)], y)

@@ -8,14 +8,12 @@ from itertools import product
 import numpy as np
 
 from smp_motor_control.arrays import Integers
-from smp_motor_ident.bag.limits import SECONDS_APART
+from smp_motor_ident.bag import limits, runs, units
 from smp_motor_ident.bag.mapping import DEFAULT_MOTOR, MotorMap, Signal, SignalMap
 from smp_motor_ident.bag.names import MOTIONS
 from smp_motor_ident.bag.readers.grid import without_unit
-from smp_motor_ident.bag.runs import laid_out
 from smp_motor_ident.bag.source import Recording
 from smp_motor_ident.bag.storage import TABLE, Channel, Table, found
-from smp_motor_ident.bag.units import FACTORS, unit_of
 from smp_motor_ident.errors import BagError
 
 TIME_NAMES = (
@@ -68,7 +66,7 @@ def _unit(name: str, signal: Signal, channel: Channel, field: str) -> str:
     """Return a signal's unit: as mapped, else as the file writes it."""
     if signal.unit or (signal.scale, signal.offset) != (1.0, 0.0):
         return signal.unit
-    return unit_of(name, channel.units.get(field, ""), field)
+    return units.unit_of(name, channel.units.get(field, ""), field)
 
 
 def self_described(recording: Recording, asked: SignalMap) -> dict[str, MotorMap]:
@@ -157,14 +155,14 @@ def timed(recording: Recording, plan: MotorMap, tables: Mapping[str, Table]) -> 
             raise BagError(f"{recording.files[0]}: has no rows with a time")
         result[topic] = Table(log, None, columns, findings=findings, clocked=True)
     rows = {topic: result[topic] for topic in written}
-    return result | laid_out(rows, plan.gap, recording.name)
+    return result | runs.laid_out(rows, plan.gap, recording.name)
 
 
 def _check_seconds(log: Integers, signal: Signal, recording: Recording) -> None:
     """Refuse a time without a unit that cannot be in seconds: no motor shows in such rows."""
     steps = np.diff(log[log > _NEVER]) * 1e-9
     step = float(np.median(steps)) if steps.size else 0.0
-    if step >= SECONDS_APART.value:
+    if step >= limits.SECONDS_APART.value:
         raise BagError(
             f"{recording.files[0]}: {signal.field} rises by {step:g} a row, which are no seconds; "
             f"tell its unit: time={signal.field}:ms (or us, ns; s where it is seconds)"
@@ -183,7 +181,7 @@ def _nanoseconds(table: Table, signal: Signal) -> tuple[Integers, str]:
     if not unit:
         size = np.nanmedian(np.abs(column.astype(np.float64))) if column.size else 0.0
         unit = next((name for least, name in EPOCHS if size > least), "")
-    factor = FACTORS["time"][unit or "s"] * signal.scale * 1e9
+    factor = units.FACTORS["time"][unit or "s"] * signal.scale * 1e9
     if column.dtype.kind in "iu" and factor == round(factor):
         return column.astype(np.int64) * round(factor), unit
     values = column.astype(np.float64) * factor

@@ -13,12 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from smp_motor_control.arrays import Array, Integers
-from smp_motor_ident.bag.clock import SAME_CLOCK, fit_clock, mean_held
-from smp_motor_ident.bag.decode import collect
-from smp_motor_ident.bag.read import STATE
-from smp_motor_ident.bag.source import Recording, recordings
+from smp_motor_ident.bag import clock, decode, read, source, types
 from smp_motor_ident.bag.storage import Table
-from smp_motor_ident.bag.types import Types
 from smp_motor_ident.errors import BagError
 
 COMMAND = "smp_interfaces/msg/MotorCommand"
@@ -53,7 +49,7 @@ class TransportDelay:
 def measure_delay(path: Path) -> dict[str, TransportDelay]:
     """Measure the delay of every wheel's loop from a bag, of those with enough answers."""
     found: dict[str, TransportDelay] = {}
-    for recording in recordings([path]):
+    for recording in source.recordings([path]):
         found |= _of_recording(recording)
     if not found:
         raise BagError(
@@ -63,17 +59,17 @@ def measure_delay(path: Path) -> dict[str, TransportDelay]:
     return found
 
 
-def _of_recording(recording: Recording) -> dict[str, TransportDelay]:
+def _of_recording(recording: source.Recording) -> dict[str, TransportDelay]:
     if recording.is_table:
         return {}
     kinds = {channel.topic: channel.type for channel in recording.channels()}
     pairs = {}
     for topic, kind in kinds.items():
         place = topic.rpartition("/")[0]
-        if kind == STATE and kinds.get(f"{place}/motor_command") == COMMAND:
+        if kind == read.STATE and kinds.get(f"{place}/motor_command") == COMMAND:
             pairs[place.rpartition("/")[2]] = topic, f"{place}/motor_command"
     wanted = {topic: ["voltage"] for pair in pairs.values() for topic in pair}
-    tables = collect(recording, wanted, Types())
+    tables = decode.collect(recording, wanted, types.Types())
     delays = {w: _delay(tables[state], tables[command]) for w, (state, command) in pairs.items()}
     return {wheel: delay for wheel, delay in delays.items() if delay is not None}
 
@@ -85,9 +81,9 @@ def _delay(state: Table, command: Table) -> TransportDelay | None:
     if np.count_nonzero(answers) < LEAST_ANSWERS:
         return None
     stamp, log = command.stamp[answers], command.logged[answers]
-    offset = fit_clock(state.stamp, state.logged)
+    offset = clock.fit_clock(state.stamp, state.logged)
     # On another clock the fastest state stands for no latency at all.
-    one_clock = abs(offset.offset) < SAME_CLOCK
+    one_clock = abs(offset.offset) < clock.SAME_CLOCK
     arrival = 1e-9 * (log - (stamp if one_clock else offset.to_log(stamp)))
     usual, longest = (float(q) for q in np.quantile(arrival, (0.5, SHARE)))
     period = 1e-9 * float(np.median(np.diff(np.sort(state.stamp))))
@@ -114,7 +110,7 @@ def _until_applied(state: Table, stamp: Integers, voltage: Array, period: float)
     left = []
     for trial in trials:
         shifted = stamp + round(1e9 * trial)
-        off = (acted - mean_held(shifted, voltage, "after", time))[1:]
+        off = (acted - clock.mean_held(shifted, voltage, "after", time))[1:]
         # The middle of the errors: a command that was late or lost says nothing of the others.
         left.append(math.sqrt(float(np.mean(np.sort(off**2)[: int(0.9 * off.size)]))))
     best = int(np.argmin(left))

@@ -18,13 +18,10 @@ from smp_motor_control import WHEELS, controller_of
 from smp_motor_control.motor.file import load_motors
 from smp_motor_control.wheel.protection import Bounds
 from smp_motor_ident import bag
-from smp_motor_ident.cli import checking, plan, protocol, steps, verifying
-from smp_motor_ident.cli.commission import NAME
+from smp_motor_ident.cli import checking, commission, plan, protocol, steps, verifying
 from smp_motor_ident.cli.processes import ProcessError, Processes, connect
 from smp_motor_ident.cli.protocol import Protocol
-from smp_motor_ident.diagnosis import validation_run
-from smp_motor_ident.diagnosis.wheel_limits import OVER_SPEED
-from smp_motor_ident.diagnosis.winding import heated
+from smp_motor_ident.diagnosis import validation_run, wheel_limits, winding
 from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.estimation.simulation import simulate
 from smp_motor_ident.finding import Finding
@@ -88,7 +85,7 @@ def _commission(arguments: argparse.Namespace, folder: Path, known: Mapping[str,
     ros = tuple(arguments.ros_arguments)
     bounds = {"max_speed": arguments.max_speed or 0.0, "max_current": arguments.max_current}
     # The client leaves last: who excites has ended when the controllers are given back.
-    with connect(NAME, ros) as client, Processes(folder / "logs") as processes:
+    with connect(commission.NAME, ros) as client, Processes(folder / "logs") as processes:
         wheels = tuple(dict.fromkeys(arguments.wheel or ())) or _found(client)
         robot = steps.Robot(processes, client, wheels or WHEELS, folder, ros, bounds)
         rates = client.wait_for_wheels(robot.wheels, timeout=15.0)
@@ -166,7 +163,7 @@ def _record(session: Session, one: plan.Recording) -> None:
     arguments, robot = session.arguments, session.robot
     speed = session.protocol.document.get("speed")
     if speed and not arguments.max_speed:
-        fastest = OVER_SPEED.value * float(speed)
+        fastest = wheel_limits.OVER_SPEED.value * float(speed)
         robot = replace(robot, bounds={**robot.bounds, "max_speed": fastest})
     session.begin(one.part, one.describe())
     draft = robot.folder / DRAFT
@@ -189,7 +186,7 @@ def too_hot(folder: Path, earlier: Sequence[plan.Recording], last: plan.Recordin
         bag.read_experiments([str(folder / r.folder / r.name) for r in some]) if some else {}
         for some in (earlier, [last])
     )
-    return [f for w in now if w in before for f in heated(w, before[w], now[w][0])]
+    return [f for w in now if w in before for f in winding.heated(w, before[w], now[w][0])]
 
 
 def _design(session: Session) -> verifying.Designed:

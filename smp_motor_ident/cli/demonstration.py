@@ -10,11 +10,8 @@ from typing import Any
 
 from smp_motor_control import LEFT, RIGHT, WHEELS, controller_of
 from smp_motor_control.motor.file import load_motors, paper_motors
-from smp_motor_ident.cli import steps
-from smp_motor_ident.cli.demo import NAME
-from smp_motor_ident.cli.driving import Drive, answers_of, drive_figure, longest_stall, read_drive
+from smp_motor_ident.cli import demo, driving, steps, verdict
 from smp_motor_ident.cli.processes import Processes, connect, free_domain, stop_when_orphaned
-from smp_motor_ident.cli.verdict import check_drive, check_estimates, show
 from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.result import Estimate
 
@@ -54,19 +51,19 @@ def work(arguments: argparse.Namespace) -> int:
     folder = _fresh(Path(arguments.output), arguments.keep)
     domain = free_domain() if arguments.domain is None else arguments.domain
     os.environ.update(ROS_DOMAIN_ID=str(domain), ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST")
-    with Processes(folder / "logs") as processes, connect(NAME) as client:
+    with Processes(folder / "logs") as processes, connect(demo.NAME) as client:
         robot = start(steps.Robot(processes, client, WHEELS, folder), motors, arguments.rate)
         say(f"running: motor_plant, {len(WHEELS)} wheel_pid, skid_steer (ROS domain {domain})")
         estimates, gains = learn(robot, say)
         driven, segments, stall = drive(robot, gains, say)
     hardware = {wheel: estimates[wheel].hardware for wheel in WHEELS}
-    answers = answers_of(driven, segments, hardware)
-    figure = drive_figure(driven, {"left": LEFT, "right": RIGHT}, hardware)
+    answers = driving.answers_of(driven, segments, hardware)
+    figure = driving.drive_figure(driven, {"left": LEFT, "right": RIGHT}, hardware)
     (folder / "drive.svg").write_text(figure, encoding="utf-8")
-    show(truth, estimates, gains, answers)
-    checks = check_estimates(truth, estimates)
+    verdict.show(truth, estimates, gains, answers)
+    checks = verdict.check_estimates(truth, estimates)
     if stall <= STALL:
-        checks += check_drive(answers)
+        checks += verdict.check_drive(answers)
     else:
         print(f"---- the drive is not judged: this machine stood still for {1e3 * stall:.0f} ms")
     for one in checks:
@@ -119,7 +116,7 @@ def learn(robot: steps.Robot, say: Any) -> tuple[dict[str, Estimate], dict[str, 
 
 def drive(
     robot: steps.Robot, gains: Mapping[str, Mapping[str, Any]], say: Any
-) -> tuple[Drive, list[tuple[str, float, float]], float]:
+) -> tuple[driving.Drive, list[tuple[str, float, float]], float]:
     """Drive through :data:`DRIVE` with the gains; return recording, segments and stall [s]."""
     from smp_motor_control.nodes.driving import drive_body
 
@@ -132,8 +129,8 @@ def drive(
         bag = steps.record(robot, name, "motor_command", "pid_state")
         segments = drive_body(robot.client, DRIVE, robot.wheels)
         robot.processes.stop("record")
-        read = read_drive(bag, robot.wheels)
-        stall = longest_stall(read)
+        read = driving.read_drive(bag, robot.wheels)
+        stall = driving.longest_stall(read)
         drives.append((stall, name, read, segments))
         if stall <= STALL:
             break

@@ -16,10 +16,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from smp_motor_ident import bag, likelihood
-from smp_motor_ident.cli.frame import progress
+from smp_motor_ident.cli import frame, tables, workers
 from smp_motor_ident.cli.identify import NAME
-from smp_motor_ident.cli.tables import console, estimate_table, list_topics
-from smp_motor_ident.cli.workers import in_parallel
 from smp_motor_ident.compilation import load
 from smp_motor_ident.diagnosis.identifiability import what_next
 from smp_motor_ident.diagnosis.validation import split
@@ -27,7 +25,7 @@ from smp_motor_ident.errors import BagError, InsufficientExcitationError, Parame
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.estimation.simulation import simulate
 from smp_motor_ident.record import Record
-from smp_motor_ident.report import history, words
+from smp_motor_ident.report import figures, history, words
 from smp_motor_ident.report.document import (
     check_free,
     identification_document,
@@ -35,7 +33,6 @@ from smp_motor_ident.report.document import (
     now,
     write_together,
 )
-from smp_motor_ident.report.figures import Comparison, Role
 from smp_motor_ident.result import UNITS, Estimate, to_json
 
 if TYPE_CHECKING:
@@ -52,7 +49,7 @@ class Outcome:
     """What came out for one wheel: an estimate with its curves, or the reason why there is none."""
 
     estimate: Estimate | None = None
-    comparisons: tuple[Comparison, ...] = ()
+    comparisons: tuple[figures.Comparison, ...] = ()
     failure: SmpError | None = None
 
     @property
@@ -66,7 +63,7 @@ class Outcome:
 def work(arguments: argparse.Namespace) -> int:
     """Do what the arguments say."""
     if arguments.topics:
-        return list_topics(arguments.bags, arguments.msg, NAME)
+        return tables.list_topics(arguments.bags, arguments.msg, NAME)
     loop = None if arguments.controller is None else reconstruction(arguments)
     mapping = signal_map(arguments) if loop is None else setpoint_map(arguments)
     if not arguments.output:
@@ -80,7 +77,7 @@ def work(arguments: argparse.Namespace) -> int:
         return fleet.work(arguments, mapping, fixed)
     paths = [Path(arguments.output) / name for name in OUTPUTS]
     check_free(paths, arguments.force)
-    with progress(NAME, arguments.quiet) as say:
+    with frame.progress(NAME, arguments.quiet) as say:
         if not arguments.quiet and not any(COMPILED.glob("*.nbi")):
             print(f"{NAME}: compiling for this machine, only this once ...", file=sys.stderr)
         say("reading")
@@ -95,7 +92,7 @@ def work(arguments: argparse.Namespace) -> int:
         }
         if len(jobs) > 1:
             load()
-        outcomes = in_parallel(jobs, say)
+        outcomes = workers.in_parallel(jobs, say)
         if any(outcome.estimate for outcome in outcomes.values()):
             tunings = _tunings(outcomes, say) if arguments.tuning else {}
             say("writing the report")
@@ -175,9 +172,9 @@ def identify_wheel(
         return Outcome(failure=InsufficientExcitationError(text))
     judged = found.fit_percent.validation is not None
     fitted, held_out = (records, kept) if kept or not judged else split(records)
-    parts: dict[Role, Sequence[Record]] = {"estimation": fitted, "validation": held_out}
+    parts: dict[figures.Role, Sequence[Record]] = {"estimation": fitted, "validation": held_out}
     compared = [
-        Comparison(role, one.source, one.time, one.voltage, *simulate(found, one))
+        figures.Comparison(role, one.source, one.time, one.voltage, *simulate(found, one))
         for role, part in parts.items()
         for one in part
     ]
@@ -198,7 +195,7 @@ def _tunings(outcomes: Mapping[str, Outcome], say: Callable[..., None]) -> dict[
             return tuning_page.Tuning(found.wheel, reason=str(error))
 
     known = {wheel: out.estimate for wheel, out in outcomes.items() if out.estimate}
-    return in_parallel({wheel: partial(one, found) for wheel, found in known.items()}, say)
+    return workers.in_parallel({wheel: partial(one, found) for wheel, found in known.items()}, say)
 
 
 def _contents(
@@ -242,7 +239,7 @@ def _conclude(
         for found in estimates.values():
             _print(found, arguments)
         if estimates:
-            console().print(f"written: {', '.join(map(str, paths))}", soft_wrap=True)
+            tables.console().print(f"written: {', '.join(map(str, paths))}", soft_wrap=True)
     code = 0
     for wheel, one in outcomes.items():
         if one.failure:
@@ -256,8 +253,8 @@ def _conclude(
 
 
 def _print(found: Estimate, arguments: argparse.Namespace) -> None:
-    out = console()
-    out.print(estimate_table(found))
+    out = tables.console()
+    out.print(tables.estimate_table(found))
     for finding in words.findings(found):
         out.print(f"{finding.severity}: {finding.message}", soft_wrap=True)
         if finding.advice:

@@ -10,15 +10,13 @@ from smp_motor_control.motor.file import load_motors
 from smp_motor_control.motor.parameters import COMBINATIONS
 from smp_motor_control.parameter_file import flat
 from smp_motor_ident.bag.transport import TransportDelay, measure_delay
-from smp_motor_ident.cli import applying, frame, relaying
-from smp_motor_ident.cli.tune import TARGETS
+from smp_motor_ident.cli import applying, frame, relaying, tune
 from smp_motor_ident.errors import DesignError, ParameterError
 from smp_motor_ident.record import Hardware
 from smp_motor_ident.report.document import check_free, now, read_identification, write_together
 from smp_motor_ident.report.tuning_page import tuning_svg
 from smp_motor_ident.result import Estimate, Quantity, to_json
-from smp_motor_ident.tune import METHODS, Design, Loop, compare, design_wheels, recommend
-from smp_motor_ident.tune.case import COMMON
+from smp_motor_ident.tune import METHODS, Design, Loop, case, compare, design_wheels, recommend
 from smp_motor_ident.tune.curves import curves
 from smp_motor_ident.tune.exports import FORMATS, export
 from smp_motor_ident.tune.source import choose_source
@@ -95,7 +93,7 @@ def _first(given: float | None, identified: float | None) -> float | None:
 
 
 def _targets(arguments: argparse.Namespace) -> dict[str, Any]:
-    return {n: getattr(arguments, n) for n in TARGETS if getattr(arguments, n) is not None}
+    return {n: getattr(arguments, n) for n in tune.TARGETS if getattr(arguments, n) is not None}
 
 
 def _design(
@@ -115,7 +113,7 @@ def _design(
         if arguments.compare:
             say("comparing the methods")
             method = _compare(estimates, loops, targets)
-            known = (*METHODS[method].targets, *COMMON)
+            known = (*METHODS[method].targets, *case.COMMON)
             targets = {k: v for k, v in targets.items() if k in known}
         say("designing")
         wheels = design_wheels(

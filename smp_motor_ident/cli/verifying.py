@@ -11,9 +11,7 @@ import numpy as np
 
 from smp_motor_control import controller_of
 from smp_motor_ident.bag.decode import Columns, read_columns
-from smp_motor_ident.cli import steps
-from smp_motor_ident.cli.driving import wheel_angle
-from smp_motor_ident.cli.processes import ProcessError
+from smp_motor_ident.cli import driving, processes, steps
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune import verification
@@ -24,7 +22,7 @@ LEAD = 0.3  # rest before a change that is simulated with it [s]
 ATTEMPTS = 3  # drives; a drive that was disturbed is repeated, whatever it showed
 
 
-class NeverHeard(ProcessError):
+class NeverHeard(processes.ProcessError):
     """A wheel's controller that was not heard at a set-point of the drive."""
 
 
@@ -150,7 +148,7 @@ def _changes(
     asked = np.where(latest < 0, 0.0, setpoints[latest])
     step = float(document["loop"]["sample_time"])
     even, speed = verification.smoothed(
-        instants, wheel_angle(state, estimate.hardware)[shown], step
+        instants, driving.wheel_angle(state, estimate.hardware)[shown], step
     )
     rows = verification.predicted(
         estimate, designed.gains[wheel], document["loop"], asked, (instants, waited), even

@@ -29,8 +29,7 @@ from smp_motor_control import WHEELS, joint_of
 from smp_motor_control.encoder import wrap
 from smp_motor_control.errors import ParameterError, SmpError
 from smp_motor_control.fields import described, fixed, nested
-from smp_motor_control.nodes import runtime
-from smp_motor_control.nodes.executor import Untouched
+from smp_motor_control.nodes import executor, runtime
 from smp_motor_control.nodes.settings import Parameters
 from smp_motor_ident.bag import read
 from smp_motor_ident.bag.window import Window
@@ -38,8 +37,7 @@ from smp_motor_ident.estimate import estimate
 from smp_motor_ident.estimation.live import Demands, missing
 from smp_motor_ident.estimation.monitor import Monitor, commissioned_of
 from smp_motor_ident.record import Record
-from smp_motor_ident.report import history
-from smp_motor_ident.report.document import read_identification
+from smp_motor_ident.report import document, history
 from smp_motor_ident.result import Estimate
 
 UNHURRIED = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -104,7 +102,7 @@ class Wheel:
         )
         topic = f"{name}/motor_state"
         self._states = node.create_subscription(
-            MotorState, topic, self._on_state, UNHURRIED, callback_group=Untouched()
+            MotorState, topic, self._on_state, UNHURRIED, callback_group=executor.Untouched()
         )
         topic = f"{name}/motor_description"
         node.create_subscription(MotorDescription, topic, self._on_description, runtime.LATCHED)
@@ -266,7 +264,7 @@ def _monitors(settings: Settings) -> dict[str, Monitor]:
         if settings.history:
             raise ParameterError("history needs commissioned: whose history shall it be?")
         return {}
-    found = read_identification(Path(settings.commissioned))
+    found = document.read_identification(Path(settings.commissioned))
     return {n: Monitor(commissioned_of(found[n])) for n in settings.wheels if n in found}
 
 

@@ -20,11 +20,9 @@ from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from smp_motor_control.errors import SmpError
-from smp_motor_control.nodes import runtime
-from smp_motor_control.nodes.executor import Untouched
+from smp_motor_control.nodes import executor, runtime
 from smp_motor_control.ros_arguments import split_arguments
-from smp_motor_ident.bag import BagWriter
-from smp_motor_ident.bag.metadata import DEFAULT_QOS
+from smp_motor_ident.bag import BagWriter, metadata
 from smp_motor_ident.nodes.bag_arguments import Choice, chosen, message_class, quality
 
 TAKE_PERIOD = 0.004
@@ -52,7 +50,7 @@ def subscription_qos(offered: list[QoSProfile]) -> QoSProfile:
 def qos_document(qos: QoSProfile) -> dict[str, Any]:
     """Return a profile as the metadata of a bag write it."""
     document = {}
-    for name in DEFAULT_QOS:
+    for name in metadata.DEFAULT_QOS:
         value = getattr(qos, name)
         if isinstance(value, Duration):
             seconds, rest = divmod(value.nanoseconds, 1_000_000_000)
@@ -71,7 +69,7 @@ class Recorder(Node):
         self._choice = replace(choice, names=frozenset(own))
         self._topics: dict[str, Topic] = {}
         self._refused: set[str] = set()
-        self._group = Untouched()
+        self._group = executor.Untouched()
         self._look()
         runtime.steady_timer(self, LOOK_PERIOD, self._look)
         runtime.steady_timer(self, TAKE_PERIOD, self._take_all)

@@ -11,14 +11,11 @@ import numpy as np
 
 from smp_motor_control.arrays import Array
 from smp_motor_ident.errors import SmpError
+from smp_motor_ident.report import drawing, words
 from smp_motor_ident.report.chart import Chart, Curve
-from smp_motor_ident.report.drawing import document
-from smp_motor_ident.report.words import label, number
 from smp_motor_ident.result import Estimate
-from smp_motor_ident.tune import METHODS, Design, Loop, design
+from smp_motor_ident.tune import METHODS, Design, Loop, design, specification, writing
 from smp_motor_ident.tune.curves import Curves, curves
-from smp_motor_ident.tune.specification import Band
-from smp_motor_ident.tune.writing import gains_yaml
 
 SHARES = (0.3, 0.45, 0.65, 0.85, 1.0)
 """Of the bandwidth that the method chooses by itself, which is the largest integral gain's."""
@@ -101,7 +98,7 @@ def page_data(tunings: Mapping[str, Tuning]) -> dict[str, Any]:
 
 
 def _document(one: Choice) -> dict[str, Any]:
-    asked = {"bandwidth": number(one.bandwidth), "margin": f"{one.phase_margin:g}"}
+    asked = {"bandwidth": words.number(one.bandwidth), "margin": f"{one.phase_margin:g}"}
     if one.design is None or one.curves is None:
         return {**asked, "reason": one.reason}
     found = one.design
@@ -113,7 +110,7 @@ def _document(one: Choice) -> dict[str, Any]:
     return {
         **asked,
         "rows": _rows(found),
-        "yaml": gains_yaml({found.wheel: found}, head),
+        "yaml": writing.gains_yaml({found.wheel: found}, head),
         "charts": {
             chart.name: [
                 chart.x,
@@ -139,7 +136,7 @@ def _rows(found: Design) -> list[tuple[str, str, str]]:
     ]
 
 
-def _banded(band: Band, scale: float, unit: str) -> tuple[str, str]:
+def _banded(band: specification.Band, scale: float, unit: str) -> tuple[str, str]:
     value, low, high = (f"{round(scale * v, 3):.3g}" for v in (band.value, band.low, band.high))
     return f"{value}{unit}", f"{low} … {high}{unit}"
 
@@ -161,7 +158,7 @@ def tuning_charts(wheels: Mapping[str, Curves], limit: float, prefix: str = "") 
             for wheel, c in wheels.items()
         }
         curves = tuple(
-            Curve(label(wheel), rows[1], f"wheel-{k % 4 + 1}", "line", rows[0], rows[2])
+            Curve(words.label(wheel), rows[1], f"wheel-{k % 4 + 1}", "line", rows[0], rows[2])
             for k, (wheel, rows) in enumerate(bands.items())
         )
         if kind == "step":
@@ -170,7 +167,7 @@ def tuning_charts(wheels: Mapping[str, Curves], limit: float, prefix: str = "") 
             name=prefix + kind, title=title, y_label=y_label, log=log, lines=lines, curves=curves,
             x_label="time [ms]" if timed else "frequency [rad/s]",
             x=1e3 * x if timed else x, height=260,
-            summary=f"{title}, of {', '.join(map(label, wheels))}",
+            summary=f"{title}, of {', '.join(map(words.label, wheels))}",
         )  # fmt: skip
 
     return [
@@ -191,4 +188,4 @@ def _on(x: Array, own: Array, rows: Array) -> Array:
 
 def tuning_svg(wheels: Mapping[str, Curves], limit: float) -> str:
     """Return the charts one below the other, as an SVG document."""
-    return document(tuning_charts(wheels, limit), list(wheels))
+    return drawing.document(tuning_charts(wheels, limit), list(wheels))
