@@ -6,18 +6,16 @@ import sys
 
 from smp_motor_ident.bag import limits as recordings
 from smp_motor_ident.diagnosis import limits as estimates
-from smp_motor_ident.diagnosis import response_limits as responses
-from smp_motor_ident.diagnosis import sample_limits as samples
-from smp_motor_ident.diagnosis import wheel_limits as wheels
+from smp_motor_ident.diagnosis import response_limits, sample_limits, wheel_limits
 from smp_motor_ident.report import limits as fleets
 from smp_motor_ident.tune import limits as gains
 
 TABLES = {
     "Recordings": recordings,
-    "Samples": samples,
+    "Samples": sample_limits,
     "Estimates": estimates,
-    "Response over frequency": responses,
-    "Wheels on blocks": wheels,
+    "Response over frequency": response_limits,
+    "Wheels on blocks": wheel_limits,
     "Gains and loops": gains,
     "Many robots": fleets,
 }

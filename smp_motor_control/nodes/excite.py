@@ -97,12 +97,8 @@ class Excite(Node):
             signal(0.0)  # Prepared now, not in the first period.
             self._outputs.append((MotorWriter(self, f"{wheel}/"), signal))
             self._watched[wheel] = Protection(bounds)
-            self.create_subscription(
-                MotorState,
-                f"{wheel}/motor_state",
-                lambda message, wheel=wheel: self._watch(wheel, message),
-                runtime.STREAM_SUBSCRIBER,
-            )
+            topic, take = f"{wheel}/motor_state", partial(self._watch, wheel)
+            self.create_subscription(MotorState, topic, take, runtime.STREAM_SUBSCRIBER)
         self._begin: float | None = None
         self._all_heard = math.inf
         self._created = time.monotonic()

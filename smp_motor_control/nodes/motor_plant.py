@@ -113,16 +113,10 @@ class MotorPlant(Node):
         self._supply = Supply(0.0, settings.supply_resistance)
         self._nominal = max(entry.supply_voltage for entry in entries.values())
         self._supply.open_voltage = settings.battery_voltage or self._nominal
-        start = time.monotonic()
-        self._wheels = [
-            Wheel(
-                self,
-                name,
-                DrivenMotor(entry, settings.drive, self._supply, start, 97 * settings.seed + k),
-                settings.ohmmeter,
-            )
-            for k, (name, entry) in enumerate(entries.items())
-        ]
+        start, self._wheels = time.monotonic(), []
+        for seed, (name, entry) in enumerate(entries.items(), 97 * settings.seed):
+            motor = DrivenMotor(entry, settings.drive, self._supply, start, seed)
+            self._wheels.append(Wheel(self, name, motor, settings.ohmmeter))
         self._samples = self._late = 0
         self._period = 1.0 / settings.rate
         self._last = start

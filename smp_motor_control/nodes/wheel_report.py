@@ -19,6 +19,7 @@ _LEVELS = {
     State.TIMED_OUT: runtime.WARN,
     State.NOT_OURS: runtime.WARN,
 }
+_TERMS = ("p_term", "i_term", "d_term", "feedforward", "unsaturated")
 UNTUNED = (
     "no gains were given: p is 1 V s/rad, i and d are 0, made for no motor; start it with "
     "--params-file gains.yaml, which tune writes"
@@ -108,11 +109,7 @@ def pid_state(wheel: WheelController, joint: str, stamp: Any) -> PidState:
         reference=reference,
         measurement=wheel.measurement,
         error=reference - wheel.measurement,
-        p_term=out.p_term,
-        i_term=out.i_term,
-        d_term=out.d_term,
-        feedforward=out.feedforward,
-        unsaturated=out.unsaturated,
+        **{name: getattr(out, name) for name in _TERMS},
         output=wheel.output,
         saturated=wheel.output != out.unsaturated,
         dt=wheel.clock.dt,

@@ -9,6 +9,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 from sensor_msgs.msg import BatteryState
 
@@ -99,11 +100,11 @@ class WheelTest:
             self._commands[wheel] = 0.0
 
 
-def counter(counts_per_revolution: float, bits: int, gear_ratio: float) -> Counter:
+def counter(hardware: Any) -> Counter:
     """Return what gives total counts; where nothing counts, the motor's angle [rad]."""
-    if not counts_per_revolution:
-        return lambda message: float(message.position * gear_ratio)
-    unwrapped = Unwrapper(bits)
+    if not hardware.counts_per_revolution:
+        return lambda message: float(message.position * hardware.gear_ratio)
+    unwrapped = Unwrapper(hardware.encoder_bits)
     return lambda message: float(unwrapped(message.encoder_count))
 
 

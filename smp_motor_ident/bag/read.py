@@ -261,15 +261,5 @@ def described(message: Any) -> Hardware:
 
 def hardware_of(known: Mapping[str, float]) -> Hardware:
     """Return what is known of the hardware; what no hardware can have is not known."""
-
-    def positive(name: str) -> float | None:
-        value = known.get(name)
-        return value if value is not None and math.isfinite(value) and value > 0 else None
-
-    return Hardware(
-        gear_ratio=positive("gear_ratio") or 1.0,
-        counts_per_revolution=positive("counts_per_revolution"),
-        encoder_bits=int(known.get("encoder_bits") or 0),
-        supply_voltage=positive("supply_voltage"),
-        resistance=positive("resistance"),
-    )
+    sound: dict[str, Any] = {n: v for n, v in known.items() if math.isfinite(v) and v > 0}
+    return Hardware(**{**sound, "encoder_bits": int(sound.get("encoder_bits", 0))})

@@ -15,22 +15,9 @@ from rosbags.interfaces import Nodetype
 from smp_motor_ident.bag.types import Definitions
 from smp_motor_ident.errors import BagError
 
-_KINDS = {
-    "bool": "u1",
-    "byte": "u1",
-    "char": "u1",
-    "octet": "u1",
-    "int8": "i1",
-    "uint8": "u1",
-    "int16": "i2",
-    "uint16": "u2",
-    "int32": "i4",
-    "uint32": "u4",
-    "int64": "i8",
-    "uint64": "u8",
-    "float32": "f4",
-    "float64": "f8",
-}
+_NUMPYS = ("float32", "float64", *(f"{u}int{bits}" for u in ("", "u") for bits in (8, 16, 32, 64)))
+_KINDS = {name: np.dtype(name).str[1:] for name in _NUMPYS}
+_KINDS |= dict.fromkeys(("bool", "byte", "char", "octet"), "u1")
 _MOST_ELEMENTS = 100_000
 _STEP = re.compile(r"(\w+)((?:\[[^\]]*\])*)")
 

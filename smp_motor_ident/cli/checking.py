@@ -98,12 +98,7 @@ def check_wheels(
     said = wheel_test.descriptions(client, wheels, PATIENCE)
     hardware = {wheel: described(said[wheel]) if wheel in said else Hardware() for wheel in wheels}
     phases: list[Phase] = []
-    counters = {
-        wheel: wheel_test.counter(
-            one.counts_per_revolution or 0.0, one.encoder_bits, one.gear_ratio
-        )
-        for wheel, one in hardware.items()
-    }
+    counters = {wheel: wheel_test.counter(one) for wheel, one in hardware.items()}
     with wheel_test.WheelTest(client, counters, bounds).open() as test:
         for wheel in wheels:
             say(wheel)

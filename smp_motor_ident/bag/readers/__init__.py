@@ -9,16 +9,9 @@ from smp_motor_ident.bag.unpack import MAGIC, Budget, unpack_file
 from smp_motor_ident.errors import BagError
 
 FORMATS: tuple[Format, ...] = (
-    mcap.FORMAT,
-    sqlite.FORMAT,
-    ros1.FORMAT,
-    wpilog.FORMAT,
-    mat.FORMAT_4,
-    mat.FORMAT_5,
-    mat.FORMAT_73,
-    xlsx.FORMAT,
-    json.FORMAT,
-    csv.FORMAT,
+    *(mcap.FORMAT, sqlite.FORMAT, ros1.FORMAT, wpilog.FORMAT),
+    *(mat.FORMAT_4, mat.FORMAT_5, mat.FORMAT_73),
+    *(xlsx.FORMAT, json.FORMAT, csv.FORMAT),
 )
 BAGS = tuple(s for f in FORMATS if not f.tables for s in f.suffixes)
 TABLES = tuple(s for f in FORMATS if f.tables for s in f.suffixes)
