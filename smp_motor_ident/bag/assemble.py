@@ -35,11 +35,8 @@ def assemble(
     times = _clock(motor)
     if plan.clock == "auto":
         times = {topic: _on_beat(motor, topic, time) for topic, time in times.items()}
-    series = {
-        name: _series(motor, name, signal, times[signal.topic])
-        for name, signal in plan.signals.items()
-        if name != "time"
-    }
+    given = {name: signal for name, signal in plan.signals.items() if name != "time"}
+    series = {n: _series(motor, n, signal, times[signal.topic]) for n, signal in given.items()}
     _check(motor, series)
     if plan.signals["voltage"].topic == plan.signals[axis_name].topic:
         _drop_lost(motor, series, axis_name)
@@ -118,11 +115,8 @@ def _clock(motor: Motor) -> dict[str, Integers]:
     if motor.plan.clock == "log":
         motor.tell("time_base", "time: log times, as asked")
         return {topic: table.logged for topic, table in tables.items()}
-    poor = {
-        topic: reason
-        for topic, table in tables.items()
-        if (reason := clock.judge_stamps(stamps[topic], table.logged))
-    }
+    judged = {t: clock.judge_stamps(stamps[t], table.logged) for t, table in tables.items()}
+    poor = {topic: reason for topic, reason in judged.items() if reason}
     if motor.plan.clock == "header" and poor:
         topic, reason = next(iter(poor.items()))
         raise BagError(f"{motor.where}: {topic} has no usable header time: {reason}")
@@ -214,11 +208,9 @@ def _series(motor: Motor, name: str, signal: mapping.Signal, time: Integers) -> 
     table = motor.tables[signal.topic]
     column = table.columns.get(signal.field)
     there = table.present.get(signal.field)
-    if column is None:
-        raise BagError(f"{motor.where}: no message of {signal.topic} has {signal.field}")
-    order = _order(motor, time, table, signal.topic)
+    order = np.zeros(0, np.int64) if column is None else _order(motor, time, table, signal.topic)
     keep = order if there is None else order[there[order]]
-    if not keep.size:
+    if column is None or not keep.size:
         raise BagError(f"{motor.where}: no message of {signal.topic} has {signal.field}")
     values = column[keep]
     number = None if table.number is None else table.number[keep]

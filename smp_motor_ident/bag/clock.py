@@ -144,16 +144,13 @@ def mean_held(time: Integers, value: Array, held: str, at: Integers) -> Array:
     whole = np.interp(wanted, seconds, integral) + np.maximum(wanted - seconds[-1], 0) * value[-1]
     mean = np.empty(at.size)
     mean[1:] = np.diff(whole) / np.diff(wanted)
-    side = (
-        np.searchsorted(time, at[0], "right") - 1
-        if held == "after"
-        else np.searchsorted(time, at[0])
-    )
-    mean[0] = value[min(max(int(side), 0), value.size - 1)]
+    after = held == "after"
+    side = int(np.searchsorted(time, at[0], "right" if after else "left")) - after
+    mean[0] = value[min(max(side, 0), value.size - 1)]
     # Between these no input instant divides the interval between outputs.
     first, last = np.searchsorted(time, at[:-1], "right"), np.searchsorted(time, at[1:], "left")
     inside = first >= last
     # An interval without a change has exactly the level that holds there.
-    index = first - 1 if held == "after" else np.minimum(last, value.size - 1)
+    index = first - 1 if after else np.minimum(last, value.size - 1)
     mean[1:][inside] = value[np.clip(index, 0, value.size - 1)][inside]
     return mean

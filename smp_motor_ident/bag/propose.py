@@ -55,9 +55,8 @@ class _Candidate:
         whole = self.value[np.isfinite(self.value)]
         if self.role == "voltage" and not hint and whole.size:
             steps = np.array_equal(whole, np.rint(whole)) and np.abs(whole).max() > 48
-            hint = (
-                ":pwm" if steps and not re.search(names.WORDS_OF_VOLTS, text, re.IGNORECASE) else ""
-            )
+            volts = re.search(names.WORDS_OF_VOLTS, text, re.IGNORECASE)
+            hint = ":pwm" if steps and not volts else ""
         if hint == ":duty" and np.abs(whole).max(initial=0.0) > 1:
             hint = ":pwm"  # of a scale that is asked for
         return hint
@@ -282,9 +281,7 @@ def _filled(proposal: Proposal) -> mapping.SignalMap:
     given = mapping.parse([i + unit if i.startswith("time=") else i for i in proposal.items])
     hardware = {"supply_voltage": 12.0, "counts_per_revolution": 1.0}
     ones: Any = dict.fromkeys(("pwm_full_scale", "wheel_radius", "sample_time"), 1.0)
-    motors = {
-        wheel: replace(motor, hardware=hardware, **ones) for wheel, motor in given.motors.items()
-    }
+    motors = {w: replace(one, hardware=hardware, **ones) for w, one in given.motors.items()}
     return replace(given, motors=motors)
 
 
@@ -308,9 +305,8 @@ def _candidates(
             if (time is not None and path == time.path) or is_time_of_part(path):
                 continue
             role = names.role_of(offer.topic, path)
-            if (role or offer.table) and not names.is_barred(
-                role, f"{offer.type} {offer.topic} {path}"
-            ):
+            barred = names.is_barred(role, f"{offer.type} {offer.topic} {path}")
+            if (role or offer.table) and not barred:
                 named.append((role, offer, path))
     wanted: dict[str, list[str]] = {}
     for _, offer, path in named:
@@ -345,11 +341,8 @@ def _counted(role: str, value: Array) -> str:
 def _is_supply(name: str, value: Array) -> bool:
     """Return whether a voltage may be the supply's by its name, and never falls to half of it."""
     size = np.abs(value)
-    return bool(
-        re.search(names.MAY_BE_SUPPLY, names.worded(name), re.IGNORECASE)
-        and size.size
-        and 0 < size.max() < 2 * size.min()
-    )
+    named = re.search(names.MAY_BE_SUPPLY, names.worded(name), re.IGNORECASE)
+    return bool(named and size.size and 0 < size.max() < 2 * size.min())
 
 
 def _explained(voltages: list[_Candidate], motions: list[_Candidate]) -> list[_Candidate]:

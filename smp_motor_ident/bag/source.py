@@ -177,14 +177,11 @@ def _of_folder(path: Path) -> list[Recording]:
         groups.setdefault(split[1] if split else _stem(file), []).append(file)
     name = path.resolve().name
     text = f"{name}: has no metadata.yaml; all its files are read"
-    every = [
-        Recording(
-            name if len(groups) == 1 else f"{name}/{key}",
-            sorted(files, key=_order),
-            findings=[] if files[0].suffix == ".bag" else [found("no_metadata", text)],
-        )
-        for key, files in groups.items()
-    ]
+    every = []
+    for key, files in groups.items():
+        amiss = [] if files[0].suffix == ".bag" else [found("no_metadata", text)]
+        whole = name if len(groups) == 1 else f"{name}/{key}"
+        every.append(Recording(whole, sorted(files, key=_order), findings=amiss))
     tables = [s for s in TABLES if s not in _NAMED_ONLY]
     every += [Recording(p.name, [p]) for p in here if p.suffix.lower() in tables]
     for folder in sorted(p for p in path.iterdir() if p.is_dir() and not p.name.startswith(".")):

@@ -245,11 +245,9 @@ def _verify(session: Session, designed: verifying.Designed) -> str:
         print("the gains were taken back")
         refused += made.warned_of({f.evidence.get("wheel") for f in refused})
     made.stop(refused)
-    return "The wheels did as designed" + (
-        "; the gains are set in the running controllers."
-        if trial.kept
-        else "; the controllers have their former gains again."
-    )
+    now = "the gains are set in the running controllers"
+    before = "the controllers have their former gains again"
+    return f"The wheels did as designed; {now if trial.kept else before}."
 
 
 def _found(client: Any) -> tuple[str, ...]:

@@ -93,11 +93,10 @@ def identify_one(path: str, settings: tuple[Any, ...]) -> list[fleet.Row]:
                 rows.append(_row(path, wheel=wheel, failure=str(error)))
                 continue
             held = {**found.combinations, **found.parameters}
-            values = {
-                name: (float(q.value), float(q.std or 0.0))
-                for name, q in held.items()
-                if name in fleet.QUANTITIES and q.value is not None
+            known = {
+                n: held[n] for n in held if n in fleet.QUANTITIES and held[n].value is not None
             }
+            values = {n: (float(q.value or 0.0), float(q.std or 0.0)) for n, q in known.items()}
             told = dict(fit_percent=found.fit_percent.validation, unreliable=found.unreliable)
             rows.append(_row(path, wheel=wheel, values=values, **told))
     except SmpError as error:

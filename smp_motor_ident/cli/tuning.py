@@ -206,17 +206,15 @@ def read_estimates(source: Path) -> dict[str, Estimate]:
     for wheel, entry in load_motors(source).items():
         held = {name: float(getattr(entry.parameters, name)) for name in COMBINATIONS}
         held["delay"] = entry.delay
+        counts = entry.encoder.counts_per_revolution
+        hardware = Hardware(entry.gearbox.ratio, counts, supply_voltage=entry.supply_voltage)
         estimates[wheel] = Estimate(
             wheel=wheel,
             model="motor file",
             parameters={},
             combinations={name: Quantity(value, status="fixed") for name, value in held.items()},
             sources=(source.name,),
-            hardware=Hardware(
-                gear_ratio=entry.gearbox.ratio,
-                counts_per_revolution=entry.encoder.counts_per_revolution,
-                supply_voltage=entry.supply_voltage,
-            ),
+            hardware=hardware,
         )
     return estimates
 

@@ -71,8 +71,7 @@ def _interval(bounds: Any) -> Any:
     """Return an interval whose missing ends, which JSON cannot say, are infinite."""
     if not isinstance(bounds, list) or len(bounds) != 2:
         return bounds
-    low, high = bounds
-    return [-math.inf if low is None else low, math.inf if high is None else high]
+    return [end if one is None else one for one, end in zip(bounds, (-math.inf, math.inf))]
 
 
 def _matrix(kind: Any, value: Any) -> Any:

@@ -103,12 +103,8 @@ class _Plane:
         parts = []
         if curve.low is not None and curve.high is not None:
             ok = np.isfinite(curve.low) & np.isfinite(curve.high)
-            x = self.x(self.chart.x[ok])
-            ring = (
-                np.concatenate((x, x[::-1])),
-                np.concatenate((self.y(curve.high[ok]), self.y(curve.low[ok])[::-1])),
-            )
-            way = _polyline(*ring)
+            x, high, low = self.x(self.chart.x[ok]), self.y(curve.high[ok]), self.y(curve.low[ok])
+            way = _polyline(np.concatenate((x, x[::-1])), np.concatenate((high, low[::-1])))
             parts.append(f'<path d="{way}" fill="var(--{curve.color})" fill-opacity=".2"/>')
         keep = thin(curve.y, POINTS)
         x, y = self.x(self.chart.x[keep]), self.y(curve.y[keep])
@@ -141,9 +137,9 @@ def _range(values: Sequence[Array], log: bool, margin: float) -> tuple[float, fl
 def _place(values: Array, ends: tuple[float, float], log: bool, first: float, last: float) -> Array:
     low, high = ends
     with np.errstate(invalid="ignore", divide="ignore"):
-        share = (
-            np.log(values / low) / math.log(high / low) if log else (values - low) / (high - low)
-        )
+        if log:
+            values, low, high = np.log(values / low), 0.0, math.log(high / low)
+        share = (values - low) / (high - low)
     return np.asarray(first + np.clip(share, -0.02, 1.02) * (last - first))
 
 

@@ -103,14 +103,9 @@ def typeset(unit: str) -> str:
 def scaled(quantity: Quantity) -> Quantity:
     """Return a time in milliseconds, anything else as it is."""
     unit, factor = {"s": ("ms", 1e3), "s^2": ("ms²", 1e6)}.get(quantity.unit, (quantity.unit, 1.0))
-    value, std, ci95 = quantity.value, quantity.std, quantity.ci95
-    return replace(
-        quantity,
-        value=None if value is None else value * factor,
-        std=None if std is None else std * factor,
-        ci95=None if ci95 is None else (ci95[0] * factor, ci95[1] * factor),
-        unit=unit,
-    )
+    value, std = (None if one is None else one * factor for one in (quantity.value, quantity.std))
+    ci95 = quantity.ci95 and (quantity.ci95[0] * factor, quantity.ci95[1] * factor)
+    return replace(quantity, value=value, std=std, ci95=ci95, unit=unit)
 
 
 def status(quantity: Quantity) -> str:

@@ -7,6 +7,7 @@ SysId and its forerunner frc-characterization keep lists of rows by the name of 
 
 import json
 from collections.abc import Iterator, Mapping
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -135,12 +136,8 @@ def _sysid(
     document: Mapping[str, Any], name: str
 ) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
     """Return the columns of all tests, one behind another."""
-    rows = [
-        row
-        for test in _TESTS
-        for row in document.get(test) or []
-        if isinstance(row, list) and len(row) >= 4
-    ]
+    every = chain.from_iterable(document.get(test) or [] for test in _TESTS)
+    rows = [row for row in every if isinstance(row, list) and len(row) >= 4]
     width = max(map(len, rows), default=0)
     names = _SIMPLE if width == 4 else _DRIVE if document.get("sysid") else _OLD
     try:
@@ -153,10 +150,8 @@ def _sysid(
     turns = {"rotations": "rev", "radians": "rad", "degrees": "deg", "meters": "m", "feet": "ft"}
     unit = turns.get(str(document.get("units", "")).lower(), "")
     columns = {key: table[:, k] for k, key in enumerate(names[:width])}
-    units = {}
-    if unit:
-        units = {key: unit for key in columns if key.endswith("position")}
-        units |= {key: f"{unit}/s" for key in columns if key.endswith("velocity")}
+    ends = {"position": unit, "velocity": f"{unit}/s"} if unit else {}
+    units = {key: one for key in columns for end, one in ends.items() if key.endswith(end)}
     return columns, units
 
 

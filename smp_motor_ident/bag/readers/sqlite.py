@@ -43,12 +43,8 @@ class _SqliteFile(Messages):
         A recorder that died leaves its last messages there, and SQLite must write to
         bring them home.
         """
-        journals = [
-            journal
-            for suffix in ("-wal", "-journal")
-            if (journal := self.path.with_name(self.path.name + suffix)).is_file()
-            and journal.stat().st_size
-        ]
+        beside = (self.path.with_name(self.path.name + end) for end in ("-wal", "-journal"))
+        journals = [path for path in beside if path.is_file() and path.stat().st_size]
         if not journals:
             return self.path
         self._folder = tempfile.TemporaryDirectory(prefix="smp_bag_")
