@@ -21,14 +21,11 @@ class Guard:
     """The tool's end of the guard, which joins the graph by the tool's ROS arguments."""
 
     def __init__(self, arguments: Sequence[str]) -> None:
+        command, nowhere = [sys.executable, "-m", __name__, *arguments], subprocess.DEVNULL
         self._process = subprocess.Popen(
-            [sys.executable, "-m", __name__, *arguments],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
+            command, stdin=subprocess.PIPE, stdout=nowhere, stderr=nowhere, text=True,
             start_new_session=True,
-            text=True,
-        )
+        )  # fmt: skip
 
     def note(self, owed: Mapping[str, Any]) -> None:
         """Replace what is owed."""

@@ -221,33 +221,26 @@ class RobotClient:
         """Return the parameters of nodes by name; those that are not set are left out."""
         requests = {f"{n}/{GET}": GetParameters.Request(names=list(p)) for n, p in nodes.items()}
         answers = self.ask_all(GetParameters, requests)
-        return {
-            node: {
-                name: parameter_value_to_python(value)
-                for name, value in zip(names, answers[f"{node}/{GET}"].values, strict=False)
-                if value.type != ParameterType.PARAMETER_NOT_SET
-            }
-            for node, names in nodes.items()
-        }
+        found: dict[str, dict[str, Any]] = {}
+        for node, names in nodes.items():
+            pairs = zip(names, answers[f"{node}/{GET}"].values, strict=False)
+            there = [(n, v) for n, v in pairs if v.type != ParameterType.PARAMETER_NOT_SET]
+            found[node] = {name: parameter_value_to_python(value) for name, value in there}
+        return found
 
     def set_parameters(
         self, nodes: Mapping[str, Mapping[str, Any]], patience: float = PATIENCE
     ) -> None:
         """Set parameters of nodes, all of a node at once or none."""
-        requests = {
-            f"{node}/{SET}": SetParametersAtomically.Request(
-                parameters=[Parameter(n, value=v).to_parameter_msg() for n, v in values.items()]
-            )
-            for node, values in nodes.items()
-        }
+        requests = {}
+        for node, values in nodes.items():
+            given = [Parameter(n, value=v).to_parameter_msg() for n, v in values.items()]
+            requests[f"{node}/{SET}"] = SetParametersAtomically.Request(parameters=given)
         answers = self.ask_all(SetParametersAtomically, requests, patience)
         results = {node: answers[f"{node}/{SET}"].result for node in nodes}
-        refused = [
-            f"{self._full(node)} refused the parameters: {result.reason}"
-            for node, result in results.items()
-            if not result.successful
-        ]
-        if refused:
+        why = {node: result.reason for node, result in results.items() if not result.successful}
+        if why:
+            refused = (f"{self._full(n)} refused the parameters: {r}" for n, r in why.items())
             raise RobotError("; ".join(refused))
 
     def get_states(self, nodes: Sequence[str]) -> dict[str, str]:

@@ -19,6 +19,7 @@ from rclpy.node import Node
 
 from smp_interfaces.msg import MotorDescription
 from smp_motor_control import WHEELS
+from smp_motor_control import serial_protocol as protocol
 from smp_motor_control.encoder import Encoder, wrap
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.fields import described, fixed
@@ -26,18 +27,12 @@ from smp_motor_control.motor.parameters import Gearbox
 from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.motor_writer import MotorDriver
 from smp_motor_control.nodes.settings import Parameters
-from smp_motor_control.serial_protocol import (
-    CLOCK,
-    BoardState,
-    Lines,
-    decode_state,
-    encode_voltages,
-)
 
 POLL = 0.002  # interval at which the line is read [s]
 SILENCE = 0.5  # of a board, after which its line is opened again [s]
 COMMANDS = 0.02  # longest interval between two lines to the board [s]; it stops after 0.2 s without
 RESET = 1.0  # a board's clock that jumps by more than this was reset, and its counts with it [s]
+DESCRIBED = ("gear_ratio", "counts_per_revolution", "encoder_bits", "supply_voltage", "resistance")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,13 +65,7 @@ class Wheel:
 
     def __init__(self, node: Node, name: str, settings: Settings) -> None:
         self.settings, self.voltage, self.commanded = settings, 0.0, -math.inf
-        description = MotorDescription(
-            gear_ratio=settings.gear_ratio,
-            counts_per_revolution=settings.counts_per_revolution,
-            encoder_bits=settings.encoder_bits,
-            supply_voltage=settings.supply_voltage,
-            resistance=settings.resistance,
-        )
+        description = MotorDescription(**{name: getattr(settings, name) for name in DESCRIBED})
         timeout = settings.command_timeout
         self._driver = MotorDriver(node, name, timeout, self._command, description)
         self.lease = self._driver.lease
@@ -125,8 +114,8 @@ class SerialDriver(Node):
         self._settings = settings = Parameters(self, Settings).settings
         self._wheels = [Wheel(self, name, settings) for name in settings.wheel_names]
         self._fd: int | None = None
-        self._lines = Lines()
-        self._before: BoardState | None = None
+        self._lines = protocol.Lines()
+        self._before: protocol.BoardState | None = None
         self._heard = self._written = self._opened = -math.inf
         self._battery = settings.supply_voltage
         self._spoilt = self._resets = self._openings = 0
@@ -161,7 +150,7 @@ class SerialDriver(Node):
         except (OSError, termios.error) as error:
             self._problem = str(error.args[-1] if error.args else error)
             return
-        self._fd, self._lines, self._problem = fd, Lines(), ""
+        self._fd, self._lines, self._problem = fd, protocol.Lines(), ""
         self._openings += 1
 
     def _close(self, problem: str) -> None:
@@ -189,7 +178,7 @@ class SerialDriver(Node):
         found = False
         for line in self._lines.feed(data):
             try:
-                state = decode_state(line, len(self._wheels))
+                state = protocol.decode_state(line, len(self._wheels))
             except ParameterError as error:
                 self._spoilt, self._problem = self._spoilt + 1, str(error)
                 continue
@@ -197,9 +186,9 @@ class SerialDriver(Node):
             self._take(state)
         return found
 
-    def _take(self, state: BoardState) -> None:
+    def _take(self, state: protocol.BoardState) -> None:
         before, self._before, self._battery = self._before, state, state.battery
-        dt = math.nan if before is None else (state.clock - before.clock) % CLOCK * 1e-6
+        dt = math.nan if before is None else (state.clock - before.clock) % protocol.CLOCK * 1e-6
         if not 0.0 < dt < RESET:
             self._resets += before is not None
             self._forget()
@@ -212,7 +201,7 @@ class SerialDriver(Node):
         assert self._fd is not None
         voltages = [wheel.wanted(now, self._battery) for wheel in self._wheels]
         with contextlib.suppress(BlockingIOError):
-            os.write(self._fd, encode_voltages(voltages))
+            os.write(self._fd, protocol.encode_voltages(voltages))
             for wheel, voltage in zip(self._wheels, voltages):
                 wheel.applied = voltage
         self._written = now
@@ -237,7 +226,7 @@ class SerialDriver(Node):
         """Leave the motors at zero."""
         if self._fd is not None:
             with contextlib.suppress(OSError):
-                os.write(self._fd, encode_voltages([0.0] * len(self._wheels)))
+                os.write(self._fd, protocol.encode_voltages([0.0] * len(self._wheels)))
                 termios.tcdrain(self._fd)
             self._close("")
 

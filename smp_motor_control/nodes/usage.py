@@ -12,13 +12,8 @@ def main() -> int:
     """Print the help of the node whose module is the argument."""
     module = importlib.import_module(sys.argv[1])
     name = sys.argv[1].rpartition(".")[2]
-    lines = [
-        f"usage: {name} [--ros-args [-r __ns:=/NAMESPACE] [-p NAME:=VALUE] [--params-file FILE]]",
-        "",
-        (module.__doc__ or "").strip(),
-        "",
-        "parameters:",
-    ]
+    usage = f"{name} [--ros-args [-r __ns:=/NAMESPACE] [-p NAME:=VALUE] [--params-file FILE]]"
+    lines = [f"usage: {usage}", "", (module.__doc__ or "").strip(), "", "parameters:"]
     for parameter, entry in parameters_in(module.Settings).items():
         default = list(entry.default) if isinstance(entry.default, tuple) else entry.default
         fixed = " (at the start only)" if entry.read_only else ""
