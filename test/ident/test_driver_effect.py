@@ -1,6 +1,8 @@
 """What a driver makes of its command is estimated beside the motor, declared, and designed for."""
 
+import math
 from dataclasses import replace
+from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
@@ -20,6 +22,7 @@ from smp_motor_ident.model.driver import Driver, terminal_voltage
 from smp_motor_ident.model.measurement import SPEED
 from smp_motor_ident.model.structures import SecondOrder
 from smp_motor_ident.record import Record
+from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune.designer import design
 from smp_motor_ident.tune.loop import Loop
 
@@ -35,13 +38,13 @@ def commands(seed: int) -> np.ndarray:
 def run(voltage: np.ndarray, seed: int) -> np.ndarray:
     """Return the speed of a motor of first order with friction, exactly but for its stops."""
     fine, w, out = 100, 0.0, np.zeros(voltage.size)
-    keep = np.exp(-STEP / fine / TAU)
-    for k in range(1, voltage.size):
+    keep = math.exp(-STEP / fine / TAU)
+    for k, volts in enumerate(voltage.tolist()[1:], 1):
         for _ in range(fine):
-            if w == 0.0 and abs(voltage[k]) <= STATIC:
-                continue
-            direction = np.sign(w) if w != 0.0 else np.sign(voltage[k])
-            after = keep * w + (1 - keep) * GAIN * (voltage[k] - STATIC * direction)
+            if w == 0.0 and abs(volts) <= STATIC:
+                break
+            direction = math.copysign(1.0, w or volts)
+            after = keep * w + (1 - keep) * GAIN * (volts - STATIC * direction)
             w = 0.0 if after * direction < 0.0 else after
         out[k] = w
     return out + NOISE * np.random.default_rng(1000 + seed).standard_normal(out.size)
@@ -57,12 +60,13 @@ def clipped(u: np.ndarray) -> np.ndarray:
 
 def slewed(u: np.ndarray) -> np.ndarray:
     """Return the means of a voltage that rises by 200 V/s, by a fine grid."""
-    fine, now, out = 200, u[0], np.empty(u.size)
-    for k, target in enumerate(u):
+    fine, now, out = 200, float(u[0]), np.empty(u.size)
+    most = 200 * STEP / fine
+    for k, target in enumerate(u.tolist()):
         total = 0.0
         for _ in range(fine):
             before = now
-            now += np.clip(target - now, -200 * STEP / fine, 200 * STEP / fine)
+            now += min(max(target - now, -most), most)
             total += 0.5 * (before + now)
         out[k] = total / fine
     return out
@@ -71,10 +75,16 @@ def slewed(u: np.ndarray) -> np.ndarray:
 DRIVERS = {"dead_zone": (dead, 1.0), "clip_voltage": (clipped, 9.0), "slew_rate": (slewed, 200.0)}
 
 
+@cache
 def recorded(name: str, seed: int) -> Record:
     command = commands(seed)
     time = np.arange(command.size) * STEP
     return Record("motor", time, command, velocity=run(DRIVERS[name][0](command), seed))
+
+
+@cache
+def estimated(name: str, seed: int) -> Estimate:
+    return estimate(recorded(name, seed))
 
 
 @pytest.mark.parametrize("name", DRIVERS)
@@ -83,7 +93,7 @@ def test_motor_and_driver_are_both_found(name):
     truth[name] = DRIVERS[name][1]
     errors = []
     for seed in range(3):
-        found = estimate(recorded(name, seed))
+        found = estimated(name, seed)
         assert not found.unreliable
         errors.append(
             [(found.combinations[n].value - v) / found.combinations[n].std
@@ -162,11 +172,11 @@ def test_a_declared_clip_holds_for_held_out_records():
 
 def test_gains_are_for_motor_and_driver():
     loop = Loop(sample_time=STEP, gear_ratio=1.0, counts_per_revolution=None, supply_voltage=12.0)
-    zone = design(estimate(recorded("dead_zone", 0)), loop)
+    zone = design(estimated("dead_zone", 0), loop)
     assert zone.gains.feedforward_static == pytest.approx(STATIC + 1.0, abs=0.05)
-    clip = design(estimate(recorded("clip_voltage", 0)), loop)
+    clip = design(estimated("clip_voltage", 0), loop)
     assert clip.gains.u_clamp_max == pytest.approx(9.0, abs=0.05)
-    slew = design(estimate(recorded("slew_rate", 0)), loop)
+    slew = design(estimated("slew_rate", 0), loop)
     assert slew.loop.loop_delay == pytest.approx(STEP + 0.5 * 12.0 / 200.0, abs=1e-3)
 
 
@@ -244,11 +254,11 @@ def coasting(seed: int, viscous: float) -> tuple[Record, dict[str, float]]:
     command = np.repeat(rng.uniform(-11.0, 11.0, 40), rng.integers(15, 40, 40))
     i = w = 0.0
     speed = np.zeros(command.size)
-    for k in range(1, command.size):
-        duty, sign = abs(command[k]) / supply, np.sign(command[k])
+    for k, volts in enumerate(command.tolist()[1:], 1):
+        duty, sign = abs(volts) / supply, math.copysign(1.0, volts)
         for n in range(fine):
             on = (n * dt * pwm) % 1.0 < duty
-            applied = sign * supply if on else -np.sign(i) * supply
+            applied = sign * supply if on else -math.copysign(supply, i)
             after = i
             if on or i != 0.0:
                 after = i + dt / te * ((applied - constant * w) / resistance - i)
@@ -256,7 +266,7 @@ def coasting(seed: int, viscous: float) -> tuple[Record, dict[str, float]]:
                 after = 0.0
             drive = constant * 0.5 * (i + after) - viscous * w
             i = after
-            drag = torque * (np.sign(w) if w != 0.0 else np.clip(drive / torque, -1.0, 1.0))
+            drag = math.copysign(torque, w) if w else min(max(drive, -torque), torque)
             turned = w + dt / inertia * (drive - drag)
             w = 0.0 if w * turned < 0.0 else turned
         speed[k] = w + 0.2 * rng.standard_normal()

@@ -37,8 +37,8 @@ def test_prbs_of_one_day_explains_the_other_day(fitted, kept):
     assert result.value("averaging_window") == pytest.approx(0.020, abs=0.002)
 
 
-def test_ten_steps_in_one_fit_tell_the_speed_filter_from_a_delay():
-    result = estimate([step(p) for p in sorted((DATA / "step_gearmotor").glob("*.csv"))])
+def test_five_steps_in_one_fit_tell_the_speed_filter_from_a_delay():
+    result = estimate([step(p) for p in sorted((DATA / "step_gearmotor").glob("*.csv"))[::2]])
     assert result.fit_percent.estimation > 93
     assert result.fit_percent.validation > 93
     # The log's speed is a position difference over 32 samples of 1 ms.
