@@ -26,7 +26,7 @@ def together():
 
 @pytest.fixture(scope="module")
 def found(together):
-    return together.identify_recorded(ENTRIES, 200.0, seed=11)
+    return together.identify_recorded(ENTRIES, 200.0, seed=11, duration=10.0)
 
 
 @pytest.mark.parametrize(("rate", "most"), [(100.0, 0.010), (200.0, 0.005), (1000.0, 0.005)])
