@@ -70,27 +70,45 @@ def likeliest(group: Sequence[Record], fit: Fit, hold: str, options: Options) ->
     without = refine(_prepared(few, hold, fit), fit.structure, fit, fit.z, options, ROUGHLY)
     behind = POLICY.hopeless * factor
     most = without.deviance + behind
-    searches: list[_Profile | _Joint] = [
+    known: list[tuple[Fit, str]] = []
+    profiles = [
         _Profile(few, how, start, options, effect)
         for effect in EFFECTS
         if effect.kind != COAST
-        for start, how in _starts(few, fit, hold, options, effect)
+        for start, how in _starts(few, fit, hold, options, effect, known)
     ]
-    found = [d for s in searches if (d := s.best(most)) is not None]
+    found = _polished(profiles, most, behind)
     if all(sandwich_factor(d.fit) > COLOURED.value for d in found):
-        searches = [_Joint(few, list(group), fit, options, e) for e in EFFECTS if e.kind == COAST]
-        found += [d for s in searches if (d := s.best(most)) is not None]
+        joint = [_Joint(few, list(group), fit, options, e) for e in EFFECTS if e.kind == COAST]
+        found += [d for s in joint if (d := s.best(most)) is not None]
     found.sort(key=cost)
     if sum(map(len, few)) < sum(map(len, group)):
         most = fit.deviance + behind
-        every = [d.search.on(list(group), most, behind) for d in found[:FINALISTS]]
-        found = [d for d in every if d is not None]
+        every: list[DriverFit] = []
+        for d in found[:FINALISTS]:
+            if (there := d.search.on(list(group), most, behind)) is not None:
+                every.append(there)
+                most = min(most, there.fit.deviance + behind)
+        found = every
     found = sorted((d for d in found if cost(d) < plain), key=cost)
     if not found:
         return None
     best, *others = found
     near = [d.fit for d in others if cost(d) < cost(best) + price]
     return replace(best, rivals=tuple(near))
+
+
+def _polished(searches: Sequence[_Profile], most: float, behind: float) -> list[DriverFit]:
+    """Return the likeliest sizes of the effects that are not far behind the best of them."""
+    sought = [(s, size) for s in searches if (size := s.sought()) is not None]
+    sought.sort(key=lambda one: one[0].near.deviance)
+    found: list[DriverFit] = []
+    for search, size in sought:
+        if found and search.near.deviance > found[0].fit.deviance + behind:
+            break
+        if (one := search.polished(size, most)) is not None:
+            found.append(one)
+    return found
 
 
 def with_voltages(group: Sequence[Record], voltage: Array) -> list[Record]:
@@ -145,12 +163,18 @@ def _pieces(group: Sequence[Record], step: float, lag: float) -> list[Record]:
 
 
 def _starts(
-    group: Sequence[Record], fit: Fit, hold: str, options: Options, effect: DriverEffect
+    group: Sequence[Record],
+    fit: Fit,
+    hold: str,
+    options: Options,
+    effect: DriverEffect,
+    known: list[tuple[Fit, str]],
 ) -> list[tuple[Fit, str]]:
     """Return the motors with which an effect's size is sought, and how the command was held.
 
     All that may stand for the effect is put back: torque noise, a command that ran otherwise or
     comes late, of a limited rate a second lag; and friction, for which the effect may stand.
+    Those that are ``known`` already, of another effect, are added to.
     """
     s = fit.structure
     if s.friction == "none" and "vc_plus" not in s.fixed:
@@ -163,9 +187,13 @@ def _starts(
         ways.append((FirstOrder.like(plain), "held"))
     out = []
     for structure, how in ways:
-        near = replace(fit, structure=structure, noise_ratio=0.0)
-        data = _prepared(group, how, near)
-        out.append((refine(data, structure, near, structure.complete(fit.z), options), how))
+        one = next((k for k in known if (k[0].structure, k[1]) == (structure, how)), None)
+        if one is None:
+            near = replace(fit, structure=structure, noise_ratio=0.0)
+            data, z = _prepared(group, how, near), structure.complete(fit.z)
+            one = refine(data, structure, near, z, options), how
+            known.append(one)
+        out.append(one)
     return out
 
 
@@ -191,7 +219,9 @@ class _Profile:
         self.driver = Driver()
         self.beside: list[Record] = []  # with the voltage for a size one standard deviation greater
 
-    def at(self, size: float, passes: int = 30) -> tuple[Fit, Experiments, list[Record]]:
+    def at(
+        self, size: float, passes: int = 30, known: Fit | None = None
+    ) -> tuple[Fit, Experiments, list[Record]]:
         """Return the motor fitted for a size, and what it was fitted to."""
         data, fit, records = self.data, self.near, self.group
         for turn in range(self.turns):
@@ -200,21 +230,22 @@ class _Profile:
             records = with_voltages(self.group, voltage)
             data = _prepared(records, self.hold, self.near)
             start = fit.at(fit.z, initial_of(data, fit))
-            fit = solve(data, fit.structure, start, self.options, passes, ROUGHLY)
+            fit = solve(data, fit.structure, start, self.options, passes, ROUGHLY, known)
         return fit, data, records
 
     def deviance(self, logarithm: float) -> float:
-        """Return the deviance at a size's logarithm; the next fit begins from the best so far."""
-        fit, data, _ = self.at(float(np.exp(logarithm)), FEW)
+        """Return the deviance at a size's logarithm; the next fit begins from the best so far.
+
+        One that does not come near that is given up; it was another voltage's, and no end of this.
+        """
+        best = replace(self.near, converged=False)
+        fit, data, _ = self.at(float(np.exp(logarithm)), FEW, best)
         if fit.deviance < self.near.deviance:
             self.near, self.data = fit, data
         return fit.deviance if np.isfinite(fit.deviance) else 1e300
 
-    def best(self, most: float) -> DriverFit | None:
-        """Return the likeliest size with its deviation.
-
-        None where none is likelier than none, or the likeliest is beyond a deviance.
-        """
+    def sought(self) -> float | None:
+        """Return the logarithm of the likeliest size; None where none is likelier than none."""
         none = self.near.deviance
         rows = rows_of(self.data, self.group, self.near)
         grid = np.log(self.effect.scale(rows) * np.array(self.effect.shares))
@@ -223,7 +254,7 @@ class _Profile:
         low = float(grid[k - 1] if k else 2 * grid[0] - grid[1])
         high = float(grid[k + 1] if k + 1 < grid.size else 2 * grid[-1] - grid[-2])
         likeliest = self._between(low, high)  # also where it begins, between it and none
-        return self._polished(likeliest, most) if self.near.deviance < none - RISE else None
+        return likeliest if self.near.deviance < none - RISE else None
 
     def on(self, group: list[Record], most: float, behind: float) -> DriverFit | None:
         """Go on from the size that was found, with more records.
@@ -235,13 +266,13 @@ class _Profile:
         more = _Profile(group, self.hold, near, self.options, self.effect)
         if more.deviance(self.size) > most + behind * more.data.size / self.data.size:
             return None
-        return more._polished(more._between(self.size - AROUND, self.size + AROUND), most)
+        return more.polished(more._between(self.size - AROUND, self.size + AROUND), most)
 
     def _between(self, low: float, high: float) -> float:
         x = fminbound(self.deviance, low, high, xtol=1e-2, maxfun=MOST, disp=0)
         return float(x)
 
-    def _polished(self, x: float, most: float) -> DriverFit | None:
+    def polished(self, x: float, most: float) -> DriverFit | None:
         """Go on to the bottom by parabolas through three deviances, whose curvature is its std.
 
         None where a parabola's bottom is beyond a deviance, or the size cannot be.
