@@ -71,7 +71,8 @@ def fitted(data: Experiments, near: Fit, full_duty: float, options: Options) -> 
     problem = _Problem(data, replace(near, structure=first), full_duty)
     starts = [problem.start(z, np.log(size), SHARE) for z in _motors(data, near) for size in SIZES]
     ahead = sorted((problem.descend(p, FEW) for p in starts), key=lambda r: float(r.cost))
-    ends = [problem.descend(r.x, MANY) for r in ahead[:FINALISTS]]
+    # Status 0: it ran out of steps.
+    ends = [r if r.status else problem.descend(r.x, MANY) for r in ahead[:FINALISTS]]
     found = min(ends, key=lambda r: float(r.cost))
     best = problem.joint(found, options)
     z, _, driver = problem.unpacked(found.x)
@@ -140,6 +141,7 @@ class _Problem:
         segments = len(data.starts) - 1
         self.owner = np.repeat(np.arange(segments), np.diff(data.starts))[self.there]
         self.weight = 1 / np.sqrt(near.noise[0, 0])
+        self.last: tuple[Array, Array] = np.zeros(0), np.zeros(0)
 
     def start(self, z: Coordinates, size: float, share: float) -> Array:
         """Return parameters: a motor, the logarithm of its driver's size and the share."""
@@ -166,6 +168,12 @@ class _Problem:
         return data, prediction.once(data, there)[:, 1]
 
     def _misses(self, p: Array) -> Array:
+        if np.array_equal(p, self.last[0]):  # of which the slopes are asked for next
+            return self.last[1]
+        self.last = p.copy(), self._missed(p)
+        return self.last[1]
+
+    def _missed(self, p: Array) -> Array:
         shown = self._shown(p)[1]
         miss = self.weight * (self.data.output - shown)[self.there]
         # What overflows is far off, yet its square is a number.
@@ -190,7 +198,7 @@ class _Problem:
         for k, (moved, scale) in enumerate(self._groups):
             there = p.copy()
             there[moved] += DIFFERENCE * scale
-            slope = (self._misses(there) - here) / (DIFFERENCE * scale)
+            slope = (self._missed(there) - here) / (DIFFERENCE * scale)
             out[rows, k if k < len(self.names) else moved[self.owner]] = slope
         return out
 
