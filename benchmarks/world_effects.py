@@ -250,7 +250,7 @@ EFFECTS = (
     Effect("rows lost", _stamps("lost", (0.005, 0.02, 0.1)), ("timing",)),
     Effect("first row is the step", _first_row),
     Effect("rest before", _rest),
-    Effect("speed low-passed", _sensor("lowpass", (0.1, 0.3, 1.0), _tau),
+    Effect("speed low-passed", _sensor("lowpass", (0.2, 1.0, 4.0), _tau),
            ("lag", "second_lag"),
            signals=SPEED),
     Effect("speed averaged", _sensor("window", (2.0, 5.0, 16.0), _step), ("lag", "averaged_speed"),

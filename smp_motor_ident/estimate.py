@@ -49,7 +49,7 @@ from smp_motor_ident.estimation.consider_covariance import (
     consider_timing,
 )
 from smp_motor_ident.estimation.constraint import constrained
-from smp_motor_ident.estimation.disturbance import disturbance
+from smp_motor_ident.estimation.disturbance import disturbance, often_disturbed
 from smp_motor_ident.estimation.driver_effect import (
     DriverFit,
     declared,
@@ -214,10 +214,11 @@ def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) 
             if not lacks_something(plain):
                 return plain
             noisy = refused is None and (plain.unreliable or one.fit.noise_ratio > 0)
-            if noisy and (rest := _undisturbed(group, request, found, one.fit)):
+            rest = _undisturbed(group, request, found, one.fit) if noisy else None
+            if rest and not often_disturbed(rest):
                 return rest
             behind, driver = _through_driver(group, request, found, data, hold, one.fit)
-            return behind or suspecting(plain, driver, one.fit)
+            return behind or rest or suspecting(plain, driver, one.fit)
         except (SignalError, InsufficientExcitationError) as refusal:
             if refused is None and (rest := _undisturbed(group, request, found, one.fit)):
                 return rest

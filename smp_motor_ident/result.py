@@ -45,6 +45,7 @@ UNITS: Mapping[str, str] = {
     "slew_rate": "V/s",
     "source_resistance_ratio": "1",
     "brush_drop": "V",
+    "current_limit_voltage": "V",
     "fast_decay_ratio": "1",
     "resonance_frequency": "rad/s",
     "resonance_damping": "1",

@@ -127,6 +127,12 @@ EFFECTS = (
         lambda m: [np.tanh(20 * m.drop / m.top)],
     ),
     Effect(
+        "current_limit", "voltage", "a driver that limits the current",
+        "raise the limit, record smaller steps of voltage, or the voltage at the terminals",
+        lambda m: [_sign(m.drop) * np.maximum(np.abs(m.drop) - c * m.top, 0.0)
+                   for c in (0.3, 0.6, 1.0)],
+    ),
+    Effect(
         "saturation", "voltage", "a field that weakens with the current",
         "record with smaller steps of voltage",
         lambda m: [np.abs(m.drop) * m.speed, np.abs(m.drop) * m.drop],

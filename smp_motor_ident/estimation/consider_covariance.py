@@ -173,6 +173,8 @@ def _consider_second_lag(data: Experiments, fit: Fit, factor: float) -> Fit:
         near = refine(data, fixed, near, z, Options(), ROUGHLY)
         deviances.append(near.deviance)
         moves.append(s.of_free(near.z.array - fit.z.array))
+    if not np.isfinite(deviances).all():
+        return fit
     likely = np.exp(-0.5 * (np.array(deviances) - min(deviances)) / factor)
     edges = np.concatenate([[0.0], 0.5 * (lags[1:] + lags[:-1]), [longest]])
     weight = likely * np.diff(edges)

@@ -7,6 +7,8 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
+
 from smp_motor_ident.diagnosis.limits import RELEVANT_BIAS
 from smp_motor_ident.estimation import data_window, descent, start
 from smp_motor_ident.estimation.fit import Fit, Options
@@ -173,6 +175,8 @@ def with_filter_for_lag(
     quick = best.z.second_lag * (s.order == 2) + 0.5 * best.z.window * s.window
     rubs = s.friction != "none" and not s.current and data.quantum == 0 and data.kind != ANGLE
     if not rubs or s.has("window") > s.window or quick < RELEVANT_BIAS.value * slow:
+        return best
+    if slow > np.ptp(data.time):  # an angle, which is never steady
         return best
     lags = {"window": True, "low_pass": True}
     first, second = FirstOrder.like(s).with_(**lags), SecondOrder.like(s).with_(**lags)

@@ -20,7 +20,7 @@ import numpy as np
 from smp_motor_control.arrays import Array, Flags
 from smp_motor_ident._compile import compiled, inlined
 
-NOTHING, DEAD_ZONE, CLIP, SLEW, SAG, DROP, COAST = range(7)
+NOTHING, DEAD_ZONE, CLIP, SLEW, SAG, DROP, COAST, CURRENT = range(8)
 
 
 class Driver(NamedTuple):
@@ -40,6 +40,11 @@ class Driver(NamedTuple):
     def limit(self) -> float:
         """Largest voltage [V] that it puts out."""
         return self.size if self.kind == CLIP else float("inf")
+
+    @property
+    def drive(self) -> float:
+        """Largest voltage [V] beyond the back-EMF, to which it limits the current."""
+        return self.size if self.kind == CURRENT else float("inf")
 
     def ramp(self, voltage: float) -> float:
         """Return how long [s] it takes to a voltage [V]."""
@@ -95,6 +100,8 @@ def terminal_voltage(
         out = back_emf + (command - back_emf) / (1 + size * duty * duty)
     elif kind == DROP:
         out = back_emf + _beyond(command - back_emf, size)
+    elif kind == CURRENT:
+        out = back_emf + min(max(command - back_emf, -size), size)
     elif kind == COAST:
         out = _fast_decay(size, command, back_emf, full_duty)
     return out, out
@@ -158,7 +165,8 @@ class DriverEffect:
 
     def may_be(self, size: float, rows: Rows) -> bool:
         """Tell whether there is anything of it, and anything left of the command."""
-        return self.kind not in (DEAD_ZONE, CLIP, DROP) or size < rows.top
+        most = 2 * rows.top if self.kind == CURRENT else rows.top  # what brakes is twice as much
+        return self.kind in (SLEW, SAG, COAST) or size < most
 
     @property
     def numbers(self) -> int:
@@ -168,7 +176,7 @@ class DriverEffect:
     @property
     def follows_motion(self) -> bool:
         """Whether it depends on how the motor runs."""
-        return self.kind in (SAG, DROP, COAST)
+        return self.kind in (SAG, DROP, CURRENT, COAST)
 
 
 EFFECTS = (
@@ -190,6 +198,10 @@ EFFECTS = (
     DriverEffect(
         DROP, "brush_drop", "brush_drop", "a voltage drop over brushes or transistors",
         (0.01, 0.03, 0.1, 0.3),
+    ),
+    DriverEffect(
+        CURRENT, "current_limit", "current_limit_voltage", "a driver that limits the current",
+        (0.15, 0.3, 0.5, 0.8, 1.2, 1.7),
     ),
     DriverEffect(
         COAST, "coast", "fast_decay_ratio", "a driver that lets the motor coast (fast decay)",

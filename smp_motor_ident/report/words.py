@@ -29,6 +29,11 @@ EXPLAINED: Mapping[str, tuple[str, str, str]] = {
     "slew_rate": ("dv/dt", "Slew rate", "how fast the driver's voltage rises"),
     "source_resistance_ratio": ("ρ", "Source resistance", "of the supply, over the armature's"),
     "brush_drop": ("vb", "Brush drop", "over brushes or transistors, whatever the current"),
+    "current_limit_voltage": (
+        "vi",
+        "Current limit",
+        "of the driver, times the resistance",
+    ),
     "fast_decay_ratio": ("τₑf", "Fast-decay ratio", "electrical time constant in PWM periods"),
     "current_lag": ("τi", "Current lag", "by which the current's sensor is late on average"),
 }

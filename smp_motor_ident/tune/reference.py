@@ -131,10 +131,12 @@ def plan_reference(
     controller: Controller,
     targets: Mapping[str, Any],
     least: float,
+    drive: float = math.inf,
 ) -> Reference:
     """Return the fastest reference, of ``least`` seconds, that is followed without overshoot.
 
-    It leads the first of ``plants``, and the others follow it, too.
+    It leads the first of ``plants``, and the others follow it, too, with no more than a voltage
+    ``drive`` beyond their back-EMF and friction.
     """
     plant = plants[0]
     ratio = loop.gear_ratio
@@ -156,6 +158,10 @@ def plan_reference(
     )
     plan = _quickest(plants, loop, controller, plan, least)
     quickest = plan.transition_time
+    if math.isfinite(drive):
+        able = min(PEAK * drive / float(m.a1[0]), _steepest(plan))
+        plan = replace(plan, max_acceleration=able)
+        rate = None if rate is None else min(rate, able)
     if rate is not None:
         steepest = _steepest(plan)
         if rate > steepest:

@@ -35,12 +35,16 @@ def commands(seed: int) -> np.ndarray:
     return np.repeat(rng.uniform(-12.0, 12.0, 60), rng.integers(20, 40, 60))
 
 
-def run(voltage: np.ndarray, seed: int) -> np.ndarray:
-    """Return the speed of a motor of first order with friction, exactly but for its stops."""
+def run(voltage: np.ndarray, seed: int, most: float = math.inf) -> np.ndarray:
+    """Return the speed of a motor of first order with friction, exactly but for its stops.
+
+    Its driver gives no more than ``most`` volts beyond the back-EMF.
+    """
     fine, w, out = 100, 0.0, np.zeros(voltage.size)
     keep = math.exp(-STEP / fine / TAU)
-    for k, volts in enumerate(voltage.tolist()[1:], 1):
+    for k, command in enumerate(voltage.tolist()[1:], 1):
         for _ in range(fine):
+            volts = w / GAIN + min(max(command - w / GAIN, -most), most)
             if w == 0.0 and abs(volts) <= STATIC:
                 break
             direction = math.copysign(1.0, w or volts)
@@ -119,8 +123,23 @@ def test_an_effect_in_volts_is_smaller_than_the_command():
     rows = driver.Rows(np.array([-6.0, 4.0]), np.zeros(2), np.ones(2), np.zeros(2, bool), 0.1)
     for effect in driver.EFFECTS:
         volts = effect.quantity in ("dead_zone", "clip_voltage", "brush_drop")
-        assert effect.may_be(5.9, rows)
-        assert effect.may_be(6.1, rows) is not volts
+        most = 12.0 if effect.quantity == "current_limit_voltage" else 6.0  # what brakes is twice
+        assert effect.may_be(most - 0.1, rows)
+        assert effect.may_be(most + 0.1, rows) is not (volts or most > 6.0)
+
+
+def test_a_driver_that_limits_the_current_is_found_and_designed_for():
+    """It looks like a hand that holds the motor at every large step."""
+    command = commands(1)
+    record = Record("motor", np.arange(command.size) * STEP, command, velocity=run(command, 1, 6.0))
+    found = estimate(record)
+    truth = {"dc_gain": GAIN, "time_constant": TAU, "current_limit_voltage": 6.0}
+    for name, value in truth.items():
+        q = found.combinations[name]
+        assert abs(q.value - value) < max(4 * q.std, 0.01 * value) and q.std < 0.02 * value, name
+    one = design(found, Loop(sample_time=STEP, gear_ratio=1.0, counts_per_revolution=None))
+    able = (6.0 - STATIC) * GAIN / TAU  # rad/s^2 from the current there is
+    assert 0.8 * able < one.reference.max_acceleration < able
 
 
 @pytest.mark.parametrize(
@@ -190,6 +209,8 @@ def test_gains_are_for_motor_and_driver():
         (driver.SAG, 1.0, 5.0, 1.0, 1.0 + 4.0 / 1.25),  # half duty: a quarter of the resistance
         (driver.DROP, 0.5, 3.0, 1.0, 2.5),
         (driver.DROP, 0.5, 1.2, 1.0, 1.0),  # no current flows
+        (driver.CURRENT, 0.5, 3.0, 1.0, 1.5),
+        (driver.CURRENT, 0.5, -3.0, 1.0, 0.5),  # it brakes
         (driver.COAST, 1.0, 0.0, 4.0, 4.0),  # a motor that runs free
         (driver.COAST, 1.0, 10.0, 4.0, 10.0),
     ],
