@@ -32,7 +32,7 @@ from smp_motor_ident.estimation.fit import Fit, Options, solve
 from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.estimation.selection import POLICY, sandwich_factor
 from smp_motor_ident.likelihood.experiments import Experiments, prepare
-from smp_motor_ident.model.driver import COAST, EFFECTS, SLEW, Driver, DriverEffect, Rows
+from smp_motor_ident.model.driver import COAST, CURRENT, EFFECTS, SLEW, Driver, DriverEffect, Rows
 from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.model.structures import FirstOrder
 from smp_motor_ident.record import Record
@@ -78,7 +78,8 @@ def likeliest(group: Sequence[Record], fit: Fit, hold: str, options: Options) ->
         for start, how in _starts(few, fit, hold, options, effect, known)
     ]
     found = _polished(profiles, most, behind)
-    if all(sandwich_factor(d.fit) > COLOURED.value for d in found):
+    plainer = [d for d in found if d.effect.kind != CURRENT]  # as a bridge that coasts, nearly
+    if all(sandwich_factor(d.fit) > COLOURED.value for d in plainer):
         joint = [_Joint(few, list(group), fit, options, e) for e in EFFECTS if e.kind == COAST]
         found += [d for s in joint if (d := s.best(most)) is not None]
     found.sort(key=cost)

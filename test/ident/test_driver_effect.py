@@ -131,14 +131,14 @@ def test_an_effect_in_volts_is_smaller_than_the_command():
 def test_a_driver_that_limits_the_current_is_found_and_designed_for():
     """It looks like a hand that holds the motor at every large step."""
     command = commands(1)
-    record = Record("motor", np.arange(command.size) * STEP, command, velocity=run(command, 1, 6.0))
+    record = Record("motor", np.arange(command.size) * STEP, command, velocity=run(command, 1, 4.0))
     found = estimate(record)
-    truth = {"dc_gain": GAIN, "time_constant": TAU, "current_limit_voltage": 6.0}
+    truth = {"dc_gain": GAIN, "time_constant": TAU, "current_limit_voltage": 4.0}
     for name, value in truth.items():
         q = found.combinations[name]
         assert abs(q.value - value) < max(4 * q.std, 0.01 * value) and q.std < 0.02 * value, name
     one = design(found, Loop(sample_time=STEP, gear_ratio=1.0, counts_per_revolution=None))
-    able = (6.0 - STATIC) * GAIN / TAU  # rad/s^2 from the current there is
+    able = (4.0 - STATIC) * GAIN / TAU  # rad/s^2 from the current there is
     assert 0.8 * able < one.reference.max_acceleration < able
 
 
