@@ -139,7 +139,7 @@ def _measured(data: Experiments, fit: Fit) -> Array:
     for a, b in pairwise(data.starts):  # the time of each record is its own
         time, output = data.time[a:b], data.output[a:b]
         there = np.isfinite(output)
-        if b - a < 2:
+        if b - a < 2 or not there.any():  # nothing was measured, as where a motor stands
             out.append(np.zeros(b - a))
             continue
         speed = np.interp(time, time[there], output[there])

@@ -163,6 +163,16 @@ def test_the_motion_of_each_record_is_its_own():
         assert np.abs(alone - record.velocity).std() < 0.1 * record.velocity.std()
 
 
+def test_a_segment_without_a_reading_stands():
+    """A timer of edges has none while the motor stands."""
+    record = recorded("dead_zone", 0)
+    lost = np.arange(len(record)) < 200
+    fit = SimpleNamespace(z=SimpleNamespace(time_constant=TAU))
+    record = replace(record, velocity=np.where(lost, np.nan, record.velocity), starts=(0, 200))
+    speed = _measured(prepare([record], False), fit)
+    assert not speed[lost].any() and np.isfinite(speed).all() and speed[~lost].any()
+
+
 def test_a_plain_driver_has_no_effect():
     command = commands(5)
     time = np.arange(command.size) * STEP
