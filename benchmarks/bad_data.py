@@ -247,6 +247,8 @@ def judge(record: Record, truth: dict, words: str = "") -> dict:
                 "model": e.model, "spent": time.perf_counter() - begun}  # fmt: skip
     worst = max(errors, key=lambda n: errors[n])
     says = "unreliable" if doubt else ("wrong" if errors[worst] > FAR else "right")
+    if says == "right" and words and any(w in "; ".join(e.warnings) for w in words.split("|")):
+        says = "named"  # and what it says is right without what is bad
     off = abs(claims[worst].value / truth[worst] - 1) if truth[worst] else claims[worst].value
     return {"says": says, "words": "; ".join(e.warnings), "worst": worst, "sigmas": errors[worst],
             "off": off, "model": e.model, "fit": e.fit_percent.estimation,

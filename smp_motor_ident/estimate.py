@@ -178,7 +178,7 @@ def _answered(group: list[Record], request: Request, found: Sequence[Finding]) -
             return first
         reason = blamed.code
     except CurrentError as error:
-        refusal, reason = error, "refused"
+        refusal, reason = error, "current_offset"
     except (SignalError, InsufficientExcitationError) as error:
         refusal, reason = error, UNDECIDED
     bare, other = request.without_current(group)

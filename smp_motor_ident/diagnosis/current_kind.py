@@ -1,4 +1,4 @@
-"""What a recorded current is: the armature's, its size without sign, or the supply's.
+"""What a recorded current is: the armature's, without sign, the supply's, or with an offset.
 
 The winding says ``i = (v - K w) / R + offset`` but for what L adds at steps; without sign it is
 the size of that, at the supply of a bridge its product with the duty cycle (power is kept).  Each
@@ -10,11 +10,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from smp_motor_control.arrays import Array
-from smp_motor_ident.diagnosis.data_quality import of_the_winding
+from smp_motor_ident.diagnosis.data_quality import of_the_winding, offset_of_current
 from smp_motor_ident.diagnosis.limits import CURRENT_KIND, FEWEST, METER, REST
 from smp_motor_ident.record import Record
 
 ARMATURE, UNSIGNED, SUPPLY = "armature", "current_unsigned", "current_of_supply"
+OFFSET = "current_offset"  # of the sensor, or of the driver: an equation that is the same for both
 ROUNDS = 6
 """In which the sign of the armature's current, and with it the coefficients, settle."""
 
@@ -35,7 +36,9 @@ def current_kind(group: Sequence[Record]) -> str:
     if rests[best] < CURRENT_KIND.value * rests[ARMATURE]:
         return best
     # A coarse encoder's speed hides the equations, and one direction leaves them alike.
-    return UNSIGNED if _one_sign(v, i) else ARMATURE
+    if _one_sign(v, i):
+        return UNSIGNED
+    return OFFSET if any(map(offset_of_current, group)) else ARMATURE
 
 
 def _one_sign(v: Array, i: Array) -> bool:

@@ -10,7 +10,7 @@ from smp_motor_ident.diagnosis.glitches import glitches_of
 from smp_motor_ident.diagnosis.signs import lagged, likeness, lost_sign
 from smp_motor_ident.diagnosis.silence import silent
 from smp_motor_ident.diagnosis.units import cause_of_ratio, implausible_voltage
-from smp_motor_ident.errors import InsufficientExcitationError, SignalError
+from smp_motor_ident.errors import CurrentError, InsufficientExcitationError, SignalError
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.record import Record
 
@@ -338,28 +338,37 @@ def of_the_winding(record: Record, current: Array) -> tuple[Array, Array, Array]
     return v.mean(axis=1)[keep], w[keep], i[keep]
 
 
-def _offset(record: Record) -> None:
-    """Refuse a current that is not nothing where ``(v - K w) / R`` is.
+def offset_of_current(record: Record) -> float:
+    """Return what a current is where ``(v - K w) / R`` is nothing [A]; 0 where that may be chance.
 
-    Friction and load have no part in this: the electric equation does not know them.
+    Friction and load have no part in this: the electric equation does not know them.  An offset
+    of the driver has: a voltage of ``R`` times an offset of the current is the same equation.
     """
     if record.current is None or np.isfinite(record.current).sum() < limits.FEWEST.value:
-        return
+        return 0.0
     v, w, i = of_the_winding(record, record.current)
     if len(v) < 20:
-        return
+        return 0.0
     answer, variance = _winding(v, w, i)
     if not np.isfinite(variance):
-        return
+        return 0.0
     std = float(np.sqrt(variance * RUN_CORRELATION))
     offset, largest = float(answer[2]), float(np.nanmax(np.abs(record.current)))
-    if abs(offset) > max(
+    likely = max(
         limits.OFFSET_SURE.value * std,
         limits.LARGEST_OFFSET.value * max(largest - abs(offset), 1e-12),
-    ):
-        raise SignalError(
+    )
+    return offset if abs(offset) > likely else 0.0
+
+
+def _offset(record: Record) -> None:
+    """Refuse a current with an offset, which may be the driver's."""
+    if offset := offset_of_current(record):
+        raise CurrentError(
             f"{where_of([record])}: current has an offset of {offset:.2g} A where it reaches "
-            f"{largest:.3g} A; zero the current sensor at rest and record again"
+            f"{np.nanmax(np.abs(record.current)):.3g} A: its sensor's, or the driver puts out a "
+            "voltage at no command; zero the current sensor at rest and record again, or estimate "
+            "without the current"
         )
 
 

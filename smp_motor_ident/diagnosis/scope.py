@@ -271,6 +271,8 @@ def current_left_out(reason: str) -> Finding:
     """
     effect = OF_CURRENT.get(reason)
     what = f"shows {effect.cause}" if effect else "does not fit voltage and motion"
+    if reason == "current_offset":
+        what += ", of its sensor or of the driver, which puts out a voltage at no command,"
     return Finding(
         "current_left_out",
         "unreliable" if reason == UNDECIDED else "warning",

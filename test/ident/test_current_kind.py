@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from smp_motor_ident.diagnosis.current_kind import ARMATURE, SUPPLY, UNSIGNED, current_kind
-from smp_motor_ident.errors import InsufficientExcitationError
+from smp_motor_ident.errors import CurrentError, InsufficientExcitationError
 from smp_motor_ident.estimate import estimate
 
 estimate_module = importlib.import_module("smp_motor_ident.estimate")
@@ -44,6 +44,28 @@ def test_without_its_current_a_record_still_says_what_the_speed_tells(kind):
     for name in ("dc_gain", "time_constant"):
         q = result.combinations[name]
         assert abs(q.value - true[name]) < 4 * q.std + 0.005 * true[name]  # four deviations
+
+
+@pytest.mark.parametrize("whose", ["sensor", "driver"])
+def test_an_offset_of_current_or_driver_is_no_reason_to_refuse(whose):
+    """The winding's equation has one constant for both, R times the one is the other."""
+    time = np.arange(1000) / 200.0
+    asked = 4.0 * np.sin(2.0 * time) + 4.0 * np.sin(5.0 * time)  # slowly: little current
+    made = motors.record("rear_left", voltage=asked + (whose == "driver"), seconds=5.0)
+    amps = made.current + (0.3 if whose == "sensor" else 0.0)
+    result = estimate(replace(made, voltage=asked, velocity=None, current=amps))
+    (left,) = [f for f in result.findings if f.code == "current_left_out"]
+    assert left.severity == "warning" and "sensor or of the driver" in left.message
+    true = motors.truth("rear_left", 0.3)
+    assert not result.unreliable and result.parameters["resistance"].value is None
+    for name in ("dc_gain", "time_constant"):
+        q = result.combinations[name]
+        assert abs(q.value - true[name]) < 4 * q.std + 0.005 * true[name]  # four deviations
+
+
+def test_an_offset_of_a_current_that_is_asked_for_is_refused_with_both_causes():
+    with pytest.raises(CurrentError, match="offset of 1.* its sensor's, or the driver"):
+        estimate(replace(GOOD, current=GOOD.current + 1.0), "electromechanical")
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])

@@ -58,7 +58,6 @@ BAD = {
         SignalError,
         "wrong gear ratio",
     ),
-    "offset current": (replace(GOOD, current=GOOD.current + 1.0), SignalError, "offset of 1"),
     "NaN gaps": (
         replace(GOOD, count=None, velocity=alternate(GOOD.velocity)),
         SignalError,
