@@ -300,7 +300,9 @@ def _signs(records: Sequence[Record], where: str, late: bool = True) -> None:
         found = likeness(kept, [s for s in signals if s is not None], lags=what == "speed")
         if found is None:
             continue
-        sure, least = limits.SIGN_SURE.value * found.chance, limits.SIGN_LEAST.value
+        sure = limits.SIGN_SURE.value * found.chance
+        # Of a current between switched voltages a sample shows what the lag makes of it: little.
+        least = (limits.SIGN_LEAST if what == "speed" else limits.SIGN_ALIKE).value
         if found.wrong - found.right > max(least, min(sure, limits.SIGN_ALIKE.value * found.wrong)):
             raise SignalError(
                 f"{where}: swapped sign, {what} runs against the voltage "

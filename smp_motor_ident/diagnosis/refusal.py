@@ -67,8 +67,8 @@ def refuse(
         raise SignalError(
             f"{where_of(group)}: the voltage does not explain the motion (fit {fitted:.0f} %); "
             "check that voltage and encoder belong to the same motor, that the driver puts out "
-            "what is commanded (no clip at the supply, no coasting), and that nothing else drives "
-            "it"
+            "what is commanded (no clip at the supply, no coasting), that no rows were left out "
+            "between, and that nothing else drives it"
         )
     _refuse_offset(group, fit)
     loose = [

@@ -64,7 +64,7 @@ def test_an_offset_of_current_or_driver_is_no_reason_to_refuse(whose):
 
 
 def test_an_offset_of_a_current_that_is_asked_for_is_refused_with_both_causes():
-    with pytest.raises(CurrentError, match="offset of 1.* its sensor's, or the driver"):
+    with pytest.raises(CurrentError, match=r"offset of 1.* its sensor's, or the driver"):
         estimate(replace(GOOD, current=GOOD.current + 1.0), "electromechanical")
 
 

@@ -55,6 +55,17 @@ def test_a_current_of_the_wrong_sign_is_found_and_the_right_one_left_alone():
             _signs([replace(record, current=-record.current)], name)
 
 
+def test_a_current_between_rows_that_were_left_out_shows_no_sign():
+    """Of a command switched every eight rows, of which every fifth is kept: it is older by then."""
+    bits = np.random.default_rng(1).choice([-10.0, 10.0], 375)
+    whole = motors.record("rear_left", voltage=np.repeat(bits, 8), rate=200.0)
+    kept = np.arange(0, 2990, 5)
+    there = {n: getattr(whole, n)[kept] for n in ("time", "voltage", "count")}
+    thin = replace(whole, velocity=None, current=whole.current[kept + 8], **there)
+    assert likeness([thin], [thin.current], lags=False).wrong > 0.4
+    _signs([thin], "record")
+
+
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize("samples", [2.9, 3.0, 3.1])
 def test_three_samples_to_a_period_tell_no_sign(samples, sign):
