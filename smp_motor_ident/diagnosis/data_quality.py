@@ -4,9 +4,10 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from smp_motor_control.arrays import Array, Flags
+from smp_motor_control.arrays import Array
 from smp_motor_ident.diagnosis import limits
 from smp_motor_ident.diagnosis.glitches import glitches_of
+from smp_motor_ident.diagnosis.saturation import saturation
 from smp_motor_ident.diagnosis.signs import lagged, likeness, lost_sign
 from smp_motor_ident.diagnosis.silence import silent
 from smp_motor_ident.diagnosis.units import cause_of_ratio, implausible_voltage
@@ -30,7 +31,7 @@ def screen(records: Sequence[Record]) -> list[Finding]:
     lost_sign(records, [measured_speed(r) for r in records], where)
     _excitation(records, where)
     for record in records:
-        _saturation(record)
+        warnings += saturation(record, measured_speed(record), where_of([record]))
         _ratio(record)
     _standing(records, where)
     for record in records:
@@ -212,58 +213,6 @@ def _compare(record: Record, angle: Array, what: str, other_values: Array, other
         )
 
 
-def _saturation(record: Record) -> None:
-    """Refuse a speed or current that rests at its limit while the voltage moves."""
-    where = where_of([record])
-    for name, unit in (("velocity", "rad/s"), ("current", "A")):
-        values = getattr(record, name)
-        if values is None:
-            continue
-        ok = np.isfinite(values)
-        x, v = values[ok], record.voltage[ok]
-        if x.size < 50 or np.unique(x).size < 20 or _one_level(v):
-            continue
-        for limit in (x.max(), x.min()):
-            at = x == limit
-            if abs(limit) < 0.5 * np.abs(x).max():  # the slowest that it turned, one way
-                continue
-            share = float(at.mean())
-            levels, times = np.unique(x, return_counts=True)
-            next_times = times[-2] if limit == levels[-1] else times[1]
-            runs = at[1:] & at[:-1]
-            # A resting sensor shows its limit far more often than the level beside it.
-            if share < 0.01 or at.sum() < 5 * next_times or runs.sum() < 0.5 * at.sum():
-                continue
-            # The last samples of a rest may be late, of a voltage that has moved since.
-            late = int(limits.LATE_ROWS.value)
-            early = at & np.append(at[late:], [False] * late)
-            if early.sum() < limits.AT_LIMIT.value:
-                continue
-            low, high = np.percentile(v[early], [5, 95])
-            if high - low < 10 * limits.METER.value * np.ptp(v) and not _abrupt(x, at):
-                continue
-            raise SignalError(
-                f"{where}: saturated sensor, {name} rests at {limit:.4g} {unit} in "
-                f"{share:.1%} of the samples while the voltage moves; widen its range or "
-                "lower the excitation"
-            )
-
-
-def _one_level(v: Array) -> bool:
-    """Tell whether the motor is driven by one level of voltage, at which it may come to rest."""
-    driven = v[np.abs(v) > limits.REST.value * np.abs(v).max()]
-    return not driven.size or bool(np.ptp(driven) < 10 * limits.METER.value * np.abs(driven).max())
-
-
-def _abrupt(x: Array, at: Flags) -> bool:
-    """Tell a clipped signal from one that settles: it jumps to its limit, scatters elsewhere."""
-    enters = np.flatnonzero(at[1:] & ~at[:-1]) + 1
-    rest = x[(x != x.max()) & (x != x.min())]
-    if not enters.size or np.unique(rest).size < 0.5 * rest.size:
-        return False
-    return bool(np.median(np.abs(x[enters] - x[enters - 1])) > 1e-3 * np.ptp(x))
-
-
 def _standing(records: Sequence[Record], where: str) -> None:
     """Refuse a speed that never changes, at 0 or at a sensor's offset, whatever the voltage."""
     speeds = [s[np.isfinite(s)] for s in map(measured_speed, records)]
@@ -365,7 +314,7 @@ def offset_of_current(record: Record) -> float:
 
 def _offset(record: Record) -> None:
     """Refuse a current with an offset, which may be the driver's."""
-    if offset := offset_of_current(record):
+    if record.current is not None and (offset := offset_of_current(record)):
         raise CurrentError(
             f"{where_of([record])}: current has an offset of {offset:.2g} A where it reaches "
             f"{np.nanmax(np.abs(record.current)):.3g} A: its sensor's, or the driver puts out a "

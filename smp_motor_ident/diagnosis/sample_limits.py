@@ -23,3 +23,9 @@ GLITCHES = Limit(
     "cost: a sensor that is wrong more often is to be mended, not corrected",
     "test_glitches.py: a sensor that is wrong too often is left as it is",
 )  # fmt: skip
+REGULATED = Limit(
+    0.98, "of the variance",
+    "physical: at one current the voltage is a line of the speed but for a voltmeter's scatter; "
+    "behind a sensor's limit the current goes on, and takes its share of the voltage",
+    "test_saturation.py: a current that a driver regulates is no clipped one",
+)  # fmt: skip

@@ -1,0 +1,53 @@
+"""A current that a driver regulates rests at its command; a clipped sensor rests at its limit."""
+
+from dataclasses import replace
+
+import motors
+import numpy as np
+import pytest
+
+from smp_motor_ident.diagnosis.data_quality import screen
+from smp_motor_ident.errors import SignalError
+from smp_motor_ident.estimate import estimate
+from smp_motor_ident.record import Record
+
+RATE, RESISTANCE, CONSTANT, INERTIA, COULOMB = 200.0, 2.0, 0.03, 4e-5, 2e-3
+
+
+def regulated() -> Record:
+    """Return a motor of which a driver regulates the current, with the voltage that this takes."""
+    fine, steps = 20, 2000
+    levels = np.random.default_rng(3).uniform(-1.0, 1.0, 40)
+    asked = np.repeat(np.clip(levels, -0.5, 0.5), 50)
+    speed, angle, rows = 0.0, 0.0, []
+    for amps in asked:
+        volts = 0.0
+        for _ in range(fine):
+            torque = CONSTANT * amps - 2e-5 * speed
+            friction = COULOMB * np.sign(speed) if speed else np.clip(torque, -COULOMB, COULOMB)
+            after = speed + (torque - friction) / INERTIA / RATE / fine
+            after = 0.0 if after * speed < 0 else after
+            volts += (RESISTANCE * amps + CONSTANT * 0.5 * (speed + after)) / fine
+            angle += 0.5 * (speed + after) / RATE / fine
+            speed = after
+        rows.append((volts, angle))
+    volts, angles = np.array(rows).T
+    time = np.arange(steps) / RATE
+    count = np.floor(angles / motors.QUANTUM).astype(np.int64)
+    return Record("motor", time, volts, current=asked, count=count,
+                  hardware=motors.record(seconds=1.0).hardware)  # fmt: skip
+
+
+def test_a_current_that_a_driver_regulates_is_no_clipped_one():
+    record = regulated()
+    assert (record.current == record.current.max()).mean() > 0.1
+    found = estimate(record)
+    assert "current_regulated" in {f.code for f in found.findings} and not found.unreliable
+    for name, true in (("resistance", RESISTANCE), ("motor_constant", CONSTANT)):
+        assert found.value(name) == pytest.approx(true, rel=0.02)  # a fiftieth costs a loop nothing
+
+
+def test_a_current_that_is_clipped_is_none_that_a_driver_regulates():
+    good = motors.record("rear_left", seconds=4.0)
+    with pytest.raises(SignalError, match="saturated sensor, current"):
+        screen([replace(good, current=np.clip(good.current, -0.8, 0.8))])
