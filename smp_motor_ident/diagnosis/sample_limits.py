@@ -1,4 +1,4 @@
-"""Thresholds of what single samples are: their instants, their readings."""
+"""Thresholds of what single samples are: instants, readings, and the driver between them."""
 
 from smp_motor_ident.diagnosis.limits import Limit
 
@@ -28,4 +28,17 @@ REGULATED = Limit(
     "physical: at one current the voltage is a line of the speed but for a voltmeter's scatter; "
     "behind a sensor's limit the current goes on, and takes its share of the voltage",
     "test_saturation.py: a current that a driver regulates is no clipped one",
+)  # fmt: skip
+
+# A driver's effect on its command.
+EFFECT_SHOWN = Limit(
+    0.5, "relative standard deviation",
+    "beyond it the 95 % interval holds a driver without that effect",
+    "test_driver_effect.py: a size that may be nothing is not stated",
+)  # fmt: skip
+SLEW_SEEN = Limit(
+    0.5, "sample",
+    "physical: a voltage that is there within half a sample lacks a quarter of one row at most: a "
+    "clock or a delay of that much is no less likely",
+    "test_driver_effect.py: a rise that is over between two rows is not stated",
 )  # fmt: skip

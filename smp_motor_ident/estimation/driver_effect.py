@@ -15,10 +15,20 @@ import numpy as np
 
 from smp_motor_control.arrays import Array
 from smp_motor_ident.diagnosis.limits import HALF_EXPLAINED
+from smp_motor_ident.diagnosis.sample_limits import EFFECT_SHOWN, SLEW_SEEN
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.fitted import NORMAL_95
 from smp_motor_ident.finding import Finding
-from smp_motor_ident.model.driver import DECLARABLE, EFFECTS, Driver, DriverEffect, Rows
+from smp_motor_ident.model.driver import (
+    CLIP,
+    COAST,
+    DECLARABLE,
+    EFFECTS,
+    SLEW,
+    Driver,
+    DriverEffect,
+    Rows,
+)
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import UNITS, Estimate, Quantity
 
@@ -56,6 +66,20 @@ class DriverFit:
     def cost(self, price: float, factor: float) -> float:
         """Return the deviance over a sandwich factor, with a price for each number."""
         return self.fit.deviance / factor + price * (self.fit.structure.size + self.effect.numbers)
+
+    @property
+    def shown(self) -> bool:
+        """Whether its 95 % interval holds nothing that is no effect, nor is over between rows."""
+        size, kind = self.driver.size, self.effect.kind
+        if kind == COAST:  # of which the size may be anything, as long as it coasts
+            return True
+        if kind == CLIP:
+            size = max(float(np.abs(r.voltage).max()) for r in self.before) - size
+        if kind == SLEW:
+            rise = max(float(np.abs(np.diff(r.voltage)).max()) for r in self.before) / size
+            if rise < SLEW_SEEN.value * min(r.sample_time for r in self.before):
+                return False
+        return self.std < EFFECT_SHOWN.value * size
 
     def widened(self, fit: Fit) -> Fit:
         """Return a fit with its covariance widened by what is not known of the driver."""

@@ -91,7 +91,7 @@ def likeliest(group: Sequence[Record], fit: Fit, hold: str, options: Options) ->
                 every.append(there)
                 most = min(most, there.fit.deviance + behind)
         found = every
-    found = sorted((d for d in found if cost(d) < plain), key=cost)
+    found = sorted((d for d in found if d.shown and cost(d) < plain), key=cost)
     if not found:
         return None
     best, *others = found

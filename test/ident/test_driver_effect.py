@@ -11,7 +11,7 @@ import pytest
 from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.estimation import fast_decay
-from smp_motor_ident.estimation.driver_effect import driver_of, leaves_torque_noise
+from smp_motor_ident.estimation.driver_effect import DriverFit, driver_of, leaves_torque_noise
 from smp_motor_ident.estimation.driver_search import _measured
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.finding import Finding
@@ -140,6 +140,30 @@ def test_a_driver_that_limits_the_current_is_found_and_designed_for():
     one = design(found, Loop(sample_time=STEP, gear_ratio=1.0, counts_per_revolution=None))
     able = (4.0 - STATIC) * GAIN / TAU  # rad/s^2 from the current there is
     assert 0.8 * able < one.reference.max_acceleration < able
+
+
+def sized(kind: int, size: float, std: float) -> DriverFit:
+    """Return an effect of a size beside a command of 5 V, switched every 10 ms and both ways."""
+    effect = next(e for e in driver.EFFECTS if e.kind == kind)
+    switched = np.tile([5.0, -5.0], 10)
+    record = Record("motor", 0.01 * np.arange(20), switched, velocity=np.zeros(20))
+    return DriverFit(effect, Driver(kind, size), std, [record], [record], None, None)
+
+
+@pytest.mark.parametrize("kind", [driver.DEAD_ZONE, driver.SLEW, driver.SAG, driver.DROP])
+def test_a_size_that_may_be_nothing_is_not_stated(kind):
+    assert sized(kind, 0.5, 0.2).shown
+    assert not sized(kind, 0.5, 0.3).shown
+
+
+def test_a_clip_that_may_be_above_the_command_is_not_stated():
+    assert sized(driver.CLIP, 4.5, 0.2).shown
+    assert not sized(driver.CLIP, 4.5, 0.3).shown
+
+
+def test_a_rise_that_is_over_between_two_rows_is_not_stated():
+    assert sized(driver.SLEW, 10.0 / 0.006, 1.0).shown
+    assert not sized(driver.SLEW, 10.0 / 0.004, 1.0).shown
 
 
 @pytest.mark.parametrize(
