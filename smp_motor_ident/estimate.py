@@ -30,6 +30,7 @@ from smp_motor_ident.diagnosis.scope import (
     scope,
 )
 from smp_motor_ident.diagnosis.stamps import bridged, clock_share, merge_bunches, on_beat
+from smp_motor_ident.diagnosis.units import implausible_motor
 from smp_motor_ident.diagnosis.unmodelled import unmodelled_dynamics
 from smp_motor_ident.errors import (
     CurrentError,
@@ -307,7 +308,6 @@ def _stated(
     gear = group[0].hardware.gear_ratio
     errors = regression(final, chosen, gear)
     chosen, parts = dependent(chosen, errors)
-
     weight = candidate_weights(data, candidates)
 
     def said(fit: Fit) -> tuple[Answer, dict[str, float]]:
@@ -337,6 +337,7 @@ def _stated(
         *found,
         *lag_unknown(result, refusal, data.step),
         *assess(final, chosen, FitPercent(fitted, common), tests),
+        *implausible_motor(group, chosen.z),
         *lacks,
         *for_noise,
         *parts,

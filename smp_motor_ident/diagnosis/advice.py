@@ -31,7 +31,6 @@ def assess(data: Experiments, fit: Fit, percent: FitPercent, tests: ResidualTest
         *_resolution(data, fit, tests),
         *sensors(data, fit),
         *_second_lag(data, fit),
-        *_implausible(fit),
         *_torque_noise(data, fit),
     ]
 
@@ -167,24 +166,6 @@ def _second_lag(data: Experiments, fit: Fit) -> Iterator[Finding]:
             "shift_share": share / (1 + share),
         },
         "switch the filter of the firmware off, or record encoder counts or the current",
-    )
-
-
-def _implausible(fit: Fit) -> Iterator[Finding]:
-    """Say of a motor that cannot be that a unit may be another."""
-    lag, gain = fit.z.time_constant, fit.z.dc_gain
-    odd = {
-        f"a time constant of {lag:.3g} s": lag > limits.LONGEST_LAG.value,
-        f"a gain of {gain:.3g} rad/s per volt": gain > limits.HIGHEST_GAIN.value,
-    }
-    if not any(odd.values()):
-        return
-    yield Finding(
-        "implausible_motor",
-        "warning",
-        f"no motor has {' and '.join(word for word, there in odd.items() if there)}",
-        {"time_constant": lag, "dc_gain": gain},
-        "check the units of time (ms taken for s?), speed and voltage (PWM taken for volts?)",
     )
 
 

@@ -42,3 +42,16 @@ SLEW_SEEN = Limit(
     "clock or a delay of that much is no less likely",
     "test_driver_effect.py: a rise that is over between two rows is not stated",
 )  # fmt: skip
+
+# What no motor does, whatever the units of a recording say.
+HIGHEST_SPEED = Limit(
+    8400.0, "rad/s",
+    "physical: 80,000 rpm, what brushes and bearings of the smallest coreless motors bear",
+    "test_poor_records.py: a speed in rpm or a command in amperes makes a motor that hardly is",
+)  # fmt: skip
+FAST_MOTOR = Limit(
+    4200.0, "rad/s",
+    "physical: 40,000 rpm; motors of small geared drives end at 33,000 (N20), catalogues of "
+    "coreless ones at 20,000; beyond are the motors of toys",
+    "test_poor_records.py: a speed in rpm or a command in amperes makes a motor that hardly is",
+)  # fmt: skip

@@ -1,12 +1,19 @@
-"""A column that is called a voltage and is none that a robot runs on."""
+"""Units that are others than they are said to be: of a voltage, an angle, a speed."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from smp_motor_ident.diagnosis.limits import EXTRA_LOW_VOLTAGE, LOW_VOLTAGE
+from smp_motor_ident.diagnosis.limits import (
+    EXTRA_LOW_VOLTAGE,
+    HIGHEST_GAIN,
+    LONGEST_LAG,
+    LOW_VOLTAGE,
+)
+from smp_motor_ident.diagnosis.sample_limits import FAST_MOTOR, HIGHEST_SPEED
 from smp_motor_ident.finding import Finding
+from smp_motor_ident.model.coordinates import Coordinates
 from smp_motor_ident.record import Hardware, Record
 
 RATIOS = {
@@ -54,3 +61,30 @@ def implausible_voltage(records: Sequence[Record]) -> list[Finding]:
             "or with its unit, such as voltage=COLUMN:mV",
         )
     ]
+
+
+def implausible_motor(records: Sequence[Record], found: Coordinates) -> Iterator[Finding]:
+    """Say of a motor that cannot be, or hardly, that a unit may be another."""
+    lag, gain = found.time_constant, found.dc_gain
+    top = max(
+        max(float(np.abs(r.voltage).max()), r.hardware.supply_voltage or 0.0) for r in records
+    )
+    speed = gain * max(top - found.vc_plus, 0.0)
+    words = f"a speed of {speed * 30 / math.pi:.3g} rpm at {top:.3g} V"
+    odd = {
+        f"a time constant of {lag:.3g} s": lag > LONGEST_LAG.value,
+        f"a gain of {gain:.3g} rad/s per volt": gain > HIGHEST_GAIN.value,
+        words: speed > HIGHEST_SPEED.value,
+    }
+    numbers: dict[str, float | str | None]
+    numbers = {"time_constant": lag, "dc_gain": gain, "speed": speed, "voltage": top}
+    advice = (
+        "check the units of time (ms taken for s?), speed (rpm or degrees taken for radians?) and "
+        "voltage (PWM, or a command in amperes, taken for volts?)"
+    )
+    if any(odd.values()):
+        said = f"no motor has {' and '.join(word for word, there in odd.items() if there)}"
+        yield Finding("implausible_motor", "warning", said, numbers, advice)
+    elif speed > FAST_MOTOR.value:
+        said = f"the motor has {words}, which of brushed motors those of toys have alone"
+        yield Finding("fast_motor", "warning", said, numbers, advice)

@@ -153,6 +153,20 @@ def test_a_motor_that_cannot_be_is_said_to_be_none():
     assert "implausible_motor" in codes[1000.0] and "implausible_motor" not in codes[1.0]
 
 
+@pytest.mark.parametrize(
+    "speed, volts, code",
+    [(1.0, 1.0, None), (60 / (2 * np.pi), 1.0, "fast_motor"), (1.0, 0.05, "implausible_motor")],
+)
+def test_a_speed_in_rpm_or_a_command_in_amperes_makes_a_motor_that_hardly_is(speed, volts, code):
+    """Of 6,300 rpm at 24 V; its driver's command is a twentieth of the volts that it takes."""
+    good = motors.record("rear_left", current=False, seconds=3.0)
+    turned = speed * good.count * motors.QUANTUM
+    hardware = replace(good.hardware, supply_voltage=24.0)
+    record = Record("m", good.time, volts * good.voltage, position=turned, hardware=hardware)
+    codes = {f.code for f in estimate(record).findings}
+    assert codes & {"fast_motor", "implausible_motor"} == ({code} if code else set())
+
+
 def test_rest_before_the_excitation_changes_nothing():
     driven = motors.record("rear_left", current=False, seconds=3.0)
     n = 4000
