@@ -12,14 +12,13 @@ from smp_motor_ident.diagnosis.advice import advise, assess, unsettled_rival
 from smp_motor_ident.diagnosis.conditions import dependent
 from smp_motor_ident.diagnosis.current_kind import ARMATURE, current_kind
 from smp_motor_ident.diagnosis.data_quality import screen
-from smp_motor_ident.diagnosis.differenced import counts_again
-from smp_motor_ident.diagnosis.glitches import without_glitches
 from smp_motor_ident.diagnosis.limits import PROFILED
 from smp_motor_ident.diagnosis.misfit import widened_by_misfit
 from smp_motor_ident.diagnosis.model_error import regression
 from smp_motor_ident.diagnosis.noise_or_effect import in_place_of_noise
 from smp_motor_ident.diagnosis.provenance import provenance
 from smp_motor_ident.diagnosis.refusal import lag_unknown, no_candidate, of_which, refuse
+from smp_motor_ident.diagnosis.repair import repaired
 from smp_motor_ident.diagnosis.residuals import residual_tests
 from smp_motor_ident.diagnosis.scope import (
     UNDECIDED,
@@ -29,7 +28,7 @@ from smp_motor_ident.diagnosis.scope import (
     one_size_or_swing,
     scope,
 )
-from smp_motor_ident.diagnosis.stamps import bridged, clock_share, merge_bunches, on_beat
+from smp_motor_ident.diagnosis.stamps import clock_share
 from smp_motor_ident.diagnosis.units import implausible_motor
 from smp_motor_ident.diagnosis.unmodelled import unmodelled_dynamics
 from smp_motor_ident.errors import (
@@ -136,7 +135,7 @@ def estimate(
         rigid = estimate(group, "second_order", fixed=fixed, loss=loss, progress=progress)
         return flexible_shaft.flexible_shaft(group, rigid)
     request = checked(group, model, fixed, bounds, loss, validation, progress)
-    group = counts_again([without_glitches(bridged(merge_bunches(on_beat(r)))) for r in group])
+    group = repaired(group)
 
     def behind(records: list[Record], kept: Sequence[Record] | None) -> Estimate:
         try:
@@ -308,6 +307,7 @@ def _stated(
     gear = group[0].hardware.gear_ratio
     errors = regression(final, chosen, gear)
     chosen, parts = dependent(chosen, errors)
+
     weight = candidate_weights(data, candidates)
 
     def said(fit: Fit) -> tuple[Answer, dict[str, float]]:

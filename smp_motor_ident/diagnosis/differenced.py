@@ -6,6 +6,10 @@ independent errors of a speed they would be far larger than what the data hold, 
 answers to them would bias the fit.  Differences over m samples sum up to m counts in a row, whose
 errors are m times as large: a motor that leaves no more than one count's rounding says which.
 
+A difference over the time that it took is the speed, over the nominal period of a loop that is late
+it is as much too large as that interval is too long: neighbouring speeds then differ as their
+intervals do, which those of a motor do not.
+
 References
 ----------
 L. Ljung, System Identification, 2nd ed. (1999), section 13.4 (noise that a loop feeds back).
@@ -17,7 +21,8 @@ from dataclasses import replace
 import numpy as np
 
 from smp_motor_control.arrays import Array
-from smp_motor_ident.diagnosis.limits import NEIGHBOURS, ONE_COUNT
+from smp_motor_ident.diagnosis.limits import FEWEST, NEIGHBOURS, ONE_COUNT, SIGN_SURE
+from smp_motor_ident.diagnosis.sample_limits import BEAT_JITTER, NOMINAL_PERIOD
 from smp_motor_ident.estimation.fit import Options
 from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.finding import Finding
@@ -26,6 +31,8 @@ from smp_motor_ident.model.structures import SecondOrder
 from smp_motor_ident.record import Record
 
 SMOOTH = 9  # samples of which a mean leaves the motion and hardly the rounding
+SLOW = 100  # counts an interval, of which the step in a speed is seen
+LONGER = 2.0  # times the usual interval: longer ones are gaps
 EVEN = 0.5  # of the usual interval: stamps that are off by more may hide a lost sample
 
 
@@ -86,3 +93,64 @@ def _against_each_other(moved: Array) -> bool:
     rest = (moved - smooth)[SMOOTH:-SMOOTH]
     size = float(rest @ rest)
     return size > 0.0 and float(rest[1:] @ rest[:-1]) < NEIGHBOURS.value * size
+
+
+def over_real_intervals(record: Record) -> Record:
+    """Return a record whose speed was divided by a nominal period with that by the real ones.
+
+    The period is that of the counts a turn where they are known, else the mean interval, which may
+    be another.
+    """
+    velocity, interval = record.velocity, np.diff(record.time, prepend=np.nan)
+    if velocity is None or record.count is not None or record.position is not None:
+        return record
+    interval[list(record.starts)] = np.nan
+    if not _as_intervals(velocity, interval):
+        return record
+    mean, shortest = float(np.nanmean(interval)), float(np.nanpercentile(interval, 5))
+    counted = _period(velocity, record.hardware.counts_per_revolution, mean)
+    known = shortest / LONGER < counted < mean * LONGER
+    period = counted if known else mean
+    words = "the speed is counts over a nominal period, not over the intervals that they took"
+    found = Finding(
+        "nominal_period",
+        "warning" if known else "unreliable",
+        f"{words}: it was put right for a period of {1e3 * period:.4g} ms"
+        + ("" if known else f", the mean one; for {1e3 * shortest:.4g} ms it would be "
+           f"{1 - shortest / mean:.0%} less"),
+        {"period": period, "shortest": shortest},
+        "record the encoder's counts" + ("" if known else ", or map counts_per_revolution=N"),
+    )  # fmt: skip
+    real = velocity * period / interval
+    return replace(record, velocity=real, velocity_window=mean, findings=(*record.findings, found))
+
+
+def _period(velocity: Array, per_turn: float | None, usual: float) -> float:
+    """Return over which period a count is the step in which slow speeds come, 0 if unknown."""
+    if not per_turn:
+        return 0.0
+    slow = np.abs(velocity) < SLOW * 2 * np.pi / per_turn / usual
+    quantum = speed_quantum(velocity[slow])
+    return 2 * np.pi / per_turn / quantum if quantum else 0.0
+
+
+def _as_intervals(velocity: Array, interval: Array) -> bool:
+    """Tell whether speeds differ from the mean of their neighbours as their intervals do.
+
+    That is the slope of a line: one of counts over a nominal period, nothing of a motor's speed.
+    """
+    known = np.isfinite(velocity) & np.isfinite(interval)
+    speed, took = velocity[known], interval[known]
+    if speed.size < FEWEST.value or np.std(took) < BEAT_JITTER.value * np.median(took):
+        return False
+    took = np.minimum(took, LONGER * np.median(took))  # over a gap the motor does what it likes
+    window = np.full(SMOOTH, 1 / SMOOTH)
+    mean, usual = (np.convolve(x, window, "same") for x in (speed, took))
+    inner = slice(SMOOTH, -SMOOTH)
+    x, y = (mean * (took / usual - 1))[inner], (speed - mean)[inner]
+    power = float(x @ x)
+    if power <= 0:
+        return False
+    slope = float(x @ y) / power
+    std = float(np.linalg.norm((y - slope * x) * x)) / power
+    return slope - SIGN_SURE.value * std > NOMINAL_PERIOD.value

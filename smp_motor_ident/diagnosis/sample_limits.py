@@ -29,6 +29,12 @@ REGULATED = Limit(
     "behind a sensor's limit the current goes on, and takes its share of the voltage",
     "test_saturation.py: a current that a driver regulates is no clipped one",
 )  # fmt: skip
+NOMINAL_PERIOD = Limit(
+    0.5, "slope",
+    "cost: half-way between a motor's speed (0) and counts over a period that is always the same "
+    "(1), by which the gain is off as much as intervals are",
+    "test_differenced.py: counts over a nominal period are a speed over the real intervals",
+)  # fmt: skip
 
 # A driver's effect on its command.
 EFFECT_SHOWN = Limit(

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from smp_motor_ident.diagnosis.differenced import counts_again, rounding
+from smp_motor_ident.diagnosis.differenced import counts_again, over_real_intervals, rounding
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.record import Record
+from smp_motor_ident.record import Hardware, Record
 
 GAIN, LAG, STEP, TURN = 40.0, 0.03, 0.001, 2 * np.pi / 48
 """rad/s/V, s, sampling interval [s] and a count [rad]: one count a sample is 131 of 480 rad/s."""
@@ -64,3 +64,49 @@ def test_what_has_lost_samples_or_values_cannot_be_summed():
     broken[500] = np.nan
     missing = replace(record, velocity=broken)
     assert counts_again([missing])[0] is missing
+
+
+PERIOD = 0.0115
+"""Of a loop of 10 ms that is late by some, in the firmware's words [s]."""
+
+
+def late_loop(per_turn: float | None, nominal: bool) -> Record:
+    """A speed from counts, over a nominal period or over the intervals that they took."""
+    rng = np.random.default_rng(7)
+    interval = 0.01 + rng.exponential(0.001, 1500) + (rng.random(1500) < 0.01) * 0.03
+    volts = np.repeat(rng.uniform(-12.0, 12.0, 50), 30)
+    angle, speed, counts = 0.0, 0.0, []
+    for u, h in zip(volts, interval, strict=True):
+        keep = np.exp(-h / 0.1)
+        angle += GAIN * u * h + (speed - GAIN * u) * 0.1 * (1 - keep)
+        speed = GAIN * u + (speed - GAIN * u) * keep
+        counts.append(np.floor(angle / TURN))
+    moved = np.diff(counts, prepend=0.0) * TURN
+    shown = moved / (PERIOD if nominal else interval)
+    hardware = Hardware(counts_per_revolution=per_turn)
+    time = np.cumsum(interval) - interval[0]
+    return Record("motor", time, volts, velocity=shown, hardware=hardware)
+
+
+def test_counts_over_a_nominal_period_are_a_speed_over_the_real_intervals():
+    put_right = over_real_intervals(late_loop(48.0, nominal=True))
+    real = late_loop(48.0, nominal=False)
+    np.testing.assert_allclose(put_right.velocity[1:], real.velocity[1:], rtol=1e-9)
+    assert over_real_intervals(real) is real
+    gain = estimate(late_loop(48.0, nominal=True)).combinations["dc_gain"]
+    assert abs(gain.value - GAIN) < 4 * gain.std and gain.std < 0.005 * GAIN
+
+
+def test_a_nominal_period_that_is_not_known_leaves_the_gain_open():
+    found = estimate(late_loop(None, nominal=True))
+    (said,) = [f for f in found.findings if f.code == "nominal_period"]
+    assert said.severity == "unreliable" and "counts_per_revolution" in said.advice
+
+
+def test_late_stamps_of_a_regular_sensor_are_no_nominal_period():
+    record = late_loop(48.0, nominal=False)
+    regular = PERIOD * np.arange(len(record))
+    even = replace(record, time=regular, velocity=GAIN * record.voltage)
+    late = np.random.default_rng(3).exponential(0.1 * PERIOD, len(record))
+    stamped = replace(even, time=np.maximum.accumulate(regular + late) + 1e-9 * regular)
+    assert over_real_intervals(stamped) is stamped

@@ -1,0 +1,17 @@
+"""What is put right in records before anything is made of them, in the order in which it is."""
+
+from collections.abc import Iterable
+
+from smp_motor_ident.diagnosis.differenced import counts_again, over_real_intervals
+from smp_motor_ident.diagnosis.glitches import without_glitches
+from smp_motor_ident.diagnosis.stamps import bridged, merge_bunches, on_beat
+from smp_motor_ident.record import Record
+
+
+def repaired(records: Iterable[Record]) -> list[Record]:
+    """Return records with their stamps, lost rows and readings put right as far as they show it.
+
+    Glitches come last: what a nominal period makes of a late interval looks like one.
+    """
+    stamped = [merge_bunches(on_beat(over_real_intervals(r))) for r in records]
+    return counts_again([without_glitches(bridged(r)) for r in stamped])
