@@ -18,7 +18,7 @@ from smp_motor_ident.diagnosis.model_error import regression
 from smp_motor_ident.diagnosis.noise_or_effect import in_place_of_noise
 from smp_motor_ident.diagnosis.provenance import provenance
 from smp_motor_ident.diagnosis.refusal import lag_unknown, no_candidate, of_which, refuse
-from smp_motor_ident.diagnosis.repair import repaired
+from smp_motor_ident.diagnosis.repair import hides_driver, repaired
 from smp_motor_ident.diagnosis.residuals import residual_tests
 from smp_motor_ident.diagnosis.scope import (
     UNDECIDED,
@@ -260,7 +260,7 @@ def _through_driver(
     fit: Fit,
 ) -> tuple[Estimate | None, DriverFit | None]:
     """Return the estimate behind the likeliest driver, if it holds, and that driver."""
-    if request.driver is not None or one_size_or_swing(data):
+    if request.driver is not None or one_size_or_swing(data) or hides_driver(group):
         return None, None
     request.say("what the driver makes of its command")
     driver = likeliest(group, fit, hold, request.options)

@@ -6,6 +6,7 @@ import numpy as np
 
 from smp_motor_control.arrays import Array
 from smp_motor_ident.diagnosis import limits
+from smp_motor_ident.diagnosis.edge_timer import held_of
 from smp_motor_ident.diagnosis.glitches import glitches_of
 from smp_motor_ident.diagnosis.saturation import saturation
 from smp_motor_ident.diagnosis.signs import lagged, likeness, lost_sign
@@ -77,6 +78,7 @@ def _lost(record: Record) -> Iterator[Finding]:
         if values is None or (record.count is not None and record.hardware.counts_per_revolution):
             continue
         lost = float(np.mean(~np.isfinite(values)))
+        lost -= held_of(record) if name == "velocity" else 0.0  # which is said already
         if lost > limits.MOST_LOST.value and (name == "velocity" or record.velocity is None):
             raise SignalError(
                 f"{where}: {name} is NaN in {lost:.0%} of the samples; "

@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 
 from smp_motor_ident.diagnosis.differenced import counts_again, over_real_intervals
+from smp_motor_ident.diagnosis.edge_timer import between_edges, held_of
 from smp_motor_ident.diagnosis.glitches import without_glitches
 from smp_motor_ident.diagnosis.stamps import bridged, merge_bunches, on_beat
 from smp_motor_ident.record import Record
@@ -13,5 +14,14 @@ def repaired(records: Iterable[Record]) -> list[Record]:
 
     Glitches come last: what a nominal period makes of a late interval looks like one.
     """
-    stamped = [merge_bunches(on_beat(over_real_intervals(r))) for r in records]
+    stamped = [merge_bunches(on_beat(over_real_intervals(between_edges(r)))) for r in records]
     return counts_again([without_glitches(bridged(r)) for r in stamped])
+
+
+def hides_driver(records: Iterable[Record]) -> bool:
+    """Tell whether too little of the slow motion was put right to tell a driver from friction.
+
+    What an edge timer leaves of a motor that comes to rest is as late as a dead zone or a drop
+    would make it.
+    """
+    return any(map(held_of, records))

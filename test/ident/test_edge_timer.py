@@ -1,0 +1,86 @@
+"""A speed from the time between edges is used for what it is: a mean, held until the next."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from smp_motor_ident.diagnosis.edge_timer import between_edges, held_of
+from smp_motor_ident.estimate import estimate
+from smp_motor_ident.record import Hardware, Record
+
+GAIN, LAG, STATIC, STEP, FINE = 40.0, 0.06, 0.4, 0.005, 1e-4
+COUNT = 2 * np.pi / 48
+
+
+def motion(seconds: float = 15.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return voltage by rows, and speed and angle of a motor with friction on a fine grid."""
+    rows = int(seconds / STEP)
+    levels = np.random.default_rng(5).uniform(-4.0, 4.0, rows // 40 + 1)
+    volts = np.repeat(levels, 40)[:rows]
+    speed, w = np.zeros(rows * round(STEP / FINE)), 0.0
+    for k in range(speed.size):
+        u = volts[k // round(STEP / FINE)]
+        if w == 0.0 and abs(u) <= STATIC:
+            continue
+        way = np.sign(w) if w else np.sign(u)
+        after = w + FINE / LAG * (GAIN * (u - STATIC * way) - w)
+        w = 0.0 if after * way < 0.0 else after
+        speed[k] = w
+    return volts, speed, np.cumsum(speed) * FINE
+
+
+def timed(speed: np.ndarray, angle: np.ndarray, tick: float) -> np.ndarray:
+    """Return what a timer of edges says at each row; nothing after a tenth of a second without."""
+    edges = np.floor(angle / COUNT + 0.3)
+    at = np.flatnonzero(np.diff(edges)) + 1
+    share = np.maximum(edges[at], edges[at - 1]) - 0.3 - angle[at - 1] / COUNT
+    instants = (at + share / ((angle[at] - angle[at - 1]) / COUNT)) * FINE
+    ticks = np.maximum(np.diff(np.floor(instants / tick)), 1.0) * tick
+    reading = np.append(0.0, np.sign(edges[at] - edges[at - 1])[1:] * COUNT / ticks)
+    rows = np.arange(1, speed.size * FINE / STEP + 0.5) * STEP
+    last = np.searchsorted(instants, rows, side="right") - 1
+    said = np.where(last < 0, 0.0, reading[last])
+    return np.where(rows - instants[last] > 0.1, 0.0, said)
+
+
+def recorded(tick: float, per_turn: float | None) -> Record:
+    volts, speed, angle = motion()
+    hardware = Hardware(counts_per_revolution=per_turn)
+    shown = timed(speed, angle, tick)
+    time = STEP * np.arange(volts.size)
+    return Record("motor", time, volts, velocity=shown, hardware=hardware)
+
+
+@pytest.mark.parametrize("tick, per_turn", [(1e-6, None), (4e-6, 48.0)])
+def test_what_a_timer_of_edges_holds_is_no_dead_zone(tick, per_turn):
+    record = recorded(tick, per_turn)
+    (said,) = [f for f in between_edges(record).findings if f.code == "edge_timer"]
+    assert said.evidence["count"] == pytest.approx(COUNT, rel=0.25)  # by how it is held: to a row
+    found = estimate(record)
+    assert "dead_zone" not in found.combinations and not found.unreliable
+    for name, true in (("dc_gain", GAIN), ("static_voltage", STATIC)):
+        q = found.combinations[name]
+        assert abs(q.value - true) < 4 * q.std and q.std < 0.25 * true
+
+
+def test_a_speed_from_counts_rounded_or_held_is_none_of_a_timer():
+    volts, speed, angle = motion()
+    every = round(STEP / FINE)
+    counts = np.floor(angle[every - 1 :: every] / COUNT)
+    time = STEP * np.arange(volts.size)
+    true = speed[every - 1 :: every]
+    for shown in (
+        np.diff(counts, prepend=0.0) * COUNT / STEP,
+        true,
+        np.round(true, 1),
+        np.round(true),
+        np.repeat(true[::7], 7)[: true.size],
+        true + np.random.default_rng(1).normal(0.0, 1.0, true.size),
+    ):
+        for per_turn in (None, 48.0):
+            hardware = Hardware(counts_per_revolution=per_turn)
+            record = Record("motor", time, volts, velocity=shown, hardware=hardware)
+            assert between_edges(record) is record and held_of(record) == 0.0
+    counted = replace(record, count=counts.astype(np.int64))
+    assert between_edges(counted) is counted
