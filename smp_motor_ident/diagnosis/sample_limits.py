@@ -38,13 +38,13 @@ NOMINAL_PERIOD = Limit(
 EDGES = Limit(
     12, "readings",
     "cost: of fewer that are held for as long as the next one says, chance makes some",
-    "test_edge_timer.py: a speed from counts, rounded or held is none of a timer",
+    "test_edge_timer.py: a speed from counts rounded or held is none of a timer",
 )  # fmt: skip
 HELD = Limit(
     0.85, "of the slow readings",
     "cost: reversals and rests begin a time that is not one of a count; what another sensor holds "
     "is held for as long as the next says in a third of the cases at most",
-    "test_edge_timer.py: a speed from counts, rounded or held is none of a timer",
+    "test_edge_timer.py: a speed from counts rounded or held is none of a timer",
 )  # fmt: skip
 
 # A driver's effect on its command.

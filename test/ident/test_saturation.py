@@ -11,7 +11,8 @@ from smp_motor_ident.errors import SignalError
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.record import Record
 
-RATE, RESISTANCE, CONSTANT, INERTIA, COULOMB = 200.0, 2.0, 0.03, 4e-5, 2e-3
+RATE, RESISTANCE, CONSTANT = 200.0, 2.0, 0.03
+INERTIA, VISCOUS, COULOMB = 4e-5, 2e-5, 2e-3
 
 
 def regulated() -> Record:
@@ -23,7 +24,7 @@ def regulated() -> Record:
     for amps in asked:
         volts = 0.0
         for _ in range(fine):
-            torque = CONSTANT * amps - 2e-5 * speed
+            torque = CONSTANT * amps - VISCOUS * speed
             friction = COULOMB * np.sign(speed) if speed else np.clip(torque, -COULOMB, COULOMB)
             after = speed + (torque - friction) / INERTIA / RATE / fine
             after = 0.0 if after * speed < 0 else after
@@ -43,7 +44,8 @@ def test_a_current_that_a_driver_regulates_is_no_clipped_one():
     assert (record.current == record.current.max()).mean() > 0.1
     found = estimate(record)
     assert "current_regulated" in {f.code for f in found.findings} and not found.unreliable
-    for name, true in (("resistance", RESISTANCE), ("motor_constant", CONSTANT)):
+    gain = CONSTANT / (RESISTANCE * VISCOUS + CONSTANT**2)
+    for name, true in (("resistance", RESISTANCE), ("dc_gain", gain)):
         assert found.value(name) == pytest.approx(true, rel=0.02)  # a fiftieth costs a loop nothing
 
 
