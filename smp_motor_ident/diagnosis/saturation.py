@@ -57,15 +57,20 @@ def saturation(record: Record, speed: Array, where: str) -> Iterator[Finding]:
                 "lower the excitation"
             )
     if regulated:
-        yield Finding(
-            "current_regulated",
-            "warning",
-            f"the current rests at {regulated:.4g} A while the voltage follows the speed: a driver "
-            "regulates it, and how fast it does is taken for the winding's lag (inductance, "
-            "time_constant_product)",
-            {"current": regulated, "quantity": "inductance"},
-            "record with a driver that follows a command in volts to know the inductance",
-        )
+        yield _regulated(regulated)
+
+
+def _regulated(current: float) -> Finding:
+    """Say what of the motor a driver hides that keeps the current."""
+    return Finding(
+        "current_regulated",
+        "warning",
+        f"the current rests at {current:.4g} A while the voltage follows the speed: a driver "
+        "regulates it, and how fast it does is taken for the winding's lag (inductance, "
+        "time_constant_product)",
+        {"current": current, "quantity": "inductance"},
+        "record with a driver that follows a command in volts to know the inductance",
+    )
 
 
 def _holds(rests: Flags, voltage: Array, speed: Array) -> bool:
