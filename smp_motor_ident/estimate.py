@@ -17,7 +17,13 @@ from smp_motor_ident.diagnosis.misfit import widened_by_misfit
 from smp_motor_ident.diagnosis.model_error import regression
 from smp_motor_ident.diagnosis.noise_or_effect import in_place_of_noise
 from smp_motor_ident.diagnosis.provenance import provenance
-from smp_motor_ident.diagnosis.refusal import lag_unknown, no_candidate, of_which, refuse
+from smp_motor_ident.diagnosis.refusal import (
+    fallen_back,
+    lag_unknown,
+    no_candidate,
+    of_which,
+    refuse,
+)
 from smp_motor_ident.diagnosis.repair import hides_driver, repaired
 from smp_motor_ident.diagnosis.residuals import residual_tests
 from smp_motor_ident.diagnosis.scope import (
@@ -209,7 +215,7 @@ def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) 
     for one in in_turn(candidates):
         left = [r for r in left if r.fit is not one.fit]
         try:
-            words = [*found, *_fallen_back(refused, one)]
+            words = [*found, *fallen_back(refused, one.label)]
             plain = _stated(group, request, words, data, hold, [*left, one])
             if not lacks_something(plain):
                 return plain
@@ -277,20 +283,6 @@ def _through_driver(
     fails = any(f.severity == "unreliable" and not blames_current(f) for f in e.findings)
     fails = fails or leaves_torque_noise(e, fit)
     return (None if fails or hollow else through(e, driver)), driver
-
-
-def _fallen_back(refusal: SmpError | None, other: FittedCandidate) -> list[Finding]:
-    if refusal is None:
-        return []
-    return [
-        Finding(
-            "choice_refused",
-            "unreliable",
-            f"the structure that fits the samples best was refused ({refusal}); this is "
-            f"the answer of {other.label}",
-            advice="record longer, with sharper and larger steps",
-        )
-    ]
 
 
 def _stated(

@@ -97,8 +97,8 @@ def identify_one(path: str, settings: tuple[Any, ...]) -> list[fleet.Row]:
                 n: held[n] for n in held if n in fleet.QUANTITIES and held[n].value is not None
             }
             values = {n: (float(q.value or 0.0), float(q.std or 0.0)) for n, q in known.items()}
-            told = dict(fit_percent=found.fit_percent.validation, unreliable=found.unreliable)
-            rows.append(_row(path, wheel=wheel, values=values, **told))
+            verdict = dict(fit_percent=found.fit_percent.validation, unreliable=found.unreliable)
+            rows.append(_row(path, wheel=wheel, values=values, **verdict))
     except SmpError as error:
         return [_row(path, failure=str(error))]
     except Exception as error:  # whatever is wrong with one recording, the others go on

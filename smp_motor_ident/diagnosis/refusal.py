@@ -86,6 +86,21 @@ def refuse(
         )
 
 
+def fallen_back(refusal: SmpError | None, other: str) -> list[Finding]:
+    """Say that an answer is another candidate's than the one that fits the samples best."""
+    if refusal is None:
+        return []
+    return [
+        Finding(
+            "choice_refused",
+            "unreliable",
+            f"the structure that fits the samples best was refused ({refusal}); this is "
+            f"the answer of {other}",
+            advice="record longer, with sharper and larger steps",
+        )
+    ]
+
+
 def lag_unknown(result: Answer, refusal: UnknownLagError | None, step: float) -> Iterator[Finding]:
     """Say that an answer leaves open how slow the motor is, at this sampling interval [s]."""
     if refusal is None:

@@ -11,7 +11,6 @@ from smp_motor_control.encoder import Encoder
 from smp_motor_control.motor.model import MotorModel
 from smp_motor_control.motor.parameters import Gearbox
 from smp_motor_control.pid import PidGains
-from smp_motor_control.reference.profile import Drive
 from smp_motor_control.wheel.controller import State, WheelController, WheelSettings
 from smp_motor_control.wheel.faults import Fault, FaultLimits
 from smp_motor_control.wheel.loop import LoopSettings
@@ -179,22 +178,6 @@ def test_speeds_up_to_the_implausible_count_in_both_directions() -> None:
         assert feed.give(sign * 100.0) == -sign * 12.0
         assert feed.give(sign * 100.01) is None
         assert feed.wheel.refused == {"feedback velocity that is not a number or implausible": 1}
-
-
-def test_a_reading_that_jumps_is_left_out_and_two_that_agree_are_not() -> None:
-    """No motor changes by half of its top speed within a sample; what hits it may."""
-    gains = replace(GAINS, feedforward_acceleration=2.0)  # 12 V of 2 V s^2/rad: 0.1 rad/s a sample
-    drive = Drive(top_speed=10.0, time_constant=0.2)
-    feed = Feed(replace(SETTINGS, loop=LoopSettings(gains=gains, drive=drive)))
-    feed.wheel.set_hardware(Gearbox(1.0), Encoder(64.0), 12.0)
-    feed.ask(0.0)
-    left_out = [feed.give(v) is None for v in (4.9, 0.1, 5.2, 0.2, -9.0, -8.9, -8.9)]
-    assert left_out == [False, False, True, False, True, False, False]
-    assert feed.wheel.refused == {"feedback speed that jumps": 2}
-    for k in range(20):
-        feed.give(20.0 * (k % 2))
-        feed.wheel.tick(feed.now)
-    assert feed.wheel.state is State.BAD_FEEDBACK
 
 
 def test_a_count_that_jumps_is_left_out_and_the_speed_begins_anew() -> None:

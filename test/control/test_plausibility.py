@@ -1,0 +1,54 @@
+"""A speed that no motor can have reached since the sample before is left out of its loop."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from smp_motor_control.encoder import Encoder
+from smp_motor_control.motor.parameters import Gearbox
+from smp_motor_control.pid import PidGains
+from smp_motor_control.reference.profile import Drive
+from smp_motor_control.wheel.controller import State, WheelController, WheelSettings
+from smp_motor_control.wheel.faults import FaultLimits
+from smp_motor_control.wheel.loop import LoopSettings
+
+STEP = 0.01
+GAINS = PidGains(p=2.0, feedforward_acceleration=2.0, u_clamp_min=-12.0, u_clamp_max=12.0)
+DRIVE = Drive(top_speed=10.0, time_constant=0.2)  # at 12 V it changes by 0.1 rad/s a sample
+
+
+def driven(speeds, drive=DRIVE) -> tuple[WheelController, list[bool]]:
+    """Return a wheel and which of the readings it left out."""
+    quiet = FaultLimits(stall_time=0.0, runaway_time=0.0, tracking_time=0.0)
+    wheel = WheelController(
+        WheelSettings(loop=LoopSettings(gains=GAINS, drive=drive), faults=quiet)
+    )
+    wheel.set_hardware(Gearbox(1.0), Encoder(64.0), 12.0)
+    wheel.activate(0.0)
+    out = []
+    for k, speed in enumerate([0.0, *speeds], 1):
+        now = k * STEP
+        wheel.take_setpoint(0.0, now)
+        sample = SimpleNamespace(voltage=0.0, current=np.nan, velocity=speed, encoder_count=0)
+        answer = wheel.take_feedback(sample, round(1e9 * now), round(1e9 * now), now)
+        wheel.tick(now)
+        out.append(answer is None)
+    return wheel, out[1:]
+
+
+def test_a_reading_that_jumps_is_left_out_and_two_that_agree_are_not() -> None:
+    """No motor changes by half of its top speed within a sample; what hits it may."""
+    wheel, left_out = driven([0.0, 4.9, 0.1, 5.2, 0.2, -9.0, -8.9, -8.9])
+    assert left_out == [False, False, False, True, False, True, False, False]
+    assert wheel.refused == {"feedback speed that jumps": 2}
+
+
+def test_nothing_jumps_where_the_drive_is_not_known() -> None:
+    assert not any(driven([0.0, 5.2, 0.2, -9.0, 9.0], drive=None)[1])
+
+
+@pytest.mark.parametrize("jump", [6.0, 900.0])
+def test_a_wheel_whose_readings_all_jump_gets_no_voltage(jump: float) -> None:
+    wheel, _ = driven([0.0, *np.resize([jump, -jump], 60)])
+    assert wheel.state is State.BAD_FEEDBACK and wheel.output == 0.0
