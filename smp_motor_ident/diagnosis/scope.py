@@ -13,11 +13,13 @@ from smp_motor_ident.diagnosis.limits import (
     REST,
     SAME_LEVEL,
 )
+from smp_motor_ident.estimation.prediction import voltage_at_samples
 from smp_motor_ident.estimation.quantities import Answer
 from smp_motor_ident.estimation.segments import Change
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.coordinates import LOGARITHMS, STANDS_FOR
+from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import Estimate
 
@@ -38,7 +40,7 @@ def scope(
     if alike:
         yield _alike(alike)
     if result.level:
-        yield _one_level(result)
+        yield _one_level(result, _turns_at_others(data, result.level))
     yield from _current_scale(result, group[0].hardware.resistance, _one_size(data) > 0)
     if change.std:
         yield _motor_changes(change, group, float(np.abs(data.voltage).max()))
@@ -159,7 +161,7 @@ def _one_size_of_voltage(top: float) -> Iterator[Finding]:
 
 def _one_direction(data: Experiments, result: Answer) -> Iterator[Finding]:
     """Say that friction and a constant load are one voltage where the motor turns one way only."""
-    if data.hold_value.min() < 0 < data.hold_value.max():
+    if not data.one_way:
         return
     if "load_voltage" in result.combinations:
         yield from _driving_load(data, result)
@@ -238,11 +240,21 @@ def _current_scale(result: Answer, ohmmeter: float | None, one_size: bool) -> It
     )
 
 
-def _one_level(result: Answer) -> Finding:
+def _turns_at_others(data: Experiments, level: float) -> bool:
+    """Tell whether a recorded speed is one under other voltages, too, at which a model stands."""
+    if data.kind == ANGLE:
+        return False
+    speed, volts = np.abs(data.output), np.abs(voltage_at_samples(data))
+    turns = speed > REST.value * np.nanmax(speed)
+    other = (volts > REST.value * level) & (np.abs(volts - level) > SAME_LEVEL.value * level)
+    return float(np.mean(turns & other)) > SAME_LEVEL.value
+
+
+def _one_level(result: Answer, contradicted: bool) -> Finding:
     speed = result.combinations["steady_speed"]
     return Finding(
         "one_level",
-        "warning",
+        "unreliable" if contradicted else "warning",
         f"of gain and static voltage only the steady speed at {result.level:.3g} V is "
         f"known, {speed.value:.4g} rad/s: every pair with this product "
         "dc_gain (voltage - static_voltage) moves the motor alike",

@@ -36,6 +36,8 @@ def varied(
     while before != best.structure:  # what was added may have hidden that the rest is there, too
         before = best.structure
         for change in _additions(before):
+            if "friction" in change and data.one_way:  # of the other direction nothing shows
+                continue
             best = _with_addition(data, best, change, options, candidates, say)
     if best.structure != candidates[0].fit.structure:  # what was added may have hidden it
         best = with_current_lag(data, best, options, candidates, say)

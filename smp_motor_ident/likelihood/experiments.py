@@ -69,6 +69,11 @@ class Experiments:
         """The command's levels [V]: as it was held, or the rows between which it ran straight."""
         return self.voltage if self.how == "interpolated" else self.hold_value
 
+    @property
+    def one_way(self) -> bool:
+        """Whether the command drives the motor in one direction only."""
+        return not self.hold_value.min() < 0 < self.hold_value.max()
+
     @cached_property
     def known_initial(self) -> Array:
         """What is known of each segment's initial state beforehand: precisions around zero.
