@@ -11,19 +11,29 @@ _GROSS = 0.5
 """Share of the top speed by which readings may differ for whatever reason."""
 
 
+_QUIET = 0.2
+"""Mean change from reading to reading, of the largest that is believed, below which one that jumps
+is none of its kind: readings in coarse steps jump all the time."""
+
+_RISE, _FALL = 0.05, 0.005
+"""Weights of the newest change in that mean where it is larger, and smaller: coarse steps are known
+after a few, outliers in one of a hundred readings are none."""
+
+
 class PlausibleSpeed:
-    """Leaves out a reading that jumps, unless the next one is there, too.
+    """Leaves out a reading that jumps where others do not, unless the next one is there, too.
 
     Examples
     --------
     >>> speed = PlausibleSpeed()
     >>> speed.gross, speed.rate = 1.0, 10.0
-    >>> [speed.accepts(one, 0.01) for one in (0.0, 0.1, 5.0, 0.1, -4.0, -4.1)]
-    [True, True, False, True, False, True]
+    >>> [speed.accepts(one, 0.01) for one in (0.0, 0.1, 5.0, 0.1)]
+    [True, True, False, True]
     """
 
     def __init__(self) -> None:
         self.gross = self.rate = math.inf  # [rad/s], [rad/s^2]: what a change may be of
+        self._usual = 0.0  # mean change, of the largest that is believed
         self.reset()
 
     def configure(self, settings: LoopSettings, supply: float) -> None:
@@ -42,7 +52,11 @@ class PlausibleSpeed:
         """Tell whether a speed [rad/s] is to be believed."""
         most = max(self.gross, self.rate * dt)
         last, self._last = self._last, speed
-        if abs(speed - self._kept) > most and not abs(speed - last) <= most:  # NaN: the first
+        change = abs(speed - last)  # NaN: the first
+        beyond = (change / most if change < most else 1.0) - self._usual
+        self._usual += (_RISE if beyond > 0.0 else _FALL) * beyond
+        jumps = abs(speed - self._kept) > most and not change <= most
+        if jumps and self._usual < _QUIET:
             return False
         self._kept = speed
         return True

@@ -287,7 +287,7 @@ def test_a_slew_limit_remembers_where_it_was():
 def test_no_driver_is_found_that_leaves_nothing_of_the_record():
     """Current flows in the on-time alone; 26 levels one way look clipped at the lowest, too."""
     rng = np.random.default_rng(1)
-    duty = np.repeat(np.arange(26) / 25, 200)
+    duty = np.repeat(np.arange(26) / 25, 100)
     w, speed = 0.0, np.zeros(duty.size)
     for k in range(duty.size):
         drive = duty[k] * (12 - w / 4.5) * 4.5 - 0.12 * w - 2.0 * (w > 0 or duty[k] > 0.05)
