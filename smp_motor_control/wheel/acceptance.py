@@ -36,6 +36,7 @@ _UNKNOWN = Encoder(2.0**20)
 """An encoder that is not known yet speaks against no gains: they may be for a fine one."""
 
 _GROWING = 1.02
+_LONGER = 6
 _FAR = 1e3
 _NOMINAL = MotorModel(dc_gain=25.0, time_constant=0.05)
 _NOMINAL_RATIO = 65.5
@@ -153,7 +154,22 @@ class _Plant:
 
 
 def _is_stable(settings: LoopSettings, plant: _Plant) -> bool:
-    """Tell whether the loop without clamps comes to rest after a step of its set-point."""
+    """Tell whether the loop without clamps comes to rest after a step of its set-point.
+
+    A measured speed may be late by a filter's lag, for which its gains are made.
+    """
+    filtered = settings.speed_source == "measured"
+    lag = settings.reference_delay - plant.dt if filtered else 0.0
+    return _settles(settings, plant, 1.0) or (
+        lag > plant.dt and _settles(settings, plant, 1 - math.exp(-plant.dt / lag))
+    )
+
+
+def _settles(settings: LoopSettings, plant: _Plant, share: float) -> bool:
+    """Tell whether the error ceases to grow, a share of the speed's change shown in a sample.
+
+    A slow integral overshoots for longer than the motor's own response takes.
+    """
     open_clamps = replace(
         settings.gains, u_clamp_min=-math.inf, u_clamp_max=math.inf, i_clamp_min=-math.inf,
         i_clamp_max=math.inf, antiwindup_strategy="none", error_deadband=0.0,
@@ -162,15 +178,20 @@ def _is_stable(settings: LoopSettings, plant: _Plant) -> bool:
         LoopSettings(gains=open_clamps, limits=UNLIMITED, reference_delay=settings.reference_delay)
     )
     plant.rest()
-    speed, errors = 0.0, []
-    for _ in range(plant.samples):
-        speed = plant.step(loop.step(1.0, speed, plant.dt).output, 0.0)
-        if not -_FAR < speed < _FAR:
-            return False
-        errors.append(abs(1.0 - speed))
-    quarter = plant.samples // 4
-    early, late = max(errors[quarter : 2 * quarter]), max(errors[-quarter:])
-    return late < max(_GROWING * early, 0.02)
+    speed = shown = 0.0
+    errors: list[float] = []
+    for length in (plant.samples, _LONGER * plant.samples):
+        while len(errors) < length:
+            speed = plant.step(loop.step(1.0, shown, plant.dt).output, 0.0)
+            shown += share * (speed - shown)
+            if not -_FAR < speed < _FAR:
+                return False
+            errors.append(abs(1.0 - speed))
+        quarter = length // 4
+        early, late = max(errors[quarter : 2 * quarter]), max(errors[-quarter:])
+        if late < max(_GROWING * early, 0.02):
+            return True
+    return False
 
 
 def _unstable(settings: LoopSettings, plant: _Plant) -> str:
