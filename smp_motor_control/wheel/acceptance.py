@@ -36,7 +36,7 @@ _UNKNOWN = Encoder(2.0**20)
 """An encoder that is not known yet speaks against no gains: they may be for a fine one."""
 
 _GROWING = 1.02
-_LONGER = 6
+_LONGER = 6  # times a trial whose error still grows: a slow integral's overshoot is over by then
 _FAR = 1e3
 _NOMINAL = MotorModel(dc_gain=25.0, time_constant=0.05)
 _NOMINAL_RATIO = 65.5

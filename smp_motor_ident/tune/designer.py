@@ -19,7 +19,7 @@ from smp_motor_ident.tune.limits import DELAY_BORNE, HELD_BACK
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.margins import Margins, loop_margins
 from smp_motor_ident.tune.methods import METHODS
-from smp_motor_ident.tune.motors import lag_in_sensor
+from smp_motor_ident.tune.motors import Motors, lag_in_sensor
 from smp_motor_ident.tune.plant import Plant, sample
 from smp_motor_ident.tune.reference import Reference, controller_for, plan_reference
 from smp_motor_ident.tune.simulation import Controller
@@ -138,10 +138,11 @@ def with_reference(case: Case, one: Design, reference: Reference) -> Design:
     return replace(one, reference=reference, performance=figures, specification=bands)
 
 
-def _usual(case: Case) -> Plant:
-    """Return the nominal motor sampled with the loop's usual delay."""
-    loop = case.problem.loop
-    return sample(case.problem.plant.motors, replace(loop, delay=loop.expected_delay))
+def _usual(case: Case, motors: Motors | None = None) -> Plant:
+    """Return the nominal motor, or another in its place, sampled with the loop's usual delay."""
+    loop, nominal = case.problem.loop, case.problem.plant.motors
+    expected = replace(loop, delay=loop.expected_delay)
+    return sample(motors or nominal, expected, believed=nominal)
 
 
 def wheel_gains(case: Case, controller: Controller) -> PidGains:
@@ -172,8 +173,7 @@ def wheel_gains(case: Case, controller: Controller) -> PidGains:
 def _plan(case: Case, usual: Plant, controller: Controller, margins: Margins) -> Reference:
     loop, plants = case.problem.loop, [usual]
     if case.lag_in_doubt:
-        expected = replace(loop, delay=loop.expected_delay)
-        plants.append(sample(lag_in_sensor(usual.motors), expected, believed=usual.motors))
+        plants.append(_usual(case, lag_in_sensor(usual.motors)))
     # Of a delay that may be longer than usual no more is asked than the loop bears.
     borne = replace(loop, delay_doubt=min(loop.delay_doubt, DELAY_BORNE.value * margins.delay))
     least = 0.4 / margins.crossover if margins.crossover > 0 else 0.0

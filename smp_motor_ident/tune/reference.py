@@ -158,12 +158,9 @@ def plan_reference(
     )
     plan = _quickest(plants, loop, controller, plan, least)
     quickest = plan.transition_time
-    if math.isfinite(drive):
-        able = min(PEAK * drive / float(m.a1[0]), _steepest(plan))
-        plan = replace(plan, max_acceleration=able)
-        rate = None if rate is None else min(rate, able)
-    if rate is not None:
-        steepest = _steepest(plan)
+    if rate is not None or math.isfinite(drive):
+        steepest = min(_steepest(plan), PEAK * drive / float(m.a1[0]))
+        rate = steepest if rate is None else rate
         if rate > steepest:
             raise DesignError(
                 f"max_acceleration {rate / ratio:.4g} rad/s^2 is beyond the motor: a "

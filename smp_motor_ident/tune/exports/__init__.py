@@ -20,8 +20,12 @@ from smp_motor_ident.tune.wheels import Sets, design_wheels
 FORMATS: Mapping[str, Format] = {
     module.FORMAT.name: module.FORMAT
     for module in (
-        *(ros2_controllers, linorobot2, ros_arduino_bridge),
-        *(arduino_pid, roboclaw, wpilib),
+        ros2_controllers,
+        linorobot2,
+        ros_arduino_bridge,
+        arduino_pid,
+        roboclaw,
+        wpilib,
     )
 }
 """Every target by its name."""
