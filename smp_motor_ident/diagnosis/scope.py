@@ -40,7 +40,7 @@ def scope(
     if alike:
         yield _alike(alike)
     if result.level:
-        yield _one_level(result, _turns_at_others(data, result.level))
+        yield _one_level(result, _turns_at_others(data, abs(result.level)))
     yield from _current_scale(result, group[0].hardware.resistance, _one_size(data) > 0)
     if change.std:
         yield _motor_changes(change, group, float(np.abs(data.voltage).max()))

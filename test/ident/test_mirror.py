@@ -33,6 +33,7 @@ def test_a_step_and_its_mirror_image_tell_the_same_motor(volts):
     mirror = replace(record, voltage=-record.voltage, velocity=-record.velocity)
     one, other = estimate(record), estimate(mirror)
     assert one.model == other.model
+    assert [f.severity for f in one.findings] == [f.severity for f in other.findings]
     for name in ("time_constant", "averaging_window"):
         # The same sums in other signs: nothing but rounding may differ.
         assert one.value(name) == pytest.approx(other.value(name), rel=1e-6)
