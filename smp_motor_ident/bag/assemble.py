@@ -275,6 +275,8 @@ def _converted(motor: Motor, name: str, signal: mapping.Signal, raw: NDArray[Any
         seen = f" (its largest value here is {np.nanmax(np.abs(raw)):g})" if raw.size else ""
         raise BagError(f"{motor.where}: {error}{seen if unit == 'pwm' else ''}") from None
     values *= by
+    if units.is_share(unit) and supply is not None:
+        values = _within(motor, values, supply)
     shaft = signal.shaft or motor.plan.shaft
     if unit.startswith("ticks"):
         shaft = signal.shaft or "motor"
@@ -287,6 +289,21 @@ def _converted(motor: Motor, name: str, signal: mapping.Signal, raw: NDArray[Any
     if name in ("velocity", "position") and shaft == "wheel":
         values = Gearbox(motor.hardware.gear_ratio).to_motor(values)
     return values
+
+
+def _within(motor: Motor, volts: Array, supply: float) -> Array:
+    """Return what a driver puts out of a command: no more than its supply, 100 %."""
+    beyond = int(np.sum(np.abs(volts) > supply * (1 + 1e-6)))  # but for what 32 bits round
+    if beyond:
+        motor.tell(
+            "beyond_full_scale",
+            f"{beyond} samples of the command are beyond 100 % (up to "
+            f"{np.nanmax(np.abs(volts)) / supply:.0%}) and taken as that; give the pwm_full_scale "
+            "that is 100 %, and write a value that is a code, such as one to brake, as 0",
+            "warning",
+            samples=beyond,
+        )
+    return np.clip(volts, -supply, supply)
 
 
 def _drop_lost(motor: Motor, series: dict[str, Series], axis_name: str) -> None:

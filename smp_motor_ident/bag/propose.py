@@ -19,7 +19,7 @@ from smp_motor_ident.bag.runs import runs
 from smp_motor_ident.bag.source import Recording, recordings
 from smp_motor_ident.bag.tables import EPOCHS, TIME_NAMES, is_time_of_part, self_described
 from smp_motor_ident.bag.types import Types
-from smp_motor_ident.bag.units import of_the_rim, unit_of
+from smp_motor_ident.bag.units import is_share, of_the_rim, unit_of
 from smp_motor_ident.errors import BagError
 
 _RADIUS = "in metres: what is measured is the way of the rim"
@@ -209,7 +209,7 @@ def _asked(chosen: list[_Candidate], time: _Candidate | None, table: bool) -> di
     if ":pwm" in units:
         largest = max(np.nanmax(np.abs(c.value)) for c in chosen if c.unit == ":pwm")
         asked["pwm_full_scale"] = f"the value that is 100 % (the largest here is {largest:g})"
-    if any(unit in (":pwm", ":duty", ":%") for unit in units):
+    if any(is_share(unit[1:]) for unit in units):
         asked["supply_voltage"] = "in volts"
     if any(of_the_rim(c.role, c.unit[1:]) for c in chosen):
         asked["wheel_radius"] = _RADIUS
@@ -280,8 +280,8 @@ def _filled(proposal: Proposal) -> mapping.SignalMap:
     unit = ":ms" if any(text.startswith("time=") for text in proposal.asked) else ""
     given = mapping.parse([i + unit if i.startswith("time=") else i for i in proposal.items])
     hardware = {"supply_voltage": 12.0, "counts_per_revolution": 1.0}
-    ones: Any = dict.fromkeys(("pwm_full_scale", "wheel_radius", "sample_time"), 1.0)
-    motors = {w: replace(one, hardware=hardware, **ones) for w, one in given.motors.items()}
+    some: Any = {"pwm_full_scale": 1e9, "wheel_radius": 1.0, "sample_time": 1.0}
+    motors = {w: replace(one, hardware=hardware, **some) for w, one in given.motors.items()}
     return replace(given, motors=motors)
 
 

@@ -83,6 +83,11 @@ def of_the_rim(signal: str, unit: str) -> bool:
     return unit in _METRES.get(signal, {})
 
 
+def is_share(unit: str) -> bool:
+    """Return whether a voltage in this unit is a share of the supply."""
+    return unit in (*_DUTY, _PWM)
+
+
 def written_unit(text: str) -> str | None:
     """Return the unit that a file writes beside a column's name; None where it is none."""
     if text.strip() in ("", "-", "1", "."):
@@ -133,7 +138,7 @@ def factor(
         return _METRES[signal][unit] / wheel_radius
     if unit == _PWM and not pwm_full_scale:
         raise BagError("a voltage in 'pwm' needs pwm_full_scale, the value that is 100 %")
-    if unit in (*_DUTY, _PWM):
+    if is_share(unit):
         if supply_voltage is None:
             raise BagError(f"a voltage in {unit!r} needs supply_voltage or a supply signal")
         return (_DUTY[unit] if unit in _DUTY else 1 / pwm_full_scale) * supply_voltage

@@ -148,3 +148,19 @@ def test_a_speed_of_the_rim_needs_the_wheels_radius(tmp_path: Path) -> None:
     np.testing.assert_allclose(record.velocity, motion(), atol=1e-12)
     with pytest.raises(BagError, match="needs wheel_radius"):
         read_records(path, ["voltage=u velocity=y:m/s time=t"])
+
+
+def test_a_driver_puts_out_no_more_than_its_supply(tmp_path):
+    rng = np.random.default_rng(5)
+    pwm = rng.integers(-255, 256, 400)
+    pwm[100:110] = 1000  # a controller's output before it is clipped, or a code
+    rows = [f"{0.01 * k},{u},{0.1 * k}" for k, u in enumerate(pwm)]
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join(["t,pwm,w", *rows]))
+    mapping = "time=t voltage=pwm:pwm velocity=w pwm_full_scale=255 supply_voltage=12 held=after"
+    record = read_records(path, [mapping])["motor"]
+    # What is held from a row on has its place before the next: the same values, one row later.
+    np.testing.assert_allclose(record.voltage[1:], np.clip(pwm / 255 * 12, -12, 12)[:-1])
+    (found,) = (f for f in record.findings if f.code == "beyond_full_scale")
+    assert found.evidence["samples"] == 10
+    assert "392%" in found.message
