@@ -22,7 +22,8 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 from smp_motor_control.errors import SmpError
 from smp_motor_control.nodes import executor, runtime
 from smp_motor_control.ros_arguments import split_arguments
-from smp_motor_ident.bag import BagWriter, metadata
+from smp_motor_ident.bag import BagWriter
+from smp_motor_ident.bag.writer import DEFAULT_QOS
 from smp_motor_ident.nodes.bag_arguments import Choice, chosen, message_class, quality
 
 TAKE_PERIOD = 0.004
@@ -50,7 +51,7 @@ def subscription_qos(offered: list[QoSProfile]) -> QoSProfile:
 def qos_document(qos: QoSProfile) -> dict[str, Any]:
     """Return a profile as the metadata of a bag write it."""
     document = {}
-    for name in metadata.DEFAULT_QOS:
+    for name in DEFAULT_QOS:
         value = getattr(qos, name)
         if isinstance(value, Duration):
             seconds, rest = divmod(value.nanoseconds, 1_000_000_000)
