@@ -73,7 +73,9 @@ def test_a_file_of_which_the_reader_of_matlab_dies_is_refused(
 ) -> None:
     path = tmp_path / "a.mat"
     path.write_bytes(FUZZ.SEEDS["mat"][1]())
-    monkeypatch.setattr("smp_motor_ident.bag.readers.mat._PROBE", "import os; os.abort()")
+    reader = tmp_path / "reader.py"
+    reader.write_text("import os; os.abort()")
+    monkeypatch.setattr("smp_motor_ident.bag.readers.mat._READER", reader)
     with pytest.raises(BagError, match=r"a\.mat: damaged MATLAB file"):
         read_records(path, FUZZ.COLUMNS)
 

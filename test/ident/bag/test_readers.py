@@ -106,7 +106,7 @@ def test_a_matlab_file_of_version_4_has_signals_in_its_rows(tmp_path: Path) -> N
         read_records(path, ["voltage=data[1] velocity=data[2]:rad/s time=data[0]"])["motor"]
     )
     path.write_bytes(path.read_bytes()[:-9])
-    with pytest.raises(BagError, match=r"log\.mat: is cut off or damaged at byte"):
+    with pytest.raises(BagError, match=r"log\.mat: no readable MATLAB file"):
         list_topics(path)
 
 

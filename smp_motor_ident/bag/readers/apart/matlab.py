@@ -1,0 +1,134 @@
+"""Reads a MATLAB file from standard input; the argument is how much memory it may take [byte].
+
+Writes a line of JSON (``error``, ``too_large``, ``objects``, ``columns``), then the columns.
+"""
+
+import io
+import json
+import resource
+import struct
+import sys
+import warnings
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+_HEAD = 128  # bytes of a file of version 5 before its first variable
+_DEEPEST = 16
+_WIDEST = 64  # columns of a matrix that are taken as signals; a wider one is something else
+_SLACK = 1 << 26  # memory that readers need beside what they read [byte]
+
+
+class Unreadable(Exception):
+    """Why the file cannot be read, for people."""
+
+
+def main() -> None:
+    """Read a file from standard input and write what is in it: JSON in a line, then columns."""
+    data = sys.stdin.buffer.read()
+    told: dict[str, Any] = {"error": "", "too_large": False, "objects": [], "columns": []}
+    columns: dict[str, np.ndarray[Any, Any]] = {}
+    try:
+        for content in _contents(data):
+            columns |= _columns("", content, 0, told["objects"])
+    except Unreadable as error:
+        told["error"] = str(error)
+    except MemoryError:
+        told["too_large"] = True
+    except Exception as error:  # readers raise whatever their bytes lead them to
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        told["error"] = f"no readable MATLAB file ({reason[:200]})"
+    told["columns"] = list(columns)
+    answer = io.BytesIO()
+    answer.write(json.dumps(told).encode() + b"\n")
+    for values in columns.values():
+        np.save(answer, values, allow_pickle=False)
+    sys.stdout.buffer.write(answer.getvalue())
+
+
+def _contents(data: bytes) -> Iterator[dict[str, Any]]:
+    """Yield the variables of a file by their names, as the library of its version gives them."""
+    if data.startswith(b"MATLAB 7.3 MAT"):
+        try:
+            import h5py
+        except ImportError:
+            raise Unreadable(
+                "is a MATLAB file of version 7.3, which needs h5py (pip install h5py); "
+                "or save it in MATLAB with -v7"
+            ) from None
+        _bound_memory()
+        taken: dict[str, Any] = {}
+
+        def take(key: str, item: Any) -> None:
+            if isinstance(item, h5py.Dataset) and item.dtype.kind in "fiub" and "#" not in key:
+                taken[key.replace("/", ".")] = np.asarray(item).T  # MATLAB counts columns first
+
+        with h5py.File(io.BytesIO(data)) as file:
+            file.visititems(take)
+        yield taken
+        return
+    from scipy.io import loadmat  # takes a while to load, for one of many formats
+
+    _bound_memory()
+    for part in _variables(data) if data.startswith(b"MATLAB 5.0 MAT") else [data]:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of objects, which have no names there
+            whole = loadmat(io.BytesIO(part), simplify_cells=True, chars_as_strings=False)
+        yield {key: value for key, value in whole.items() if not key.startswith("__")}
+
+
+def _bound_memory() -> None:
+    """Let this process take no more than it was told, beside what it has."""
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    limit = pages * resource.getpagesize() + int(sys.argv[1]) + _SLACK
+    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+
+
+def _variables(data: bytes) -> Iterator[bytes]:
+    """Yield every variable as a file of its own: scipy gives all objects one and the same name."""
+    order = "<" if data[126:_HEAD] == b"IM" else ">"
+    at = _HEAD
+    while at + 8 <= len(data):
+        size = struct.unpack_from(order + "I", data, at + 4)[0]
+        if at + 8 + size > len(data):
+            raise Unreadable(f"is cut off at byte {at} of {len(data)}; save it again")
+        yield data[:_HEAD] + data[at : at + 8 + size]
+        at += 8 + size
+
+
+def _columns(
+    prefix: str, value: Any, depth: int, objects: list[str]
+) -> Iterator[tuple[str, np.ndarray[Any, Any]]]:
+    """Yield the vectors of a structure by their paths; note its objects."""
+    if isinstance(value, Mapping):
+        for key, inner in value.items():
+            if depth < _DEEPEST:
+                path = f"{prefix}.{key}" if prefix else str(key)
+                yield from _columns(path, inner, depth + 1, objects)
+        return
+    if not isinstance(value, np.ndarray):
+        return
+    if value.dtype.names and value.dtype.names[:3] == ("s0", "s1", "s2"):  # only MATLAB opens it
+        name, _, kind = (_printable(text) for text in value.ravel()[0].tolist()[:3])
+        objects.append(f"{name or 'a field'} ({kind or 'of an unknown class'})")
+    if value.dtype.kind not in "fiub" or value.size < 2:
+        return
+    value = np.squeeze(value)
+    if value.ndim == 1:
+        yield prefix, value
+    elif value.ndim == 2:
+        rows = value if value.shape[0] >= value.shape[1] else value.T
+        if rows.shape[1] <= _WIDEST:
+            for k in range(rows.shape[1]):
+                yield f"{prefix}[{k}]", rows[:, k]
+
+
+def _printable(text: Any) -> str:
+    text = text.decode("latin-1") if isinstance(text, bytes) else str(text)
+    return "".join(filter(str.isprintable, text))[:80]
+
+
+if __name__ == "__main__":
+    main()
