@@ -181,7 +181,7 @@ def _stamp(motor: Motor, table: Table) -> Integers | None:
     column = table.columns.get(signal.field)
     if column is None:
         return None
-    to_nanoseconds = units.FACTORS["time"][signal.unit or "s"] * 1e9
+    to_nanoseconds = units.UNITS["time"][signal.unit or "s"].factor * 1e9
     if column.dtype.kind in "iu" and signal.scale == 1 and to_nanoseconds >= 1:
         # Whole nanoseconds since 1970 have no room in a float.
         whole: Integers = column.astype(np.int64) * round(to_nanoseconds)
@@ -259,23 +259,21 @@ def _converted(motor: Motor, name: str, signal: mapping.Signal, raw: NDArray[Any
     values: Array = raw.astype(np.float64)
     values *= signal.scale
     values += signal.offset
-    supply = motor.hardware.supply_voltage
-    if "supply" in motor.plan.signals and name == "voltage":
-        supply = 1.0  # the supply as it was measured comes in below
+    hardware, plan = motor.hardware, motor.plan
+    measured = "supply" in plan.signals and name == "voltage"  # which comes in below
+    known = {
+        "counts_per_revolution": hardware.counts_per_revolution,
+        "supply_voltage": 1.0 if measured else hardware.supply_voltage,
+        "wheel_radius": plan.wheel_radius,
+        "pwm_full_scale": plan.pwm_full_scale,
+    }
     try:
-        by = units.factor(
-            name,
-            unit,
-            counts_per_revolution=motor.hardware.counts_per_revolution,
-            supply_voltage=supply,
-            wheel_radius=motor.plan.wheel_radius,
-            pwm_full_scale=motor.plan.pwm_full_scale,
-        )
+        values *= units.factor(name, unit, known)
     except BagError as error:
         seen = f" (its largest value here is {np.nanmax(np.abs(raw)):g})" if raw.size else ""
         raise BagError(f"{motor.where}: {error}{seen if unit == 'pwm' else ''}") from None
-    values *= by
-    if units.is_share(unit) and supply is not None:
+    supply = known["supply_voltage"]
+    if units.needs(name, unit, "supply_voltage") and supply is not None:
         values = _within(motor, values, supply)
     shaft = signal.shaft or motor.plan.shaft
     if unit.startswith("ticks"):

@@ -238,24 +238,13 @@ def collect(
     return {topic: collector.table() for topic, collector in collectors.items()}
 
 
-@dataclass(frozen=True, eq=False)
-class Columns:
-    """Fields of one topic, where no record of a motor is wanted."""
-
-    # shape (n,), [s]: header stamps where the messages have them, else when they were recorded;
-    # since 1970
-    time: NDArray[np.float64]
-    fields: Mapping[str, NDArray[Any]]  # shape (n,): by field path
-
-
-def read_columns(path: Path, wanted: Mapping[str, Sequence[str]]) -> dict[str, Columns]:
+def read_columns(path: Path, wanted: Mapping[str, Sequence[str]]) -> dict[str, Table]:
     """Read fields of topics of one bag; a topic without a message is an error."""
     asked = {topic: list(fields) for topic, fields in wanted.items()}
-    found = {}
+    found: dict[str, Table] = {}
     for recording in recordings([path]):
-        for topic, table in collect(recording, asked, Types()).items():
-            clock = table.logged if table.stamp is None else table.stamp
-            if clock.size == 0:
+        found |= collect(recording, asked, Types())
+        for topic in asked:
+            if not found[topic].logged.size:
                 raise BagError(f"{recording.name}: has no message on {topic}")
-            found[topic] = Columns(1e-9 * clock.astype(np.float64), table.columns)
     return found

@@ -19,7 +19,7 @@ from smp_motor_ident.bag.runs import runs
 from smp_motor_ident.bag.source import Recording, recordings
 from smp_motor_ident.bag.tables import EPOCHS, TIME_NAMES, is_time_of_part, self_described
 from smp_motor_ident.bag.types import Types
-from smp_motor_ident.bag.units import is_share, of_the_rim, unit_of
+from smp_motor_ident.bag.units import needs, unit_of
 from smp_motor_ident.errors import BagError
 
 _RADIUS = "in metres: what is measured is the way of the rim"
@@ -209,9 +209,9 @@ def _asked(chosen: list[_Candidate], time: _Candidate | None, table: bool) -> di
     if ":pwm" in units:
         largest = max(np.nanmax(np.abs(c.value)) for c in chosen if c.unit == ":pwm")
         asked["pwm_full_scale"] = f"the value that is 100 % (the largest here is {largest:g})"
-    if any(is_share(unit[1:]) for unit in units):
+    if any(needs(c.role, c.unit[1:], "supply_voltage") for c in chosen):
         asked["supply_voltage"] = "in volts"
-    if any(of_the_rim(c.role, c.unit[1:]) for c in chosen):
+    if any(needs(c.role, c.unit[1:], "wheel_radius") for c in chosen):
         asked["wheel_radius"] = _RADIUS
     if any(c.role == "count" or c.unit.startswith(":ticks") for c in chosen):
         asked["counts_per_revolution"] = "of the motor shaft"
@@ -238,7 +238,7 @@ def _of_the_file(recording: Recording) -> Proposal | None:
             prefix = f"{wheel}." if name != "time" and wheel != mapping.DEFAULT_MOTOR else ""
             source = f"{signal.topic}.{signal.field}" if signal.topic else signal.field
             items.append(f"{prefix}{name}={source}" + (f":{signal.unit}" if signal.unit else ""))
-            rim |= of_the_rim(name, signal.unit)
+            rim |= needs(name, signal.unit, "wheel_radius")
     asked = [f"wheel_radius=… {_RADIUS}"] if rim else []
     alone = "wheel_radius alone is enough" if rim else "no mapping is needed"
     return Proposal(list(dict.fromkeys(items)), asked, f"the file says this itself: {alone}")

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_control.arrays import Flags, Integers
+from smp_motor_control.arrays import Array, Flags, Integers
 from smp_motor_ident.finding import Finding, Severity
 
 Bytes = NDArray[np.uint8]
@@ -99,6 +99,11 @@ class Table:
         """When the recorder got them, once that is known."""
         assert self.log is not None
         return self.log
+
+    @property
+    def seconds(self) -> Array:
+        """Their stamps where they have such, else when they were recorded, since 1970 [s]."""
+        return 1e-9 * (self.logged if self.stamp is None else self.stamp).astype(np.float64)
 
 
 def gather(data: Bytes, at: Integers, dtype: str) -> NDArray[Any]:

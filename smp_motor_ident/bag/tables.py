@@ -181,7 +181,7 @@ def _nanoseconds(table: Table, signal: Signal) -> tuple[Integers, str]:
     if not unit:
         size = np.nanmedian(np.abs(column.astype(np.float64))) if column.size else 0.0
         unit = next((name for least, name in EPOCHS if size > least), "")
-    factor = units.FACTORS["time"][unit or "s"] * signal.scale * 1e9
+    factor = units.UNITS["time"][unit or "s"].factor * signal.scale * 1e9
     if column.dtype.kind in "iu" and factor == round(factor):
         return column.astype(np.int64) * round(factor), unit
     values = column.astype(np.float64) * factor

@@ -2,40 +2,50 @@
 
 import math
 import re
+from collections.abc import Mapping
+from typing import NamedTuple
 
 from smp_motor_ident.errors import BagError
 
+
+class Unit(NamedTuple):
+    """A factor to SI, times powers of what must be known of the robot besides."""
+
+    factor: float
+    needs: Mapping[str, int] = {}
+
+
 _TURN = 2 * math.pi
-
-FACTORS: dict[str, dict[str, float]] = {
-    "voltage": {"V": 1.0, "mV": 1e-3, "kV": 1e3},
-    "supply": {"V": 1.0, "mV": 1e-3},
-    "current": {"A": 1.0, "mA": 1e-3},
-    "velocity": {
-        "rad/s": 1.0,
-        "deg/s": math.pi / 180,
-        "rpm": _TURN / 60,
-        "rev/s": _TURN,
-        "Hz": _TURN,
-        "mrad/s": 1e-3,
-        "rad/min": 1 / 60,
-        "deg/min": math.pi / 10800,
-    },
-    "position": {"rad": 1.0, "deg": math.pi / 180, "rev": _TURN, "mrad": 1e-3},
-    "count": {"ticks": 1.0},
-    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0},
-    "direction": {"": 1.0},
+_DUTY, _RIM, _COUNTS = {"supply_voltage": 1}, {"wheel_radius": -1}, {"counts_per_revolution": -1}
+_NEEDED = {
+    "wheel_radius": "wheel_radius: give --map wheel_radius=METRES",
+    "pwm_full_scale": "pwm_full_scale, the value that is 100 %",
+    "supply_voltage": "supply_voltage or a supply signal",
+    "counts_per_revolution": "counts_per_revolution",
 }
-"""By signal: unit to factor; the first of each is assumed where none is given."""
 
-_METRES = {
-    "velocity": {"m/s": 1.0, "mm/s": 1e-3, "cm/s": 1e-2, "km/h": 1 / 3.6, "ft/s": 0.3048},
-    "position": {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "ft": 0.3048},
-}
-"""Units of the rim, which need the wheel's radius."""
-_COUNTS = {"velocity": "ticks/s", "position": "ticks"}
-_DUTY = {"duty": 1.0, "%": 1e-2}
-_PWM = "pwm"
+_ROWS: tuple[tuple[str, Mapping[str, int], dict[str, float]], ...] = (
+    ("voltage", {}, {"V": 1.0, "mV": 1e-3, "kV": 1e3}),
+    ("voltage", _DUTY, {"duty": 1.0, "%": 1e-2}),
+    ("voltage", {"pwm_full_scale": -1, **_DUTY}, {"pwm": 1.0}),
+    ("supply", {}, {"V": 1.0, "mV": 1e-3}),
+    ("current", {}, {"A": 1.0, "mA": 1e-3}),
+    ("velocity", {}, {"rad/s": 1.0, "deg/s": _TURN / 360, "rpm": _TURN / 60, "rev/s": _TURN}),
+    ("velocity", {}, {"Hz": _TURN, "mrad/s": 1e-3, "rad/min": 1 / 60, "deg/min": _TURN / 21600}),
+    ("velocity", _RIM, {"m/s": 1.0, "mm/s": 1e-3, "cm/s": 1e-2, "km/h": 1 / 3.6, "ft/s": 0.3048}),
+    ("velocity", _COUNTS, {"ticks/s": _TURN}),
+    ("position", {}, {"rad": 1.0, "deg": _TURN / 360, "rev": _TURN, "mrad": 1e-3}),
+    ("position", _RIM, {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "ft": 0.3048}),
+    ("position", _COUNTS, {"ticks": _TURN}),
+    ("count", {}, {"ticks": 1.0}),
+    ("time", {}, {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}),
+    ("direction", {}, {"": 1.0}),
+)
+UNITS: dict[str, dict[str, Unit]] = {signal: {} for signal, _, _ in _ROWS}
+"""By signal; the first unit of each is assumed where none is given."""
+for _signal, _needs, _factors in _ROWS:
+    UNITS[_signal] |= {unit: Unit(value, _needs) for unit, value in _factors.items()}
+
 _ALIASES = {
     alias: unit
     for unit, aliases in {
@@ -59,15 +69,9 @@ _ALIASES = {
 }
 
 
-def _known(signal: str) -> list[str]:
-    known = [*FACTORS[signal], *_METRES.get(signal, {})]
-    known += [_COUNTS[signal]] if signal in _COUNTS else []
-    return known + ([*_DUTY, _PWM] if signal == "voltage" else [])
-
-
 def check_unit(signal: str, unit: str) -> str:
     """Return the unit under its usual name, the first of the signal's where none is given."""
-    known = _known(signal)
+    known = list(UNITS[signal])
     if not unit:
         return known[0]
     unit = unit.strip()
@@ -78,21 +82,17 @@ def check_unit(signal: str, unit: str) -> str:
     raise BagError(f"{signal} cannot be in {unit!r}; use one of {', '.join(known)}")
 
 
-def of_the_rim(signal: str, unit: str) -> bool:
-    """Return whether a unit is a length, or a length in time, which needs the wheel's radius."""
-    return unit in _METRES.get(signal, {})
-
-
-def is_share(unit: str) -> bool:
-    """Return whether a voltage in this unit is a share of the supply."""
-    return unit in (*_DUTY, _PWM)
+def needs(signal: str, unit: str, name: str) -> bool:
+    """Return whether a signal in this unit needs, say, the ``wheel_radius`` or supply_voltage."""
+    one = UNITS.get(signal, {}).get(unit)
+    return one is not None and name in one.needs
 
 
 def written_unit(text: str) -> str | None:
     """Return the unit that a file writes beside a column's name; None where it is none."""
     if text.strip() in ("", "-", "1", "."):
         return ""
-    for signal in FACTORS:
+    for signal in UNITS:
         try:
             return check_unit(signal, text)
         except BagError:
@@ -113,35 +113,19 @@ def unit_of(signal: str, written: str, name: str) -> str:
         except BagError:
             continue
         # What a name may call the signal itself is no unit.
-        if written or unit not in ("", _known(signal)[0], "duty", _PWM):
+        if written or unit not in ("", next(iter(UNITS[signal])), "duty", "pwm"):
             return unit
     return ""
 
 
-def factor(
-    signal: str,
-    unit: str,
-    *,
-    counts_per_revolution: float | None = None,
-    supply_voltage: float | None = None,
-    wheel_radius: float = 0.0,
-    pwm_full_scale: float = 0.0,
-) -> float:
-    """Return what a value in the unit must be multiplied by; BagError names what is missing."""
-    if unit in FACTORS[signal]:
-        return FACTORS[signal][unit]
-    if of_the_rim(signal, unit):
-        if not wheel_radius:
-            raise BagError(
-                f"a {signal} in {unit!r} needs wheel_radius: give --map wheel_radius=METRES"
-            )
-        return _METRES[signal][unit] / wheel_radius
-    if unit == _PWM and not pwm_full_scale:
-        raise BagError("a voltage in 'pwm' needs pwm_full_scale, the value that is 100 %")
-    if is_share(unit):
-        if supply_voltage is None:
-            raise BagError(f"a voltage in {unit!r} needs supply_voltage or a supply signal")
-        return (_DUTY[unit] if unit in _DUTY else 1 / pwm_full_scale) * supply_voltage
-    if counts_per_revolution is None:
-        raise BagError(f"a {signal} in {unit!r} needs counts_per_revolution")
-    return _TURN / counts_per_revolution
+def factor(signal: str, unit: str, known: Mapping[str, float | None]) -> float:
+    """Return what a value in the unit must be multiplied by; BagError names what is missing.
+
+    What is not known of the robot is None or 0.
+    """
+    result, needed = UNITS[signal][unit]
+    for name, power in needed.items():
+        if not (value := known.get(name)):
+            raise BagError(f"a {signal} in {unit!r} needs {_NEEDED[name]}")
+        result *= value**power
+    return result

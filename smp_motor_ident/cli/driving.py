@@ -9,7 +9,8 @@ import numpy as np
 from smp_motor_control.arrays import Array
 from smp_motor_control.encoder import unwrap
 from smp_motor_control.motor.parameters import Gearbox
-from smp_motor_ident.bag.decode import Columns, read_columns
+from smp_motor_ident.bag.decode import read_columns
+from smp_motor_ident.bag.storage import Table
 from smp_motor_ident.record import Hardware
 from smp_motor_ident.report.chart import Chart, Curve
 from smp_motor_ident.report.drawing import document
@@ -30,7 +31,7 @@ class Answer:
     figures: StepFigures  # of the change
 
 
-Drive = Mapping[str, Columns]
+Drive = Mapping[str, Table]
 """What is judged and drawn of the recording of a drive, by topic."""
 
 
@@ -58,13 +59,13 @@ def drive_figure(
 ) -> str:
     """Return an SVG file: what the wheels of each side were asked for, and what they did."""
     wheels = list(hardware)
-    begin = min(float(columns.time[0]) for columns in drive.values())
+    begin = min(float(columns.seconds[0]) for columns in drive.values())
     charts = []
     for side, names in sides.items():
         asked = drive[f"/{names[0]}/pid_state"]
-        time = asked.time
+        time = asked.seconds
         speeds = {w: wheel_speed(drive[f"/{w}/motor_state"], hardware[w]) for w in names}
-        curves = [Curve("set-point", asked.fields["setpoint"], "muted")]
+        curves = [Curve("set-point", asked.columns["setpoint"], "muted")]
         curves += [
             Curve(w, np.interp(time, *speeds[w]), f"wheel-{wheels.index(w) % 4 + 1}") for w in names
         ]
@@ -78,37 +79,37 @@ def drive_figure(
 
 def longest_stall(drive: Drive) -> float:
     """Return how long the machine that simulates stood still at worst."""
-    gaps = (np.diff(c.time) for c in drive.values() if "age" not in c.fields)
-    ages = (c.fields["age"] for c in drive.values() if "age" in c.fields)
+    gaps = (np.diff(c.seconds) for c in drive.values() if "age" not in c.columns)
+    ages = (c.columns["age"] for c in drive.values() if "age" in c.columns)
     return max(float(np.max(found)) for found in (*gaps, *ages))
 
 
-def wheel_angle(state: Columns, hardware: Hardware) -> Array:
+def wheel_angle(state: Table, hardware: Hardware) -> Array:
     """Return the wheel's angle as its counts tell it, where there are counts."""
     if not hardware.counts_per_revolution:
-        return state.fields["position"]
+        return state.columns["position"]
     turn = 2 * np.pi / hardware.counts_per_revolution
-    counts = unwrap(state.fields["encoder_count"], hardware.encoder_bits).astype(np.float64)
+    counts = unwrap(state.columns["encoder_count"], hardware.encoder_bits).astype(np.float64)
     return Gearbox(hardware.gear_ratio).to_wheel(turn) * counts
 
 
-def wheel_speed(state: Columns, hardware: Hardware) -> tuple[Array, Array]:
+def wheel_speed(state: Table, hardware: Hardware) -> tuple[Array, Array]:
     """Return the wheel's speed as its encoder saw it."""
     angle = wheel_angle(state, hardware)
-    return smoothed(state.time, angle - angle[0], float(np.median(np.diff(state.time))))
+    return smoothed(state.seconds, angle - angle[0], float(np.median(np.diff(state.seconds))))
 
 
 def _answer(
-    time: Array, speed: Array, asked: Columns, name: str, begin: float, end: float
+    time: Array, speed: Array, asked: Table, name: str, begin: float, end: float
 ) -> Answer | None:
     """Read one segment; its set-point is the last one asked for in it."""
-    during = np.flatnonzero((asked.time > begin) & (asked.time < end))
+    during = np.flatnonzero((asked.seconds > begin) & (asked.seconds < end))
     before = (time > begin - 0.3) & (time < begin)
     inside = (time >= begin) & (time < end)
     if during.size == 0 or not inside.any():
         return None
     start = float(speed[before].mean()) if before.any() else 0.0
-    final = float(asked.fields["setpoint"][during[-1]])
+    final = float(asked.columns["setpoint"][during[-1]])
     if abs(final - start) < LEAST_CHANGE:
         return None
     figures = step_figures(

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from smp_motor_control import controller_of
-from smp_motor_ident.bag.decode import Columns, read_columns
+from smp_motor_ident.bag.decode import read_columns
+from smp_motor_ident.bag.storage import Table
 from smp_motor_ident.cli import driving, processes, steps
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.result import Estimate
@@ -119,32 +120,32 @@ def read_changes(
         state = read[f"{namespace}/{wheel}/motor_state"]
         answers = read[f"{namespace}/{wheel}/pid_state"]
         delays = verification.arrival_delays(
-            (answers.time, answers.fields["age"], answers.fields["output"]),
-            (state.time, state.fields["voltage"]),
+            (answers.seconds, answers.columns["age"], answers.columns["output"]),
+            (state.seconds, state.columns["voltage"]),
             designed.document[wheel]["loop"],
         )
         changes += _changes(wheel, plan, designed, state, answers, delays)
         # The first interval is that since another drive.
-        late = answers.fields["dt"][1:], delays[1:]
+        late = answers.columns["dt"][1:], delays[1:]
         silence = max(silence, *(float(np.max(one, initial=0.0)) for one in late))
     return changes, silence
 
 
 def _changes(
-    wheel: str, plan: Sequence[tuple[str, float, float]], designed: Designed, state: Columns,
-    answers: Columns, delays: np.ndarray[Any, Any],
+    wheel: str, plan: Sequence[tuple[str, float, float]], designed: Designed, state: Table,
+    answers: Table, delays: np.ndarray[Any, Any],
 ) -> list[Change]:  # fmt: skip
     """Return the changes of one wheel; the prediction is of its whole drive."""
     estimate, document = designed.estimates[wheel], designed.document[wheel]
-    setpoints = answers.fields["setpoint"]
+    setpoints = answers.columns["setpoint"]
     moves = [one for one in plan if one[1]]
     begun = {name: (_begin(wheel, speed, answers), speed, lasts) for name, speed, lasts in moves}
     end = max(begin + lasts for begin, _, lasts in begun.values())
-    shown = (state.time > answers.time[0] - LEAD) & (state.time < end)
-    instants = state.time[shown]
-    known = dict(zip(answers.time, delays))
+    shown = (state.seconds > answers.seconds[0] - LEAD) & (state.seconds < end)
+    instants = state.seconds[shown]
+    known = dict(zip(answers.seconds, delays))
     waited = np.array([known.get(instant, np.nan) for instant in instants])
-    latest = np.searchsorted(answers.time, instants, side="right") - 1
+    latest = np.searchsorted(answers.seconds, instants, side="right") - 1
     asked = np.where(latest < 0, 0.0, setpoints[latest])
     step = float(document["loop"]["sample_time"])
     even, speed = verification.smoothed(
@@ -168,12 +169,12 @@ def _changes(
     return changes
 
 
-def _begin(wheel: str, setpoint: float, answers: Columns) -> float:
+def _begin(wheel: str, setpoint: float, answers: Table) -> float:
     """Return when a wheel was first heard at a set-point."""
-    asked = np.flatnonzero(np.isclose(answers.fields["setpoint"], setpoint))
+    asked = np.flatnonzero(np.isclose(answers.columns["setpoint"], setpoint))
     if not asked.size:
         raise NeverHeard(
             f"{wheel}: wheel_pid was never heard at {setpoint:.3g} rad/s in the drive: it was at "
             "fault, or its messages were lost; look at /diagnostics, then go on with --resume"
         )
-    return float(answers.time[asked[0]])
+    return float(answers.seconds[asked[0]])

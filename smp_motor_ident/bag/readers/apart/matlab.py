@@ -11,7 +11,7 @@ import sys
 import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -75,7 +75,9 @@ def _contents(data: bytes) -> Iterator[dict[str, Any]]:
     for part in _variables(data) if data.startswith(b"MATLAB 5.0 MAT") else [data]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of objects, which have no names there
-            whole = loadmat(io.BytesIO(part), simplify_cells=True, chars_as_strings=False)
+            whole = loadmat(
+                cast(Any, io.BytesIO(part)), simplify_cells=True, chars_as_strings=False
+            )
         yield {key: value for key, value in whole.items() if not key.startswith("__")}
 
 
