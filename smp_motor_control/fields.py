@@ -44,8 +44,7 @@ class Described(NamedTuple):
 class _Nested(NamedTuple):
     kind: type
     prefix: str
-    texts: Mapping[str, str]
-    needs: Sequence[str]
+    needs: Sequence[str] = ()
 
 
 def described(default: Any, description: str, **more: Any) -> Any:
@@ -60,15 +59,14 @@ def fixed(default: Any, description: str, **more: Any) -> Any:
     return described(default, description, read_only=True, **more)
 
 
-def nested(default: Any, texts: Mapping[str, str] | None = None, *, prefix: str = "") -> Any:
-    """Return a field of settings in settings; ``texts`` describe them where they do not."""
-    inside = _Nested(type(default), prefix, texts or {}, ())
-    return dataclasses.field(default=default, metadata={"": inside})
+def nested(default: Any, *, prefix: str = "") -> Any:
+    """Return a field of settings in settings."""
+    return dataclasses.field(default=default, metadata={"": _Nested(type(default), prefix)})
 
 
 def optional(kind: type, *needs: str, prefix: str) -> Any:
     """Return a field of settings that are not there where what they need is 0, as it is first."""
-    return dataclasses.field(default=None, metadata={"": _Nested(kind, prefix, {}, needs)})
+    return dataclasses.field(default=None, metadata={"": _Nested(kind, prefix, needs)})
 
 
 def documented(settings: type[S]) -> type[S]:
@@ -93,8 +91,6 @@ def parameters_in(settings: type, default: Any = None, prefix: str = "") -> dict
             )
             continue
         inside = prefix + known.prefix
-        for name, text in known.texts.items():
-            found[inside + name] = Described(getattr(value, name), text)
         for name, one in parameters_in(known.kind, value, inside).items():
             found[name] = one._replace(default=0.0, minimum=0.0) if known.needs else one
     return found
@@ -126,8 +122,6 @@ def check_limits(settings: Any) -> None:
 
 
 def _inner(known: _Nested, values: Mapping[str, Any], prefix: str) -> Any:
-    if known.texts:
-        return known.kind(**{name: values[prefix + name] for name in known.texts})
     try:
         return settings_of(known.kind, values, prefix)
     except ParameterError as error:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from smp_motor_control.arrays import Array
+from smp_motor_control.fields import described
 from smp_motor_ident.record import Record
 
 
@@ -12,14 +13,12 @@ from smp_motor_ident.record import Record
 class Demands:
     """What a window must have seen before an estimate is made of it."""
 
-    duration: float = 5.0  # seconds of data
-    moving: float = 3.0  # seconds in which the motor turned
-    # bins, filled: the range of voltages that occurred is cut into `bins`; `filled` of them must
-    # hold at least 2 % of the samples each
-    bins: int = 8
-    filled: int = 3
-    changes: int = 6  # how often the voltage must have crossed its mean
-    both_directions: bool = True  # whether the motor must have turned forward and backward
+    duration: float = described(5.0, "Least time in the window [s].")
+    moving: float = described(3.0, "Least time of motion in it [s].")
+    bins: int = described(8, "Levels that the range of voltages is cut into [1].")
+    filled: int = described(3, "Least number of levels that hold 2 % of the samples each [1].")
+    changes: int = described(6, "Least number of times that the voltage crossed its mean [1].")
+    both_directions: bool = described(True, "Whether the motor must have turned both ways.")
 
 
 def missing(record: Record | None, demands: Demands) -> list[str]:

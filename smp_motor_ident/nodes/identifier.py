@@ -61,18 +61,7 @@ class Settings:
     model: str = described("auto", "Model to fit; auto chooses the simplest that holds.")
     commissioned: str = fixed("", "identification.json, or its folder, of the motors to watch.")
     history: str = fixed("", "File that what is seen of them is added to.")
-    demands: Demands = nested(
-        Demands(),
-        {
-            "duration": "Least time in the window [s].",
-            "moving": "Least time of motion in it [s].",
-            "bins": "Levels that the range of voltages is cut into [1].",
-            "filled": "Least number of levels that occurred [1].",
-            "changes": "Least number of times that the voltage crossed its mean [1].",
-            "both_directions": "Whether the motor must have turned both ways.",
-        },
-        prefix="demands.",
-    )
+    demands: Demands = nested(Demands(), prefix="demands.")
 
     def __post_init__(self) -> None:
         """Refuse a window that can never meet its demands."""
