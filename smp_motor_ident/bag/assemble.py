@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from smp_motor_control.arrays import Array, Integers
 from smp_motor_control.motor.parameters import Gearbox
-from smp_motor_ident.bag import checks, clock, counter, mapping, runs, units
+from smp_motor_ident.bag import checks, clock, counter, mapping, units
 from smp_motor_ident.bag.axis import Motor, Series, on_one_axis, unwrapped
 from smp_motor_ident.bag.storage import Table
 from smp_motor_ident.diagnosis.stamps import find_beat, moves_on
@@ -165,9 +165,9 @@ def _set_back(
     stamp = stamps[topic]
     assert stamp is not None
     parts, log = clock.epochs(stamp), table.logged
-    least = runs.pause_between(stamp, parts, motor.plan.gap)
+    least = clock.pause_between(stamp, parts, motor.plan.gap)
     pauses = [max(int(log[begin] - log[begin - 1]), least) for begin, _ in parts[1:]]
-    time = runs.one_after_another([stamp], [parts], pauses)[0]
+    time = clock.one_after_another([stamp], [parts], pauses)[0]
     text = f"{topic}: the clock of the header stamps was set back {len(parts) - 1} times"
     motor.tell("clock_set_back", f"{text}; a new segment each", "warning")
     return {topic: time}

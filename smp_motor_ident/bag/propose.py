@@ -14,8 +14,8 @@ import numpy as np
 
 from smp_motor_control.arrays import Array
 from smp_motor_ident.bag import axis, checks, decode, drives, mapping, names, read, storage
+from smp_motor_ident.bag.clock import runs
 from smp_motor_ident.bag.offers import Listing, Offer, offers_of
-from smp_motor_ident.bag.runs import runs
 from smp_motor_ident.bag.source import Recording, recordings
 from smp_motor_ident.bag.tables import EPOCHS, TIME_NAMES, is_time_of_part, self_described
 from smp_motor_ident.bag.types import Types

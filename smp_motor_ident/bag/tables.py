@@ -8,7 +8,7 @@ from itertools import product
 import numpy as np
 
 from smp_motor_control.arrays import Integers
-from smp_motor_ident.bag import limits, runs, units
+from smp_motor_ident.bag import clock, limits, units
 from smp_motor_ident.bag.mapping import DEFAULT_MOTOR, MotorMap, Signal, SignalMap
 from smp_motor_ident.bag.names import MOTIONS
 from smp_motor_ident.bag.readers.grid import without_unit
@@ -155,7 +155,7 @@ def timed(recording: Recording, plan: MotorMap, tables: Mapping[str, Table]) -> 
             raise BagError(f"{recording.files[0]}: has no rows with a time")
         result[topic] = Table(log, None, columns, findings=findings, clocked=True)
     rows = {topic: result[topic] for topic in written}
-    return result | runs.laid_out(rows, plan.gap, recording.name)
+    return result | clock.laid_out(rows, plan.gap, recording.name)
 
 
 def _check_seconds(log: Integers, signal: Signal, recording: Recording) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from smp_motor_ident.bag import list_topics, read_records
-from smp_motor_ident.bag.runs import runs
+from smp_motor_ident.bag.clock import runs
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.record import Record
 
