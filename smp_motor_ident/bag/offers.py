@@ -32,18 +32,23 @@ class Offer:
     units: Mapping[str, str] = field(default_factory=dict)
 
 
-@dataclass
-class Listing:
-    """What a recording offers."""
+@dataclass(kw_only=True)
+class Proposal:
+    """A mapping that reads a recording."""
+
+    suggestion: list[str] = field(default_factory=list)  # items for ``--map``
+    asked: list[str] = field(default_factory=list)  # what the user must add to them
+    remark: str = ""  # why there are none, or what the data could not confirm
+
+
+@dataclass(kw_only=True)
+class Listing(Proposal):
+    """What a recording offers, and a mapping that was tried on it; none where none is needed."""
 
     name: str  # of the recording
     offers: list[Offer]  # by topic
-    # Items for ``--map``, tried on the recording; empty where nothing fits or is needed
-    suggestion: list[str]
-    asked: list[str]  # what the user must add to them, such as the full scale of a PWM
     needs_mapping: bool  # false where the recording holds our own messages
     findings: list[Finding]  # what is missing or damaged
-    remark: str = ""  # why nothing is suggested, or what the data could not confirm
 
 
 def offers_of(recording: source.Recording, types: Types) -> list[Offer]:

@@ -6,7 +6,7 @@ do not tell the time, the voltage or the motion of a table, what the data show i
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
 
@@ -15,7 +15,7 @@ import numpy as np
 from smp_motor_control.arrays import Array
 from smp_motor_ident.bag import axis, checks, decode, drives, mapping, names, read, storage
 from smp_motor_ident.bag.clock import runs
-from smp_motor_ident.bag.offers import Listing, Offer, offers_of
+from smp_motor_ident.bag.offers import Listing, Offer, Proposal, offers_of
 from smp_motor_ident.bag.source import Recording, recordings
 from smp_motor_ident.bag.tables import EPOCHS, TIME_NAMES, is_time_of_part, self_described
 from smp_motor_ident.bag.types import Types
@@ -71,25 +71,18 @@ def list_topics(paths: Any, msg_files: Iterable[str] = ()) -> list[Listing]:
             offers = offers_of(recording, types)
             needed = all(offer.type != read.STATE for offer in offers)
             proposal = propose(recording, offers, types) if needed else Proposal()
-            if proposal.items:
+            if proposal.suggestion:
                 try:
                     read.read_recording(recording, _filled(proposal), types)
                 except BagError as error:
                     text = f"a mapping was proposed by names and cannot be read: {error}"
                     recording.findings.append(storage.found("proposal_failed", text))
                     proposal = Proposal(remark="no mapping is suggested that can be read")
-        made = (proposal.items, proposal.asked, needed, recording.findings, proposal.remark)
-        listings.append(Listing(recording.name, offers, *made))
+        listings.append(Listing(
+            name=recording.name, offers=offers, needs_mapping=needed,
+            findings=recording.findings, **vars(proposal),
+        ))  # fmt: skip
     return listings
-
-
-@dataclass(frozen=True)
-class Proposal:
-    """Items for ``--map`` that read a recording."""
-
-    items: list[str] = field(default_factory=list)
-    asked: list[str] = field(default_factory=list)  # what the user must add to them
-    remark: str = ""  # why there are none, or what the data could not confirm
 
 
 def propose(recording: Recording, offers: list[Offer], types: Types) -> Proposal:
@@ -98,7 +91,7 @@ def propose(recording: Recording, offers: list[Offer], types: Types) -> Proposal
         return own
     apart = [[offer] for offer in offers] if any(o.table and o.count for o in offers) else [offers]
     proposals = [_of_names_and_data(recording, group, types) for group in apart]
-    return next((p for p in proposals if p.items), proposals[0])
+    return next((p for p in proposals if p.suggestion), proposals[0])
 
 
 def _of_names_and_data(recording: Recording, offers: list[Offer], types: Types) -> Proposal:
@@ -120,7 +113,8 @@ def _of_names_and_data(recording: Recording, offers: list[Offer], types: Types) 
     if time:
         items.append(f"time={time.source}{time.unit}")
     asked = _asked([c for _, fields in chosen for c in fields], time, recording.is_table)
-    return Proposal(items, [f"{key}=… {why}" for key, why in asked.items()], "; ".join(remarks))
+    added = [f"{key}=… {why}" for key, why in asked.items()]
+    return Proposal(suggestion=items, asked=added, remark="; ".join(remarks))
 
 
 def _by_names(every: Sequence[_Candidate]) -> tuple[list[tuple[str, list[_Candidate]]], list[str]]:
@@ -241,7 +235,8 @@ def _of_the_file(recording: Recording) -> Proposal | None:
             rim |= needs(name, signal.unit, "wheel_radius")
     asked = [f"wheel_radius=… {_RADIUS}"] if rim else []
     alone = "wheel_radius alone is enough" if rim else "no mapping is needed"
-    return Proposal(list(dict.fromkeys(items)), asked, f"the file says this itself: {alone}")
+    remark = f"the file says this itself: {alone}"
+    return Proposal(suggestion=list(dict.fromkeys(items)), asked=asked, remark=remark)
 
 
 def _untestable(voltages: list[_Candidate], motions: list[_Candidate]) -> list[_Candidate]:
@@ -278,7 +273,7 @@ def _reason(fields: list[_Candidate]) -> str:
 def _filled(proposal: Proposal) -> mapping.SignalMap:
     """Return the mapping of a proposal, with any value for what the user must add."""
     unit = ":ms" if any(text.startswith("time=") for text in proposal.asked) else ""
-    given = mapping.parse([i + unit if i.startswith("time=") else i for i in proposal.items])
+    given = mapping.parse([i + unit if i.startswith("time=") else i for i in proposal.suggestion])
     hardware = {"supply_voltage": 12.0, "counts_per_revolution": 1.0}
     some: Any = {"pwm_full_scale": 1e9, "wheel_radius": 1.0, "sample_time": 1.0}
     motors = {w: replace(one, hardware=hardware, **some) for w, one in given.motors.items()}

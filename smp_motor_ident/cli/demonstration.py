@@ -3,6 +3,7 @@
 import argparse
 import os
 import shutil
+import signal
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,7 +12,8 @@ from typing import Any
 from smp_motor_control import LEFT, RIGHT, WHEELS, controller_of
 from smp_motor_control.motor.file import load_motors, paper_motors
 from smp_motor_ident.cli import demo, driving, steps, verdict
-from smp_motor_ident.cli.processes import Processes, connect, free_domain, stop_when_orphaned
+from smp_motor_ident.cli.processes import Processes, connect, free_domain
+from smp_motor_ident.cli.workers import die_with_parent
 from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.result import Estimate
 
@@ -40,7 +42,7 @@ ATTEMPTS = 3
 
 def work(arguments: argparse.Namespace) -> int:
     """Do what the arguments say."""
-    stop_when_orphaned()
+    die_with_parent(signal.SIGTERM)
     begun = time.monotonic()
 
     def say(text: str) -> None:
