@@ -57,7 +57,7 @@ def messages(seconds: float, rate: float):
             head = struct.pack("<4sii", b"\0\1\0\0", second, rest) + string(f"{wheel}_wheel_joint")
             volts = 12 * np.sin(0.001 * k * (w + 1))
             count = (k * (w + 3) + 32768) % 65536 - 32768
-            numbers = (volts, 0.1, 0.5 * w, 0.01 * k, count, volts / 12)
+            numbers = (volts, 0.1 * volts, 0.5 * w, 0.01 * k, count, volts / 12)
             yield (
                 f"/{wheel}/motor_state",
                 STATE,
