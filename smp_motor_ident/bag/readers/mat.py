@@ -27,7 +27,7 @@ def _open(path: Path, name: str, budget: Budget) -> ColumnFile:
     command = [sys.executable, str(_READER), str(budget.left)]
     done = subprocess.run(command, input=path.read_bytes(), capture_output=True, check=False)
     if done.returncode:
-        raise BagError(f"{name}: damaged MATLAB file (its reader ends by {-done.returncode})")
+        raise BagError(f"{name}: damaged MATLAB file (its reader ends with {done.returncode})")
     answer = io.BytesIO(done.stdout)
     told = json.loads(answer.readline())
     if told["too_large"]:

@@ -18,6 +18,7 @@ import numpy as np
 _HEAD = 128  # bytes of a file of version 5 before its first variable
 _DEEPEST = 16
 _WIDEST = 64  # columns of a matrix that are taken as signals; a wider one is something else
+_UNBOUND = resource.getrlimit(resource.RLIMIT_AS)[1]
 _SLACK = 1 << 26  # memory that readers need beside what they read [byte]
 
 
@@ -40,12 +41,13 @@ def main() -> None:
     except Exception as error:  # readers raise whatever their bytes lead them to
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         told["error"] = f"no readable MATLAB file ({reason[:200]})"
+    resource.setrlimit(resource.RLIMIT_AS, (_UNBOUND, _UNBOUND))  # the answer is a copy
     told["columns"] = list(columns)
-    answer = io.BytesIO()
-    answer.write(json.dumps(told).encode() + b"\n")
+    sys.stdout.buffer.write(json.dumps(told).encode() + b"\n")
     for values in columns.values():
+        answer = io.BytesIO()
         np.save(answer, values, allow_pickle=False)
-    sys.stdout.buffer.write(answer.getvalue())
+        sys.stdout.buffer.write(answer.getbuffer())
 
 
 def _contents(data: bytes) -> Iterator[dict[str, Any]]:
@@ -85,7 +87,7 @@ def _bound_memory() -> None:
     """Let this process take no more than it was told, beside what it has."""
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     limit = pages * resource.getpagesize() + int(sys.argv[1]) + _SLACK
-    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    resource.setrlimit(resource.RLIMIT_AS, (limit, _UNBOUND))
 
 
 def _variables(data: bytes) -> Iterator[bytes]:
