@@ -61,11 +61,11 @@ def follows(u: Array, y: Array) -> tuple[float, bool]:
     if np.count_nonzero(np.diff(u)) < LAGS or _is_clock(u) or _is_clock(y):
         return 0.0, False
     steps = np.diff(y, prepend=y[:1])
-    late = _late(u, y) if _alike(u, steps) < HALF_EXPLAINED.value else 0.0
-    return max((late, False), (_late(u, steps), True))
+    itself = late(u, y) if _alike(u, steps) < HALF_EXPLAINED.value else 0.0
+    return max((itself, False), (late(u, steps), True))
 
 
-def _late(u: Array, y: Array) -> float:
+def late(u: Array, y: Array) -> float:
     """Return which share of a signal a lag of another explains; 0 where that is not its best."""
     lags = np.geomspace(1.0, max(y.size / 20, 2.0), 8)
     share = max(_alike(lagged(u - u[0], float(lag)), y) for lag in lags)

@@ -341,12 +341,15 @@ def _is_supply(name: str, value: Array) -> bool:
 
 
 def _explained(voltages: list[_Candidate], motions: list[_Candidate]) -> list[_Candidate]:
-    """Return the voltage that explains a motion best, and the motions that it explains."""
+    """Return the voltage that explains a motion best, and the motions that it explains.
+
+    Where chance may be what tells two apart, one in volts goes before a share of the supply.
+    """
     best: list[_Candidate] = []
     least = np.inf
-    for voltage in voltages:
+    for voltage in sorted(voltages, key=lambda c: is_share(c.unit[1:])):
         explained = [(c, rest) for c in motions if (rest := _rest(voltage, c)) is not None]
-        if explained and explained[0][1] < least:
+        if explained and explained[0][1] * (1 + 1 / voltage.value.size) < least:
             least = explained[0][1]
             first = {c.role: c for c, _ in reversed(explained)}
             best = [voltage, *(first[role] for role in names.MOTIONS[::-1] if role in first)]
@@ -357,10 +360,14 @@ def _rest(voltage: _Candidate, motion: _Candidate) -> float | None:
     """Return the share of the motion that a voltage leaves unexplained; None where it does not."""
     order = np.argsort(motion.time, kind="stable")[:_MOST]
     y = motion.value[order]
-    if motion.role != "velocity":
-        y = np.diff(y, prepend=y[:1])
     if voltage.time.size < 2:
         return None
     ranked = np.argsort(voltage.time, kind="stable")
     index = np.searchsorted(voltage.time[ranked], motion.time[order], "right") - 1
-    return drives.unexplained(voltage.value[ranked][np.maximum(index, 0)], y)
+    u = voltage.value[ranked][np.maximum(index, 0)]
+    if motion.role != "velocity":
+        steps = np.diff(y, prepend=y[:1])
+        if drives.late(u, y) > drives.late(u, steps):  # counts of an interval are a speed
+            return None
+        y = steps
+    return drives.unexplained(u, y)

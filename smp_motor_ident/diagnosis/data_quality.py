@@ -243,8 +243,8 @@ def _signs(records: Sequence[Record], where: str, late: bool = True) -> None:
     answer is a reversed one.
     """
     for what, remedy in (
-        ("speed", "swap the motor's leads or the encoder's channels"),
-        ("current", "swap the current sensor's sign"),
+        ("speed", "swap the motor's leads or the encoder's channels, or scale it by -1"),
+        ("current", "swap the current sensor's sign, or scale it by -1"),
     ):
         kept = [r for r in records if what == "speed" or r.current is not None]
         signals = [measured_speed(r) if what == "speed" else r.current for r in kept]

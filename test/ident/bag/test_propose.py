@@ -323,3 +323,14 @@ def test_columns_of_one_length_are_listed_and_proposed_together(tmp_path: Path) 
     assert len(read_records(tmp_path / "lab.mat", items)["motor"]) == N
     with pytest.raises(BagError, match=r"differ in length: limits 2, .*map columns of one length"):
         read_records(tmp_path / "lab.mat", ["voltage=limits", *items[1:]])
+
+
+def test_counts_of_an_interval_are_no_angle_and_volts_go_before_their_pwm(tmp_path: Path) -> None:
+    voltage, speed = motor(11)
+    columns = {"t": T, "pwm": np.rint(voltage / 12 * 999), "Voltage_V": np.round(voltage, 3)}
+    counts = np.rint(speed * 20)
+    path = write(tmp_path / "log.csv", **columns, Delta_Count=counts, rpm=speed)
+    suggestion = list_topics(path)[0].suggestion
+    assert suggestion == ["voltage=Voltage_V", "velocity=rpm:rpm", "time=t"]
+    path = write(tmp_path / "sum.csv", **columns, encoder=np.cumsum(counts))
+    assert list_topics(path)[0].suggestion == ["voltage=Voltage_V", "count=encoder", "time=t"]
