@@ -245,7 +245,8 @@ def _signal(name: str, value: Any, place: str) -> Signal:
         signal = Signal(topic, source, scale, offset, unit, shaft)
     else:
         signal = _written(str(value), place)
-    if signal.scale == 0 or not math.isfinite(signal.scale):
+    constant = name == "voltage" and signal.offset != 0  # a level that no column holds
+    if not (signal.scale or constant) or not math.isfinite(signal.scale):
         raise BagError(f"{place}: a scale of {signal.scale} leaves nothing of the signal")
     if signal.shaft:
         _choice("shaft", signal.shaft, place)

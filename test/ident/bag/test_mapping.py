@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from smp_motor_ident.bag import Signal, load, parse
+from smp_motor_ident.bag import Signal, load, parse, read_records
 from smp_motor_ident.bag.mapping import of
 from smp_motor_ident.errors import BagError
 
@@ -126,3 +127,10 @@ def test_a_file_that_is_no_mapping_is_refused_by_its_name(tmp_path: Path, text: 
 def test_a_mapping_file_that_does_not_exist_is_named(tmp_path: Path) -> None:
     with pytest.raises(BagError, match=r"nothing\.yaml"):
         load(tmp_path / "nothing.yaml")
+
+
+def test_a_level_that_no_column_holds_is_written_in_the_mapping(tmp_path: Path) -> None:
+    path = tmp_path / "step_12V.csv"
+    path.write_text("t,w\n" + "\n".join(f"{0.01 * k},{20 * k}" for k in range(30)))
+    record = read_records(path, ["voltage=w*0+12 velocity=w time=t"])["motor"]
+    assert np.all(record.voltage == 12.0)
