@@ -53,7 +53,7 @@ _ALIASES = {
         "ticks/s": ("counts/s",),
         "V": ("volt", "volts"),
         "A": ("ampere", "amperes", "amps"),
-        "%": ("percent", "pct"),
+        "%": ("percent", "pct", "prozent", "porcentaje", "porcentagem", "percentuale"),
         "rev/s": ("rps",),
         "rpm": ("rev/min", "u/min", "1/min"),
         "rev": ("turn", "turns"),

@@ -20,8 +20,13 @@ _COMMENTS = ("#", "%", "//")
 _MATRIX = re.compile(r"^\s*\[(?=[\s\d.+-])|(?<=\d)\s*\]?;?\s*$|^\];?\s*$")
 """What stands around the rows of a matrix or of lists."""
 _ARROW, _TIME = " -> ", re.compile(r"\d\d?:\d\d:\d\d")
-_LABEL = re.compile(r"(?:^|(?<=[\s,;|]))([A-Za-z_]\w*)\s*[:=,;\s]\s*(?=[-+.\d])")
+_WORD = r"[A-Za-z_]\w*"
+_LABEL = re.compile(
+    rf"(?:^|(?<=[\s,;|]))({_WORD}(?: {_WORD})*(?=\s*[:=])|{_WORD})\s*[:=,;\s]\s*(?=[-+.\d])"
+)
 """What a serial plotter's or a debug output's rows have before every number."""
+_UNIT = re.compile(r"(?<=\d) ?([A-Za-z%°µ][\w%°µ/]*)(?=\s*(?:[,;|]|$))")
+"""And what may stand behind one: ``Speed: 33 rpm, Duty: 40%``."""
 
 
 class _CsvFile(Tables):
@@ -42,7 +47,7 @@ class _CsvFile(Tables):
         if _ARROW in usual:  # behind a serial monitor's time of arrival
             mark = next((c for c in ";\t," if c in usual), " ")
             self._lines = [s.replace(_ARROW, mark) for s in self._lines]
-        labels = self._labels(seen)
+        labels, seen = self._labels(seen)
         self._separator = _separator([self._lines[k] for k in seen])
         rows = [_row(self._lines[k], self._separator) for k in seen]
         if self._separator == " ":
@@ -95,17 +100,21 @@ class _CsvFile(Tables):
             return None
         return [values[:, k].copy() for k in range(len(use))]
 
-    def _labels(self, seen: list[int]) -> list[str]:
-        """Take the labels off rows that have one before every number, and return them."""
-        labels: list[str] = _LABEL.findall(self._lines[seen[len(seen) // 2]])
+    def _labels(self, seen: list[int]) -> tuple[list[str], list[int]]:
+        """Take the labels off rows that have one before every number; return them and such rows."""
+        usual = self._lines[seen[len(seen) // 2]]
+        labels: list[str] = _LABEL.findall(usual)
         alike = [k for k in seen if labels and _LABEL.findall(self._lines[k]) == labels]
-        bare = [_LABEL.sub("", self._lines[k]) for k in alike]
+        bare = [_bare(self._lines[k]) for k in alike]
+        units = [_UNIT.search(cell) for cell in re.split("[,;|]", _LABEL.sub("", usual))]
+        if len(units) == len(labels):
+            labels = [f"{one} [{unit[1]}]" if unit else one for one, unit in zip(labels, units)]
         widths = {len(re.split(r"[\s,;|]+", text.strip())) for text in bare}
         names = (["time"] if bare and _TIME.match(bare[0].strip()) else []) + labels
         if len(alike) <= len(seen) / 2 or widths != {len(names)}:
-            return []
-        self._lines = [_LABEL.sub("", line) for line in self._lines]
-        return names
+            return [], seen
+        self._lines = [_bare(line) for line in self._lines]
+        return names, alike
 
     @staticmethod
     def _spaced(line: str, row: list[str], width: int) -> list[str]:
@@ -133,6 +142,11 @@ class _CsvFile(Tables):
         marks = [*self._separator.strip(), *";\t|,", *[None][: self._separator == " "]]
         several = [[cell.strip(' \t"') for cell in text.split(mark)] for mark in marks]
         return next((c for c in several if len(c) == width and all(c)), [])
+
+
+def _bare(line: str) -> str:
+    """Return the numbers of a row of labels."""
+    return _UNIT.sub("", _LABEL.sub("", line))
 
 
 def _row(line: str, separator: str) -> list[str]:

@@ -107,6 +107,7 @@ def test_a_comment_right_above_the_numbers_may_name_the_columns(
         pytest.param("", "t: {}\tu: {}\ty: {}", "", id="a serial plotter of tabs"),
         pytest.param("", "t={} u={} y={}", "", id="equations"),
         pytest.param("log of 2024", "t,{},u,{},y,{}", "", id="names between the numbers"),
+        pytest.param("C.07A, y: 3", "t: {}s, u: {}V, y: {}deg/s", "", id="units behind numbers"),
     ],
 )
 def test_rows_as_programs_print_them_are_read(
@@ -352,3 +353,11 @@ def test_the_recordings_of_real_motors_are_read() -> None:
     assert highest[0] == pytest.approx(0.3, abs=0.03)
     assert highest[-1] == pytest.approx(0.75, abs=0.03)
     assert records[0].velocity_window == 0.032
+
+
+def test_labels_of_several_words_have_their_units(tmp_path: Path) -> None:
+    rows = [f"PWM percent: {u}%, Motor speed: {y} rpm" for u, y in zip(U, Y)]
+    (tmp_path / "log.txt").write_text("\n".join(["connected", *rows]))
+    offer = list_topics(tmp_path / "log.txt")[0].offers[0]
+    assert offer.fields == ["PWM percent [%]", "Motor speed [rpm]"]
+    assert offer.units == {"PWM percent [%]": "%", "Motor speed [rpm]": "rpm"}

@@ -334,3 +334,12 @@ def test_counts_of_an_interval_are_no_angle_and_volts_go_before_their_pwm(tmp_pa
     assert suggestion == ["voltage=Voltage_V", "velocity=rpm:rpm", "time=t"]
     path = write(tmp_path / "sum.csv", **columns, encoder=np.cumsum(counts))
     assert list_topics(path)[0].suggestion == ["voltage=Voltage_V", "count=encoder", "time=t"]
+
+
+def test_a_power_of_a_motor_goes_before_another_wheels_speed(tmp_path: Path) -> None:
+    voltage, speed = motor(12)
+    other = np.convolve(speed, [0.0, 0.5, 0.5])[:N]
+    columns = {"t": T, "powerPctLeft": np.rint(voltage * 10), "vLeft": speed, "vRight": other}
+    listing = list_topics(write(tmp_path / "log.csv", **columns))[0]
+    assert listing.suggestion[0] == "voltage=powerPctLeft:%"
+    assert listing.suggestion[1].startswith("velocity=v")
