@@ -9,8 +9,7 @@ WORDS_OF_VOLTS = (
 ROLES = {
     # What a field or its topic is called, the most telling first.
     "direction": r"(?:^|\W|_)dir(?:ection)?(?:$|\W|_)|richtung|sentido|direcci",
-    "voltage": WORDS_OF_VOLTS
-    + r"|pwm|duty|throttle|entrada|eingang|^in$|(?:^|\W|_)power(?:$|\W|_)"
+    "voltage": WORDS_OF_VOLTS + r"|pwm|duty|throttle|entrada|eingang|^in$|(?:^|\W|_)power(?:$|\W|_)"
     r"|(?:^|\W|_)(?:cmd|command|effort|u|input|v_?in)(?:$|\W|_)",
     "current": r"current|strom|courant|corriente|corrente|curent|intensi[dt]|proud|akım|(?:^|\W)ток"
     r"|电流|電流|전류|amp(?:s|ere)?(?:$|\W|_)",

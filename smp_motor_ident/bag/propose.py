@@ -57,6 +57,8 @@ class _Candidate:
             steps = np.array_equal(whole, np.rint(whole)) and np.abs(whole).max() > 48
             volts = re.search(names.WORDS_OF_VOLTS, text, re.IGNORECASE)
             hint = ":pwm" if steps and not volts else ""
+        if self.role == "position" and not hint and _turn_of(whole) == 360:
+            hint = ":deg"
         if hint == ":duty" and np.abs(whole).max(initial=0.0) > 1:
             hint = ":pwm"  # of a scale that is asked for
         return hint
@@ -328,6 +330,12 @@ def _candidates(
             yield _Candidate(role, wheel, offer, path, at.astype(np.float64)[kept], value[kept])
 
 
+def _turn_of(angle: Array) -> float:
+    """Return at what an angle starts again, a turn in radians or degrees; 0 where it does not."""
+    span, jump = np.ptp(angle) if angle.size else 0.0, np.abs(np.diff(angle)).max(initial=0.0)
+    return next((turn for turn in (2 * np.pi, 360.0) if span <= turn and jump > turn / 2), 0.0)
+
+
 def _counted(role: str, value: Array) -> str:
     """Return the role of a field that its name may call a count: only whole numbers are one."""
     return "position" if role == "count" and not np.array_equal(value, np.rint(value)) else role
@@ -366,7 +374,8 @@ def _rest(voltage: _Candidate, motion: _Candidate) -> float | None:
     index = np.searchsorted(voltage.time[ranked], motion.time[order], "right") - 1
     u = voltage.value[ranked][np.maximum(index, 0)]
     if motion.role != "velocity":
-        steps = np.diff(y, prepend=y[:1])
+        turn = _turn_of(y) if motion.role == "position" else 0.0
+        steps = np.diff(np.unwrap(y, period=turn) if turn else y, prepend=y[:1])
         if drives.late(u, y) > drives.late(u, steps):  # counts of an interval are a speed
             return None
         y = steps

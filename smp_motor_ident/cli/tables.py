@@ -56,7 +56,7 @@ def estimate_table(estimate: Estimate) -> Table:
 
 _WHAT_TO_MAP = (
     "where one of the above is, say which: --map voltage=… velocity=… (or position=…, count=…); "
-    "where it is in another file, give both: voltage=/FILE.COLUMN; one level that no column holds is "
+    "where it is in another file, give both: voltage=/FILE.COLUMN; a level that no column holds is "
     "voltage=COLUMN*0+VOLTS; without a voltage or a command none can be identified; see "
     "docs/mapping.md"
 )

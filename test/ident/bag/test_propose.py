@@ -343,3 +343,10 @@ def test_a_power_of_a_motor_goes_before_another_wheels_speed(tmp_path: Path) -> 
     listing = list_topics(write(tmp_path / "log.csv", **columns))[0]
     assert listing.suggestion[0] == "voltage=powerPctLeft:%"
     assert listing.suggestion[1].startswith("velocity=v")
+
+
+def test_an_angle_that_starts_again_at_360_is_in_degrees(tmp_path: Path) -> None:
+    voltage, speed = motor(13)
+    angle = np.rad2deg(np.cumsum(speed) * 0.001) % 360
+    listing = list_topics(write(tmp_path / "log.csv", t=T, volts=voltage, angle=angle))[0]
+    assert listing.suggestion[1] == "position=angle:deg"
