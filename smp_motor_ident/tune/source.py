@@ -48,7 +48,11 @@ def choose_source(estimate: Estimate, loop: Loop, **targets: Any) -> tuple[Loop,
     if loop.counts_per_revolution is None:
         words = "the reported speed: the encoder's counts are not known"
         return loop, words + _averaged(estimate, loop, usual, targets)
-    longer = _longer(estimate, replace(loop, speed_source="difference"), usual, targets)
+    # Of a speed that was recorded no window is known; of counts one sample is the shortest.
+    counted = replace(
+        loop, speed_source="difference", difference_window=max(loop.difference_window, 1)
+    )
+    longer = _longer(estimate, counted, usual, targets)
     lacks = _lacking(estimate)
     watched = None if lacks else _trial(estimate, replace(loop, speed_source="observer"), targets)
     best = usual

@@ -135,6 +135,14 @@ def test_without_counts_there_is_nothing_to_choose(estimates):
     assert "not known" in why
 
 
+def test_counts_may_be_named_for_a_motor_that_a_recorded_speed_told(estimates):
+    loop, why = choose_source(
+        estimates["rear_left"], Loop(sample_time=0.001, difference_window=0, speed_noise=0.5)
+    )
+    assert loop.counts_per_revolution
+    assert "the reported speed allows" in why
+
+
 def test_the_choice_is_printed_and_can_be_overruled(tmp_path, capsys):
     for source in ("auto", "measured"):
         output = tmp_path / f"{source}.yaml"
