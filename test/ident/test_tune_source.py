@@ -15,6 +15,7 @@ from smp_motor_control.motor.model import MotorModel
 from smp_motor_control.wheel.loop import LoopSettings
 from smp_motor_ident.cli.tune import main
 from smp_motor_ident.cli.tuning import read_estimates
+from smp_motor_ident.errors import DesignError
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.tune import Loop, design
 from smp_motor_ident.tune.feedback import spectral_radius
@@ -151,3 +152,14 @@ def test_the_choice_is_printed_and_can_be_overruled(tmp_path, capsys):
         assert ("speed from the observer" in capsys.readouterr().out) == (source == "auto")
         chosen = "observer" if source == "auto" else "measured"
         assert f"speed_source: {chosen}" in output.read_text()
+
+
+def test_what_keeps_gains_from_being_designed_is_advised_and_no_note(estimates):
+    found = (
+        Finding("not_separable", "note", "a family", advice="record the motor current too"),
+        Finding("one_level", "warning", "one level", advice="record two levels of voltage"),
+    )
+    given = replace(estimates["rear_left"], combinations={}, parameters={}, findings=found)
+    with pytest.raises(DesignError, match="two levels") as refused:
+        design(given, Loop())
+    assert "current too" not in str(refused.value)
