@@ -122,7 +122,7 @@ class WheelLoop:
         """Make the speed's source anew from the settings."""
         self._observer: SpeedObserver | None = None
         self._differenced: DifferencedSpeed | None = None
-        self._count: int | None = None  # of the last sample, where the speed is made of counts
+        self._count: int | None = None  # of the last sample
         self._intervals: list[float] = []
         self._time = 0.0
         self._speed_of: Callable[[float, float, int, float], float] = self._measured
@@ -147,6 +147,7 @@ class WheelLoop:
 
     def _measured(self, dt: float, velocity: float, count: int, voltage: float) -> float:
         self.source = "measured"
+        self._count = count or None  # 0: of hardware without counts
         return velocity
 
     def _difference(self, dt: float, velocity: float, count: int, voltage: float) -> float:
@@ -187,7 +188,7 @@ class WheelLoop:
         """Close the loop on a wheel that turns at ``measurement``, without a jump."""
         self.pid.reset()
         self._path.start(measurement)
-        self._standstill.reset()
+        self._standstill = Standstill()
 
     def step(self, setpoint: float, measurement: float, dt: float) -> PidOutput:
         """Advance reference and controller by one sample; a wheel that stands is left alone."""
@@ -195,7 +196,7 @@ class WheelLoop:
         if count is None or setpoint != 0.0:
             self._standstill.reset()
             return self._follow(setpoint, measurement, dt)
-        held = self._standstill.voltage(count)
+        held = self._standstill.voltage(count, dt)
         if held is not None:
             self.pid.reset()
             self.pid.i_term = held  # with which it goes on when the wheel moves

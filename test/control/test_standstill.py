@@ -101,3 +101,22 @@ def test_one_count_is_standing_and_two_are_not():
     assert still.voltage(2) is None
     still.reset()
     assert still.voltage(0) is None
+
+
+@pytest.mark.parametrize("source", ["observer", "measured"])
+def test_a_voltage_that_is_not_needed_fades_and_one_that_is_stays(source):
+    """Friction holds a wheel with any voltage within it: the integral's would heat the motor."""
+    for load, left in ((0.0, 0.0), (0.5, 0.5)):
+        settings = LoopSettings(gains=GAINS, speed_source=source, model=MODEL)
+        loop = WheelLoop(settings, Gearbox(GEAR), Encoder(COUNTS), 9.0)
+        motor = Motor(load)
+        motor.angle, motor.late = 1.0, load
+        loop.pid.i_term = voltage = load + 0.9 * STATIC
+        first = motor.step(voltage)
+        for _ in range(2_000):
+            count = motor.step(voltage)
+            speed = loop.speed(STEP, motor.speed / GEAR, count, voltage)
+            if not math.isnan(speed):
+                voltage = loop.step(0.0, speed, STEP).output
+        assert abs(voltage - left) <= 1.05 * STATIC * (load > 0)
+        assert abs(count - first) <= 5 and motor.speed == 0.0  # it is caught, if it slips
