@@ -76,6 +76,10 @@ class WheelSettings:
     implausible_velocity: float = described(
         1000.0, "Feedback beyond this speed is left out [rad/s, wheel].", minimum=0.0
     )
+    implausible_jump: float = described(
+        0.0, "Feedback that jumps for one sample by this, beyond what the motor can change by, is "
+        "left out [rad/s, wheel]; 0: half of the top speed.", minimum=0.0
+    )  # fmt: skip
 
 
 class WheelController:
@@ -110,7 +114,7 @@ class WheelController:
     def configure(self, settings: WheelSettings) -> None:
         """Change the settings while running, without a jump of the voltage."""
         self.loop.configure(settings.loop.within(self.supply))
-        self._plausible.configure(settings.loop, self.supply)
+        self._plausible.configure(settings.loop, self.supply, settings.implausible_jump)
         self.settings = settings
         self.advice = ""  # why the gains do not suit the interval of the feedback
         self._detector.limits = settings.faults
@@ -199,7 +203,7 @@ class WheelController:
                     self.refuse("feedback count that jumps")
                     self.loop.reset_speed()
                 return None
-            if not self._plausible.accepts(measurement, dt):
+            if not self._plausible.accepts(measurement, dt, self.output):
                 self._bad_at = now
                 self.refuse("feedback speed that jumps")
                 self.loop.reset_speed()

@@ -4,12 +4,12 @@ import math
 
 from smp_motor_control.wheel.loop import LoopSettings
 
-_SPARE = 2.0
-"""Times the acceleration of the motor at full voltage that something else may add to it."""
-
 _GROSS = 0.5
-"""Share of the top speed by which readings may differ for whatever reason."""
+"""Share of the top speed by which readings may differ for whatever reason, if none is known."""
 
+
+LOAD = 0.25
+"""Share of the voltage by which a load changes a speed whose noise is known."""
 
 _QUIET = 0.2
 """Mean change from reading to reading, of the largest that is believed, below which one that jumps
@@ -34,29 +34,47 @@ class PlausibleSpeed:
     def __init__(self) -> None:
         self.gross = self.rate = math.inf  # [rad/s], [rad/s^2]: what a change may be of
         self._usual = 0.0  # mean change, of the largest that is believed
+        self._jump = self._inertia = self._load = self._back_emf = self._lag = 0.0
         self.reset()
 
-    def configure(self, settings: LoopSettings, supply: float) -> None:
-        """Learn what the motor can do; nothing jumps where that is not known."""
-        inertia, drive = settings.gains.feedforward_acceleration, settings.drive
-        volts = min(supply, settings.gains.u_clamp_max)
+    def configure(self, settings: LoopSettings, supply: float, jump: float = 0.0) -> None:
+        """Learn what the motor can do; nothing jumps where that is not known.
+
+        ``jump`` [rad/s] is what readings differ by for another reason, 0 where nobody knows it.
+        """
+        gains, drive = settings.gains, settings.drive
+        volts, inertia = min(supply, gains.u_clamp_max), gains.feedforward_acceleration
         known = drive is not None and inertia > 0.0 and math.isfinite(volts)
         self.gross = _GROSS * drive.top_speed if drive is not None and known else math.inf
-        self.rate = _SPARE * 2.0 * volts / inertia if known else math.inf
+        # At full voltage, reversed at full speed.
+        self.rate = 2.0 * volts / inertia if known else math.inf
+        self._jump, self._inertia = jump if known else 0.0, inertia
+        self._load = gains.feedforward_static + LOAD * volts
+        self._back_emf, self._lag = gains.feedforward_velocity, settings.reference_delay
 
     def reset(self) -> None:
         """Forget what was read, as after lost feedback."""
         self._kept = self._last = math.nan
+        self._drive = 0.0  # most voltage that accelerated the motor, fading with what it lags by
 
-    def accepts(self, speed: float, dt: float) -> bool:
-        """Tell whether a speed [rad/s] is to be believed."""
-        most = max(self.gross, self.rate * dt)
+    def _most(self, voltage: float, dt: float) -> float:
+        """Return the largest change within a sample that is believed."""
+        if not self._jump:
+            return max(self.gross, self.rate * dt)
+        drive = abs(voltage - self._back_emf * self._kept) + self._load
+        faded = self._drive + dt / (2.0 * (self._lag + dt)) * (drive - self._drive)
+        self._drive = drive if not drive < faded else faded  # NaN: the first
+        return self._jump + self._drive / self._inertia * dt
+
+    def accepts(self, speed: float, dt: float, voltage: float = 0.0) -> bool:
+        """Tell whether a speed [rad/s] is to be believed under a voltage."""
+        most = self._most(voltage, dt)
         last, self._last = self._last, speed
         change = abs(speed - last)  # NaN: the first
         beyond = (change / most if change < most else 1.0) - self._usual
         self._usual += (_RISE if beyond > 0.0 else _FALL) * beyond
         jumps = abs(speed - self._kept) > most and not change <= most
-        if jumps and self._usual < _QUIET:
+        if jumps and (self._jump or self._usual < _QUIET):
             return False
         self._kept = speed
         return True

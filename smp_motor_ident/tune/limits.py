@@ -41,6 +41,12 @@ SPEED_NOISE = Limit(
     "band in which the specification calls a change settled",
     "test_tune_methods.py",
 )
+JUMP = Limit(
+    8.0,
+    "standard deviations of a reported speed's noise",
+    "significance: two readings differ by more once in 70 million, a day at 1 kHz",
+    "test_tune_truth.py: outliers do not reach the loop",
+)
 
 UNKNOWN_RESPONSE = Limit(
     2.0,

@@ -9,6 +9,8 @@ from smp_motor_control.parameter_file import written
 from smp_motor_control.wheel.controller import WheelSettings
 from smp_motor_ident.result import plain
 from smp_motor_ident.tune.designer import Design
+from smp_motor_ident.tune.limits import JUMP
+from smp_motor_ident.tune.loop import Loop
 
 SCHEMA = 1
 
@@ -30,14 +32,21 @@ def parameters(design: Design) -> dict[str, Any]:
         "speed_source": str(design.loop.speed_source),
         "difference_window": int(max(design.loop.difference_window, 1)),
         "model": {name: float(value) for name, value in design.motor.items()},
-        **_plausible(reference.drive.top_speed),
+        **_plausible(reference.drive.top_speed, design.loop),
     }
 
 
-def _plausible(top_speed: float) -> dict[str, float]:
-    """Return the limit of plausible feedback where a wheel may be faster than that by default."""
-    usual = WheelSettings().implausible_velocity
-    return {"implausible_velocity": 2 * top_speed} if 2 * top_speed > usual else {}
+def _plausible(top_speed: float, loop: Loop) -> dict[str, float]:
+    """Return the limits of plausible feedback where they are not those by default.
+
+    A wheel may be faster; the noise of a speed that was recorded is known.
+    """
+    limits, usual = {}, WheelSettings().implausible_velocity
+    if 2 * top_speed > usual:
+        limits["implausible_velocity"] = 2 * top_speed
+    if loop.reported_noise:
+        limits["implausible_jump"] = JUMP.value * loop.reported_noise / loop.gear_ratio
+    return limits
 
 
 def gains_yaml(designs: Mapping[str, Design], provenance: Iterable[str]) -> str:
