@@ -23,6 +23,8 @@ from smp_motor_ident.tune.motors import (
     lag_of_sensor,
     motors_of,
     one_size_of_voltage,
+    outliers_of,
+    torque_noise_of,
     unreliable_spread,
 )
 from smp_motor_ident.tune.plant import sample
@@ -56,6 +58,8 @@ class Case:
     drawn: bool  # whether these were drawn; else the ensemble is the nominal motor alone
     friction: Friction  # what is known of it
     driver: Driver  # what its driver makes of a command
+    torque_noise: float  # load that fluctuates, over a sample [V rms]
+    outliers: float  # share of the reported speed's readings
     lag_in_doubt: bool  # whether the second lag may be the reported speed's filter
     findings: tuple[Finding, ...]  # what is to be said of the estimate
 
@@ -75,7 +79,8 @@ def prepare(estimate: Estimate, loop: Loop, method: str, targets: dict[str, Any]
     lag = lag_of_sensor(estimate) if loop.reports_speed else None
     level = one_size_of_voltage(estimate)
     findings += [one for one in (friction.finding, lag, level) if one is not None]
-    planned = np.array([friction.planned + driver.threshold])
+    load = abs(estimate.value("load_voltage"))  # the reference leaves room for it, too
+    planned = np.array([friction.planned + driver.threshold + load])
     plant = sample(replace(motors_of(estimate), static_voltage=planned), loop)
     problem = Problem(plant, loop, targets, unmodelled_dynamics(estimate))
     required = _required(chosen, problem)
@@ -102,6 +107,8 @@ def prepare(estimate: Estimate, loop: Loop, method: str, targets: dict[str, Any]
         drawn,
         friction,
         driver,
+        torque_noise_of(estimate, loop.sample_time),
+        outliers_of(estimate) if loop.reports_speed else 0.0,
         lag is not None,
         tuple(findings),
     )

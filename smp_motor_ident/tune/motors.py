@@ -181,6 +181,20 @@ def lag_of_sensor(estimate: Estimate) -> Finding | None:
     )
 
 
+def torque_noise_of(estimate: Estimate, sample_time: float) -> float:
+    """Return the load that fluctuates, as the voltage that it takes over a sample [V rms]."""
+    found = next((f for f in estimate.findings if f.code == "torque_noise"), None)
+    rate = 0.0 if found is None else float(found.evidence.get("acceleration") or 0.0)
+    inertia = estimate.value("time_constant") / estimate.value("dc_gain", math.inf)
+    return rate * inertia / math.sqrt(sample_time)
+
+
+def outliers_of(estimate: Estimate) -> float:
+    """Return the share of the reported speed's readings that were left out as outliers."""
+    found = (f for f in estimate.findings if f.code == "glitches")
+    return sum(float(f.evidence["samples"] or 0.0) for f in found) / max(estimate.samples, 1)
+
+
 def lag_in_sensor(motors: Motors) -> Motors:
     """Return motors with the second lag as the reported speed's filter.
 

@@ -50,16 +50,16 @@ class Inputs:
     low: Array
     high: Array | None = None
     forward: Array | None = None  # [V]: Feed-forward
-    load: Array | None = None  # [V]: what a load takes
+    load: Array | None = None  # [V]: what a load takes, shape (k,) or (n, k)
     noise: Array | None = None  # [rad/s]: on the measured speed, shape (n, k)
     angle_noise: Array | None = None  # [rad]: on the angle that it is made from, shape (n, k)
 
 
-def white(deviation: float, shape: tuple[int, int]) -> Array | None:
+def white(deviation: float, shape: tuple[int, int], seed: int = 0) -> Array | None:
     """Return white noise, the same every time; None where there is none."""
     if deviation == 0.0:
         return None
-    return np.asarray(deviation * np.random.default_rng(0).standard_normal(shape))
+    return np.asarray(deviation * np.random.default_rng(seed).standard_normal(shape))
 
 
 def simulate(
@@ -91,7 +91,7 @@ def simulate(
         np.asarray(inputs.low, dtype=np.float64),
         np.asarray(inputs.low if inputs.high is None else inputs.high, dtype=np.float64),
         none if inputs.forward is None else inputs.forward,
-        none if inputs.load is None else inputs.load,
+        still if inputs.load is None else np.broadcast_to(inputs.load, (n, steps)),
         np.zeros(n) if friction is None else np.ascontiguousarray(friction),
         modelled, count_angle, np.ascontiguousarray(noise), np.ascontiguousarray(of_angle), driver,
         np.broadcast_to(plant.motors.a0, n),
@@ -196,7 +196,7 @@ def _run(
                 past[q], put_out[q] = past[q - 1], put_out[q - 1]
             past[0] = given
             put_out[0], last = terminal_voltage(driver, given, back_emf[j] * x[0], last, T)
-            drag = _drag(x[0], friction[j], put_out, taps_angle[j], load[k])
+            drag = _drag(x[0], friction[j], put_out, taps_angle[j], load[j, k])
             swept = 0.0
             following[:] = 0.0
             for a in range(s):
@@ -205,7 +205,7 @@ def _run(
                     following[a] += phi[j, a, b] * x[b]
             # Load and friction act at once, the controller's voltage after its delay.
             for q in range(m):
-                volts = put_out[q] - load[k] - drag
+                volts = put_out[q] - load[j, k] - drag
                 swept += taps_angle[j, q] * volts
                 for a in range(s):
                     following[a] += taps[j, q, a] * volts

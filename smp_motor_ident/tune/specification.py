@@ -6,9 +6,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from smp_motor_control.arrays import Array
+from smp_motor_control.wheel.plausibility import LOAD
 from smp_motor_ident.tune.case import Case
 from smp_motor_ident.tune.ensemble import SHARE
 from smp_motor_ident.tune.feedback import Feedback
+from smp_motor_ident.tune.limits import JUMP
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.margins import Margins
 from smp_motor_ident.tune.plant import Plant, sample
@@ -126,7 +128,8 @@ def _runs(
         replace(
             plan.inputs,
             forward=plan.forward + case.swallowed * plan.friction,
-            noise=white(loop.reported_noise, shape),
+            load=white(case.torque_noise, shape, 1),
+            noise=_reported_noise(case, loop, shape),
             angle_noise=white(0.0 if filtered else loop.angle_noise, shape),
         ),
         count_angle=0.0 if filtered else loop.count_angle,
@@ -138,6 +141,23 @@ def _runs(
         step_figures(time, speed, volts, change)
         for speed, volts in zip(run.speed, run.voltage, strict=True)
     ]
+
+
+def _reported_noise(case: Case, loop: Loop, shape: tuple[int, int]) -> Array | None:
+    """Return the noise of the reported speed, with the outliers that the running loop believes.
+
+    They are of any size up to the top speed; it leaves out what no motor can change by.
+    """
+    noise = white(loop.reported_noise, shape)
+    if noise is None or not case.outliers:
+        return noise
+    motor = case.problem.plant.motors
+    top = loop.supply_voltage / float(motor.a0[0])
+    load = LOAD * loop.supply_voltage + case.swallowed
+    believed = JUMP.value * loop.reported_noise + load / float(motor.a1[0]) * loop.sample_time
+    rng = np.random.default_rng(2)
+    there = rng.random(shape) < case.outliers * min(believed / top, 1.0)
+    return np.asarray(noise + np.where(there, believed * rng.uniform(-1.0, 1.0, shape), 0.0))
 
 
 def _performance(
