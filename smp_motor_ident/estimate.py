@@ -36,7 +36,6 @@ from smp_motor_ident.diagnosis.scope import (
 )
 from smp_motor_ident.diagnosis.stamps import clock_share
 from smp_motor_ident.diagnosis.units import implausible_motor
-from smp_motor_ident.diagnosis.unmodelled import unmodelled_dynamics
 from smp_motor_ident.errors import (
     CurrentError,
     InsufficientExcitationError,
@@ -313,9 +312,6 @@ def _stated(
     own, common = validate.validated(group, request, final, chosen, hold)
     percent = FitPercent(fitted, own)
     tests = residual_tests(final, chosen)
-    if request.driver is not None:  # what a controller that knows nothing of it meets
-        there = of_kind(prepare(request.driver.before, request.use_current, hold=hold), chosen)
-        tests = replace(tests, model_error=unmodelled_dynamics(there, chosen))
     numbers = stated(chosen, result)
     lacks, possible = adequacy(errors, data.step, numbers, tests)
     for_noise: list[Finding] = []

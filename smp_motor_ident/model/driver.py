@@ -46,9 +46,10 @@ class Driver(NamedTuple):
         """Largest voltage [V] beyond the back-EMF, to which it limits the current."""
         return self.size if self.kind == CURRENT else float("inf")
 
-    def ramp(self, voltage: float) -> float:
-        """Return how long [s] it takes to a voltage [V]."""
-        return voltage / self.size if self.kind == SLEW else 0.0
+    @property
+    def slew(self) -> float:
+        """How fast its voltage changes at most [V/s]."""
+        return self.size if self.kind == SLEW else float("inf")
 
 
 @inlined

@@ -115,11 +115,13 @@ def prepare(estimate: Estimate, loop: Loop, method: str, targets: dict[str, Any]
 
 
 def _behind(driver: Driver, loop: Loop) -> Loop:
-    """Return a loop with what a driver takes of it: a ramp is late by half of its length."""
+    """Return a loop with what a driver takes of it: a ramp is late by half of its length.
+
+    The margins bear that; planned changes are no faster than the driver, and not late.
+    """
     supply = min(loop.supply_voltage, driver.limit)
-    ramp = 0.5 * driver.ramp(supply)
-    usual, longest = loop.expected_delay + ramp, loop.loop_delay + ramp
-    return replace(loop, supply_voltage=supply, delay=longest, usual_delay=usual)
+    longest = loop.loop_delay + 0.5 * supply / driver.slew
+    return replace(loop, supply_voltage=supply, delay=longest, usual_delay=loop.expected_delay)
 
 
 def _reliability(estimate: Estimate, accepted: bool) -> tuple[Finding, ...]:

@@ -178,7 +178,9 @@ def _plan(case: Case, usual: Plant, controller: Controller, margins: Margins) ->
     borne = replace(loop, delay_doubt=min(loop.delay_doubt, DELAY_BORNE.value * margins.delay))
     least = 0.4 / margins.crossover if margins.crossover > 0 else 0.0
     drive = max(case.driver.drive - case.friction.planned, 0.1 * case.driver.drive)
-    return plan_reference(plants, borne, controller, case.problem.targets, least, drive)
+    return plan_reference(
+        plants, borne, controller, case.problem.targets, least, drive, case.driver.slew
+    )
 
 
 def _explain(

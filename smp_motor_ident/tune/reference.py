@@ -132,11 +132,12 @@ def plan_reference(
     targets: Mapping[str, Any],
     least: float,
     drive: float = math.inf,
+    slew: float = math.inf,
 ) -> Reference:
     """Return the fastest reference, of ``least`` seconds, that is followed without overshoot.
 
     It leads the first of ``plants``, and the others follow it, too, with no more than a voltage
-    ``drive`` beyond their back-EMF and friction.
+    ``drive`` beyond their back-EMF and friction, which changes by no more than ``slew`` [V/s].
     """
     plant = plants[0]
     ratio = loop.gear_ratio
@@ -158,8 +159,9 @@ def plan_reference(
     )
     plan = _quickest(plants, loop, controller, plan, least)
     quickest = plan.transition_time
-    if rate is not None or math.isfinite(drive):
-        steepest = min(_steepest(plan), PEAK * drive / float(m.a1[0]))
+    if rate is not None or math.isfinite(min(drive, slew)):
+        steepest = _steepest(plan, PEAK * slew / float(m.a0[0]))
+        steepest = min(steepest, PEAK * drive / float(m.a1[0]))
         rate = steepest if rate is None else rate
         if rate > steepest:
             raise DesignError(
@@ -234,16 +236,21 @@ def _overshoot(led: Plant, plant: Plant, controller: Controller, plan: Reference
     return step_figures(time, run.speed[0], run.voltage[0], 1.0).overshoot
 
 
-def _steepest(plan: Reference) -> float:
-    """Return the largest acceleration that no change of speed takes beyond the voltage."""
+def _steepest(plan: Reference, slew: float) -> float:
+    """Return the largest acceleration that no change of speed takes beyond the voltage.
+
+    Nor beyond how fast that changes, as the speed [rad/s^2] that it would hold for ever.
+    """
     quickest, drive, rest = plan.transition_time, plan.drive, minimum_jerk.Reference(0.0, 0.0, 0.0)
     highest = PEAK_ACCELERATION * plan.max_velocity / quickest
     for rate in highest * np.geomspace(1.0, 0.01, 200):
         # A change that just takes the shortest time has the most jerk for its acceleration.
         for change in np.geomspace(rate * quickest / PEAK_ACCELERATION, plan.max_velocity, 4):
             motion = minimum_jerk.MinimumJerk(rest, change, PEAK_ACCELERATION * change / rate)
-            instants = np.linspace(0.0, motion.duration, 100).tolist()
-            if max(drive.needed(motion.at(t)) for t in instants) > drive.top_speed:
+            instants = np.linspace(0.0, motion.duration, 100)
+            needed = np.array([drive.needed(motion.at(t)) for t in instants.tolist()])
+            fastest = np.abs(np.diff(needed)).max() / float(instants[1])
+            if needed.max() > drive.top_speed or fastest > slew:
                 break
         else:
             break

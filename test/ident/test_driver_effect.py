@@ -233,6 +233,14 @@ def test_gains_are_for_motor_and_driver():
     assert slew.loop.loop_delay == pytest.approx(STEP + 0.5 * 12.0 / 200.0, abs=1e-3)
 
 
+@pytest.mark.parametrize("name", DRIVERS)
+def test_what_a_known_driver_does_is_not_unmodelled(name):
+    """A motor behind it answers as its model says: the loop is simulated with both."""
+    error = estimated(name, 0).residuals.model_error
+    shown = np.array(error.shown)[np.array(error.frequency) < 1 / TAU]
+    assert shown.size and shown.max() < 0.02
+
+
 @pytest.mark.parametrize(
     ("kind", "size", "command", "back_emf", "expected"),
     [

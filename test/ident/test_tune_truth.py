@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from smp_motor_control.wheel.plausibility import PlausibleSpeed
 from smp_motor_ident.cli import tuning
 from smp_motor_ident.cli.tune import main as tune
 from smp_motor_ident.cli.tune import parser
@@ -20,6 +21,8 @@ from smp_motor_ident.report.document import identification_document
 from smp_motor_ident.result import Estimate, FitPercent, Quantity
 from smp_motor_ident.tune import Loop, design
 from smp_motor_ident.tune.case import prepare
+from smp_motor_ident.tune.verification import loop_settings
+from smp_motor_ident.tune.writing import parameters
 
 MOTOR = {"dc_gain": 25.0, "time_constant": 0.05, "time_constant_product": 6e-4}
 LOOP = Loop(sample_time=0.01, delay=0.01, gear_ratio=1.0, counts_per_revolution=2000.0)
@@ -139,6 +142,70 @@ def test_a_lag_that_may_be_the_sensors_overshoots_no_change(share):
         assert over <= aware.specification.overshoot.high + 0.25
         assert over < 4.0
     assert any("filter" in words for words in aware.warnings)
+
+
+def test_changes_are_no_faster_than_the_driver():
+    """Nor late: a driver that ramps follows what is fed forward, whatever the change."""
+    size = {"quantity": "slew_rate", "size": 40.0, "full_duty": 12.0, "emf_share": 1.0}
+    slewed = Finding("slew", "warning", "a driver that ramps", size)
+    one = design(estimate(findings=[slewed]), LOOP)
+    plan, gains, T = one.reference, one.gains, LOOP.sample_time
+    for begin, end in ((0.0, 0.5), (0.0, 0.05), (1.0, -1.0), (-0.9, -0.2)):
+        profile = plan.profile()
+        profile.reset(begin * plan.max_velocity)
+        profile.set_target(end * plan.max_velocity, T)
+        path = [profile.ahead(k * T) for k in range(int(3.0 / T))]
+        volts = [gains.feedforward_velocity * p.velocity + gains.feedforward_acceleration
+                 * p.acceleration for p in path]  # fmt: skip
+        assert np.abs(np.diff(volts)).max() <= 40.0 * T
+        assert path[-1].velocity == pytest.approx(end * plan.max_velocity)
+    assert plan.lag == design(estimate(), LOOP).reference.lag
+    assert one.loop.loop_delay == pytest.approx(0.01 + 0.5 * 12.0 / 40.0)
+    assert one.specification.overshoot.high < 5.0
+
+
+def test_changes_leave_room_for_a_load_that_the_recording_shows():
+    plain, uphill = (design(estimate(load_voltage=x), LOOP) for x in (0.0, -2.0))
+    less = plain.reference.drive.top_speed - uphill.reference.drive.top_speed
+    assert less == pytest.approx(2.0 * MOTOR["dc_gain"])
+    assert uphill.reference.max_velocity < plain.reference.max_velocity
+
+
+def test_bands_hold_a_load_that_fluctuates_as_the_recording_shows():
+    """A speed that wanders with a deviation s reaches several s beyond the change."""
+    rough = 0.5 * MOTOR["dc_gain"] / MOTOR["time_constant"] * 0.1  # 0.5 V over 10 ms
+    noise = Finding("torque_noise", "warning", "a load that fluctuates", {"acceleration": rough})
+    steady, shaken = (design(estimate(findings=f), LOOP) for f in ([], [noise]))
+    wander = 100 * rough * math.sqrt(0.5 * MOTOR["time_constant"]) / shaken.specification.change
+    more = shaken.specification.overshoot.high - steady.specification.overshoot.high
+    assert 1.0 * wander < more < 6.0 * wander  # of the speed without a loop, which takes some off
+
+
+def test_outliers_do_not_reach_the_loop():
+    """Of a speed whose noise is known: two in a hundred, most of them within half of the top."""
+    found = Finding("glitches", "warning", "", {"signal": "velocity", "samples": 20.0})
+    counts = replace(LOOP, counts_per_revolution=None, speed_noise=1.0, difference_window=0)
+    one = design(replace(estimate(findings=[found]), samples=1000), counts)
+    quiet = design(replace(estimate(), samples=1000), counts)
+    assert one.specification.overshoot.high > quiet.specification.overshoot.high
+    written = parameters(one)
+    assert written["implausible_jump"] == pytest.approx(8.0)
+    loop, speed = loop_settings(written), PlausibleSpeed()
+    speed.configure(loop, 12.0, written["implausible_jump"])
+    rng, true, T = np.random.default_rng(5), 0.0, LOOP.sample_time
+    lost, believed = [], []
+    for k in range(6000):
+        volts = 11.0 if k // 60 % 2 else -11.0  # as fast as it can, there and back
+        true += (MOTOR["dc_gain"] * volts - true) * -math.expm1(-T / MOTOR["time_constant"])
+        outlier = rng.random() < 0.02
+        reading = true + rng.normal() + outlier * rng.uniform(-250.0, 250.0)
+        off = abs(reading - true)
+        taken = speed.accepts(reading, T, volts)
+        if outlier and k % 60 > 20 and off > 40.0:  # where it is steady
+            believed.append(taken)
+        elif not outlier:
+            lost.append(not taken)
+    assert np.mean(lost) < 0.005 and len(believed) > 20 and np.mean(believed) < 0.1
 
 
 def test_gains_from_one_size_of_voltage_hold_at_others():
