@@ -355,7 +355,7 @@ def _explained(voltages: list[_Candidate], motions: list[_Candidate]) -> list[_C
     """
     best: list[_Candidate] = []
     least = np.inf
-    for voltage in sorted(voltages, key=lambda c: is_share(c.unit[1:])):
+    for voltage in sorted(voltages, key=lambda c: needs("voltage", c.unit[1:], "supply_voltage")):
         explained = [(c, rest) for c in motions if (rest := _rest(voltage, c)) is not None]
         if explained and explained[0][1] * (1 + 1 / voltage.value.size) < least:
             least = explained[0][1]

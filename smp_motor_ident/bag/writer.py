@@ -147,12 +147,12 @@ class BagWriter:
                 return True
             schema, type_hash = self._schema(type_name)
             profiles = [{**DEFAULT_QOS, **profile} for profile in qos or [{}]]
-            told = {
+            described = {
                 "offered_qos_profiles": _dumped(profiles),
                 "topic_type_hash": type_hash,
                 **({NUMBERED: "true"} if numbered else {}),
             }
-            channel = self._mcap.register_channel(topic, "cdr", schema, told)
+            channel = self._mcap.register_channel(topic, "cdr", schema, described)
             metadata = {
                 "name": topic,
                 "type": type_name,

@@ -245,8 +245,8 @@ def _names(estimate: Estimate) -> tuple[str, ...]:
         return (*COMBINATIONS, *SENSOR)
     if all(estimate.value(n) for n in ("resistance", "motor_constant", "inertia")):
         return (*PHYSICAL, *SENSOR)
-    told = (f for f in estimate.findings if f.severity != "note" and f.advice)
-    advice = "; ".join(f.advice for f in told)
+    grave = (f for f in estimate.findings if f.severity != "note" and f.advice)
+    advice = "; ".join(f.advice for f in grave)
     raise DesignError(
         f"{estimate.wheel}: the estimate holds neither dc_gain and time_constant nor all physical "
         "parameters, so that no gains can be stood for; "

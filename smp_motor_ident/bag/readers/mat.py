@@ -29,18 +29,18 @@ def _open(path: Path, name: str, budget: Budget) -> ColumnFile:
     if done.returncode:
         raise BagError(f"{name}: damaged MATLAB file (its reader ends with {done.returncode})")
     answer = io.BytesIO(done.stdout)
-    told = json.loads(answer.readline())
-    if told["too_large"]:
+    head = json.loads(answer.readline())
+    if head["too_large"]:
         budget.take(budget.left + 1)
     budget.take(len(done.stdout))
-    if told["error"]:
-        raise BagError(f"{name}: {told['error']}")
-    columns = {key: np.load(answer, allow_pickle=False) for key in told["columns"]}
-    advice = f"{name}: {_advice(told['objects'])}"
-    if told["objects"] and not columns:
+    if head["error"]:
+        raise BagError(f"{name}: {head['error']}")
+    columns = {key: np.load(answer, allow_pickle=False) for key in head["columns"]}
+    advice = f"{name}: {_advice(head['objects'])}"
+    if head["objects"] and not columns:
         raise BagError(advice)
     file = ColumnFile(path, name, columns)
-    if told["objects"]:
+    if head["objects"]:
         file.problems.append(found("matlab_object", advice, "warning"))
     return file
 

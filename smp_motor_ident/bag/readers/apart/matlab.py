@@ -29,21 +29,21 @@ class Unreadable(Exception):
 def main() -> None:
     """Read a file from standard input and write what is in it: JSON in a line, then columns."""
     data = sys.stdin.buffer.read()
-    told: dict[str, Any] = {"error": "", "too_large": False, "objects": [], "columns": []}
+    head: dict[str, Any] = {"error": "", "too_large": False, "objects": [], "columns": []}
     columns: dict[str, np.ndarray[Any, Any]] = {}
     try:
         for content in _contents(data):
-            columns |= _columns("", content, 0, told["objects"])
+            columns |= _columns("", content, 0, head["objects"])
     except Unreadable as error:
-        told["error"] = str(error)
+        head["error"] = str(error)
     except MemoryError:
-        told["too_large"] = True
+        head["too_large"] = True
     except Exception as error:  # readers raise whatever their bytes lead them to
         reason = (str(error).splitlines() or [type(error).__name__])[0]
-        told["error"] = f"no readable MATLAB file ({reason[:200]})"
+        head["error"] = f"no readable MATLAB file ({reason[:200]})"
     resource.setrlimit(resource.RLIMIT_AS, (_UNBOUND, _UNBOUND))  # the answer is a copy
-    told["columns"] = list(columns)
-    sys.stdout.buffer.write(json.dumps(told).encode() + b"\n")
+    head["columns"] = list(columns)
+    sys.stdout.buffer.write(json.dumps(head).encode() + b"\n")
     for values in columns.values():
         answer = io.BytesIO()
         np.save(answer, values, allow_pickle=False)
@@ -84,7 +84,7 @@ def _contents(data: bytes) -> Iterator[dict[str, Any]]:
 
 
 def _bound_memory() -> None:
-    """Let this process take no more than it was told, beside what it has."""
+    """Let this process take no more than it was given, beside what it has."""
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     limit = pages * resource.getpagesize() + int(sys.argv[1]) + _SLACK
     resource.setrlimit(resource.RLIMIT_AS, (limit, _UNBOUND))
