@@ -181,14 +181,8 @@ def _stamp(motor: Motor, table: Table) -> Integers | None:
     column = table.columns.get(signal.field)
     if column is None:
         return None
-    to_nanoseconds = units.UNITS["time"][signal.unit or "s"].factor * 1e9
-    if column.dtype.kind in "iu" and signal.scale == 1 and to_nanoseconds >= 1:
-        # Whole nanoseconds since 1970 have no room in a float.
-        whole: Integers = column.astype(np.int64) * round(to_nanoseconds)
-        whole += round(signal.offset * to_nanoseconds)
-        return whole
-    values = (column.astype(np.float64) * signal.scale + signal.offset) * to_nanoseconds
-    return np.rint(np.nan_to_num(values)).astype(np.int64)
+    time = clock.nanoseconds(column, signal, signal.unit)
+    return np.where(time == clock.NEVER, 0, time)
 
 
 def _tell_offset(

@@ -10,11 +10,16 @@ from numpy.typing import NDArray
 
 from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident.bag.limits import SET_BACK
+from smp_motor_ident.bag.mapping import Signal
 from smp_motor_ident.bag.storage import Table, found
+from smp_motor_ident.bag.units import UNITS
 from smp_motor_ident.errors import BagError
 
 Parts = list[tuple[int, int]]
 """Begin and end of runs of rows."""
+
+NEVER = -(2**62)
+"""Where a row has no time."""
 
 _ROWS = round(SET_BACK.value)
 _BEFORE = 1000
@@ -24,6 +29,22 @@ _SECOND = 1_000_000_000
 _BEATS = 32
 SAME_CLOCK = 50_000_000
 """Clocks of two topics whose offsets differ by less [ns] are one clock: latency explains it."""
+
+
+def nanoseconds(column: NDArray[Any], signal: Signal, unit: str) -> Integers:
+    """Return a column of times [ns], `NEVER` where there is none; seconds where no unit is given.
+
+    Whole nanoseconds since 1970 have no room in a float: what is whole stays so.
+    """
+    second = UNITS["time"][unit or "s"].factor * 1e9
+    factor, offset = second * signal.scale, second * signal.offset
+    if column.dtype.kind in "iu" and factor == round(factor):
+        return column.astype(np.int64) * round(factor) + round(offset)
+    values = column.astype(np.float64) * factor + offset
+    sound = np.isfinite(values) & (np.abs(values) < -float(NEVER))
+    time = np.full(values.size, NEVER, np.int64)
+    time[sound] = np.rint(values[sound]).astype(np.int64)
+    return time
 
 
 @dataclass(frozen=True)

@@ -145,7 +145,7 @@ def timed(recording: Recording, plan: MotorMap, tables: Mapping[str, Table]) -> 
                 if unit and unit != signal.unit:
                     text = f"{recording.name}: {signal.field} is taken for {unit} since 1970"
                     findings.append(found("time_unit", text))
-        sound = log > _NEVER
+        sound = log > clock.NEVER
         columns = table.columns
         if not sound.all():
             text = f"{recording.name}: {int((~sound).sum())} rows without time were left out"
@@ -160,7 +160,7 @@ def timed(recording: Recording, plan: MotorMap, tables: Mapping[str, Table]) -> 
 
 def _check_seconds(log: Integers, signal: Signal, recording: Recording) -> None:
     """Refuse a time without a unit that cannot be in seconds: no motor shows in such rows."""
-    steps = np.diff(log[log > _NEVER]) * 1e-9
+    steps = np.diff(log[log > clock.NEVER]) * 1e-9
     step = float(np.median(steps)) if steps.size else 0.0
     if step >= limits.SECONDS_APART.value:
         raise BagError(
@@ -169,11 +169,8 @@ def _check_seconds(log: Integers, signal: Signal, recording: Recording) -> None:
         )
 
 
-_NEVER = -(2**62)
-
-
 def _nanoseconds(table: Table, signal: Signal) -> tuple[Integers, str]:
-    """Return the times of a table, `_NEVER` where there is none; and a unit that was inferred."""
+    """Return the times of a table, `NEVER` where there is none; and a unit that was inferred."""
     column = table.columns[signal.field]
     if signal.field in table.exact:
         return column.astype(np.int64), ""
@@ -181,11 +178,4 @@ def _nanoseconds(table: Table, signal: Signal) -> tuple[Integers, str]:
     if not unit:
         size = np.nanmedian(np.abs(column.astype(np.float64))) if column.size else 0.0
         unit = next((name for least, name in EPOCHS if size > least), "")
-    factor = units.UNITS["time"][unit or "s"].factor * signal.scale * 1e9
-    if column.dtype.kind in "iu" and factor == round(factor):
-        return column.astype(np.int64) * round(factor), unit
-    values = column.astype(np.float64) * factor
-    sound = np.isfinite(values) & (np.abs(values) < -float(_NEVER))
-    log = np.full(values.size, _NEVER, np.int64)
-    log[sound] = np.rint(values[sound]).astype(np.int64)
-    return log, unit
+    return clock.nanoseconds(column, signal, unit), unit

@@ -272,6 +272,19 @@ def test_a_file_without_time_has_a_sample_time(tmp_path: Path) -> None:
     np.testing.assert_allclose(record.time, np.arange(5) * 0.5)
 
 
+def test_a_time_with_an_offset_brings_two_tables_onto_one_clock(tmp_path: Path) -> None:
+    time = np.arange(100) * 0.02
+    voltage, late = np.where(time % 0.6 < 0.3, 3.0, -3.0), (0.0, 0.5)
+    np.savetxt(tmp_path / "set.csv", np.stack([time, voltage], 1), header="t,u", delimiter=",")
+    records = []
+    for shift in late:
+        columns = np.stack([time + shift, np.cumsum(voltage)], 1)
+        np.savetxt(tmp_path / "state.csv", columns, header="ts,w", delimiter=",")
+        mapping = [f"voltage=/set.u velocity=/state.w time=/state.ts-{shift}"]
+        records.append(read_records(tmp_path, mapping)["motor"])
+    np.testing.assert_array_equal(*(record.voltage for record in records))
+
+
 def test_several_files_are_several_experiments_of_several_motors(tmp_path: Path) -> None:
     for name in ("a.csv", "b.csv"):
         (tmp_path / name).write_text(table())
