@@ -12,7 +12,7 @@ import numpy as np
 from smp_motor_ident.diagnosis.limits import RELEVANT_BIAS
 from smp_motor_ident.estimation import data_window, descent, start
 from smp_motor_ident.estimation.fit import Fit, Options
-from smp_motor_ident.estimation.initialisation import first_fit, initial_fit
+from smp_motor_ident.estimation.initialisation import beginning, first_fit, initial_fit
 from smp_motor_ident.estimation.selection import POLICY, FittedCandidate
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.coordinates import Coordinates
@@ -182,13 +182,19 @@ def with_filter_for_lag(
     first, second = FirstOrder.like(s).with_(**lags), SecondOrder.like(s).with_(**lags)
     say(f"trying {first.label}")
     part = descent.screening_subset(data)
-    there = best if part is data else descent.refine(part, s, best, best.z, options)
+    few = beginning(part)
+    soon = best if few is data else descent.refine(few, s, best, best.z, options)
+    there = best if part is data else soon if few is part else None
     for motor, lag in ((quick, slow), (slow, quick)):
         z = best.z.with_(ln_a1=best.z.ln_a0 + math.log(motor), window=2 * lag)
         for structure in (first, second):
-            tried = _filtered(part, structure, there, z, options)
+            tried = _filtered(few, structure, soon, z, options, soon)
+            far = POLICY.rejects_on_subset(tried, soon.deviance)
+            if few is not part and not far:
+                there = there or descent.refine(part, s, best, best.z, options)
+                tried = _filtered(part, structure, there, z, options)
             z = tried.z.with_second_lag(WINDING * tried.z.time_constant)
-            if not POLICY.replaces(there, tried)[0]:
+            if far or there is None or not POLICY.replaces(there, tried)[0]:
                 continue
             there = tried
             if part is not data:
@@ -200,11 +206,16 @@ def with_filter_for_lag(
 
 
 def _filtered(
-    data: Experiments, structure: Structure, near: Fit, z: Coordinates, options: Options
+    data: Experiments,
+    structure: Structure,
+    near: Fit,
+    z: Coordinates,
+    options: Options,
+    known: Fit | None = None,
 ) -> Fit:
     """Fit a low-passed speed from another's answer on the same data."""
     data = data.measured_as(structure.speed)
-    return descent.refine(data, structure, near, structure.complete(z), options)
+    return descent.refine(data, structure, near, structure.complete(z), options, known=known)
 
 
 def _quicker(z: Coordinates, share: float) -> Coordinates:

@@ -76,11 +76,16 @@ def refine(
     """Fit a structure from another's answer on the same data."""
     start = near.at(z, initial_of(data, near))
     fit = solve(data, structure, start, options, 30, tolerance, known)
-    return fit if fit is known else at_rest(data, structure, fit, options, tolerance)
+    return fit if fit is known else at_rest(data, structure, fit, options, tolerance, known)
 
 
 def at_rest(
-    data: Experiments, structure: Structure, fit: Fit, options: Options, tolerance: float = 1e-2
+    data: Experiments,
+    structure: Structure,
+    fit: Fit,
+    options: Options,
+    tolerance: float = 1e-2,
+    known: Fit | None = None,
 ) -> Fit:
     """Try whether segments that begin slowly began at rest: friction makes that a kink."""
     if structure.friction == "none":
@@ -91,7 +96,7 @@ def at_rest(
         return fit
     initial = fit.initial.copy()
     initial[slow, :2] = 0.0
-    other = solve(data, structure, fit.at(fit.z, initial), options, 12, tolerance)
+    other = solve(data, structure, fit.at(fit.z, initial), options, 12, tolerance, known)
     return other if other.deviance < fit.deviance else fit
 
 
