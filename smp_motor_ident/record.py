@@ -7,6 +7,7 @@ start of the record.  Records know no files, no topics and no ROS.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Annotated, Any
 
 import msgspec
@@ -140,7 +141,7 @@ class Record:
         """Length of the record [s]."""
         return float(self.time[-1] - self.time[0])
 
-    @property
+    @cached_property
     def sample_time(self) -> float:
         """Median sampling interval [s]."""
         return float(np.median(np.diff(self.time)))

@@ -40,7 +40,8 @@ def screen(records: Sequence[Record]) -> list[Finding]:
     _motion(records, where)
     _signs(records, where)
     for record in records:
-        _signs([record], where_of([record]), late=False)  # the many do not hide the one
+        if len(records) > 1:  # the many do not hide the one
+            _signs([record], where_of([record]), late=False)
         _offset(record)
     read = [finding for record in records for finding in record.findings]
     return [*warnings, *(f for k, f in enumerate(read) if f not in read[:k])]

@@ -7,6 +7,7 @@ model's own free run, so they know nothing of the noise.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -39,6 +40,13 @@ class Motion:
     # resistance [ohm] and L/R [s], where the current is measured
     resistance: float = 0.0
     electric_lag: float = 0.0
+
+    @cached_property
+    def own_lag(self) -> float:
+        """The motor's own lag [sections] from how its speed follows its voltage."""
+        speed, voltage = self.speed / self.fastest, self.voltage / self.top
+        way = max(float(np.abs(np.diff(speed)).sum()), 1e-9)
+        return max(float(np.abs(voltage - speed).sum() / way), 1.0)
 
 
 @dataclass(frozen=True)
@@ -227,8 +235,5 @@ EFFECTS = (
 
 def _lagged(signal: Array, m: Motion, factor: float) -> Array:
     """Return a signal through a first-order lag that is faster or slower than the motor's."""
-    speed, voltage = m.speed / m.fastest, m.voltage / m.top
-    # The motor's own lag [sections] from how its speed follows its voltage.
-    own = max(float(np.abs(voltage - speed).sum() / max(np.abs(np.diff(speed)).sum(), 1e-9)), 1.0)
-    a = float(np.exp(-1.0 / max(factor * own, 0.3)))
+    a = float(np.exp(-1.0 / max(factor * m.own_lag, 0.3)))
     return np.asarray(lfilter([1 - a], [1.0, -a], signal))

@@ -106,8 +106,8 @@ def _scatter(data: Experiments, fit: Fit) -> float:
     x = np.zeros_like(base)
     several = carried(data, PATTERNS)
     for n in range(0, PATTERNS, several):
-        shape = voltage.size, min(several, PATTERNS - n)
-        made = (2.0 * rng.integers(0, 2, shape, np.int8) - 1.0) * moved[:, None]
+        shape = min(several, PATTERNS - n), voltage.size
+        made = (2.0 * rng.integers(0, 2, shape, np.int8) - 1.0) * moved
         moves = answered(data, fit, (made, np.zeros((0, 0, 0))), 1)
         x += np.einsum("noc,noc->no", moves, moves) / PATTERNS
     x /= np.square(deviation)

@@ -23,7 +23,6 @@ from smp_motor_ident.model.measurement import ANGLE
 BLOCKS = 40  # whose sums of scores give the covariance
 ROWS = 6_000  # of each output that the regression has at most
 ROOM = 16_000_000  # numbers in a table of signals
-TILE = 2_000  # rows of it that are filled at once
 SEGMENTS = 20  # beyond which only the angle's offset of each is projected out
 
 
@@ -286,27 +285,18 @@ def _tables(data: Experiments, made: Sequence[Signal]) -> tuple[Array, Array]:
     volts: Array = np.zeros((0, 0))
     added: Array = np.zeros((0, 0, 0))
     if any(s.voltage is not None for s in made):
-        volts = _beside([s.voltage for s in made], data.hold_end.size)
+        none = np.zeros(data.hold_end.size)
+        volts = np.array([none if s.voltage is None else s.voltage for s in made])
     if any(s.output is not None or s.current is not None for s in made):
-        both = [s.output for s in made], [s.current for s in made]
-        added = np.stack([_beside(columns, data.size) for columns in both])
+        both, none = [(s.output, s.current) for s in made], np.zeros(data.size)
+        added = np.array([[none if x is None else x for x in of] for of in zip(*both, strict=True)])
     return volts, added
-
-
-def _beside(columns: Sequence[Array | None], rows: int) -> Array:
-    """Return columns beside each other, zero where there is none; by tiles that a cache holds."""
-    out = np.zeros((rows, len(columns)))
-    for a in range(0, rows, TILE):
-        for n, column in enumerate(columns):
-            if column is not None:
-                out[a : a + TILE, n] = column[a : a + TILE]
-    return out
 
 
 def _as_it_is(data: Experiments, signal: Signal) -> Array:
     """Return sums by rows of what is added to the measurements alone."""
     outputs = 1 + (data.current.size > 0)
-    added = _tables(data, [signal])[1][:outputs, :, 0].T
+    added = _tables(data, [signal])[1][:outputs, 0].T
     return _summed(data, added, together(data))
 
 

@@ -75,7 +75,7 @@ def _smooth(record: Record, signal: Array) -> tuple[float, Array, Array] | None:
     known = np.isfinite(signal)
     if known.sum() < 20:
         return None
-    step = float(np.median(np.diff(record.time)))
+    step = record.sample_time
     y, there = np.where(known, signal, 0.0), known.astype(np.float64)
     k, volts = max(1, len(record) // RUNS), record.voltage
     while k > 1 and 2 * np.square(_means(volts, k)).sum() < np.square(volts).sum():
@@ -86,7 +86,7 @@ def _smooth(record: Record, signal: Array) -> tuple[float, Array, Array] | None:
 def _every(values: Array, k: int) -> Array:
     """Return the means of k neighbours, one of each k."""
     n = values.size // k * k
-    return np.asarray(values[:n].reshape(-1, k).mean(axis=1)) if 1 < k <= n else values
+    return np.asarray(values[:n].reshape(-1, k) @ np.full(k, 1 / k)) if 1 < k <= n else values
 
 
 def _means(values: Array, k: int) -> Array:

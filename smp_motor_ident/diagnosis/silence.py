@@ -72,7 +72,7 @@ def _swing(record: Record, name: str, a: int, b: int) -> float:
 
 def _answer(record: Record, speed: Array, known: Flags) -> Array:
     """Return the speed that the voltage lets expect, by what is known of it."""
-    step, volts = float(np.median(np.diff(record.time))), record.voltage
+    step, volts = record.sample_time, record.voltage
     top, y = float(np.abs(volts).max()), speed[known]
 
     def run(motor: Array) -> tuple[Array, float]:

@@ -119,15 +119,15 @@ def relative_error(omega: Array, error: Complex, output: Complex) -> ModelError 
 
 def _most_shown(omega: Array, error: Complex, output: Complex) -> tuple[float, float]:
     """Return size and radius of a band's error: of its mean, or of a resonance's peak."""
-    mean = _circle(error, output, BAND_LEVEL.value)
     width, span = 2 * RESONANCE_DAMPING.value, float(np.log(omega[-1] / omega[0]))
     n = max(round(span / width), 1)
-    peaks = [
-        _circle(error, output * _resonance(omega, at), BAND_LEVEL.value / n)
-        for at in omega[0] * np.exp(span * (np.arange(n) + 0.5) / n)
-    ]
-    peak = max(peaks, key=_surely)
-    return peak if _surely(peak) > max(_surely(mean), 0.0) else mean
+    at = omega[0] * np.exp(span * (np.arange(n) + 0.5) / n)
+    outputs = output * np.vstack([np.ones(omega.size), _resonance(omega, at[:, None])])
+    size, radius = _circles(error, outputs, BAND_LEVEL.value / np.array([1, *[n] * n]))
+    surely = size - radius
+    most = 1 + int(np.argmax(surely[1:]))
+    most = most if surely[most] > max(surely[0], 0.0) else 0
+    return float(size[most]), float(radius[most])
 
 
 def _surely(stated: tuple[float, float]) -> float:
@@ -135,16 +135,15 @@ def _surely(stated: tuple[float, float]) -> float:
     return stated[0] - stated[1]
 
 
-def _circle(error: Complex, output: Complex, level: float) -> tuple[float, float]:
-    """Return the size of an error relative to an output, and the radius of its circle."""
-    power, m = float(np.square(np.abs(output)).sum()), error.size / HANN
-    size = complex(np.sum(error * output.conj())) / power
-    rest = float(np.square(np.abs(error - size * output)).sum()) / HANN / (m - 1)
-    radius = np.sqrt(fdtri(2, 2 * (m - 1), 1 - level) * rest * HANN / power)
-    return abs(size), float(radius)
+def _circles(error: Complex, outputs: Complex, level: Array) -> tuple[Array, Array]:
+    """Return the sizes of an error relative to outputs, one a row, and the radii of its circles."""
+    power, m = np.square(np.abs(outputs)).sum(axis=1), error.size / HANN
+    size = outputs.conj() @ error / power
+    rest = np.square(np.abs(error - size[:, None] * outputs)).sum(axis=1) / HANN / (m - 1)
+    return np.abs(size), np.sqrt(fdtri(2, 2 * (m - 1), 1 - level) * rest * HANN / power)
 
 
-def _resonance(omega: Array, at: float) -> Complex:
+def _resonance(omega: Array, at: Array) -> Complex:
     """Return the response of a resonance, 1 at its peak."""
     width = 2j * RESONANCE_DAMPING.value * at * omega
     response: Complex = width / (at**2 - omega**2 + width)

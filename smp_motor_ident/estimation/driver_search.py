@@ -59,7 +59,7 @@ def likeliest(group: Sequence[Record], fit: Fit, hold: str, options: Options) ->
     if fit.noise_ratio > 0:
         fit = replace(fit, noise_ratio=0.0)
         fit = refine(_prepared(group, hold, fit), fit.structure, fit, fit.z, options)
-    step = float(np.median(np.diff(group[0].time)))
+    step = group[0].sample_time
     few = _pieces(group, step, fit.z.time_constant)
     price, factor = POLICY.price(1, fit.samples), sandwich_factor(fit)
 

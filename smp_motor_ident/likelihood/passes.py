@@ -79,8 +79,8 @@ class Pass:
 class Beside:
     """Signals beside what was given, each of which the motor answers."""
 
-    voltage: Array  # shape (sections, r): to the voltage of each section [V]; (0, 0) for none
-    # shape (2, n, r): to what output and current show, which may correct the state; (0, 0, 0)
+    voltage: Array  # shape (r, sections): to the voltage of each section [V]; (0, 0) for none
+    # shape (2, r, n): to what output and current show, which may correct the state; (0, 0, 0)
     added: Array
     # shape (rows, o, p + r): sums, over runs of samples, of what the own columns and the signals
     # change in output and current
@@ -109,7 +109,7 @@ def answers(
 ) -> Array:
     """Return what own columns and signals (`Beside`) change in the predictions, summed by rows."""
     count = own * (structure.matrix.shape[1] + len(own_columns(data, structure)))
-    width = count + max(signals[0].shape[-1], signals[1].shape[-1])
+    width = count + max(signals[0].shape[0], signals[1].shape[1])
     sums = np.zeros((row_starts(data, together).size, 1 + (data.current.size > 0), width))
     beside = Beside(*signals, sums, together)
     gather(data, structure, z, initial, noise, differentiate=own, beside=beside)

@@ -263,7 +263,7 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
         while section < limit and hold_end[section] + delay <= now:
             section += 1
         if pushed:
-            _put(beside[section], m, PUSH, p, False)
+            _put(beside[:, section], m, PUSH, p, False)
         for k in range(first, last):
             target = time[k]
             due = samples_between(target - now, period) if smoothed and k > first else 0.0
@@ -291,7 +291,7 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
                 if section < limit and change <= end + 1e-9 * (target - time[k - 1]):
                     section += 1
                     if pushed:
-                        _put(beside[section], m, PUSH, p, False)
+                        _put(beside[:, section], m, PUSH, p, False)
                     if late:
                         _switch(v, hold_value[section], load, direction, friction, par, m)
                 if due > 0.0 and now >= take:
@@ -308,9 +308,9 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
                 y1 = observe_lagging(sensor, k, par, x, m, D1, trail)
             elif has_current:
                 y1 = observe_current(par, x, m)
-            if added.shape[0] > 0:
-                _put(added[0, k], m, D0, p, True)
-                _put(added[1, k], m, D1, p, True)
+            if added.shape[1] > 0:
+                _put(added[0, :, k], m, D0, p, True)
+                _put(added[1, :, k], m, D1, p, True)
             if predicted.shape[0] > 0:
                 note(predicted[k], x[1], y0, y1)
             # Residuals, whitened.

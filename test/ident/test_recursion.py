@@ -154,7 +154,7 @@ def test_answer_to_a_signal_is_what_little_of_it_changes(sensor, with_gain):
     shown = 1e-2 * np.sin(5 * data.time)
     found = answers(
         data, structure, z, data.initial, NoiseModel(gain=gain),
-        (signal[:, None], np.array([shown, 0 * shown])[:, :, None]), 7, False,
+        (signal[None], np.array([shown, 0 * shown])[:, None]), 7, False,
     )[:, :, 0]  # fmt: skip
     size = 1e-4
     nudged = replace(
