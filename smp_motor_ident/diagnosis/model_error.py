@@ -73,16 +73,15 @@ def regression(data: Experiments, fit: Fit, gear: float) -> Regression | None:
 
 def _conditions(data: Experiments, m: Motion) -> dict[str, Array]:
     """Return the halves of the motion by each condition that there is, for every row."""
-    power = m.voltage * m.drop
-    kinds = {
-        "size of the voltage": _halves(np.abs(m.voltage)),
-        "speed": _halves(np.abs(m.speed)),
-        "acceleration": _halves(np.abs(np.gradient(m.speed))),
-        "direction": np.sign(m.speed),
-        "braking": np.sign(power),
-    }
     begins = row_starts(data, together(data))
-    out = {name: half[begins] for name, half in kinds.items()}
+    voltage, speed, drop = m.voltage[begins], m.speed[begins], m.drop[begins]
+    out = {
+        "size of the voltage": _halves(np.abs(voltage)),
+        "speed": _halves(np.abs(speed)),
+        "acceleration": _halves(np.abs(np.gradient(m.speed)[begins])),
+        "direction": np.sign(speed),
+        "braking": np.sign(voltage * drop),
+    }
     if data.current.size:
         out = {name: np.tile(half, 2) for name, half in out.items()}
         out["current"] = np.repeat([-1.0, 1.0], begins.size)

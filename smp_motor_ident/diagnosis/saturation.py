@@ -27,14 +27,14 @@ def saturation(record: Record, speed: Array, where: str) -> Iterator[Finding]:
             continue
         ok = np.isfinite(values)
         x, v = values[ok], record.voltage[ok]
-        if x.size < 50 or np.unique(x).size < 20 or _one_level(v):
+        levels, times = np.unique(x, return_counts=True)
+        if x.size < 50 or levels.size < 20 or _one_level(v):
             continue
         for limit in (x.max(), x.min()):
             at = x == limit
             if abs(limit) < 0.5 * np.abs(x).max():  # the slowest that it turned, one way
                 continue
             share = float(at.mean())
-            levels, times = np.unique(x, return_counts=True)
             next_times = times[-2] if limit == levels[-1] else times[1]
             runs = at[1:] & at[:-1]
             # A resting sensor shows its limit far more often than the level beside it.

@@ -105,10 +105,11 @@ def relative_error(omega: Array, error: Complex, output: Complex) -> ModelError 
     omega, error, outputs = omega[order], error[order], np.atleast_2d(output)[:, order]
     found = []
     for a, b in _bands(omega):
-        moved = sorted(outputs[:, a:b], key=lambda one: float(np.square(np.abs(one)).sum()))
-        if np.abs(moved[0]).max() > 0:
+        moved = outputs[np.argsort(_power(outputs[:, a:b])), a:b]
+        if moved[0].any():
             middle = float(np.sqrt(omega[a] * omega[b - 1]))
-            stated = [_most_shown(omega[a:b], error[a:b], one) for one in moved]
+            filters = _filters(omega[a:b])
+            stated = [_most_shown(error[a:b], one * filters) for one in moved]
             most = max(stated, key=_surely)
             found.append((middle, *(most if _surely(most) > 1 else stated[0])))
     if not found:
@@ -117,12 +118,17 @@ def relative_error(omega: Array, error: Complex, output: Complex) -> ModelError 
     return ModelError(frequency, shown, tuple(s + r for s, r in zip(shown, radius, strict=True)))
 
 
-def _most_shown(omega: Array, error: Complex, output: Complex) -> tuple[float, float]:
+def _filters(omega: Array) -> Complex:
+    """Return what the output of a band may be behind, rows: nothing, and resonances."""
+    span = float(np.log(omega[-1] / omega[0]))
+    n = max(round(span / (2 * RESONANCE_DAMPING.value)), 1)
+    at = omega[0] * np.exp(span * (np.arange(n)[:, None] + 0.5) / n)
+    return np.vstack([np.ones(omega.size), _resonance(omega, at)])
+
+
+def _most_shown(error: Complex, outputs: Complex) -> tuple[float, float]:
     """Return size and radius of a band's error: of its mean, or of a resonance's peak."""
-    width, span = 2 * RESONANCE_DAMPING.value, float(np.log(omega[-1] / omega[0]))
-    n = max(round(span / width), 1)
-    at = omega[0] * np.exp(span * (np.arange(n) + 0.5) / n)
-    outputs = output * np.vstack([np.ones(omega.size), _resonance(omega, at[:, None])])
+    n = len(outputs) - 1
     size, radius = _circles(error, outputs, BAND_LEVEL.value / np.array([1, *[n] * n]))
     surely = size - radius
     most = 1 + int(np.argmax(surely[1:]))
@@ -137,10 +143,15 @@ def _surely(stated: tuple[float, float]) -> float:
 
 def _circles(error: Complex, outputs: Complex, level: Array) -> tuple[Array, Array]:
     """Return the sizes of an error relative to outputs, one a row, and the radii of its circles."""
-    power, m = np.square(np.abs(outputs)).sum(axis=1), error.size / HANN
+    power, m = _power(outputs), error.size / HANN
     size = outputs.conj() @ error / power
-    rest = np.square(np.abs(error - size[:, None] * outputs)).sum(axis=1) / HANN / (m - 1)
+    rest = _power(error - size[:, None] * outputs) / HANN / (m - 1)
     return np.abs(size), np.sqrt(fdtri(2, 2 * (m - 1), 1 - level) * rest * HANN / power)
+
+
+def _power(rows: Complex) -> Array:
+    """Return the sums of squares of rows."""
+    return np.asarray(np.square(rows.real).sum(axis=1) + np.square(rows.imag).sum(axis=1))
 
 
 def _resonance(omega: Array, at: Array) -> Complex:

@@ -165,8 +165,9 @@ def squares_sliding(
     par: Array,
     initial: Array,
     usual: float,
+    predicted: Array,
 ) -> tuple[float, float]:
-    """Return the sum of squared residuals and their number, without sensitivities."""
+    """Return the sum of squared residuals and their number; note speed and output, if asked."""
     row, table = np.zeros(NUMBERS), tabulate(usual, par)
     step = -1.0
     total = count = 0.0
@@ -188,7 +189,10 @@ def squares_sliding(
                 old = q
                 q = e00 * q + e01 * w + v0 * v
                 w = e10 * old + e11 * w + v1 * v
-            e = output[n] - (th if angle else w)
+            y = th if angle else w
+            if predicted.shape[0] > 0:
+                predicted[n, 0], predicted[n, 1] = w, y
+            e = output[n] - y
             if e == e:
                 total += e * e
                 count += 1.0

@@ -151,11 +151,13 @@ def gather(
     normal, gradient, cost = np.empty((segments, p, p)), np.empty((segments, p)), np.zeros(segments)
     spread = np.zeros(6)
     angle = data.kind == ANGLE
-    if predicted is None and beside is NOTHING and _slides(data, structure, z, noise):
+    noted = np.zeros((0, 3)) if predicted is None else predicted
+    alone = beside is NOTHING and (predicted is None or p == 0)
+    if alone and _slides(data, structure, z, noise):
         if p == 0:
             spread[0], spread[3] = squares_sliding(
                 data.time, data.starts, data.hold_value, data.output, angle, par, initial,
-                data.jittered,
+                data.jittered, noted,
             )  # fmt: skip
             used = 0
         else:
@@ -171,8 +173,7 @@ def gather(
             initial, own, noise.gain, whitening(noise.covariance), noise.huber, normal, gradient,
             cost, spread, length, scores, owner, _ring(data, par, max(p, beside.answers.shape[-1])),
             SENSORS.index(sensor_of(structure)), _trail(data, structure, par), data.step,
-            np.zeros((0, 3)) if predicted is None else predicted,
-            data.jittered, beside.voltage, beside.added, beside.answers, beside.together,
+            noted, data.jittered, beside.voltage, beside.added, beside.answers, beside.together,
         )  # fmt: skip
     return Sums(normal, gradient, cost, spread, scores[:used], owner[:used])
 
