@@ -58,8 +58,11 @@ def _follow(
         elif h > 0.0:
             slack = 1e-9 * h + 1e-15 * abs(now)
             middle, turned = x[1], direction
-            for _ in range(TURNS):
+            for turn in range(TURNS):
+                before = out[k]
                 out[k], _ = terminal_voltage(driver, command[k], a0 * middle, command[k], h)
+                if turn > 0 and out[k] == before:
+                    break
                 after[:] = x
                 turned = move(
                     h, slack, out[k], direction, load, friction, par, after, m, cache, marks,
