@@ -22,7 +22,8 @@ from smp_motor_ident.diagnosis.refusal import (
     lag_unknown,
     no_candidate,
     of_which,
-    refuse,
+    refuse_unexplained,
+    refuse_untold,
 )
 from smp_motor_ident.diagnosis.repair import hides_driver, repaired
 from smp_motor_ident.diagnosis.residuals import residual_tests
@@ -75,7 +76,7 @@ from smp_motor_ident.estimation.subset import excitation
 from smp_motor_ident.estimation.thinning import thinned
 from smp_motor_ident.estimation.transients import widened_by_pieces
 from smp_motor_ident.finding import Finding
-from smp_motor_ident.likelihood.experiments import Experiments, prepare
+from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.structures import Structure
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import Estimate, FitPercent
@@ -215,7 +216,7 @@ def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) 
         left = [r for r in left if r.fit is not one.fit]
         try:
             words = [*found, *fallen_back(refused, one.label)]
-            plain = _stated(group, request, words, data, hold, [*left, one])
+            plain = _stated(group, request, words, data, hold, [*left, one], refused is None)
             if not lacks_something(plain):
                 return plain
             noisy = refused is None and (plain.unreliable or one.fit.noise_ratio > 0)
@@ -291,23 +292,30 @@ def _stated(
     data: Experiments,
     hold: str,
     candidates: list[FittedCandidate],
+    first: bool,
 ) -> Estimate:
-    """Return what the last candidate says, and how far it can be trusted."""
-    chosen, friction_std, change = _certain(data, candidates[-1].fit, request, group, hold)
-    final = of_kind(data, chosen)
-    gear = group[0].hardware.gear_ratio
-    errors = regression(final, chosen, gear)
-    chosen, parts = dependent(chosen, errors)
+    """Return what the last candidate says, and how far it can be trusted.
 
+    Where only the lag is not known, that is said of the ``first`` candidate; others are refused.
+    """
+    final = of_kind(data, candidates[-1].fit)
+    chosen = constrained(final, candidates[-1].fit, request)
+    fitted = validate.speed_fit(group, final, chosen)
+    refuse_unexplained(group, final, chosen, fitted)
+    chosen, friction_std, change = _certain(final, chosen, request, group, hold)
     weight = candidate_weights(data, candidates)
 
     def said(fit: Fit) -> tuple[Answer, dict[str, float]]:
         own = answer(fit, request.known, friction_std, driven_longest(final))
         return covering(weight, candidates, own, request.known)
 
+    if not first:
+        refuse_untold(group, chosen, said(chosen)[0])
+    gear = group[0].hardware.gear_ratio
+    errors = regression(final, chosen, gear)
+    chosen, parts = dependent(chosen, errors)
     result, alike = said(chosen)
-    fitted = validate.speed_fit(group, final, chosen)
-    refusal = _without_lag(group, final, chosen, result, fitted)
+    refusal = _without_lag(group, chosen, result)
     request.say("validating")
     own, common = validate.validated(group, request, final, chosen, hold)
     percent = FitPercent(fitted, own)
@@ -352,12 +360,10 @@ def _stated(
     return estimate
 
 
-def _without_lag(
-    group: list[Record], data: Experiments, fit: Fit, result: Answer, fitted: float
-) -> UnknownLagError | None:
+def _without_lag(group: list[Record], fit: Fit, result: Answer) -> UnknownLagError | None:
     """Refuse what cannot be stated; return the refusal of which the lag alone is the reason."""
     try:
-        refuse(group, data, fit, result, fitted)
+        refuse_untold(group, fit, result)
     except UnknownLagError as refusal:
         return refusal
     return None
@@ -367,17 +373,14 @@ def _prepared(
     group: list[Record], base: Structure, request: Request
 ) -> tuple[Experiments, str, Fit | None]:
     """Return the data, how the command was held in them, and the fit that showed that."""
-    hold, first = chosen_hold(group, base, request.options, request.say)
-    data = prepare(group, request.use_current, hold=hold)
+    data, hold, first = chosen_hold(group, base, request.options, request.say)
     return data.measured_as(base.speed), hold, first
 
 
 def _certain(
-    data: Experiments, fit: Fit, request: Request, group: Sequence[Record], hold: str
+    final: Experiments, chosen: Fit, request: Request, group: Sequence[Record], hold: str
 ) -> tuple[Fit, float, Change]:
     """Return the chosen fit with all of its uncertainty, and how the motor changes."""
-    final = of_kind(data, fit)
-    chosen = constrained(final, fit, request)
     few = thinned(final) if final.size > PROFILED.value else final
     chosen = profiled(few, widened_by_pieces(final, widened(final, chosen)), request.options)
     timed = consider_timing(final, chosen, instant_deviation(group, hold))

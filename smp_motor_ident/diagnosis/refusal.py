@@ -53,10 +53,8 @@ def of_which(
     return type(refusal)(f"{refusal}; {words}")
 
 
-def refuse(
-    group: Sequence[Record], data: Experiments, fit: Fit, result: Answer, fitted: float
-) -> None:
-    """Refuse what the model does not explain, and what the data hardly tell."""
+def refuse_unexplained(group: Sequence[Record], data: Experiments, fit: Fit, fitted: float) -> None:
+    """Refuse what the model does not explain."""
     explained = np.isfinite(fitted) and fitted >= WORST_FIT.value
     if not explained and stands(data, fit):
         raise InsufficientExcitationError(
@@ -71,6 +69,10 @@ def refuse(
             "between, and that nothing else drives it"
         )
     _refuse_offset(group, fit)
+
+
+def refuse_untold(group: Sequence[Record], fit: Fit, result: Answer) -> None:
+    """Refuse what the data hardly tell."""
     loose = [
         n
         for n in ("dc_gain", "time_constant")

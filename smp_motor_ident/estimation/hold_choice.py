@@ -41,27 +41,26 @@ its switches before; one from its row on; one straight from row to row."""
 
 def chosen_hold(
     group: Sequence[Record], base: Structure, options: Options, say: Callable[[str], None]
-) -> tuple[str, Fit | None]:
+) -> tuple[Experiments, str, Fit | None]:
     """Choose how the command ran inside the intervals, by what explains the outputs best."""
-    samples = sum(len(r) for r in group)
-    if base.order != 2 or "window" in base.fixed or samples > limits.HOLD_COST.value:
-        return "held", None
     plain = prepare(group, base.current)
+    if base.order != 2 or "window" in base.fixed or plain.size > limits.HOLD_COST.value:
+        return plain, "held", None
     if plain.kind != ANGLE or thinned(plain) is not plain:
-        return "held", None  # how the command ran within so short an interval does not show
+        return plain, "held", None  # how the command ran within so short an interval is not shown
     others = {h: prepare(group, base.current, hold=h) for h in ("switched", "middle")}
     others = {h: d for h, d in others.items() if d.hold_end.size > plain.hold_end.size}
     if len(others) > 1 and others["switched"].held_like(others["middle"]):
         del others["middle"]
     if not others:
-        return "held", None
+        return plain, "held", None
     say("how the command was held between samples")
     best = initial_fit(
         plain, base if base.current else SecondOrder.like(base, shape=False), options
     )
+    chosen, hold = plain, "held"
     if best is None:
-        return "held", None
-    hold = "held"
+        return chosen, hold, None
     part = screening_subset(plain)
     near = refine(part, best.structure, best, best.z, options) if part is not plain else best
     for other, data in others.items():
@@ -74,8 +73,8 @@ def chosen_hold(
         fitted = grow(part, best.structure, near, options)
         fitted = extend(data, best.structure, fitted, options)
         if fitted.deviance < best.deviance - limits.HOLD_EVIDENCE.value:
-            hold, best = other, fitted
-    return hold, best
+            chosen, hold, best = data, other, fitted
+    return chosen, hold, best
 
 
 def otherwise(

@@ -105,14 +105,14 @@ def test_the_scatter_of_coarse_counts_at_one_speed_refuses_no_motor(fit_of):
 
 
 def test_a_refusal_is_tried_again_with_the_simpler_structure(monkeypatch):
-    refuse = refusal.refuse
+    refuse = refusal.refuse_unexplained
 
-    def strict(group, data, fit, result, fitted):
+    def strict(group, data, fit, fitted):
         if fit.structure.order == 2:
             raise SignalError("no second order today")
-        refuse(group, data, fit, result, fitted)
+        refuse(group, data, fit, fitted)
 
-    monkeypatch.setattr("smp_motor_ident.estimate.refuse", strict)
+    monkeypatch.setattr("smp_motor_ident.estimate.refuse_unexplained", strict)
     found = estimate(motors.record("rear_left", current=False, seconds=3.0))
     assert found.model == "first_order"
     reasons = {c.model: c.reason for c in found.candidates if c.reason.startswith("refused: ")}
