@@ -182,8 +182,15 @@ def lag_of_sensor(estimate: Estimate) -> Finding | None:
 
 
 def torque_noise_of(estimate: Estimate, sample_time: float) -> float:
-    """Return the load that fluctuates, as the voltage that it takes over a sample [V rms]."""
+    """Return the load that fluctuates, as the voltage that it takes over a sample [V rms].
+
+    Where the recording shows more of an error than the response itself, that is a resonance, which
+    the bands hold as such.
+    """
     found = next((f for f in estimate.findings if f.code == "torque_noise"), None)
+    error = estimate.residuals.model_error
+    if error is not None and max(2 * s - b for s, b in zip(error.shown, error.bound)) > 1:
+        return 0.0
     rate = 0.0 if found is None else float(found.evidence.get("acceleration") or 0.0)
     inertia = estimate.value("time_constant") / estimate.value("dc_gain", math.inf)
     return rate * inertia / math.sqrt(sample_time)

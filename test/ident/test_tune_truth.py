@@ -18,9 +18,10 @@ from smp_motor_ident.estimate import estimate as identify
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.record import Hardware, Record
 from smp_motor_ident.report.document import identification_document
-from smp_motor_ident.result import Estimate, FitPercent, Quantity
+from smp_motor_ident.result import Estimate, FitPercent, ModelError, Quantity, ResidualTests
 from smp_motor_ident.tune import Loop, design
 from smp_motor_ident.tune.case import prepare
+from smp_motor_ident.tune.motors import torque_noise_of
 from smp_motor_ident.tune.verification import loop_settings
 from smp_motor_ident.tune.writing import parameters
 
@@ -179,6 +180,8 @@ def test_bands_hold_a_load_that_fluctuates_as_the_recording_shows():
     wander = 100 * rough * math.sqrt(0.5 * MOTOR["time_constant"]) / shaken.specification.change
     more = shaken.specification.overshoot.high - steady.specification.overshoot.high
     assert 1.0 * wander < more < 6.0 * wander  # of the speed without a loop, which takes some off
+    springs = ResidualTests(model_error=ModelError((30.0, 200.0), (0.0, 3.0), (0.1, 3.5)))
+    assert torque_noise_of(replace(estimate(findings=[noise]), residuals=springs), 0.01) == 0.0
 
 
 def test_outliers_do_not_reach_the_loop():
