@@ -9,7 +9,7 @@ from smp_motor_control.parameter_file import written
 from smp_motor_control.wheel.controller import WheelSettings
 from smp_motor_ident.result import plain
 from smp_motor_ident.tune.designer import Design
-from smp_motor_ident.tune.limits import JUMP
+from smp_motor_ident.tune.limits import DELAY_BORNE, JUMP
 from smp_motor_ident.tune.loop import Loop
 
 SCHEMA = 1
@@ -30,10 +30,23 @@ def parameters(design: Design) -> dict[str, Any]:
         "reference_doubt": float(reference.doubt),
         "drive": {n: float(x) for n, x in dataclasses.asdict(reference.drive).items()},
         "speed_source": str(design.loop.speed_source),
-        "difference_window": int(max(design.loop.difference_window, 1)),
+        "difference_window": _window(design),
         "model": {name: float(value) for name, value in design.motor.items()},
         **_plausible(reference.drive.top_speed, design.loop),
     }
+
+
+def _window(design: Design) -> int:
+    """Return the samples to difference counts over.
+
+    An observer that its counts contradict is replaced by their difference, of as little noise as
+    the loop bears its delay, half of the window.
+    """
+    loop = design.loop
+    given = loop.speed_source != "observer" or loop.averaging_given
+    if given or not math.isfinite(design.margins.delay):
+        return int(max(loop.difference_window, 1))
+    return min(max(int(2 * DELAY_BORNE.value * design.margins.delay * loop.rate), 1), 1000)
 
 
 def _plausible(top_speed: float, loop: Loop) -> dict[str, float]:

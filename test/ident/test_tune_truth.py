@@ -211,6 +211,18 @@ def test_outliers_do_not_reach_the_loop():
     assert np.mean(lost) < 0.005 and len(believed) > 20 and np.mean(believed) < 0.1
 
 
+def test_counts_that_replace_an_observer_are_differenced_as_long_as_the_loop_bears():
+    """Over one sample a count of 48 would be 65 rad/s, of which an observer's gains make 12 V."""
+    fast = replace(LOOP, sample_time=0.002, delay=0.002, counts_per_revolution=48.0)
+    one = design(estimate(), replace(fast, speed_source="observer"))
+    window = parameters(one)["difference_window"]
+    assert 0.25 * one.margins.delay < 0.5 * window * 0.002 <= 0.5 * one.margins.delay
+    count = one.gains.p * 2 * math.pi / 48 / (window * 0.002)
+    assert count < 0.5 * 12.0 < window * count
+    given = replace(fast, speed_source="observer", averaging_given=True)
+    assert parameters(design(estimate(), given))["difference_window"] == 1
+
+
 def test_gains_from_one_size_of_voltage_hold_at_others():
     """A driver that is clipped where it was recorded has a fifth more gain at half the speed."""
     level = Finding("one_size_of_voltage", "warning", "the voltage has one size, 12 V")
