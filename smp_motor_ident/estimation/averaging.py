@@ -36,7 +36,11 @@ ABSENT = (
 
 
 def weights(data: Sequence[Experiments], fits: Sequence[Fit], seed: int = 0) -> Array:
-    """Return the weight of each candidate, by a Bayesian bootstrap of runs of samples."""
+    """Return the weight of each candidate, the choice first, by a Bayesian bootstrap of runs.
+
+    What costs nothing is a mean over a window where the speed comes in coarse steps, a difference
+    of counts by its making, and a friction that the choice was found to do without.
+    """
     rows = []
     for own, fit in zip(data, fits, strict=True):
         predicted = prediction.simulate(own, fit, gain=True)
@@ -54,7 +58,11 @@ def weights(data: Sequence[Experiments], fits: Sequence[Fit], seed: int = 0) -> 
     rng = np.random.default_rng(seed)
     shares = rng.dirichlet(np.ones(BLOCKS), DRAWS) * BLOCKS
     # Of a choice between two holds nobody knows the odds: a second lag is as likely as the later.
-    sizes = [f.structure.size + (f.structure.shift > 0) for f in fits]
+    rubs = fits[0].structure.friction
+    sizes = [
+        min(s.size, s.with_(friction=rubs).size) + (s.shift > 0) - (own.quantum > 0 and s.window)
+        for own, s in zip(data, (f.structure for f in fits), strict=True)
+    ]
     price = np.array([POLICY.price(n, f.samples) for n, f in zip(sizes, fits, strict=True)])
     price += np.array([POLICY.second_lag * _slowly_filtered(f) for f in fits])
     total = shares @ runs.T + price
@@ -103,8 +111,8 @@ def candidate_weights(data: Experiments, candidates: Sequence[FittedCandidate]) 
     last = len(candidates) - 1
     finite = [bool(np.isfinite(r.fit.deviance)) for r in candidates]
     places = [n for n in range(last) if candidates[n].whole and finite[n]]
-    if data.quantum > 0:  # a speed in coarse steps is a difference of counts, by its making
-        places = [n for n in places if candidates[n].fit.kind == candidates[last].fit.kind]
+    if data.quantum > 0 and candidates[last].fit.structure.window:  # as it must be
+        places = [n for n in places if candidates[n].fit.structure.window]
     if not places:
         return {}
     places = [last, *places]

@@ -4,7 +4,9 @@ from dataclasses import replace
 
 import motors
 import numpy as np
+import pytest
 
+from smp_motor_ident.estimate import estimate
 from smp_motor_ident.estimation.averaging import averaged, candidate_weights, covering, weights
 from smp_motor_ident.estimation.fitted import Options
 from smp_motor_ident.estimation.initialisation import initial_fit
@@ -12,6 +14,7 @@ from smp_motor_ident.estimation.quantities import Answer, answer
 from smp_motor_ident.estimation.selection import FittedCandidate
 from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.model.structures import Electromechanical
+from smp_motor_ident.record import Record
 from smp_motor_ident.result import Quantity
 
 
@@ -72,3 +75,23 @@ def test_a_candidate_that_did_not_settle_is_covered_as_far_as_it_explains_the_da
     other = answer(unsettled.fit, {}).combinations["time_constant"].value
     assert after.std > before.std
     assert min(before.value, other) < after.value < max(before.value, other)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_speed_of_whole_counts_is_a_mean_that_is_no_delay(seed):
+    step, late, lag, gain, count = 0.02, 0.0205, 0.037, 2.8, 0.00224
+    rng = np.random.default_rng(seed)
+    levels = np.repeat(np.where(rng.integers(0, 2, 334) > 0, 2.7, 1.2), 3)[:1000]
+    fine = step / 20
+    drive = np.concatenate([np.full(round(late / fine), levels[0]), np.repeat(levels, 20)])
+    keep, speed = np.exp(-fine / lag), np.full(20_000, gain * levels[0])
+    for k in range(1, speed.size):
+        speed[k] = keep * speed[k - 1] + (1 - keep) * gain * drive[k - 1]
+    speed += np.repeat(0.05 * rng.standard_normal(1000), 20)
+    turned = np.concatenate([[0.0], np.cumsum(speed) * fine])[::20]
+    shown = np.diff(np.floor(turned / count)) * count / step
+    found = estimate(Record("motor", step * np.arange(1000), levels, velocity=shown))
+    delay = found.combinations["delay"]
+    # 4 standard deviations: one in 16,000. The mean over a sample is 10 ms late.
+    assert abs(delay.value - late) < 4 * delay.std
+    assert delay.std < 0.01
