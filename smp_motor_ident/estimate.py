@@ -7,15 +7,14 @@ from dataclasses import replace
 from typing import cast
 
 from smp_motor_ident.diagnosis import validation as validate
-from smp_motor_ident.diagnosis.adequacy import adequacy, lacks_something, stated
+from smp_motor_ident.diagnosis.adequacy import is_moved, lacks_something
 from smp_motor_ident.diagnosis.advice import advise, assess, unsettled_rival
+from smp_motor_ident.diagnosis.beside import held_against_effects
 from smp_motor_ident.diagnosis.conditions import dependent
 from smp_motor_ident.diagnosis.current_kind import ARMATURE, current_kind
 from smp_motor_ident.diagnosis.data_quality import screen
 from smp_motor_ident.diagnosis.limits import PROFILED
-from smp_motor_ident.diagnosis.misfit import widened_by_misfit
 from smp_motor_ident.diagnosis.model_error import regression
-from smp_motor_ident.diagnosis.noise_or_effect import in_place_of_noise
 from smp_motor_ident.diagnosis.provenance import provenance
 from smp_motor_ident.diagnosis.refusal import (
     fallen_back,
@@ -219,7 +218,7 @@ def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) 
             plain = _stated(group, request, words, data, hold, [*left, one], refused is None)
             if not lacks_something(plain):
                 return plain
-            noisy = refused is None and (plain.unreliable or one.fit.noise_ratio > 0)
+            noisy = refused is None and (is_moved(plain) or one.fit.noise_ratio > 0)
             rest = _undisturbed(group, request, found, one.fit) if noisy else None
             if rest and not often_disturbed(rest):
                 return rest
@@ -320,14 +319,9 @@ def _stated(
     own, common = validate.validated(group, request, final, chosen, hold)
     percent = FitPercent(fitted, own)
     tests = residual_tests(final, chosen)
-    numbers = stated(chosen, result)
-    lacks, possible = adequacy(errors, data.step, numbers, tests)
-    for_noise: list[Finding] = []
-    if not any(f.severity == "unreliable" for f in lacks):
-        for_noise = in_place_of_noise(final, chosen, gear, numbers, request.options)
-    (result, alike), beside = widened_by_misfit(final, chosen, possible, said)
-    if beside:  # what a number's interval holds in the end does not make it unreliable
-        lacks, _ = adequacy(errors, data.step, stated(chosen, result), tests)
+    (result, alike), lacks = held_against_effects(
+        final, chosen, gear, errors, tests.white is True, said, request.options
+    )
     result = without_lag(result) if refusal else result
     findings = [
         *found,
@@ -335,9 +329,7 @@ def _stated(
         *assess(final, chosen, FitPercent(fitted, common), tests),
         *implausible_motor(group, chosen.z),
         *lacks,
-        *for_noise,
         *parts,
-        *beside,
         *unsettled_rival(candidates, result, request.known),
         *advise(chosen, result, request.known),
         *scope(final, result, change, alike, group),

@@ -17,7 +17,7 @@ Inference with dependent data using cluster covariance estimators, J. Econometri
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.special import fdtrc
@@ -30,7 +30,7 @@ from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.quantities import Answer
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.model.physical import physical_gradients
-from smp_motor_ident.result import Estimate, Quantity, ResidualTests
+from smp_motor_ident.result import Estimate, Quantity
 
 Stated = tuple[str, Quantity, Array]
 """Name, value and gradient by the free coordinates of a number that is stated."""
@@ -48,41 +48,38 @@ class Evidence:
     gain: float  # deviance that the effect explains
     shift: Array  # shape (f,): what it did to the free coordinates
     columns: tuple[int, ...]  # of the regressors
+    size: Array = field(default_factory=lambda: np.zeros(0))  # of each
 
 
-def adequacy(
-    errors: Regression | None, step: float, numbers: Sequence[Stated], tests: ResidualTests
-) -> tuple[list[Finding], Array | None]:
-    """Name what the model lacks, and whether that moves a stated number beyond its interval.
-
-    Beside the findings: how far the coordinates may be off by what is neither shown nor excluded.
+def lacking(errors: Regression | None, white: bool) -> tuple[list[list[Evidence]], list[Evidence]]:
+    """Return the effects that are shown, the likeliest first, one after the other beside the ones
+    before it, and what is then not excluded.
     """
-    out: list[Finding] = []
+    out: list[list[Evidence]] = []
     named: list[int] = []
     for _ in range(ROUNDS if errors is not None else 0):
         assert errors is not None
-        left, white = _without(errors, named), tests.white is True
+        left = _without(errors, named)
         tried = (_test(left, effect, columns, white) for effect, columns in left.members)
         evidence = [e for e in tried if e is not None]
         level = limits.EFFECT_LEVEL.value / max(len(evidence), 1)
         shown = [e for e in evidence if e.p_value < level]
         if not shown:
             level = limits.EFFECT_COVERED.value / max(len(evidence), 1)
-            return _covered([e for e in evidence if e.p_value < level], out, numbers, step)
-        first = max(shown, key=lambda e: e.gain - 2 * len(e.columns))
-        out.append(as_finding(first, shown, numbers, step))
-        named += first.columns
-    return out, None
+            return out, [e for e in evidence if e.p_value < level]
+        out.append(sorted(shown, key=lambda e: 2 * len(e.columns) - e.gain))
+        named += out[-1][0].columns
+    return out, []
 
 
-def _covered(
-    possible: Sequence[Evidence], out: list[Finding], numbers: Sequence[Stated], step: float
+def farthest_possible(
+    possible: Sequence[Evidence], numbers: Sequence[Stated], step: float
 ) -> tuple[list[Finding], Array | None]:
-    """Return with the findings the move by the effect that moves a number farthest, if any."""
+    """Return the move by the effect that moves a number farthest, and say so, if any does."""
     moves = [(_farthest(e, numbers, step), e) for e in possible]
     (name, times, share), far = max(moves, key=lambda m: m[0][1], default=(("", 0.0, 0.0), None))
     if far is None or times < limits.HALF_WIDTH.value:
-        return out, None
+        return [], None
     found = Finding(
         far.effect.code,
         "note",
@@ -91,7 +88,12 @@ def _covered(
         {"p_value": far.p_value, "quantity": name, "shift_share": share},
         far.effect.advice,
     )
-    return [*out, found], far.shift
+    return [found], far.shift
+
+
+def matters(shown: Evidence, numbers: Sequence[Stated], step: float) -> bool:
+    """Tell whether an effect moves a number beyond its interval, by what matters."""
+    return _farthest(shown, numbers, step)[1] >= limits.HALF_WIDTH.value
 
 
 def _test(
@@ -128,7 +130,7 @@ def _test(
     p_robust = float(fdtrc(q, freedom, robust * freedom / (freedom + q - 1)))
     p_plain = float(fdtrc(q, max(n - q, 1), plain))
     p = p_plain if stretches - q < limits.EFFECT_BLOCKS.value else max(p_robust, p_plain)
-    return Evidence(effect, p, plain * q, errors.shifts[:, columns] @ size, columns)
+    return Evidence(effect, p, plain * q, errors.shifts[:, columns] @ size, columns, size)
 
 
 def _without(errors: Regression, named: Sequence[int]) -> Regression:
@@ -199,6 +201,12 @@ def lacks_something(estimate: Estimate) -> bool:
     """Tell whether an estimate's findings leave room for what the model lacks."""
     misfits = {effect.code for effect in EFFECTS} | {"conditions", "command_jitter"}
     return estimate.unreliable or any(f.code in misfits for f in estimate.findings)
+
+
+def is_moved(estimate: Estimate) -> bool:
+    """Tell whether a stated number is moved by what the model lacks, in its interval or not."""
+    moved = (f.severity == "warning" and "shift_std" in f.evidence for f in estimate.findings)
+    return estimate.unreliable or any(moved)
 
 
 def stated(fit: Fit, result: Answer) -> list[Stated]:

@@ -25,7 +25,6 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import erfc
 
-from smp_motor_control.arrays import Array
 from smp_motor_ident.diagnosis.limits import CONDITION_LEVEL
 from smp_motor_ident.diagnosis.model_error import answered, carried, measured, predicted
 from smp_motor_ident.diagnosis.observers import slower
@@ -40,20 +39,16 @@ Said = tuple[Answer, dict[str, float]]
 
 
 def widened_by_misfit(
-    data: Experiments,
-    fit: Fit,
-    possible: Array | None,
-    said: Callable[[Fit], Said],
+    data: Experiments, fit: Fit, said: Callable[[Fit], Said]
 ) -> tuple[Said, list[Finding]]:
-    """Return what is stated with an effect that is possible and what two tests show, and say so.
+    """Return what is stated with what two tests show, and say so.
 
     Where a number would be lost in an interval so wide, it stays as it is and is unreliable.
     """
-    narrow = fit if possible is None else fit.along(possible)
-    wide, slow = slower(data, narrow)
+    wide, slow = slower(data, fit)
     wide, late = jittered(data, wide)
-    before = said(narrow)
-    if wide is narrow:
+    before = said(fit)
+    if wide is fit:
         return before, []
     after = said(wide)
     lost = [

@@ -20,7 +20,7 @@ from functools import cached_property
 import numpy as np
 
 from smp_motor_control.arrays import Array
-from smp_motor_ident.diagnosis.adequacy import Evidence, Stated, as_finding
+from smp_motor_ident.diagnosis.adequacy import Evidence
 from smp_motor_ident.diagnosis.effects import EFFECTS, Effect
 from smp_motor_ident.diagnosis.limits import EFFECT_LEVEL
 from smp_motor_ident.diagnosis.model_error import (
@@ -38,7 +38,6 @@ from smp_motor_ident.diagnosis.model_error import (
 from smp_motor_ident.estimation import data_window
 from smp_motor_ident.estimation.fit import Fit, Options
 from smp_motor_ident.estimation.selection import sandwich_factor
-from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.coordinates import LOGARITHMS
 
@@ -53,14 +52,14 @@ REWEIGHTED = 3  # passes in which each output gets the variance of its own error
 
 
 def in_place_of_noise(
-    data: Experiments, fit: Fit, gear: float, numbers: Sequence[Stated], options: Options
-) -> list[Finding]:
-    """Name the effect that explains what was taken for torque noise, where it moves a number."""
+    data: Experiments, fit: Fit, gear: float, options: Options
+) -> tuple[Evidence, Experiments, Fit] | None:
+    """Return the effect that explains what was taken for torque noise, and the motor beside it."""
     if not np.any(fit.gain != 0.0):
-        return []
+        return None
     here = _linearised(data, replace(fit, gain=np.zeros_like(fit.gain)), EFFECTS, gear)
     if here is None:
-        return []
+        return None
     price = float(np.log(data.size))
     runs = [(_settled(here, effect, gear), effect) for effect in here.most_likely()]
     run, effect = min(runs, key=lambda r: r[0].deviance + len(r[0].signals) * price)
@@ -68,11 +67,10 @@ def in_place_of_noise(
     gain = (fit.deviance - again.deviance) / sandwich_factor(fit) - len(run.signals) * price
     chance = len(EFFECTS) * float(np.exp(min(-0.5 * gain, 0.0)))
     if chance > EFFECT_LEVEL.value:
-        return []
+        return None
     moved = np.linalg.lstsq(fit.structure.matrix, again.z.array - fit.z.array, rcond=None)[0]
     shown = Evidence(effect, chance, gain, np.asarray(-moved, dtype=np.float64), ())
-    found = as_finding(shown, [shown], numbers, data.step)
-    return [found] if found.severity == "unreliable" else []
+    return shown, run.data, again
 
 
 @dataclass(frozen=True, eq=False)

@@ -104,7 +104,7 @@ def suspecting(estimate: Estimate, found: DriverFit | None, fit: Fit) -> Estimat
     if found is None:
         return estimate
     left = math.exp((found.fit.deviance - fit.deviance) / fit.samples)
-    codes = {f.code for f in estimate.findings if f.severity == "unreliable"}
+    codes = {f.code for f in estimate.findings if f.severity != "note"}
     if left > HALF_EXPLAINED.value or found.effect.code in codes:
         return estimate
     words = (

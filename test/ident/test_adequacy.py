@@ -8,7 +8,7 @@ import motors
 import numpy as np
 import pytest
 
-from smp_motor_ident.diagnosis import adequacy, model_error
+from smp_motor_ident.diagnosis import adequacy, beside, model_error
 from smp_motor_ident.diagnosis.conditions import dependent
 from smp_motor_ident.diagnosis.effects import EFFECTS
 from smp_motor_ident.estimate import estimate
@@ -17,7 +17,7 @@ from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.model.structures import StaticGain
 from smp_motor_ident.record import Record
-from smp_motor_ident.result import Quantity, ResidualTests
+from smp_motor_ident.result import Quantity
 
 
 def commanded(dead: float = 0.0, top: float = np.inf) -> Record:
@@ -43,10 +43,21 @@ def test_a_clipped_command_is_found_out() -> None:
     assert any(f.severity == "warning" and "record" in f.advice for f in found.findings)
 
 
-def test_a_clipped_command_is_no_sound_result_without_its_driver(monkeypatch) -> None:
+@pytest.mark.parametrize("settles", [True, False])
+def test_what_a_clipped_command_moves_is_in_the_intervals_or_unreliable(
+    monkeypatch, settles: bool
+) -> None:
+    """Without its driver the motor is fitted beside effects that its error shows."""
     monkeypatch.setattr("smp_motor_ident.estimate.likeliest", lambda *_: None)
-    found = [f for f in estimate(commanded(top=6.0)).findings if f.severity == "unreliable"]
-    assert any(f.evidence.get("quantity") and f.advice for f in found)
+    if not settles:
+        monkeypatch.setattr(beside, "_fitted", lambda data, fit, options: fit)
+    found = estimate(commanded(top=6.0))
+    shown = [f for f in found.findings if f.evidence.get("shift_std") and f.severity != "note"]
+    assert shown and all(f.evidence["quantity"] and f.advice for f in shown)
+    assert {f.severity for f in shown} == ({"warning"} if settles else {"unreliable"})
+    true = motors.truth("rear_left", 0.3)
+    off = [abs(q.value - true[n]) / q.std for n, q in found.combinations.items() if q.value]
+    assert max(off) < 3.0  # a move that is one standard deviation, and twice chance
 
 
 def test_an_effect_whose_shape_the_model_has_to_a_twentieth_is_not_tried() -> None:
@@ -129,9 +140,14 @@ def error_with(deviations: float, seed: int) -> model_error.Regression:
 
 def held_against(deviations: float, value: float = 30.0, seed: int = 5):
     numbers = [("dc_gain", Quantity(value, 0.3, (0.0, 2 * value), "rad/(V s)"), np.ones(1))]
-    return adequacy.adequacy(
-        error_with(deviations, seed), 0.005, numbers, ResidualTests(True, True)
-    )
+    return found_of(error_with(deviations, seed), numbers)
+
+
+def found_of(errors: model_error.Regression, numbers: list[adequacy.Stated]):
+    """Return the findings of white errors, and the move that is neither shown nor excluded."""
+    shown, possible = adequacy.lacking(errors, white=True)
+    notes, move = adequacy.farthest_possible(possible, numbers, 0.005)
+    return [*(adequacy.as_finding(e[0], e, numbers, 0.005) for e in shown), *notes], move
 
 
 def test_an_effect_that_is_neither_shown_nor_excluded_is_in_the_intervals():
@@ -172,7 +188,7 @@ def test_an_effect_whose_rows_hold_no_error_is_not_tried_and_nothing_breaks():
         whole=shape,
     )
     numbers = [("dc_gain", Quantity(30.0, 0.3, (0.0, 60.0), "rad/(V s)"), np.ones(1))]
-    assert adequacy.adequacy(errors, 0.005, numbers, ResidualTests(True, True)) == ([], None)
+    assert found_of(errors, numbers) == ([], None)
 
 
 def test_a_motor_at_rest_turns_by_no_rounding_error():
@@ -188,9 +204,11 @@ def test_an_effect_is_held_against_the_intervals_that_are_stated(monkeypatch) ->
     """What moves a number beyond the likelihood's interval may be within that of the answer."""
     record = commanded(top=6.0)
     monkeypatch.setattr("smp_motor_ident.estimate.likeliest", lambda *_: None)
+    monkeypatch.setattr(beside, "_move", lambda *_: None)
 
     def unreliable() -> set[str]:
-        return {f.code for f in estimate(record).findings if f.evidence.get("shift_std", 0) > 2}
+        found = [f for f in estimate(record).findings if f.evidence.get("shift_std", 0) > 2]
+        return {f.code for f in found if f.severity == "unreliable"}
 
     def late(data, fit):
         wide = fit.wider(np.diag(np.square(np.full(len(fit.structure.free), 0.15))))

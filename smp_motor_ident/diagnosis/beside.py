@@ -1,0 +1,135 @@
+"""By how much the numbers move where the motor is estimated beside what its model lacks.
+
+A regression of the model's error names an effect and its size at the estimate.  With that put into
+what is given to the model the motor is fitted again, and its error may show a rest of the effect
+(Gauss-Newton steps) or another one.  Where, after a few of them, nothing that is shown moves a
+number beyond its interval, the first estimate was off by as much as these moved it: with that move
+as a standard deviation its intervals hold the motor.  Where something stays, nobody knows how much.
+
+References
+----------
+L. Ljung, System Identification, 2nd ed., section 16.6 (model-error modelling).
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+
+from smp_motor_control.arrays import Array
+from smp_motor_ident.diagnosis.adequacy import (
+    Evidence,
+    Stated,
+    as_finding,
+    farthest_possible,
+    lacking,
+    matters,
+    stated,
+)
+from smp_motor_ident.diagnosis.effects import EFFECTS
+from smp_motor_ident.diagnosis.misfit import Said, widened_by_misfit
+from smp_motor_ident.diagnosis.model_error import Regression, motions, regression, signals
+from smp_motor_ident.diagnosis.noise_or_effect import in_place_of_noise
+from smp_motor_ident.diagnosis.residuals import residual_tests
+from smp_motor_ident.estimation import data_window
+from smp_motor_ident.estimation.descent import refine
+from smp_motor_ident.estimation.fit import Fit, Options
+from smp_motor_ident.finding import Finding
+from smp_motor_ident.likelihood.experiments import Experiments
+
+STEPS = 4  # in which effects are put in at most
+
+
+def held_against_effects(
+    data: Experiments,
+    fit: Fit,
+    gear: float,
+    errors: Regression | None,
+    white: bool,
+    said: Callable[[Fit], Said],
+    options: Options,
+) -> tuple[Said, list[Finding]]:
+    """Return what is stated, as wide as what the model lacks asks for, and name that."""
+    numbers = stated(fit, said(fit)[0])
+    shown, possible = lacking(errors, white)
+    begin = data, fit, errors
+    grave = any(matters(e[0], numbers, data.step) for e in shown)
+    if not grave and (instead := in_place_of_noise(data, fit, gear, options)):
+        evidence, there, now = instead
+        if matters(evidence, numbers, data.step):
+            grave, begin, shown = True, (there, now, None), [*shown, [evidence]]
+    notes, move = farthest_possible(possible, numbers, data.step)
+    wide = fit if move is None else fit.along(move)
+    if grave and (move := _move(begin, wide, gear, said, options)) is not None:
+        wide = wide.along(move)
+    answer, beside = widened_by_misfit(data, wide, said)
+    held = stated(wide, answer[0])
+    return answer, [*_named(shown, numbers, held, data.step), *notes, *beside]
+
+
+def _named(
+    shown: Sequence[Sequence[Evidence]],
+    numbers: Sequence[Stated],
+    held: Sequence[Stated],
+    step: float,
+) -> Iterator[Finding]:
+    """Name effects: what an interval holds in the end makes nothing unreliable."""
+    for several in shown:
+        narrow = as_finding(several[0], several, numbers, step)
+        wide = as_finding(several[0], several, held, step)
+        if narrow.severity == wide.severity:
+            yield wide
+        else:
+            message = f"{narrow.message}: the intervals cover that"
+            yield replace(narrow, severity="warning", message=message)
+
+
+def _move(
+    begin: tuple[Experiments, Fit, Regression | None],
+    fit: Fit,
+    gear: float,
+    said: Callable[[Fit], Said],
+    options: Options,
+) -> Array | None:
+    """Return by how much the coordinates move beside effects that leave nothing; None if none do.
+
+    A current that is off is left out instead, and a number that would be lost is kept as it is.
+    """
+    there, now, errors = begin
+    first = said(fit)[0]
+    for _ in range(STEPS):
+        errors = errors or regression(there, now, gear)
+        move = fit.structure.of_free(now.z.array - fit.z.array)
+        wide = fit.along(move)
+        answer = said(wide)[0]
+        values = {n for n, q in first.combinations.items() if q.value is not None}
+        if any(answer.combinations[n].value is None for n in values):
+            return None
+        numbers = stated(wide, answer)
+        shown, _ = lacking(errors, residual_tests(there, now).white is True)
+        left = next((e[0] for e in shown if matters(e[0], numbers, there.step)), None)
+        if left is None:
+            return move
+        if left.effect.place == "current":
+            return None
+        there = _with(there, now, left, gear)
+        before, errors = now, None
+        now = _fitted(there, now, options)
+        if not (now.converged and now.deviance < before.deviance):
+            return None
+    return None
+
+
+def _fitted(data: Experiments, fit: Fit, options: Options) -> Fit:
+    """Return the motor fitted to other data, under a torque noise of their own if that fits."""
+    near = refine(data, fit.structure, fit, fit.z, options)
+    if fit.noise_ratio <= 0:
+        return near
+    return min(near, data_window.grow(data, fit.structure, fit, options), key=lambda f: f.deviance)
+
+
+def _with(data: Experiments, fit: Fit, shown: Evidence, gear: float) -> Experiments:
+    """Return experiments in which the model finds an effect as a part of what is given."""
+    sections, samples = motions(data, fit, gear)
+    made = [signal for effect in EFFECTS for signal in signals(effect, sections, samples)]
+    for column, size in zip(shown.columns, shown.size, strict=True):
+        data = made[column].within(data, float(size))
+    return data
