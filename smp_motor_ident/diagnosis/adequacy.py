@@ -107,7 +107,7 @@ def _test(
         return None
     if np.linalg.cond(normal / np.outer(scale, scale)) > 1e8:
         return _test(errors, effect, columns[:1], white) if len(columns) > 1 else None
-    size = np.linalg.solve(normal, z.T @ e)
+    size = np.asarray(np.linalg.solve(normal, z.T @ e), dtype=np.float64)
     own, whole = np.square(z @ size).sum(), np.square(errors.whole[:, columns] @ size).sum()
     if own <= limits.EFFECT_OWN.value * whole:  # nothing of nothing where no error is in its rows
         return None  # what is left of it is smaller than what is not known of its shape

@@ -11,13 +11,12 @@ References
 L. Ljung, System Identification, 2nd ed., section 16.6 (model-error modelling).
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 
 from smp_motor_control.arrays import Array
 from smp_motor_ident.diagnosis.adequacy import (
     Evidence,
-    Stated,
     as_finding,
     farthest_possible,
     lacking,
@@ -58,28 +57,25 @@ def held_against_effects(
             grave, begin, shown = True, (there, now, None), [*shown, [evidence]]
     notes, move = farthest_possible(possible, numbers, data.step)
     wide = fit if move is None else fit.along(move)
-    if grave and (move := _move(begin, wide, gear, said, options)) is not None:
-        wide = wide.along(move)
+    move = _move(begin, wide, gear, said, options) if grave else None
+    wide = wide if move is None else wide.along(move)
     answer, beside = widened_by_misfit(data, wide, said)
     held = stated(wide, answer[0])
-    return answer, [*_named(shown, numbers, held, data.step), *notes, *beside]
+    named = (
+        _covered(as_finding(e[0], e, numbers, data.step))
+        if move is not None
+        else as_finding(e[0], e, held, data.step)
+        for e in shown
+    )
+    return answer, [*named, *notes, *beside]
 
 
-def _named(
-    shown: Sequence[Sequence[Evidence]],
-    numbers: Sequence[Stated],
-    held: Sequence[Stated],
-    step: float,
-) -> Iterator[Finding]:
-    """Name effects: what an interval holds in the end makes nothing unreliable."""
-    for several in shown:
-        narrow = as_finding(several[0], several, numbers, step)
-        wide = as_finding(several[0], several, held, step)
-        if narrow.severity == wide.severity:
-            yield wide
-        else:
-            message = f"{narrow.message}: the intervals cover that"
-            yield replace(narrow, severity="warning", message=message)
+def _covered(found: Finding) -> Finding:
+    """Return a finding of an effect whose move is in the intervals."""
+    if found.severity == "note":
+        return found
+    message = f"{found.message}: the intervals cover that"
+    return replace(found, severity="warning", message=message)
 
 
 def _move(

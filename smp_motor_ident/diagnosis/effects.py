@@ -14,6 +14,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from smp_motor_control.arrays import Array
+from smp_motor_ident.diagnosis.limits import SWING
 from smp_motor_ident.model.measurement import ANGLE, Measurement
 
 Place = Literal["voltage", "torque", "output", "current"]
@@ -85,6 +86,14 @@ def _once_a_turn(m: Motion, gear: float = 1.0) -> list[Array]:
     if m.kind != ANGLE or np.ptp(m.angle) < 2 * np.pi * gear:
         return []
     return [np.sin(m.angle / gear), np.cos(m.angle / gear)]
+
+
+def _weight(m: Motion) -> list[Array]:
+    """Return what a weight on an output shaft does that swings by less than a turn."""
+    angle = m.angle / m.gear
+    if m.kind != ANGLE or not SWING.value < np.ptp(angle) < 2 * np.pi:
+        return []
+    return [np.sin(angle), np.cos(angle)]
 
 
 def _missed(m: Motion) -> list[Array]:
@@ -175,6 +184,11 @@ EFFECTS = (
         "position", "torque", "a torque that depends on the angle (cogging, an unbalanced wheel)",
         "lift the wheel, or record at higher speed and for more turns",
         lambda m: _once_a_turn(m) + (_once_a_turn(m, m.gear) if m.gear > 1.5 else []),
+    ),
+    Effect(
+        "gravity", "torque", "a weight that the motor lifts (an arm)",
+        "take the weight off, or balance it, while recording",
+        _weight,
     ),
     Effect(
         "dynamics", "voltage", "linear dynamics that the model lacks (compliance, a filter)",

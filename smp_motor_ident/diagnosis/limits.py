@@ -311,6 +311,10 @@ EFFECT_OWN = Limit(
     "an effect's shape is known to a tenth at best: what the model imitates so far shows nothing",
     "test_adequacy.py",
 )  # fmt: skip
+SWING = Limit(
+    1.0, "rad", "physical: over less a weight's torque changes by less than itself: it is a load",
+    "test_noise_or_effect.py: a weight that a motor lifts is named",
+)  # fmt: skip
 BUNCHED = Limit(
     0.05, "share of the mean interval",
     "cost: the start puts the samples on a grid of their median interval, of 20 times as many "

@@ -22,6 +22,7 @@ from smp_motor_ident.result import Estimate
 RESISTANCE, LAG, CONSTANT, INERTIA, VISCOUS = independent.TABLE_1["rear_left"]
 STATIC = 0.3
 TURN = 5000.0  # counts
+GEAR = 65.5
 
 
 def dragged(share: float, *, current: bool, seed: int = 3) -> Record:
@@ -43,8 +44,35 @@ def dragged(share: float, *, current: bool, seed: int = 3) -> Record:
     amps = out[:, 0] + 0.01 * rng.standard_normal(t.size) if current else None
     return Record(
         "rear_left", t, voltage, amps, None, None, count,
-        hardware=Hardware(65.5, TURN, 0, 12.0, None), source="bag",
+        hardware=Hardware(GEAR, TURN, 0, 12.0, None), source="bag",
     )  # fmt: skip
+
+
+def lifting(share: float, seed: int = 4) -> Record:
+    """Random steps of a motor that lifts an arm, whose weight is a share of 8 V."""
+    rng = np.random.default_rng(seed)
+    voltage = np.repeat(rng.uniform(-10.0, 10.0, 60), 25)
+    t = np.arange(voltage.size) / 200
+    coulomb = STATIC * CONSTANT / RESISTANCE
+    load = np.zeros(t.size)
+    for _ in range(12):  # the angle is that to which the load itself lets the arm swing
+        out = independent.simulate(
+            t, voltage, RESISTANCE, LAG, CONSTANT, INERTIA, VISCOUS, coulomb, load, 50
+        )
+        middle = 0.5 * (out[:, 2] + np.concatenate([[0.0], out[:-1, 2]]))
+        load = share * 8.0 * CONSTANT / RESISTANCE * np.sin(middle / GEAR + 0.4)
+    count = np.floor(out[:, 2] * TURN / (2 * np.pi)).astype(np.int64)
+    hardware = Hardware(GEAR, TURN, 0, 12.0, None)
+    return Record("rear_left", t, voltage, count=count, hardware=hardware, source="bag")
+
+
+def test_a_weight_that_a_motor_lifts_is_named() -> None:
+    arm = lifting(0.2)
+    assert 1.0 < np.ptp(arm.count) * 2 * np.pi / TURN / GEAR < 2 * np.pi  # it swings
+    found = estimate(arm)
+    assert {f.code: f.severity for f in found.findings}["gravity"] == "warning"
+    gain = found.combinations["dc_gain"]
+    assert abs(gain.value - CONSTANT / (RESISTANCE * VISCOUS + CONSTANT**2)) < 3 * gain.std
 
 
 def severities(found: Estimate) -> dict[str, str]:
