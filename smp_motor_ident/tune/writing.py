@@ -39,14 +39,16 @@ def parameters(design: Design) -> dict[str, Any]:
 def _window(design: Design) -> int:
     """Return the samples to difference counts over.
 
-    An observer that its counts contradict is replaced by their difference, of as little noise as
-    the loop bears its delay, half of the window.
+    An observer that its counts contradict is replaced by their difference, over as many samples as
+    make its noise one that the loop allows, but not so many that it does not bear their delay.
     """
-    loop = design.loop
+    loop, gains = design.loop, design.feedback
     given = loop.speed_source != "observer" or loop.averaging_given
     if given or not math.isfinite(design.margins.delay):
         return int(max(loop.difference_window, 1))
-    return min(max(int(2 * DELAY_BORNE.value * design.margins.delay * loop.rate), 1), 1000)
+    volts = gains.p + gains.d / max(gains.filter_time, loop.sample_time)  # per rad/s, at once
+    quiet = math.ceil(volts * loop.count_angle * loop.rate / loop.noise_limit)
+    return max(min(quiet, int(2 * DELAY_BORNE.value * design.margins.delay * loop.rate), 1000), 1)
 
 
 def _plausible(top_speed: float, loop: Loop) -> dict[str, float]:
