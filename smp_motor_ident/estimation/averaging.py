@@ -60,7 +60,9 @@ def weights(data: Sequence[Experiments], fits: Sequence[Fit], seed: int = 0) -> 
     # Of a choice between two holds nobody knows the odds: a second lag is as likely as the later.
     rubs = fits[0].structure.friction
     sizes = [
-        min(s.size, s.with_(friction=rubs).size) + (s.shift > 0) - (own.quantum > 0 and s.window)
+        (s.with_(friction=rubs) if rubs == "none" else s).size
+        + (s.shift > 0)
+        - (own.quantum > 0 and s.window)
         for own, s in zip(data, (f.structure for f in fits), strict=True)
     ]
     price = np.array([POLICY.price(n, f.samples) for n, f in zip(sizes, fits, strict=True)])
