@@ -200,20 +200,22 @@ def _steps(data: Experiments, fit: Fit, count: int) -> Steps | None:
     # blocks (von Neumann) leave out what drifts.
     factors = np.sqrt(fit.factors(lambda sums: 0.5 * np.square(np.diff(sums, axis=0)).sum(axis=0)))
     plausible = np.diag(structure.of_free(PLAUSIBLE))
-    middle, steps, covs = [], [], []
-    for b, (normal, gradient) in enumerate(zip(sums.normal, sums.gradient, strict=True)):
+    asked = []
+    for normal, gradient in zip(sums.normal, sums.gradient, strict=True):
         left, score = _without_beginning(normal, gradient, f)
-        inverse = _bounded_inverse(left + plausible)
-        middle.append(0.5 * (cut.starts[b] + cut.starts[b + 1]) / data.size)
-        steps.append(inverse @ score)
-        covs.append(inverse * np.outer(factors, factors))
-    step, cov, when = np.array(steps), np.array(covs), np.array(middle)
+        asked.append((left + plausible, score))
+    step, cov = _answered(asked, list(range(f)), factors)
+    when = 0.5 * (cut.starts[:-1] + cut.starts[1:]) / data.size
     variance = np.einsum("bii->bi", cov)
     size = [1.0 if n in LOGARITHMS else abs(fit.z.value(n)) for n in structure.free]
     known = 1 / np.maximum(variance, 1e-300)
     enough = known >= SEGMENT_INFORMATION.value * known.mean(axis=0)
-    common = [i for i in common
-              if np.median(variance[:, i]) < (LOOSE * max(size[i], 1e-12)) ** 2]  # fmt: skip
+    loose = {i for i in common if np.median(variance[:, i]) >= (LOOSE * max(size[i], 1e-12)) ** 2}
+    common = [i for i in common if i not in loose]
+    if loose and common:
+        # Held where they are: free, they would carry others that only together are known along.
+        step, cov = _answered(asked, [i for i in range(f) if i not in loose], factors)
+        variance = np.einsum("bii->bi", cov)
     keep = enough[:, common].all(axis=1)
     if keep.sum() < fewest or not common:
         return None
@@ -223,6 +225,19 @@ def _steps(data: Experiments, fit: Fit, count: int) -> Steps | None:
     beside = 0.0 if fit.added is None else np.diag(fit.added)
     own = (variance / np.square(factors) + beside)[np.ix_(keep, common)]
     return Steps(middles, step[np.ix_(keep, common)], cov[at], own, owner[keep], common)
+
+
+def _answered(
+    asked: list[tuple[Array, Array]], free: list[int], factors: Array
+) -> tuple[Array, Array]:
+    """Return the steps of parts and their covariances, of the coordinates that are free."""
+    steps, covs = np.zeros((len(asked), factors.size)), np.zeros((len(asked), *[factors.size] * 2))
+    scale = np.outer(factors, factors)
+    for b, (information, score) in enumerate(asked):
+        inverse = _bounded_inverse(information[np.ix_(free, free)])
+        steps[b, free] = inverse @ score[free]
+        covs[b][np.ix_(free, free)] = inverse * scale[np.ix_(free, free)]
+    return steps, covs
 
 
 def _without_beginning(normal: Array, gradient: Array, f: int) -> tuple[Array, Array]:

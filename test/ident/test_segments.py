@@ -169,3 +169,27 @@ def test_a_refusal_of_several_names_those_that_are_refused_alone():
     assert "not of one motor" in str(refusal.of_which(records, together, lambda _: None))
     own = SignalError("run1: motor: of one record")
     assert refusal.of_which(records, own, alone) is own
+
+
+def _one_step(gain, tau, friction, seed):
+    """Return a step to 10 V from rest, of which gain and friction are known only together."""
+    t = np.arange(300) / 100.0
+    speed = gain * (10.0 - friction) * -np.expm1(-np.maximum(t - 0.3, 0.0) / tau)
+    noise = 0.02 * gain * np.random.default_rng(seed).standard_normal(t.size)
+    return Record("motor", t, np.where(t < 0.3, 0.0, 10.0), velocity=speed + noise)
+
+
+@pytest.mark.parametrize("seed", [1, 4])
+def test_repeats_of_a_step_whose_friction_changes_scatter_no_more_than_their_interval(seed):
+    """Gain and friction are known along a ridge: a change of one is judged with the other held."""
+    rng = np.random.default_rng(seed)
+    gain, tau = rng.uniform(5, 30), rng.uniform(0.1, 0.4)
+    frictions = 8.0 + 0.1 * rng.standard_normal(8)
+    repeats = [_one_step(gain, tau, f, n) for n, f in enumerate(frictions)]
+    found = estimate(repeats, "first_order")
+    assert any(f.code == "motor_changes" for f in found.findings)
+    steady, scatter = found.combinations["steady_speed"], gain * frictions.std(ddof=1)
+    # The next one's: the scatter, by Student's t of seven degrees of freedom over the normal's.
+    assert scatter < steady.std < 1.5 * scatter
+    same = [_one_step(gain, tau, 8.0, n) for n in range(8)]
+    assert not any(f.code == "motor_changes" for f in estimate(same, "first_order").findings)
