@@ -48,7 +48,8 @@ def grow(
         whole = best.samples == data.size
         return best if whole else extend(data, structure, best, options, rival)
     found = tried(part, best, RIDGE, options)
-    if found.noise_ratio > 0 and found.deviance < best.deviance - TORQUE_NOISE.value:
+    moved = found.deviance < best.deviance - TORQUE_NOISE.value
+    if found.noise_ratio > 0 and (moved or not found.converged):
         again = _find_noise_ratio(part, structure, found, options, found)
         found = min(found, again, key=lambda f: f.deviance)
     slowest = noise_ratio_of(SLOW * bandwidth(found.z, part), part.step, part.kind)
