@@ -22,7 +22,7 @@ from smp_motor_ident.diagnosis.refusal import (
     no_candidate,
     of_which,
     refuse_unexplained,
-    refuse_untold,
+    refuse_unidentifiable,
 )
 from smp_motor_ident.diagnosis.repair import hides_driver, repaired
 from smp_motor_ident.diagnosis.residuals import residual_tests
@@ -309,7 +309,7 @@ def _stated(
         return covering(weight, candidates, own, request.known)
 
     if not first:
-        refuse_untold(group, chosen, said(chosen)[0])
+        refuse_unidentifiable(group, chosen, said(chosen)[0])
     gear = group[0].hardware.gear_ratio
     errors = regression(final, chosen, gear)
     chosen, parts = dependent(chosen, errors)
@@ -355,7 +355,7 @@ def _stated(
 def _without_lag(group: list[Record], fit: Fit, result: Answer) -> UnknownLagError | None:
     """Refuse what cannot be stated; return the refusal of which the lag alone is the reason."""
     try:
-        refuse_untold(group, fit, result)
+        refuse_unidentifiable(group, fit, result)
     except UnknownLagError as refusal:
         return refusal
     return None

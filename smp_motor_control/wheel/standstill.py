@@ -18,9 +18,7 @@ class Standstill:
     """Follows counts and voltage of a wheel while its reference is zero."""
 
     def __init__(self) -> None:
-        self._needed = (
-            False  # whether the wheel moved when the voltage faded, at this or another stop
-        )
+        self._needed = False  # whether the wheel moved when the voltage faded, at any stop
         self.reset()
 
     def reset(self) -> None:

@@ -71,7 +71,7 @@ def refuse_unexplained(group: Sequence[Record], data: Experiments, fit: Fit, fit
     _refuse_offset(group, fit)
 
 
-def refuse_untold(group: Sequence[Record], fit: Fit, result: Answer) -> None:
+def refuse_unidentifiable(group: Sequence[Record], fit: Fit, result: Answer) -> None:
     """Refuse what the data hardly tell."""
     loose = [
         n
