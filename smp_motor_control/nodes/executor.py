@@ -2,13 +2,14 @@
 
 The stock executor gathers all entities, builds a wait set and wraps every callback in a task
 anew for every message, and wakes itself twice for each.  This one gathers again only when an
-entity was made or destroyed, and calls the callbacks of subscriptions and timers directly: they
-are no coroutines here.  Everything else goes the stock way.
+entity was made or destroyed, and calls plain callbacks of subscriptions and timers directly.
+Everything else, and whatever is a coroutine, goes the stock way.
 
 While messages come in quick succession it waits for them, for timers and for guard conditions
 alone, and looks at the many other entities of a node only every :data:`LOOK`.
 """
 
+import inspect
 import time
 from contextlib import ExitStack
 from typing import Any
@@ -109,6 +110,7 @@ class LeanExecutor(SingleThreadedExecutor):
         super().__init__(**options)
         self._waits: tuple[_WaitSet, _WaitSet] | None = None
         self._stream_until = self._heard = 0
+        self._plain: dict[Any, bool] = {}
 
     def entities(self) -> tuple[tuple[Any, ...], ...]:
         nodes = self.get_nodes()
@@ -154,6 +156,8 @@ class LeanExecutor(SingleThreadedExecutor):
                 for entity in waits.ready(kind):
                     self._do_stock(entity, take)
         self._pace(bool(messages), waits is everything)
+        if self._tasks:
+            self._do_tasks()
 
     def _take_living(self, waitable: Any) -> Any:
         try:
@@ -178,6 +182,7 @@ class LeanExecutor(SingleThreadedExecutor):
             self._do_stock(guard, self._take_guard_condition)
 
     def _gather(self) -> tuple[_WaitSet, _WaitSet]:
+        self._plain = {}
         key = self.entities()
         subscriptions, timers, _, _, guards, _ = key
         stream = (subscriptions, timers, (), (), guards, ())
@@ -193,7 +198,16 @@ class LeanExecutor(SingleThreadedExecutor):
             waits.release()
         self._waits = None
 
+    def _is_plain(self, entity: Any) -> bool:
+        plain = self._plain.get(entity)
+        if plain is None:
+            plain = self._plain[entity] = not inspect.iscoroutinefunction(entity.callback)
+        return plain
+
     def _do_timer(self, timer: Any) -> None:
+        if not self._is_plain(timer):
+            self._do_stock(timer, self._take_timer)
+            return
         try:
             with timer.handle:
                 if not timer.handle.is_timer_ready():
@@ -204,6 +218,9 @@ class LeanExecutor(SingleThreadedExecutor):
         timer.callback()
 
     def _do_subscription(self, subscription: Any) -> None:
+        if not self._is_plain(subscription):
+            self._do_stock(subscription, self._take_subscription)
+            return
         try:
             with subscription.handle:
                 taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
@@ -224,6 +241,15 @@ class LeanExecutor(SingleThreadedExecutor):
         if handler.done():
             self._tasks = [t for t in self._tasks if t[0] is not handler]
             handler.result()
+
+    def _do_tasks(self) -> None:
+        for task, *_ in list(self._tasks):
+            if not task.executing() and not task.done():
+                task()
+            if task.done() and not task.cancelled():
+                task.result()
+        with self._tasks_lock:
+            self._tasks = [t for t in self._tasks if not (t[0].done() or t[0].cancelled())]
 
     def shutdown(self, timeout_sec: float | None = None) -> bool:
         """Stop, and let go of all entities."""

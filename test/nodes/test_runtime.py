@@ -71,17 +71,23 @@ def spin_until(executor: LeanExecutor, node: Node, condition, seconds: float = 1
     node.destroy_timer(ticking)
 
 
-def test_lean_executor_serves_topics_timers_services_and_clients(context, executor):
+def test_lean_executor_serves_topics_timers_services_clients_and_coroutines(context, executor):
     node = rclpy.create_node("all_kinds", context=context)
     executor.add_node(node)
     heard: list[float] = []
+    awaited: list[float] = []
+
+    async def coroutine(message: Float64) -> None:
+        awaited.append(message.data)
+
     node.create_subscription(Float64, "x", lambda m: heard.append(m.data), STREAM_SUBSCRIBER)
+    node.create_subscription(Float64, "x", coroutine, STREAM_SUBSCRIBER)
     node.create_service(Trigger, "ask", lambda _, r: Trigger.Response(success=True, message="yes"))
     client = node.create_client(Trigger, "ask")
     publisher = node.create_publisher(Float64, "x", STREAM_PUBLISHER)
     sent = iter(range(10_000))
     timer = steady_timer(node, 0.005, lambda: publisher.publish(Float64(data=float(next(sent)))))
-    spin_until(executor, node, lambda: len(heard) > 20)
+    spin_until(executor, node, lambda: len(heard) > 20 and len(awaited) > 20)
     assert heard == sorted(heard)
     spin_until(executor, node, client.service_is_ready)
     future = client.call_async(Trigger.Request())
