@@ -79,9 +79,9 @@ def prepare(estimate: Estimate, loop: Loop, method: str, targets: dict[str, Any]
     lag = lag_of_sensor(estimate) if loop.reports_speed else None
     level = one_size_of_voltage(estimate)
     findings += [one for one in (friction.finding, lag, level) if one is not None]
-    load = abs(estimate.value("load_voltage"))  # the reference leaves room for it, too
-    planned = np.array([friction.planned + driver.threshold + load])
-    plant = sample(replace(motors_of(estimate), static_voltage=planned), loop)
+    # The reference leaves room for all of it.
+    lost = friction.planned + driver.threshold + abs(estimate.value("load_voltage"))
+    plant = sample(replace(motors_of(estimate), static_voltage=np.array([lost])), loop)
     problem = Problem(plant, loop, targets, unmodelled_dynamics(estimate))
     required = _required(chosen, problem)
     n = int(checked(targets, "samples") or 1000)
