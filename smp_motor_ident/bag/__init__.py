@@ -2,14 +2,18 @@
 
 `read_records` gives one `smp_motor_ident.record.Record` per wheel, whatever the format; a
 mapping says which topics, fields or columns are which signals where the messages are not ours.
-`BagWriter` writes.
+`BagWriter` writes.  Each is imported when it is first asked for: who writes needs no reader.
 """
 
-from smp_motor_ident.bag.mapping import MotorMap, Signal, SignalMap, load, parse
-from smp_motor_ident.bag.offers import Listing, Offer
-from smp_motor_ident.bag.propose import list_topics
-from smp_motor_ident.bag.read import join_records, read_experiments, read_records
-from smp_motor_ident.bag.writer import BagWriter
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from smp_motor_ident.bag.mapping import MotorMap, Signal, SignalMap, load, parse
+    from smp_motor_ident.bag.offers import Listing, Offer
+    from smp_motor_ident.bag.propose import list_topics
+    from smp_motor_ident.bag.read import join_records, read_experiments, read_records
+    from smp_motor_ident.bag.writer import BagWriter
 
 __all__ = [
     "BagWriter",
@@ -25,3 +29,19 @@ __all__ = [
     "read_experiments",
     "read_records",
 ]
+
+_HOMES = {
+    "mapping": ("MotorMap", "Signal", "SignalMap", "load", "parse"),
+    "offers": ("Listing", "Offer"),
+    "propose": ("list_topics",),
+    "read": ("join_records", "read_experiments", "read_records"),
+    "writer": ("BagWriter",),
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import what is asked for (PEP 562)."""
+    for module, exported in _HOMES.items():
+        if name in exported:
+            return getattr(import_module(f"{__name__}.{module}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -10,7 +10,7 @@ ROLES = {
     # What a field or its topic is called, the most telling first.
     "direction": r"(?:^|\W|_)dir(?:ection)?(?:$|\W|_)|richtung|sentido|direcci",
     "voltage": WORDS_OF_VOLTS + r"|pwm|duty|throttle|entrada|eingang|^in$|(?:^|\W|_)power(?:$|\W|_)"
-    r"|(?:^|\W|_)(?:cmd|command|effort|u|input|v_?in)(?:$|\W|_)",
+    r"|esfor[çc]o|esfuerzo|(?:^|\W|_)(?:cmd|command|effort|u|input|v_?in)(?:$|\W|_)",
     "current": r"current|strom|courant|corriente|corrente|curent|intensi[dt]|proud|akım|(?:^|\W)ток"
     r"|电流|電流|전류|amp(?:s|ere)?(?:$|\W|_)",
     "count": r"tick|count|encoder|impuls|(?:^|\W|_)enc(?:$|\W|_)",
@@ -23,7 +23,10 @@ ROLES = {
 MOTIONS = ("velocity", "position", "count")
 NO_VOLTAGE = r"twist|cmd_vel|linear|angular|batter|supply|vbat"
 MAY_BE_SUPPLY = r"(?:^|\W|_)v_?in(?:$|\W|_)"
-NO_MOTION = r"set_?point|target|desired|reference|soll|cmd|command|[\W_]m?v$"
+NO_MOTION = (
+    r"set_?point|target|desired|refer[eê]n[ct]|soll|cmd|command|consign|[\W_]m?v$"
+    r"|(?:^|\W|_)(?:erro?r?e?|erreur|fehler|hata|uchyb|ошибка)(?:$|\W|_)"
+)
 _HINTS = {
     "velocity": ((r"rpm|drehzahl", ":rpm"), (r"deg", ":deg/s")),
     "position": ((r"deg", ":deg"),),

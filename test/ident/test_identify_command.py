@@ -235,6 +235,13 @@ def test_help_loads_nothing_that_computes(tool: str) -> None:
     subprocess.run([sys.executable, "-c", program], check=True, stdout=subprocess.DEVNULL)
 
 
+@pytest.mark.parametrize("node", ["record", "play"])
+def test_what_moves_messages_loads_nothing_that_computes(node: str) -> None:
+    slow = "assert not {'scipy', 'numba', 'matplotlib'} & set(sys.modules)"
+    program = f"import sys\nimport smp_motor_ident.nodes.{node}\n{slow}\n"
+    subprocess.run([sys.executable, "-c", program], check=True)
+
+
 @pytest.mark.skipif(not REAL.is_dir(), reason="recordings of real motors are not here")
 def test_a_real_motor_is_recovered_and_predicts_another_day(tmp_path: Path) -> None:
     first, second = REAL / "prbs_2026-08-14.csv", REAL / "prbs_2026-08-18.csv"

@@ -190,6 +190,16 @@ def test_where_names_tell_too_little_the_data_do(
     np.testing.assert_allclose(record.voltage[1:], voltage[:-1], atol=6 / 255)
 
 
+@pytest.mark.parametrize("error", ["Erro", "error", "Fehler", "ang_err"])
+def test_a_loops_error_is_no_motion(tmp_path: Path, error: str) -> None:
+    voltage, speed = motor(12)
+    rows = zip(T, 300.0 - speed, voltage)
+    text = "\n".join(f"{t:.2f};{e:.4f};{v:.4f}" for t, e, v in rows)
+    (tmp_path / "log.csv").write_text(f"Tempo;{error};Esforço\n{text}")
+    listing = list_topics(tmp_path / "log.csv")[0]
+    assert listing.suggestion == [] and listing.remark == "no field is called a motion"
+
+
 def test_a_speed_is_not_proposed_as_the_voltage_of_its_own_angle(tmp_path: Path) -> None:
     speed = motor(11)[1]
     rows = zip(T, np.cumsum(speed) * 0.01, speed)
