@@ -58,12 +58,12 @@ def wrong_model(entry: MotorEntry, seed: int) -> MotorModel:
 def gains_for(model: MotorModel, bandwidth: float) -> PidGains:
     """PI gains that put the crossover of the motor's slow pole at the bandwidth, at the motor."""
     return PidGains(
-        p=model.a1 * bandwidth,
-        i=model.a0 * bandwidth,
+        p=model.time_constant / model.dc_gain * bandwidth,
+        i=bandwidth / model.dc_gain,
         u_clamp_min=-12.0,
         u_clamp_max=12.0,
         antiwindup_strategy="conditional_integration",
-        feedforward_velocity=model.a0,
+        feedforward_velocity=1 / model.dc_gain,
         feedforward_static=model.static_voltage,
     )
 
