@@ -19,7 +19,6 @@ from smp_motor_control.wheel.acceptance import Circumstances, check
 from smp_motor_control.wheel.faults import Fault, FaultDetector, FaultLimits, Recovery
 from smp_motor_control.wheel.freshness import FeedbackClock, Verdict
 from smp_motor_control.wheel.loop import LoopSettings, WheelLoop
-from smp_motor_control.wheel.plausibility import PlausibleSpeed
 
 _LARGEST_SETPOINT = 1e4
 _LEARNING = 20
@@ -76,10 +75,6 @@ class WheelSettings:
     implausible_velocity: float = described(
         1000.0, "Feedback beyond this speed is left out [rad/s, wheel].", minimum=0.0
     )
-    implausible_jump: float = described(
-        0.0, "Feedback that jumps for one sample by this, beyond what the motor can change by, is "
-        "left out [rad/s, wheel]; 0: half of the top speed.", minimum=0.0
-    )  # fmt: skip
 
 
 class WheelController:
@@ -89,7 +84,6 @@ class WheelController:
         self.loop = WheelLoop(settings.loop)
         self.recovery = Recovery()
         self.clock = FeedbackClock(math.inf, math.inf)
-        self._plausible = PlausibleSpeed()
         self.refused: Counter[str] = Counter()  # what was left out, and how often
         self.state = State.INACTIVE
         self.active = False  # whether it answers feedback
@@ -114,7 +108,6 @@ class WheelController:
     def configure(self, settings: WheelSettings) -> None:
         """Change the settings while running, without a jump of the voltage."""
         self.loop.configure(settings.loop.within(self.supply))
-        self._plausible.configure(settings.loop, self.supply, settings.implausible_jump)
         self.settings = settings
         self.advice = ""  # why the gains do not suit the interval of the feedback
         self._detector.limits = settings.faults
@@ -196,17 +189,17 @@ class WheelController:
         if voltage - voltage != 0.0:
             voltage = self.output
         try:
+            before = self.loop.jumps
             measurement = self.loop.speed(dt, velocity, sample.encoder_count, voltage)
+            if self.loop.jumps > before:
+                self._bad_at = now
+                self.refuse("feedback speed that jumps")
+                return None
             if not -limit <= measurement <= limit:
                 if measurement == measurement:
                     self._bad_at = now
                     self.refuse("feedback count that jumps")
                     self.loop.reset_speed()
-                return None
-            if not self._plausible.accepts(measurement, dt, self.output):
-                self._bad_at = now
-                self.refuse("feedback speed that jumps")
-                self.loop.reset_speed()
                 return None
             self._feedback_at = now
             if not self.active:
@@ -254,7 +247,6 @@ class WheelController:
     def _not_fresh(self, verdict: Verdict, now: float) -> float | None:
         if verdict is _FIRST:
             self.loop.reset_speed()
-            self._plausible.reset()
         elif verdict is _LATE:
             self._late_at = now
         else:

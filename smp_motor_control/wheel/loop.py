@@ -16,6 +16,7 @@ from smp_motor_control.observer import ObserverNoise, SpeedObserver
 from smp_motor_control.pid import Pid, PidGains, PidOutput
 from smp_motor_control.reference.path import ReferencePath
 from smp_motor_control.reference.profile import Drive, Profile, ProfileLimits, Reference
+from smp_motor_control.wheel.plausibility import PlausibleSpeed
 from smp_motor_control.wheel.standstill import Standstill
 
 SPEED_SOURCES = ("measured", "difference", "observer")
@@ -57,6 +58,10 @@ class LoopSettings:
     # Of the motor, for the observer, and for the jerk in the feed-forward
     model: MotorModel | None = optional(MotorModel, "dc_gain", "time_constant", prefix="model.")
     noise: ObserverNoise = nested(ObserverNoise(), prefix="observer.")
+    implausible_jump: float = described(
+        0.0, "Feedback that jumps for one sample by this, beyond what the motor can change by, is "
+        "left out [rad/s, wheel]; 0: half of the top speed.", minimum=0.0
+    )  # fmt: skip
 
     def __post_init__(self) -> None:
         check_limits(self)
@@ -81,7 +86,8 @@ class LoopSettings:
 class WheelLoop:
     """Speed loop of one wheel, one step per feedback sample.
 
-    ``reference`` and ``source`` (of the speed) are those of the last step.
+    ``reference`` and ``source`` (of the speed) are those of the last step, ``jumps`` how many
+    readings of the speed were left out.
     """
 
     def __init__(
@@ -96,8 +102,10 @@ class WheelLoop:
         self.profile = Profile(settings.limits, settings.transition_time, settings.drive)
         self.reference = Reference(0.0, 0.0, 0.0)
         self._path = ReferencePath(self.profile)
-        self.source = "measured"
+        self.source, self.jumps = "measured", 0
         self._standstill = Standstill()
+        self._plausible = PlausibleSpeed()
+        self.configure(settings)
         self.set_hardware(gearbox, encoder, max_load)
 
     def set_hardware(
@@ -112,6 +120,9 @@ class WheelLoop:
         old, self.settings = self.settings, settings
         self.pid.set_gains(settings.gains)
         self.profile.configure(settings.limits, settings.transition_time, settings.drive)
+        self._plausible.configure(
+            settings.gains, settings.drive, settings.implausible_jump, settings.reference_delay
+        )
         if bool(old.reference_delay) != bool(settings.reference_delay):
             self._path.start(self.reference.velocity)  # its past is older than that
         shaped = ("speed_source", "difference_window", "model", "noise")
@@ -136,14 +147,23 @@ class WheelLoop:
 
     def reset_speed(self) -> None:
         """Forget past samples, as after lost feedback."""
+        self._plausible.reset()
+        self._restart()
+
+    def _restart(self) -> None:
         if self._differenced is not None:
             self._differenced.reset()
         if self._observer is not None:
             self._observer.reset()
 
     def speed(self, dt: float, velocity: float, count: int, voltage: float) -> float:
-        """Return the wheel's speed after one more sample."""
-        return self._speed_of(dt, velocity, count, voltage)
+        """Return the wheel's speed after one more sample, NaN where it is not known or jumps."""
+        speed = self._speed_of(dt, velocity, count, voltage)
+        if speed != speed or self._plausible.accepts(speed, dt, voltage):
+            return speed
+        self.jumps += 1
+        self._restart()
+        return math.nan
 
     def _measured(self, dt: float, velocity: float, count: int, voltage: float) -> float:
         self.source = "measured"

@@ -2,7 +2,8 @@
 
 import math
 
-from smp_motor_control.wheel.loop import LoopSettings
+from smp_motor_control.pid import PidGains
+from smp_motor_control.reference.profile import Drive
 
 _GROSS = 0.5
 """Share of the top speed by which readings may differ for whatever reason, if none is known."""
@@ -37,20 +38,20 @@ class PlausibleSpeed:
         self._jump = self._inertia = self._load = self._back_emf = self._lag = 0.0
         self.reset()
 
-    def configure(self, settings: LoopSettings, supply: float, jump: float = 0.0) -> None:
+    def configure(self, gains: PidGains, drive: Drive | None, jump: float, lag: float) -> None:
         """Learn what the motor can do; nothing jumps where that is not known.
 
-        ``jump`` [rad/s] is what readings differ by for another reason, 0 where nobody knows it.
+        ``jump`` [rad/s] is what readings differ by for another reason, 0 where nobody knows it,
+        ``lag`` [s] by what they are late.
         """
-        gains, drive = settings.gains, settings.drive
-        volts, inertia = min(supply, gains.u_clamp_max), gains.feedforward_acceleration
+        volts, inertia = gains.u_clamp_max, gains.feedforward_acceleration
         known = drive is not None and inertia > 0.0 and math.isfinite(volts)
         self.gross = _GROSS * drive.top_speed if drive is not None and known else math.inf
         # At full voltage, reversed at full speed.
         self.rate = 2.0 * volts / inertia if known else math.inf
         self._jump, self._inertia = jump if known else 0.0, inertia
         self._load = gains.feedforward_static + LOAD * volts
-        self._back_emf, self._lag = gains.feedforward_velocity, settings.reference_delay
+        self._back_emf, self._lag = gains.feedforward_velocity, lag
 
     def reset(self) -> None:
         """Forget what was read, as after lost feedback."""

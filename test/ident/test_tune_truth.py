@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from smp_motor_control.wheel.plausibility import PlausibleSpeed
+from smp_motor_control.wheel.loop import WheelLoop
 from smp_motor_ident.cli import tuning
 from smp_motor_ident.cli.tune import main as tune
 from smp_motor_ident.cli.tune import parser
@@ -193,8 +193,7 @@ def test_outliers_do_not_reach_the_loop():
     assert one.specification.overshoot.high > quiet.specification.overshoot.high
     written = parameters(one)
     assert written["implausible_jump"] == pytest.approx(8.0)
-    loop, speed = loop_settings(written), PlausibleSpeed()
-    speed.configure(loop, 12.0, written["implausible_jump"])
+    loop = WheelLoop(loop_settings(written))
     rng, true, T = np.random.default_rng(5), 0.0, LOOP.sample_time
     lost, believed = [], []
     for k in range(6000):
@@ -203,7 +202,7 @@ def test_outliers_do_not_reach_the_loop():
         outlier = rng.random() < 0.02
         reading = true + rng.normal() + outlier * rng.uniform(-250.0, 250.0)
         off = abs(reading - true)
-        taken = speed.accepts(reading, T, volts)
+        taken = not math.isnan(loop.speed(T, reading, 0, volts))
         if outlier and k % 60 > 20 and off > 40.0:  # where it is steady
             believed.append(taken)
         elif not outlier:
