@@ -35,8 +35,8 @@ from smp_motor_control.motor.response import FreeResponse, zero_order_hold
 
 _STEPS_PER_OCTAVE = 2
 _OCTAVES = 2
-_AGREE, _DISAGREE = 3.0, 9.0
-_INNOVATION_MEMORY = 0.05
+_AGREE, DISAGREE = 3.0, 9.0
+INNOVATION_MEMORY = 0.05
 _LEVELS = 10
 _REGULAR = 0.5
 """Of the usual interval, by which stamps scatter; what is farther off is a sample lost."""
@@ -219,7 +219,7 @@ class SpeedObserver:
         self.acceleration += g_acceleration * innovation
         self.load += g_load * innovation
         unlike = self._surprise / scatter
-        if unlike > _DISAGREE or abs(self.load) > self._max_load:
+        if unlike > DISAGREE or abs(self.load) > self._max_load:
             if self.trusted:
                 self._restart(angle, differenced)
             self.trusted = False
@@ -243,7 +243,7 @@ class SpeedObserver:
         place = math.log2(max(dt / self._shortest, 1.0)) * _STEPS_PER_OCTAVE
         self._place = min(round(place), len(self._steps) - 1)
         self._variance = self._gains[0, self._place].variance
-        self._memory = min(dt / _INNOVATION_MEMORY, 1.0)
+        self._memory = min(dt / INNOVATION_MEMORY, 1.0)
         self._coefficients = self._free.after(dt)
 
     def _gain_under(self, scatter: float) -> SteadyGain:

@@ -37,6 +37,7 @@ class ObserverModel:
     # shape (m,): shares of the last controller outputs in the mean voltage of a sample, as the
     # observer gets it and shifts it by the delay of its model
     taps: Array
+    variance: float = 1.0  # of the innovation, as the observer takes it [rad^2]
 
     def transfer(self, z: Complex) -> tuple[Complex, Complex]:
         """Return the transfer from swept angle and from mean voltage to the observed speed."""
@@ -54,7 +55,8 @@ def observer_model(
     model: MotorModel, sample_time: float, quantum: float, noise: ObserverNoise, loop_delay: float
 ) -> ObserverModel:
     """Return the steady-state observer of a model as a filter."""
-    correct = np.array(steady_gain(model, quantum, noise, sample_time)[:4])
+    *gain, variance = steady_gain(model, quantum, noise, sample_time)
+    correct = np.array(gain)
     (F,), (G,) = prediction(model, np.array([sample_time]))
     size = correct.size
     # Rows: what the innovation is made of.
@@ -70,4 +72,4 @@ def observer_model(
     late = min(max(total / sample_time - whole, 0.0), 1.0)
     taps = np.zeros(whole + 2)
     taps[whole], taps[whole + 1] = 1 - late, late
-    return ObserverModel(advance, by_angle, by_voltage, taps if late else taps[:-1])
+    return ObserverModel(advance, by_angle, by_voltage, taps if late else taps[:-1], variance)

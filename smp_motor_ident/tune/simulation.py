@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_control.arrays import Array
+from smp_motor_control.observer import DISAGREE, INNOVATION_MEMORY
 from smp_motor_ident._compile import compiled
 from smp_motor_ident.model.driver import Driver, terminal_voltage
 from smp_motor_ident.tune.feedback import Feedback
@@ -39,6 +40,8 @@ class Response:
 
     speed: Array  # shape (n, k), [rad/s]: true speed of the motor
     voltage: Array  # shape (n, k), [V]: output of the controller
+    # shape (n,): whether the counts contradicted the observer, which the running loop replaces then
+    contradicted: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,9 +87,10 @@ def simulate(
     still = np.broadcast_to(0.0, (n, steps))
     noise = still if inputs.noise is None else inputs.noise
     of_angle = still if inputs.angle_noise is None else inputs.angle_noise
-    speed, voltage = _run(
+    found = _run(
         plant.phi, plant.taps, plant.phi_angle, plant.taps_angle, plant.sample_time, plant.sensor,
         plant.average, observer.advance, observer.by_angle, observer.by_voltage, observer.taps,
+        observer.variance,
         np.stack([np.broadcast_to(np.asarray(x, dtype=np.float64), n) for x in numbers], axis=1),
         np.asarray(inputs.low, dtype=np.float64),
         np.asarray(inputs.low if inputs.high is None else inputs.high, dtype=np.float64),
@@ -96,7 +100,7 @@ def simulate(
         modelled, count_angle, np.ascontiguousarray(noise), np.ascontiguousarray(of_angle), driver,
         np.broadcast_to(plant.motors.a0, n),
     )  # fmt: skip
-    return Response(speed, voltage)
+    return Response(*found)
 
 
 @compiled
@@ -154,6 +158,7 @@ def _run(
     by_angle: Array,
     by_voltage: Array,
     observer_taps: Array,
+    variance: float,
     controllers: Array,
     low: Array,
     high: Array,
@@ -166,16 +171,17 @@ def _run(
     angle_noise: Array,
     driver: Driver,
     back_emf: Array,
-) -> tuple[Array, Array]:
+) -> tuple[Array, Array, NDArray[np.bool_]]:
     n, m, s = taps.shape
     steps, window = low.size, average.shape[1]
     speed, voltage = np.empty((n, steps)), np.empty((n, steps))
+    contradicted, memory = np.zeros(n, dtype=np.bool_), min(T / INNOVATION_MEMORY, 1.0)
     for j in range(n):
         p, i, d, filter_time, weight, weight_d, limit, back = controllers[j]
         x, following, past, put_out = np.zeros(s), np.zeros(s), np.zeros(m), np.zeros(m)
         angle = np.full(window + 1, count_angle * ((0.5 + 0.618034 * j) % 1.0))
         observer, place = np.zeros(by_angle.size), angle[0]
-        integral = previous = rate = last = 0.0
+        integral = previous = rate = last = surprise = 0.0
         for k in range(steps):
             measured = observer[SPEED] if observer.size else x[sensor]
             if window > 0:
@@ -221,8 +227,11 @@ def _run(
                 delayed = np.sum(observer_taps * past[: observer_taps.size])
                 delayed -= modelled * np.sign(observer[SPEED])
                 observer[:] = _observed(advance, by_angle, by_voltage, observer, swept, delayed)
+                innovation = observer[0] / by_angle[0]
+                surprise += memory * (innovation * innovation / variance - surprise)
+                contradicted[j] = contradicted[j] or surprise > DISAGREE
             x[:] = following
-    return speed, voltage
+    return speed, voltage, contradicted
 
 
 @dataclass(frozen=True)

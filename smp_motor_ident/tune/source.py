@@ -2,15 +2,21 @@
 
 Each candidate costs in its own way: a difference over more samples makes less noise and more
 lag, the observer makes little of both while its model is right.  All are designed for, and the
-gains that reject a load best within the same margins and the same control noise tell which to take.
+gains that reject a load best within the same margins and the same control noise tell which to take,
+of those with which every motor that may be settles.
 """
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.result import Estimate
-from smp_motor_ident.tune.case import prepare, solve
+from smp_motor_ident.tune.case import Case, prepare, solve
+from smp_motor_ident.tune.designer import finish
+from smp_motor_ident.tune.ensemble import Robustness
+from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.loop import Loop
 
 WINDOWS = (2, 4, 8, 16)
@@ -28,9 +34,26 @@ class Trial:
     """What one source allows."""
 
     loop: Loop  # with the source
-    # Integral gain within the margins [V/rad, wheel]; the error that a load leaves is its inverse
-    integral: float
-    control_noise: float  # voltage from the measurement's noise [V rms]
+    case: Case  # the motor in that loop
+    solved: tuple[Feedback, float, Robustness]  # gains within the margins
+
+    @property
+    def integral(self) -> float:
+        """Integral gain [V/rad, wheel]; the error that a load leaves is its inverse."""
+        return self.solved[0].i * self.loop.gear_ratio
+
+    @property
+    def control_noise(self) -> float:
+        """Voltage from the measurement's noise [V rms]."""
+        return self.case.problem.control_noise(self.solved[0])
+
+    def settles(self) -> bool:
+        """Tell whether a largest settling time can be stated."""
+        try:
+            specification = finish(self.case, *self.solved).specification
+        except DesignError:
+            return False
+        return math.isfinite(specification.settling.high)
 
     @property
     def name(self) -> str:
@@ -55,10 +78,7 @@ def choose_source(estimate: Estimate, loop: Loop, **targets: Any) -> tuple[Loop,
     longer = _longer(estimate, counted, usual, targets)
     lacks = _lacking(estimate)
     watched = None if lacks else _trial(estimate, replace(loop, speed_source="observer"), targets)
-    best = usual
-    for trial, worth in ((longer, WORTH_WINDOW), (watched, WORTH_OBSERVER)):
-        if trial is not None and (best is None or trial.integral > worth * best.integral):
-            best = trial
+    best, unsettled = _best(usual, longer, watched)
     if best is None:
         return loop, "the reported speed: no source allows what is asked"
     compared = "; ".join(
@@ -67,7 +87,27 @@ def choose_source(estimate: Estimate, loop: Loop, **targets: Any) -> tuple[Loop,
         for t in (usual, longer, watched)
         if t is not None
     )
+    lacks += "".join(f"; not {t.name}, with which some motors do not settle" for t in unsettled)
     return best.loop, f"{best.name}: {compared}{lacks}"
+
+
+def _best(*trials: Trial | None) -> tuple[Trial | None, Sequence[Trial]]:
+    """Return what to take of the usual, the longer and the observed speed, and what was better.
+
+    Had it but settled with every motor that may be.
+    """
+    left = [(t, w) for t, w in zip(trials, (1.0, WORTH_WINDOW, WORTH_OBSERVER), strict=True) if t]
+    passed: list[Trial] = []
+    while left:
+        best = left[0]
+        for each in left[1:]:
+            if each[0].integral > each[1] * best[0].integral:
+                best = each
+        if best[0].settles():
+            return best[0], passed
+        left.remove(best)
+        passed.append(best[0])
+    return (passed[0] if passed else None), ()
 
 
 def _longer(
@@ -119,7 +159,6 @@ def _trial(estimate: Estimate, loop: Loop, targets: dict[str, Any]) -> Trial | N
     strict = replace(loop, noise_voltage=loop.noise_limit)
     try:
         case = prepare(estimate, strict, "margin", {**targets, "samples": DRAWS})
-        feedback = solve(case)[0]
+        return Trial(loop, case, solve(case))
     except DesignError:
         return None
-    return Trial(loop, feedback.i * loop.gear_ratio, case.problem.control_noise(feedback))

@@ -1,5 +1,6 @@
 """How a design performs in simulation: figures of the nominal loop, and bands over the ensemble."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -137,9 +138,14 @@ def _runs(
         modelled=case.swallowed,
         driver=case.driver,
     )
-    return [
+    each = [
         step_figures(time, speed, volts, change)
         for speed, volts in zip(run.speed, run.voltage, strict=True)
+    ]
+    # What the running loop does with another speed than the observer's was not simulated.
+    return [
+        replace(one, settling=math.nan) if other else one
+        for one, other in zip(each, run.contradicted, strict=True)
     ]
 
 

@@ -163,3 +163,15 @@ def test_what_keeps_gains_from_being_designed_is_advised_and_no_note(estimates):
     with pytest.raises(DesignError, match="two levels") as refused:
         design(given, Loop())
     assert "current too" not in str(refused.value)
+
+
+def test_an_observer_that_the_driver_contradicts_is_not_taken_nor_its_settling_stated(estimates):
+    """It predicts from a command of which a driver that coasts makes another voltage."""
+    coast = Finding("coast", "warning", "", {"size": 10.0, "full_duty": 12.0, "emf_share": 0.8})
+    plain = replace(estimates["front_left"], findings=())
+    coasting, loop = replace(plain, findings=(coast,)), observed(500.0)
+    assert np.isfinite(design(plain, loop).specification.settling.high)
+    assert np.isnan(design(coasting, loop).specification.settling.high)
+    chosen, why = choose_source(coasting, replace(loop, speed_source="measured"))
+    assert chosen.speed_source == "difference" and "not the observer, with which some" in why
+    assert np.isfinite(design(coasting, chosen).specification.settling.high)
