@@ -152,8 +152,9 @@ class Estimate:
         Standard deviation [rad/s] of the noise on the recorded speed that the model was fitted to;
         0 where it was fitted to an angle.
     angle_noise : float
-        Standard deviation [rad] of the noise on the recorded angle that the model was fitted to; 0
-        where that was made of counts, whose quantisation is known, or where it was a speed.
+        Standard deviation [rad] of the noise on the angle that was recorded, or that a recorded
+        speed is the difference of; 0 where that was counts, whose quantisation is known, or a speed
+        that is none.
     """
 
     wheel: str

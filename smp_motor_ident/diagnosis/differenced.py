@@ -73,9 +73,11 @@ def _summed(record: Record) -> Record:
 
 
 def rounding(record: Record) -> float:
-    """Return the noise [rad/s] of a recorded speed whose counts are used, 0 where it is another."""
+    """Return the deviation [rad] of the counts that a speed was made of, 0 where it is another."""
     found = next((f for f in record.findings if f.code == "speed_summed"), None)
-    return 0.0 if found is None else float(found.evidence["quantum"] or 0.0) / 6**0.5
+    if found is None:
+        return 0.0
+    return float(found.evidence["quantum"] or 0.0) * record.velocity_window / 12**0.5
 
 
 def _rounds_once(record: Record, count: float) -> bool:

@@ -22,21 +22,22 @@ def provenance(group: Sequence[Record], data: Experiments, fit: Fit) -> dict[str
         "hardware": group[0].hardware,
         "samples": data.size,
         "sample_time": data.step,
-        "speed_noise": _speed_noise(group, data, fit),
+        "speed_noise": _speed_noise(data, fit),
         "angle_noise": _angle_noise(group, data, fit),
     }
 
 
-def _speed_noise(group: Sequence[Record], data: Experiments, fit: Fit) -> float:
+def _speed_noise(data: Experiments, fit: Fit) -> float:
     """Return the noise of the speed that was recorded [rad/s], 0 where only an angle was."""
-    if data.kind == ANGLE:
-        return max(map(rounding, group))
-    return float(np.sqrt(fit.noise[0, 0]))
+    return 0.0 if data.kind == ANGLE else float(np.sqrt(fit.noise[0, 0]))
 
 
 def _angle_noise(group: Sequence[Record], data: Experiments, fit: Fit) -> float:
-    """Return the noise of the angle that was recorded [rad], 0 where counts or a speed were."""
+    """Return the noise of the angle that was recorded [rad], 0 where counts or a speed were.
+
+    Of a speed that is the difference of counts it is their rounding, which no loop is told of.
+    """
     counted = any(r.count is not None and r.hardware.counts_per_revolution for r in group)
-    if data.kind != ANGLE or counted or max(map(rounding, group)) > 0.0:
+    if data.kind != ANGLE or counted:
         return 0.0
-    return float(np.sqrt(fit.noise[0, 0]))
+    return max(map(rounding, group)) or float(np.sqrt(fit.noise[0, 0]))

@@ -44,8 +44,9 @@ def test_a_speed_of_one_count_a_sample_is_its_counts_and_no_loop_biases_them():
     gain, lag = found.combinations["dc_gain"], found.combinations["time_constant"]
     assert abs(gain.value - GAIN) < 4 * gain.std and gain.std < 0.005 * GAIN
     assert abs(lag.value - LAG) < 4 * lag.std and lag.std < 0.02 * LAG
-    # What a loop gets to see is the speed: two roundings of a uniform error.
-    assert found.speed_noise == pytest.approx(TURN / STEP / np.sqrt(6), rel=1e-6)
+    # What a loop gets to see is the difference of an angle that is rounded by a uniform error.
+    assert found.angle_noise == pytest.approx(TURN / np.sqrt(12), rel=1e-6)
+    assert found.speed_noise == 0.0
     assert found.value("averaging_window") == pytest.approx(STEP)
 
 
