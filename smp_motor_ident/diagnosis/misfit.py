@@ -76,13 +76,15 @@ def jittered(data: Experiments, fit: Fit) -> tuple[Fit, list[Finding]]:
         return fit, []
     late = math.sqrt(3.0 * scatter)
     wider = consider_late(data, fit, late)
+    change = np.delete(np.diff(data.hold_value), data.hold_start[1:-1] - 1)
+    impulses = math.sqrt(scatter * float(change @ change) / (data.size * data.step))
     return wider, [
         Finding(
             "command_jitter",
             "note",
             f"right after changes of the command the residuals scatter as if it took effect up to "
             f"{2e3 * late:.2g} ms late, each time by another: the intervals cover that",
-            {"delay": late, "scatter": math.sqrt(scatter)},
+            {"delay": late, "scatter": math.sqrt(scatter), "as_noise": impulses},
             "record the voltage at the motor's terminals, with the stamps of one clock",
         )
     ]

@@ -24,6 +24,7 @@ from smp_motor_ident.tune.motors import (
     motors_of,
     one_size_of_voltage,
     outliers_of,
+    scatter_of,
     torque_noise_of,
     unreliable_spread,
 )
@@ -58,7 +59,9 @@ class Case:
     drawn: bool  # whether these were drawn; else the ensemble is the nominal motor alone
     friction: Friction  # what is known of it
     driver: Driver  # what its driver makes of a command
+    load: float  # that is always there, either way [V]
     torque_noise: float  # load that fluctuates, over a sample [V rms]
+    scatter: float  # of the instants of commands and samples [s rms]
     outliers: float  # share of the reported speed's readings
     lag_in_doubt: bool  # whether the second lag may be the reported speed's filter
     findings: tuple[Finding, ...]  # what is to be said of the estimate
@@ -80,7 +83,8 @@ def prepare(estimate: Estimate, loop: Loop, method: str, targets: dict[str, Any]
     level = one_size_of_voltage(estimate)
     findings += [one for one in (friction.finding, lag, level) if one is not None]
     # The reference leaves room for all of it.
-    lost = friction.planned + driver.threshold + abs(estimate.value("load_voltage"))
+    load = abs(estimate.value("load_voltage"))
+    lost = friction.planned + driver.threshold + load
     plant = sample(replace(motors_of(estimate), static_voltage=np.array([lost])), loop)
     problem = Problem(plant, loop, targets, unmodelled_dynamics(estimate))
     required = _required(chosen, problem)
@@ -107,7 +111,9 @@ def prepare(estimate: Estimate, loop: Loop, method: str, targets: dict[str, Any]
         drawn,
         friction,
         driver,
+        load,
         torque_noise_of(estimate, loop.sample_time),
+        scatter_of(estimate),
         outliers_of(estimate) if loop.reports_speed else 0.0,
         lag is not None,
         tuple(findings),

@@ -175,7 +175,8 @@ def _plan(case: Case, usual: Plant, controller: Controller, margins: Margins) ->
     if case.lag_in_doubt:
         plants.append(_usual(case, lag_in_sensor(usual.motors)))
     # Of a delay that may be longer than usual no more is asked than the loop bears.
-    borne = replace(loop, delay_doubt=min(loop.delay_doubt, DELAY_BORNE.value * margins.delay))
+    doubt = max(loop.delay_doubt, case.scatter)
+    borne = replace(loop, delay_doubt=min(doubt, DELAY_BORNE.value * margins.delay))
     least = 0.4 / margins.crossover if margins.crossover > 0 else 0.0
     drive = max(case.driver.drive - case.friction.planned, 0.1 * case.driver.drive)
     return plan_reference(

@@ -185,15 +185,27 @@ def torque_noise_of(estimate: Estimate, sample_time: float) -> float:
     """Return the load that fluctuates, as the voltage that it takes over a sample [V rms].
 
     Where the recording shows more of an error than the response itself, that is a resonance, which
-    the bands hold as such.
+    the bands hold as such; what commands made that came late by scatter is none of a load.
     """
-    found = next((f for f in estimate.findings if f.code == "torque_noise"), None)
     error = estimate.residuals.model_error
     if error is not None and max(2 * s - b for s, b in zip(error.shown, error.bound)) > 1:
         return 0.0
-    rate = 0.0 if found is None else float(found.evidence.get("acceleration") or 0.0)
     inertia = estimate.value("time_constant") / estimate.value("dc_gain", math.inf)
-    return rate * inertia / math.sqrt(sample_time)
+    load = inertia * _evidence(estimate, "torque_noise", "acceleration")
+    late = _evidence(estimate, "command_jitter", "as_noise")
+    return math.sqrt(max(load**2 - late**2, 0.0) / sample_time)
+
+
+def scatter_of(estimate: Estimate) -> float:
+    """Return by how much the instants of commands and samples scatter [s rms]."""
+    late = _evidence(estimate, "command_jitter", "scatter")
+    return math.hypot(late, _evidence(estimate, "arrival_beat", "latency"))
+
+
+def _evidence(estimate: Estimate, code: str, name: str) -> float:
+    """Return a number of a finding, 0 where there is none."""
+    return max((float(f.evidence.get(name) or 0.0) for f in estimate.findings if f.code == code),
+               default=0.0)  # fmt: skip
 
 
 def outliers_of(estimate: Estimate) -> float:

@@ -123,14 +123,16 @@ def _runs(
     plant = sample(motors, loop, believed=nominal)
     shape = (len(plant), time.size)
     filtered = bool(np.any(plant.motors.sensor_lag > 0))
+    forward = plan.forward + case.swallowed * plan.friction
+    late = _late(case, loop, shape)
     run = simulate(
         plant,
         controller,
         replace(
             plan.inputs,
-            forward=plan.forward + case.swallowed * plan.friction,
-            load=white(case.torque_noise, shape, 1),
-            noise=_reported_noise(case, loop, shape),
+            forward=forward,
+            load=_load(case, plant.motors.static_voltage, shape) + late * _change(forward),
+            noise=_reported_noise(case, loop, shape) + late * _change(plan.reference),
             angle_noise=white(0.0 if filtered else loop.angle_noise, shape),
         ),
         count_angle=0.0 if filtered else loop.count_angle,
@@ -149,14 +151,35 @@ def _runs(
     ]
 
 
-def _reported_noise(case: Case, loop: Loop, shape: tuple[int, int]) -> Array | None:
+def _load(case: Case, friction: Array, shape: tuple[int, int]) -> Array:
+    """Return what a load takes beyond the voltage with which the wheel stood before the change.
+
+    That is up to what friction holds, or as much as it may hold it with too little or too much.
+    """
+    either = np.where(np.arange(shape[0]) // 2 % 2, -1.0, 1.0)
+    noise = white(case.torque_noise, shape, 1)
+    held: Array = np.broadcast_to((either * np.minimum(case.load, friction))[:, None], shape)
+    return held if noise is None else held + noise
+
+
+def _late(case: Case, loop: Loop, shape: tuple[int, int]) -> Array:
+    """Return by which share of a sample each step is late, or early: any is as likely."""
+    most = min(math.sqrt(3.0) * case.scatter / loop.sample_time, 1.0)
+    return np.random.default_rng(3).uniform(-most, most, shape)
+
+
+def _change(planned: Array) -> Array:
+    return np.diff(planned, prepend=planned[:1])
+
+
+def _reported_noise(case: Case, loop: Loop, shape: tuple[int, int]) -> Array | float:
     """Return the noise of the reported speed, with the outliers that the running loop believes.
 
     They are of any size up to the top speed; it leaves out what no motor can change by.
     """
     noise = white(loop.reported_noise, shape)
     if noise is None or not case.outliers:
-        return noise
+        return 0.0 if noise is None else noise
     motor = case.problem.plant.motors
     top = loop.supply_voltage / float(motor.a0[0])
     load = LOAD * loop.supply_voltage + case.swallowed

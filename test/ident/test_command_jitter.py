@@ -57,6 +57,10 @@ def test_the_scatter_of_commands_is_found_and_covered(seed: int) -> None:
     weight = np.diff(record.voltage) ** 2
     changes = np.square(np.square(weight).sum()) / (weight**4).sum()
     assert jitter(found) == pytest.approx(expected, rel=3 * 0.5 * np.sqrt(0.8 / changes))
+    # Each change is an impulse of its size times how late it is.
+    noise = np.sqrt(np.square(np.diff(record.voltage)).sum() / record.duration)
+    late = next(f for f in found.findings if f.code == "command_jitter").evidence
+    assert late["as_noise"] == pytest.approx(late["scatter"] * noise, rel=0.02)  # its ends
     true = motors.truth("rear_left", 0.0)
     for name in ("dc_gain", "time_constant", "time_constant_product"):
         quantity = found.combinations[name]

@@ -94,9 +94,8 @@ def change(one, motor, window=0.0, lag=0.0, share=0.5, seconds=2.0):
         sent = [given, *sent[:-1]]
         out[k] = speed
         for _ in range(sub):
-            drive = sent[-1] - math.copysign(friction, speed) if speed else max(
-                sent[-1] - friction, 0.0
-            )  # fmt: skip
+            pull = sent[-1] - motor.get("load_voltage", 0.0)
+            drive = pull - math.copysign(friction, speed) if speed else max(pull - friction, 0.0)
             rate += h * (gain * drive - speed - tau * rate) / tp
             speed = max(speed + h * rate, 0.0)
             rate = rate if speed > 0 or drive > 0 else 0.0
@@ -170,6 +169,36 @@ def test_changes_leave_room_for_a_load_that_the_recording_shows():
     less = plain.reference.drive.top_speed - uphill.reference.drive.top_speed
     assert less == pytest.approx(2.0 * MOTOR["dc_gain"])
     assert uphill.reference.max_velocity < plain.reference.max_velocity
+
+
+def test_bands_hold_a_load_that_friction_held_before_the_change():
+    """Feed-forward knows of friction alone: the integral has the load still to find."""
+    uphill = {**TRUE, "load_voltage": 0.35}
+    aware, ignorant = design(estimate(load_voltage=0.35), LOOP), design(estimate(), LOOP)
+    time, speed = change(aware, uphill)
+    settling = time[np.flatnonzero(np.abs(speed - 1) > 0.02)[-1] + 1]
+    assert settling > ignorant.specification.settling.high + LOOP.sample_time
+    assert settling <= aware.specification.settling.high
+    downhill = overshoot(aware, {**TRUE, "load_voltage": -0.35})
+    assert ignorant.specification.overshoot.high + 1.0 < downhill
+    assert downhill <= aware.specification.overshoot.high + 0.25
+
+
+def test_commands_that_came_late_by_scatter_are_no_load_but_widen_what_a_change_does():
+    rough = 0.02 * MOTOR["dc_gain"] / MOTOR["time_constant"]  # 0.02 V sqrt(s)
+    load = Finding("torque_noise", "warning", "", {"acceleration": rough})
+    late = Finding("command_jitter", "note", "", {"scatter": 3e-3, "as_noise": 0.0199})
+    assert torque_noise_of(estimate(findings=[load]), 0.01) == pytest.approx(0.2)
+    assert torque_noise_of(estimate(findings=[load, late]), 0.01) < 0.03
+    shaken, scattered = (design(estimate(findings=f), LOOP) for f in ([load], [load, late]))
+    assert math.isnan(shaken.specification.settling.high)
+    assert math.isfinite(scattered.specification.settling.high)
+    exact = design(estimate(), LOOP)
+    assert scattered.specification.settling.high > exact.specification.settling.high
+    assert scattered.specification.overshoot.high > exact.specification.overshoot.high
+    assert scattered.reference.doubt == pytest.approx(3e-3)  # and is no slower than it must
+    arrivals = Finding("arrival_beat", "note", "", {"latency": 3e-3})
+    assert design(estimate(findings=[arrivals]), LOOP).reference.doubt == pytest.approx(3e-3)
 
 
 def test_bands_hold_a_load_that_fluctuates_as_the_recording_shows():
