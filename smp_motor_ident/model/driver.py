@@ -34,7 +34,7 @@ class Driver(NamedTuple):
     @property
     def threshold(self) -> float:
         """Command [V] that it swallows before anything moves."""
-        return self.size if self.kind == DEAD_ZONE else 0.0
+        return self.size if self.kind in (DEAD_ZONE, DROP) else 0.0
 
     @property
     def limit(self) -> float:

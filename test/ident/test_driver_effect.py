@@ -227,6 +227,10 @@ def test_gains_are_for_motor_and_driver():
     loop = Loop(sample_time=STEP, gear_ratio=1.0, counts_per_revolution=None, supply_voltage=12.0)
     zone = design(estimated("dead_zone", 0), loop)
     assert zone.gains.feedforward_static == pytest.approx(STATIC + 1.0, abs=0.05)
+    size = {"size": 1.0, "full_duty": 12.0, "emf_share": 1.0}
+    drop = Finding("brush_drop", "warning", "", size)
+    dropped = design(replace(estimated("dead_zone", 0), findings=(drop,)), loop)
+    assert dropped.gains.feedforward_static == pytest.approx(STATIC + 1.0, abs=0.05)
     clip = design(estimated("clip_voltage", 0), loop)
     assert clip.gains.u_clamp_max == pytest.approx(9.0, abs=0.05)
     slew = design(estimated("slew_rate", 0), loop)
