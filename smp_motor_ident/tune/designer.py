@@ -4,7 +4,7 @@ Methods work at the motor shaft; the gains that come out are per wheel rad/s.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -15,7 +15,7 @@ from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune.case import COMMON, Case, prepare, solve
 from smp_motor_ident.tune.ensemble import Robustness
 from smp_motor_ident.tune.feedback import Feedback
-from smp_motor_ident.tune.limits import DELAY_BORNE, HELD_BACK
+from smp_motor_ident.tune.limits import AS_GOOD, DELAY_BORNE, HELD_BACK
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.margins import Margins, loop_margins
 from smp_motor_ident.tune.methods import METHODS
@@ -97,9 +97,13 @@ def finish(case: Case, feedback: Feedback, factor: float, robustness: Robustness
     controller = controller_for(loop, feedback)
     usual = _usual(case)
     margins = loop_margins(plant, feedback)
-    reference = _plan(case, usual, controller, margins)
+    quickest = _plan(case, usual, controller, margins)
     noise = problem.control_noise(feedback)
-    figures, bands = figures_of(case, usual, controller, reference, margins, noise)
+    reference, figures, bands = _calmest(
+        quickest,
+        lambda plan: figures_of(case, usual, controller, plan, margins, noise),
+        "transition_time" not in problem.targets,
+    )
     reason, findings = _explain(case, margins, factor, robustness, (figures, bands))
     m = plant.motors
     return Design(
@@ -182,6 +186,27 @@ def _plan(case: Case, usual: Plant, controller: Controller, margins: Margins) ->
     return plan_reference(
         plants, borne, controller, case.problem.targets, least, drive, case.driver.slew
     )
+
+
+def _calmest(
+    quickest: Reference,
+    figures: Callable[[Reference], tuple[Performance, Specification]],
+    free: bool,
+) -> tuple[Reference, Performance, Specification]:
+    """Return the reference, no quicker, whose stated settling is least, and its figures.
+
+    What is not known of a motor answers quick changes most: they take as long to settle as slower
+    ones, and overshoot more.  Of those that settle in as good as the least time, that is the one
+    that is stated to overshoot least.
+    """
+    tried = [(quickest, *figures(quickest))]
+    most = (1 + AS_GOOD.value) * tried[0][2].settling.high  # NaN: nothing is tried
+    while free and 2 * tried[-1][0].transition_time < most:
+        plan = replace(quickest, transition_time=2 * tried[-1][0].transition_time)
+        tried.append((plan, *figures(plan)))
+        most = min(most, (1 + AS_GOOD.value) * tried[-1][2].settling.high)
+    good = [one for one in tried if one[2].settling.high <= most] or tried[:1]
+    return min(good, key=lambda one: one[2].overshoot.high)
 
 
 def _explain(

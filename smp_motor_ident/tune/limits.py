@@ -82,6 +82,13 @@ DELAY_BORNE = Limit(
     "than `delay_doubt` no more is asked",
     "test_tune_truth.py",
 )
+AS_GOOD = Limit(
+    0.1,
+    "of a settling time",
+    "cost: a change that is stated to settle later by a tenth is none that a driver notices, one "
+    "that may overshoot several times as far is",
+    "test_tune_truth.py",
+)
 
 # Loops whose commands are reconstructed.
 COMMAND_RESOLUTION = Limit(

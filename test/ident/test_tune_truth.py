@@ -190,10 +190,11 @@ def test_commands_that_came_late_by_scatter_are_no_load_but_widen_what_a_change_
     late = Finding("command_jitter", "note", "", {"scatter": 3e-3, "as_noise": 0.0199})
     assert torque_noise_of(estimate(findings=[load]), 0.01) == pytest.approx(0.2)
     assert torque_noise_of(estimate(findings=[load, late]), 0.01) < 0.03
-    shaken, scattered = (design(estimate(findings=f), LOOP) for f in ([load], [load, late]))
+    shaken, scattered, exact = (
+        design(estimate(findings=f), LOOP, transition_time=0.05) for f in ([load], [load, late], [])
+    )
     assert math.isnan(shaken.specification.settling.high)
     assert math.isfinite(scattered.specification.settling.high)
-    exact = design(estimate(), LOOP)
     assert scattered.specification.settling.high > exact.specification.settling.high
     assert scattered.specification.overshoot.high > exact.specification.overshoot.high
     assert scattered.reference.doubt == pytest.approx(3e-3)  # and is no slower than it must
@@ -218,7 +219,8 @@ def test_outliers_do_not_reach_the_loop():
     found = Finding("glitches", "warning", "", {"signal": "velocity", "samples": 20.0})
     counts = replace(LOOP, counts_per_revolution=None, speed_noise=1.0, difference_window=0)
     one = design(replace(estimate(findings=[found]), samples=1000), counts)
-    quiet = design(replace(estimate(), samples=1000), counts)
+    alike = one.reference.transition_time
+    quiet = design(replace(estimate(), samples=1000), counts, transition_time=alike)
     assert one.specification.overshoot.high > quiet.specification.overshoot.high
     written = parameters(one)
     assert written["implausible_jump"] == pytest.approx(8.0)

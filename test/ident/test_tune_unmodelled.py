@@ -244,9 +244,24 @@ def test_nothing_is_added_where_all_is_known():
 
 def test_bands_hold_a_resonance_that_the_recording_does_not_show():
     loop = replace(LOOP, difference_window=0)
-    free, held = (design(known_up_to(f), loop).specification for f in (600.0, 20.0))
+    least = design(known_up_to(600.0), loop).reference.transition_time
+    free, held = (
+        design(known_up_to(f), loop, transition_time=least).specification for f in (600.0, 20.0)
+    )
     assert held.overshoot.high > free.overshoot.high + 2
     assert held.settling.high > free.settling.high
+
+
+def test_a_change_is_no_quicker_than_what_is_known_lets_it_settle():
+    loop = replace(LOOP, difference_window=0)
+    known, unknown = (design(known_up_to(f), loop) for f in (600.0, 20.0))
+    most = unknown.specification
+    assert most.overshoot.high < 2.5 and most.settling.high < 0.5
+    quick = known.reference.transition_time
+    assert quick < unknown.reference.transition_time
+    quicker = design(known_up_to(20.0), loop, transition_time=quick).specification
+    assert quicker.overshoot.high > 2 * most.overshoot.high
+    assert 1.1 * quicker.settling.high >= most.settling.high
 
 
 def test_band_is_what_99_percent_keep_on_either_side():
