@@ -96,17 +96,18 @@ class ReferencePath:
         if self._from * target > 0.0 or not target:
             return _sign(now.velocity or following.velocity)
         half = max((0.5 if self._from else 0.25) * electrical, 0.5 * self.usual)
-        first, last = (_share(each, target, half) for each in (now, following))
+        first, last = (_share(each, half) for each in (now, following))
         return 0.5 * (first + last) + electrical * (last - first) / self.usual
 
 
-def _share(reference: Reference, target: float, half: float) -> float:
-    """Return where the friction's ramp is, from the time to or since the passage of zero."""
-    velocity, acceleration = reference.velocity, reference.acceleration
-    if not acceleration:
-        return _sign(velocity)
-    ahead = velocity / acceleration / half
-    return math.copysign(min(max(ahead, -1.0), 1.0), ahead * target) if ahead else 0.0
+def _share(reference: Reference, half: float) -> float:
+    """Return where the friction's ramp is, from the time to or since the passage of zero.
+
+    At its end a change's rate is nothing but rounding, of either sign.
+    """
+    velocity, rate = reference.velocity, abs(reference.acceleration)
+    reach = max(rate * half, abs(velocity))
+    return velocity / reach if reach else 0.0
 
 
 def _sign(value: float) -> float:

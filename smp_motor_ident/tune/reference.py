@@ -113,7 +113,7 @@ def planned_change(plant: Plant, plan: Reference, distance: float, time: Array) 
     low, high = np.min(around, axis=0), np.max(around, axis=0)
     # From rest the running loop leads along a ramp, with what the rate of its current takes.
     electrical = float(m.a2[0] / m.a1[0])
-    reach = rate * max(0.25 * electrical, 0.5 * T)
+    reach = np.abs(rate) * max(0.25 * electrical, 0.5 * T)
     share = np.clip(np.divide(speed, reach, out=np.sign(speed), where=reach != 0), -1.0, 1.0)
     friction = 0.5 * (share[1:] + share[:-1]) + electrical * np.diff(share) / T
     return Change(low, around[1], high, forward, friction)

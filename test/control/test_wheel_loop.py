@@ -154,6 +154,21 @@ def test_a_delayed_reference_is_the_one_of_that_long_ago() -> None:
     assert seen[1][4:] == pytest.approx(seen[0][:-4]) and seen[0][-1] > 0.25
 
 
+@pytest.mark.parametrize(("target", "rest"), [(1.7323209436980074, 52), (1.931078245306091, 54)])
+def test_friction_is_fed_forward_up_to_the_end_of_a_change(target: float, rest: int) -> None:
+    """Its rate ends in a rounding error, here below zero: no turn back."""
+    gains = PidGains(
+        p=0.0, feedforward_static=0.5, feedforward_acceleration=1e-6, u_clamp_min=-9.0,
+        u_clamp_max=9.0,
+    )  # fmt: skip
+    loop = WheelLoop(LoopSettings(gains=gains, transition_time=0.12, reference_delay=0.01))
+    loop.start(0.0)
+    volts = [loop.step(target * (k >= rest), 0.0, 0.01).output for k in range(rest + 20)]
+    assert volts[:rest] == pytest.approx([0.0] * rest)
+    # A change takes some 10 uV for its acceleration.
+    assert volts[rest + 2 :] == pytest.approx([0.5] * 18, abs=1e-4)
+
+
 def test_switching_the_delay_on_begins_its_past_at_the_present_reference() -> None:
     for before, after in ((0.0, 8 * DT), (8 * DT, 0.0), (8 * DT, 4 * DT)):
         limits = ProfileLimits(acceleration=1.0)
