@@ -17,6 +17,7 @@ from smp_motor_ident.tune.methods import METHODS
 from smp_motor_ident.tune.motors import (
     Friction,
     draw_motors,
+    eccentric_of,
     every_other,
     friction_of,
     lag_in_sensor,
@@ -62,6 +63,7 @@ class Case:
     load: float  # that is always there, either way [V]
     torque_noise: float  # load that fluctuates, over a sample [V rms]
     scatter: float  # of the instants of commands and samples [s rms]
+    eccentric: float  # amplitude of the encoder's error once a turn [rad]
     outliers: float  # share of the reported speed's readings
     lag_in_doubt: bool  # whether the second lag may be the reported speed's filter
     findings: tuple[Finding, ...]  # what is to be said of the estimate
@@ -114,6 +116,7 @@ def prepare(estimate: Estimate, loop: Loop, method: str, targets: dict[str, Any]
         load,
         torque_noise_of(estimate, loop.sample_time),
         scatter_of(estimate),
+        eccentric_of(estimate, loop),
         outliers_of(estimate) if loop.reports_speed else 0.0,
         lag is not None,
         tuple(findings),

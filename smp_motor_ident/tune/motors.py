@@ -16,6 +16,7 @@ from smp_motor_ident.tune.limits import (
     ONE_SIZE_SPREAD,
     UNRELIABLE_SPREAD,
 )
+from smp_motor_ident.tune.loop import Loop
 
 SENSOR = ("delay", "averaging_window", "sensor_lag")
 """What stands between the motor's speed and the one that is reported: [s] each."""
@@ -200,6 +201,19 @@ def scatter_of(estimate: Estimate) -> float:
     """Return by how much the instants of commands and samples scatter [s rms]."""
     late = _evidence(estimate, "command_jitter", "scatter")
     return math.hypot(late, _evidence(estimate, "arrival_beat", "latency"))
+
+
+def eccentric_of(estimate: Estimate, loop: Loop) -> float:
+    """Return the amplitude of an encoder's error once a turn [rad].
+
+    A sine explains half the square of its amplitude in each sample, in units of the noise's; where
+    a load fluctuates, which is larger, the error is part of that.
+    """
+    if _evidence(estimate, "torque_noise", "acceleration"):
+        return 0.0
+    explained = _evidence(estimate, "encoder_error", "explained_deviance")
+    noise = math.hypot(loop.count_angle / math.sqrt(12), loop.angle_noise)
+    return noise * math.sqrt(2 * explained / max(estimate.samples, 1))
 
 
 def _evidence(estimate: Estimate, code: str, name: str) -> float:

@@ -71,12 +71,14 @@ def simulate(
     inputs: Inputs,
     *,
     count_angle: float = 0.0,
+    eccentric: float = 0.0,
     friction: Array | None = None,
     modelled: float = 0.0,
     driver: Driver = NO_EFFECT,
 ) -> Response:
     """Run the closed loop from rest; ``modelled`` is the friction [V] that the observer knows.
 
+    ``eccentric`` [rad] is the amplitude of an encoder's error once a turn of the motor.
     The driver stands between what the controller puts out, which the observer knows, and the motor.
     """
     n, steps, fb = len(plant), inputs.low.size, controller.feedback
@@ -97,7 +99,8 @@ def simulate(
         none if inputs.forward is None else inputs.forward,
         still if inputs.load is None else np.broadcast_to(inputs.load, (n, steps)),
         np.zeros(n) if friction is None else np.ascontiguousarray(friction),
-        modelled, count_angle, np.ascontiguousarray(noise), np.ascontiguousarray(of_angle), driver,
+        modelled, count_angle, eccentric, np.ascontiguousarray(noise),
+        np.ascontiguousarray(of_angle), driver,
         np.broadcast_to(plant.motors.a0, n),
     )  # fmt: skip
     return Response(*found)
@@ -167,6 +170,7 @@ def _run(
     friction: Array,
     modelled: float,
     count_angle: float,
+    eccentric: float,
     noise: Array,
     angle_noise: Array,
     driver: Driver,
@@ -221,7 +225,7 @@ def _run(
                 angle[q] = angle[q - 1]
             before = angle[0]
             place += swept
-            angle[0] = place + angle_noise[j, k]
+            angle[0] = place + angle_noise[j, k] + eccentric * math.sin(place + j)
             if observer.size:
                 swept = _turned(angle[0], before, count_angle)
                 delayed = np.sum(observer_taps * past[: observer_taps.size])

@@ -136,6 +136,7 @@ def _runs(
             angle_noise=white(0.0 if filtered else loop.angle_noise, shape),
         ),
         count_angle=0.0 if filtered else loop.count_angle,
+        eccentric=0.0 if filtered else case.eccentric,
         friction=motors.static_voltage if case.drawn else np.array([case.friction.known]),
         modelled=case.swallowed,
         driver=case.driver,

@@ -21,7 +21,7 @@ from smp_motor_ident.report.document import identification_document
 from smp_motor_ident.result import Estimate, FitPercent, ModelError, Quantity, ResidualTests
 from smp_motor_ident.tune import Loop, design
 from smp_motor_ident.tune.case import prepare
-from smp_motor_ident.tune.motors import torque_noise_of
+from smp_motor_ident.tune.motors import eccentric_of, torque_noise_of
 from smp_motor_ident.tune.verification import loop_settings
 from smp_motor_ident.tune.writing import parameters
 
@@ -200,6 +200,20 @@ def test_commands_that_came_late_by_scatter_are_no_load_but_widen_what_a_change_
     assert scattered.reference.doubt == pytest.approx(3e-3)  # and is no slower than it must
     arrivals = Finding("arrival_beat", "note", "", {"latency": 3e-3})
     assert design(estimate(findings=[arrivals]), LOOP).reference.doubt == pytest.approx(3e-3)
+
+
+def test_bands_hold_an_encoder_that_is_off_once_a_turn_as_the_recording_shows():
+    """Of an amplitude of a count in 1000 samples: a sine's mean square over a rounding's."""
+    count = 2 * math.pi / 32
+    explained = 1000 * (count**2 / 2) / (count**2 / 12)
+    off = Finding("encoder_error", "note", "", {"explained_deviance": explained})
+    counts = replace(LOOP, counts_per_revolution=32.0)
+    found = [replace(estimate(findings=f), samples=1000) for f in ([], [off])]
+    assert eccentric_of(found[1], counts) == pytest.approx(count)
+    true, shaken = (design(one, counts, transition_time=0.1).specification for one in found)
+    assert shaken.overshoot.high > true.overshoot.high + 1.0
+    load = Finding("torque_noise", "warning", "", {"acceleration": 1.0})
+    assert eccentric_of(replace(found[1], findings=(off, load)), counts) == 0.0
 
 
 def test_bands_hold_a_load_that_fluctuates_as_the_recording_shows():
