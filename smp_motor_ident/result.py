@@ -151,6 +151,8 @@ class Estimate:
     speed_noise : float
         Standard deviation [rad/s] of the noise on the recorded speed that the model was fitted to;
         0 where it was fitted to an angle.
+    speed_step : float
+        Step [rad/s] in which that speed comes; 0 where it comes in none, or was an angle.
     angle_noise : float
         Standard deviation [rad] of the noise on the angle that was recorded, or that a recorded
         speed is the difference of; 0 where that was counts, whose quantisation is known, or a speed
@@ -171,6 +173,7 @@ class Estimate:
     duration: float = 0.0
     sample_time: NotNegative = 0.0
     speed_noise: NotNegative = 0.0
+    speed_step: NotNegative = 0.0
     angle_noise: NotNegative = 0.0
     largest_voltage: float = 0.0
     sources: tuple[str, ...] = ()
@@ -277,8 +280,8 @@ class Estimate:
 _WRITTEN = (
     "model", "parameters", "identifiable", "unidentifiable", "combinations", "covariance",
     "fit_percent", "candidates", "residuals", "findings", "warnings", "advice", "samples",
-    "duration", "sample_time", "speed_noise", "angle_noise", "largest_voltage", "sources",
-    "hardware",
+    "duration", "sample_time", "speed_noise", "speed_step", "angle_noise", "largest_voltage",
+    "sources", "hardware",
 )  # fmt: skip
 """What of an estimate stands in ``identification.json``."""
 

@@ -83,6 +83,7 @@ def loop_for(
         speed_source="measured" if arguments.speed_source == "auto" else arguments.speed_source,
         difference_window=usual_window if window is None else window,
         speed_noise=_first(arguments.speed_noise, estimate.speed_noise) or 0.0,
+        speed_step=estimate.speed_step,
         angle_noise=_first(arguments.angle_noise, estimate.angle_noise) or 0.0,
         averaging_given=window is not None,
     )

@@ -7,7 +7,7 @@ import numpy as np
 
 from smp_motor_ident.diagnosis.differenced import rounding
 from smp_motor_ident.estimation.fit import Fit
-from smp_motor_ident.likelihood.experiments import Experiments
+from smp_motor_ident.likelihood.experiments import Experiments, speed_quantum
 from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.record import Record
 
@@ -23,6 +23,7 @@ def provenance(group: Sequence[Record], data: Experiments, fit: Fit) -> dict[str
         "samples": data.size,
         "sample_time": data.step,
         "speed_noise": _speed_noise(data, fit),
+        "speed_step": _speed_step(group, data),
         "angle_noise": _angle_noise(group, data, fit),
     }
 
@@ -30,6 +31,12 @@ def provenance(group: Sequence[Record], data: Experiments, fit: Fit) -> dict[str
 def _speed_noise(data: Experiments, fit: Fit) -> float:
     """Return the noise of the speed that was recorded [rad/s], 0 where only an angle was."""
     return 0.0 if data.kind == ANGLE else float(np.sqrt(fit.noise[0, 0]))
+
+
+def _speed_step(group: Sequence[Record], data: Experiments) -> float:
+    """Return the largest step in which a speed that was recorded comes [rad/s]."""
+    speeds = [] if data.kind == ANGLE else [r.velocity for r in group if r.velocity is not None]
+    return max(map(speed_quantum, speeds), default=0.0)
 
 
 def _angle_noise(group: Sequence[Record], data: Experiments, fit: Fit) -> float:

@@ -49,7 +49,9 @@ class Loop:
         Largest control noise [V rms] that the measurement may cause at the output;
         None takes 4 % of the supply.
     speed_noise : float
-        Standard deviation of the noise on a reported speed [rad/s, motor], beside quantisation.
+        Standard deviation of the noise on a reported speed [rad/s, motor], its rounding included.
+    speed_step : float
+        Step in which a reported speed comes [rad/s, motor].
     angle_noise : float
         Standard deviation of the noise on the angle that the speed is made from [rad, motor],
         beside quantisation.
@@ -75,6 +77,7 @@ class Loop:
     observer_bandwidth: float | None = None
     noise_voltage: float | None = None
     speed_noise: float = 0.0
+    speed_step: float = 0.0
     angle_noise: float = 0.0
     averaging_given: bool = False
 
@@ -111,6 +114,15 @@ class Loop:
     def reported_noise(self) -> float:
         """Noise of what is fed back [rad/s], beside quantisation: only a reported speed has any."""
         return self.speed_noise if self.reports_speed else 0.0
+
+    @property
+    def rounding(self) -> float:
+        """Step [rad/s] of what is fed back, where its noise is little else.
+
+        More noise makes a mean of what is rounded; a difference of counts is none of a speed.
+        """
+        rounded = self.reports_speed and 3.0 * self.speed_noise < self.speed_step
+        return self.speed_step if rounded else 0.0
 
     @property
     def loop_delay(self) -> float:

@@ -71,6 +71,7 @@ def simulate(
     inputs: Inputs,
     *,
     count_angle: float = 0.0,
+    speed_step: float = 0.0,
     eccentric: float = 0.0,
     friction: Array | None = None,
     modelled: float = 0.0,
@@ -78,7 +79,8 @@ def simulate(
 ) -> Response:
     """Run the closed loop from rest; ``modelled`` is the friction [V] that the observer knows.
 
-    ``eccentric`` [rad] is the amplitude of an encoder's error once a turn of the motor.
+    A speed is reported in steps of ``speed_step`` [rad/s]; ``eccentric`` [rad] is the amplitude of
+    an encoder's error once a turn of the motor.
     The driver stands between what the controller puts out, which the observer knows, and the motor.
     """
     n, steps, fb = len(plant), inputs.low.size, controller.feedback
@@ -99,7 +101,7 @@ def simulate(
         none if inputs.forward is None else inputs.forward,
         still if inputs.load is None else np.broadcast_to(inputs.load, (n, steps)),
         np.zeros(n) if friction is None else np.ascontiguousarray(friction),
-        modelled, count_angle, eccentric, np.ascontiguousarray(noise),
+        modelled, count_angle, speed_step, eccentric, np.ascontiguousarray(noise),
         np.ascontiguousarray(of_angle), driver,
         np.broadcast_to(plant.motors.a0, n),
     )  # fmt: skip
@@ -122,6 +124,12 @@ def _averaged(weights: Array, angle: Array, count_angle: float) -> float:
     for q in range(weights.size):
         total += weights[q] * _turned(angle[q], angle[q + 1], count_angle)
     return total
+
+
+@compiled
+def _rounded(speed: float, step: float) -> float:
+    """Return a speed as it is reported."""
+    return step * math.floor(speed / step + 0.5) if step > 0.0 else speed
 
 
 @compiled
@@ -170,6 +178,7 @@ def _run(
     friction: Array,
     modelled: float,
     count_angle: float,
+    speed_step: float,
     eccentric: float,
     noise: Array,
     angle_noise: Array,
@@ -190,7 +199,7 @@ def _run(
             measured = observer[SPEED] if observer.size else x[sensor]
             if window > 0:
                 measured = _averaged(average[j], angle, count_angle)
-            measured += noise[j, k]
+            measured = _rounded(measured + noise[j, k], speed_step)
             reference = min(max(measured, low[k]), high[k])
             slope = weight_d * reference - measured
             rate = (filter_time * rate + slope - previous) / (filter_time + T)
@@ -233,7 +242,7 @@ def _run(
                 observer[:] = _observed(advance, by_angle, by_voltage, observer, swept, delayed)
                 innovation = observer[0] / by_angle[0]
                 surprise += memory * (innovation * innovation / variance - surprise)
-                contradicted[j] = contradicted[j] or surprise > DISAGREE
+                contradicted[j] |= surprise > DISAGREE
             x[:] = following
     return speed, voltage, contradicted
 

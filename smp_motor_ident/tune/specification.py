@@ -136,6 +136,7 @@ def _runs(
             angle_noise=white(0.0 if filtered else loop.angle_noise, shape),
         ),
         count_angle=0.0 if filtered else loop.count_angle,
+        speed_step=loop.rounding,
         eccentric=0.0 if filtered else case.eccentric,
         friction=motors.static_voltage if case.drawn else np.array([case.friction.known]),
         modelled=case.swallowed,
@@ -178,7 +179,8 @@ def _reported_noise(case: Case, loop: Loop, shape: tuple[int, int]) -> Array | f
 
     They are of any size up to the top speed; it leaves out what no motor can change by.
     """
-    noise = white(loop.reported_noise, shape)
+    rounding = loop.rounding**2 / 12
+    noise = white(math.sqrt(max(loop.reported_noise**2 - rounding, 0.0)), shape)
     if noise is None or not case.outliers:
         return 0.0 if noise is None else noise
     motor = case.problem.plant.motors

@@ -426,6 +426,32 @@ def test_noise_of_a_recorded_speed_limits_the_gains():
     assert one.specification.overshoot.high > deaf.specification.overshoot.high
 
 
+def test_no_settling_is_stated_of_a_speed_that_is_rounded_by_more_than_its_band():
+    """Within a step the loop sees nothing; as noise of that size it would average it."""
+    step = 0.1 * 0.5 * 240.0
+    smooth = replace(
+        LOOP, counts_per_revolution=None, difference_window=0, speed_noise=0.289 * step
+    )
+    steps = replace(smooth, speed_step=step)
+    seen, rounded = (design(estimate(), x, max_velocity=240.0) for x in (smooth, steps))
+    assert rounded.gains == seen.gains and math.isnan(rounded.specification.settling.high)
+    assert rounded.specification.overshoot.high > 3.0  # half of a step, less what sees it
+    assert replace(steps, speed_noise=0.4 * step).rounding == 0.0  # of so much noise it is a mean
+    fine = design(estimate(), replace(steps, speed_noise=0.03 * step, speed_step=0.1 * step))
+    assert math.isfinite(fine.specification.settling.high)
+    rng, T = np.random.default_rng(8), 0.01
+    voltage = np.repeat(rng.uniform(-10.0, 10.0, 60), 30)
+    speed = np.zeros(voltage.size)
+    decay = math.exp(-T / MOTOR["time_constant"])
+    for k in range(1, speed.size):
+        speed[k] = decay * speed[k - 1] + (1 - decay) * MOTOR["dc_gain"] * voltage[k]
+    shown = Record("m", T * np.arange(speed.size), voltage, velocity=step * np.round(speed / step))
+    found = identify(replace(shown, hardware=Hardware(1.0, None, 0, 12.0)))
+    assert tuning.loop_for(
+        found, parser().parse_args(["identification"])
+    ).rounding == pytest.approx(step)
+
+
 def test_of_a_fast_loop_no_more_delay_is_asked_than_it_bears():
     """Two milliseconds are ten samples at 5 kHz: such an answer would be unstable."""
     fast = replace(LOOP, sample_time=2e-4, delay=2e-4, counts_per_revolution=None)
