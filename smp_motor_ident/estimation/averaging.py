@@ -39,7 +39,8 @@ def weights(data: Sequence[Experiments], fits: Sequence[Fit], seed: int = 0) -> 
     """Return the weight of each candidate, the choice first, by a Bayesian bootstrap of runs.
 
     What costs nothing is a mean over a window where the speed comes in coarse steps, a difference
-    of counts by its making, and a friction that the choice was found to do without.
+    of counts by its making, and a friction that the choice was found to do without.  What is late
+    is as likely as a second lag, or has the odds of the choice against it: half of the weight each.
     """
     rows = []
     for own, fit in zip(data, fits, strict=True):
@@ -69,12 +70,23 @@ def weights(data: Sequence[Experiments], fits: Sequence[Fit], seed: int = 0) -> 
     price += np.array([POLICY.second_lag * _slowly_filtered(f) for f in fits])
     total = shares @ runs.T + price
     each = np.exp(-0.5 * (total - total.min(axis=1, keepdims=True)))
+    late = np.array([_late_without_lag(o, f) for o, f in zip(data, fits, strict=True)])
+    either = late | np.array([f.structure.order == 2 for f in fits])
+    odds = each[:, either] * np.exp(-0.5 * POLICY.second_lag * late[either])
+    there = each[:, either].sum(axis=1) / np.maximum(odds.sum(axis=1), 1e-300)
+    each[:, either] = 0.5 * (each[:, either] + odds * there[:, None])
     return np.asarray((each / each.sum(axis=1, keepdims=True)).mean(axis=0))
 
 
 def _slowly_filtered(fit: Fit) -> bool:
     """Tell whether a speed's filter is slower than the motor, which few are."""
     return fit.structure.low_pass and 0.5 * fit.z.window > fit.z.time_constant
+
+
+def _late_without_lag(data: Experiments, fit: Fit) -> bool:
+    """Tell whether a delay or a mean stands where every motor has a second lag."""
+    s, late = fit.structure, {"delay"} if data.quantum > 0 else {"delay", "window"}
+    return s.order == 1 and (s.shift > 0 or not late.isdisjoint(s.free))
 
 
 def averaged(result: Answer, weight: Array, others: Sequence[Answer]) -> Answer:

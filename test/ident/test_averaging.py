@@ -11,9 +11,9 @@ from smp_motor_ident.estimation.averaging import averaged, candidate_weights, co
 from smp_motor_ident.estimation.fitted import Options
 from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.estimation.quantities import Answer, answer
-from smp_motor_ident.estimation.selection import FittedCandidate
+from smp_motor_ident.estimation.selection import POLICY, FittedCandidate
 from smp_motor_ident.likelihood.experiments import prepare
-from smp_motor_ident.model.structures import Electromechanical
+from smp_motor_ident.model.structures import Electromechanical, FirstOrder, SecondOrder
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import Quantity
 
@@ -59,6 +59,24 @@ def test_a_candidate_that_only_the_current_rejects_has_no_weight():
     other = replace(fit, z=fit.z.with_(ln_r=fit.z.ln_r + 0.02))
     assert weights([data, data], [fit, other])[1] < 1e-6
     assert np.ptp(weights([data, data], [fit, fit])) < 1e-9
+
+
+@pytest.mark.parametrize("name", ["delay", "window"])
+def test_what_is_late_is_as_likely_as_a_second_lag_or_has_the_odds_of_the_choice(name):
+    data = prepare([motors.record("rear_left", seconds=2.0)], False)
+    fit = initial_fit(data, FirstOrder(), Options())
+    data, second = replace(data, quantum=0.0), SecondOrder(shape=True)
+    lag = replace(fit, structure=second, z=second.complete(fit.z.with_second_lag(1e-7)))
+    late = replace(fit, structure=FirstOrder(**{name: True}))
+    known = replace(fit, structure=FirstOrder(**{name: True}, fixed={name: 0.0}))
+    # They answer alike: even odds or e^10 to 1 for the lag, but where the user states the other.
+    assert weights([data, data], [lag, late])[1] == pytest.approx(0.25, rel=0.01)
+    assert weights([data, data], [lag, known])[1] > 0.5
+    # Against a motor that is not late it has the price of a parameter, with a lag beside it or not.
+    price = np.exp(-0.5 * POLICY.price(1, fit.samples))
+    alone, among = weights([data] * 2, [fit, late]), weights([data] * 3, [fit, late, lag])
+    assert alone[1] / alone[0] == pytest.approx(price, rel=0.1)
+    assert among[1:].sum() / among[0] == pytest.approx(2 * price, rel=0.1)
 
 
 def test_a_candidate_that_did_not_settle_is_covered_as_far_as_it_explains_the_data():
