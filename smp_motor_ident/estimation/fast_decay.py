@@ -37,8 +37,7 @@ LITTLE = 0.02  # of the largest voltage: a friction from which more is found
 ALLOWED = {"size": (np.log(1e-3), np.log(1e4)), "share": (0.3, 1.0)}
 SHORTEST = 1e-9  # s, of a window
 DIFFERENCE = 1e-5  # of each parameter's scale, over which a derivative is taken
-FEW, MANY = 10, 40  # steps after which starts are ranked, and at most
-FINALISTS = 3  # starts that go on to the end
+STEPS = 40  # of a descent at most
 SETTLED = 3  # turns of initial states and the voltage of other data
 SECOND = (0.02, 0.2)  # second lags that are tried, of the first
 
@@ -70,10 +69,8 @@ def fitted(data: Experiments, near: Fit, full_duty: float, options: Options) -> 
     first = FirstOrder.like(first, friction="symmetric")
     problem = _Problem(data, replace(near, structure=first), full_duty)
     starts = [problem.start(z, np.log(size), SHARE) for z in _motors(data, near) for size in SIZES]
-    ahead = sorted((problem.descend(p, FEW) for p in starts), key=lambda r: float(r.cost))
-    # Status 0: it ran out of steps.
-    ends = [r if r.status else problem.descend(r.x, MANY) for r in ahead[:FINALISTS]]
-    found = min(ends, key=lambda r: float(r.cost))
+    # Far from its minimum a descent does not tell how deep that is: all go on to their ends.
+    found = min((problem.descend(p) for p in starts), key=lambda r: float(r.cost))
     best = problem.joint(found, options)
     z, _, driver = problem.unpacked(found.x)
     richer: list[tuple[Structure, Coordinates]] = [(first.with_(delay=True), z)]
@@ -82,7 +79,7 @@ def fitted(data: Experiments, near: Fit, full_duty: float, options: Options) -> 
     for structure, begin in richer:
         other = _Problem(data, replace(near, structure=structure), full_duty)
         p = other.start(begin, np.log(driver.size), driver.emf_share)
-        one = other.joint(other.descend(p, MANY), options)
+        one = other.joint(other.descend(p), options)
         best = min((j for j in (best, one) if j), key=lambda j: j.cost, default=None)
     return best
 
@@ -92,7 +89,7 @@ def continued(data: Experiments, joint: Joint, options: Options) -> Joint | None
     near = replace(joint.fit, initial=initial_of(data, joint.fit))
     problem = _Problem(data, near, joint.driver.full_duty)
     p = problem.start(joint.fit.z, np.log(joint.driver.size), joint.driver.emf_share)
-    return problem.joint(problem.descend(p, MANY), options)
+    return problem.joint(problem.descend(p), options)
 
 
 def voltage_of(data: Experiments, joint: Joint) -> Array:
@@ -191,6 +188,14 @@ class _Problem:
         segment = every * np.arange(len(self.data.starts) - 1) + len(self.names)
         return of_motor + [(segment + j, states[own]) for j, own in enumerate(self.own)]
 
+    @property
+    def _scale(self) -> Array:
+        """What is much of each parameter; slopes far from the minimum are no measure of that."""
+        out = np.ones(len(self.names) + len(self.own) * (len(self.data.starts) - 1))
+        for moved, scale in self._groups:
+            out[moved] = scale
+        return out
+
     def _slopes(self, p: Array) -> Array:
         here = self._misses(p)
         out = np.zeros((here.size, p.size))
@@ -202,7 +207,7 @@ class _Problem:
             out[rows, k if k < len(self.names) else moved[self.owner]] = slope
         return out
 
-    def descend(self, p: Array, steps: int) -> optimize.OptimizeResult:
+    def descend(self, p: Array, steps: int = STEPS) -> optimize.OptimizeResult:
         """Return where at most so many steps lead."""
         low, high = np.full(p.size, -np.inf), np.full(p.size, np.inf)
         for j, name in enumerate(self.names):
@@ -215,7 +220,7 @@ class _Problem:
         with np.errstate(all="ignore"):  # what runs away has a cost that says so
             found: optimize.OptimizeResult = optimize.least_squares(  # type: ignore[operator]
                 self._misses, np.clip(p, *inside), self._slopes, (low, high),
-                x_scale="jac", max_nfev=steps,
+                x_scale=self._scale, max_nfev=steps,
             )  # fmt: skip
         return found
 
