@@ -96,6 +96,8 @@ def likeliest(group: Sequence[Record], fit: Fit, hold: str, options: Options) ->
         return None
     best, *others = found
     near = [d.fit for d in others if cost(d) < cost(best) + price]
+    if plain < cost(best) + price:  # there may be none of them
+        near.append(fit)
     return replace(best, rivals=tuple(near))
 
 

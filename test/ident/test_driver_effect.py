@@ -12,15 +12,16 @@ from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.estimation import fast_decay
 from smp_motor_ident.estimation.driver_effect import DriverFit, driver_of, leaves_torque_noise
-from smp_motor_ident.estimation.driver_search import _measured
-from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.estimation.driver_search import _measured, likeliest
+from smp_motor_ident.estimation.fit import Fit, Options
+from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.model import driver
 from smp_motor_ident.model.coordinates import Coordinates
 from smp_motor_ident.model.driver import Driver, terminal_voltage
 from smp_motor_ident.model.measurement import SPEED
-from smp_motor_ident.model.structures import SecondOrder
+from smp_motor_ident.model.structures import FirstOrder, SecondOrder
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune.designer import design
@@ -35,7 +36,7 @@ def commands(seed: int) -> np.ndarray:
     return np.repeat(rng.uniform(-12.0, 12.0, 60), rng.integers(20, 40, 60))
 
 
-def run(voltage: np.ndarray, seed: int, most: float = math.inf) -> np.ndarray:
+def run(voltage: np.ndarray, seed: int, most: float = math.inf, noise: float = NOISE) -> np.ndarray:
     """Return the speed of a motor of first order with friction, exactly but for its stops.
 
     Its driver gives no more than ``most`` volts beyond the back-EMF.
@@ -51,7 +52,7 @@ def run(voltage: np.ndarray, seed: int, most: float = math.inf) -> np.ndarray:
             after = keep * w + (1 - keep) * GAIN * (volts - STATIC * direction)
             w = 0.0 if after * direction < 0.0 else after
         out[k] = w
-    return out + NOISE * np.random.default_rng(1000 + seed).standard_normal(out.size)
+    return out + noise * np.random.default_rng(1000 + seed).standard_normal(out.size)
 
 
 def dead(u: np.ndarray) -> np.ndarray:
@@ -203,6 +204,18 @@ def test_a_plain_driver_has_no_effect():
     found = estimate(Record("motor", time, command, velocity=run(command, 5)))
     assert driver_of(found).kind == driver.NOTHING
     assert not set(DRIVERS) & set(found.combinations)
+
+
+def test_a_driver_that_explains_hardly_more_than_none_leaves_room_for_none():
+    command = commands(2)
+    speed = run(np.sign(command) * np.maximum(np.abs(command) - 0.023, 0.0), 2, noise=2.0)
+    record = Record("motor", np.arange(command.size) * STEP, command, velocity=speed)
+    plain = initial_fit(prepare([record], False), FirstOrder(), Options())
+    found = likeliest([record], plain, "held", Options())
+    friction = plain.structure.free.index("vc_plus")
+    std = math.sqrt(found.widened(found.fit).covariance()[friction, friction])
+    # What lies between the two is within one deviation.
+    assert abs(plain.z.vc_plus - found.fit.z.vc_plus) <= std
 
 
 def test_a_declared_driver_is_taken_for_known():
