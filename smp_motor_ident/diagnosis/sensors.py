@@ -69,9 +69,10 @@ def _late_command(shift: float) -> Finding:
 def _filtered_speed(fit: Fit) -> Finding:
     """Say over what the speed's sensor averages, or how it low-passes."""
     window, lag = fit.z.window, 0.5 * fit.z.window
-    low = fit.structure.low_pass
+    low, ticks = fit.structure.low_pass, fit.structure.ticks
     how = (
         f"low-passed with a time constant of {1e3 * lag:.3g} ms"
+        + (f", by {ticks} samples a row" if ticks else "")
         if low
         else f"averaged over {1e3 * window:.3g} ms"
     )

@@ -22,6 +22,7 @@ from smp_motor_ident.model.structures import FirstOrder, SecondOrder, Structure
 HARDLY = 0.01  # of a sample: a window that is as good as none, for the score
 WINDOWS = (1.0, 4.0)  # samples at which a low-pass is begun
 SHARES = (0.6, 0.2)  # of a time constant that are the motor's, beside a filter's of its speed
+TICKS = (1, 2, 5, 10)  # samples that a digital low-pass takes a row
 WINDING = 0.05  # of a motor's time constant, as which a second lag is begun
 DELAYS = (0.3, 1.5, 3.5)  # samples at which a delay is begun that torque noise may have hidden
 
@@ -157,6 +158,31 @@ def with_low_pass(
         return other
     candidates.append(FittedCandidate(simple, f"as good as {other.structure.label}"))
     return simple
+
+
+def with_digital_filter(
+    data: Experiments,
+    best: Fit,
+    options: Options,
+    candidates: list[FittedCandidate],
+    say: Callable[[str], None],
+) -> Fit:
+    """Return the fit, or one whose speed is smoothed sample by sample where that explains more.
+
+    It spreads an impulse further than a continuous one that is as late, which else would be missing
+    from L/R, or stand for a current that comes late.
+    """
+    s = best.structure
+    if not (s.window and s.low_pass):
+        return best
+    for ticks in TICKS:
+        structure = s.with_(ticks=ticks)
+        say(f"trying {structure.label}")
+        tried = _filtered(data, structure, best, best.z, options)
+        verdict, reason = POLICY.preferred(best, tried)
+        candidates.append(FittedCandidate(tried, reason))
+        best = tried if verdict else best
+    return best
 
 
 def with_filter_for_lag(

@@ -27,7 +27,7 @@ from smp_motor_ident.estimation.prediction import simulate
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.passes import gather
 from smp_motor_ident.model.coordinates import LOGARITHMS, PLAUSIBLE
-from smp_motor_ident.model.measurement import ANGLE, LOW_PASSED
+from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.model.structures import sensor_of
 
 FEWEST = 4  # parts of which a scatter can be taken
@@ -301,7 +301,7 @@ def _parted(data: Experiments, fit: Fit, parts: int) -> Experiments:
         )
         if data.kind != ANGLE or not np.isfinite(data.output[begin]):
             initial[n, 2] = predicted[begin, 1] if data.kind == ANGLE else 0.0
-        if data.kind == LOW_PASSED:
+        if data.kind.low_passed:
             initial[n, 2] = predicted[begin, 1] - predicted[begin, 0]
     return replace(data, starts=starts, hold_start=np.append(first, data.hold_start[-1]),
                    initial=initial, current=current)  # fmt: skip

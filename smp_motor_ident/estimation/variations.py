@@ -10,6 +10,7 @@ from smp_motor_ident.estimation.candidate_starts import of_kind
 from smp_motor_ident.estimation.current_lag import with_current_lag
 from smp_motor_ident.estimation.delay_and_averaging import (
     delay_without_noise,
+    with_digital_filter,
     with_filter_for_lag,
     with_low_pass,
 )
@@ -31,6 +32,7 @@ def varied(
     """Add what the data ask for, take away what they do not show."""
     best = with_filter_for_lag(data, best, options, candidates, say)
     best = with_low_pass(data, best, options, candidates, say)
+    best = with_digital_filter(data, best, options, candidates, say)
     data = data.measured_as(best.kind)
     before = None
     while before != best.structure:  # what was added may have hidden that the rest is there, too

@@ -1,7 +1,8 @@
 """A speed behind a first-order low-pass, ``lag y' = w - y``, from sample to sample.
 
 Between two samples the speed is taken for the parabola that has its values at both and the angle
-between them for its integral: the low-pass answers that exactly.
+between them for its integral: the low-pass answers that exactly, as does a digital one that takes
+equally many samples of it in each interval.
 Derivation: docs/derivations.md, section 4.
 """
 
@@ -43,11 +44,28 @@ def _moments(x: float, moment: Array, slope: Array) -> None:
 
 
 @compiled
-def weigh(h: float, lag: float, weights: Array) -> None:
+def _sampled_moments(x: float, ticks: int, moment: Array, slope: Array) -> None:
+    """Put the same of ``y += a (w - y)``, ``a = x / (x + ticks)``, at the ends of equal parts."""
+    a, by_x = x / (x + ticks), ticks / (x + ticks) ** 2
+    moment[:], slope[:] = 0.0, 0.0
+    for left in range(ticks):
+        kept = (1 - a) ** left
+        weight, change = a * kept, (kept - a * left * kept / (1 - a)) * by_x
+        u = (ticks - left) / ticks
+        for n in range(3):
+            moment[n] += weight * u**n
+            slope[n] += change * u**n
+
+
+@compiled
+def weigh(h: float, lag: float, ticks: int, weights: Array) -> None:
     """Put the weights of a step of the low-pass, and their derivatives by the lag."""
     moment, slope = np.empty(3), np.empty(3)
     x = h / lag
-    _moments(x, moment, slope)
+    if ticks:
+        _sampled_moments(x, ticks, moment, slope)
+    else:
+        _moments(x, moment, slope)
     weights[0] = h
     for at, m, share in ((1, moment, 1.0), (5, slope, -x / lag)):
         weights[at] = share * ((1.0 if at == 1 else 0.0) - m[0])
@@ -57,7 +75,9 @@ def weigh(h: float, lag: float, weights: Array) -> None:
 
 
 @compiled
-def low_passed(first: bool, t: float, lag: float, x: Array, m: Array, kept: Array, p: int) -> float:
+def low_passed(
+    first: bool, t: float, lag: float, ticks: int, x: Array, m: Array, kept: Array, p: int
+) -> float:
     """Return the low-passed speed at a sample; put its derivative into D0.
 
     It begins ahead of the speed by the number in the angle's place, of which only differences
@@ -73,7 +93,7 @@ def low_passed(first: bool, t: float, lag: float, x: Array, m: Array, kept: Arra
     else:
         h = t - before[0]
         if c[0] != h:
-            weigh(h, lag, c)
+            weigh(h, lag, ticks, c)
         mean = (angle - before[1]) / h
         y = c[1] * before[3] + c[2] * before[2] + c[3] * speed + c[4] * mean
         by_lag = c[5] * before[3] + c[6] * before[2] + c[7] * speed + c[8] * mean

@@ -79,8 +79,9 @@ def observe(
         for j in range(p):
             m[D0 + j] = (m[ST + j] - past[1 + j] + (speed - y) * m[ON_WINDOW + j]) / width
         return y
-    if kind == LOW_PASSED:
-        return low_passed(k == first, t, 0.5 * par[WINDOW], x, m, ring, past.shape[0] - 1)
+    if kind >= LOW_PASSED:
+        lag, ticks, p = 0.5 * par[WINDOW], kind - LOW_PASSED, past.shape[0] - 1
+        return low_passed(k == first, t, lag, ticks, x, m, ring, p)
     if columns:
         if kind == ANGLE:
             for j in range(LANES):

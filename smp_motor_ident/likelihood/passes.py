@@ -22,7 +22,7 @@ from smp_motor_ident.likelihood.normal_equations import eliminate
 from smp_motor_ident.likelihood.sensitivities import LANES
 from smp_motor_ident.model.columns import CURRENT_LAG, WINDOW
 from smp_motor_ident.model.coordinates import Coordinates
-from smp_motor_ident.model.measurement import ANGLE, LOW_PASSED, MEAN_SPEED, SPEED
+from smp_motor_ident.model.measurement import ANGLE, MEAN_SPEED, SPEED
 from smp_motor_ident.model.structures import SENSORS, Structure, sensor_of
 
 LEAST_LAG = 1e-3  # of a sample: of a sensor that shows the current as good as at once
@@ -121,7 +121,7 @@ def own_columns(data: Experiments, structure: Structure) -> tuple[int, ...]:
 
     In the angle's place a low-passed speed has what it is ahead of the speed at first.
     """
-    angle = (2,) if data.kind in (ANGLE, LOW_PASSED) else ()
+    angle = (2,) if data.kind == ANGLE or data.kind.low_passed else ()
     own = (1,) if structure.order == 1 else (0, 1)
     earlier = (4,) if structure.lags else ()
     return own + angle + ((3,) if structure.own_load else ()) + earlier
@@ -180,7 +180,7 @@ def gather(
 
 def _ring(data: Experiments, par: Array, p: int) -> Array:
     """Return the memory for the filter of a speed."""
-    if data.kind == LOW_PASSED:
+    if data.kind.low_passed:
         return np.zeros((2, max(4 + 3 * p, LOW_PASS_WEIGHTS)))
     if data.kind != MEAN_SPEED:
         return np.zeros((0, 0))

@@ -13,6 +13,11 @@ class Measurement:
     code: int  # by which the compiled pass calls it
     integrals: int = 0  # how often the speed is integrated to it
 
+    @property
+    def low_passed(self) -> bool:
+        """Whether it is a low-pass of the speed."""
+        return self.code >= LOW_PASSED.code
+
 
 SPEED = Measurement("speed", 0)
 """The speed at the stamp [rad/s]."""
@@ -22,3 +27,8 @@ MEAN_SPEED = Measurement("mean speed", 2)
 """The mean of the speed over a trailing window [rad/s]."""
 LOW_PASSED = Measurement("low-passed speed", 3)
 """A first-order low-pass of the speed that is as late as the mean over a window [rad/s]."""
+
+
+def smoothed(ticks: int) -> Measurement:
+    """Return a low-pass that takes so many samples of the speed a row; continuous for none."""
+    return Measurement(LOW_PASSED.name, LOW_PASSED.code + ticks)

@@ -16,7 +16,7 @@ import numpy as np
 
 from smp_motor_control.arrays import Array
 from smp_motor_ident.model.coordinates import NAMES, Coordinates, direction, place
-from smp_motor_ident.model.measurement import LOW_PASSED, MEAN_SPEED, SPEED, Measurement
+from smp_motor_ident.model.measurement import MEAN_SPEED, SPEED, Measurement, smoothed
 
 S = TypeVar("S", bound="Structure")
 Gradients = dict[str, tuple[float, Array]]
@@ -47,6 +47,7 @@ class Structure(ABC):
     delay: bool = False
     window: bool = False
     low_pass: bool = False  # whether a low-pass of half the window's lag stands in its place
+    ticks: int = 0  # samples of the speed that a digital one takes a row
     # How the command ran: a row's value before it, after it, or interpolated from row to row
     held: str = "before"
     shift: float = 0.0  # by how much later than recorded such a command ran as a whole [s]
@@ -73,7 +74,7 @@ class Structure(ABC):
         """What the sensor shows of the speed."""
         if not self.has("window"):
             return SPEED
-        return LOW_PASSED if self.low_pass else MEAN_SPEED
+        return smoothed(self.ticks) if self.low_pass else MEAN_SPEED
 
     @property
     def lags(self) -> bool:
@@ -163,7 +164,8 @@ class Structure(ABC):
         yield self.load, "load"
         yield self.delay, "delay"
         yield self.window and not self.low_pass, "averaged speed"
-        yield self.window and self.low_pass, "low-passed speed"
+        yield self.window and self.low_pass and not self.ticks, "low-passed speed"
+        yield self.window and self.ticks > 0, f"speed smoothed {self.ticks} times a row"
         yield self.held == "after", "command held after its row"
         yield self.held == "interpolated", "command interpolated"
 

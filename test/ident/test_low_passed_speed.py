@@ -12,7 +12,6 @@ from smp_motor_ident.estimate import estimate
 from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.likelihood.noise import NoiseModel
 from smp_motor_ident.likelihood.passes import gather
-from smp_motor_ident.model.measurement import LOW_PASSED
 from smp_motor_ident.model.physical import from_physical
 from smp_motor_ident.model.structures import Electromechanical, SecondOrder
 from smp_motor_ident.record import Record
@@ -22,8 +21,13 @@ STEP = 5e-3
 FINE = 50  # parts of a sample in which the tests' own motor and filter run
 
 
-def filtered(lag, static_voltage, seconds=10.0, noise=0.0, kind="fourier", wheel="rear_left"):
-    """Return a record of a motor of Table 1 whose speed went through a low-pass."""
+def filtered(
+    lag, static_voltage, seconds=10.0, noise=0.0, kind="fourier", wheel="rear_left", ticks=0
+):
+    """Return a record of a motor of Table 1 whose speed went through a low-pass, or a digital one.
+
+    That takes so many samples of the speed a row.
+    """
     n = int(seconds / STEP)
     t = np.arange(n * FINE) * STEP / FINE
     voltage = independent.excitation(np.arange(n) * STEP, kind, 10.0)
@@ -37,18 +41,23 @@ def filtered(lag, static_voltage, seconds=10.0, noise=0.0, kind="fourier", wheel
     gone = np.exp(-STEP / FINE / lag)
     mean = 0.5 * (out[1:, 1] + out[:-1, 1])
     speed = np.concatenate([[0.0], lfilter([1 - gone], [1, -gone], mean)])[::FINE]
+    if ticks:
+        a = STEP / (STEP + ticks * lag)
+        speed = lfilter([a], [1, a - 1], out[:: FINE // ticks, 1])[::ticks]
     rng = np.random.default_rng(2)
     speed = speed + noise * rng.standard_normal(n)
     amps = out[::FINE, 0] + 0.01 * rng.standard_normal(n)
     return Record("motor", np.arange(n) * STEP, voltage, amps, speed, source="bag")
 
 
+@pytest.mark.parametrize("ticks", [0, 1, 5])
 @pytest.mark.parametrize("lag", [0.1 * STEP, STEP, 30 * STEP])
-def test_prediction_is_that_of_a_filter_in_small_steps(lag):
-    record = filtered(lag, 0.3)
-    data = replace(prepare([record], True), initial=np.zeros((1, 5))).measured_as(LOW_PASSED)
+def test_prediction_is_that_of_a_filter_in_small_steps(lag, ticks):
+    record = filtered(lag, 0.3, ticks=ticks)
     p = independent.TABLE_1["rear_left"]
-    structure = Electromechanical(window=True, low_pass=True)
+    structure = Electromechanical(window=True, low_pass=True, ticks=ticks)
+    data = prepare([record], True).measured_as(structure.speed)
+    data = replace(data, initial=np.zeros((1, 5)))
     z = structure.complete(from_physical(*p, 0.3 * p[2] / p[0])).with_(window=2 * lag)
     out = np.zeros((data.size, 3))
     gather(data, structure, z, data.initial, NoiseModel(), out, differentiate=False)
@@ -57,11 +66,12 @@ def test_prediction_is_that_of_a_filter_in_small_steps(lag):
     assert np.median(np.abs(out[:, 1] - record.velocity)) < 2e-5 * np.ptp(record.velocity)
 
 
+@pytest.mark.parametrize("ticks", [0, 1, 5])
 @pytest.mark.parametrize("lag", [0.1 * STEP, STEP, 30 * STEP])
-def test_gradient_is_that_of_finite_differences(lag):
+def test_gradient_is_that_of_finite_differences(lag, ticks):
     record = filtered(STEP, 0.0, 3.0, noise=1.0)
-    data = prepare([record], False).measured_as(LOW_PASSED)
-    structure = SecondOrder(friction="none", window=True, low_pass=True)
+    structure = SecondOrder(friction="none", window=True, low_pass=True, ticks=ticks)
+    data = prepare([record], False).measured_as(structure.speed)
     z = structure.complete(from_physical(*independent.TABLE_1["rear_left"])).with_(window=2 * lag)
     matrix = structure.matrix
     gradient = gather(data, structure, z, data.initial).gradient[0]
@@ -75,14 +85,17 @@ def test_gradient_is_that_of_finite_differences(lag):
         assert gradient[j] == pytest.approx(-0.5 * (up - down) / (2 * step), abs=1e-4 * scale)
 
 
-@pytest.mark.parametrize("lag", [0.4 * STEP, 3 * STEP])
-def test_a_motor_with_current_is_found_behind_its_speed_s_low_pass(lag):
-    found = estimate(filtered(lag, 0.3, 20.0, noise=0.1))
+@pytest.mark.parametrize(
+    ("lag", "ticks"), [(0.4 * STEP, 0), (3 * STEP, 0), (3 * STEP, 1), (STEP, 5)]
+)
+def test_a_motor_with_current_is_found_behind_its_speed_s_low_pass(lag, ticks):
+    found = estimate(filtered(lag, 0.3, 20.0, noise=0.1, ticks=ticks))
     assert "low_passed_speed" in [f.code for f in found.findings]
     truth = motors.truth("rear_left", 0.3) | {"sensor_lag": lag}
     for name in ("sensor_lag", "dc_gain", "time_constant", "resistance", "inductance"):
         q = (found.parameters | found.combinations)[name]
         assert abs(q.value - truth[name]) < max(4 * q.std, 5e-3 * truth[name]), name
+        assert q.std < 3e-3 * truth[name]
     # What gains are computed for is that motor behind that filter.
     assert tuned.motors_of(found).sensor_lag[0] == pytest.approx(lag, rel=0.05)
 
