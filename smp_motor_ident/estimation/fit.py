@@ -291,7 +291,9 @@ def _bounds(data: Experiments) -> tuple[Coordinates, Coordinates]:
     logarithms = dict.fromkeys(LOGARITHMS, LARGEST)
     # Friction next to the largest voltage would put off a motor's start as long as one likes.
     most = MOST_FRICTION.value * float(np.abs(data.hold_value).max(initial=0.0))
-    upper = Coordinates(**{**free, **logarithms}).with_friction(max(most, 1e-9))
+    longest = max(float(np.ptp(data.time)), data.step)  # beyond it a sensor shows no motion at all
+    late = {"delay": longest, "window": 2 * longest, "current_lag": longest}
+    upper = Coordinates(**{**free, **logarithms, **late}).with_friction(max(most, 1e-9))
     lower = Coordinates.of(-upper.array).with_friction(0.0).with_(delay=0.0)
     lower = lower.with_(window=SHORTEST, current_lag=SHORTEST)
     if data.quantum > 0:  # a speed in coarse steps is a difference of counts, over a sample or more

@@ -186,13 +186,14 @@ def test_current_lost_at_every_other_sample_still_gives_the_motor():
     assert found.value("resistance") == pytest.approx(truth["resistance"], rel=0.01)
 
 
-def test_a_start_outside_the_bounds_is_taken_to_them():
+@pytest.mark.parametrize("window", [-0.1, 1e30])
+def test_a_start_outside_the_bounds_is_taken_to_them(window):
     record, _ = random_record(1)
     data = prepare([record], False).measured_as(MEAN_SPEED)
     structure = SecondOrder(friction="none", window=True)
-    z = Coordinates(*np.log([0.03, 1e-3, 1e-5])).with_(window=-0.1, ln_te=1e4)
+    z = Coordinates(*np.log([0.03, 1e-3, 1e-5])).with_(window=window, ln_te=1e4)
     fit = solve(data, structure, Start(z, data.initial, first_noise(data)), iterations=3)
-    assert fit.z.window > 0
+    assert 0 < fit.z.window <= 2 * np.ptp(data.time)
     assert np.all(np.isfinite(fit.z.array))
 
 
