@@ -42,7 +42,7 @@ def _speed_step(group: Sequence[Record], data: Experiments) -> float:
 def _angle_noise(group: Sequence[Record], data: Experiments, fit: Fit) -> float:
     """Return the noise of the angle that was recorded [rad], 0 where counts or a speed were.
 
-    Of a speed that is the difference of counts it is their rounding, which no loop is told of.
+    Of a speed that is the difference of counts it is their rounding, which no loop is given.
     """
     counted = any(r.count is not None and r.hardware.counts_per_revolution for r in group)
     if data.kind != ANGLE or counted:
