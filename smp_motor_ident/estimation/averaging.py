@@ -58,11 +58,11 @@ def weights(data: Sequence[Experiments], fits: Sequence[Fit], seed: int = 0) -> 
     runs = np.array(rows)
     rng = np.random.default_rng(seed)
     shares = rng.dirichlet(np.ones(BLOCKS), DRAWS) * BLOCKS
-    # Of a choice between two holds nobody knows the odds: a second lag is as likely as the later.
+    # Of two holds nobody knows the odds, and a second lag is as likely as the later hold.
     rubs = fits[0].structure.friction
     sizes = [
         (s.with_(friction=rubs) if rubs == "none" else s).size
-        + (s.shift > 0)
+        + (s.order == 1 and s.shift > 0)
         - (own.quantum > 0 and s.window)
         for own, s in zip(data, (f.structure for f in fits), strict=True)
     ]
