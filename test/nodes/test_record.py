@@ -80,7 +80,7 @@ def test_best_effort_messages_are_recorded_or_told_as_lost(
     publishers = [node.create_publisher(MotorState, name, BEST_EFFORT) for name in names]
     recorder = process("record", "--output", bag)
     eventually(lambda: all(p.get_subscription_count() for p in publishers), deadline=20.0)
-    sent = publish_steadily(publishers, 2000, 1000.0)
+    sent = publish_steadily(publishers, 1000, 250.0)
     # Nobody acknowledges best effort: it is all there when no more comes.
     seen: list[int] = []
 
@@ -96,9 +96,9 @@ def test_best_effort_messages_are_recorded_or_told_as_lost(
     for name in names:
         places = [sent.index(data) for data in found[name]]
         assert places == sorted(set(places))
-        # The kernel of DDS holds some hundred messages for a process that does not run: a machine
-        # that stands still for a tenth of a second may lose as many.
-        assert len(places) > 1700
+        # The kernel holds some hundred messages for a process that does not run: a machine that
+        # stands still for half a second may lose as many.
+        assert len(places) > 850
         lost = places[-1] - places[0] + 1 - len(places)
         said = re.search(rf"{name}  \((\d+) lost\)", recorder.output)
         assert lost == (int(said[1]) if said else 0)
