@@ -92,8 +92,9 @@ def _lag(data: Experiments, angle: Array) -> int:
     first = float(np.nanstd(_means(data, angle, 1)))
     lag = 1
     while noise / (lag * data.step) > COARSE * first and 8 * lag < data.size:
-        if np.nanstd(_means(data, angle, 2 * lag)) < 0.7 * first:
-            break  # longer, and the motion itself would be averaged away
+        longer = _means(data, angle, 2 * lag)
+        if np.isnan(longer).all() or np.nanstd(longer) < 0.7 * first:
+            break  # no segment is as long, or the motion itself would be averaged away
         lag *= 2
     return lag
 

@@ -8,6 +8,7 @@ import pytest
 
 from smp_motor_ident.diagnosis import validation
 from smp_motor_ident.estimate import estimate
+from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.record import Record
 
 RATE = 2000.0
@@ -38,3 +39,10 @@ def test_held_out_data_are_judged_by_what_their_sensor_can_show(monkeypatch, sha
         found = estimate(weaker(volts, share, 200.0))
     assert judged
     assert ("validation" in [f.code for f in found.findings]) == (share < 1.0)
+
+
+def test_no_speed_is_a_mean_over_more_than_the_longest_segment():
+    record = motors.record("rear_left", current=False, seconds=2.0)
+    record = replace(record, starts=tuple(range(0, len(record), 6)))
+    data = replace(prepare([record], False, "auto", "held"), quantum=1.0)  # far above its motion
+    assert validation._lag(data, data.output) < 6
