@@ -95,6 +95,11 @@ class Pid:
         """Time constant [s] of back-calculation in force, its default filled in."""
         return self._tracking
 
+    @property
+    def saturated(self) -> bool:
+        """Whether the clamps changed the last command."""
+        return self._last.saturated
+
     def step(
         self,
         reference: float,

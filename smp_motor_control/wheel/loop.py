@@ -16,6 +16,7 @@ from smp_motor_control.observer import ObserverNoise, SpeedObserver
 from smp_motor_control.pid import Pid, PidGains, PidOutput
 from smp_motor_control.reference.path import ReferencePath
 from smp_motor_control.reference.profile import Drive, Profile, ProfileLimits, Reference
+from smp_motor_control.wheel.differenced import differenced_gains
 from smp_motor_control.wheel.plausibility import PlausibleSpeed
 from smp_motor_control.wheel.standstill import Standstill
 
@@ -103,6 +104,7 @@ class WheelLoop:
         self.reference = Reference(0.0, 0.0, 0.0)
         self._path = ReferencePath(self.profile)
         self.source, self.jumps = "measured", 0
+        self._late = 0.0  # by which counts differenced in the observer's place are later [s]
         self._standstill = Standstill()
         self._plausible = PlausibleSpeed()
         self.configure(settings)
@@ -118,7 +120,7 @@ class WheelLoop:
     def configure(self, settings: LoopSettings) -> None:
         """Change settings while running, without a jump of the output."""
         old, self.settings = self.settings, settings
-        self.pid.set_gains(settings.gains)
+        self.pid.set_gains(self._gains(self._late))
         self.profile.configure(settings.limits, settings.transition_time, settings.drive)
         self._plausible.configure(
             settings.gains, settings.drive, settings.implausible_jump, settings.reference_delay
@@ -131,6 +133,8 @@ class WheelLoop:
 
     def renew_speed(self) -> None:
         """Make the speed's source anew from the settings."""
+        if self._late:
+            self._trust(True)
         self._observer: SpeedObserver | None = None
         self._differenced: DifferencedSpeed | None = None
         self._count: int | None = None  # of the last sample
@@ -201,8 +205,30 @@ class WheelLoop:
         assert observer is not None and self._gearbox is not None
         self._count = count
         speed = observer.step(count, voltage, dt)
-        self.source = "observer" if observer.trusted else "difference (observer not trusted)"
+        trusted = observer.trusted
+        self.source = "observer" if trusted else "difference (observer not trusted)"
+        if trusted == (self._late > 0.0):
+            self._trust(trusted, dt)
         return self._gearbox.to_wheel(speed)
+
+    def _trust(self, observer: bool, dt: float = 0.0) -> None:
+        """Go on with the gains for the observer, or those for counts differenced in its place.
+
+        The integral of a command beyond its clamps is no load's, and is not kept.
+        """
+        self._late = 0.0 if observer else 0.5 * self.settings.difference_window * dt
+        self.pid.reset(save_i_term=observer or not self.pid.saturated)
+        self.pid.set_gains(self._gains(self._late))
+
+    def _gains(self, late: float) -> PidGains:
+        """Return the gains for a speed that is so much later than the observer's [s]."""
+        settings = self.settings
+        if not late:
+            return settings.gains
+        assert settings.model is not None and self._gearbox is not None
+        return differenced_gains(
+            settings.gains, settings.model, self._gearbox.ratio, late, settings.difference_window
+        )
 
     def start(self, measurement: float) -> None:
         """Close the loop on a wheel that turns at ``measurement``, without a jump."""
@@ -231,7 +257,7 @@ class WheelLoop:
         if settings.reference_delay:
             path = self._path
             now = path.step(setpoint, dt)
-            delay, doubt = settings.reference_delay, settings.reference_doubt
+            delay, doubt = settings.reference_delay + self._late, settings.reference_doubt
             nominal, compared = path.ago(delay, doubt, measurement)
             forward = path.forward(compared, settings.gains, settings.model)
             self.reference = now._replace(velocity=nominal)

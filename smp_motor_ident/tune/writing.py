@@ -1,15 +1,18 @@
 """Designs as files: the parameter file of the wheel nodes, and ``gains.json``."""
 
+import bisect
 import dataclasses
 import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from smp_motor_control.motor.model import MotorModel
 from smp_motor_control.parameter_file import written
 from smp_motor_control.wheel.controller import WheelSettings
+from smp_motor_control.wheel.differenced import differenced_gains
 from smp_motor_ident.result import plain
 from smp_motor_ident.tune.designer import Design
-from smp_motor_ident.tune.limits import DELAY_BORNE, JUMP
+from smp_motor_ident.tune.limits import JUMP
 from smp_motor_ident.tune.loop import Loop
 
 SCHEMA = 1
@@ -40,15 +43,20 @@ def _window(design: Design) -> int:
     """Return the samples to difference counts over.
 
     An observer that its counts contradict is replaced by their difference, over as many samples as
-    make its noise one that the loop allows, but not so many that it does not bear their delay.
+    make a count no more than the control noise that the loop allows, with the gains that take
+    their place.
     """
-    loop, gains = design.loop, design.feedback
-    given = loop.speed_source != "observer" or loop.averaging_given
-    if given or not math.isfinite(design.margins.delay):
+    loop, motor = design.loop, MotorModel(**design.motor)
+    if loop.speed_source != "observer" or loop.averaging_given:
         return int(max(loop.difference_window, 1))
-    volts = gains.p + gains.d / max(gains.filter_time, loop.sample_time)  # per rad/s, at once
-    quiet = math.ceil(volts * loop.count_angle * loop.rate / loop.noise_limit)
-    return max(min(quiet, int(2 * DELAY_BORNE.value * design.margins.delay * loop.rate), 1000), 1)
+    quantum = loop.count_angle / loop.gear_ratio
+
+    def quiet(window: int) -> bool:
+        span = window * loop.sample_time
+        gains = differenced_gains(design.gains, motor, loop.gear_ratio, 0.5 * span, window)
+        return gains.p * quantum <= loop.noise_limit * span
+
+    return bisect.bisect_left(range(1000), True, lo=1, key=quiet)
 
 
 def _plausible(top_speed: float, loop: Loop) -> dict[str, float]:

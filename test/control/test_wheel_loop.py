@@ -8,12 +8,14 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from smp_motor_control.encoder import Encoder
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.motor.model import MotorModel
 from smp_motor_control.motor.parameters import Gearbox
+from smp_motor_control.motor.response import zero_order_hold
 from smp_motor_control.observer import ObserverNoise
 from smp_motor_control.pid import PidGains
 from smp_motor_control.reference.profile import ProfileLimits
@@ -181,3 +183,45 @@ def test_switching_the_delay_on_begins_its_past_at_the_present_reference() -> No
         loop.step(9.0, 0.0, DT)
         # No further than the acceleration goes in the samples by which the delay is changed.
         assert abs(loop.reference.velocity - then) <= 6 * DT
+
+
+def clipped(clip: float, samples: int = 1500) -> tuple[list[float], list[float], list[str]]:
+    """Return speeds, voltages and sources of a wheel that goes to 0.7 rad/s behind a clip [V].
+
+    Gains are what the observer bears at 5 kHz; nobody knows of the clip.
+    """
+    ratio, dt = 65.0, 2e-4
+    model = MotorModel(dc_gain=2.4, time_constant=0.032, time_constant_product=8.7e-5)
+    gains = PidGains(
+        p=457.0, i=1e5, d=1.9, derivative_filter_time_constant=1.4e-4, u_clamp_min=-48.0,
+        u_clamp_max=48.0, feedforward_velocity=ratio / 2.4, feedforward_acceleration=0.87,
+        antiwindup_strategy="back_calculation", tracking_time_constant=4e-3,
+    )  # fmt: skip
+    settings = LoopSettings(
+        gains=gains, transition_time=0.05, reference_delay=dt, reference_doubt=9e-4,
+        speed_source="observer", difference_window=4, model=model,
+    )  # fmt: skip
+    loop = WheelLoop(settings, Gearbox(ratio), Encoder(2000.0), 72.0)
+    angle, command, state = 0.0, 0.0, np.zeros(2)
+    held = zero_order_hold(2.4, 0.032, 8.7e-5, np.array([dt]))
+    speeds, voltages, sources = [], [0.0, 0.0], []
+    for k in range(samples):
+        measured = loop.speed(dt, 0.0, math.floor(angle * 2000.0 / math.tau), voltages[-2])
+        if measured == measured:
+            command = loop.step(0.7 if k >= 2 * LEARNT else 0.0, measured, dt).output
+        voltages.append(command)
+        drive = min(max(voltages[-2], -clip), clip)
+        angle += float(held.angle_transition[0] @ state + held.angle_forced[0] * drive)
+        state = held.transition[0] @ state + held.forced[0] * drive
+        speeds.append(state[0] / ratio)
+        sources.append(loop.source)
+    return speeds, voltages, sources
+
+
+@pytest.mark.parametrize("clip", [48.0, 21.0, 19.2])  # 18.96 V are 0.7 rad/s
+def test_a_wheel_whose_observer_is_contradicted_stays_calm_and_reaches_its_speed(clip) -> None:
+    speeds, voltages, sources = clipped(clip)
+    assert ("difference (observer not trusted)" in sources) == (clip < 48.0)
+    assert speeds[-500:] == pytest.approx([0.7] * 500, rel=0.02)
+    assert np.ptp(voltages[-500:]) < 0.2 * 48.0  # not all of both, to and fro
+    assert max(speeds) < 1.1 * 0.7
