@@ -8,7 +8,7 @@ import numpy as np
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.estimation.driver_effect import driver_of
 from smp_motor_ident.finding import Finding
-from smp_motor_ident.model.driver import Driver
+from smp_motor_ident.model.driver import Driver, terminal_voltage
 from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune.ensemble import Robustness, UncertaintyEnsemble, back_off, softer
 from smp_motor_ident.tune.feedback import Feedback
@@ -72,6 +72,14 @@ class Case:
     def swallowed(self) -> float:
         """Voltage [V] that is surely lost before the motor turns, which feed-forward adds."""
         return self.friction.known + self.driver.threshold
+
+    @property
+    def breakaway(self) -> float:
+        """Least command [V] at which the motor must turn, whatever load there is; the supply's."""
+        commands = np.linspace(0.0, self.problem.loop.supply_voltage, 256)
+        put_out = [terminal_voltage(self.driver, v, 0.0, v, 1.0)[0] for v in commands.tolist()]
+        enough = int(np.searchsorted(put_out, self.friction.planned + self.load))
+        return float(commands[min(enough, commands.size - 1)])
 
 
 def prepare(estimate: Estimate, loop: Loop, method: str, targets: dict[str, Any]) -> Case:

@@ -46,6 +46,7 @@ class Design:
     wheel: str = ""  # whose gains these are
     findings: tuple[Finding, ...] = ()  # what the user should know beside
     feedback: Feedback = field(default_factory=lambda: Feedback(0.0, 0.0))
+    breakaway: float = 0.0  # command at which the motor must turn [V]
 
     @property
     def wheel_reference(self) -> Reference:
@@ -130,6 +131,7 @@ def finish(case: Case, feedback: Feedback, factor: float, robustness: Robustness
         wheel=case.wheel,
         findings=findings,
         feedback=feedback,
+        breakaway=case.breakaway,
     )
 
 

@@ -10,6 +10,7 @@ from smp_motor_control.motor.model import MotorModel
 from smp_motor_control.parameter_file import written
 from smp_motor_control.wheel.controller import WheelSettings
 from smp_motor_control.wheel.differenced import differenced_gains
+from smp_motor_control.wheel.faults import FaultLimits
 from smp_motor_ident.result import plain
 from smp_motor_ident.tune.designer import Design
 from smp_motor_ident.tune.limits import JUMP
@@ -36,6 +37,7 @@ def parameters(design: Design) -> dict[str, Any]:
         "difference_window": _window(design),
         "model": {name: float(value) for name, value in design.motor.items()},
         **_plausible(reference.drive.top_speed, design.loop),
+        **_must_turn(design.breakaway),
     }
 
 
@@ -70,6 +72,11 @@ def _plausible(top_speed: float, loop: Loop) -> dict[str, float]:
     if loop.reported_noise:
         limits["implausible_jump"] = JUMP.value * loop.reported_noise / loop.gear_ratio
     return limits
+
+
+def _must_turn(breakaway: float) -> dict[str, float]:
+    """Return the voltage from which a wheel that stands is at fault, where the usual is too low."""
+    return {"stall_voltage": breakaway} if breakaway > FaultLimits().stall_voltage else {}
 
 
 def gains_yaml(designs: Mapping[str, Design], provenance: Iterable[str]) -> str:

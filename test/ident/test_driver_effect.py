@@ -26,6 +26,7 @@ from smp_motor_ident.record import Record
 from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune.designer import design
 from smp_motor_ident.tune.loop import Loop
+from smp_motor_ident.tune.writing import parameters
 
 GAIN, TAU, STATIC, STEP = 20.0, 0.08, 0.4, 0.005
 NOISE = 0.3  # rad/s
@@ -248,6 +249,22 @@ def test_gains_are_for_motor_and_driver():
     assert clip.gains.u_clamp_max == pytest.approx(9.0, abs=0.05)
     slew = design(estimated("slew_rate", 0), loop)
     assert slew.loop.loop_delay == pytest.approx(STEP + 0.5 * 12.0 / 200.0, abs=1e-3)
+
+
+def test_a_wheel_that_its_driver_holds_back_is_no_stall():
+    """Feed-forward knows no driver that coasts: the integral passes the usual 4 V on its way."""
+    loop = Loop(sample_time=STEP, gear_ratio=1.0, counts_per_revolution=None, supply_voltage=12.0)
+    plain = estimated("dead_zone", 0)
+    assert "stall_voltage" not in parameters(design(plain, loop))
+    coast = Finding("coast", "warning", "", {"size": 4.0, "full_duty": 12.0, "emf_share": 1.0})
+    must_turn = parameters(design(replace(plain, findings=(coast,)), loop))["stall_voltage"]
+    # The mean of the current's triangle from rest: v^2 / (size supply), less what decays meanwhile.
+    assert 4.0 < math.sqrt(STATIC * 4.0 * 12.0) < must_turn < 5.0
+    short, enough = (
+        terminal_voltage(Driver(driver.COAST, 4.0, 12.0), share * must_turn, 0.0, 0.0, STEP)[0]
+        for share in (0.95, 1.05)
+    )
+    assert short < STATIC < enough
 
 
 @pytest.mark.parametrize("name", DRIVERS)
