@@ -81,7 +81,7 @@ def _filtered_speed(fit: Fit) -> Finding:
         "warning",
         f"the speed is {how}: {1e3 * lag:.3g} ms of what looks like a delay is that filter, not "
         "the motor",
-        {"lag": lag} if low else {"window": window},
+        {"lag": lag, "samples_per_row": ticks} if low else {"window": window},
     )
 
 
