@@ -116,7 +116,10 @@ def _find_noise_ratio(
         return min(
             free_run, best, key=lambda f: f.deviance + TORQUE_NOISE.value * (f.noise_ratio > 0)
         )
-    for factor in (1.0, 0.3, 0.1, 0.03, 0.01):
+    # Where a current was kept under any load, down from where the angle was followed at once.
+    fastest = (first.noise_ratio / part.step) ** 0.25 / band if structure.current else 1.0
+    above = fastest * 0.3 ** np.arange(round(np.log(max(fastest, 1.0)) / np.log(1 / 0.3)))
+    for factor in (*above, 1.0, 0.3, 0.1, 0.03, 0.01):
         here = fitted(here, noise_ratio_of(band * factor, part.step, part.kind), 20)
         path[float(np.log(factor))] = here
         worst = here.deviance - min(f.deviance for f in path.values())

@@ -23,6 +23,7 @@ from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.noise import NoiseModel, deviance, kalman_gain
 from smp_motor_ident.likelihood.passes import gather
 from smp_motor_ident.model.coordinates import Coordinates, direction
+from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.model.structures import Structure
 
 ALIKE = 0.05  # e-folds or volts by which starts differ that end alike
@@ -109,8 +110,25 @@ def first_fit(
             break  # two starts agree, or the surface is smooth
     assert best is not None
     if structure.current:
+        if subset.kind == ANGLE:
+            other = _under_any_load(subset, structure, ranked[0], noise, options)
+            best = min(best, other, key=lambda f: f.deviance)
         best = tried(subset, best, WINDINGS, options, 25, 0.1)
     return best
+
+
+def _under_any_load(
+    subset: Experiments, structure: Structure, z: Coordinates, noise: Array, options: Options
+) -> Fit:
+    """Fit with the angle followed at once, of which the electrical equation holds under any load.
+
+    A load that wanders sets angle against current, and a descent gives up either: with R kept
+    until the noise of both is known, neither.
+    """
+    at_once = noise_ratio_of(np.pi / subset.step, subset.step, subset.kind)
+    kept = structure.with_(fixed={**structure.fixed, "ln_r": z.ln_r})
+    start = Start(z, subset.initial, noise, at_once)
+    return solve(subset, structure, solve(subset, kept, start, options, 25, 0.1), options, 25, 0.1)
 
 
 def _distinct(starts: Sequence[Coordinates], step: float) -> list[Coordinates]:

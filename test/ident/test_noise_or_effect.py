@@ -66,6 +66,36 @@ def lifting(share: float, seed: int = 4) -> Record:
     return Record("rear_left", t, voltage, count=count, hardware=hardware, source="bag")
 
 
+@pytest.mark.parametrize(
+    ("kind", "share", "seed"), [("fourier", 0.15, 1), ("fourier", 0.5, 2), ("square", 1.0, 2)]
+)
+def test_no_current_is_given_up_under_a_load_that_wanders(
+    kind: str, share: float, seed: int
+) -> None:
+    """R, L and K show in the voltage alone, whatever the load: an angle that fits tells less."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(600) / 200
+    voltage = independent.excitation(t, kind, 10.0)
+    kept = np.exp(-t[1] / 0.1)
+    wander = np.zeros(t.size)
+    for n in range(t.size):
+        wander[n] = kept * wander[n - 1] + np.sqrt(1 - kept**2) * rng.standard_normal()
+    volts = CONSTANT / RESISTANCE
+    out = independent.simulate(
+        t, voltage, RESISTANCE, LAG, CONSTANT, INERTIA, VISCOUS, STATIC * volts,
+        share * volts * wander, 50,
+    )  # fmt: skip
+    amps = out[:, 0] + 0.01 * rng.standard_normal(t.size)
+    angle = out[:, 2] + 2e-3 * rng.standard_normal(t.size)
+    found = estimate(Record("rear_left", t, voltage, amps, position=angle, source="bag"))
+    assert found.model == "electromechanical" and not found.unreliable
+    truth = {"resistance": RESISTANCE, "inductance": LAG, "motor_constant": CONSTANT}
+    for name, value in truth.items():
+        q = found.parameters[name]
+        assert abs(q.value - value) < 4 * q.std, name
+        assert abs(q.value - value) < 0.01 * value, name
+
+
 def test_a_weight_that_a_motor_lifts_is_named() -> None:
     arm = lifting(0.2)
     assert 1.0 < np.ptp(arm.count) * 2 * np.pi / TURN / GEAR < 2 * np.pi  # it swings
