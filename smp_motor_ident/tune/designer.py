@@ -96,15 +96,10 @@ def finish(case: Case, feedback: Feedback, factor: float, robustness: Robustness
     """Add feed-forward, reference, figures and words to gains of which ``factor`` is left."""
     problem, plant, loop = case.problem, case.problem.plant, case.problem.loop
     controller = controller_for(loop, feedback)
-    usual = _usual(case)
     margins = loop_margins(plant, feedback)
-    quickest = _plan(case, usual, controller, margins)
-    noise = problem.control_noise(feedback)
-    reference, figures, bands = _calmest(
-        quickest,
-        lambda plan: figures_of(case, usual, controller, plan, margins, noise),
-        "transition_time" not in problem.targets,
-    )
+    quickest = _plan(case, controller, margins)
+    free = "transition_time" not in problem.targets
+    reference, figures, bands = _calmest(quickest, _simulation(case, controller, margins), free)
     reason, findings = _explain(case, margins, factor, robustness, (figures, bands))
     m = plant.motors
     return Design(
@@ -135,12 +130,30 @@ def finish(case: Case, feedback: Feedback, factor: float, robustness: Robustness
     )
 
 
+def settles(case: Case, feedback: Feedback) -> bool:
+    """Tell whether a largest settling time can be stated.
+
+    Where it cannot for the quickest change, none is sought: the others need not be simulated.
+    """
+    controller = controller_for(case.problem.loop, feedback)
+    margins = loop_margins(case.problem.plant, feedback)
+    quickest = _plan(case, controller, margins)
+    return math.isfinite(_simulation(case, controller, margins)(quickest)[1].settling.high)
+
+
+def _simulation(
+    case: Case, controller: Controller, margins: Margins
+) -> Callable[[Reference], tuple[Performance, Specification]]:
+    """Return what tells the figures of a change of set-point."""
+    usual, feedback = _usual(case), controller.feedback
+    noise, found = case.problem.control_noise(feedback), case.ensemble.margins(feedback)
+    return lambda plan: figures_of(case, usual, controller, plan, (margins, found), noise)
+
+
 def with_reference(case: Case, one: Design, reference: Reference) -> Design:
     """Return a design with another reference, and the figures that go with it."""
     controller = controller_for(one.loop, one.feedback)
-    figures, bands = figures_of(
-        case, _usual(case), controller, reference, one.margins, one.performance.control_noise
-    )
+    figures, bands = _simulation(case, controller, one.margins)(reference)
     return replace(one, reference=reference, performance=figures, specification=bands)
 
 
@@ -176,8 +189,9 @@ def wheel_gains(case: Case, controller: Controller) -> PidGains:
     )
 
 
-def _plan(case: Case, usual: Plant, controller: Controller, margins: Margins) -> Reference:
-    loop, plants = case.problem.loop, [usual]
+def _plan(case: Case, controller: Controller, margins: Margins) -> Reference:
+    loop, usual = case.problem.loop, _usual(case)
+    plants = [usual]
     if case.lag_in_doubt:
         plants.append(_usual(case, lag_in_sensor(usual.motors)))
     # Of a delay that may be longer than usual no more is asked than the loop bears.

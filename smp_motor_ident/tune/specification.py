@@ -13,7 +13,7 @@ from smp_motor_ident.tune.ensemble import SHARE
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.limits import JUMP
 from smp_motor_ident.tune.loop import Loop
-from smp_motor_ident.tune.margins import Margins
+from smp_motor_ident.tune.margins import BatchMargins, Margins
 from smp_motor_ident.tune.plant import Plant, sample
 from smp_motor_ident.tune.problem import Problem
 from smp_motor_ident.tune.reference import CHANGE, Change, Reference, planned_change
@@ -86,11 +86,14 @@ WORK, FEWEST = 1e6, 100
 
 
 def figures_of(
-    case: Case, usual: Plant, controller: Controller, reference: Reference, margins: Margins,
-    control_noise: float,
+    case: Case, usual: Plant, controller: Controller, reference: Reference,
+    kept: tuple[Margins, BatchMargins], control_noise: float,
 ) -> tuple[Performance, Specification]:  # fmt: skip
-    """Simulate a design: the nominal motor, ``usual`` as it is sampled, and those that may be."""
-    problem = case.problem
+    """Simulate a design: the nominal motor, ``usual`` as it is sampled, and those that may be.
+
+    What margins they keep is known.
+    """
+    problem, (margins, found) = case.problem, kept
     loop = replace(problem.loop, delay=problem.loop.expected_delay)
     change = CHANGE * reference.max_velocity
     time = _instants(problem, controller.feedback, reference)
@@ -100,7 +103,6 @@ def figures_of(
     answer = run.speed[0] / change
     figures = _performance(problem, controller.feedback, time, planned, control_noise)
     each = _runs(case, controller, loop, plan, change, time)
-    found = case.ensemble.margins(controller.feedback)
     more, longer = added_by_resonance(problem.unmodelled, usual, controller.feedback, answer)
     return figures, Specification(
         samples=len(each) if case.drawn else 0,
