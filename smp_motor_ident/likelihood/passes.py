@@ -253,7 +253,7 @@ def evaluate(
         common, score, step, local_gain, sums.scores, sums.owner,
     )  # fmt: skip
     total += prior
-    if not math.isfinite(total + float(common.sum()) + float(score.sum()) + float(step.sum())):
+    if not all(np.isfinite(part).all() for part in (total, common, score, step)):
         return nowhere
     return Pass(total, common, score, step, local_gain, decrease, sums.spread, sums.scores[:, :f],
                 occam)  # fmt: skip
