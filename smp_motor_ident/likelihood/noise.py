@@ -217,24 +217,19 @@ def renewed(spread: Array, noise: Array, current: bool) -> Array:
     fresh[0, 1] = fresh[1, 0] = 0.0
     if current:
         fresh[1, 1] = max(spread[1] / max(spread[4], 1), LEAST)
-        limit = CLOSEST * math.sqrt(fresh[0, 0] * fresh[1, 1])
+        limit = CLOSEST * math.sqrt(fresh[0, 0]) * math.sqrt(fresh[1, 1])
         fresh[0, 1] = fresh[1, 0] = min(max(spread[2] / max(spread[5], 1), -limit), limit)
     return fresh
 
 
 def deviance(spread: Array) -> float:
     """Return -2 log likelihood up to a constant: N log det of the innovations' covariance."""
-    v0 = spread[0] / max(spread[3], 1)
+    log0 = math.log(max(spread[0] / max(spread[3], 1), 1e-300))
     if spread[4] < 1:
-        return float(spread[3] * np.log(max(v0, 1e-300)))
-    v1 = spread[1] / spread[4]
+        return float(spread[3] * log0)
+    log1 = math.log(max(spread[1] / spread[4], 1e-300))
     # The three are means over different samples where outputs were lost, and need not belong
-    # to one covariance.
-    limit = CLOSEST * np.sqrt(v0 * v1)
-    c = np.clip(spread[2] / max(spread[5], 1), -limit, limit)
-    together = np.log(max(v0 * v1 - c * c, 1e-300))
-    return float(
-        spread[5] * together
-        + (spread[3] - spread[5]) * np.log(max(v0, 1e-300))
-        + (spread[4] - spread[5]) * np.log(max(v1, 1e-300))
-    )
+    # to one covariance.  Far from the motor only their logarithms are numbers.
+    alike = float(spread[2]) / max(spread[5], 1) * math.exp(-0.5 * log0) * math.exp(-0.5 * log1)
+    alike = min(max(alike, -CLOSEST), CLOSEST)
+    return float(spread[5] * math.log1p(-alike * alike) + spread[3] * log0 + spread[4] * log1)

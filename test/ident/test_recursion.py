@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from smp_motor_ident.likelihood.experiments import prepare
-from smp_motor_ident.likelihood.noise import NO_GAIN, NoiseModel, kalman_gain
+from smp_motor_ident.likelihood.noise import NO_GAIN, NoiseModel, deviance, kalman_gain
 from smp_motor_ident.likelihood.passes import answers, evaluate, gather
 from smp_motor_ident.model.coordinates import LOGARITHMS, NAMES, Coordinates
 from smp_motor_ident.model.measurement import ANGLE, MEAN_SPEED
@@ -167,3 +167,13 @@ def test_answer_to_a_signal_is_what_little_of_it_changes(sensor, with_gain):
         expected = np.add.reduceat(change[:, 1 + output], rows)
         # A stop or a start that comes a little earlier or later bends the answer.
         assert np.abs(found[:, output] - expected).max() < 2e-3 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("size", [1.0, 1e90])
+def test_the_deviance_of_two_outputs_is_that_of_their_covariance_however_far_off(size):
+    rng = np.random.default_rng(7)
+    first, second = rng.multivariate_normal([0.0, 0.0], [[4.0, 1.5], [1.5, 9.0]], 50).T
+    spread = np.array([first @ first, second @ second, first @ second, 50.0, 50.0, 50.0])
+    covariance = np.cov(first, second, bias=True) + np.outer(*[[first.mean(), second.mean()]] * 2)
+    found = deviance(spread * np.repeat([size**2, 1.0], 3))
+    assert found == pytest.approx(50 * (np.linalg.slogdet(covariance)[1] + 4 * np.log(size)))
