@@ -143,10 +143,9 @@ def _alike(blocks: list[Record]) -> Flags | None:
     count = len(every.starts) - 1
     stretch = np.arange(count) * STRETCHES // count
     tried = [_explained(blocks, stretch == n, every) for n in range(STRETCHES)]
-    finite = [r for r in tried if np.isfinite(r[0]).all()]
-    if not finite:
-        return None
-    cost, lag = min(finite, key=lambda r: float(np.quantile(r[0], 1 - LEFT_OUT.value)))
+    if not all(np.isfinite(cost).all() for cost, _ in tried):
+        return None  # where a stretch tells no motor, of fewer levels, no other need tell its own
+    cost, lag = min(tried, key=lambda r: float(np.quantile(r[0], 1 - LEFT_OUT.value)))
     kept: Flags = np.zeros(count, dtype=np.bool_)
     for _ in range(ROUNDS):
         if not np.isfinite(cost).all() or not (cost > 0).any():
