@@ -144,7 +144,7 @@ def _alike(blocks: list[Record]) -> Flags | None:
     stretch = np.arange(count) * STRETCHES // count
     tried = [_explained(blocks, stretch == n, every) for n in range(STRETCHES)]
     if not all(np.isfinite(cost).all() for cost, _ in tried):
-        return None  # where a stretch tells no motor, of fewer levels, no other need tell its own
+        return None  # a stretch of one level tells no motor, and what a level does is no accident
     cost, lag = min(tried, key=lambda r: float(np.quantile(r[0], 1 - LEFT_OUT.value)))
     kept: Flags = np.zeros(count, dtype=np.bool_)
     for _ in range(ROUNDS):
