@@ -120,16 +120,16 @@ class WheelLoop:
     def configure(self, settings: LoopSettings) -> None:
         """Change settings while running, without a jump of the output."""
         old, self.settings = self.settings, settings
-        self.pid.set_gains(self._gains(self._late))
+        shaped = ("speed_source", "difference_window", "model", "noise")
+        if any(getattr(old, name) != getattr(settings, name) for name in shaped):
+            self.renew_speed()
+        self.pid.set_gains(self._gains())
         self.profile.configure(settings.limits, settings.transition_time, settings.drive)
         self._plausible.configure(
             settings.gains, settings.drive, settings.implausible_jump, settings.reference_delay
         )
         if bool(old.reference_delay) != bool(settings.reference_delay):
             self._path.start(self.reference.velocity)  # its past is older than that
-        shaped = ("speed_source", "difference_window", "model", "noise")
-        if any(getattr(old, name) != getattr(settings, name) for name in shaped):
-            self.renew_speed()
 
     def renew_speed(self) -> None:
         """Make the speed's source anew from the settings."""
@@ -218,16 +218,20 @@ class WheelLoop:
         """
         self._late = 0.0 if observer else 0.5 * self.settings.difference_window * dt
         self.pid.reset(save_i_term=observer or not self.pid.saturated)
-        self.pid.set_gains(self._gains(self._late))
+        self.pid.set_gains(self._gains())
 
-    def _gains(self, late: float) -> PidGains:
-        """Return the gains for a speed that is so much later than the observer's [s]."""
+    def _gains(self) -> PidGains:
+        """Return the gains for the speed that there is."""
         settings = self.settings
-        if not late:
+        if not self._late:
             return settings.gains
         assert settings.model is not None and self._gearbox is not None
         return differenced_gains(
-            settings.gains, settings.model, self._gearbox.ratio, late, settings.difference_window
+            settings.gains,
+            settings.model,
+            self._gearbox.ratio,
+            self._late,
+            settings.difference_window,
         )
 
     def start(self, measurement: float) -> None:

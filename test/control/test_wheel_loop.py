@@ -107,6 +107,10 @@ def test_an_observer_that_the_counts_contradict_gives_way_to_them() -> None:
     sources = rest(loop, LEARNT + 64, voltage=12.0)  # blocked: more load than 1 V
     assert sources[-1] == "difference (observer not trusted)"
     assert loop.speed(DT, 9.0, 0, 12.0) == 0.0
+    # Another source of speed has no observer to give way, and the gains that are given.
+    gains = PidGains(p=3.0, i=20.0)
+    loop.configure(replace(loop.settings, gains=gains, speed_source="measured", model=None))
+    assert rest(loop, 1) == ["measured"] and loop.pid.gains == gains
 
 
 @pytest.mark.parametrize(
