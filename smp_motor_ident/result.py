@@ -222,6 +222,24 @@ class Estimate:
         quantity = self.combinations.get(name) or self.parameters.get(name)
         return default if quantity is None or quantity.value is None else quantity.value
 
+    def evidence(self, code: str, name: str) -> float:
+        """Return the largest number of that name in the findings of a code, 0 where there is none.
+
+        Parameters
+        ----------
+        code : str
+            Of the findings, such as ``torque_noise``.
+        name : str
+            Of their evidence.
+
+        Returns
+        -------
+        float
+            In the unit of the evidence.
+        """
+        found = (f.evidence.get(name) for f in self.findings if f.code == code)
+        return max((float(x) for x in found if isinstance(x, int | float)), default=0.0)
+
     def samples_of(self, names: Sequence[str], n: int, rng: np.random.Generator) -> Array:
         """Draw from the distribution of the estimation error around the estimate.
 

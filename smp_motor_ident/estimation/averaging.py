@@ -70,12 +70,23 @@ def weights(data: Sequence[Experiments], fits: Sequence[Fit], seed: int = 0) -> 
     price += np.array([POLICY.second_lag * _slowly_filtered(f) for f in fits])
     total = shares @ runs.T + price
     each = np.exp(-0.5 * (total - total.min(axis=1, keepdims=True)))
+    each = _of_both_odds(each, data, fits)
+    return np.asarray((each / each.sum(axis=1, keepdims=True)).mean(axis=0))
+
+
+def _of_both_odds(each: Array, data: Sequence[Experiments], fits: Sequence[Fit]) -> Array:
+    """Return likelihoods, half of each with even odds of a delay to a lag, half with the choice's.
+
+    Shape (draws, candidates).  What a delay loses in the latter, the second lags gain.
+    """
     late = np.array([_late_without_lag(o, f) for o, f in zip(data, fits, strict=True)])
     either = late | np.array([f.structure.order == 2 for f in fits])
-    odds = each[:, either] * np.exp(-0.5 * POLICY.second_lag * late[either])
-    there = each[:, either].sum(axis=1) / np.maximum(odds.sum(axis=1), 1e-300)
-    each[:, either] = 0.5 * (each[:, either] + odds * there[:, None])
-    return np.asarray((each / each.sum(axis=1, keepdims=True)).mean(axis=0))
+    even = each[:, either]
+    odds = even * np.exp(-0.5 * POLICY.second_lag * late[either])
+    as_much = even.sum(axis=1, keepdims=True) / np.maximum(odds.sum(axis=1, keepdims=True), 1e-300)
+    out = each.copy()
+    out[:, either] = 0.5 * (even + odds * as_much)
+    return out
 
 
 def _slowly_filtered(fit: Fit) -> bool:

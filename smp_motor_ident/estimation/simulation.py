@@ -50,7 +50,7 @@ def _motor(estimate: Estimate) -> Fit:
     second = estimate.value("time_constant_product") > 0
     kind = SecondOrder if second else StaticGain if instant else FirstOrder
     filtered = estimate.value("sensor_lag") > 0
-    ticks = int(_found(estimate, "low_passed_speed", "samples_per_row"))
+    ticks = int(estimate.evidence("low_passed_speed", "samples_per_row"))
     structure = kind("asymmetric", low_pass=filtered, ticks=ticks, fixed=fixed)
     nothing = np.zeros((0, 0))
     return Fit(
@@ -95,11 +95,5 @@ def coordinates(estimate: Estimate) -> Coordinates:
 
 def _gain_without_friction(estimate: Estimate) -> float:
     """Return the gain that moves the motor alike at the one level of which it is known."""
-    level = _found(estimate, "one_level", "voltage")
+    level = estimate.evidence("one_level", "voltage")
     return estimate.value("steady_speed") / level if level else 0.0
-
-
-def _found(estimate: Estimate, code: str, name: str) -> float:
-    """Return a number of a finding; none where there is no such finding, or it has another."""
-    found = next((f.evidence.get(name) for f in estimate.findings if f.code == code), None)
-    return found if isinstance(found, int | float) else 0.0

@@ -192,15 +192,15 @@ def torque_noise_of(estimate: Estimate, sample_time: float) -> float:
     if error is not None and max(2 * s - b for s, b in zip(error.shown, error.bound)) > 1:
         return 0.0
     inertia = estimate.value("time_constant") / estimate.value("dc_gain", math.inf)
-    load = inertia * _evidence(estimate, "torque_noise", "acceleration")
-    late = _evidence(estimate, "command_jitter", "as_noise")
+    load = inertia * estimate.evidence("torque_noise", "acceleration")
+    late = estimate.evidence("command_jitter", "as_noise")
     return math.sqrt(max(load**2 - late**2, 0.0) / sample_time)
 
 
 def scatter_of(estimate: Estimate) -> float:
     """Return by how much the instants of commands and samples scatter [s rms]."""
-    late = _evidence(estimate, "command_jitter", "scatter")
-    return math.hypot(late, _evidence(estimate, "arrival_beat", "latency"))
+    late = estimate.evidence("command_jitter", "scatter")
+    return math.hypot(late, estimate.evidence("arrival_beat", "latency"))
 
 
 def eccentric_of(estimate: Estimate, loop: Loop) -> float:
@@ -209,17 +209,11 @@ def eccentric_of(estimate: Estimate, loop: Loop) -> float:
     A sine explains half the square of its amplitude in each sample, in units of the noise's; where
     a load fluctuates, which is larger, the error is part of that.
     """
-    if _evidence(estimate, "torque_noise", "acceleration"):
+    if estimate.evidence("torque_noise", "acceleration"):
         return 0.0
-    explained = _evidence(estimate, "encoder_error", "explained_deviance")
+    explained = estimate.evidence("encoder_error", "explained_deviance")
     noise = math.hypot(loop.count_angle / math.sqrt(12), loop.angle_noise)
     return noise * math.sqrt(2 * explained / max(estimate.samples, 1))
-
-
-def _evidence(estimate: Estimate, code: str, name: str) -> float:
-    """Return a number of a finding, 0 where there is none."""
-    return max((float(f.evidence.get(name) or 0.0) for f in estimate.findings if f.code == code),
-               default=0.0)  # fmt: skip
 
 
 def outliers_of(estimate: Estimate) -> float:
