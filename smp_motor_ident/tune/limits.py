@@ -45,7 +45,7 @@ JUMP = Limit(
     8.0,
     "standard deviations of a reported speed's noise",
     "significance: two readings differ by more once in 70 million, a day at 1 kHz",
-    "test_tune_truth.py: outliers do not reach the loop",
+    "test_tune_disturbances.py: outliers do not reach the loop",
 )
 
 UNKNOWN_RESPONSE = Limit(

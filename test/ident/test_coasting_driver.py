@@ -1,0 +1,111 @@
+"""A bridge that is off between its pulses is estimated together with its motor."""
+
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from smp_motor_ident.estimate import estimate
+from smp_motor_ident.estimation import fast_decay
+from smp_motor_ident.estimation.driver_effect import driver_of
+from smp_motor_ident.likelihood.experiments import prepare
+from smp_motor_ident.model import driver
+from smp_motor_ident.model.coordinates import Coordinates
+from smp_motor_ident.model.driver import Driver, terminal_voltage
+from smp_motor_ident.record import Record
+
+STEP = 0.005
+
+
+@pytest.mark.parametrize("ratio", [0.05, 0.4, 2.0, 20.0])
+@pytest.mark.parametrize("duty", [0.1, 0.5, 0.9])
+@pytest.mark.parametrize("share", [-0.4, 0.0, 0.6])
+def test_a_bridge_that_is_off_for_the_rest_of_each_period(ratio, duty, share):
+    """A winding's current in small steps, against the supply through diodes while it is off."""
+    supply, steps, current, volts, periods = 10.0, 2000, 0.0, 0.0, 1 + int(20 * ratio)
+    keep, back = np.exp(-1 / (steps * ratio)), share * supply
+    for k in range(periods * steps):
+        on = k % steps < duty * steps
+        applied = supply if on else -supply
+        after = keep * current + (1 - keep) * (applied - back)  # times the resistance
+        if not on and after < 0.0:
+            applied, after = back, 0.0
+        volts += applied * (k >= (periods - 1) * steps)
+        current = after
+    mean, _ = terminal_voltage(Driver(driver.COAST, ratio, supply), duty * supply, back, 0.0, STEP)
+    assert mean == pytest.approx(volts / steps, abs=0.01 * supply)
+    mirrored = terminal_voltage(
+        Driver(driver.COAST, ratio, supply), -duty * supply, -back, 0.0, STEP
+    )
+    assert mirrored[0] == pytest.approx(-mean)
+
+
+def coasting(
+    seed: int, viscous: float, te: float = 1.5e-3, pwm: float = 500.0, fine: int = 400
+) -> tuple[Record, dict[str, float]]:
+    """Return a record of a bridge that is off between its pulses, by a fine grid, and its truth."""
+    supply, resistance, constant, inertia = 12.0, 2.0, 0.05, 2e-4
+    step, torque = 0.01, 0.012
+    dt = step / fine
+    rng = np.random.default_rng(seed)
+    command = np.repeat(rng.uniform(-11.0, 11.0, 40), rng.integers(15, 40, 40))
+    i = w = 0.0
+    speed = np.zeros(command.size)
+    for k, volts in enumerate(command.tolist()[1:], 1):
+        duty, sign = abs(volts) / supply, math.copysign(1.0, volts)
+        for n in range(fine):
+            on = (n * dt * pwm) % 1.0 < duty
+            applied = sign * supply if on else -math.copysign(supply, i)
+            after = i
+            if on or i != 0.0:
+                after = i + dt / te * ((applied - constant * w) / resistance - i)
+            if not on and i * after < 0.0:
+                after = 0.0
+            drive = constant * 0.5 * (i + after) - viscous * w
+            i = after
+            drag = math.copysign(torque, w) if w else min(max(drive, -torque), torque)
+            turned = w + dt / inertia * (drive - drag)
+            w = 0.0 if w * turned < 0.0 else turned
+        speed[k] = w + 0.2 * rng.standard_normal()
+    a0 = constant + resistance * viscous / constant
+    truth = {
+        "dc_gain": 1 / a0,
+        "time_constant": (resistance * inertia / constant + te * (a0 - constant)) / a0,
+        "static_voltage": torque * resistance / constant,
+        "fast_decay_ratio": te * pwm,
+    }
+    return Record("motor", step * np.arange(command.size), command, velocity=speed), truth
+
+
+@pytest.mark.parametrize(
+    ("seed", "viscous", "pulses"), [(0, 1e-5, ()), (1, 2.5e-4, ()), (2, 1e-4, (0.02, 2e3, 800))]
+)
+def test_a_coasting_bridge_is_fitted_together_with_its_motor(seed, viscous, pulses):
+    record, truth = coasting(seed, viscous, *pulses)
+    if pulses:  # a current that hardly falls between them does not show how slowly it does
+        del truth["fast_decay_ratio"]
+    record = replace(record, hardware=replace(record.hardware, supply_voltage=12.0))
+    found = estimate(record)
+    assert not found.unreliable
+    for name, value in truth.items():
+        q = found.combinations[name]
+        assert abs(q.value - value) < max(4 * q.std, 0.02 * value), name
+        assert q.std < 0.2 * value
+    behind = driver_of(found)
+    constant = 0.05 / (0.05 + 2.0 * viscous / 0.05)
+    assert (behind.kind, behind.full_duty) == (driver.COAST, 12.0)
+    assert behind.emf_share == pytest.approx(constant, abs=0.03)
+
+
+def test_a_bridge_that_coasts_is_sought_from_two_motors_in_records_of_counts_too():
+    t = np.arange(200) * STEP
+    angle = 3.0 * np.arange(200.0)
+    record = Record("motor", t, np.full(200, 5.0), position=angle)
+    one = prepare([record, record], False)  # the second begins at the instant 0 again
+    at_once = prepare([replace(record, time=t + t[-1]), record], False)
+    near = SimpleNamespace(z=Coordinates(ln_a0=-3.0, ln_a1=-5.0))
+    for data in (one, at_once):
+        first, second = fast_decay._motors(data, near)
+        assert second.dc_gain == pytest.approx(3.0 / STEP / 5.0, rel=1e-4)  # counts are dithered
