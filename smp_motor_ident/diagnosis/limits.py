@@ -54,6 +54,12 @@ SEGMENTS = Limit(
     "enough for a scatter (a factor of 1.2 by Student's t), few enough for each to know the motor",
     "test_segments.py: a motor that warms up",
 )  # fmt: skip
+TEMPERATURE = Limit(
+    5.0, "K, a standard deviation",
+    "physical: what an unheated room differs by from day to day, and a motor that runs from one "
+    "that begins",
+    "test_segments.py: the interval of a motor that changes holds another days friction",
+)  # fmt: skip
 SEGMENT_INFORMATION = Limit(
     0.25, "of the average part's",
     "a part whose interval is more than twice the others' adds its noise, not the motor's change",

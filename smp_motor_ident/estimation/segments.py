@@ -3,15 +3,17 @@
 Each part, with a beginning of its own, asks for a step ``d_b = N_b^-1 g_b`` of its own from the
 common estimate.  Where these steps scatter or drift more than their covariances ``C_b`` let them
 (chi-square for each coordinate), the motor changes: the excess ``S - mean C_b`` is a random
-effect that the next recording has as well, and a drift is expected to go on as far again.
+effect that the next recording has as well, and a drift is expected to go on as far again.  The
+drift of one record is a single draw, and says nothing of another day: its temperature is added.
 
 References
 ----------
 DerSimonian and Laird, Controlled Clinical Trials 7 (1986), 177 (the excess by moments);
-Higgins, Thompson and Spiegelhalter, J. R. Stat. Soc. A 172 (2009), 137 (interval of a new one).
+Higgins, Thompson and Spiegelhalter, J. R. Stat. Soc. A 172 (2009), 137 (interval of a new one);
+docs/derivations.md, section 9 (temperature).
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
@@ -19,14 +21,19 @@ import numpy as np
 from scipy.special import chdtri, fdtri, stdtrit
 
 from smp_motor_control.arrays import Array, Integers
-from smp_motor_ident.diagnosis.limits import HOMOGENEITY, SEGMENT_INFORMATION, SEGMENTS
+from smp_motor_ident.diagnosis.limits import (
+    HOMOGENEITY,
+    SEGMENT_INFORMATION,
+    SEGMENTS,
+    TEMPERATURE,
+)
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.fitted import NORMAL_95
 from smp_motor_ident.estimation.prediction import inverse as inverse_of
 from smp_motor_ident.estimation.prediction import simulate
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.passes import gather
-from smp_motor_ident.model.coordinates import LOGARITHMS, PLAUSIBLE
+from smp_motor_ident.model.coordinates import LOGARITHMS, PLAUSIBLE, Coordinates
 from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.model.structures import sensor_of
 
@@ -35,6 +42,9 @@ ORDERED = 6  # parts of which a drift is distinguishable from scatter
 WHOLE = 1  # part of all that is recorded: cut only where the segments begin
 LOOSE = 0.3  # e-folds, or of the value: a coordinate known worse from a part is left out
 ROUNDING = 1e-12  # of the largest eigenvalue: what the sums of a part are exact to
+# What changes with temperature [1/K]: the resistance of copper, the flux of ferrite magnets, and
+# the torque of a lubricant's film (power 2/3 of a viscosity that falls by 5.5 % a kelvin).
+COPPER, FERRITE, LUBRICANT = 0.0039, -0.002, -0.037
 
 
 @dataclass(frozen=True)
@@ -90,6 +100,8 @@ def heterogeneous(data: Experiments, fit: Fit) -> tuple[Fit, Change]:
     between, freedom = _between(use.middle, use.step, _noise(use, parts, level), ordered)
     between = between * (stdtrit(freedom, 0.975) / NORMAL_95) ** 2
     names = [fit.structure.free[i] for i in use.free]
+    if ordered:
+        between = between + _another_day(fit.z, names)
     added = np.zeros((len(fit.structure.free),) * 2)
     added[np.ix_(use.free, use.free)] = between
     std = dict(zip(names, map(float, np.sqrt(np.diag(between))), strict=True))
@@ -180,6 +192,21 @@ def _between(middle: Array, step: Array, noise: Array, ordered: bool) -> tuple[A
     scatter = np.atleast_2d(rest.T @ rest / (parts - 2))
     drift = np.outer(answer[1], answer[1]) - scatter / np.square(middle).sum()
     return _positive(scatter - noise, noise) + _positive(drift, noise), parts - 2
+
+
+def _another_day(z: Coordinates, names: Sequence[str]) -> Array:
+    """Return the covariance of a motor at another day's temperature.
+
+    Nobody knows how much of friction is the lubricant's: anything from nothing to all of it.
+    """
+    tm, plus, minus = COPPER - FERRITE, z.vc_plus, z.vc_minus
+    winding = Coordinates(ln_a0=FERRITE, ln_a1=tm, ln_a2=-FERRITE, ln_te=-COPPER, ln_r=COPPER,
+                          vc_plus=tm * plus, vc_minus=tm * minus, load=tm * z.load)  # fmt: skip
+    lubricant = Coordinates(vc_plus=LUBRICANT * plus, vc_minus=LUBRICANT * minus)
+    own, film = (np.array([by.value(n) for n in names]) for by in (winding, lubricant))
+    half = own + film / 2
+    cov: Array = TEMPERATURE.value**2 * (np.outer(half, half) + np.outer(film, film) / 12)
+    return cov
 
 
 def _positive(matrix: Array, scale: Array) -> Array:

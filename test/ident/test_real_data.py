@@ -37,6 +37,14 @@ def test_prbs_of_one_day_explains_the_other_day(fitted, kept):
     assert result.value("averaging_window") == pytest.approx(0.020, abs=0.002)
 
 
+def test_five_days_scatter_no_more_than_the_intervals_of_each():
+    found = [estimate(prbs(f"2026-08-{day}")).combinations for day in (11, 14, 15, 17, 18)]
+    for name in ("dc_gain", "time_constant", "static_voltage"):
+        value, std = (np.array([getattr(f[name], a) for f in found]) for a in ("value", "std"))
+        mean = np.average(value, weights=std**-2)
+        assert np.sum(np.square((value - mean) / std)) / 4 < 1.5**2, name
+
+
 def test_five_steps_in_one_fit_tell_the_speed_filter_from_a_delay():
     result = estimate([step(p) for p in sorted((DATA / "step_gearmotor").glob("*.csv"))[::2]])
     assert result.fit_percent.estimation > 93

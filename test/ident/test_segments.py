@@ -43,6 +43,14 @@ def test_a_motor_that_warms_up_is_said_to_and_its_interval_reaches_the_next_day(
     assert gain.std < 0.6  # three quarters more than the drift: Student's t and its noise
 
 
+def test_the_interval_of_a_motor_that_changes_holds_another_days_friction():
+    drifts = _first_order(np.linspace(10.0, 10.2, 4000), 0.08, 0.6, 1)
+    low, high = estimate(drifts, "first_order").combinations["static_voltage"].ci95
+    # 5 K: half of friction the lubricant's (3.7 % a kelvin), volts by copper and magnets.
+    for kelvin in (-5, 5):
+        assert low < 0.6 * (1 + kelvin * (0.0039 + 0.002 - 0.037 / 2)) < high
+
+
 def test_a_motor_that_does_not_change_is_rarely_said_to():
     # One in a hundred by the test's size: two of eight has a chance of 0.3 %.
     assert sum(bool(_changes(_first_order(10.0, 0.08, 0.6, s))) for s in range(8)) < 2
