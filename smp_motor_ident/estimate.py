@@ -62,7 +62,7 @@ from smp_motor_ident.estimation.driver_effect import (
     suspecting,
     through,
 )
-from smp_motor_ident.estimation.driver_search import likeliest
+from smp_motor_ident.estimation.driver_search import likeliest, run_free
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.hold_choice import chosen_hold, instant_deviation, otherwise
 from smp_motor_ident.estimation.profile import profiled
@@ -76,6 +76,7 @@ from smp_motor_ident.estimation.thinning import thinned
 from smp_motor_ident.estimation.transients import widened_by_pieces
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import Experiments
+from smp_motor_ident.model.driver import EFFECTS, RAMPS, DriverEffect
 from smp_motor_ident.model.structures import Structure
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import Estimate, FitPercent
@@ -217,7 +218,10 @@ def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) 
             words = [*found, *fallen_back(refused, one.label)]
             plain = _stated(group, request, words, data, hold, [*left, one], refused is None)
             if not lacks_something(plain):
-                return plain
+                if refused is not None or not one.fit.noise_ratio > 0:
+                    return plain
+                ramped, _ = _through_driver(group, request, found, data, hold, one.fit, RAMPS)
+                return ramped or plain
             noisy = refused is None and (is_moved(plain) or one.fit.noise_ratio > 0)
             rest = _undisturbed(group, request, found, one.fit) if noisy else None
             if rest and not often_disturbed(rest):
@@ -263,12 +267,18 @@ def _through_driver(
     data: Experiments,
     hold: str,
     fit: Fit,
+    effects: Sequence[DriverEffect] = EFFECTS,
 ) -> tuple[Estimate | None, DriverFit | None]:
-    """Return the estimate behind the likeliest driver, if it holds, and that driver."""
+    """Return the estimate behind the likeliest driver, if it holds, and that driver.
+
+    A ramp is sought beside torque noise, which stands for none of it.
+    """
     if request.driver is not None or one_size_or_swing(data) or hides_driver(group):
         return None, None
     request.say("what the driver makes of its command")
-    driver = likeliest(group, fit, hold, request.options)
+    beside = effects is RAMPS
+    start = fit if beside else run_free(group, fit, hold, request.options)
+    driver = likeliest(group, start, hold, request.options, effects)
     if driver is None:
         return None, None
     known = request.validation
@@ -280,7 +290,7 @@ def _through_driver(
     emptied = {"implausible_motor", "one_level", "one_size_of_voltage"}
     hollow = any(f.code in emptied for f in e.findings)  # little is left of what was recorded
     fails = any(f.severity == "unreliable" and not blames_current(f) for f in e.findings)
-    fails = fails or leaves_torque_noise(e, fit)
+    fails = fails or (leaves_torque_noise(e, fit) and not beside)
     return (None if fails or hollow else through(e, driver)), driver
 
 

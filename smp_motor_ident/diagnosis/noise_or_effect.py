@@ -177,9 +177,10 @@ def _linearised(
 def _settled(here: _Point, effect: Effect, gear: float) -> _Point:
     """Return the free run with an effect at the coordinates and size that fit it best."""
     best, damping = here.only(effect), FIRST
+    without = here.fitted(list(range(here.own)))[1]
     for _ in range(STEPS):
         hoped = best.deviance - best.fitted(list(range(best.length.size)))[1]
-        if hoped < SETTLED * (here.deviance - best.deviance) + 1.0 or damping > 1.0:
+        if hoped < SETTLED * max(without - best.deviance, 0.0) + 1.0 or damping > 1.0:
             break
         near = best.moved(damping, effect, gear)
         if near is None or not near.deviance < best.deviance:

@@ -50,15 +50,17 @@ FINALISTS = 3  # that are held against each other on all of them
 FEW = 12  # passes of a descent while the size is sought
 
 
-def likeliest(group: Sequence[Record], fit: Fit, hold: str, options: Options) -> DriverFit | None:
+def likeliest(
+    group: Sequence[Record],
+    fit: Fit,
+    hold: str,
+    options: Options,
+    effects: Sequence[DriverEffect] = EFFECTS,
+) -> DriverFit | None:
     """Return the effect that explains the records best; None where none is worth its number.
 
-    All run free: torque noise would stand for the effect.  Where one number leaves the residuals
-    white, the two of a driver that coasts are not asked for.
+    Where one number leaves the residuals white, the two of a driver that coasts are not asked for.
     """
-    if fit.noise_ratio > 0:
-        fit = replace(fit, noise_ratio=0.0)
-        fit = refine(_prepared(group, hold, fit), fit.structure, fit, fit.z, options)
     step = group[0].sample_time
     few = _pieces(group, step, fit.z.time_constant)
     price, factor = POLICY.price(1, fit.samples), sandwich_factor(fit)
@@ -73,14 +75,14 @@ def likeliest(group: Sequence[Record], fit: Fit, hold: str, options: Options) ->
     known: list[tuple[Fit, str]] = []
     profiles = [
         _Profile(few, how, start, options, effect)
-        for effect in EFFECTS
+        for effect in effects
         if effect.kind != COAST
         for start, how in _starts(few, fit, hold, options, effect, known)
     ]
     found = _polished(profiles, most, behind)
     plainer = [d for d in found if d.effect.kind != CURRENT]  # as a bridge that coasts, nearly
     if all(sandwich_factor(d.fit) > COLOURED.value for d in plainer):
-        joint = [_Joint(few, list(group), fit, options, e) for e in EFFECTS if e.kind == COAST]
+        joint = [_Joint(few, list(group), fit, options, e) for e in effects if e.kind == COAST]
         found += [d for s in joint if (d := s.best(most)) is not None]
     found.sort(key=cost)
     if sum(map(len, few)) < sum(map(len, group)):
@@ -99,6 +101,14 @@ def likeliest(group: Sequence[Record], fit: Fit, hold: str, options: Options) ->
     if plain < cost(best) + price:  # there may be none of them
         near.append(fit)
     return replace(best, rivals=tuple(near))
+
+
+def run_free(group: Sequence[Record], fit: Fit, hold: str, options: Options) -> Fit:
+    """Return a fit without torque noise, which would stand for an effect."""
+    if not fit.noise_ratio > 0:
+        return fit
+    fit = replace(fit, noise_ratio=0.0)
+    return refine(_prepared(group, hold, fit), fit.structure, fit, fit.z, options)
 
 
 def _polished(searches: Sequence[_Profile], most: float, behind: float) -> list[DriverFit]:
@@ -175,24 +185,25 @@ def _starts(
 ) -> list[tuple[Fit, str]]:
     """Return the motors with which an effect's size is sought, and how the command was held.
 
-    All that may stand for the effect is put back: torque noise, a command that ran otherwise or
-    comes late, of a limited rate a second lag; and friction, for which the effect may stand.
+    All that may stand for the effect is put back: a command that ran otherwise or comes late, of a
+    limited rate a second lag; and friction, for which the effect may stand.
     Those that are ``known`` already, of another effect, are added to.
     """
     s = fit.structure
     if s.friction == "none" and "vc_plus" not in s.fixed:
         s = s.with_(friction="symmetric")
-    ways = [(s, hold)]
-    plain = s.with_(held="before", shift=0.0, delay=s.delay and "delay" in s.fixed)
-    if plain != s or hold != "held":
-        ways.append((plain, "held"))
-    if effect.kind == SLEW and s.order == 2 and not s.current:
-        ways.append((FirstOrder.like(plain), "held"))
+    prompt = s.with_(delay=s.delay and "delay" in s.fixed)
+    plain = prompt.with_(held="before", shift=0.0)
+    ways = [(s, hold), (plain, "held")]
+    if effect.kind == SLEW:
+        ways.append((prompt, hold))
+        if s.order == 2 and not s.current:
+            ways += [(FirstOrder.like(prompt), hold), (FirstOrder.like(plain), "held")]
     out = []
-    for structure, how in ways:
+    for structure, how in (way for k, way in enumerate(ways) if way not in ways[:k]):
         one = next((k for k in known if (k[0].structure, k[1]) == (structure, how)), None)
         if one is None:
-            near = replace(fit, structure=structure, noise_ratio=0.0)
+            near = replace(fit, structure=structure)
             data, z = _prepared(group, how, near), structure.complete(fit.z)
             one = refine(data, structure, near, z, options), how
             known.append(one)

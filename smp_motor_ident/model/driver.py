@@ -210,5 +210,8 @@ EFFECTS = (
     ),
 )  # fmt: skip
 
+RAMPS = tuple(e for e in EFFECTS if e.kind == SLEW)
+"""What is no more than a delay to first order: it takes a search to see it."""
+
 DECLARABLE: Mapping[str, DriverEffect] = {e.quantity: e for e in EFFECTS if not e.follows_motion}
 """What a user may know of a driver: the command alone tells its voltage."""

@@ -110,6 +110,28 @@ def test_motor_and_driver_are_both_found(name):
     assert 0.4 < np.sqrt(np.square(errors).mean()) < 1.6  # neither too narrow nor too wide
 
 
+def test_steps_of_one_size_through_a_ramp_are_no_second_lag_under_a_load_that_fluctuates():
+    rng, rate, fine = np.random.default_rng(5), 1000, 10
+    levels = 1.4 * np.array([1, 2, 3, 4, 5, 6, 5, 4, 3, 2, 1, 2, 3, 4, 5, 6])
+    command = np.repeat(levels, 300)
+    volts, w, angle = 1.4, GAIN * (1.4 - STATIC), 0.0
+    most, keep = 110.0 / rate / fine, math.exp(-1 / rate / fine / TAU)
+    position = []
+    for target in command.tolist():
+        position.append(angle)
+        for _ in range(fine):
+            volts += min(max(target - volts, -most), most)
+            w = keep * w + (1 - keep) * GAIN * (volts - STATIC)
+            angle += w / rate / fine
+        w += 0.02 * rng.standard_normal()
+    angles = np.array(position) + 1e-3 * rng.standard_normal(len(position))
+    time = np.arange(command.size) / rate
+    found = estimate(Record("motor", time, command, position=angles))
+    for name, value in {"dc_gain": GAIN, "time_constant": TAU, "slew_rate": 110.0}.items():
+        quantity = found.combinations[name]
+        assert abs(quantity.value - value) < 4 * quantity.std + 0.005 * value, name
+
+
 def test_a_clip_just_below_the_largest_command_is_found():
     command = commands(0)
     limit = 0.97 * np.abs(command).max()
