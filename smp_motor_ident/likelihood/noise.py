@@ -203,7 +203,7 @@ def proper(noise: Array) -> Array:
 def whitening(noise: Array) -> Array:
     """Return the whitening rows of `recursion.run` for a 2 x 2 noise covariance."""
     v0, c, v1 = noise[0, 0], noise[1, 0], noise[1, 1]
-    rest = math.sqrt(v1 - c * c / v0)
+    rest = math.sqrt(v1 - c / v0 * c)  # of variances whose product overflows, too
     w = np.zeros((2, 3))
     w[0, 0] = w[0, 2] = 1 / math.sqrt(v0)
     w[1] = -c / v0 / rest, 1 / rest, 1 / math.sqrt(v1)

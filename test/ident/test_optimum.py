@@ -205,6 +205,12 @@ def test_a_covariance_that_is_none_is_replaced_by_one_that_can_be(broken):
     np.testing.assert_allclose(w @ fixed @ w.T, np.eye(2), atol=1e-12)  # rounding
 
 
+def test_a_covariance_whose_squares_overflow_is_whitened():
+    huge = 1e160 * np.array([[1.0, 0.5], [0.5, 1.0]])
+    w = whitening(huge)[:, :2]
+    np.testing.assert_allclose(w @ huge @ w.T, np.eye(2), atol=1e-12)  # rounding
+
+
 @pytest.mark.parametrize("current", [True, False])
 def test_a_covariance_renewed_from_residuals_is_one_whatever_was_believed_before(current):
     believed = np.array([[1.0, 0.9], [0.9, 1.0]])
