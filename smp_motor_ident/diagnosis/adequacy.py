@@ -16,6 +16,7 @@ L. Ljung, System Identification, 2nd ed., section 16.6; C. Bester, T. Conley, C.
 Inference with dependent data using cluster covariance estimators, J. Econometrics 165 (2011).
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -70,6 +71,27 @@ def lacking(errors: Regression | None, white: bool) -> tuple[list[list[Evidence]
         out.append(sorted(shown, key=lambda e: 2 * len(e.columns) - e.gain))
         named += out[-1][0].columns
     return out, []
+
+
+def hidden(errors: Regression | None) -> list[Evidence]:
+    """Return effects that hide in the model's own coordinates, of the size that they may have.
+
+    That is the root of its mean square where the ordinary size is a deviation known beforehand, and
+    no more than that: a misfit that is like what is left of it shows another effect as well.
+    """
+    return [] if errors is None else [_hidden(errors, *one) for one in errors.hidden]
+
+
+def _hidden(errors: Regression, effect: Effect, column: int, ordinary: float) -> Evidence:
+    z, e = errors.regressors[:, column], errors.residual
+    normal = max(float(z @ z), 1e-300)
+    found = float(z @ e) / normal
+    scores = np.bincount(errors.block, z * (e - found * z))
+    variance = max(float(e @ e) / max(np.count_nonzero(e), 1) * normal, float(scores @ scores))
+    variance /= normal * normal
+    kept = ordinary**2 / (ordinary**2 + variance)
+    size = min(math.sqrt(kept * variance + (kept * found) ** 2), ordinary)
+    return Evidence(effect, 1.0, 0.0, errors.shifts[:, column] * size, (column,), np.array([size]))
 
 
 def farthest_possible(

@@ -19,6 +19,7 @@ from smp_motor_ident.diagnosis.adequacy import (
     Evidence,
     as_finding,
     farthest_possible,
+    hidden,
     lacking,
     matters,
     stated,
@@ -47,8 +48,11 @@ def held_against_effects(
     options: Options,
 ) -> tuple[Said, list[Finding]]:
     """Return what is stated, as wide as what the model lacks asks for, and name that."""
-    numbers = stated(fit, said(fit)[0])
+    first = said(fit)[0]
+    numbers = stated(fit, first)
     shown, possible = lacking(errors, white)
+    if not first.level:  # of one level no line is stated that could be bent
+        possible += hidden(errors)
     begin = data, fit, errors
     grave = any(matters(e[0], numbers, data.step) for e in shown)
     if not grave and (instead := in_place_of_noise(data, fit, gear, options)):

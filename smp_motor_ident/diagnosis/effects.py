@@ -59,6 +59,7 @@ class Effect:
     cause: str
     advice: str
     regressors: Callable[[Motion], list[Array]]
+    bends: bool = False  # whether it bends the line of steady speeds over voltages a little
 
 
 def _sign(x: Array) -> Array:
@@ -131,6 +132,7 @@ EFFECTS = (
         "supply_sag", "voltage", "a supply that sags under load",
         "record the supply's voltage, or the voltage at the terminals",
         lambda m: [m.drop * (m.voltage / m.top) ** 2, np.abs(m.voltage / m.top) * m.drop],
+        bends=True,
     ),
     Effect(
         "supply_recovers", "voltage", "a supply that sags and recovers slowly",
@@ -152,7 +154,7 @@ EFFECTS = (
     Effect(
         "saturation", "voltage", "a field that weakens with the current",
         "record with smaller steps of voltage",
-        lambda m: [np.abs(m.drop) * m.speed, np.abs(m.drop) * m.drop],
+        lambda m: [np.abs(m.drop) * m.speed, np.abs(m.drop) * m.drop], bends=True,
     ),
     Effect(
         "asymmetry", "voltage", "a motor or driver that differs between the directions",
@@ -162,7 +164,7 @@ EFFECTS = (
     Effect(
         "drag", "torque", "a drag that grows with the square of the speed",
         "record at the speeds at which the motor will run",
-        lambda m: [m.speed * np.abs(m.speed)],
+        lambda m: [m.speed * np.abs(m.speed)], bends=True,
     ),
     Effect(
         "stribeck", "torque", "friction that falls with speed (Stribeck)",

@@ -317,6 +317,12 @@ EFFECT_OWN = Limit(
     "an effect's shape is known to a tenth at best: what the model imitates so far shows nothing",
     "test_adequacy.py",
 )  # fmt: skip
+ORDINARY_BEND = Limit(
+    0.015, "of the largest voltage",
+    "physical: a battery and leads of a twentieth of the winding's resistance, 0.3 V over a "
+    "transistor at 12 V, a fan's drag: every drive has one of them",
+    "test_adequacy.py: what hides in the motor's own numbers is in their intervals",
+)  # fmt: skip
 SWING = Limit(
     1.0, "rad", "physical: over less a weight's torque changes by less than itself: it is a load",
     "test_noise_or_effect.py: a weight that a motor lifts is named",

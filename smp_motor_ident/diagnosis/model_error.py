@@ -12,7 +12,7 @@ import numpy as np
 
 from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident.diagnosis.effects import EFFECTS, Effect, Motion, slope
-from smp_motor_ident.diagnosis.limits import EFFECT_OWN
+from smp_motor_ident.diagnosis.limits import EFFECT_OWN, ORDINARY_BEND
 from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.likelihood.experiments import Experiments
@@ -41,6 +41,8 @@ class Regression:
     n_free: int
     # shape (n,) each: -1 in one half of the motion, 1 in the other
     conditions: dict[str, Array] = field(default_factory=dict)
+    # effects that the model's own coordinates imitate: column, and size that is ordinary
+    hidden: Sequence[tuple[Effect, int, float]] = ()
 
 
 def regression(data: Experiments, fit: Fit, gear: float) -> Regression | None:
@@ -49,6 +51,7 @@ def regression(data: Experiments, fit: Fit, gear: float) -> Regression | None:
         return None
     sections, samples = motions(data, fit, gear)
     members: list[tuple[Effect, tuple[int, ...]]] = []
+    peaks: list[float] = []  # [V]
 
     def made() -> Iterator[Signal]:
         count = 0
@@ -57,6 +60,8 @@ def regression(data: Experiments, fit: Fit, gear: float) -> Regression | None:
             if several:
                 members.append((effect, tuple(range(count, count + len(several)))))
             count += len(several)
+            peaks.extend(0.0 if s.voltage is None else float(np.abs(s.voltage).max(initial=0.0))
+                         for s in several)  # fmt: skip
             yield from several
 
     own = whitened(data, fit, own_responses(data, fit, together(data)))
@@ -68,7 +73,14 @@ def regression(data: Experiments, fit: Fit, gear: float) -> Regression | None:
     block = row_starts(data, together(data)) * BLOCKS // data.size
     block = np.tile(block, 2 if data.current.size else 1)
     whole = _projected(table, len(own), block, members, len(fit.structure.free))
-    return replace(whole, conditions=_conditions(data, samples))
+    seen = {c for _, columns in whole.members for c in columns}
+    hidden = [
+        (effect, c, ORDINARY_BEND.value * samples.top / peaks[c])
+        for effect, columns in members
+        for c in columns
+        if effect.bends and c not in seen and peaks[c] > 0
+    ]
+    return replace(whole, conditions=_conditions(data, samples), hidden=hidden)
 
 
 def _conditions(data: Experiments, m: Motion) -> dict[str, Array]:

@@ -225,3 +225,36 @@ def test_an_effect_counts_in_no_unit():
     small = replace(errors, regressors=1e-100 * errors.regressors, whole=1e-100 * errors.whole)
     usual, tiny = (adequacy._test(e, EFFECTS[0], (0,), False) for e in (errors, small))
     assert tiny.p_value == pytest.approx(usual.p_value, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("kept", "deviations", "size"),
+    [(0.001, 0.0, 0.01), (1000.0, 0.0, 0.001), (1000.0, 30.0, 0.01)],
+)
+def test_what_hides_in_the_motors_own_numbers_is_no_larger_than_ordinary(kept, deviations, size):
+    """A unit of it moves a number by one; what is left of its response is so long."""
+    errors = error_with(deviations, 5)
+    hides = replace(
+        errors, members=[], regressors=kept * errors.regressors, hidden=[(EFFECTS[0], 0, 0.01)]
+    )
+    (found,) = adequacy.hidden(hides)
+    # Nobody knows; or data tell to a thousandth; or another effect explains what is like it.
+    assert size / 3 < found.shift[0] <= 1.5 * size
+
+
+def test_a_drag_between_two_levels_is_in_the_interval_of_the_gain():
+    rate, rng = 200, np.random.default_rng(8)
+    voltage = np.repeat(np.tile([5.0, 9.0], 8), 200)
+    gain, tau, friction, drag = 12.0, 0.03, 0.6, 2e-5  # 0.2 V at the highest speed
+    w, speed = 0.0, []
+    for v in voltage.tolist():
+        for _ in range(20):
+            ahead = gain * (v - friction - drag * w * w) - w
+            w = max(w + ahead / tau / rate / 20, 0.0)
+        speed.append(w)
+    time = np.arange(voltage.size) / rate
+    found = estimate(
+        Record("motor", time, voltage, velocity=np.array(speed) + rng.standard_normal(time.size))
+    )
+    known = found.combinations["dc_gain"]
+    assert abs(known.value - gain) < 5 * known.std  # 3.5 % off
