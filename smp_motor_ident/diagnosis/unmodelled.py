@@ -55,6 +55,9 @@ HANN = 1 + 2 * (2 / 3) ** 2 + 2 * (1 / 6) ** 2
 """Lines under a Hann window that tell as much as one of independent ones: neighbours correlate by
 2/3, the next by 1/6."""
 
+ROUNDING = 1e-14
+"""Share of a sum of squares that rounding leaves."""
+
 FIRST = 2
 """Lines from 0 that the window fills with the mean."""
 
@@ -65,16 +68,18 @@ def unmodelled_dynamics(data: Experiments, fit: Fit) -> ModelError | None:
     Where nothing was measured, as between two edges of a count, the error is taken to run straight.
     """
     output = prediction.simulate(data, fit)[:, 1]
-    error, free = data.output - output, _without_friction(data, fit)
+    error, outputs = data.output - output, [output]
+    if fit.z.vc_plus or fit.z.vc_minus:
+        outputs.append(_without_friction(data, fit))
     lines = [
-        _spectra(data, error[a:b], output[a:b], free[a:b])
+        _spectra(data, error[a:b], *(one[a:b] for one in outputs))
         for a, b in pairwise(data.starts)
         if np.isfinite(error[a:b]).sum() > 2 * BAND_LINES.value + FIRST
     ]
     if not lines:
         return None
-    omega, of_error, *outputs = (np.concatenate(x) for x in zip(*lines, strict=True))
-    return relative_error(omega, of_error, np.array(outputs))
+    omega, of_error, *moved = (np.concatenate(x) for x in zip(*lines, strict=True))
+    return relative_error(omega, of_error, np.array(moved))
 
 
 def _without_friction(data: Experiments, fit: Fit) -> Array:
@@ -144,14 +149,17 @@ def _surely(stated: tuple[float, float]) -> float:
 def _circles(error: Complex, outputs: Complex, level: Array) -> tuple[Array, Array]:
     """Return the sizes of an error relative to outputs, one a row, and the radii of its circles."""
     power, m = _power(outputs), error.size / HANN
-    size = outputs.conj() @ error / power
-    rest = _power(error - size[:, None] * outputs) / HANN / (m - 1)
-    return np.abs(size), np.sqrt(fdtri(2, 2 * (m - 1), 1 - level) * rest * HANN / power)
+    size = np.abs(outputs.conj() @ error) / power
+    # What a projection leaves of an error; none of less than its rounding is known.
+    whole = _power(error)
+    rest = np.maximum(whole - size**2 * power, ROUNDING * whole) / HANN / (m - 1)
+    return size, np.sqrt(fdtri(2, 2 * (m - 1), 1 - level) * rest * HANN / power)
 
 
 def _power(rows: Complex) -> Array:
     """Return the sums of squares of rows."""
-    return np.asarray(np.square(rows.real).sum(axis=1) + np.square(rows.imag).sum(axis=1))
+    parts = np.ascontiguousarray(rows).view(np.float64)
+    return np.asarray(np.einsum("...i,...i->...", parts, parts))
 
 
 def _resonance(omega: Array, at: Array) -> Complex:
