@@ -86,7 +86,7 @@ def _beside(data: Experiments, structure: Structure) -> Structure:
     return more if room else structure
 
 
-def scale_of(normal: Array) -> Array:
+def _scale_of(normal: Array) -> Array:
     """Return what each coordinate of a normal matrix is divided by to be of unit information.
 
     Infinite where nothing is known of it, but for rounding.
@@ -100,9 +100,16 @@ def inverse(normal: Array, rcond: float = RANK) -> Array:
 
     Coordinates of which nothing is known, but for rounding, are zero in it.
     """
-    scale = scale_of(normal)
-    scaled = np.linalg.pinv(normal / np.outer(scale, scale), rcond=rcond, hermitian=True)
-    return np.asarray(scaled / np.outer(scale, scale))
+    root = root_of_inverse(normal, rcond)
+    return np.asarray(root @ root.T)
+
+
+def root_of_inverse(normal: Array, rcond: float = RANK) -> Array:
+    """Return a root of the same, shape (p, p): it times its transpose."""
+    scale = _scale_of(normal)
+    values, vectors = np.linalg.eigh(normal / scale[:, None] / scale)
+    known = values > rcond * values[-1:]
+    return np.asarray(vectors / np.sqrt(np.where(known, values, np.inf)) / scale[:, None])
 
 
 def information(data: Experiments, fit: Fit) -> Array:

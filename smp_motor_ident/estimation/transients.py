@@ -89,7 +89,7 @@ def _moves(data: Experiments, fit: Fit) -> Array:
         g = int(np.searchsorted(data.starts, a, side="right")) - 1
         normal = parts[g].copy()
         normal[:size, :size] += whole - seen[g]
-        root, piece = _root_of_inverse(normal), rows[a:b].T @ rows[a:b]
+        root, piece = prediction.root_of_inverse(normal), rows[a:b].T @ rows[a:b]
         taken, along = np.linalg.eigh(root.T @ piece @ root)
         taken = np.clip(taken, 1e-12, 1 - 1e-6)
         more = root @ along * ((1 / np.sqrt(1 - taken) - 1) / taken)
@@ -97,11 +97,3 @@ def _moves(data: Experiments, fit: Fit) -> Array:
         gradient = gradient + piece @ more @ (root @ along).T @ gradient
         moves.append((root @ (root.T @ gradient))[:size])
     return np.array(moves)
-
-
-def _root_of_inverse(normal: Array) -> Array:
-    """Return a root of the pseudo-inverse that `prediction.inverse` gives of a normal matrix."""
-    scale = prediction.scale_of(normal)
-    values, vectors = np.linalg.eigh(normal / np.outer(scale, scale))
-    known = values > prediction.RANK * values[-1]
-    return np.asarray(vectors / np.sqrt(np.where(known, values, np.inf)) / scale[:, None])
