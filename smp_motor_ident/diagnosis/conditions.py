@@ -34,13 +34,15 @@ def dependent(fit: Fit, errors: Regression | None) -> tuple[Fit, list[Finding]]:
         return fit, []
     size = errors.n_free
     level = CONDITION_LEVEL.value / max(2 * size * len(errors.conditions), 1)
-    unweighted = inverse(errors.own.T @ errors.own, 1e-12)
+    normal = errors.own.T @ errors.own
+    unweighted = inverse(normal, 1e-12)[:, :size]
     added, said = np.zeros((size, size)), {}
     for name, condition in errors.conditions.items():
+        tilted = errors.own * (CONDITION_WEIGHT.value * condition)[:, None]
         moves = []
         for sign in (1.0, -1.0):
-            weight = 1 + sign * CONDITION_WEIGHT.value * condition
-            move, p_value = _moved(errors, unweighted, weight)
+            other = inverse(normal + sign * (errors.own.T @ tilted), 1e-12)[:, :size]
+            move, p_value = _moved(errors, errors.own + sign * tilted, other, unweighted)
             moves.append(np.where(p_value < level, move, 0.0))
         far = max(moves, key=lambda d: float(np.abs(d).max()))
         if far.any():
@@ -61,15 +63,13 @@ def dependent(fit: Fit, errors: Regression | None) -> tuple[Fit, list[Finding]]:
     ]
 
 
-def _moved(errors: Regression, unweighted: Array, weight: Array) -> tuple[Array, Array]:
+def _moved(
+    errors: Regression, weighted: Array, other: Array, unweighted: Array
+) -> tuple[Array, Array]:
     """Return by how much other weights move the coordinates, and how likely chance does that."""
     own, e = errors.own, errors.residual
-    free = slice(errors.n_free)
-    weighted = own * weight[:, None]
-    other = inverse(own.T @ weighted, 1e-12)[:, free]
-    move = other.T @ (weighted.T @ e)
     # Of the residuals in the move of each coordinate.
-    rows = weighted @ other - own @ unweighted[:, free]
+    rows = weighted @ other - own @ unweighted
     seen = e != 0.0  # rows without a measurement are zero
     white = float(e @ e) / max(int(seen.sum()) - own.shape[1], 1)
     share = _by_block(np.square(rows) * seen[:, None], errors.block)
@@ -78,6 +78,7 @@ def _moved(errors: Regression, unweighted: Array, weight: Array) -> tuple[Array,
     stretches = 1 / np.maximum(np.square(share / whole).sum(axis=0), 1e-300)
     blocks = len(sums)
     variance = np.maximum(np.square(sums).sum(axis=0) * blocks / (blocks - 1), white * whole)
+    move = other.T @ (weighted.T @ e)
     ratio = np.square(move) / np.maximum(variance, 1e-300)
     return move, np.asarray(fdtrc(1, np.maximum(stretches - 1, 1.0), ratio))
 
