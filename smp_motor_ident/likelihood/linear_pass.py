@@ -65,7 +65,7 @@ def tabulate(usual: float, par: Array) -> Array:
 
 
 @compiled
-def _fill(row: Array, h: float, par: Array, table: Array) -> None:
+def fill(row: Array, h: float, par: Array, table: Array) -> None:
     """Put the propagator over h into a row."""
     if table.shape[0] > 0 and abs(h - table[-2]) <= table[-1]:
         evaluate(table[:-2], (h - table[-2]) / table[-1], row, 0)
@@ -107,7 +107,7 @@ def march(
             h = time[n] - time[n - 1]
             if abs(h - step) > 1e-9 * h + 1e-15 * abs(time[n]):
                 step = h
-                _fill(row, h, par, table)
+                fill(row, h, par, table)
                 e00, e01, e10, e11, h0, h1 = row[0], row[1], row[2], row[3], row[4], row[5]
                 v0, v1, v2 = row[6], row[7], row[8]
                 d00, d01, d10, d11 = row[o], row[o + 1], row[o + 2], row[o + 3]
@@ -181,7 +181,7 @@ def squares_sliding(
                 h = time[n] - time[n - 1]
                 if abs(h - step) > 1e-9 * h + 1e-15 * abs(time[n]):
                     step = h
-                    _fill(row, h, par, table)
+                    fill(row, h, par, table)
                     e00, e01, e10, e11, h0, h1 = row[0], row[1], row[2], row[3], row[4], row[5]
                     v0, v1, v2 = row[6], row[7], row[8]
                 v = voltage[n] - load

@@ -15,6 +15,7 @@ import numpy as np
 from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident.likelihood import recursion
 from smp_motor_ident.likelihood.experiments import Experiments
+from smp_motor_ident.likelihood.linear_answers import answers_sliding
 from smp_motor_ident.likelihood.linear_pass import run_sliding, squares_sliding
 from smp_motor_ident.likelihood.low_pass import LOW_PASS_WEIGHTS
 from smp_motor_ident.likelihood.noise import NoiseModel, whitening
@@ -111,6 +112,12 @@ def answers(
     count = own * (structure.matrix.shape[1] + len(own_columns(data, structure)))
     width = count + max(signals[0].shape[0], signals[1].shape[1])
     sums = np.zeros((row_starts(data, together).size, 1 + (data.current.size > 0), width))
+    if width == len(signals[0]) and not signals[1].size and _slides(data, structure, z, noise):
+        answers_sliding(
+            data.time, data.starts, data.output, data.kind == ANGLE, structure.internal(z)[0],
+            data.jittered, signals[0], together, sums,
+        )  # fmt: skip
+        return sums
     beside = Beside(*signals, sums, together)
     gather(data, structure, z, initial, noise, differentiate=own, beside=beside)
     return sums

@@ -11,7 +11,7 @@ from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.likelihood.noise import NO_GAIN, NoiseModel, deviance, kalman_gain
 from smp_motor_ident.likelihood.passes import answers, evaluate, gather
 from smp_motor_ident.model.coordinates import LOGARITHMS, NAMES, Coordinates
-from smp_motor_ident.model.measurement import ANGLE, MEAN_SPEED
+from smp_motor_ident.model.measurement import ANGLE, MEAN_SPEED, SPEED
 from smp_motor_ident.model.physical import from_physical
 from smp_motor_ident.model.structures import SENSORS, Electromechanical, FirstOrder, SecondOrder
 
@@ -167,6 +167,23 @@ def test_answer_to_a_signal_is_what_little_of_it_changes(sensor, with_gain):
         expected = np.add.reduceat(change[:, 1 + output], rows)
         # A stop or a start that comes a little earlier or later bends the answer.
         assert np.abs(found[:, output] - expected).max() < 2e-3 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("kind", [SPEED, ANGLE])
+@pytest.mark.parametrize("order", [FirstOrder, SecondOrder])
+def test_answers_of_a_motor_that_only_slides_are_those_of_the_pass_with_events(kind, order):
+    _, data, z = exact(static_voltage=0.0, kind="sine", seconds=2.0)
+    held = np.sort(np.r_[data.time[:-1], data.time[-1]] + 1e-4 * np.sin(np.arange(data.size)))
+    output = np.where(np.arange(data.size) % 7 == 3, np.nan, data.output)
+    data = replace(data, kind=kind, time=held, hold_end=held, output=output, current=np.zeros(0))
+    z, signals = z.with_friction(0.0), np.cos(np.outer([3.0, 40.0], held))
+    beside = signals, np.zeros((0, 0, 0))
+    found = [
+        answers(data, s, s.complete(z), data.initial, NoiseModel(), beside, 7, False)
+        for s in (order(friction="none"), order())
+    ]
+    # The second pass locates turns, of which no friction makes anything.
+    np.testing.assert_allclose(found[0], found[1], rtol=0, atol=1e-9 * np.abs(found[1]).max())
 
 
 @pytest.mark.parametrize("size", [1.0, 1e90])
