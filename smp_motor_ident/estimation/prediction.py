@@ -75,7 +75,7 @@ def again(data: Experiments, structure: Structure, fit: Fit) -> Pass:
 
 def _beside(data: Experiments, structure: Structure) -> Structure:
     """Return a structure with all free that is asked for beside a fit, if a pass has the room."""
-    free = structure.friction == "symmetric" and "vc_plus" in structure.free
+    free = structure.friction == "none" or "vc_plus" in structure.free
     more = structure.with_(
         load=not structure.own_load,
         delay=structure.delay or "delay" not in structure.fixed,

@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, fields
 from functools import cached_property
+from operator import itemgetter
 
 import numpy as np
 
@@ -56,7 +57,7 @@ class Coordinates:
     @classmethod
     def of(cls, values: Array) -> Coordinates:
         """Return coordinates from their values in the order of the fields, shape (12,)."""
-        return cls(*map(float, values))
+        return cls(*values.tolist())
 
     @cached_property
     def array(self) -> Array:
@@ -68,7 +69,7 @@ class Coordinates:
     def with_(self, **values: float) -> Coordinates:
         """Return the same but for some coordinates."""
         # Asked for at every step of a descent: what `replace` does takes ten times as long.
-        every = {n: self.__dict__[n] for n in NAMES} | {n: float(v) for n, v in values.items()}
+        every = dict(zip(NAMES, _VALUES(self.__dict__))) | {n: float(v) for n, v in values.items()}
         if len(every) > len(NAMES):
             raise TypeError(f"no coordinates: {', '.join(set(every) - set(NAMES))}")
         made = object.__new__(Coordinates)
@@ -133,6 +134,7 @@ class Coordinates:
 
 
 NAMES = tuple(f.name for f in fields(Coordinates))
+_VALUES = itemgetter(*NAMES)
 LOGARITHMS = tuple(n for n in NAMES if n.startswith("ln_"))
 PLAUSIBLE = 1 / np.square([float(f.metadata["far"]) for f in fields(Coordinates)])
 """Inverse squares of how far each coordinate could be from any value at all, shape (12,)."""
