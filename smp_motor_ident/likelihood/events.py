@@ -176,7 +176,7 @@ def advance(
         f = load + (par[VC_PLUS] if direction > 0.0 else -par[VC_MINUS])
         t = _zero_crossing(left, par, x, direction, v, f)
         span = t if t >= 0.0 else left
-        fill(span, par, m, cache, SLOTS, scratch)
+        fill(span, par, m, cache, marks, SLOTS, scratch)
         activate(m, cache, marks, SLOTS, 0)
         if lags:
             before_move(x, m)

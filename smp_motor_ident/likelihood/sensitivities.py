@@ -65,12 +65,19 @@ def _aligned(size: int) -> Array:
 
 
 @compiled
-def fill(h: float, par: Array, m: Array, cache: Array, slot: int, scratch: Array) -> None:
-    """Put the propagator over h into a slot, with its derivative by each column."""
+def fill(
+    h: float, par: Array, m: Array, cache: Array, marks: Array, slot: int, scratch: Array
+) -> None:
+    """Put the propagator over h into a slot, with its derivative by each column that it reaches."""
     if par[TE] == 0.0:
         first_order(scratch, h, par[TM], par[K], par[BE])
     else:
         second_order(scratch, h, par[TE], par[TM], par[K], par[BE])
+    at = slot * SLOT + ROW * LANES
+    for c in range(ROW):
+        cache[at + c] = scratch[c]
+    if not marks[REACHED] > 0.0:
+        return
     at = slot * SLOT
     for c in range(ROW):
         a, b = scratch[ROW + c], scratch[2 * ROW + c]
@@ -83,8 +90,6 @@ def fill(h: float, par: Array, m: Array, cache: Array, slot: int, scratch: Array
                 + e * m[SLOPE + 3 * LANES + j]
             )
         at += LANES
-    for c in range(ROW):
-        cache[at + c] = scratch[c]
 
 
 @compiled
@@ -104,16 +109,20 @@ def activate(m: Array, cache: Array, marks: Array, slot: int, bank: int) -> None
 def tabulate(
     step: float, par: Array, m: Array, cache: Array, marks: Array, scratch: Array
 ) -> Array:
-    """Return a table of the propagators around a usual interval."""
+    """Return a table of the propagators around a usual interval.
+
+    Their derivatives are in it only where there are columns that they reach.
+    """
     half = half_range(step, par[TE], par[TM], par[K], par[BE])
     marks[MIDDLE], marks[HALF] = step, half
     if half == 0.0:
         return np.zeros(0)
-    table, values = _aligned(NODES * SLOT), np.empty(NODES * SLOT)
+    width = SLOT if marks[REACHED] > 0.0 else ROW
+    table, values = _aligned(NODES * width), np.empty(NODES * width)
     for n in range(NODES):
-        fill(step + half * POINTS[n], par, m, cache, SLOTS, scratch)
-        for i in range(SLOT):
-            values[n * SLOT + i] = cache[SLOTS * SLOT + i]
+        fill(step + half * POINTS[n], par, m, cache, marks, SLOTS, scratch)
+        for i in range(width):
+            values[n * width + i] = cache[CACHE - width + i]
     expand(values, table)
     return table
 
@@ -131,7 +140,8 @@ def prepare_slide(
 ) -> int:
     """Return the bank that has the propagator over h: tabulated, kept, or computed."""
     if table.shape[0] > 0 and abs(h - marks[MIDDLE]) <= marks[HALF]:
-        evaluate(table, (h - marks[MIDDLE]) / marks[HALF], m, FORCED)
+        to = FORCED if marks[REACHED] > 0.0 else WHOLE
+        evaluate(table, (h - marks[MIDDLE]) / marks[HALF], m, to)
         marks[ACTIVE] = h
         return 0
     bank = int(marks[BANK])
@@ -143,7 +153,7 @@ def prepare_slide(
     slot = int(marks[NEXT])
     marks[NEXT] = (slot + 1) % SLOTS
     marks[slot] = h
-    fill(h, par, m, cache, slot, scratch)
+    fill(h, par, m, cache, marks, slot, scratch)
     activate(m, cache, marks, slot, bank)
     return bank
 
