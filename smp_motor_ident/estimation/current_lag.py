@@ -64,8 +64,8 @@ def with_current_lag(
             candidates.append(FittedCandidate(other, "no lag of the current shows", whole=False))
             continue
         verdict, reason = POLICY.preferred(best, other)
-        if verdict and other.noise_ratio > 0:
-            other = data_window.grow(data, richer, other, options)
+        if verdict:
+            other = data_window.grown(data, other, options)
         candidates.append(FittedCandidate(other, reason))
         best = other if verdict else best
     return best

@@ -66,6 +66,14 @@ def grow(
     return extend(data, structure, best, options)
 
 
+def grown(data: Experiments, fit: Fit, options: Options) -> Fit:
+    """Find anew how much torque noise there is: what a model lacked may have looked like it."""
+    if not fit.noise_ratio > 0:
+        return fit
+    again = grow(data, fit.structure, fit, options)
+    return again if again.deviance < fit.deviance + TORQUE_NOISE.value else fit
+
+
 def extend(
     data: Experiments, structure: Structure, best: Fit, options: Options, known: Fit | None = None
 ) -> Fit:

@@ -148,8 +148,8 @@ def with_low_pass(
     tried = [_filtered(low, richer, near, z, options) for z in starts]
     other = min(tried, key=lambda f: f.deviance)
     verdict, reason = POLICY.preferred(best, other)
-    if verdict and other.noise_ratio > 0:  # what looked like torque noise may have been this
-        other = data_window.grow(low, richer, other, options)
+    if verdict:
+        other = data_window.grown(low, other, options)
     candidates.append(FittedCandidate(other, reason))
     if not verdict:
         return best
@@ -285,8 +285,5 @@ def delay_without_noise(data: Experiments, best: Fit, options: Options) -> Fit |
         for samples in DELAYS
     ]
     other = min(late, key=lambda f: f.deviance)
-    return (
-        data_window.grow(data, richer, other, options)
-        if POLICY.preferred(plain, other)[0]
-        else None
-    )
+    preferred, _ = POLICY.preferred(plain, other)
+    return data_window.grow(data, richer, other, options) if preferred else None

@@ -391,8 +391,8 @@ def _orders_again(
         ]
         other = no_worse(there, min(fits, key=lambda f: f.deviance), [best], options)
         better, reason = POLICY.replaces(best, other)
-        if better and other.noise_ratio > 0:  # what looked like torque noise may have been this
-            other = data_window.grow(there, structure, other, options)
+        if better:
+            other = data_window.grown(there, other, options)
         candidates.append(FittedCandidate(other, reason))
         best, s = (other, structure) if better else (best, s)
     return best

@@ -68,8 +68,8 @@ def _with_addition(
     verdict, reason = POLICY.preferred(best, other)
     if verdict and "delay" in change and other.z.delay < 0.03 * data.step:
         verdict, reason = False, "a delay of hundredths of a sample is how the input was held"
-    if verdict and other.noise_ratio > 0:  # what looked like torque noise may have been this
-        other = data_window.grow(data, richer, other, options)
+    if verdict:
+        other = data_window.grown(data, other, options)
     if verdict and richer.current and "load" in change:  # R and K were found where it was missing
         other = initial_fit(data, richer, options, [other.z], near=other) or other
     candidates.append(FittedCandidate(other, reason))

@@ -123,9 +123,8 @@ def _breakaway(h: float, v: float, load: float, par: Array, x: Array) -> tuple[f
     else:
         return h, STUCK
     wait = 0.0
-    if par[TE] > 0.0 and (limit - drive) * (end - drive) > 0.0:
-        ratio = (limit - end) / (drive - end)
-        wait = -par[TE] * math.log(ratio) if ratio > 0.0 else h
+    if par[TE] > 0.0 and direction * (limit - drive) > 0.0:  # else it pulls enough already
+        wait = -par[TE] * math.log((limit - end) / (drive - end))
     return (wait, direction) if wait < h else (h, STUCK)
 
 

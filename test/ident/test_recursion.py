@@ -14,6 +14,7 @@ from smp_motor_ident.model.coordinates import LOGARITHMS, NAMES, Coordinates
 from smp_motor_ident.model.measurement import ANGLE, MEAN_SPEED, SPEED
 from smp_motor_ident.model.physical import from_physical
 from smp_motor_ident.model.structures import SENSORS, Electromechanical, FirstOrder, SecondOrder
+from smp_motor_ident.record import Record
 
 
 def predict(data, structure, z, gain=NO_GAIN):
@@ -107,6 +108,22 @@ def test_irregular_stamps_are_taken_as_they_are():
     z = from_physical(*p, 0.2 * p[2] / p[0])
     out = predict(data, Electromechanical(), z)
     np.testing.assert_allclose(out[:, 0], small[:, 1], atol=0.05)  # as above
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_motor_at_rest_goes_where_more_than_its_friction_pulls_however_that_fades(sign):
+    t = np.arange(200) / 1000.0
+    data = prepare([Record("motor", t, np.full(200, 3.0 * sign), velocity=0 * t)], False)
+    structure = SecondOrder(load=True)
+    z = structure.complete(
+        Coordinates(*np.log([0.05, 2e-3, 4e-7])).with_friction(0.5).with_(load=-0.2, ln_te=-8.5)
+    )
+    ends = []
+    for voltage in (3.0, 3.0 + 1e-9, 3.2):  # over the winding, towards the 3 V of the supply
+        begins = np.array([[sign * voltage, 0.0, 0.0, 0.0, 0.0]])
+        ends.append(predict(replace(data, initial=begins), structure, z)[-1, 0])
+    assert sign * ends[0] > 10.0
+    np.testing.assert_allclose(ends, ends[0], rtol=1e-3)
 
 
 def test_coordinates_that_are_no_numbers_are_no_motor_and_no_crash():
