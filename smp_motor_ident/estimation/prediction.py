@@ -39,7 +39,7 @@ def once(data: Experiments, fit: Fit, gain: bool = False) -> Array:
 def voltage_at_samples(data: Experiments) -> Array:
     """Return the voltage at the samples' instants, segment by segment."""
     if data.plain:
-        return data.hold_value
+        return data.hold_value[: data.size]  # a window of the data keeps the whole input
     out = np.empty(data.size)
     for g, (a, b) in enumerate(zip(data.starts[:-1], data.starts[1:])):
         first = int(data.hold_start[g])

@@ -5,6 +5,11 @@ import pytest
 from independent import simulate
 
 from smp_motor_ident.estimate import estimate
+from smp_motor_ident.estimation.fit import Options
+from smp_motor_ident.estimation.initialisation import initial_fit
+from smp_motor_ident.estimation.profile import one_level
+from smp_motor_ident.likelihood.experiments import prepare
+from smp_motor_ident.model.structures import Electromechanical
 from smp_motor_ident.record import Hardware, Record
 
 R, L, K, J, B, TC = 0.70, 6.2e-3, 0.0182, 2.29e-4, 2.0e-4, 4.2e-3
@@ -43,6 +48,12 @@ def test_a_step_with_current_is_known_where_its_first_samples_tell_it():
         for name in ("resistance", "inductance", "motor_constant", "time_constant"):
             assert every[name].value is not None, (seed, name)
             assert abs(every[name].value / TRUTH[name] - 1) < 0.1, (seed, name)
+
+
+def test_a_window_of_one_level_is_of_one_level():
+    window = prepare([_step(0)], True).data_window(2.0)
+    fit = initial_fit(window, Electromechanical(friction="symmetric"), Options())
+    assert one_level(window, fit)
 
 
 def _random_step(seed: int) -> tuple[Record, dict[str, float]]:
