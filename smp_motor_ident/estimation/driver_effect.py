@@ -19,6 +19,7 @@ from smp_motor_ident.diagnosis.sample_limits import EFFECT_SHOWN, SLEW_SEEN
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.fitted import NORMAL_95
 from smp_motor_ident.finding import Finding
+from smp_motor_ident.likelihood.experiments import output_of
 from smp_motor_ident.model.driver import (
     CLIP,
     COAST,
@@ -29,6 +30,7 @@ from smp_motor_ident.model.driver import (
     DriverEffect,
     Rows,
 )
+from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import UNITS, Estimate, Quantity
 
@@ -154,7 +156,10 @@ def _driven(record: Record, driver: Driver) -> Record:
     first = np.zeros(len(record), dtype=np.bool_)
     first[list(record.starts)] = True
     interval = np.diff(record.time, prepend=record.time[0])
-    rows = Rows(record.voltage, np.zeros(len(record)), interval, first, 0.0)
+    output, kind, _ = output_of(record)
+    speed = np.gradient(output, record.time) if kind == ANGLE else output
+    most, top = float(np.nanmax(np.abs(speed), initial=0.0)) or 1.0, np.abs(record.voltage).max()
+    rows = Rows(record.voltage, speed * top / most, interval, first, 0.0)
     return replace(record, voltage=rows.through(driver))
 
 

@@ -265,8 +265,8 @@ class _Profile:
         grid = np.log(self.effect.scale(rows) * np.array(self.effect.shares))
         values = [self.deviance(x) for x in grid]
         k = int(np.argmin(values))
-        low = float(grid[k - 1] if k else 2 * grid[0] - grid[1])
-        high = float(grid[k + 1] if k + 1 < grid.size else 2 * grid[-1] - grid[-2])
+        ends = [2 * grid[0] - grid[1], *grid, 2 * grid[-1] - grid[-2]]
+        low, high = sorted((float(ends[k]), float(ends[k + 2])))
         likeliest = self._between(low, high)  # also where it begins, between it and none
         return likeliest if self.near.deviance < none - RISE else None
 

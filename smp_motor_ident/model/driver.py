@@ -21,6 +21,8 @@ from smp_motor_control.arrays import Array, Flags
 from smp_motor_ident._compile import compiled, inlined
 
 NOTHING, DEAD_ZONE, CLIP, SLEW, SAG, DROP, COAST, CURRENT = range(8)
+REST = 0.05
+"""Back-EMF of a motor that begins at rest, of the largest command at most."""
 
 
 class Driver(NamedTuple):
@@ -130,8 +132,13 @@ class Rows:
         return max(self.supply, self.top)
 
     def through(self, driver: Driver) -> Array:
-        """Return the mean voltage at the terminals over each row's interval [V]."""
-        return _through(driver, self.command, self.back_emf, self.interval, self.first)
+        """Return the mean voltage at the terminals over each row's interval [V].
+
+        A driver that remembers begins from nothing where the motor begins at rest.
+        """
+        rest = self.first & ~(np.abs(self.back_emf) >= REST * self.top)
+        command = np.where(rest, 0.0, self.command) if driver.kind == SLEW else self.command
+        return _through(driver, command, self.back_emf, self.interval, self.first)
 
 
 @compiled
@@ -155,7 +162,8 @@ class DriverEffect:
     code: str  # of its finding
     quantity: str  # name of the number that it is described by
     cause: str
-    # Sizes between which its own is looked for: in the unit, or as shares of `scale`
+    # Sizes between which its own is looked for, in the unit or as shares of `scale`, the mildest
+    # first: the motor behind each is where the search for the next begins
     shares: tuple[float, ...]
 
     def scale(self, rows: Rows) -> float:
@@ -186,11 +194,11 @@ EFFECTS = (
     ),
     DriverEffect(
         CLIP, "clip", "clip_voltage", "a command that is clipped at the supply",
-        (0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0),
+        (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4),
     ),
     DriverEffect(
         SLEW, "slew", "slew_rate", "a driver that limits how fast the voltage rises",
-        (0.1, 0.3, 1.0, 3.0, 10.0, 30.0),
+        (30.0, 10.0, 5.5, 3.0, 1.8, 1.0, 0.55, 0.3, 0.18, 0.1),
     ),
     DriverEffect(
         SAG, "supply_sag", "source_resistance_ratio", "a supply that sags under load",
@@ -202,7 +210,7 @@ EFFECTS = (
     ),
     DriverEffect(
         CURRENT, "current_limit", "current_limit_voltage", "a driver that limits the current",
-        (0.15, 0.3, 0.5, 0.8, 1.2, 1.7),
+        (1.7, 1.2, 0.8, 0.5, 0.3, 0.15),
     ),
     DriverEffect(
         COAST, "coast", "fast_decay_ratio", "a driver that lets the motor coast (fast decay)",

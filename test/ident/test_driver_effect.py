@@ -64,11 +64,11 @@ def clipped(u: np.ndarray) -> np.ndarray:
     return np.clip(u, -9.0, 9.0)
 
 
-def slewed(u: np.ndarray) -> np.ndarray:
-    """Return the means of a voltage that rises by 200 V/s, by a fine grid."""
-    fine, now, out = 200, float(u[0]), np.empty(u.size)
-    most = 200 * STEP / fine
-    for k, target in enumerate(u.tolist()):
+def slewed(u: np.ndarray, rate: float = 200.0) -> np.ndarray:
+    """Return the means of a voltage that rises at a rate, from nothing, by a fine grid."""
+    fine, now, out = 200, 0.0, np.zeros(u.size)
+    most = rate * STEP / fine
+    for k, target in enumerate(u.tolist()[1:], 1):
         total = 0.0
         for _ in range(fine):
             before = now
@@ -130,6 +130,27 @@ def test_steps_of_one_size_through_a_ramp_are_no_second_lag_under_a_load_that_fl
     for name, value in {"dc_gain": GAIN, "time_constant": TAU, "slew_rate": 110.0}.items():
         quantity = found.combinations[name]
         assert abs(quantity.value - value) < 4 * quantity.std + 0.005 * value, name
+
+
+def test_a_rise_begins_from_nothing_where_the_motor_begins_at_rest():
+    first = np.array([True, False, False])
+    for emf, expected in ((0.0, [0.0, 2.5, 7.5]), (9.0, [10.0, 10.0, 10.0])):
+        rows = driver.Rows(np.full(3, 10.0), np.full(3, emf), np.full(3, 0.1), first, 0.1)
+        assert rows.through(Driver(driver.SLEW, 50.0)) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("levels", [(8, 3, 10, 5, 12, 7, 2, 9), (9, -4, 6, 12, -10, 3, -7)])
+def test_a_rise_as_slow_as_the_motor_is_no_lag_of_it(levels):
+    """The command is there in the first row, the voltage is not: the motor begins at rest."""
+    command = np.repeat(np.array(levels, dtype=float), 120)
+    speed = run(slewed(command, 80.0), 0)
+    record = Record("motor", np.arange(command.size) * STEP, command, velocity=speed)
+    found = estimate(record)
+    for name, true in {"time_constant": TAU, "slew_rate": 80.0}.items():
+        q = found.combinations[name]
+        # 4 standard deviations; a two-hundredth besides, of what lies between the rows.
+        assert abs(q.value - true) < max(4 * q.std, 0.005 * true)
+        assert abs(q.value / true - 1) < 0.02
 
 
 def test_a_clip_just_below_the_largest_command_is_found():
