@@ -60,6 +60,7 @@ from smp_motor_ident.estimation.driver_effect import (
     declared,
     leaves_torque_noise,
     suspecting,
+    suspects_driver,
     through,
 )
 from smp_motor_ident.estimation.driver_search import likeliest, run_free
@@ -188,6 +189,7 @@ def _answered(group: list[Record], request: Request, found: Sequence[Finding]) -
     except (SignalError, InsufficientExcitationError) as error:
         refusal, reason = error, UNDECIDED
     bare, other = request.without_current(group)
+    other = replace(other, suspected=first is not None and suspects_driver(first))
     try:
         second: Estimate | None = _estimated(bare, other, [*found, current_left_out(reason)])
     except (SignalError, InsufficientExcitationError):
@@ -217,7 +219,7 @@ def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) 
         try:
             words = [*found, *fallen_back(refused, one.label)]
             plain = _stated(group, request, words, data, hold, [*left, one], refused is None)
-            if not lacks_something(plain):
+            if not (request.suspected or lacks_something(plain)):
                 if refused is not None or not one.fit.noise_ratio > 0:
                     return plain
                 ramped, _ = _through_driver(group, request, found, data, hold, one.fit, RAMPS)

@@ -118,6 +118,12 @@ def suspecting(estimate: Estimate, found: DriverFit | None, fit: Fit) -> Estimat
     return replace(estimate, findings=(finding, *estimate.findings))
 
 
+def suspects_driver(estimate: Estimate) -> bool:
+    """Tell whether an estimate is unreliable for what a driver may do."""
+    codes = {effect.code for effect in EFFECTS}
+    return any(f.severity == "unreliable" and f.code in codes for f in estimate.findings)
+
+
 def leaves_torque_noise(estimate: Estimate, fit: Fit) -> bool:
     """Tell whether a motor behind a driver needs most of the torque noise of one without it.
 

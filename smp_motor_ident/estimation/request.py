@@ -40,6 +40,7 @@ class Request:
     driver: DriverFit | None = None  # what the driver is taken to make of its command
     # Time at which the excitation of each record begins [s]; none where disturbances are left out
     since: tuple[float, ...] = ()
+    suspected: bool = False  # whether the driver is sought although nothing is lacking
 
     @property
     def options(self) -> Options:

@@ -11,7 +11,12 @@ import pytest
 from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.estimation import fast_decay
-from smp_motor_ident.estimation.driver_effect import DriverFit, driver_of, leaves_torque_noise
+from smp_motor_ident.estimation.driver_effect import (
+    DriverFit,
+    driver_of,
+    leaves_torque_noise,
+    suspects_driver,
+)
 from smp_motor_ident.estimation.driver_search import _measured, likeliest
 from smp_motor_ident.estimation.fit import Fit, Options
 from smp_motor_ident.estimation.initialisation import initial_fit
@@ -219,6 +224,15 @@ def test_what_leaves_most_of_the_torque_noise_is_no_driver(before, behind, leave
     found, fit = SimpleNamespace(findings=(noise,)), SimpleNamespace(noise_ratio=before)
     assert leaves_torque_noise(found, fit) is leaves
     assert not leaves_torque_noise(SimpleNamespace(findings=()), fit)
+
+
+@pytest.mark.parametrize(
+    ("code", "severity", "suspected"),
+    [("slew", "unreliable", True), ("slew", "note", False), ("current_lag", "unreliable", False)],
+)
+def test_a_driver_is_suspected_where_an_estimate_is_unreliable_for_one(code, severity, suspected):
+    found = Finding(code, severity, "")
+    assert suspects_driver(SimpleNamespace(findings=(found,))) is suspected
 
 
 def test_the_motion_of_each_record_is_its_own():
