@@ -17,7 +17,8 @@ from smp_motor_ident.estimation.driver_effect import (
     leaves_torque_noise,
     suspects_driver,
 )
-from smp_motor_ident.estimation.driver_search import _measured, likeliest
+from smp_motor_ident.estimation.driver_rows import _measured
+from smp_motor_ident.estimation.driver_search import likeliest
 from smp_motor_ident.estimation.fit import Fit, Options
 from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.finding import Finding

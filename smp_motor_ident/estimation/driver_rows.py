@@ -1,0 +1,57 @@
+"""The rows of records as a driver meets them: command and back-EMF; and what it makes of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+
+from smp_motor_control.arrays import Array
+from smp_motor_ident.estimation import prediction
+from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.likelihood.experiments import Experiments
+from smp_motor_ident.model.driver import Rows
+from smp_motor_ident.model.measurement import ANGLE
+from smp_motor_ident.record import Record
+
+SMOOTHED, MOST_SMOOTHED = 0.2, 1_000  # of the motor's lag, and rows: a measured speed is its mean
+
+
+def with_voltages(group: Sequence[Record], voltage: Array) -> list[Record]:
+    """Return records with other voltages, one after the other."""
+    ends = np.cumsum([0, *map(len, group)])
+    return [replace(r, voltage=voltage[a:b]) for r, (a, b) in zip(group, pairwise(ends))]
+
+
+def rows_of(data: Experiments, group: Sequence[Record], fit: Fit, measured: bool = False) -> Rows:
+    """Return the commands of records and how the fitted motor runs, or did as measured."""
+    speed = _measured(data, fit) if measured else prediction.simulate(data, fit)[:, 0]
+    first = np.zeros(data.size, dtype=np.bool_)
+    first[data.starts[:-1]] = True
+    middle, interval = speed.copy(), np.full(data.size, data.step)
+    middle[1:] = np.where(first[1:], speed[1:], 0.5 * (speed[1:] + speed[:-1]))
+    interval[1:] = np.where(first[1:], data.step, np.diff(data.time))
+    back = float(fit.structure.internal(fit.z)[0][2])
+    command = np.concatenate([r.voltage for r in group])
+    supply = min((r.hardware.supply_voltage or 0.0 for r in group), default=0.0)
+    return Rows(command, back * middle, interval, first, fit.z.time_constant, supply)
+
+
+def _measured(data: Experiments, fit: Fit) -> Array:
+    """Return the speed as measured, a mean over a fraction of the motor's lag."""
+    width = int(np.clip(SMOOTHED * fit.z.time_constant / data.step, 1, MOST_SMOOTHED))
+    out = []
+    for a, b in pairwise(data.starts):  # the time of each record is its own
+        time, output = data.time[a:b], data.output[a:b]
+        there = np.isfinite(output)
+        if b - a < 2 or not there.any():  # nothing was measured, as where a motor stands
+            out.append(np.zeros(b - a))
+            continue
+        speed = np.interp(time, time[there], output[there])
+        if data.kind == ANGLE:
+            speed = np.gradient(speed, time)
+        out.append(uniform_filter1d(speed, width, mode="nearest"))
+    return np.concatenate(out)
