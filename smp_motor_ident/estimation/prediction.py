@@ -117,23 +117,31 @@ def information(data: Experiments, fit: Fit) -> Array:
     return again(data, fit.structure, fit).normal
 
 
-def influence(data: Experiments, fit: Fit) -> tuple[Array, Array]:
-    """Return how an error of one in each output moves the coordinates, and they the output, (n, f).
+def positive_part(matrix: Array, scale: Array) -> Array:
+    """Return the nearest covariance, in the units of another."""
+    unit = np.sqrt(np.maximum(np.diag(scale), 1e-300))
+    values, vectors = np.linalg.eigh(matrix / np.outer(unit, unit))
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T * np.outer(unit, unit))
 
-    The motion stays the one that the fit predicts, so the Gauss-Newton step is a sum over the
-    samples.
+
+def influence(data: Experiments, fit: Fit, of: int = 0) -> tuple[Array, Array]:
+    """Return how an error of one in an output moves the coordinates, and they that output, (n, f).
+
+    Output 0 is the motion, 1 the current.  The motion stays the one that the fit predicts, so the
+    Gauss-Newton step is a sum over the samples.
     """
     here, free = again(data, fit.structure, fit), len(fit.structure.free)
     none = np.zeros((0, 0)), np.zeros((0, 0, 0))
     moved = answers(data, fit.structure, fit.z, fit.initial, fit.noise_model(), none, 1, True)
     weight = whitening(fit.noise)
-    score = weight[0, 0] ** 2 * moved[:, 0]
+    score = weight[0, 0] * weight[0, of] * moved[:, 0]
     if data.current.size:
         both = np.isfinite(data.current)[:, None]
-        score += both * weight[1, 0] * (weight[1, 0] * moved[:, 0] + weight[1, 1] * moved[:, 1])
+        apart = weight[1, 0] * moved[:, 0] + weight[1, 1] * moved[:, 1]
+        score = score + both * weight[1, of] * apart
     for g, (a, b) in enumerate(pairwise(data.starts)):  # the initial states follow
         score[a:b, :free] -= score[a:b, free:] @ here.local_gain[g]
-    return score[:, :free] @ inverse(here.normal), moved[:, 0, :free]
+    return score[:, :free] @ inverse(here.normal), moved[:, of, :free]
 
 
 def predicted_decrease(

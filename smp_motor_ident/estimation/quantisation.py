@@ -1,7 +1,7 @@
-"""How far counts that are not exact can mislead an estimate.
+"""How far counts and currents that are not exact can mislead an estimate.
 
 Quantisation is not noise: where the motion repeats, so does its error, and more samples do
-not average it away.  The fitted motor is replayed with the counter's zero at random places;
+not average it away.  The fitted motor is replayed, with a counter's zero at random places;
 the Gauss-Newton step from each replay is the estimate's error on this very motion.
 Derivation: docs/derivations.md, section 9.
 """
@@ -18,31 +18,47 @@ from smp_motor_ident.model.measurement import ANGLE, MEAN_SPEED
 
 REPLAYS = 8, 32  # fewest and most
 MOST = 500_000  # samples in all replays
+MOSTLY = 3.0  # times rounding's variance, beyond which an error is another's
 COUNTED = 2.0**45  # counts that a double holds to a hundredth
 REACH = 2.0  # standard deviations to which motions near the estimate are replayed
 
 
 def widened(data: Experiments, fit: Fit, seed: int = 0) -> Fit:
     """Return the fit with its covariance widened where quantisation repeats."""
-    if data.quantum == 0 or fit.noise_ratio > 0 or not fit.structure.free:
+    if fit.noise_ratio > 0 or not fit.structure.free:
         return fit
-    own = data.quantum**2 / 12
-    if fit.noise[0, 0] > 3 * own or (data.kind != ANGLE and _counted(data, fit)):
-        return fit
-    cov = fit.covariance()
-    counted, metered = (np.diag(share) for share in _shares(data, fit))
+    motion, current = _steps(data, fit)
+    shares, rng = _shares(data, fit), np.random.default_rng(seed)
+    wide = fit
+    if current:  # of which quantities are differences that coordinates by themselves hardly show
+        half, carried = _half(REACH**2 * fit.covariance()), prediction.influence(data, fit, 1)
+        errors = _errors(data, fit, 1, current, carried, half, rng)
+        excess = errors.T @ errors / max(len(errors), 1) - shares[1]
+        wide = wide.wider(prediction.positive_part(excess, shares[1]))
+    if not motion:
+        return wide
+    cov, counted, metered = fit.covariance(), *(np.diag(share) for share in shares)
     expected = np.maximum(metered + counted, 1e-300)
-    rng = np.random.default_rng(seed)
-    excess, (influence, slope) = np.ones(len(cov)), prediction.influence(data, fit)
+    ratio, carried = np.ones(len(cov)), prediction.influence(data, fit)
     # How the counter errs hangs on the motion itself, known as well as the estimate tells:
     # a first round shows how well that is, the second takes it from there.
     for _ in range(2):
-        spread = REACH**2 * cov * np.sqrt(np.outer(excess, excess))
-        errors = _counting_errors(data, fit, own, slope @ _half(spread), rng) @ influence
+        half = _half(REACH**2 * cov * np.sqrt(np.outer(ratio, ratio)))
+        errors = _errors(data, fit, 0, motion, carried, half, rng)
         # Only what the counter does is replayed; what the current's noise does is known.
         second = metered + np.square(errors).sum(axis=0) / max(len(errors), 1)
-        excess = np.maximum(second / np.maximum(expected, np.diag(cov)), excess)
-    return replace(fit, widen=np.sqrt(excess))
+        ratio = np.maximum(second / np.maximum(expected, np.diag(cov)), ratio)
+    return replace(wide, widen=np.sqrt(ratio))
+
+
+def _steps(data: Experiments, fit: Fit) -> tuple[float, float]:
+    """Return the steps of motion and current, 0 where other errors are larger, or it is a mean."""
+    motion, current = data.quantum, data.current_quantum
+    if fit.noise[0, 0] > MOSTLY * motion**2 / 12 or (data.kind != ANGLE and _counted(data, fit)):
+        motion = 0.0
+    if fit.noise[1, 1] > MOSTLY * current**2 / 12:
+        current = 0.0
+    return motion, current
 
 
 def _counted(data: Experiments, fit: Fit) -> bool:
@@ -75,23 +91,31 @@ def _half(spread: Array) -> Array:
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
-def _counting_errors(
-    data: Experiments, fit: Fit, own: float, moves: Array, rng: np.random.Generator
+def _errors(
+    data: Experiments,
+    fit: Fit,
+    of: int,
+    step: float,
+    carried: tuple[Array, Array],
+    spread: Array,
+    rng: np.random.Generator,
 ) -> Array:
-    """Return what rounding adds to the output of motions near the fit's, shape (replays, n).
+    """Return what rounding an output does to the estimate, for motions near it, (replays, f).
 
-    A counter's zero may be anywhere, a speed's is known; an angle's offset is free besides.
+    Where a zero is free, a counter's or a current's of unknown offset, it may be anywhere.
     """
-    noise = np.sqrt(max(fit.noise[0, 0] - own, 0.0))
-    there = prediction.simulate(data, fit)[:, 1]
+    noise = np.sqrt(max(fit.noise[of, of] - step**2 / 12, 0.0))
+    influence, slope = carried
+    there, moves = prediction.simulate(data, fit)[:, 1 + of], slope @ spread
+    measured = np.isfinite(data.current) if of else np.isfinite(data.output)
+    anywhere = "current_offset" in fit.structure.free if of else data.kind == ANGLE
     errors = []
     for _ in range(int(np.clip(MOST // data.size, *REPLAYS))):
         true = there + moves @ rng.standard_normal(moves.shape[1])
-        if not np.abs(true).max() < COUNTED * data.quantum:
+        if not np.abs(true).max() < COUNTED * step:
             continue  # no motor: a coordinate that the data leave open went out of all bounds
-        counted = data.kind == ANGLE
         shown = true + noise * rng.standard_normal(data.size)
-        shown += rng.uniform(-0.5, 0.5) * data.quantum * counted
-        wrong = np.rint(shown / data.quantum) * data.quantum - true
-        errors.append(wrong - wrong.mean() * counted)
-    return np.array(errors).reshape(-1, data.size)
+        shown += rng.uniform(-0.5, 0.5) * step * anywhere
+        wrong = np.rint(shown / step) * step - true
+        errors.append((wrong - wrong.mean() * anywhere) * measured)
+    return np.asarray(np.array(errors).reshape(-1, data.size) @ influence)

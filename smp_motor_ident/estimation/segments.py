@@ -30,7 +30,7 @@ from smp_motor_ident.diagnosis.limits import (
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.fitted import NORMAL_95
 from smp_motor_ident.estimation.prediction import inverse as inverse_of
-from smp_motor_ident.estimation.prediction import simulate
+from smp_motor_ident.estimation.prediction import positive_part, simulate
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.passes import gather
 from smp_motor_ident.model.coordinates import LOGARITHMS, PLAUSIBLE, Coordinates
@@ -185,13 +185,13 @@ def _between(middle: Array, step: Array, noise: Array, ordered: bool) -> tuple[A
     """Return the covariance of the next recording's motor around this one's."""
     parts = len(step)
     if not ordered:
-        return _positive(np.cov(step.T).reshape(noise.shape) - noise, noise), parts - 1
+        return positive_part(np.cov(step.T).reshape(noise.shape) - noise, noise), parts - 1
     x = np.column_stack([np.ones(parts), middle])
     answer = np.linalg.lstsq(x, step, rcond=None)[0]
     rest = step - x @ answer
     scatter = np.atleast_2d(rest.T @ rest / (parts - 2))
     drift = np.outer(answer[1], answer[1]) - scatter / np.square(middle).sum()
-    return _positive(scatter - noise, noise) + _positive(drift, noise), parts - 2
+    return positive_part(scatter - noise, noise) + positive_part(drift, noise), parts - 2
 
 
 def _another_day(z: Coordinates, names: Sequence[str]) -> Array:
@@ -207,13 +207,6 @@ def _another_day(z: Coordinates, names: Sequence[str]) -> Array:
     half = own + film / 2
     cov: Array = TEMPERATURE.value**2 * (np.outer(half, half) + np.outer(film, film) / 12)
     return cov
-
-
-def _positive(matrix: Array, scale: Array) -> Array:
-    """Return the nearest covariance, in the units of another."""
-    unit = np.sqrt(np.maximum(np.diag(scale), 1e-300))
-    values, vectors = np.linalg.eigh(matrix / np.outer(unit, unit))
-    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T * np.outer(unit, unit))
 
 
 def _steps(data: Experiments, fit: Fit, count: int) -> Steps | None:

@@ -50,6 +50,7 @@ class Experiments:
     voltage: Array  # as it was recorded, by the row
     stood: Flags  # shape (g,): segments that begin with a standstill, no voltage before them
     how: str = "before"  # how a row's command ran, as in `Structure.held`
+    current_quantum: float = 0.0  # resolution of the current [A]; 0 where it has none
 
     @property
     def plain(self) -> bool:
@@ -160,6 +161,7 @@ class Experiments:
             self.voltage[:end],
             self.stood[:segments],
             self.how,
+            self.current_quantum,
         )
 
 
@@ -312,6 +314,7 @@ def prepare(
         _initial(time, output, bounds, outputs[0][1]),
         voltage,
         stood,
+        current_quantum=speed_quantum(_join(currents)) if use_current else 0.0,
     )
 
 

@@ -254,6 +254,21 @@ def test_a_rounded_speed_is_not_averaged_where_the_motor_keeps_it() -> None:
             assert q.value is None or abs(q.value - true) < 5 * q.std, (seed, name)
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_current_in_steps_of_what_a_motor_takes_is_not_averaged(seed: int) -> None:
+    R, L, K, J, B, TC = 18.4, 6.9e-3, 0.034, 5.1e-6, 8e-6, 1.3e-3
+    rng = np.random.default_rng(seed)
+    t = np.arange(4000) / 1000.0
+    volts = np.repeat(rng.uniform(6.0, 21.0, 8), 500)
+    motion = independent.simulate(t, volts, R, L, K, J, B, TC, np.zeros(t.size), 20)
+    count = np.floor(motion[:, 2] * 500 / (2 * np.pi) + rng.uniform()).astype(np.int64)
+    shown = 0.12 * np.rint(motion[:, 0] / 0.12)  # it takes 0.05 to 0.2 A at these speeds
+    found = estimate(Record("motor", t, volts, shown, count=count, hardware=Hardware(1.0, 500.0)))
+    for name, true in (("motor_constant", K), ("inertia", J), ("resistance", R)):
+        q = found.parameters[name]
+        assert abs(q.value - true) < 4 * q.std, name  # 49 and 33 of the motor constant's before
+
+
 def test_a_speed_that_is_a_difference_of_counts_is_right_on_average() -> None:
     record = motors.record("rear_left", current=False, seconds=3.0)
     data = prepare([replace(record, count=None)], False)
