@@ -321,7 +321,7 @@ ORDINARY_BEND = Limit(
     0.015, "of the largest voltage",
     "physical: a battery and leads of a twentieth of the winding's resistance, 0.3 V over a "
     "transistor at 12 V, a fan's drag: every drive has one of them",
-    "test_adequacy.py: what hides in the motor's own numbers is in their intervals",
+    "test_adequacy.py: what hides in the motors own numbers is no larger than ordinary",
 )  # fmt: skip
 SWING = Limit(
     1.0, "rad", "physical: over less a weight's torque changes by less than itself: it is a load",
