@@ -38,7 +38,7 @@ from smp_motor_ident.record import Record
 TURNS = 3  # of a motion that the effect asks for, and that follows from it
 NEAR = 0.02  # e-folds of the size at which its deviance is first looked at beside the best
 RISE = 2.0  # of the deviance on both sides together, from which its curvature is read
-PARABOLAS = 5  # that are laid through it at most
+PARABOLAS = 8  # that are laid through it at most
 CLOSE = 0.2  # standard deviations within which a size is the likeliest
 MOST = 25  # sizes that are tried between those of the table
 SUBSET, PIECES, LAGS = 5_000, 5, 10  # rows on which effects are ranked, in pieces of so many lags
@@ -189,7 +189,7 @@ class _Profile:
         self.group, self.hold, self.options, self.effect = group, hold, options, effect
         self.data, self.near = _prepared(group, hold, fit), fit
         self.turns = TURNS if effect.follows_motion else 1
-        self.size = math.nan  # logarithm of the likeliest
+        self.size = math.nan  # logarithm of the likeliest, of those that were tried
         self.driver = Driver()
         self.beside: list[Record] = []  # with the voltage for a size one standard deviation greater
 
@@ -215,7 +215,7 @@ class _Profile:
         best = replace(self.near, converged=False)
         fit, data, _ = self.at(float(np.exp(logarithm)), FEW, best)
         if fit.deviance < self.near.deviance:
-            self.near, self.data = fit, data
+            self.near, self.data, self.size = fit, data, logarithm
         return fit.deviance if np.isfinite(fit.deviance) else 1e300
 
     def sought(self) -> float | None:
@@ -227,8 +227,8 @@ class _Profile:
         k = int(np.argmin(values))
         ends = [2 * grid[0] - grid[1], *grid, 2 * grid[-1] - grid[-2]]
         low, high = sorted((float(ends[k]), float(ends[k + 2])))
-        likeliest = self._between(low, high)  # also where it begins, between it and none
-        return likeliest if self.near.deviance < none - RISE else None
+        self._seek(low, high)  # also where it begins, between it and none
+        return self.size if self.near.deviance < none - RISE else None
 
     def on(self, group: list[Record], most: float, behind: float) -> DriverFit | None:
         """Go on from the size that was found, with more records.
@@ -240,25 +240,31 @@ class _Profile:
         more = _Profile(group, self.hold, near, self.options, self.effect)
         if more.deviance(self.size) > most + behind * more.data.size / self.data.size:
             return None
-        return more.polished(more._between(self.size - AROUND, self.size + AROUND), most)
+        more._seek(self.size - AROUND, self.size + AROUND)
+        return more.polished(self.size if math.isnan(more.size) else more.size, most)
 
-    def _between(self, low: float, high: float) -> float:
-        x = fminbound(self.deviance, low, high, xtol=1e-2, maxfun=MOST, disp=0)
-        return float(x)
+    def _seek(self, low: float, high: float) -> None:
+        fminbound(self.deviance, low, high, xtol=1e-2, maxfun=MOST, disp=0)
 
     def polished(self, x: float, most: float) -> DriverFit | None:
         """Go on to the bottom by parabolas through three deviances, whose curvature is its std.
 
         None where a parabola's bottom is beyond a deviance, or the size cannot be.
         """
-        away = NEAR
+        away, widest, here, best = NEAR, 1.0, x, None
         for _ in range(PARABOLAS):
-            fit, data, records = self.at(float(np.exp(x)))
+            tried = self.at(float(np.exp(x)))
+            if best is not None and tried[0].deviance > best[0].deviance:
+                x, away = here, 0.25 * away  # no parabola so far around
+                widest = away
+            else:
+                here, best = x, tried
+            fit, data, records = best
             self.near, self.data = fit, data
-            low, high = self._beside(x, away)
-            while low + high - 2 * fit.deviance < RISE and away < 1.0:
+            low, high, settled = self._beside(x, away)
+            while low + high - 2 * fit.deviance < RISE and away < widest:
                 away *= 2
-                low, high = self._beside(x, away)
+                low, high, settled = self._beside(x, away)
             curved = max(low + high - 2 * fit.deviance, 0.1 * RISE)
             std = away * float(np.sqrt(2 * sandwich_factor(fit) / curved))
             move = 0.5 * away * (low - high) / curved
@@ -267,8 +273,10 @@ class _Profile:
             if abs(move) < CLOSE * std:
                 break
             x += float(np.clip(move, -2 * away, 2 * away))
-            away = min(max(std, 0.1 * NEAR), 1.0)
-        self.size, size = x, float(np.exp(x))
+            away = min(max(std, 0.1 * NEAR), widest)
+        if not (settled and fit.converged):  # the curvature is that of where descents ended
+            std = max(std, away)
+        self.size, size = here, float(np.exp(here))
         rows = rows_of(self.data, self.group, fit)
         if not self.effect.may_be(size, rows):
             return None
@@ -287,10 +295,10 @@ class _Profile:
         rows = rows_of(data, records, prediction.settle(data, fit))
         return with_voltages(records, rows.through(self.driver))
 
-    def _beside(self, x: float, away: float) -> tuple[float, float]:
-        """Return the deviances so many e-folds of the size below and above."""
-        low, high = (self.at(float(np.exp(x + s * away)))[0].deviance for s in (-1, 1))
-        return low, high
+    def _beside(self, x: float, away: float) -> tuple[float, float, bool]:
+        """Return the deviances so many e-folds of the size below and above, if settled."""
+        low, high = (self.at(float(np.exp(x + s * away)))[0] for s in (-1, 1))
+        return low.deviance, high.deviance, low.converged and high.converged
 
 
 class _Joint:
