@@ -34,7 +34,7 @@ from smp_motor_ident.diagnosis.scope import (
     one_size_or_swing,
     scope,
 )
-from smp_motor_ident.diagnosis.stamps import clock_share, latency_of
+from smp_motor_ident.diagnosis.stamps import clock_share
 from smp_motor_ident.diagnosis.units import implausible_motor
 from smp_motor_ident.errors import (
     CurrentError,
@@ -387,8 +387,7 @@ def _certain(
     """Return the chosen fit with all of its uncertainty, and how the motor changes."""
     few = thinned(final) if final.size > PROFILED.value else final
     chosen = profiled(few, widened_by_pieces(final, widened(final, chosen)), request.options)
-    late = max(instant_deviation(group, hold), latency_of(group))
-    timed = consider_timing(final, chosen, late)
+    timed = consider_timing(final, chosen, instant_deviation(group, hold))
     timed = consider_drop(final, consider_clock(final, timed, clock_share(group)))
     chosen, friction_std = consider_friction(final, consider_left_out(final, timed))
     if request.driver is not None:

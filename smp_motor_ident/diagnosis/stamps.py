@@ -215,12 +215,6 @@ def on_beat(record: Record) -> Record:
     )
 
 
-def latency_of(records: Sequence[Record]) -> float:
-    """Return how late stamps came that were put back [s]: a command's own way is not known."""
-    beats = [f.evidence for r in records for f in r.findings if f.code == "arrival_beat"]
-    return max((float(b["latency"] or 0.0) for b in beats), default=0.0)
-
-
 def clock_share(records: Sequence[Record]) -> float:
     """Return how well the sender's clock is known behind arrivals: a share of its interval."""
     beats = [f.evidence for r in records for f in r.findings if f.code == "arrival_beat"]

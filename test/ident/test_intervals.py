@@ -24,7 +24,6 @@ from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.estimation.prediction import inverse, predicted_decrease
 from smp_motor_ident.estimation.quantisation import widened
 from smp_motor_ident.estimation.thinning import thinned
-from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.model.structures import FirstOrder, SecondOrder
@@ -221,14 +220,6 @@ def test_stamps_that_scatter_leave_the_instant_of_one_step_open():
     # A stamp's own deviation for one step; divided by the root of their number for many.
     assert 1e-4 < instant_deviation([step], "held") < 4e-4
     assert instant_deviation([many], "held") < 1e-4
-
-
-def test_a_command_on_its_own_way_may_be_as_late_as_the_stamps_were():
-    record = motors.record("rear_left", current=False, seconds=4.0)
-    beat = {"latency": 5e-4, "period": record.sample_time, "deviation": 0.0}
-    late = replace(record, findings=(Finding("arrival_beat", "note", "put back", beat),))
-    sure, open_ = (estimate(r).combinations["time_constant"].std for r in (record, late))
-    assert open_ == pytest.approx(np.hypot(sure, 5e-4), rel=0.3)
 
 
 def _rounded(seed: int) -> tuple[Record, dict[str, float]]:
