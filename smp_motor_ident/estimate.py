@@ -239,10 +239,23 @@ def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) 
             left = [replace(r, whole=r.whole and r.fit.structure.size <= most) for r in left]
             left.append(replace(one, reason=f"refused: {refusal}", whole=False))
     assert refused is not None
+    if loaded := _under_load(group, request, found):
+        return loaded
     again, _ = _through_driver(group, request, found, data, hold, candidates[-1].fit)
     if again:
         return again
     raise refused
+
+
+def _under_load(group: list[Record], request: Request, found: Sequence[Finding]) -> Estimate | None:
+    """Return the estimate of candidates that all have a load, which hides what they are."""
+    if request.loaded:
+        return None
+    try:
+        e = _estimated(group, replace(request, loaded=True), found)
+    except (SignalError, InsufficientExcitationError):
+        return None
+    return None if e.unreliable else e
 
 
 def _undisturbed(

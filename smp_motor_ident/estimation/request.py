@@ -41,6 +41,7 @@ class Request:
     # Time at which the excitation of each record begins [s]; none where disturbances are left out
     since: tuple[float, ...] = ()
     suspected: bool = False  # whether the driver is sought although nothing is lacking
+    loaded: bool = False  # whether every candidate has a constant load
 
     @property
     def options(self) -> Options:
@@ -153,10 +154,11 @@ def base_structure(request: Request, group: Sequence[Record]) -> Structure:
     candidate = model.removesuffix("_asymmetric")
     asymmetric = model.endswith("_asymmetric")
     friction = "asymmetric" if asymmetric else "symmetric"
+    load = asymmetric or request.loaded
     if use_current:
-        return Electromechanical(friction, asymmetric, low_pass=low_pass, fixed=fixed)
+        return Electromechanical(friction, load, low_pass=low_pass, fixed=fixed)
     if candidate in ("auto", "electromechanical"):
         candidate = "second_order"
-    structure = CANDIDATES[candidate](friction, asymmetric, low_pass=low_pass, fixed=fixed)
+    structure = CANDIDATES[candidate](friction, load, low_pass=low_pass, fixed=fixed)
     # How friction is felt depends on L/R, which the linear response leaves open.
     return structure.with_(shape=True) if isinstance(structure, SecondOrder) else structure

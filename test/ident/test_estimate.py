@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 
+import independent
 import motors
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from smp_motor_ident.diagnosis import validation
 from smp_motor_ident.diagnosis.identifiability import what_next
 from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.estimate import estimate
+from smp_motor_ident.record import Hardware, Record
 from smp_motor_ident.tune.motors import torque_noise_of
 
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
@@ -250,3 +252,21 @@ def test_a_square_wave_without_current_does_not_lead_friction_astray(seed):
     )
     truth = motors.truth("front_right", 0.3)
     check(result, truth, ("dc_gain", "time_constant", "static_voltage"))
+
+
+def test_a_load_that_is_stronger_than_friction_is_no_reason_to_refuse() -> None:
+    R, L, K, J, B, TC, load = 0.56, 7.7e-5, 0.044, 7.15e-5, 7.6e-4, 0.033, 0.04
+    t = np.arange(1558) / 500.0
+    up = np.linspace(0.0, 3.0, 7)
+    steps = np.concatenate([up, up[-2::-1], -up[1:], -up[-2::-1]])
+    volts = np.resize(np.repeat(steps, 65), t.size)
+    motion = independent.simulate(t, volts, R, L, K, J, B, TC, np.full(t.size, load), 40)
+    count = np.floor(motion[:, 2] * 2000 / (2 * np.pi) + 0.637).astype(np.int64)
+    found = estimate(Record("motor", t, volts, count=count, hardware=Hardware(1.0, 2000.0)))
+    truth = {
+        "dc_gain": K / (K * K + R * B),
+        "static_voltage": R * TC / K,
+        "load_voltage": R * load / K,
+    }
+    for name, true in truth.items():
+        assert abs(found.combinations[name].value - true) < 0.005 * true, name
