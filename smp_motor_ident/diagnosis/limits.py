@@ -319,8 +319,8 @@ EFFECT_OWN = Limit(
 )  # fmt: skip
 ORDINARY_BEND = Limit(
     0.015, "of the largest voltage",
-    "physical: a battery and leads of a twentieth of the winding's resistance, 0.3 V over a "
-    "transistor at 12 V, a fan's drag: every drive has one of them",
+    "physical: a battery and leads of a twentieth of the winding's resistance, at a third of the "
+    "stall current; a transistor's 0.2 V of 12 V: every drive has one of them",
     "test_adequacy.py: what hides in the motors own numbers is no larger than ordinary",
 )  # fmt: skip
 SWING = Limit(
