@@ -190,12 +190,9 @@ def _answered(group: list[Record], request: Request, found: Sequence[Finding]) -
         refusal, reason = error, UNDECIDED
     bare, other = request.without_current(group)
     other = replace(other, suspected=first is not None and suspects_driver(first))
-    try:
-        second: Estimate | None = _estimated(bare, other, [*found, current_left_out(reason)])
-    except (SignalError, InsufficientExcitationError):
-        if refusal is not None:
-            raise refusal from None
-        second = None
+    second = _tried(bare, other, [*found, current_left_out(reason)])
+    if second is None and refusal is not None:
+        raise refusal
     if first is not None and (second is None or second.unreliable):
         return first
     assert second is not None
@@ -239,23 +236,21 @@ def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) 
             left = [replace(r, whole=r.whole and r.fit.structure.size <= most) for r in left]
             left.append(replace(one, reason=f"refused: {refusal}", whole=False))
     assert refused is not None
-    if loaded := _under_load(group, request, found):
+    # A load hides what the others are: with it in every candidate they may be found.
+    loaded = None if request.loaded else _tried(group, replace(request, loaded=True), found)
+    if loaded and not loaded.unreliable:
         return loaded
-    again, _ = _through_driver(group, request, found, data, hold, candidates[-1].fit)
-    if again:
+    if again := _through_driver(group, request, found, data, hold, candidates[-1].fit)[0]:
         return again
     raise refused
 
 
-def _under_load(group: list[Record], request: Request, found: Sequence[Finding]) -> Estimate | None:
-    """Return the estimate of candidates that all have a load, which hides what they are."""
-    if request.loaded:
-        return None
+def _tried(group: list[Record], request: Request, found: Sequence[Finding]) -> Estimate | None:
+    """Estimate; return nothing where that is refused."""
     try:
-        e = _estimated(group, replace(request, loaded=True), found)
+        return _estimated(group, request, found)
     except (SignalError, InsufficientExcitationError):
         return None
-    return None if e.unreliable else e
 
 
 def _undisturbed(
@@ -268,11 +263,8 @@ def _undisturbed(
     there = disturbance(group, request.since)
     if there is None:
         return None
-    try:
-        e = _estimated(there.records, replace(request, since=()), [*found, there.finding()])
-    except (SignalError, InsufficientExcitationError):
-        return None
-    return None if e.unreliable or leaves_torque_noise(e, fit) else e
+    e = _tried(there.records, replace(request, since=()), [*found, there.finding()])
+    return None if e is None or e.unreliable or leaves_torque_noise(e, fit) else e
 
 
 def _through_driver(
@@ -298,9 +290,8 @@ def _through_driver(
         return None, None
     known = request.validation
     kept = None if known is None else driver.search.applied(known, driver.fit)
-    try:
-        e = _estimated(driver.records, replace(request, driver=driver, validation=kept), found)
-    except (SignalError, InsufficientExcitationError):
+    e = _tried(driver.records, replace(request, driver=driver, validation=kept), found)
+    if e is None:
         return None, driver
     emptied = {"implausible_motor", "one_level", "one_size_of_voltage"}
     hollow = any(f.code in emptied for f in e.findings)  # little is left of what was recorded

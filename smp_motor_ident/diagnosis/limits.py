@@ -56,8 +56,7 @@ SEGMENTS = Limit(
 )  # fmt: skip
 TEMPERATURE = Limit(
     5.0, "K, a standard deviation",
-    "physical: what an unheated room differs by from day to day, and a motor that runs from one "
-    "that begins",
+    "physical: what a room differs by from day to day, and a warm motor from a cold one",
     "test_segments.py: the interval of a motor that changes holds another days friction",
 )  # fmt: skip
 SEGMENT_INFORMATION = Limit(
@@ -316,12 +315,6 @@ EFFECT_OWN = Limit(
     1e-2, "share of the sum of squares",
     "an effect's shape is known to a tenth at best: what the model imitates so far shows nothing",
     "test_adequacy.py",
-)  # fmt: skip
-ORDINARY_BEND = Limit(
-    0.015, "of the largest voltage",
-    "physical: a battery and leads of a twentieth of the winding's resistance, at a third of the "
-    "stall current; a transistor's 0.2 V of 12 V: every drive has one of them",
-    "test_adequacy.py: what hides in the motors own numbers is no larger than ordinary",
 )  # fmt: skip
 SWING = Limit(
     1.0, "rad", "physical: over less a weight's torque changes by less than itself: it is a load",

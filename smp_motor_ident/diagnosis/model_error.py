@@ -12,7 +12,8 @@ import numpy as np
 
 from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident.diagnosis.effects import EFFECTS, Effect, Motion, slope
-from smp_motor_ident.diagnosis.limits import EFFECT_OWN, ORDINARY_BEND
+from smp_motor_ident.diagnosis.limits import EFFECT_OWN
+from smp_motor_ident.diagnosis.sample_limits import ORDINARY_BEND
 from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.likelihood.experiments import Experiments
