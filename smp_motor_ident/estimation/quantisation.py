@@ -28,6 +28,8 @@ def widened(data: Experiments, fit: Fit, seed: int = 0) -> Fit:
     if fit.noise_ratio > 0 or not fit.structure.free:
         return fit
     motion, current = _steps(data, fit)
+    if not (motion or current):
+        return fit
     shares, rng = _shares(data, fit), np.random.default_rng(seed)
     wide = fit
     if current:  # of which quantities are differences that coordinates by themselves hardly show
