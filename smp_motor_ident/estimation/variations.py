@@ -85,6 +85,8 @@ def _additions(s: Structure) -> list[dict[str, object]]:
             trials.append({"delay": True})
     if s.friction != "asymmetric":
         trials.append({"load": True})
+    if s.current:  # an offset of the driver is both at once, and may be neither alone
+        trials.append({"offset": True, "load": True})
     if s.friction == "symmetric":
         trials.append({"friction": "asymmetric", "load": True})
     return trials

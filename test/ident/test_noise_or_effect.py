@@ -155,6 +155,35 @@ def test_a_current_offset_is_found_beside_an_offset_of_the_driver() -> None:
     assert abs(load.value + 0.2) < 4.5 * load.std
 
 
+def test_an_offset_beyond_friction_is_found_although_neither_half_of_it_helps() -> None:
+    """A speed loop's integrator holds the motor at rest against its driver's offset."""
+    R, L, K, J, B, TC, off = 3.82, 0.00195, 0.00444, 2.69e-7, 1.3e-7, 1.95e-4, 0.36
+    rng = np.random.default_rng(0)
+    levels = rng.permutation([550.0, 0.0, 760.0, -370.0, 550.0, 0.0, -370.0, 200.0])
+    asked = np.repeat(levels, 94)[:745]
+    command = np.zeros(asked.size + 1)
+    motion = np.zeros((asked.size, 2))
+    seen = integral = i = w = 0.0
+    for n, goal in enumerate(asked):
+        motion[n] = i, w
+        seen += 0.5 * (w - seen)
+        command[n + 1] = 0.00355 * (goal - seen) + integral
+        integral += 6.4e-5 * (goal - seen)
+        for _ in range(100):  # of 0.1 ms: the current exact, the speed by a step
+            steady = (command[n + 1] + off - K * w) / R
+            i = steady + (i - steady) * np.exp(-1e-4 * R / L)
+            if w == 0.0 and abs(K * i) <= TC:
+                continue
+            faster = w + 1e-4 * (K * i - TC * np.sign(w or i) - B * w) / J
+            w = 0.0 if faster * w < 0 else faster
+    t = np.arange(asked.size) / 100
+    speed = motion[:, 1] + 5.0 * rng.standard_normal(t.size)
+    current = motion[:, 0] + 0.005 * rng.standard_normal(t.size)
+    found = estimate(Record("motor", t, command[:-1], velocity=speed, current=current)).combinations
+    assert abs(found["load_voltage"].value + off) < 5 * found["load_voltage"].std < 0.02 * off
+    assert abs(found["dc_gain"].value - K / (K * K + R * B)) < 5 * found["dc_gain"].std < 2.0
+
+
 def test_a_step_out_of_all_bounds_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
     data = prepare([motors.record("rear_left", current=False, seconds=2.0)], False)
     fit = initial_fit(data, SecondOrder(), Options())
