@@ -12,7 +12,7 @@ from scipy.fft import irfft, next_fast_len, rfft
 from scipy.signal import lfilter
 
 from smp_motor_control.arrays import Array
-from smp_motor_ident.diagnosis.limits import BACKWARD, HALF_EXPLAINED, SIGN_LATE, SIGN_LEAST
+from smp_motor_ident.diagnosis.limits import BACKWARD, HALF_EXPLAINED, SIGN_LATE, SIGN_LEAST, SIGN_SURE
 from smp_motor_ident.errors import SignalError
 from smp_motor_ident.record import Record
 
@@ -121,7 +121,7 @@ def _chance(v: Array, y: Array) -> float:
 def lost_sign(records: Sequence[Record], speeds: Sequence[Array], where: str) -> None:
     """Refuse sizes that stand where a sign decides."""
     lowest = min(float(np.nanmin(r.voltage)) for r in records)
-    ways = np.concatenate([_ways(w) for w in speeds])
+    ways = np.concatenate([_ways(r, w) for r, w in zip(records, speeds, strict=True)])
     way, back = float(np.abs(ways).sum()), -float(np.minimum(ways, 0.0).sum())
     if lowest >= 0 and back > BACKWARD.value * way and way - back > BACKWARD.value * way:
         raise SignalError(
@@ -136,10 +136,15 @@ def lost_sign(records: Sequence[Record], speeds: Sequence[Array], where: str) ->
         )
 
 
-def _ways(speed: Array) -> Array:
-    """Return the ways of runs of samples, in which a sensor's noise is next to nothing."""
+def _ways(record: Record, speed: Array) -> Array:
+    """Return the ways of runs of samples; none where its sensor's noise makes one as long."""
     starts = np.unique(np.linspace(0, speed.size, WAYS, endpoint=False).astype(int))
-    return np.asarray(np.add.reduceat(np.nan_to_num(speed), starts))
+    speed = np.nan_to_num(speed)
+    ways = np.add.reduceat(speed, starts)
+    squares = np.add.reduceat(np.square(np.diff(speed, prepend=speed[:1])), starts)
+    # The errors of all speeds add up, of the differences of angles those at the two ends.
+    share = 1 / np.diff(starts, append=speed.size) if record.velocity is None else 0.5
+    return np.where(np.abs(ways) > SIGN_SURE.value * np.sqrt(squares * share), ways, 0.0)
 
 
 def _size_of(record: Record) -> bool:

@@ -42,6 +42,19 @@ def test_one_direction_with_pulses_that_brake_is_no_lost_sign():
     assert found.value("dc_gain") == pytest.approx(truth["dc_gain"], rel=0.05)
 
 
+@pytest.mark.parametrize("speed", [True, False])
+def test_noise_of_a_motor_at_rest_is_no_way_back(speed):
+    volts = np.repeat([0.0, 3.0, 6.0, 2.0], [1800, 40, 60, 40])
+    record = motors.record("rear_left", current=False, voltage=volts, seconds=4.0)
+    rng = np.random.default_rng(2)
+    noise = rng.standard_normal(len(record))
+    own = {"velocity": record.velocity + 0.15 * np.ptp(record.velocity) * noise}
+    if not speed:
+        own = {"velocity": None, "position": record.count * motors.QUANTUM + 5.0 * noise}
+    found = estimate(replace(record, count=None, **own))
+    assert found.value("dc_gain") == pytest.approx(motors.truth("rear_left", 0.3)["dc_gain"], 0.5)
+
+
 @pytest.mark.parametrize("full", [100, 255, 1023])
 def test_a_duty_in_counts_that_is_called_a_voltage_is_questioned(full):
     record = driven()
