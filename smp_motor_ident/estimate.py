@@ -31,6 +31,7 @@ from smp_motor_ident.diagnosis.scope import (
     blames_current,
     contradicted,
     current_left_out,
+    differing,
     one_size_or_swing,
     scope,
 )
@@ -78,7 +79,6 @@ from smp_motor_ident.estimation.transients import widened_by_pieces
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.driver import EFFECTS, RAMPS, DriverEffect
-from smp_motor_ident.model.structures import Structure
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import Estimate, FitPercent
 
@@ -202,7 +202,8 @@ def _answered(group: list[Record], request: Request, found: Sequence[Finding]) -
 def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) -> Estimate:
     """Choose a structure, fit it, and say how far it can be trusted."""
     base = base_structure(request, group)
-    data, hold, first = _prepared(group, base, request)
+    data, hold, first = chosen_hold(group, base, request.options, request.say)
+    data = data.measured_as(base.speed)
     candidates = order_selection.explore(
         data, base, request.options, request.model == "auto", request.say, first
     )
@@ -222,13 +223,13 @@ def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) 
                 ramped, _ = _through_driver(group, request, found, data, hold, one.fit, RAMPS)
                 return ramped or plain
             noisy = refused is None and (is_moved(plain) or one.fit.noise_ratio > 0)
-            rest = _undisturbed(group, request, found, one.fit) if noisy else None
+            rest = _undisturbed(group, request, found, one.fit, plain) if noisy else None
             if rest and not often_disturbed(rest):
                 return rest
             behind, driver = _through_driver(group, request, found, data, hold, one.fit)
             return behind or rest or suspecting(plain, driver, one.fit)
         except (SignalError, InsufficientExcitationError) as refusal:
-            if refused is None and (rest := _undisturbed(group, request, found, one.fit)):
+            if refused is None and (rest := _undisturbed(group, request, found, one.fit, None)):
                 return rest
             refused = refused or refusal
             # What was refused, and what is richer, is no rival that another's answer must cover.
@@ -254,17 +255,24 @@ def _tried(group: list[Record], request: Request, found: Sequence[Finding]) -> E
 
 
 def _undisturbed(
-    group: list[Record], request: Request, found: Sequence[Finding], fit: Fit
+    group: list[Record],
+    request: Request,
+    found: Sequence[Finding],
+    fit: Fit,
+    noisy: Estimate | None,
 ) -> Estimate | None:
-    """Return the estimate without what something else did to the motor, if it holds."""
-    if not request.since:
-        return None
+    """Return the estimate without what something else did to the motor, if it holds.
+
+    One that took that for torque noise is not contradicted: if so, the part that tells was lost.
+    """
     request.say("what else moved the motor")
-    there = disturbance(group, request.since)
+    there = disturbance(group, request.since) if request.since else None
     if there is None:
         return None
     e = _tried(there.records, replace(request, since=()), [*found, there.finding()])
-    return None if e is None or e.unreliable or leaves_torque_noise(e, fit) else e
+    if e is None or e.unreliable or leaves_torque_noise(e, fit):
+        return None
+    return None if noisy and not noisy.unreliable and differing(noisy, e) else e
 
 
 def _through_driver(
@@ -375,14 +383,6 @@ def _without_lag(group: list[Record], fit: Fit, result: Answer) -> UnknownLagErr
     except UnknownLagError as refusal:
         return refusal
     return None
-
-
-def _prepared(
-    group: list[Record], base: Structure, request: Request
-) -> tuple[Experiments, str, Fit | None]:
-    """Return the data, how the command was held in them, and the fit that showed that."""
-    data, hold, first = chosen_hold(group, base, request.options, request.say)
-    return data.measured_as(base.speed), hold, first
 
 
 def _certain(

@@ -307,22 +307,30 @@ def contradicted(
     others = str(blamed.evidence.get("alternatives") or "").split(", ")
     if not set(others) - set(OF_CURRENT) - {""}:
         return []
+    name = differing(with_it, without)
+    if name is None:
+        return []
+    a, b = with_it.combinations[name], without.combinations[name]
+    return [
+        Finding(
+            "current_contradicts",
+            "unreliable",
+            f"{name} is {a.value:.4g} {a.unit} with the current and {b.value:.4g} without "
+            "it, and motor or driver may be to blame as well as the current's sensor",
+            {"quantity": name, "with": a.value, "without": b.value},
+            "check the current's sensor; " + blamed.advice,
+        )
+    ]
+
+
+def differing(one: Estimate, other: Estimate) -> str | None:
+    """Return the name of a number in which two estimates of a motor contradict each other."""
     for name in ("dc_gain", "time_constant", "static_voltage"):
-        a, b = with_it.combinations.get(name), without.combinations.get(name)
+        a, b = one.combinations.get(name), other.combinations.get(name)
         if a is None or b is None or a.value is None or b.value is None:
             continue
         apart = abs(a.value - b.value)
-        if apart < RELEVANT_BIAS.value * abs(b.value):
-            continue
-        if apart > HALF_WIDTH.value * math.hypot(a.std or 0.0, b.std or 0.0):
-            return [
-                Finding(
-                    "current_contradicts",
-                    "unreliable",
-                    f"{name} is {a.value:.4g} {a.unit} with the current and {b.value:.4g} without "
-                    "it, and motor or driver may be to blame as well as the current's sensor",
-                    {"quantity": name, "with": a.value, "without": b.value},
-                    "check the current's sensor; " + blamed.advice,
-                )
-            ]
-    return []
+        most = HALF_WIDTH.value * math.hypot(a.std or 0.0, b.std or 0.0)
+        if apart > max(most, RELEVANT_BIAS.value * abs(b.value)):
+            return name
+    return None

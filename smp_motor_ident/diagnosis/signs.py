@@ -12,7 +12,13 @@ from scipy.fft import irfft, next_fast_len, rfft
 from scipy.signal import lfilter
 
 from smp_motor_control.arrays import Array
-from smp_motor_ident.diagnosis.limits import BACKWARD, HALF_EXPLAINED, SIGN_LATE, SIGN_LEAST, SIGN_SURE
+from smp_motor_ident.diagnosis.limits import (
+    BACKWARD,
+    HALF_EXPLAINED,
+    SIGN_LATE,
+    SIGN_LEAST,
+    SIGN_SURE,
+)
 from smp_motor_ident.errors import SignalError
 from smp_motor_ident.record import Record
 

@@ -3,6 +3,7 @@
 import math
 import re
 
+import independent
 import numpy as np
 import pytest
 
@@ -107,3 +108,22 @@ def test_nothing_is_left_out_under_torque_noise_or_a_drift(seed, kind):
 def test_a_motor_that_something_holds_half_of_the_time_is_not_mended():
     held = [(n, n + 0.5) for n in range(20)]
     assert disturbance([recorded(20, held=held)], [0.0]) is None
+
+
+def test_what_tells_the_motor_is_not_left_out_as_a_disturbance():
+    """Of a sine only its beginning tells gain, friction and lag apart, were a part of it odd."""
+    R, L, K, J, B, TC = 1.4946, 7.747e-3, 0.026169, 4.7487e-5, 5.776e-5, 3.872e-3
+    rng = np.random.default_rng(1)
+    t = np.arange(805) / 100
+    volts = np.r_[0.0, 3.23 * np.sin(2 * np.pi * 2.0016 * t[:-1])]
+    motion = independent.simulate(t, volts, R, L, K, J, B, TC, np.zeros(t.size), 50)
+    exact = motion[:, 2] * 2000 / (2 * np.pi) + rng.uniform()
+    way = np.diff(exact, prepend=exact[0])
+    missed = np.cumsum(np.where(np.abs(way) > 0.5 * np.abs(way).max(), 0.003 * way, 0.0))
+    count = np.floor(exact - missed).astype(np.int64)
+    current = motion[:, 0] + 0.008 * rng.standard_normal(t.size)
+    record = Record("motor", t, volts, count=count, current=current, hardware=Hardware(1.0, 2000.0))
+    found = estimate(record)
+    assert found.unreliable or abs(found.value("inductance") - L) < 0.1 * L
+    gain = found.combinations["dc_gain"]
+    assert found.unreliable or abs(gain.value - K / (K * K + R * B)) < 3 * gain.std
