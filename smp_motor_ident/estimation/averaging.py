@@ -100,8 +100,13 @@ def _late_without_lag(data: Experiments, fit: Fit) -> bool:
     return s.order == 1 and (s.shift > 0 or not late.isdisjoint(s.free))
 
 
-def averaged(result: Answer, weight: Array, others: Sequence[Answer]) -> Answer:
-    """Return an answer that covers the candidates."""
+def averaged(
+    result: Answer, weight: Array, others: Sequence[Answer], own_fit: Answer | None = None
+) -> Answer:
+    """Return an answer that covers the candidates.
+
+    ``own_fit``: what the choice's fit says, to hold the others' against; by default the answer.
+    """
     keep = np.flatnonzero(weight[1:] > CANDIDATE_WEIGHT.value)
     if not keep.size or not result.names:
         return result
@@ -114,6 +119,7 @@ def averaged(result: Answer, weight: Array, others: Sequence[Answer]) -> Answer:
     between = (values - mean).T @ (share[:, None] * (values - mean))
     # One that explains the data better than the choice, and knows less, speaks for what it knows.
     variance = np.maximum(np.diag(result.covariance), 1e-300)
+    variance = np.maximum(variance, _variances(own_fit or result, result.names, variance))
     each = np.array([variance] + [
         _variances(others[k], result.names, variance) if w >= share[0] else variance
         for k, w in zip(keep, share[1:])
@@ -153,10 +159,10 @@ def covering(
     known: Mapping[str, float],
 ) -> tuple[Answer, dict[str, float]]:
     """Return the answer over all structures that explain the data as well, and their weights."""
-    if not weight or result.level:
+    if not weight:
         return result, {}
-    others = [answer(candidates[n].fit, known) for n in list(weight)[1:]]
-    found = averaged(result, np.array(list(weight.values())), others)
+    own, *others = (answer(candidates[n].fit, known, level=result.level) for n in weight)
+    found = averaged(result, np.array(list(weight.values())), others, own)
     likely = {candidates[n].label: w for n, w in weight.items() if w > CANDIDATE_WEIGHT.value}
     return found, likely if len(likely) > 1 else {}
 

@@ -97,9 +97,9 @@ def otherwise(
         rivals = [] if lost else _explored(again, there, request)
         whole = extend(of_kind(again, fit), fit.structure, fit, request.options)
         near = FittedCandidate(whole, f"as {candidates[-1].label}")
-        first = not rivals or near.bic < rivals[-1].bic
+        first = not rivals or POLICY.likelier(near, rivals[-1])
         rivals = [*rivals, near] if first else [near, *rivals]
-        better = rivals[-1].bic < candidates[-1].bic
+        better = POLICY.likelier(rivals[-1], candidates[-1])
         if other == hold:
             candidates = [*candidates, *rivals] if better else [*rivals, *candidates]
             continue

@@ -7,6 +7,7 @@ import numpy as np
 from smp_motor_ident.diagnosis.limits import (
     LOOSE_ADDITION,
     PRIOR_ODDS,
+    RELEVANT_BIAS,
     SECOND_LAG,
     SUBSET_HOPELESS,
     SURE_GAIN,
@@ -105,6 +106,11 @@ class SelectionPolicy:
         better = other.deviance < best.deviance + self.second_lag * sandwich_factor(other) * lag
         return better, f"fits {'better' if better else 'worse'} than {best.structure.label}"
 
+    def likelier(self, other: FittedCandidate, best: FittedCandidate) -> bool:
+        """Decide between candidates under different holds, of which neither contains the other."""
+        lag = other.fit.structure.order - best.fit.structure.order
+        return other.bic < best.bic + self.second_lag * sandwich_factor(other.fit) * lag
+
     def replaces(self, best: Fit, other: Fit) -> tuple[bool, str]:
         """Decide whether a candidate of any number of parameters takes the place of the best."""
         if other.structure.size >= best.structure.size:
@@ -131,6 +137,7 @@ class SelectionPolicy:
         """Decide whether the data reject the simpler of two models."""
         gained = (simple.deviance - rich.deviance) / float(rich.sandwich_factors().max())
         price = self.price(rich.structure.size - simple.structure.size, simple.samples)
+        price += self.second_lag * _delayed_instead(simple, rich)
         than = f"(gain {gained:.0f}, price {price:.0f})"
         if not rich.converged and gained < self.sure_gain * price:
             return False, "did not converge"
@@ -150,6 +157,17 @@ class SelectionPolicy:
             if name == "ln_a2" and std > self.loose:
                 return "second time constant"
         return ""
+
+
+def _delayed_instead(simple: Fit, rich: Fit) -> bool:
+    """Tell whether a delay takes the place of a second lag, of which nothing that matters is left.
+
+    That is a motor of the first order with a delay, whatever else is free.
+    """
+    s, t = simple.structure, rich.structure
+    if s.order != 2 or t.order != 2 or s.current or s.delay or not t.delay:
+        return False
+    return rich.z.second_lag < RELEVANT_BIAS.value * rich.z.time_constant
 
 
 POLICY = SelectionPolicy()

@@ -22,6 +22,7 @@ from smp_motor_ident.likelihood.passes import answers, own_columns
 from smp_motor_ident.model.coordinates import PLAUSIBLE
 
 PIECES = 24
+ENDED = 1e-2  # standard deviations at which a descent ends
 MOST = 1_000_000  # samples whose sensitivities are held in memory at once
 
 
@@ -63,7 +64,7 @@ def _moves(data: Experiments, fit: Fit) -> Array:
     """Return how the errors of each piece move the free coordinates, shape (pieces, f).
 
     Of errors that were as large everywhere, what a piece leaves of its own is less by its leverage:
-    they count by the root of that more.
+    they count by the root of that more, where they are more than where a descent happened to end.
     """
     none = np.zeros((0, 0)), np.zeros((0, 0, 0))
     moved = answers(data, fit.structure, fit.z, fit.initial, fit.noise_model(), none, 1, True)
@@ -91,8 +92,9 @@ def _moves(data: Experiments, fit: Fit) -> Array:
         normal[:size, :size] += whole - seen[g]
         root, piece = prediction.root_of_inverse(normal), rows[a:b].T @ rows[a:b]
         taken, along = np.linalg.eigh(root.T @ piece @ root)
-        taken = np.clip(taken, 1e-12, 1 - 1e-6)
-        more = root @ along * ((1 / np.sqrt(1 - taken) - 1) / taken)
+        taken = np.clip(taken, 1e-12, 1.0)
+        left = np.where(1 - taken > ENDED**2, 1 - taken, 1.0)
+        more = root @ along * ((1 / np.sqrt(left) - 1) / taken)
         gradient = rows[a:b].T @ error[a:b]
         gradient = gradient + piece @ more @ (root @ along).T @ gradient
         moves.append((root @ (root.T @ gradient))[:size])

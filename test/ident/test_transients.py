@@ -8,12 +8,13 @@ import pytest
 from independent import simulate
 from scipy.linalg import fractional_matrix_power
 
+from smp_motor_ident.estimate import estimate
 from smp_motor_ident.estimation.fit import Options, solve
 from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.estimation.transients import widened_by_pieces
 from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.model.structures import FirstOrder, SecondOrder
-from smp_motor_ident.record import Record
+from smp_motor_ident.record import Hardware, Record
 
 GAIN, LAG, RATE, STEP = 20.0, 0.05, 1000.0, 8.0  # rad/s/V, s, Hz, V
 
@@ -107,3 +108,17 @@ def test_an_angle_known_finely_loses_nothing_where_a_direction_is_unknown(fricti
     assert np.all(after[told] < 2.5 * before[told])  # 24 pieces of chance
     # What no data tell is known as beforehand.
     assert friction or after[3] < 2.0 * before[3]
+
+
+def test_a_direction_that_one_piece_alone_tells_says_nothing_of_its_errors():
+    """Of a rest in which a load turns the motor by two counts, only that rest tells how fast."""
+    R, L, K, J, B, TC, load = 8.5, 0.161, 0.0275, 1.487e-5, 1.429e-5, 7.36e-4, 8.83e-4
+    t = np.arange(2200) / 500.0
+    volts = np.where(t >= 0.36, 3.17, 0.0)
+    motion = simulate(t, volts, R, L, K, J, B, TC, np.full(t.size, load), 20)
+    count = np.floor(motion[:, 2] * 28 / (2 * np.pi) + 0.3).astype(np.int64)
+    record = Record("motor", t, volts, count=count, hardware=Hardware(1.0, 28.0))
+    found = estimate(record)
+    lag = found.combinations["time_constant"]
+    assert abs(lag.value - (R * J + L * B) / (R * B + K * K)) < 3 * lag.std < 0.5 * lag.value
+    assert "disturbed" not in {f.code for f in found.findings}
