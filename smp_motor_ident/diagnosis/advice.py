@@ -32,6 +32,7 @@ def assess(data: Experiments, fit: Fit, percent: FitPercent, tests: ResidualTest
         *_resolution(data, fit, tests),
         *sensors(data, fit),
         *_second_lag(data, fit),
+        *_resonance(fit),
         *_torque_noise(data, fit),
     ]
 
@@ -167,6 +168,22 @@ def _second_lag(data: Experiments, fit: Fit) -> Iterator[Finding]:
             "shift_share": share / (1 + share),
         },
         "switch the filter of the firmware off, or record encoder counts or the current",
+    )
+
+
+def _resonance(fit: Fit) -> Iterator[Finding]:
+    """Say of a motor that rings beside a filter slower than it that the filter may be the motor."""
+    ring, lag = _ring(fit), 0.5 * fit.z.window
+    filtered = fit.structure.window and fit.structure.low_pass and not fit.structure.current
+    if not filtered or ring == 0.0 or lag < fit.z.time_constant:
+        return
+    yield Finding(
+        "compliance",
+        "unreliable",
+        f"the speed rings at {ring / (2 * np.pi):.3g} Hz beside a lag of {lag:.3g} s: that is "
+        "likelier the motor's than a filter's, and what rings a shaft between motor and encoder",
+        {"frequency": ring / (2 * np.pi), "lag": lag},
+        "identify the shaft with --model flexible_shaft, or measure at the motor",
     )
 
 

@@ -11,7 +11,7 @@ import motors
 import numpy as np
 import pytest
 from independent import simulate
-from scipy.signal import lfilter
+from scipy.signal import cont2discrete, lfilter
 
 from smp_motor_ident.bag import limits as recordings
 from smp_motor_ident.diagnosis import limits
@@ -158,3 +158,18 @@ def test_a_current_that_is_mostly_noise_is_no_poor_fit():
     noise = 3.0 * np.std(good.current) * np.random.default_rng(0).standard_normal(len(good))
     found = estimate(replace(good, current=good.current + noise))
     assert "poor_fit_of_current" not in [f.code for f in found.findings]
+
+
+def test_a_shaft_that_rings_is_no_motor_behind_a_slow_filter() -> None:
+    """A motor of 23 ms behind which 40 Hz ring, under a voltage of two levels, solved exactly."""
+    rate, lag, turn, rng = 1000.0, 0.023, 2 * np.pi * 40.0, np.random.default_rng(6)
+    voltage = np.repeat(rng.choice([-7.0, 7.0], 260), 12)
+    both = np.polymul([lag, 1.0], [1 / turn**2, 2 * 0.1 / turn, 1.0])
+    numerator, denominator, _ = cont2discrete(([95.0], both), 1 / rate)
+    speed = lfilter(numerator.ravel(), denominator, voltage)
+    t = np.arange(voltage.size) / rate
+    noisy = speed + 0.5 * rng.standard_normal(t.size)
+    found = estimate(Record("motor", t, np.r_[0.0, voltage[:-1]], velocity=noisy)).findings
+    (shaft,) = [f for f in found if f.code == "compliance"]
+    assert shaft.severity == "unreliable"
+    np.testing.assert_allclose([shaft.evidence[n] for n in ("frequency", "lag")], [40.0, lag], 0.01)
