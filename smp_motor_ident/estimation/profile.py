@@ -33,7 +33,7 @@ NONLINEAR = ("vc_plus", "ln_a1", "ln_a2", "delay", "window", "current_lag")
 LAGS = ("ln_a1", "ln_a2")  # logarithms
 """Coordinates that act other than linearly, in the order in which they are followed."""
 NEAR = 3.0  # standard deviations to a bound within which no parabola is trusted
-STEPS = 8  # points on each side
+STEPS = 8  # points on each side, the last of which is the bound
 FARTHEST = 4.0  # e-folds
 SLOWEST = 10.0  # time constants of the motor, for a delay and for a sensor
 
@@ -161,9 +161,9 @@ def _end(
     begin = fit.z.value(coordinate)
     side = np.sign(bound - begin)
     inner, inner_rise, move, near = fit, 0.0, first, fit
-    for _ in range(STEPS if side else 0):
+    for step in range(STEPS if side else 0):
         value = float(begin + side * move)
-        last = side * (value - bound) >= 0
+        last = side * (value - bound) >= 0 or step == STEPS - 1
         value = bound if last else value
         outer = _fixed_at(data, near, coordinate, value, options)
         rise = outer.deviance - fit.deviance

@@ -106,3 +106,22 @@ def test_a_descent_that_ended_without_friction_is_no_reason_to_believe_in_none(s
     # 0.58 V in truth; what these samples like best is 0.18 V, 2 to 4 in deviance below none.
     assert found.value("static_voltage") > 0.1
     assert found.combinations["dc_gain"].ci95[1] > 25.4
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_profile_that_rises_slowly_ends_at_its_bound(seed: int) -> None:
+    """Of a step from rest any share of what drags may be friction, of which little is tried first.
+
+    L/R is 0.6 ms beside a time constant of 0.2 s: what breaks loose late tells nothing of it.
+    """
+    r, el, k, j, b, tc = 2.15, 1.338e-3, 0.03044, 9.325e-5, 1.99e-5, 8.04e-3
+    rng = np.random.default_rng(seed)
+    t = np.arange(8000) / 1000
+    volts = np.where(t > 1.1, -4.5, 0.0)
+    motion = simulate(t, volts, r, el, k, j, b, tc, np.zeros(t.size), 5)
+    current = motion[:, 0] + 0.0129 * rng.standard_normal(t.size)
+    speed = motion[:, 1] + 0.648 * rng.standard_normal(t.size)
+    found = estimate(Record("motor", t, volts, current, velocity=speed)).combinations
+    for name, true in (("dc_gain", k / (k * k + r * b)), ("static_voltage", r * tc / k)):
+        low, high = found[name].ci95
+        assert low < true < high, name
