@@ -9,6 +9,8 @@ of mean zero and variance s2, residuals ``e`` of variance one have the variance
 
 over the changes ``k`` of the command, where no other noise knows when it changed.  The regression
 of ``e^2`` on ``x`` gives s2, with a standard deviation that allows for any other variance (White).
+A noise that hangs on the speed does know: what a coarse speed is rounded by, of a motor at rest by
+nothing.  Both are held against others at that speed alone (Frisch, Waugh and Lovell).
 Times that are never negative have a mean beside their scatter: where they are uniform from nothing
 to a period, the square of the mean is three times the variance.
 
@@ -25,6 +27,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import erfc
 
+from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident.diagnosis.limits import CONDITION_LEVEL
 from smp_motor_ident.diagnosis.model_error import answered, carried, measured, predicted
 from smp_motor_ident.diagnosis.observers import slower
@@ -66,6 +69,7 @@ def widened_by_misfit(
 
 
 PATTERNS = 8  # of random signs, whose mean square is the sum over the changes
+LEVELS = 32  # of speed, between which a noise may differ
 MOST = 4.0  # deviations at which a residual is cut off: outliers are no scatter
 
 
@@ -75,9 +79,12 @@ def jittered(data: Experiments, fit: Fit) -> tuple[Fit, list[Finding]]:
     if scatter <= 0.0:
         return fit, []
     late = math.sqrt(3.0 * scatter)
+    change = np.square(np.delete(np.diff(data.hold_value), data.hold_start[1:-1] - 1))
+    often = float(change.sum()) / (data.size * data.step)
+    if 2.0 * late * often * float(change.sum()) > float(change @ change):
+        return fit, []  # a command that is later than the next one never acts
     wider = consider_late(data, fit, late)
-    change = np.delete(np.diff(data.hold_value), data.hold_start[1:-1] - 1)
-    impulses = math.sqrt(scatter * float(change @ change) / (data.size * data.step))
+    impulses = math.sqrt(scatter * often)
     return wider, [
         Finding(
             "command_jitter",
@@ -110,13 +117,31 @@ def _scatter(data: Experiments, fit: Fit) -> float:
     x /= np.square(deviation)
     known = np.isfinite(values)
     square = np.minimum(np.square((values - base) / deviation)[known], MOST**2)
-    away = x[known] - x[known].mean()
+    level = np.broadcast_to(_level(data, base[:, 0])[:, None], known.shape)[known]
+    away, square = (v - _mean_at(level, v) for v in (x[known], square))
     spread = float(away @ away)
     if not spread > 0.0:
         return 0.0
     found = float(away @ square) / spread
-    left = square - square.mean() - found * away
+    left = square - found * away
     robust = math.sqrt(float(np.square(away * left).sum())) / spread
     plain = float(square.std()) / math.sqrt(spread)
     surprise = found / max(robust, plain, 1e-300)
     return found if 0.5 * erfc(surprise / math.sqrt(2)) < CONDITION_LEVEL.value else 0.0
+
+
+def _level(data: Experiments, output: Array) -> Integers:
+    """Return at which level of speed each sample is, of `LEVELS`."""
+    speed = output
+    for _ in range(data.kind.integrals):
+        speed = np.diff(speed, prepend=speed[0])
+        speed[data.starts[:-1]] = 0.0
+    low, high = np.percentile(speed, (1, 99))
+    share = (speed - low) / max(high - low, 1e-300)
+    return np.asarray(np.rint((LEVELS - 1) * np.clip(share, 0.0, 1.0)), dtype=np.int64)
+
+
+def _mean_at(level: Integers, value: Array) -> Array:
+    """Return the mean of a value over all samples at the same level."""
+    total, count = np.bincount(level, value), np.bincount(level)
+    return np.asarray((total / np.maximum(count, 1))[level])

@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from smp_motor_control.arrays import Array
+from smp_motor_ident.diagnosis.limits import SIGN_SURE
 from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.likelihood.experiments import Experiments
@@ -66,14 +67,14 @@ def _steps(data: Experiments, fit: Fit) -> tuple[float, float]:
 def _counted(data: Experiments, fit: Fit) -> bool:
     """Tell whether a speed in steps is a difference of counts, which is right on average.
 
-    Neighbours then share a count: their errors correlate by -1/2, those of a rounded speed by 0 or
-    more.
+    Neighbours then share a count: at c counts and a share f of another a sample their errors
+    correlate by -f / (1 - f), f up to a half, those of a rounded speed by 0 or more.
     """
     if data.kind == MEAN_SPEED:
         return True
     error = data.output - prediction.simulate(data, fit)[:, 1]
     error = error[np.isfinite(error)]
-    return bool(error[1:] @ error[:-1] < -0.25 * (error @ error))
+    return bool(error[1:] @ error[:-1] < -SIGN_SURE.value / error.size**0.5 * (error @ error))
 
 
 def _shares(data: Experiments, fit: Fit) -> tuple[Array, Array]:

@@ -245,6 +245,29 @@ def test_a_rounded_speed_is_not_averaged_where_the_motor_keeps_it() -> None:
             assert q.value is None or abs(q.value - true) < 5 * q.std, (seed, name)
 
 
+def test_differences_of_counts_are_averaged_where_a_speed_is_nearly_whole_counts_a_sample() -> None:
+    rng = np.random.default_rng(4)
+    gain, lag, step, turn = 103.0, 0.0215, 1e-3, 2 * np.pi / 44
+    t = np.arange(8000) * step
+    volts = np.repeat([0.0, 4.2, 0.0, -4.2, 0.0, 4.2, 0.0, -4.2], 1000)  # 3 counts a sample
+    # Friction that varies with the angle moves the count of seconds by more than its rounding.
+    angle, speed, counts = rng.uniform(0.0, turn), 0.0, []
+    for u in volts:
+        rubs = 0.11 * (1 + 0.2 * np.sin(angle / 30))
+        towards = gain * (u - np.sign(speed or u) * rubs) if abs(u) > rubs or speed else 0.0
+        after = towards + (speed - towards) * np.exp(-step / lag)
+        speed = 0.0 if after * speed < 0 else after
+        angle += speed * step
+        counts.append(np.floor(angle / turn))
+    shown = np.diff(counts, prepend=counts[0]) * turn / step
+    found = estimate(Record("motor", t, volts, velocity=shown))
+    # The rounding of a motor that stands half of the time is no scatter of its commands.
+    assert all(f.code != "command_jitter" for f in found.findings)
+    for name, true, share in (("dc_gain", gain, 0.02), ("time_constant", lag, 0.06)):
+        q = found.combinations[name]
+        assert abs(q.value - true) < 4 * q.std < 4 * share * true, name
+
+
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_current_in_steps_of_what_a_motor_takes_is_not_averaged(seed: int) -> None:
     R, L, K, J, B, TC = 18.4, 6.9e-3, 0.034, 5.1e-6, 8e-6, 1.3e-3
