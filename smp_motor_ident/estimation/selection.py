@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import chdtri, fdtrc
 
 from smp_motor_ident.diagnosis.limits import (
     LOOSE_ADDITION,
@@ -14,6 +15,7 @@ from smp_motor_ident.diagnosis.limits import (
 )
 from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.estimation.fitted import long_run
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.structures import Structure
 
@@ -49,6 +51,22 @@ class FittedCandidate:
 def sandwich_factor(fit: Fit) -> float:
     """Return by how much the scores scatter more than white residuals would let them."""
     return max(1.0, float(np.median(fit.sandwich_factors())))
+
+
+def evidence(simple: Fit, rich: Fit, coordinate: str) -> float:
+    """Return the gain of a number that errors may imitate in a coordinate, as a chi-square's.
+
+    Errors that outlast a run of samples leave few independent ones, as many as the runs times what
+    these sum up to over what all of a record does; with those that remain the gain is Snedecor's F.
+    """
+    i, at = (fit.structure.free.index(coordinate) for fit in (simple, rich))
+    left = float(rich.factors(long_run)[at])
+    gained = max(simple.deviance - rich.deviance, 0.0) / left
+    pieces = len(simple.scores) * float(simple.sandwich_factors()[i] / simple.factors(long_run)[i])
+    freedom = pieces - simple.structure.size - 1
+    if left <= 1:  # white
+        return gained
+    return float(chdtri(1, fdtrc(1, freedom, gained * freedom / pieces))) if freedom > 0 else 0.0
 
 
 @dataclass(frozen=True)
