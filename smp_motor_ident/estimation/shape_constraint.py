@@ -63,7 +63,7 @@ def edge(z: Coordinates, share: float) -> tuple[float, dict[str, float]] | None:
     if root <= 0.0:
         return None
     larger = a1 + math.sqrt(root)  # a difference would lose a short winding to rounding
-    both = 2 * a2 / larger, larger / (2 * share * a0)
+    both = 2 * a2 / larger, larger / max(2 * share * a0, 5e-324)
     if not min(both) > 0.0:  # a step that runs away leaves no lag that a number can hold
         return None
     te = float(min(both, key=lambda x: (_slow(math.log(x), z), abs(math.log(x) - z.ln_te))))

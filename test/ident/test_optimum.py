@@ -253,6 +253,11 @@ def test_tabulated_propagators_of_jittered_stamps_are_the_exact_ones(order, fric
     np.testing.assert_allclose(a.normal, b.normal, rtol=1e-8, atol=1e-10 * np.abs(b.normal).max())
 
 
+def test_a_step_that_runs_away_to_no_steady_voltage_has_the_edge_of_a_short_winding():
+    z = Coordinates(ln_a0=-800.0, ln_a1=-5.0, ln_a2=-12.0, ln_te=-7.0)
+    assert shape_constraint.edge(z, 0.95)[0] == pytest.approx(-7.0)  # a2/a1
+
+
 @pytest.mark.parametrize("runaway", [{"ln_a1": 800.0}, {"ln_a2": -1600.0, "ln_a1": -790.0}])
 def test_a_step_that_runs_away_reaches_no_edge(runaway):
     """A descent that is asked where one full step more would lead asks for lags beyond numbers."""
