@@ -47,6 +47,7 @@ UNITS: Mapping[str, str] = {
     "brush_drop": "V",
     "current_limit_voltage": "V",
     "fast_decay_ratio": "1",
+    "coasting_share": "1",
     "resonance_frequency": "rad/s",
     "resonance_damping": "1",
 }

@@ -191,6 +191,7 @@ def driver_of(estimate: Estimate) -> Driver:
         for finding in estimate.findings:
             numbers = [finding.evidence.get(n) for n in Driver._fields[1:]]
             known = [n for n in numbers if isinstance(n, float)]
-            if finding.code == effect.code and len(known) == len(numbers):
+            same = finding.evidence.get("quantity", effect.quantity) == effect.quantity
+            if finding.code == effect.code and same and len(known) == len(numbers):
                 return Driver(effect.kind, *known)
     return Driver()

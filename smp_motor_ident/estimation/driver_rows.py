@@ -28,7 +28,11 @@ def with_voltages(group: Sequence[Record], voltage: Array) -> list[Record]:
 
 def rows_of(data: Experiments, group: Sequence[Record], fit: Fit, measured: bool = False) -> Rows:
     """Return the commands of records and how the fitted motor runs, or did as measured."""
-    speed = _measured(data, fit) if measured else prediction.simulate(data, fit)[:, 0]
+    speed = (
+        measured_speed(data, fit.z.time_constant)
+        if measured
+        else prediction.simulate(data, fit)[:, 0]
+    )
     first = np.zeros(data.size, dtype=np.bool_)
     first[data.starts[:-1]] = True
     middle, interval = speed.copy(), np.full(data.size, data.step)
@@ -40,9 +44,9 @@ def rows_of(data: Experiments, group: Sequence[Record], fit: Fit, measured: bool
     return Rows(command, back * middle, interval, first, fit.z.time_constant, supply)
 
 
-def _measured(data: Experiments, fit: Fit) -> Array:
+def measured_speed(data: Experiments, lag: float) -> Array:
     """Return the speed as measured, a mean over a fraction of the motor's lag."""
-    width = int(np.clip(SMOOTHED * fit.z.time_constant / data.step, 1, MOST_SMOOTHED))
+    width = int(np.clip(SMOOTHED * lag / data.step, 1, MOST_SMOOTHED))
     out = []
     for a, b in pairwise(data.starts):  # the time of each record is its own
         time, output = data.time[a:b], data.output[a:b]

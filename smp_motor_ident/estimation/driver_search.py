@@ -30,8 +30,9 @@ from smp_motor_ident.estimation.driver_rows import rows_of, with_voltages
 from smp_motor_ident.estimation.fit import Fit, Options, solve
 from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.estimation.selection import POLICY, evidence, sandwich_factor
+from smp_motor_ident.estimation.thinning import thinned
 from smp_motor_ident.likelihood.experiments import Experiments, prepare
-from smp_motor_ident.model.driver import COAST, CURRENT, EFFECTS, RAMPS, SLEW, Driver, DriverEffect
+from smp_motor_ident.model.driver import CURRENT, EFFECTS, RAMPS, SLEW, Driver, DriverEffect
 from smp_motor_ident.model.structures import FirstOrder
 from smp_motor_ident.record import Record
 
@@ -54,10 +55,7 @@ def likeliest(
     options: Options,
     effects: Sequence[DriverEffect] = EFFECTS,
 ) -> DriverFit | None:
-    """Return the effect that explains the records best; None where none is worth its number.
-
-    Where one number leaves the residuals white, the two of a driver that coasts are not asked for.
-    """
+    """Return the effect that explains the records best; None where none is worth its number."""
     step = group[0].sample_time
     few = _pieces(group, step, fit.z.time_constant)
     price, factor = POLICY.price(1, fit.samples), sandwich_factor(fit)
@@ -73,19 +71,18 @@ def likeliest(
     profiles = [
         _Profile(few, how, start, options, effect)
         for effect in effects
-        if effect.kind != COAST
+        if effect.shares
         for start, how in _starts(few, fit, hold, options, effect, known)
     ]
-    found = _polished(profiles, most, behind)
-    plainer = [d for d in found if d.effect.kind != CURRENT]  # as a bridge that coasts, nearly
-    if all(sandwich_factor(d.fit) > COLOURED.value for d in plainer):
-        joint = [_Joint(few, list(group), fit, options, e) for e in effects if e.kind == COAST]
-        found += [d for s in joint if (d := s.best(most)) is not None]
-    found.sort(key=cost)
-    if sum(map(len, few)) < sum(map(len, group)):
+    joints = [_Joint(few, list(group), fit, options, e) for e in effects if not e.shares]
+    found = _polished(profiles, joints, most, behind)
+    if found and sum(map(len, few)) < sum(map(len, group)):
+        least = min(d.fit.deviance for d in found)
         most = fit.deviance + behind
         every: list[DriverFit] = []
-        for d in found[:FINALISTS]:
+        for d in sorted(found, key=cost)[:FINALISTS]:
+            if d.fit.deviance > least + behind:
+                continue
             if (there := d.search.on(list(group), most, behind)) is not None:
                 every.append(there)
                 most = min(most, there.fit.deviance + behind)
@@ -117,16 +114,36 @@ def run_free(group: Sequence[Record], fit: Fit, hold: str, options: Options) -> 
     return refine(_prepared(group, hold, fit), fit.structure, fit, fit.z, options)
 
 
-def _polished(searches: Sequence[_Profile], most: float, behind: float) -> list[DriverFit]:
-    """Return the likeliest sizes of the effects that are not far behind the best of them."""
+def _polished(
+    searches: Sequence[_Profile], joints: Sequence[_Joint], most: float, behind: float
+) -> list[DriverFit]:
+    """Return the likeliest sizes of the effects that are not far behind the best of them.
+
+    Whether the best of them leaves colour is not asked of a limited current, which is as a bridge
+    that coasts, nearly.
+    """
     sought = [(s, size) for s in searches if (size := s.sought()) is not None]
     sought.sort(key=lambda one: one[0].near.deviance)
     found: list[DriverFit] = []
     for search, size in sought:
-        if found and search.near.deviance > found[0].fit.deviance + behind:
+        if search.near.deviance > min((d.fit.deviance for d in found), default=math.inf) + behind:
             break
-        if (one := search.polished(size, most)) is not None:
+        if (one := search.polished(size, most)) is None:
+            continue
+        found.append(one)
+        if search.effect.kind != CURRENT and joints:
+            found += _coasting(joints, most, sandwich_factor(one.fit) > COLOURED.value)
+            joints = ()
+    return found + _coasting(joints, most, True)
+
+
+def _coasting(searches: Sequence[_Joint], most: float, coloured: bool) -> list[DriverFit]:
+    """Return the drivers that coast, those of several numbers only where others leave colour."""
+    found: list[DriverFit] = []
+    for search in sorted(searches, key=lambda s: s.effect.numbers):
+        if (coloured or search.effect.numbers == 1) and (one := search.best(most)) is not None:
             found.append(one)
+            coloured = coloured and sandwich_factor(one.fit) > COLOURED.value
     return found
 
 
@@ -322,8 +339,7 @@ class _Joint:
         effect: DriverEffect,
     ) -> None:
         self.group, self.near, self.options, self.effect = group, fit, options, effect
-        # Pieces do not tell the back-EMF's share, which steady speeds do.
-        self.most = every if sum(map(len, every)) <= SCREENING_SAMPLES else group
+        self.every = every
         self.found: fast_decay.Joint | None = None
 
     def _data(self, records: Sequence[Record]) -> Experiments:
@@ -333,13 +349,15 @@ class _Joint:
 
     def best(self, most: float) -> DriverFit | None:
         """Return the likeliest driver; None where there is none, or beyond a deviance."""
-        data = self._data(self.most)
+        # Pieces do not tell the back-EMF's share, which steady speeds do.
+        data, few = thinned(self._data(self.every)), self._data(self.group)
+        data = data if data.size <= SCREENING_SAMPLES else few
         supply = min(r.hardware.supply_voltage or 0.0 for r in self.group)
         full = max(float(np.abs(data.hold_value).max(initial=0.0)), supply)
-        self.found = fast_decay.fitted(data, self.near, full, self.options)
-        if self.most is self.group or self.found is None:
+        driver = Driver(self.effect.kind, 1.0, full)
+        self.found = fast_decay.fitted(data, self.near, driver, self.options)
+        if data is few or self.found is None:
             return self._driver_fit(self.found, data, most)
-        few = self._data(self.group)
         return self._driver_fit(fast_decay.continued(few, self.found, self.options), few, most)
 
     def on(self, group: list[Record], most: float, behind: float) -> DriverFit | None:

@@ -1,16 +1,16 @@
-"""A driver that coasts in every PWM period, fitted together with the motor by least squares.
+"""A driver that coasts, fitted together with the motor by least squares.
 
 Its voltage follows the motion and the motion that voltage: neither can be fixed while the other is
-sought.  Two numbers describe it: L/R in PWM periods, and how much of the voltage at steady speed
-is back-EMF.
+sought.  Of one that coasts in every PWM period two numbers describe it, L/R in PWM periods and how
+much of the voltage at steady speed is back-EMF; of one that coasts at a command of zero the second.
 Derivation: docs/derivations.md, section 13.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise, product
 
 import numpy as np
 from scipy import optimize
@@ -18,28 +18,39 @@ from scipy import optimize
 from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.descent import initial_of
+from smp_motor_ident.estimation.driver_rows import measured_speed
 from smp_motor_ident.estimation.fit import FASTEST as SHORTEST_LAG
 from smp_motor_ident.estimation.fit import Fit, Options, solve
 from smp_motor_ident.estimation.selection import POLICY, sandwich_factor
+from smp_motor_ident.estimation.start import cutoffs, speed_candidates
 from smp_motor_ident.likelihood.driver_feedback import terminal_voltages
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.passes import own_columns
 from smp_motor_ident.model.coordinates import Coordinates
-from smp_motor_ident.model.driver import COAST, Driver
+from smp_motor_ident.model.driver import COAST, FREE, Driver, Rows
 from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.model.structures import FirstOrder, SecondOrder, Structure
 
-NUMBERS = 2  # of the driver, beside the motor's
-SIZES = (0.1, 1.0, 10.0, 100.0)  # of L/R in PWM periods, at which a descent begins
-SHARE = 0.9  # of back-EMF, the same
-FASTEST = 0.98  # quantile of speed and of voltage that belong together
-LITTLE = 0.02  # of the largest voltage: a friction from which more is found
-ALLOWED = {"size": (np.log(1e-3), np.log(1e4)), "share": (0.3, 1.0)}
+SIZES = (0.05, 0.3, 1.0, 3.0, 30.0)  # of L/R in PWM periods, for which motors are regressed
+BACK = (0.9, 0.6, 0.4, 0.25, 0.15)  # of the full voltage: back-EMF at the largest speed, the same
+BANDS = 4  # cut-offs of their filters
+APART = 0.3  # e-folds by which starts differ of which the descents may end apart
+BEGUN = 4  # starts from which it is descended, at most
+SPAN = 20  # samples over which an angle that is predicted drifts little
+MOVES, SEEN = 0.02, 5  # of the largest speed, and sections, above which coasting shows
+FASTEST = 0.999  # quantile of the speed that is the largest
+LEAST = 0.3  # of the voltage at steady speed, back-EMF with which a descent begins
+WEAKER = 3.0  # how much less a current drives that rises for L/R of a period
+LAGS, VOLTS = ("ln_a1", "ln_a2"), ("vc_plus", "vc_minus", "load")
+ALLOWED = {"size": (np.log1p(WEAKER * 1e-3), np.log1p(WEAKER * 1e4))}
+ALLOWED |= dict.fromkeys(("share", "vc_plus", "vc_minus", "delay"), (0.0, np.inf))
 SHORTEST = 1e-9  # s, of a window
 DIFFERENCE = 1e-5  # of each parameter's scale, over which a derivative is taken
-STEPS = 40  # of a descent at most
+STEPS, LONGEST = 40, 100  # of a descent at most, and of the best
+CLOSE = 0.01  # of the deviance, which a step gains where a descent ends
 SETTLED = 3  # turns of initial states and the voltage of other data
 SECOND = (0.02, 0.2)  # second lags that are tried, of the first
+LATE = 0.3  # samples of delay, the same
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +59,7 @@ class Joint:
 
     fit: Fit  # the motor, under the voltage of the driver
     driver: Driver
-    std: tuple[float, float]  # of L/R in PWM periods and of the back-EMF's share
+    std: tuple[float, ...]  # of L/R in PWM periods, if it is one of its numbers, and of the share
     voltage: Array  # by sections of the command [V]
     # shape (12,) each: how much less is known of the motor than under a voltage that is known
     moves: tuple[Array, ...]
@@ -56,40 +67,50 @@ class Joint:
     @property
     def cost(self) -> float:
         """The deviance with a price for each number."""
-        price = POLICY.price(1, self.fit.samples)
-        return self.fit.deviance + price * (self.fit.structure.size + NUMBERS)
+        return self.fit.deviance + POLICY.price(1, self.fit.samples) * self.fit.structure.size
 
 
-def fitted(data: Experiments, near: Fit, full_duty: float, options: Options) -> Joint | None:
+def fitted(data: Experiments, near: Fit, driver: Driver, options: Options) -> Joint | None:
     """Return a motor behind a coasting driver from a fit that knows of none.
 
-    The first order is sought from many starts, what is richer from its answer.
+    The first order is sought from motors that are regressed on what drivers would put out, until
+    two descents end alike; from its answer what is richer, if a score says that it may show.
     """
     first = near.structure.with_(delay=False, load=False, shift=0.0)
     first = FirstOrder.like(first, friction="symmetric")
-    problem = _Problem(data, replace(near, structure=first), full_duty)
-    starts = [problem.start(z, np.log(size), SHARE) for z in _motors(data, near) for size in SIZES]
-    # Far from its minimum a descent does not tell how deep that is: all go on to their ends.
-    found = min((problem.descend(p) for p in starts), key=lambda r: float(r.cost))
-    best = problem.joint(found, options)
-    z, _, driver = problem.unpacked(found.x)
-    richer: list[tuple[Structure, Coordinates]] = [(first.with_(delay=True), z)]
-    second = SecondOrder.like(first)
-    richer += [(second, z.with_second_lag(s * z.time_constant)) for s in SECOND]
-    for structure, begin in richer:
-        other = _Problem(data, replace(near, structure=structure), full_duty)
-        p = other.start(begin, np.log(driver.size), driver.emf_share)
-        one = other.joint(other.descend(p), options)
-        best = min((j for j in (best, one) if j), key=lambda j: j.cost, default=None)
-    return best
+    problem = _Problem(data, replace(near, structure=first, initial=data.initial), driver)
+    ends: list[optimize.OptimizeResult] = []
+    for p in problem.starts()[:BEGUN]:
+        ends.append(problem.descend(p))
+        if any(not problem.apart(e.x, ends[-1].x) for e in ends[:-1]):
+            break
+    if not ends:
+        return None
+    found = min(ends, key=lambda r: float(r.cost))
+    found = found if found.status else problem.descend(found.x, LONGEST)
+    z, initial, driver = problem.unpacked(found.x)
+    second, lag = SecondOrder.like(first), z.time_constant
+    begins: list[tuple[Structure, Coordinates]] = [
+        (first.with_(delay=True), z.with_(delay=LATE * data.step)),
+        *((second, z.with_second_lag(s * lag)) for s in SECOND),
+    ]
+    joints, most, more = [problem.joint(found, options)], 0.5 * float(np.log(data.size)), None
+    for structure, z in begins:
+        other = _Problem(data, replace(near, structure=structure, initial=initial), driver)
+        p = other.start(z, driver)
+        if (score := problem.score(found, other.misses(p))) > most:
+            more, most = (other, p), score
+    if more:
+        richer, p = more
+        joints.append(richer.joint(richer.descend(p), options))
+    return min((j for j in joints if j), key=lambda j: j.cost, default=None)
 
 
 def continued(data: Experiments, joint: Joint, options: Options) -> Joint | None:
     """Return the same of more data."""
     near = replace(joint.fit, initial=initial_of(data, joint.fit))
-    problem = _Problem(data, near, joint.driver.full_duty)
-    p = problem.start(joint.fit.z, np.log(joint.driver.size), joint.driver.emf_share)
-    return problem.joint(problem.descend(p), options)
+    problem = _Problem(data, near, joint.driver)
+    return problem.joint(problem.descend(problem.start(joint.fit.z, joint.driver)), options)
 
 
 def voltage_of(data: Experiments, joint: Joint) -> Array:
@@ -110,51 +131,124 @@ def rows_of(data: Experiments, voltage: Array) -> Array:
     return np.where(last, data.voltage, np.roll(voltage, -1))
 
 
-def _motors(data: Experiments, near: Fit) -> Iterator[Coordinates]:
-    """Yield motors to begin with: as it was found, and one of little friction."""
-    yield near.z
-    there = np.isfinite(data.output)
-    speed = data.output[there]
-    if data.kind == ANGLE:
-        segment = np.searchsorted(data.starts, np.flatnonzero(there), side="right")
-        within = np.diff(segment) == 0  # each record has a time of its own
-        speed = np.diff(speed)[within] / np.diff(data.time[there])[within]
-    gain = np.quantile(np.abs(speed), FASTEST) / np.quantile(np.abs(data.hold_value), FASTEST)
-    if gain > 0:
-        ln_a0 = -float(np.log(gain))
-        z = near.z.with_(ln_a0=ln_a0, ln_a1=near.z.ln_a1 - near.z.ln_a0 + ln_a0)
-        yield z.with_friction(LITTLE * float(np.abs(data.hold_value).max()))
+def _section_speeds(data: Experiments, lag: float) -> Array:
+    """Return the measured speed at the middle of each section of the command."""
+    speed, out = measured_speed(data, lag), np.empty(data.hold_end.size)
+    sections = pairwise([*data.hold_start[: len(data.starts) - 1].tolist(), data.hold_end.size])
+    for (a, b), (i, j) in zip(pairwise(data.starts), sections, strict=True):
+        end = data.hold_end[i:j]  # the time of each record is its own
+        out[i:j] = np.interp(end - 0.5 * np.diff(end, prepend=end[0]), data.time[a:b], speed[a:b])
+    return out
 
 
 class _Problem:
     """The errors by the motor's free coordinates, the driver's numbers and the initial states."""
 
-    def __init__(self, data: Experiments, near: Fit, full_duty: float) -> None:
-        self.data, self.near, self.full_duty = data, near, full_duty
+    def __init__(self, data: Experiments, near: Fit, driver: Driver) -> None:
+        self.data, self.near, self.driver = data, near, driver
         self.structure = near.structure
         self.own = list(own_columns(data, near.structure))
-        self.names = (*near.structure.free, "size", "share")
+        self.numbers = ("size", "share") if driver.kind == COAST else ("share",)
+        self.names = (*near.structure.free, *self.numbers)
         self.there = np.isfinite(data.output)
         segments = len(data.starts) - 1
         self.owner = np.repeat(np.arange(segments), np.diff(data.starts))[self.there]
         self.weight = 1 / np.sqrt(near.noise[0, 0])
         self.last: tuple[Array, Array] = np.zeros(0), np.zeros(0)
 
-    def start(self, z: Coordinates, size: float, share: float) -> Array:
-        """Return parameters: a motor, the logarithm of its driver's size and the share."""
-        initial = initial_of(self.data, self.near)
-        z = self.structure.complete(z)
-        motor = [z.value(n) for n in self.structure.free]
-        return np.array([*motor, size, share, *initial[:, self.own].ravel()])
+    def starts(self) -> list[Array]:
+        """Return parameters to begin with, the likeliest first.
+
+        What a driver would put out at the measured speed is a known voltage, to which a motor's
+        equation of motion is linear: drivers of several numbers are tried.
+        """
+        data, full, found = self.data, self.driver.full_duty, list[Array]()
+        first = np.zeros(data.hold_end.size, dtype=np.bool_)
+        first[data.hold_start[: len(data.starts) - 1]] = True
+        sizes = SIZES if "size" in self.numbers else BACK[:1]
+        for cutoff in cutoffs(data, BANDS):
+            speed = _section_speeds(data, BANDS / cutoff)
+            fastest = float(np.quantile(np.abs(speed), FASTEST)) or 1.0
+            open_ = (data.hold_value == 0) & (np.abs(speed) > MOVES * fastest)
+            if self.driver.kind == FREE and np.count_nonzero(open_) < SEEN:
+                return []
+            for size, back in product(sizes, BACK):
+                driver = self.driver._replace(size=size, emf_share=1.0)
+                emf = back * full / fastest
+                rows = Rows(data.hold_value, emf * speed, data.hold_end, first, 0.0)
+                there = replace(data, hold_value=rows.through(driver))
+                bands = np.array([cutoff])
+                for z in speed_candidates(there, 1, frictions=(True,), bands=bands):
+                    share = float(np.clip(emf * z.dc_gain, LEAST, 1.0))
+                    found.append(self.start(z, driver._replace(emf_share=share)))
+        with np.errstate(all="ignore"):
+            ranked = sorted(found, key=self._drift)
+        out: list[Array] = []
+        for p in ranked:
+            if all(self.apart(p, q) for q in out):
+                out.append(p)
+        return out
+
+    def apart(self, one: Array, other: Array) -> bool:
+        """Tell whether the motors or drivers of two differ by more than some e-folds."""
+        logarithms = [k for k, n in enumerate(self.names) if n.startswith("ln_") or n == "size"]
+        return bool(np.abs(one - other)[logarithms].max() > APART)
+
+    def _drift(self, p: Array) -> float:
+        """Return how far a prediction misses; of an angle, how far it drifts in some samples."""
+        miss = self._missed(p)
+        if self.data.kind == ANGLE:
+            miss = (miss[SPAN:] - miss[:-SPAN])[self.owner[SPAN:] == self.owner[:-SPAN]]
+        return float(miss @ miss)
+
+    def start(self, z: Coordinates, driver: Driver) -> Array:
+        """Return parameters: a motor, its driver, and the initial states.
+
+        While the current is interrupted it drives by as much less as it rises more slowly: by that
+        lag, friction and what is lost to it are multiplied, lest all of them follow the size.
+        """
+        z, initial = self.structure.complete(z), initial_of(self.data, self.near)
+        h = float(np.log1p(WEAKER * driver.size)) if "size" in self.numbers else 0.0
+        there = {n: z.value(n) for n in self.structure.free} | {"size": h}
+        there |= {n: there[n] + h for n in LAGS if n in there}
+        there |= {n: there[n] * np.exp(h) for n in VOLTS if n in there}
+        if "ln_a0" in there:
+            there["ln_a0"] += np.log(driver.emf_share)
+        there["share"] = (1 / driver.emf_share - 1) * np.exp(h)
+        return np.array([*(there[n] for n in self.names), *initial[:, self.own].ravel()])
 
     def unpacked(self, p: Array) -> tuple[Coordinates, Array, Driver]:
         """Return the motor, its initial states, and its driver."""
         there, k = dict(zip(self.names, map(float, p))), len(self.names)
-        size, share = float(np.exp(there.pop("size"))), there.pop("share")
+        h = there.pop("size", 0.0)
+        share = 1 / (1 + there.pop("share") * float(np.exp(-h)))
+        there |= {n: there[n] - h for n in LAGS if n in there}
+        there |= {n: there[n] * float(np.exp(-h)) for n in VOLTS if n in there}
+        if "ln_a0" in there:
+            there["ln_a0"] -= float(np.log(share))
         initial = initial_of(self.data, self.near)
         initial[:, self.own] = p[k:].reshape(-1, len(self.own))
         z = self.structure.complete(self.near.z.with_(**there))
-        return z, initial, Driver(COAST, size, self.full_duty, share)
+        size = float(np.expm1(h)) / WEAKER if "size" in self.numbers else share
+        return z, initial, self.driver._replace(size=size, emf_share=share)
+
+    def _values(self, p: Array) -> Array:
+        """Return the motor's coordinates, the size if it is one, and the share."""
+        z, _, driver = self.unpacked(p)
+        own = [driver.size] if "size" in self.numbers else []
+        return np.array([*(z.value(n) for n in self.structure.free), *own, driver.emf_share])
+
+    def explained(self, before: float, after: float) -> float:
+        """Return the deviance between two sums of squares."""
+        return float(self.owner.size * np.log(before / max(after, 1e-12 * before)))
+
+    def score(self, found: optimize.OptimizeResult, misses: Array) -> float:
+        """Return the deviance that it gains to go on towards other misses, to first order."""
+        q, _ = np.linalg.qr(found.jac)
+        way = misses - found.fun
+        way -= q @ (q.T @ way)
+        down, whole = max(-float(way @ found.fun), 0.0), 2 * float(found.cost)
+        return self.explained(whole, whole - down**2 / max(float(way @ way), 1e-300))
 
     def _shown(self, p: Array) -> tuple[Experiments, Array]:
         """Return the data under the driver's voltage, and what a motor shows under it."""
@@ -164,7 +258,8 @@ class _Problem:
         there = replace(self.near, structure=self.structure, z=z, initial=initial)
         return data, prediction.once(data, there)[:, 1]
 
-    def _misses(self, p: Array) -> Array:
+    def misses(self, p: Array) -> Array:
+        """Return the errors of what was measured, of unit variance."""
         if np.array_equal(p, self.last[0]):  # of which the slopes are asked for next
             return self.last[1]
         self.last = p.copy(), self._missed(p)
@@ -188,16 +283,8 @@ class _Problem:
         segment = every * np.arange(len(self.data.starts) - 1) + len(self.names)
         return of_motor + [(segment + j, states[own]) for j, own in enumerate(self.own)]
 
-    @property
-    def _scale(self) -> Array:
-        """What is much of each parameter; slopes far from the minimum are no measure of that."""
-        out = np.ones(len(self.names) + len(self.own) * (len(self.data.starts) - 1))
-        for moved, scale in self._groups:
-            out[moved] = scale
-        return out
-
     def _slopes(self, p: Array) -> Array:
-        here = self._misses(p)
+        here = self.misses(p)
         out = np.zeros((here.size, p.size))
         rows = np.arange(here.size)
         for k, (moved, scale) in enumerate(self._groups):
@@ -208,19 +295,19 @@ class _Problem:
         return out
 
     def descend(self, p: Array, steps: int = STEPS) -> optimize.OptimizeResult:
-        """Return where at most so many steps lead."""
+        """Return where the steps from there lead."""
         low, high = np.full(p.size, -np.inf), np.full(p.size, np.inf)
         for j, name in enumerate(self.names):
             low[j], high[j] = ALLOWED.get(name, (-np.inf, np.inf))
-            if name in ("vc_plus", "vc_minus", "delay", "window"):
-                low[j] = SHORTEST if name == "window" else 0.0
+            if name == "window":
+                low[j] = SHORTEST
             if name == "ln_a2":  # a shorter second lag shows in nothing, and friction chatters
-                low[j] = self.unpacked(p)[0].ln_a1 + np.log(SHORTEST_LAG * self.data.step)
+                low[j] = p[self.names.index("ln_a1")] + np.log(SHORTEST_LAG * self.data.step)
         inside = np.nextafter(low, high), np.nextafter(high, low)
         with np.errstate(all="ignore"):  # what runs away has a cost that says so
             found: optimize.OptimizeResult = optimize.least_squares(  # type: ignore[operator]
-                self._misses, np.clip(p, *inside), self._slopes, (low, high),
-                x_scale=self._scale, max_nfev=steps,
+                self.misses, np.clip(p, *inside), self._slopes, (low, high),
+                x_scale="jac", max_nfev=steps, ftol=CLOSE / self.data.size,
             )  # fmt: skip
         return found
 
@@ -234,12 +321,16 @@ class _Problem:
         slopes, k = found.jac, len(self.names)
         variance = 2 * found.cost / max(slopes.shape[0] - slopes.shape[1], 1)
         variance *= sandwich_factor(fit)
-        together = variance * prediction.inverse(slopes.T @ slopes)[:k, :k]
-        of_size, share = np.sqrt(np.diag(together)[-NUMBERS:])
+        moved = np.eye(k, slopes.shape[1]) * DIFFERENCE
+        turn = np.array([self._values(found.x + m) - self._values(found.x - m) for m in moved])
+        turn /= 2 * DIFFERENCE
+        inverse = prediction.inverse(slopes.T @ slopes)[:k, :k]
+        together = variance * turn.T @ inverse @ turn
+        k = len(self.structure.free)
+        *of_size, share = map(float, np.sqrt(np.diag(together)[k:]))
         known = sandwich_factor(fit) * fit.white()
-        moves = [fit.structure.matrix @ m for m in _beyond(together[:-NUMBERS, :-NUMBERS], known)]
-        std = float(of_size * driver.size), float(share)
-        return Joint(fit, driver, std, data.hold_value, tuple(moves))
+        moves = [fit.structure.matrix @ m for m in _beyond(together[:k, :k], known)]
+        return Joint(fit, driver, (*of_size, share), data.hold_value, tuple(moves))
 
 
 def _beyond(whole: Array, part: Array) -> list[Array]:

@@ -89,7 +89,11 @@ def cutoffs(data: Experiments, count: int = 7) -> Array:
 
 
 def speed_candidates(
-    data: Experiments, order: int, lag: int = 0, frictions: tuple[bool, ...] = (True, False)
+    data: Experiments,
+    order: int,
+    lag: int = 0,
+    frictions: tuple[bool, ...] = (True, False),
+    bands: Array | None = None,
 ) -> list[Coordinates]:
     """Return candidate coordinates from voltage and the mechanical output.
 
@@ -103,7 +107,7 @@ def speed_candidates(
         output = np.concatenate([u.output for u in grids])
         bounds = np.cumsum([0, *(len(u.output) for u in grids)])
         steps = np.array([u.step for u in grids])
-        bands = cutoffs(data, 7 if lag == 0 else 4)
+        bands = cutoffs(data, 7 if lag == 0 else 4) if bands is None else bands
         angle = data.kind == ANGLE
         for friction in frictions:
             for theta in search(voltage, output, bounds, steps, bands, order, angle, friction):

@@ -20,7 +20,7 @@ import numpy as np
 from smp_motor_control.arrays import Array, Flags
 from smp_motor_ident._compile import compiled, inlined
 
-NOTHING, DEAD_ZONE, CLIP, SLEW, SAG, DROP, COAST, CURRENT = range(8)
+NOTHING, DEAD_ZONE, CLIP, SLEW, SAG, DROP, COAST, CURRENT, FREE = range(9)
 REST = 0.05
 """Back-EMF of a motor that begins at rest, of the largest command at most."""
 
@@ -107,6 +107,8 @@ def terminal_voltage(
         out = back_emf + min(max(command - back_emf, -size), size)
     elif kind == COAST:
         out = _fast_decay(size, command, back_emf, full_duty)
+    elif kind == FREE and command == 0.0:  # open: the terminals show the back-EMF
+        out = back_emf
     return out, out
 
 
@@ -163,19 +165,20 @@ class DriverEffect:
     quantity: str  # name of the number that it is described by
     cause: str
     # Sizes between which its own is looked for, in the unit or as shares of `scale`, the mildest
-    # first: the motor behind each is where the search for the next begins
+    # first: the motor behind each is where the search for the next begins; none where it is sought
+    # together with the motor
     shares: tuple[float, ...]
 
     def scale(self, rows: Rows) -> float:
         """Return what the shares are of."""
         if self.kind == SLEW:
             return rows.top / rows.time_constant
-        return 1.0 if self.kind in (SAG, COAST) else rows.top
+        return 1.0 if self.kind == SAG else rows.top
 
     def may_be(self, size: float, rows: Rows) -> bool:
         """Tell whether there is anything of it, and anything left of the command."""
         most = 2 * rows.top if self.kind == CURRENT else rows.top  # what brakes is twice as much
-        return self.kind in (SLEW, SAG, COAST) or size < most
+        return self.kind in (SLEW, SAG) or not self.shares or size < most
 
     @property
     def numbers(self) -> int:
@@ -185,7 +188,7 @@ class DriverEffect:
     @property
     def follows_motion(self) -> bool:
         """Whether it depends on how the motor runs."""
-        return self.kind in (SAG, DROP, CURRENT, COAST)
+        return self.kind in (SAG, DROP, CURRENT) or not self.shares
 
 
 EFFECTS = (
@@ -213,8 +216,11 @@ EFFECTS = (
         (1.7, 1.2, 0.8, 0.5, 0.3, 0.15),
     ),
     DriverEffect(
-        COAST, "coast", "fast_decay_ratio", "a driver that lets the motor coast (fast decay)",
-        (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 100.0),
+        COAST, "coast", "fast_decay_ratio", "a driver that lets the motor coast (fast decay)", ()
+    ),
+    DriverEffect(
+        FREE, "coast", "coasting_share", "a driver that lets the motor coast at a command of zero",
+        (),
     ),
 )  # fmt: skip
 

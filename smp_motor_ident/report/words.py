@@ -35,6 +35,7 @@ EXPLAINED: Mapping[str, tuple[str, str, str]] = {
         "of the driver, times the resistance",
     ),
     "fast_decay_ratio": ("τₑf", "Fast-decay ratio", "electrical time constant in PWM periods"),
+    "coasting_share": ("s₀", "Coasting share", "of back-EMF in the voltage at steady speed"),
     "current_lag": ("τi", "Current lag", "by which the current's sensor is late on average"),
 }
 """Symbol, name and meaning of every quantity."""

@@ -17,7 +17,7 @@ from smp_motor_ident.estimation.driver_effect import (
     leaves_torque_noise,
     suspects_driver,
 )
-from smp_motor_ident.estimation.driver_rows import _measured
+from smp_motor_ident.estimation.driver_rows import measured_speed
 from smp_motor_ident.estimation.driver_search import likeliest
 from smp_motor_ident.estimation.fit import Fit, Options
 from smp_motor_ident.estimation.initialisation import initial_fit
@@ -254,10 +254,9 @@ def test_a_driver_is_suspected_where_an_estimate_is_unreliable_for_one(code, sev
 
 def test_the_motion_of_each_record_is_its_own():
     record = recorded("dead_zone", 0)
-    fit = SimpleNamespace(z=SimpleNamespace(time_constant=TAU))
     for one in (record, replace(record, velocity=None, position=np.cumsum(record.velocity) * STEP)):
-        alone = _measured(prepare([one], False), fit)
-        both = _measured(prepare([one, one], False), fit)
+        alone = measured_speed(prepare([one], False), TAU)
+        both = measured_speed(prepare([one, one], False), TAU)
         assert both == pytest.approx(np.tile(alone, 2), abs=NOISE)
         # A mean over a fifth of the lag.
         assert np.abs(alone - record.velocity).std() < 0.1 * record.velocity.std()
@@ -267,9 +266,8 @@ def test_a_segment_without_a_reading_stands():
     """A timer of edges has none while the motor stands."""
     record = recorded("dead_zone", 0)
     lost = np.arange(len(record)) < 200
-    fit = SimpleNamespace(z=SimpleNamespace(time_constant=TAU))
     record = replace(record, velocity=np.where(lost, np.nan, record.velocity), starts=(0, 200))
-    speed = _measured(prepare([record], False), fit)
+    speed = measured_speed(prepare([record], False), TAU)
     assert not speed[lost].any() and np.isfinite(speed).all() and speed[~lost].any()
 
 
@@ -407,7 +405,8 @@ def test_a_second_lag_that_nothing_shows_ends_at_a_thousandth_of_a_row():
         gain=np.zeros((3, 2)), objective=1.0, deviance=0.0, information=np.eye(2),
         scores=np.zeros((0, 2)), passes=1, converged=True, samples=command.size, kind=SPEED,
     )  # fmt: skip
-    problem = fast_decay._Problem(data, near, 12.0)
-    found = problem.descend(problem.start(motor, 0.0, 0.9), 3)
+    coasting = Driver(driver.COAST, 1.0, 12.0, 0.9)
+    problem = fast_decay._Problem(data, near, coasting)
+    found = problem.descend(problem.start(motor, coasting), 3)
     z, _, _ = problem.unpacked(found.x)
     assert z.a2 / z.a1 > 0.9e-3 * STEP
