@@ -10,10 +10,10 @@ from smp_motor_ident.diagnosis import validation as validate
 from smp_motor_ident.diagnosis.adequacy import is_moved, lacks_something
 from smp_motor_ident.diagnosis.advice import advise, assess, unsettled_rival
 from smp_motor_ident.diagnosis.beside import held_against_effects
+from smp_motor_ident.diagnosis.certainty import certain
 from smp_motor_ident.diagnosis.conditions import dependent
 from smp_motor_ident.diagnosis.current_kind import ARMATURE, current_kind
 from smp_motor_ident.diagnosis.data_quality import screen
-from smp_motor_ident.diagnosis.limits import PROFILED
 from smp_motor_ident.diagnosis.model_error import regression
 from smp_motor_ident.diagnosis.provenance import provenance
 from smp_motor_ident.diagnosis.refusal import (
@@ -35,7 +35,6 @@ from smp_motor_ident.diagnosis.scope import (
     one_size_or_swing,
     scope,
 )
-from smp_motor_ident.diagnosis.stamps import clock_share
 from smp_motor_ident.diagnosis.units import implausible_motor
 from smp_motor_ident.errors import (
     CurrentError,
@@ -47,15 +46,8 @@ from smp_motor_ident.errors import (
 from smp_motor_ident.estimation import flexible_shaft, order_selection
 from smp_motor_ident.estimation.averaging import candidate_weights, covering
 from smp_motor_ident.estimation.candidate_starts import of_kind
-from smp_motor_ident.estimation.consider_covariance import (
-    consider_clock,
-    consider_drop,
-    consider_friction,
-    consider_left_out,
-    consider_timing,
-)
 from smp_motor_ident.estimation.constraint import constrained
-from smp_motor_ident.estimation.disturbance import disturbance, often_disturbed
+from smp_motor_ident.estimation.disturbance import disturbance
 from smp_motor_ident.estimation.driver_effect import (
     DriverFit,
     declared,
@@ -66,16 +58,11 @@ from smp_motor_ident.estimation.driver_effect import (
 )
 from smp_motor_ident.estimation.driver_search import likeliest, run_free
 from smp_motor_ident.estimation.fit import Fit
-from smp_motor_ident.estimation.hold_choice import chosen_hold, instant_deviation, otherwise
-from smp_motor_ident.estimation.profile import profiled
-from smp_motor_ident.estimation.quantisation import widened
+from smp_motor_ident.estimation.hold_choice import chosen_hold, otherwise
 from smp_motor_ident.estimation.quantities import Answer, answer, driven_longest, without_lag
 from smp_motor_ident.estimation.request import Request, base_structure, checked
-from smp_motor_ident.estimation.segments import Change, heterogeneous
 from smp_motor_ident.estimation.selection import FittedCandidate, in_turn
 from smp_motor_ident.estimation.subset import excitation
-from smp_motor_ident.estimation.thinning import thinned
-from smp_motor_ident.estimation.transients import widened_by_pieces
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.driver import EFFECTS, RAMPS, DriverEffect
@@ -223,14 +210,13 @@ def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) 
                 ramped, _ = _through_driver(group, request, found, data, hold, one.fit, RAMPS)
                 return ramped or plain
             noisy = refused is None and (is_moved(plain) or one.fit.noise_ratio > 0)
-            rest = _undisturbed(group, request, found, one.fit, plain) if noisy else None
-            if rest and not often_disturbed(rest):
-                return rest
-            behind, driver = _through_driver(group, request, found, data, hold, one.fit)
-            return behind or rest or suspecting(plain, driver, one.fit)
+            held, driver = _beside_model(group, request, found, data, hold, one.fit, plain, noisy)
+            return held or suspecting(plain, driver, one.fit)
         except (SignalError, InsufficientExcitationError) as refusal:
-            if refused is None and (rest := _undisturbed(group, request, found, one.fit, None)):
-                return rest
+            if refused is None and (
+                held := _beside_model(group, request, found, data, hold, one.fit, None, True)[0]
+            ):
+                return held
             refused = refused or refusal
             # What was refused, and what is richer, is no rival that another's answer must cover.
             most = one.fit.structure.size
@@ -241,8 +227,6 @@ def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) 
     loaded = None if request.loaded else _tried(group, replace(request, loaded=True), found)
     if loaded and not loaded.unreliable:
         return loaded
-    if again := _through_driver(group, request, found, data, hold, candidates[-1].fit)[0]:
-        return again
     raise refused
 
 
@@ -252,6 +236,27 @@ def _tried(group: list[Record], request: Request, found: Sequence[Finding]) -> E
         return _estimated(group, request, found)
     except (SignalError, InsufficientExcitationError):
         return None
+
+
+def _beside_model(
+    group: list[Record],
+    request: Request,
+    found: Sequence[Finding],
+    data: Experiments,
+    hold: str,
+    fit: Fit,
+    plain: Estimate | None,
+    noisy: bool,
+) -> tuple[Estimate | None, DriverFit | None]:
+    """Return the estimate beside what no motor does, if one holds, and the likeliest driver.
+
+    What a driver explains without an accident is none.
+    """
+    behind, driver = _through_driver(group, request, found, data, hold, fit)
+    accident = behind is not None and any(f.code == "disturbed" for f in behind.findings)
+    if noisy and (behind is None or accident):
+        behind = _undisturbed(group, request, found, fit, plain) or behind
+    return behind, driver
 
 
 def _undisturbed(
@@ -325,7 +330,7 @@ def _stated(
     chosen = constrained(final, candidates[-1].fit, request)
     fitted = validate.speed_fit(group, final, chosen)
     refuse_unexplained(group, final, chosen, fitted)
-    chosen, friction_std, change = _certain(final, chosen, request, group, hold)
+    chosen, friction_std, change = certain(final, chosen, request, group, hold)
     weight = candidate_weights(data, candidates)
 
     def said(fit: Fit) -> tuple[Answer, dict[str, float]]:
@@ -383,18 +388,3 @@ def _without_lag(group: list[Record], fit: Fit, result: Answer) -> UnknownLagErr
     except UnknownLagError as refusal:
         return refusal
     return None
-
-
-def _certain(
-    final: Experiments, chosen: Fit, request: Request, group: Sequence[Record], hold: str
-) -> tuple[Fit, float, Change]:
-    """Return the chosen fit with all of its uncertainty, and how the motor changes."""
-    few = thinned(final) if final.size > PROFILED.value else final
-    chosen = profiled(few, widened_by_pieces(final, widened(final, chosen)), request.options)
-    timed = consider_timing(final, chosen, instant_deviation(group, hold))
-    timed = consider_drop(final, consider_clock(final, timed, clock_share(group)))
-    chosen, friction_std = consider_friction(final, consider_left_out(final, timed))
-    if request.driver is not None:
-        chosen = request.driver.widened(chosen)
-    chosen, change = heterogeneous(final, chosen)
-    return chosen, friction_std, change

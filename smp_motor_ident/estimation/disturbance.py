@@ -32,13 +32,11 @@ from smp_motor_ident.likelihood.passes import gather
 from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.model.structures import FirstOrder
 from smp_motor_ident.record import Record
-from smp_motor_ident.result import Estimate
 
 BLOCKS = 30  # of all records together, at most
 STRETCHES = 6  # of the same, each of which may be the one that nothing disturbed
 ROUNDS = 6  # most times that the rest is fitted
 FEWEST = 8  # samples of a block
-SELDOM = 2  # spans that a hand or an obstacle makes; a driver is asked for where there are more
 NEAR = 0.1  # of the largest voltage, by which levels may differ that do the same to a driver
 
 
@@ -60,12 +58,6 @@ class Disturbance:
             "look for what touched the motor or made its wheel slip then; the numbers are those of "
             "the rest of the record",
         )
-
-
-def often_disturbed(estimate: Estimate) -> bool:
-    """Tell whether so much was left out so often that a driver may do it at each large change."""
-    spans = [len(f.evidence) for f in estimate.findings if f.code == "disturbed"]
-    return any(n > SELDOM for n in spans)
 
 
 def disturbance(group: Sequence[Record], since: Sequence[float]) -> Disturbance | None:

@@ -111,11 +111,13 @@ def test_the_speed_of_each_section_is_that_of_its_own_record():
         assert speed == pytest.approx(np.full(400, 3.0 / STEP), rel=1e-4)  # counts are dithered
 
 
-def open_at_zero(seed: int) -> tuple[Record, dict[str, float]]:
-    """Return a record of a bridge that brakes but at a command of zero, and its truth."""
+def open_at_zero(seed: int, rests: int) -> tuple[Record, dict[str, float]]:
+    """Return a record of a bridge that brakes but at some commands of zero, and its truth."""
     constant, resistance, inertia, viscous, torque = 0.05, 2.0, 2e-4, 2e-4, 0.01
     rng = np.random.default_rng(seed)
-    command = np.repeat(rng.choice([0.0, 4.0, 9.0, -4.0, -9.0], 40), rng.integers(20, 60, 40))
+    levels = rng.choice([4.0, 9.0, -4.0, -9.0], 40)
+    levels[np.linspace(5, 35, rests).astype(int)] = 0.0
+    command = np.repeat(levels, rng.integers(20, 60, 40))
     fine, w = 100, 0.0
     speed = np.zeros(command.size)
     for k, volts in enumerate(command.tolist()[1:], 1):
@@ -136,10 +138,12 @@ def open_at_zero(seed: int) -> tuple[Record, dict[str, float]]:
     return Record("motor", 0.01 * np.arange(command.size), command, velocity=speed), truth
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_a_bridge_that_is_open_at_a_command_of_zero_is_estimated_with_its_motor(seed):
-    record, truth = open_at_zero(seed)
+@pytest.mark.parametrize("rests", [2, 8])
+def test_a_bridge_that_is_open_at_a_command_of_zero_is_estimated_with_its_motor(rests):
+    """Seldom it looks like a hand that turned the motor on, but one that a driver explains."""
+    record, truth = open_at_zero(rests, rests)
     found = estimate(record)
+    assert "disturbed" not in {f.code for f in found.findings}
     assert not found.unreliable
     for name, value in truth.items():
         q = found.combinations[name]
