@@ -375,20 +375,19 @@ class _Joint:
             return None
         records = with_voltages(self.group, fast_decay.rows_of(data, joint.voltage))
         fit = self._with_current(records, joint.fit) if self.near.structure.current else joint.fit
-        if fit is None or fit.deviance > most:
+        if fit.deviance > most:
             return None
         return DriverFit(self.effect, joint.driver, joint.std[0], self.group, records, self, fit)
 
-    def _with_current(self, records: list[Record], fit: Fit) -> Fit | None:
+    def _with_current(self, records: list[Record], fit: Fit) -> Fit:
         """Return the motor that a measured current shows under the voltage that was found."""
         near, s = self.near, self.near.structure
         data = _prepared(records, "held", near)
         z = near.z.with_(ln_a0=fit.z.ln_a0, ln_a1=fit.z.ln_a1).with_friction(fit.z.vc_plus)
-        tried = [
-            refine(data, s, near, s.complete(z), self.options),
-            initial_fit(data, s, self.options),
-        ]
-        return min((f for f in tried if f is not None), key=lambda f: f.deviance, default=None)
+        tried = [refine(data, s, near, s.complete(z), self.options)]
+        if other := initial_fit(data, s, self.options):
+            tried.append(run_free(records, other, "held", self.options))
+        return min(tried, key=lambda f: f.deviance)
 
     def moves(self, fit: Fit) -> list[Array]:
         """Return by how much less is known of a motor than under a voltage that is known."""

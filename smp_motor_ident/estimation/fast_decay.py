@@ -39,7 +39,7 @@ BEGUN = 4  # starts from which it is descended, at most
 SPAN = 20  # samples over which an angle that is predicted drifts little
 MOVES, SEEN = 0.02, 5  # of the largest speed, and sections, above which coasting shows
 FASTEST = 0.999  # quantile of the speed that is the largest
-LEAST = 0.3  # of the voltage at steady speed, back-EMF with which a descent begins
+LEAST = 0.3  # of the voltage at steady speed, what is back-EMF of a motor
 WEAKER = 3.0  # how much less a current drives that rises for L/R of a period
 LAGS, VOLTS = ("ln_a1", "ln_a2"), ("vc_plus", "vc_minus", "load")
 ALLOWED = {"size": (np.log1p(WEAKER * 1e-3), np.log1p(WEAKER * 1e4))}
@@ -312,11 +312,11 @@ class _Problem:
         return found
 
     def joint(self, found: optimize.OptimizeResult, options: Options) -> Joint | None:
-        """Return what is found and what is known of it; None where a descent ran away."""
+        """Return what is found and what is known of it; None where it ran away, or is no motor."""
         z, initial, driver = self.unpacked(found.x)
         data = self._shown(found.x)[0]
         fit = solve(data, self.structure, self.near.at(z, initial, 0.0), options)
-        if not np.isfinite(fit.deviance):
+        if not np.isfinite(fit.deviance) or driver.emf_share < LEAST:
             return None
         slopes, k = found.jac, len(self.names)
         variance = 2 * found.cost / max(slopes.shape[0] - slopes.shape[1], 1)
