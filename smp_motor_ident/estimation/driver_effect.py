@@ -18,6 +18,7 @@ from smp_motor_ident.diagnosis.limits import HALF_EXPLAINED
 from smp_motor_ident.diagnosis.sample_limits import EFFECT_SHOWN, SLEW_SEEN
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.fitted import NORMAL_95
+from smp_motor_ident.estimation.selection import evidence
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import output_of
 from smp_motor_ident.model.driver import (
@@ -25,6 +26,7 @@ from smp_motor_ident.model.driver import (
     COAST,
     DECLARABLE,
     EFFECTS,
+    RAMPS,
     SLEW,
     Driver,
     DriverEffect,
@@ -82,6 +84,13 @@ class DriverFit:
             if rise < SLEW_SEEN.value * min(r.sample_time for r in self.before):
                 return False
         return self.std < EFFECT_SHOWN.value * size
+
+    def beyond_chance(self, plain: Fit, price: float) -> bool:
+        """Tell whether errors of few steady speeds, or of few changes, hardly look like it."""
+        bent = ("ln_a1",) if self.effect in RAMPS else ("ln_a0", "vc_plus")
+        both = set(plain.structure.free) & set(self.fit.structure.free)
+        least = min((evidence(plain, self.fit, c) for c in bent if c in both), default=math.inf)
+        return least > price * self.effect.numbers
 
     def widened(self, fit: Fit) -> Fit:
         """Return a fit with its covariance widened by what is not known of the driver."""

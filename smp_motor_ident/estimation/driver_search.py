@@ -29,10 +29,10 @@ from smp_motor_ident.estimation.driver_effect import DriverFit
 from smp_motor_ident.estimation.driver_rows import rows_of, with_voltages
 from smp_motor_ident.estimation.fit import Fit, Options, solve
 from smp_motor_ident.estimation.initialisation import initial_fit
-from smp_motor_ident.estimation.selection import POLICY, evidence, sandwich_factor
+from smp_motor_ident.estimation.selection import POLICY, sandwich_factor
 from smp_motor_ident.estimation.thinning import thinned
 from smp_motor_ident.likelihood.experiments import Experiments, prepare
-from smp_motor_ident.model.driver import CURRENT, EFFECTS, RAMPS, SLEW, Driver, DriverEffect
+from smp_motor_ident.model.driver import CURRENT, EFFECTS, SLEW, Driver, DriverEffect
 from smp_motor_ident.model.structures import FirstOrder
 from smp_motor_ident.record import Record
 
@@ -87,8 +87,8 @@ def likeliest(
                 every.append(there)
                 most = min(most, there.fit.deviance + behind)
         found = every
-    found = sorted((d for d in found if d.shown and cost(d) < plain), key=cost)
-    found = [d for d in found if _beyond_chance(fit, d, price)]
+    shown = (d for d in found if d.shown and cost(d) < plain and d.beyond_chance(fit, price))
+    found = sorted(shown, key=cost)
     if not found:
         return None
     best, *others = found
@@ -96,14 +96,6 @@ def likeliest(
     if plain < cost(best) + price:  # there may be none of them
         near.append(fit)
     return replace(best, rivals=tuple(near))
-
-
-def _beyond_chance(plain: Fit, found: DriverFit, price: float) -> bool:
-    """Tell whether errors of few steady speeds, or of few changes, hardly look like an effect."""
-    bent = ("ln_a1",) if found.effect in RAMPS else ("ln_a0", "vc_plus")
-    both = set(plain.structure.free) & set(found.fit.structure.free)
-    shown = (evidence(plain, found.fit, c) for c in bent if c in both)
-    return min(shown, default=math.inf) > price * found.effect.numbers
 
 
 def run_free(group: Sequence[Record], fit: Fit, hold: str, options: Options) -> Fit:
