@@ -326,11 +326,12 @@ def _stated(
 
     Where only the lag is not known, that is said of the ``first`` candidate; others are refused.
     """
-    final = of_kind(data, candidates[-1].fit)
-    chosen = constrained(final, candidates[-1].fit, request)
+    free = candidates[-1].fit
+    final = of_kind(data, free)
+    chosen = constrained(final, free, request)
     fitted = validate.speed_fit(group, final, chosen)
     refuse_unexplained(group, final, chosen, fitted)
-    chosen, friction_std, change = certain(final, chosen, request, group, hold)
+    chosen, friction_std, change = certain(final, free, chosen, request, group, hold)
     weight = candidate_weights(data, candidates)
 
     def said(fit: Fit) -> tuple[Answer, dict[str, float]]:

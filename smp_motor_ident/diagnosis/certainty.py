@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from smp_motor_ident.diagnosis.limits import PROFILED
 from smp_motor_ident.diagnosis.stamps import clock_share
 from smp_motor_ident.estimation.consider_covariance import (
+    consider_bound,
     consider_clock,
     consider_drop,
     consider_friction,
@@ -27,11 +28,21 @@ from smp_motor_ident.record import Record
 
 
 def certain(
-    final: Experiments, chosen: Fit, request: Request, group: Sequence[Record], hold: str
+    final: Experiments,
+    free: Fit,
+    chosen: Fit,
+    request: Request,
+    group: Sequence[Record],
+    hold: str,
 ) -> tuple[Fit, float, Change]:
-    """Return the chosen fit with all of its uncertainty, and how the motor changes."""
+    """Return the chosen fit with all of its uncertainty, and how the motor changes.
+
+    ``free``: the same without what physics forbids.
+    """
     few = thinned(final) if final.size > PROFILED.value else final
     chosen = profiled(few, widened_by_pieces(final, widened(final, chosen)), request.options)
+    if "viscous_friction" not in request.known:
+        chosen = consider_bound(free, chosen)
     timed = consider_timing(final, chosen, instant_deviation(group, hold))
     timed = consider_drop(final, consider_clock(final, timed, clock_share(group)))
     chosen, friction_std = consider_friction(final, consider_left_out(final, timed))

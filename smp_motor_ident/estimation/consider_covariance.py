@@ -83,9 +83,15 @@ def consider_drop(data: Experiments, fit: Fit) -> Fit:
 def consider_bound(free: Fit, bound: Fit) -> Fit:
     """Return a fit whose viscous friction is held at zero, widened by what that may be above it.
 
-    ``free`` is the same fit without the bound, where it is negative.
+    ``free`` is the same fit without the bound, where it may be negative.  A profile of friction
+    ends where viscous friction is none, and needs no more.
     """
+    followed = any(p.coordinate == "vc_plus" for p in bound.profiles)
+    if bound is free or not free.structure.current or followed:
+        return bound
     value, row = physical_gradients(free.z)["viscous_friction"]
+    if value >= 0:
+        return bound
     row = row @ free.structure.matrix
     covariance = free.conditional()
     variance = float(row @ covariance @ row)

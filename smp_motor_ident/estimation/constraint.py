@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 
 from smp_motor_control.motor.parameters import PHYSICAL
-from smp_motor_ident.estimation.consider_covariance import consider_bound
 from smp_motor_ident.estimation.descent import refine
 from smp_motor_ident.estimation.fit import Fit, Prior
+from smp_motor_ident.estimation.profile import rubbing
 from smp_motor_ident.estimation.request import Request
 from smp_motor_ident.likelihood.experiments import Experiments
+from smp_motor_ident.model.coordinates import Coordinates
 from smp_motor_ident.model.physical import physical
 
 
@@ -37,5 +38,18 @@ def constrained(data: Experiments, fit: Fit, request: Request) -> Fit:
     if not priors:
         return fit
     bound = replace(request.options, priors=tuple(priors))
-    held = refine(data, fit.structure, fit, fit.z, bound)
-    return consider_bound(fit, held) if negative else held
+    if not negative:
+        return refine(data, fit.structure, fit, fit.z, bound)
+    starts = [fit.z, _rubbing_less(data, fit, values["motor_constant"])]
+    tried = (refine(data, fit.structure, fit, z, bound) for z in starts)
+    return min(tried, key=lambda f: f.deviance)
+
+
+def _rubbing_less(data: Experiments, fit: Fit, constant: float) -> Coordinates:
+    """Return a motor that turns as fast at the largest voltage and loses nothing but to friction.
+
+    Where friction and what grows with speed hardly differ, the way there is longer than a descent.
+    """
+    full = float(np.abs(data.hold_value).max())
+    less = full - constant / fit.z.a0 * (full - fit.z.vc_plus)
+    return fit.structure.complete(rubbing(data, fit, max(less, 0.0))[0])

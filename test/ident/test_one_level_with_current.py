@@ -125,3 +125,26 @@ def test_a_profile_that_rises_slowly_ends_at_its_bound(seed: int) -> None:
     for name, true in (("dc_gain", k / (k * k + r * b)), ("static_voltage", r * tc / k)):
         low, high = found[name].ci95
         assert low < true < high, name
+
+
+@pytest.mark.parametrize("seed", [0, 4])
+def test_viscous_friction_that_came_out_negative_is_no_reason_to_refuse(seed: int) -> None:
+    """Of friction and what grows with speed only the sum is known: the bound is far along a ridge.
+
+    From there the gain may be what it is without either of them.
+    """
+    r, el, k, j, b, tc = 3.62, 2.453e-3, 0.020856, 1.306e-5, 4.848e-6, 9.824e-4
+    rng = np.random.default_rng(seed)
+    t = np.arange(681) / 50
+    volts = np.where(t > 0.9, 3.0, 0.0)
+    motion = simulate(t, volts, r, el, k, j, b, tc, np.zeros(t.size), 200)
+    count = np.floor(motion[:, 2] * 2000 / (2 * np.pi) + rng.uniform()).astype(np.int64)
+    current = motion[:, 0] + 0.005 * rng.standard_normal(t.size)
+    found = estimate(
+        Record("motor", t, volts, current, count=count, hardware=Hardware(1.0, 2000.0))
+    )
+    assert not found.unreliable
+    low, high = found.combinations["dc_gain"].ci95
+    assert low < k / (k * k + r * b) < high < 1.01 / k
+    lag = found.combinations["time_constant"]
+    assert abs(lag.value - (r * j + el * b) / (r * b + k * k)) < 4 * lag.std < 0.1 * lag.value
