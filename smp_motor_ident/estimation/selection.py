@@ -137,11 +137,12 @@ class SelectionPolicy:
         return not verdict, reason
 
     def preferred_but_for_descent(self, best: FittedCandidate, other: FittedCandidate) -> bool:
-        """Decide whether a candidate would take the place of the best, had its fit settled."""
+        """Decide whether what explains more would take the place of the best, had it settled."""
         settled = replace(other.fit, converged=True)
-        if settled.structure.size < best.fit.structure.size:
-            return settled.deviance < best.fit.deviance
-        return self.preferred(best.fit, settled)[0]
+        if settled.deviance >= best.fit.deviance:
+            return False
+        smaller = settled.structure.size < best.fit.structure.size
+        return smaller or self.preferred(best.fit, settled)[0]
 
     def simplest_left(self, best: FittedCandidate, candidates: list[FittedCandidate]) -> Fit:
         """Return the choice, or what it contains where the data ask for no more.

@@ -135,6 +135,11 @@ def test_a_better_structure_that_did_not_settle_makes_the_answer_unreliable() ->
     assert not unsettled_rival([FittedCandidate(rich), FittedCandidate(poor)], result, {})
     worse = dataclasses.replace(unsettled, deviance=poor.deviance)
     assert not unsettled_rival([FittedCandidate(worse), FittedCandidate(poor)], result, {})
+    # Nor is a second lag one that is believed over a delay although it fits worse.
+    late = initial_fit(data, FIRST.with_(delay=True), Options())
+    behind = dataclasses.replace(unsettled, deviance=late.deviance + 10.0)
+    assert POLICY.preferred(late, dataclasses.replace(behind, converged=True))[0]
+    assert not POLICY.preferred_but_for_descent(FittedCandidate(late), FittedCandidate(behind))
     own = answer(rich, {})
     better = FittedCandidate(dataclasses.replace(unsettled, deviance=rich.deviance - 1e4))
     assert not unsettled_rival([better, FittedCandidate(rich)], own, {})
