@@ -6,6 +6,7 @@ pieces of equal leverage, however short, instead, and their errors count by that
 Derivation: docs/derivations.md, section 9.
 """
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -16,6 +17,7 @@ from smp_motor_ident.diagnosis.limits import CONDITION_LEVEL, FEW_TRANSIENTS
 from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.fitted import long_run
+from smp_motor_ident.estimation.profile import one_level
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.noise import whitening
 from smp_motor_ident.likelihood.passes import answers, own_columns
@@ -37,6 +39,8 @@ def widened_by_pieces(data: Experiments, fit: Fit) -> Fit:
         return fit
     if not np.any(_runs(fit) < FEW_TRANSIENTS.value):
         return fit
+    if "vc_plus" in fit.structure.free and one_level(data, fit):
+        return _beside_friction(data, fit)
     moves = _moves(data, fit)
     pieces = len(moves)
     if pieces <= 2 * moves.shape[1]:
@@ -51,6 +55,24 @@ def widened_by_pieces(data: Experiments, fit: Fit) -> Fit:
     ratio[ratio < chdtri(pieces - 1, CONDITION_LEVEL.value) / (pieces - 1)] = 1.0
     more = half @ along * np.sqrt(np.maximum(ratio - 1.0, 0.0))
     return fit.wider(more @ more.T)
+
+
+def _beside_friction(data: Experiments, fit: Fit) -> Fit:
+    """Return the fit widened as one of known friction: of one level its profile follows that."""
+    keep = np.array([n != "vc_plus" for n in fit.structure.free])
+    fixed = {**fit.structure.fixed, "vc_plus": fit.z.vc_plus}
+    known = replace(
+        fit,
+        structure=fit.structure.with_(fixed=fixed),
+        information=fit.information[np.ix_(keep, keep)],
+        scores=fit.scores[:, keep],
+        widen=None if fit.widen is None else fit.widen[keep],
+        added=None,
+    )
+    added = np.zeros((keep.size, keep.size))
+    more = widened_by_pieces(data, known).added
+    added[np.ix_(keep, keep)] = 0.0 if more is None else more
+    return fit.wider(added)
 
 
 def _runs(fit: Fit) -> Array:

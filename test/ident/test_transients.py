@@ -79,6 +79,16 @@ def test_a_step_alone_scatters_as_it_says(seed):
     assert 0.9 * alone < wider < 2.0 * alone
 
 
+def test_friction_that_no_piece_tells_is_left_to_its_profile():
+    """Of one level it trades with the gain: errors of pieces say nothing of that ridge."""
+    data = prepare([stepped(1, 1.0)], False)
+    fit = free_run(data, initial_fit(data, FirstOrder(friction="symmetric"), Options()))
+    wide = widened_by_pieces(data, fit)
+    at = fit.structure.free.index("vc_plus")
+    assert wide.conditional()[at, at] == fit.conditional()[at, at]
+    assert lag_of(wide) > 1.2 * lag_of(fit)
+
+
 @pytest.mark.parametrize("uneven, often", [(0.0, False), (0.0, True), (0.3, True)])
 def test_what_is_noise_or_comes_again_and_again_is_left_as_it_is(uneven, often):
     data, fit = fitted(stepped(5, uneven, often))
