@@ -201,22 +201,6 @@ def sized(kind: int, size: float, std: float) -> DriverFit:
     return DriverFit(effect, Driver(kind, size), std, [record], [record], None, None)
 
 
-def test_friction_that_varies_over_a_turn_of_the_output_is_no_driver_at_few_steady_speeds():
-    gain, lag, friction, step = 5.0, 0.0265, 2.2, 0.005
-    volts = np.repeat(24.0 * np.array([0, 0.25, 0.4, 0.55, 0.7, 0.85, 1, 0.5]), 200)
-    angle, speed, shown = 0.0, 0.0, []
-    for u in volts:
-        towards = gain * (u - friction * (1 + 0.1 * np.sin(angle / 50 + 4.19)))
-        after = max(towards + (speed - towards) * math.exp(-step / lag), 0.0)
-        angle, speed = angle + step * (speed + after) / 2, after
-        shown.append(speed)
-    noise = np.random.default_rng(8).normal(0.0, 0.6, volts.size)
-    found = estimate(Record("motor", step * np.arange(volts.size), volts, velocity=shown + noise))
-    for name, true in (("dc_gain", gain), ("static_voltage", friction), ("time_constant", lag)):
-        q = found.combinations[name]
-        assert abs(q.value - true) < 4 * q.std, name  # 19, 11 and 5 behind a supply that sagged
-
-
 @pytest.mark.parametrize("kind", [driver.DEAD_ZONE, driver.SLEW, driver.SAG, driver.DROP])
 def test_a_size_that_may_be_nothing_is_not_stated(kind):
     assert sized(kind, 0.5, 0.2).shown
