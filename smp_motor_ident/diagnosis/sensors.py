@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from smp_motor_ident.diagnosis.limits import FIT_EXPLAINS, LONG_DELAY, SHARP
+from smp_motor_ident.diagnosis.limits import FIT_EXPLAINS, INSTANT, LONG_DELAY, SHARP
 from smp_motor_ident.diagnosis.residuals import coloured
 from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.fit import Fit
@@ -28,7 +28,7 @@ def sensors(data: Experiments, fit: Fit) -> Iterator[Finding]:
         )
     if isinstance(s, Electromechanical) and s.lags:
         yield _current_lag(s.current_sensor, fit.z.current_lag)
-    if s.has("window"):
+    if s.has("window") and fit.z.window > INSTANT.value * data.step:
         yield _filtered_speed(fit)
     if s.shift > 0:
         yield _late_command(s.shift)

@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from smp_motor_ident.diagnosis.sensors import sensors
 from smp_motor_ident.estimate import estimate
+from smp_motor_ident.estimation.fit import Options
+from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.estimation.simulation import simulate
 from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.likelihood.noise import NoiseModel
@@ -103,6 +106,15 @@ def test_a_motor_with_current_is_found_behind_its_speed_s_low_pass(lag, ticks):
     # What it would have done is seen through the filter that was found: but for noise the same.
     measured, simulated = simulate(found, record)
     assert np.std(measured - simulated) < 1.03 * 0.1
+
+
+def test_a_filter_of_no_time_is_not_spoken_of():
+    structure = SecondOrder(friction="none", window=True, low_pass=True, ticks=1)
+    data = prepare([filtered(STEP, 0.0, 3.0, noise=1.0)], False).measured_as(structure.speed)
+    fit = initial_fit(data, structure, Options())
+    for window, codes in ((2 * STEP, ["low_passed_speed"]), (1e-9, [])):
+        there = replace(fit, z=fit.z.with_(window=window))
+        assert [f.code for f in sensors(data, there)] == codes
 
 
 @pytest.mark.parametrize("current", [False, True])
