@@ -6,7 +6,7 @@ from scipy.special import fdtrc, ndtri
 from smp_motor_control.arrays import Array
 from smp_motor_ident.bag.limits import EXPLAINS
 from smp_motor_ident.diagnosis.limits import HALF_EXPLAINED
-from smp_motor_ident.diagnosis.signs import lagged
+from smp_motor_ident.likelihood.first_order_lag import lagged
 
 LAGS, OWN = 6, 2
 BLOCKS = 200  # stretches over which motions are averaged: in them a counter's noise is small

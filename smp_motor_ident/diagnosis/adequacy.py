@@ -28,6 +28,7 @@ from smp_motor_ident.diagnosis import limits
 from smp_motor_ident.diagnosis.effects import EFFECTS, Effect
 from smp_motor_ident.diagnosis.model_error import Regression
 from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.estimation.prediction import inverse
 from smp_motor_ident.estimation.quantities import Answer
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.model.physical import physical_gradients
@@ -122,37 +123,41 @@ def _test(
     errors: Regression, effect: Effect, columns: tuple[int, ...], white: bool
 ) -> Evidence | None:
     """Return the Wald test of one effect; None where the data cannot tell."""
-    z, e = errors.regressors[:, columns], errors.residual
-    normal = z.T @ z
-    scale = np.sqrt(np.diag(normal))
+    several = list(columns)
+    scale = np.sqrt(np.diag(errors.normal)[several])
     if not np.all(scale > 0):
         return None
-    if np.linalg.cond(normal / np.outer(scale, scale)) > 1e8:
+    unit = np.outer(scale, scale)
+    normal = errors.normal[np.ix_(several, several)] / unit
+    values = np.linalg.eigvalsh(normal)
+    if values[-1] > 1e8 * values[0]:
         return _test(errors, effect, columns[:1], white) if len(columns) > 1 else None
-    size = np.asarray(np.linalg.solve(normal, z.T @ e), dtype=np.float64)
-    own, whole = np.square(z @ size).sum(), np.square(errors.whole[:, columns] @ size).sum()
-    if own <= limits.EFFECT_OWN.value * whole:  # nothing of nothing where no error is in its rows
+    moved = errors.moved[several] / scale
+    size = np.linalg.solve(normal, moved)
+    own = moved @ size
+    whole = errors.whole[:, several] @ (size / scale)
+    if own <= limits.EFFECT_OWN.value * float(
+        whole @ whole
+    ):  # nothing of nothing where no error is in its rows
         return None  # what is left of it is smaller than what is not known of its shape
-    left = e - z @ size
-    n, q = int(np.count_nonzero(e)), len(columns)  # rows without a measurement are zero
+    z = errors.regressors[:, several]
+    left = errors.residual - z @ (size / scale)
+    n, q = np.count_nonzero(errors.known), len(several)
     variance = float(left @ left) / max(n - q, 1)
-    blocks = int(errors.block[-1]) + 1 if errors.block.size else 0
-    scores = np.stack([np.bincount(errors.block, z[:, j] * left, blocks) for j in range(q)], axis=1)
-    weights = np.stack([np.bincount(errors.block, z[:, j] ** 2, blocks) for j in range(q)])
-    weights = weights / weights.max(axis=1, keepdims=True)  # squares of the smallest are no numbers
-    stretches = float(np.min(weights.sum(axis=1) ** 2 / np.square(weights).sum(axis=1)))
+    weights = errors.weights[:, several]
+    stretches = float(np.min(weights.sum(axis=0) ** 2 / np.square(weights).sum(axis=0)))
     if stretches - q < limits.EFFECT_BLOCKS.value and not white:
         return None  # what shows it lies in a few stretches: chance cannot be excluded
-    middle = scores.T @ scores * blocks / (blocks - 1)
-    least = variance * normal
-    moved = z.T @ e
-    robust = float(moved @ np.linalg.pinv(middle, hermitian=True) @ moved) / q
-    plain = float(moved @ np.linalg.solve(least, moved)) / q
+    scores = errors.by_block(z * left[:, None]) / scale
+    blocks = len(scores)
+    robust = float(moved @ inverse(scores.T @ scores) @ moved) * (blocks - 1) / blocks / q
+    plain = float(own) / variance / q
     freedom = max(stretches - q, 1.0)
     p_robust = float(fdtrc(q, freedom, robust * freedom / (freedom + q - 1)))
     p_plain = float(fdtrc(q, max(n - q, 1), plain))
     p = p_plain if stretches - q < limits.EFFECT_BLOCKS.value else max(p_robust, p_plain)
-    return Evidence(effect, p, plain * q, errors.shifts[:, columns] @ size, columns, size)
+    size = size / scale
+    return Evidence(effect, p, plain * q, errors.shifts[:, several] @ size, columns, size)
 
 
 def _without(errors: Regression, named: Sequence[int]) -> Regression:

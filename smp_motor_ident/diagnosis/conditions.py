@@ -19,7 +19,7 @@ likelihood estimation of misspecified models, Econometrica 50 (1982), 1, section
 import numpy as np
 from scipy.special import fdtrc
 
-from smp_motor_control.arrays import Array, Integers
+from smp_motor_control.arrays import Array
 from smp_motor_ident.diagnosis.limits import CONDITION_LEVEL, CONDITION_WEIGHT
 from smp_motor_ident.diagnosis.model_error import Regression
 from smp_motor_ident.estimation.fit import Fit
@@ -34,16 +34,20 @@ def dependent(fit: Fit, errors: Regression | None) -> tuple[Fit, list[Finding]]:
         return fit, []
     size = errors.n_free
     level = CONDITION_LEVEL.value / max(2 * size * len(errors.conditions), 1)
-    normal = errors.own.T @ errors.own
+    own, e = errors.own, errors.residual
+    normal, score = own.T @ own, own.T @ e
     unweighted = inverse(normal, 1e-12)[:, :size]
     added, said = np.zeros((size, size)), {}
     for name, condition in errors.conditions.items():
-        tilted = errors.own * (CONDITION_WEIGHT.value * condition)[:, None]
+        tilted = own * (CONDITION_WEIGHT.value * condition)[:, None]
+        tilt, score_tilt = own.T @ tilted, tilted.T @ e
         moves = []
         for sign in (1.0, -1.0):
-            other = inverse(normal + sign * (errors.own.T @ tilted), 1e-12)[:, :size]
-            move, p_value = _moved(errors, errors.own + sign * tilted, other, unweighted)
-            moves.append(np.where(p_value < level, move, 0.0))
+            other = inverse(normal + sign * tilt, 1e-12)[:, :size]
+            move = other.T @ (score + sign * score_tilt)
+            # Of the residuals in the move of each coordinate.
+            rows = ((other - unweighted).T @ own.T + sign * (other.T @ tilted.T)).T
+            moves.append(np.where(_by_chance(errors, rows, move) < level, move, 0.0))
         far = max(moves, key=lambda d: float(np.abs(d).max()))
         if far.any():
             added += np.outer(far, far)
@@ -63,29 +67,15 @@ def dependent(fit: Fit, errors: Regression | None) -> tuple[Fit, list[Finding]]:
     ]
 
 
-def _moved(
-    errors: Regression, weighted: Array, other: Array, unweighted: Array
-) -> tuple[Array, Array]:
-    """Return by how much other weights move the coordinates, and how likely chance does that."""
-    own, e = errors.own, errors.residual
-    # Of the residuals in the move of each coordinate.
-    rows = weighted @ other - own @ unweighted
-    seen = e != 0.0  # rows without a measurement are zero
-    white = float(e @ e) / max(int(seen.sum()) - own.shape[1], 1)
-    share = _by_block(np.square(rows) * seen[:, None], errors.block)
-    sums = _by_block(rows * e[:, None], errors.block)
+def _by_chance(errors: Regression, rows: Array, move: Array) -> Array:
+    """Return how likely chance moves the coordinates so far; rows: of the residuals in that."""
+    known, e = errors.known, errors.residual
+    white = float(e @ e) / max(np.count_nonzero(known) - errors.own.shape[1], 1)
+    share = errors.by_block(np.square(rows) * known[:, None])
+    sums = errors.by_block(rows * e[:, None])
     whole = np.maximum(share.sum(axis=0), 1e-300)
     stretches = 1 / np.maximum(np.square(share / whole).sum(axis=0), 1e-300)
     blocks = len(sums)
     variance = np.maximum(np.square(sums).sum(axis=0) * blocks / (blocks - 1), white * whole)
-    move = other.T @ (weighted.T @ e)
     ratio = np.square(move) / np.maximum(variance, 1e-300)
-    return move, np.asarray(fdtrc(1, np.maximum(stretches - 1, 1.0), ratio))
-
-
-def _by_block(x: Array, block: Integers) -> Array:
-    """Return the sums of columns over the rows of each block."""
-    begins = np.flatnonzero(np.diff(block, prepend=-1))
-    sums = np.zeros((int(block.max()) + 1, x.shape[1]))
-    np.add.at(sums, block[begins], np.add.reduceat(x, begins))
-    return sums
+    return np.asarray(fdtrc(1, np.maximum(stretches - 1, 1.0), ratio))

@@ -9,11 +9,12 @@ from smp_motor_ident.diagnosis import limits
 from smp_motor_ident.diagnosis.edge_timer import held_of
 from smp_motor_ident.diagnosis.glitches import glitches_of
 from smp_motor_ident.diagnosis.saturation import saturation
-from smp_motor_ident.diagnosis.signs import lagged, likeness, lost_sign
+from smp_motor_ident.diagnosis.signs import likeness, lost_sign
 from smp_motor_ident.diagnosis.silence import silent
 from smp_motor_ident.diagnosis.units import cause_of_ratio, implausible_voltage
 from smp_motor_ident.errors import CurrentError, InsufficientExcitationError, SignalError
 from smp_motor_ident.finding import Finding
+from smp_motor_ident.likelihood.first_order_lag import lagged
 from smp_motor_ident.record import Record
 
 RUNS = 2_000  # runs of samples in which signals are averaged before they are compared

@@ -11,10 +11,10 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from scipy.signal import lfilter
 
 from smp_motor_control.arrays import Array
 from smp_motor_ident.diagnosis.limits import SWING
+from smp_motor_ident.likelihood.first_order_lag import lagged
 from smp_motor_ident.model.measurement import ANGLE, Measurement
 
 Place = Literal["voltage", "torque", "output", "current"]
@@ -251,5 +251,4 @@ EFFECTS = (
 
 def _lagged(signal: Array, m: Motion, factor: float) -> Array:
     """Return a signal through a first-order lag that is faster or slower than the motor's."""
-    a = float(np.exp(-1.0 / max(factor * m.own_lag, 0.3)))
-    return np.asarray(lfilter([1 - a], [1.0, -a], signal))
+    return lagged(signal, max(factor * m.own_lag, 0.3))

@@ -25,11 +25,12 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from scipy.linalg import hadamard
 from scipy.special import erfc
 
 from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident.diagnosis.limits import CONDITION_LEVEL
-from smp_motor_ident.diagnosis.model_error import answered, carried, measured, predicted
+from smp_motor_ident.diagnosis.model_error import ROWS, answered, carried, measured, predicted
 from smp_motor_ident.diagnosis.observers import slower
 from smp_motor_ident.estimation.consider_covariance import consider_late
 from smp_motor_ident.estimation.fit import Fit
@@ -68,7 +69,7 @@ def widened_by_misfit(
     ]
 
 
-PATTERNS = 8  # of random signs, whose mean square is the sum over the changes
+PATTERNS = 8  # of signs, whose mean square is the sum over the changes
 LEVELS = 32  # of speed, between which a noise may differ
 MOST = 4.0  # deviations at which a residual is cut off: outliers are no scatter
 
@@ -108,17 +109,20 @@ def _scatter(data: Experiments, fit: Fit) -> float:
     length[data.hold_start[:-1]] = data.step
     moved = np.divide(change, length, out=np.zeros_like(change), where=length > 1e-3 * data.step)
     x = np.zeros_like(base)
+    # Patterns of signs that are orthogonal over as many changes in a row, and random from then on.
+    moved *= 2.0 * rng.integers(0, 2, moved.size) - 1.0
+    signs, nth = hadamard(PATTERNS, np.float64), np.cumsum(moved != 0.0) % PATTERNS
     several = carried(data, PATTERNS)
     for n in range(0, PATTERNS, several):
-        shape = min(several, PATTERNS - n), voltage.size
-        made = (2.0 * rng.integers(0, 2, shape, np.int8) - 1.0) * moved
+        made = signs[n : n + several].take(nth, axis=1) * moved
         moves = answered(data, fit, (made, np.zeros((0, 0, 0))), 1)
         x += np.einsum("noc,noc->no", moves, moves) / PATTERNS
     x /= np.square(deviation)
     known = np.isfinite(values)
     square = np.minimum(np.square((values - base) / deviation)[known], MOST**2)
     level = np.broadcast_to(_level(data, base[:, 0])[:, None], known.shape)[known]
-    away, square = (v - _mean_at(level, v) for v in (x[known], square))
+    count = np.maximum(np.bincount(level), 1)
+    away, square = (v - (np.bincount(level, v) / count)[level] for v in (x[known], square))
     spread = float(away @ away)
     if not spread > 0.0:
         return 0.0
@@ -136,12 +140,6 @@ def _level(data: Experiments, output: Array) -> Integers:
     for _ in range(data.kind.integrals):
         speed = np.diff(speed, prepend=speed[0])
         speed[data.starts[:-1]] = 0.0
-    low, high = np.percentile(speed, (1, 99))
-    share = (speed - low) / max(high - low, 1e-300)
-    return np.asarray(np.rint((LEVELS - 1) * np.clip(share, 0.0, 1.0)), dtype=np.int64)
-
-
-def _mean_at(level: Integers, value: Array) -> Array:
-    """Return the mean of a value over all samples at the same level."""
-    total, count = np.bincount(level, value), np.bincount(level)
-    return np.asarray((total / np.maximum(count, 1))[level])
+    low, high = np.percentile(speed[:: max(1, speed.size // ROWS)], (1, 99))
+    share = (speed - low) * ((LEVELS - 1) / max(high - low, 1e-300))
+    return np.asarray(np.clip(share + 0.5, 0.0, LEVELS - 0.5), dtype=np.int64)

@@ -6,6 +6,7 @@ sensitivities are: they stick, are delayed and are corrected by the measurements
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -45,6 +46,39 @@ class Regression:
     # effects that the model's own coordinates imitate: column, and size that is ordinary
     hidden: Sequence[tuple[Effect, int, float]] = ()
 
+    @cached_property
+    def normal(self) -> Array:
+        """Products of the regressors, shape (r, r)."""
+        return np.asarray(self.regressors.T @ self.regressors)
+
+    @cached_property
+    def moved(self) -> Array:
+        """Products of regressors and residual, shape (r,)."""
+        return np.asarray(self.regressors.T @ self.residual)
+
+    @cached_property
+    def known(self) -> Array:
+        """1 for rows with a measurement, 0 for others: their residual is zero."""
+        return np.asarray(self.residual != 0.0, dtype=np.float64)
+
+    @cached_property
+    def weights(self) -> Array:
+        """What each block has of the regressors' squares, of the most of any; shape (b, r)."""
+        squares = self.by_block(np.square(self.regressors))
+        return np.asarray(squares / np.maximum(squares.max(axis=0), 1e-300))
+
+    def by_block(self, columns: Array) -> Array:
+        """Return the sums of columns, shape (n, c), over the rows of each block, shape (b, c)."""
+        begins = self._runs
+        sums: Array = np.zeros((int(self.block.max()) + 1, columns.shape[1]))
+        np.add.at(sums, self.block[begins], np.add.reduceat(columns, begins))
+        return sums
+
+    @cached_property
+    def _runs(self) -> Integers:
+        """Where runs of rows of one block begin."""
+        return np.flatnonzero(np.diff(self.block, prepend=-1))
+
 
 def regression(data: Experiments, fit: Fit, gear: float) -> Regression | None:
     """Return residuals and responses, whitened, the model's coordinates projected out."""
@@ -61,7 +95,7 @@ def regression(data: Experiments, fit: Fit, gear: float) -> Regression | None:
             if several:
                 members.append((effect, tuple(range(count, count + len(several)))))
             count += len(several)
-            peaks.extend(0.0 if s.voltage is None else float(np.abs(s.voltage).max(initial=0.0))
+            peaks.extend(0.0 if s.voltage is None or not effect.bends else _largest(s.voltage)
                          for s in several)  # fmt: skip
             yield from several
 
@@ -82,6 +116,10 @@ def regression(data: Experiments, fit: Fit, gear: float) -> Regression | None:
         if effect.bends and c not in seen and peaks[c] > 0
     ]
     return replace(whole, conditions=_conditions(data, samples), hidden=hidden)
+
+
+def _largest(values: Array) -> float:
+    return float(np.abs(values).max(initial=0.0))
 
 
 def _conditions(data: Experiments, m: Motion) -> dict[str, Array]:
@@ -200,7 +238,8 @@ def own_responses(data: Experiments, fit: Fit, together: int = 1) -> Array:
 
 def _summed(data: Experiments, columns: Array, together: int) -> Array:
     """Return sums over rows of so many samples, of those that were measured."""
-    known = np.where(np.isfinite(measured(data)), columns, 0.0)
+    there = np.isfinite(measured(data))
+    known = columns if there.all() else np.where(there, columns, 0.0)
     return np.asarray(np.add.reduceat(known, row_starts(data, together), axis=0))
 
 

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
-from scipy.signal import lfilter
 
 from smp_motor_control.arrays import Array
 from smp_motor_ident.diagnosis.limits import (
@@ -20,6 +19,7 @@ from smp_motor_ident.diagnosis.limits import (
     SIGN_SURE,
 )
 from smp_motor_ident.errors import SignalError
+from smp_motor_ident.likelihood.first_order_lag import lagged
 from smp_motor_ident.record import Record
 
 LAGS = 16  # between a sampling interval and a quarter of the record: each 1.5 to 2 times the last
@@ -102,14 +102,6 @@ def _means(values: Array, k: int) -> Array:
     sums = np.cumsum(values)
     sums[k:] -= sums[:-k].copy()
     return sums / k
-
-
-def lagged(values: Array, samples: float) -> Array:
-    """Return a signal through a lag of the first order."""
-    if samples == 0.0:
-        return values
-    keeps = float(np.exp(-1 / samples))
-    return np.asarray(lfilter([1 - keeps], [1, -keeps], values))
 
 
 def _chance(v: Array, y: Array) -> float:

@@ -4,12 +4,12 @@ from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
-from scipy.signal import lfilter
 
 from smp_motor_control.arrays import Array, Flags
 from smp_motor_ident._compile import compiled
 from smp_motor_ident.diagnosis.limits import FEWEST, FLICKER, SILENT_SWING
 from smp_motor_ident.errors import SignalError
+from smp_motor_ident.likelihood.first_order_lag import lagged
 from smp_motor_ident.record import Record
 
 LAGS = 12  # between a sampling interval and a quarter of the record, from which a descent starts
@@ -77,9 +77,9 @@ def _answer(record: Record, speed: Array, known: Flags) -> Array:
 
     def run(motor: Array) -> tuple[Array, float]:
         """Return the motion, and what of the squares it leaves, for two log lags and friction."""
-        keeps = np.exp(-step / np.exp(np.minimum(motor[:2], 50.0)))
-        torque = np.asarray(lfilter([1 - keeps[1]], [1, -keeps[1]], volts))
-        x = _sliding(torque, float(keeps[0]), abs(float(motor[2])) * top)
+        lags = np.exp(np.minimum(motor[:2], 50.0)) / step
+        torque = lagged(volts, float(lags[1]))
+        x = _sliding(torque, float(np.exp(-1 / lags[0])), abs(float(motor[2])) * top)
         size, alike = float(x[known] @ x[known]), float(x[known] @ y)
         return x * (alike / size if size > 0 else 0.0), -(alike**2) / size if size > 0 else 0.0
 

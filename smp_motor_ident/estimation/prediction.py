@@ -91,7 +91,7 @@ def _scale_of(normal: Array) -> Array:
 
     Infinite where nothing is known of it, but for rounding.
     """
-    known = np.diag(normal)
+    known = np.diagonal(normal, axis1=-2, axis2=-1)
     return np.asarray(np.sqrt(np.where(known > 1e-200, known, np.inf)))
 
 
@@ -101,15 +101,15 @@ def inverse(normal: Array, rcond: float = RANK) -> Array:
     Coordinates of which nothing is known, but for rounding, are zero in it.
     """
     root = root_of_inverse(normal, rcond)
-    return np.asarray(root @ root.T)
+    return np.asarray(root @ np.swapaxes(root, -1, -2))
 
 
 def root_of_inverse(normal: Array, rcond: float = RANK) -> Array:
-    """Return a root of the same, shape (p, p): it times its transpose."""
-    scale = _scale_of(normal)
-    values, vectors = np.linalg.eigh(normal / scale[:, None] / scale)
-    known = values > rcond * values[-1:]
-    return np.asarray(vectors / np.sqrt(np.where(known, values, np.inf)) / scale[:, None])
+    """Return a root of the same, shape (..., p, p): it times its transpose."""
+    scale = _scale_of(normal)[..., None]
+    values, vectors = np.linalg.eigh(normal / scale / np.swapaxes(scale, -1, -2))
+    known = values > rcond * values[..., -1:]
+    return np.asarray(vectors / np.sqrt(np.where(known, values, np.inf))[..., None, :] / scale)
 
 
 def information(data: Experiments, fit: Fit) -> Array:

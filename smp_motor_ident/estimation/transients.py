@@ -92,32 +92,28 @@ def _moves(data: Experiments, fit: Fit) -> Array:
     moved = answers(data, fit.structure, fit.z, fit.initial, fit.noise_model(), none, 1, True)
     rows = whitening(fit.noise)[0, 0] * moved[:, 0]
     error = whitening(fit.noise)[0, 0] * (data.output - prediction.simulate(data, fit)[:, 1])
-    error, size = np.nan_to_num(error), len(fit.structure.free)
-    own = list(own_columns(data, fit.structure))
-    parts, seen = [], []
-    for g, (a, b) in enumerate(pairwise(data.starts)):
-        parts.append(rows[a:b].T @ rows[a:b])
-        parts[-1][size:, size:] += np.diag(data.known_initial[g, own])
-        inner = parts[-1][:size, size:] @ prediction.inverse(parts[-1][size:, size:])
-        seen.append(parts[-1][:size, :size] - inner @ parts[-1][size:, :size])
+    error[np.isnan(error)] = 0.0
+    size, own = len(fit.structure.free), list(own_columns(data, fit.structure))
+    parts = np.array([rows[a:b].T @ rows[a:b] for a, b in pairwise(data.starts)])
+    parts[:, size:, size:] += data.known_initial[:, own, None] * np.eye(len(own))
+    inner = prediction.inverse(parts[:, size:, size:]) @ parts[:, size:, :size]
+    seen = parts[:, :size, :size] - parts[:, :size, size:] @ inner
     # As in the covariance: a piece moves a coordinate that no data tell within any motor's.
-    whole = np.sum(seen, axis=0) + np.diag(fit.structure.of_free(PLAUSIBLE))
-    free = rows[:, :size]
-    share = np.einsum("nf,nf->n", free @ prediction.inverse(whole), free)
-    leverage = np.cumsum(share)
+    whole = seen.sum(axis=0) + np.diag(fit.structure.of_free(PLAUSIBLE))
+    alike = rows[:, :size] @ prediction.root_of_inverse(whole)
+    leverage = np.cumsum(np.einsum("nf,nf->n", alike, alike))
     shares = np.linspace(0.0, leverage[-1], PIECES + 1)[:-1]
     cuts = np.union1d(np.searchsorted(leverage, shares), data.starts)
-    moves = []
-    for a, b in pairwise(cuts):
-        g = int(np.searchsorted(data.starts, a, side="right")) - 1
-        normal = parts[g].copy()
-        normal[:size, :size] += whole - seen[g]
-        root, piece = prediction.root_of_inverse(normal), rows[a:b].T @ rows[a:b]
-        taken, along = np.linalg.eigh(root.T @ piece @ root)
-        taken = np.clip(taken, 1e-12, 1.0)
-        left = np.where(1 - taken > ENDED**2, 1 - taken, 1.0)
-        more = root @ along * ((1 / np.sqrt(left) - 1) / taken)
-        gradient = rows[a:b].T @ error[a:b]
-        gradient = gradient + piece @ more @ (root @ along).T @ gradient
-        moves.append((root @ (root.T @ gradient))[:size])
-    return np.array(moves)
+    normal = parts.copy()
+    normal[:, :size, :size] += whole - seen
+    normal = normal[np.searchsorted(data.starts, cuts[:-1], side="right") - 1]
+    root = prediction.root_of_inverse(normal)
+    piece = np.array([rows[a:b].T @ rows[a:b] for a, b in pairwise(cuts)])
+    gradient = np.array([rows[a:b].T @ error[a:b] for a, b in pairwise(cuts)])[:, :, None]
+    taken, along = np.linalg.eigh(np.swapaxes(root, 1, 2) @ piece @ root)
+    taken = np.clip(taken, 1e-12, 1.0)
+    left = np.where(1 - taken > ENDED**2, 1 - taken, 1.0)
+    turned = root @ along
+    more = turned * ((1 / np.sqrt(left) - 1) / taken)[:, None, :]
+    gradient += piece @ more @ (np.swapaxes(turned, 1, 2) @ gradient)
+    return np.asarray((root @ (np.swapaxes(root, 1, 2) @ gradient))[:, :size, 0])

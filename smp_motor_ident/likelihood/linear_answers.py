@@ -10,7 +10,8 @@ import numpy as np
 
 from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident._compile import compiled
-from smp_motor_ident.likelihood.linear_pass import NUMBERS, fill, tabulate
+from smp_motor_ident.likelihood.linear_pass import NUMBERS, TILE, fill, tabulate
+from smp_motor_ident.likelihood.propagator import DECAYED
 
 
 @compiled
@@ -46,6 +47,10 @@ def answers_sliding(
                     fill(row, h, par, table)
                     e00, e01, e10, e11, h0, h1 = row[0], row[1], row[2], row[3], row[4], row[5]
                     v0, v1, v2 = row[6], row[7], row[8]
+                if n % TILE == 0:
+                    for j in range(q.shape[0]):
+                        if abs(q[j]) + abs(w[j]) < DECAYED:
+                            q[j] = w[j] = 0.0
                 for j in range(q.shape[0]):
                     v = beside[j, n]
                     th[j] += h0 * q[j] + h1 * w[j] + v2 * v

@@ -16,6 +16,7 @@ from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident._compile import compiled
 from smp_motor_ident.likelihood.propagator import (
     BE,
+    DECAYED,
     NODES,
     POINTS,
     ROW,
@@ -93,6 +94,10 @@ def march(
     te, k, be = par[TE], par[K], par[BE]
     back = k if te > 0.0 else k + be
     step, q, w, th, cq, cw, cth = x[0], x[1], x[2], x[3], x[4], x[5], x[6]
+    if abs(q) + abs(w) < DECAYED:
+        q = w = 0.0
+    if abs(cq) + abs(cw) < DECAYED:
+        cq = cw = 0.0
     pq, pw, pth, rq, rw, rth = x[7], x[8], x[9], x[10], x[11], x[12]
     fades = abs(pw) > GONE * abs(x[13]) or abs(pq) > GONE
     fades = fades or abs(rq) > GONE * abs(x[14]) or abs(rw) > GONE
@@ -185,6 +190,8 @@ def squares_sliding(
                     e00, e01, e10, e11, h0, h1 = row[0], row[1], row[2], row[3], row[4], row[5]
                     v0, v1, v2 = row[6], row[7], row[8]
                 v = voltage[n] - load
+                if v == 0.0 and abs(q) + abs(w) < DECAYED:
+                    q = w = 0.0
                 th += h0 * q + h1 * w + v2 * v
                 old = q
                 q = e00 * q + e01 * w + v0 * v
@@ -266,6 +273,20 @@ def _gather(tile: Array, m: int, rows: Integers, squares: Array, scores: Array) 
 
 
 @compiled
+def _answer(tile: Array, c: Array, rows: Integers, answers: Array) -> None:
+    """Put the sensitivities of the tile's samples, shape (m, p), from the basis."""
+    one = np.empty(TILE)
+    for j in range(answers.shape[1]):
+        one[:] = 0.0
+        for a in range(rows.shape[0]):
+            signal, share = tile[rows[a]], c[rows[a], j]
+            for i in range(TILE):
+                one[i] += share * signal[i]
+        for i in range(answers.shape[0]):
+            answers[i, j] = one[i]
+
+
+@compiled
 def _project(c: Array, squares: Array, weight: float, normal: Array) -> None:
     """Fill the normal matrix of the columns, ``weight^2 c' S c``."""
     n, p = c.shape
@@ -324,11 +345,12 @@ def run_sliding(
     block_length: int,
     blocks: Array,
     block_segment: Integers,
+    answers: Array,
 ) -> int:
     """Run as `recursion.run` does where nothing happens between the samples.
 
     Without friction, delay, window, current, robust loss and innovations; the input changes
-    at the samples.
+    at the samples.  ``answers``, shape (n, 1, p) or none, takes the sensitivities of each sample.
     """
     p = slope.shape[1] + local.shape[0]
     loaded = bool(np.any(slope[LOAD] != 0.0)) or bool(np.any(local == 3))
@@ -369,6 +391,8 @@ def run_sliding(
                     rows = _rows(angle, loaded, False)
                 spread[3] += there
                 total += _gather(tile, end - begin, rows, squares, scores)
+                if answers.shape[0] > 0:
+                    _answer(tile, c, rows, answers[begin:end, 0])
                 begin = end
             for j in range(p):
                 score = 0.0

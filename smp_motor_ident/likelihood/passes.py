@@ -159,8 +159,8 @@ def gather(
     spread = np.zeros(6)
     angle = data.kind == ANGLE
     noted = np.zeros((0, 3)) if predicted is None else predicted
-    alone = beside is NOTHING and (predicted is None or p == 0)
-    if alone and _slides(data, structure, z, noise):
+    alone = not (beside.voltage.size or beside.added.size) and (predicted is None or p == 0)
+    if alone and beside.together == 1 and _slides(data, structure, z, noise):
         if p == 0:
             spread[0], spread[3] = squares_sliding(
                 data.time, data.starts, data.hold_value, data.output, angle, par, initial,
@@ -171,7 +171,7 @@ def gather(
             used = run_sliding(
                 data.time, data.starts, data.hold_value, data.output, angle, par, slope,
                 initial, own, data.jittered, 1 / math.sqrt(noise.covariance[0, 0]), normal,
-                gradient, cost, spread, length, scores, owner,
+                gradient, cost, spread, length, scores, owner, beside.answers,
             )  # fmt: skip
     else:
         used = recursion.run(

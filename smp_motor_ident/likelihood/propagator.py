@@ -32,6 +32,7 @@ from smp_motor_ident._compile import compiled
 TE, TM, K, BE = range(4)
 ROW = 12
 WIDTH = 5 * ROW
+DECAYED = 1e-100  # of a state or a sensitivity: its square is still a normal number
 
 
 @compiled

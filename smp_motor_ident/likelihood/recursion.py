@@ -31,7 +31,7 @@ from smp_motor_ident.likelihood.current_sensor import (
 from smp_motor_ident.likelihood.events import STUCK, advance, keeps_turning
 from smp_motor_ident.likelihood.normal_equations import ROOM, TILE, robust, sum_up
 from smp_motor_ident.likelihood.observation import note, observe, observe_current
-from smp_motor_ident.likelihood.propagator import TE, TM
+from smp_motor_ident.likelihood.propagator import DECAYED, TE, TM
 from smp_motor_ident.likelihood.sensitivities import (
     ACTIVE,
     BESIDE,
@@ -302,6 +302,10 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
                 predicted[k:] = math.nan
                 cost[g] = spread[0] = math.inf
                 return block + 1
+            if (k - first) % TILE == 0:
+                fade(m)
+                if not friction and abs(x[0]) + abs(x[1]) < DECAYED:
+                    x[0] = x[1] = 0.0
             y0 = observe(kind, k, first, target, par, x, m, ring, past, columns)
             y1 = 0.0
             if has_current and sensor > 0:
@@ -339,7 +343,6 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
             cost[g] += loss0 + loss1
             if filled >= block_length or count > TILE - 2:
                 sum_up(rows, count, p, tile, normal[g], gradient[g], blocks[block])
-                fade(m)
                 count = 0
             if filled >= block_length:
                 block += 1

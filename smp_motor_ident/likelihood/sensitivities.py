@@ -16,6 +16,7 @@ from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident._compile import compiled, inlined
 from smp_motor_ident.likelihood.propagator import (
     BE,
+    DECAYED,
     NODES,
     POINTS,
     ROW,
@@ -43,7 +44,6 @@ FORCED = BEFORE + 3 * LANES  # 12 rows: derivative of the propagator at hand by 
 WHOLE = FORCED + ROW * LANES  # the propagator itself, 12 numbers
 OTHER = WHOLE + ROW + 4  # the same of a second propagator: a delay cuts intervals in two
 SIZE = OTHER + ROW * LANES + ROW
-GONE = 1e-100  # of a sensitivity: its square is still a normal number
 SLOTS = 4  # propagators that are kept, one more is scratch
 SLOT = ROW * LANES + ROW
 CACHE = (SLOTS + 1) * SLOT
@@ -253,7 +253,7 @@ def fade(m: Array) -> None:
     """Put to nothing what has decayed so far: numbers below the normal ones cost ten times more."""
     for at in (SQ, SW, ST, KEPT):
         for j in range(at, at + LANES):
-            if abs(m[j]) < GONE:
+            if abs(m[j]) < DECAYED:
                 m[j] = 0.0
 
 
