@@ -66,6 +66,7 @@ from smp_motor_ident.estimation.subset import excitation
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.driver import EFFECTS, RAMPS, DriverEffect
+from smp_motor_ident.one_thread import one_thread
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import Estimate, FitPercent
 
@@ -137,10 +138,11 @@ def estimate(
         except UnknownLagError as refusal:
             return cast(Estimate, refusal.estimate)
 
-    try:
-        return declared(behind, group, request.validation, request.known)
-    except (SignalError, InsufficientExcitationError) as refusal:
-        raise of_which(group, refusal, lambda r: behind([r], None)) from None
+    with one_thread():
+        try:
+            return declared(behind, group, request.validation, request.known)
+        except (SignalError, InsufficientExcitationError) as refusal:
+            raise of_which(group, refusal, lambda r: behind([r], None)) from None
 
 
 def _checked(group: list[Record], request: Request) -> Estimate:

@@ -91,7 +91,9 @@ def _without_friction(data: Experiments, fit: Fit) -> Array:
 def _spectra(data: Experiments, error: Array, *outputs: Array) -> tuple[Any, ...]:
     """Return frequencies, and the spectra of error and outputs of one segment."""
     known = np.flatnonzero(np.isfinite(error))
-    signals = np.array([np.interp(np.arange(error.size), known, error[known]), *outputs])
+    if known.size < error.size:
+        error = np.interp(np.arange(error.size), known, error[known])
+    signals = np.array([error, *outputs])
     if data.kind == ANGLE:
         signals = np.diff(signals)
     window = np.hanning(signals.shape[1] + 2)[1:-1]

@@ -81,10 +81,11 @@ def _jumps(record: Record) -> tuple[Integers, Array]:
     none = np.zeros(0, dtype=np.int64), np.zeros(0)
     if len(v) < 6:
         return none
-    jump = v[3:-1] - v[1:-3]
-    inside = (v[2:-2] - v[1:-3]) * (v[3:-1] - v[2:-2]) > 0
-    steady = np.maximum(np.abs(v[1:-3] - v[:-4]), np.abs(v[4:] - v[3:-1])) < 0.1 * np.abs(jump)
-    k = np.flatnonzero(inside & steady & (np.abs(jump) > 0.2 * np.ptp(v))) + 2
+    k = np.flatnonzero(np.abs(v[3:-1] - v[1:-3]) > 0.2 * np.ptp(v)) + 2
+    jump = np.abs(v[k + 1] - v[k - 1])
+    inside = (v[k] - v[k - 1]) * (v[k + 1] - v[k]) > 0
+    steady = np.maximum(np.abs(v[k - 1] - v[k - 2]), np.abs(v[k + 2] - v[k + 1])) < 0.1 * jump
+    k = k[inside & steady]
     starts = np.array(record.starts)
     k = k[~np.isin(k, starts) & ~np.isin(k - 1, starts) & ~np.isin(k + 1, starts)]
     before = (v[k + 1] - v[k]) / (v[k + 1] - v[k - 1])

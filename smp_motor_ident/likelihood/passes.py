@@ -237,30 +237,35 @@ def evaluate(
     segments, f, o = len(data.starts) - 1, structure.matrix.shape[1], len(own)
     common, score = np.zeros((f, f)), np.zeros(f)
     step, local_gain = np.zeros((segments, o)), np.zeros((segments, o, f))
-    nowhere = Pass(math.inf, np.zeros((f, f)), np.zeros(f), np.zeros_like(step),
-                   np.zeros_like(local_gain), 0.0, np.full(6, np.nan),
-                   np.zeros((0, f)))  # fmt: skip
     if not np.isfinite(z.array).all():  # what predicts no number misses no measurement
-        return nowhere
+        return _nowhere(segments, f, o)
     sums = gather(data, structure, z, initial, noise)
     total = float(sums.cost.sum())
     if not math.isfinite(total):
-        return nowhere
+        return _nowhere(segments, f, o)
     for row, miss in priors:
         common += np.outer(row, row)
         score += row * miss
         total += miss * miss
     known = data.known_initial
     uncurbed = own[0] == 0 and not structure.current  # a measured current tells how it began
-    both = np.stack([known[:, 0], known[:, 0] + sums.normal[:, f, f]])
-    occam = float(np.diff(np.log(both), axis=0).sum()) if uncurbed else 0.0
-    value, away = initial[:, list(own)], (initial - start)[:, list(own)]
+    shown = sums.normal[:, f, f] / known[:, 0] if uncurbed else 0.0
+    places = list(own)
+    value = initial[:, places]
     prior, decrease = eliminate(
-        sums.normal, sums.gradient, away, value, known[:, list(own)], data.size,
+        sums.normal, sums.gradient, value - start[:, places], value, known[:, places], data.size,
         common, score, step, local_gain, sums.scores, sums.owner,
     )  # fmt: skip
     total += prior
-    if not all(np.isfinite(part).all() for part in (total, common, score, step)):
-        return nowhere
+    if not (math.isfinite(total) and all(np.isfinite(x).all() for x in (common, score, step))):
+        return _nowhere(segments, f, o)
+    occam = float(np.log1p(shown).sum())
     return Pass(total, common, score, step, local_gain, decrease, sums.spread, sums.scores[:, :f],
                 occam)  # fmt: skip
+
+
+def _nowhere(segments: int, f: int, o: int) -> Pass:
+    """Return the pass of coordinates that predict no numbers."""
+    return Pass(math.inf, np.zeros((f, f)), np.zeros(f), np.zeros((segments, o)),
+                np.zeros((segments, o, f)), 0.0, np.full(6, np.nan),
+                np.zeros((0, f)))  # fmt: skip

@@ -119,12 +119,18 @@ class Structure(ABC):
 
     def complete(self, z: Coordinates) -> Coordinates:
         """Return coordinates with the fixed and tied ones put to their values."""
-        there = {*self._added()}
-        absent = {"load", "current_offset", "delay", "current_lag"} - there
-        z = z.with_(**{**dict.fromkeys(absent, 0.0), **self.fixed})
-        if self.friction != "asymmetric":
-            z = z.with_friction(z.vc_plus if self.friction == "symmetric" else 0.0)
-        return self._tied(z)
+        values = self._settled
+        if self.friction == "symmetric":
+            friction = values.get("vc_plus", z.vc_plus)
+            values = {**values, "vc_plus": friction, "vc_minus": friction}
+        return self._tied(z.with_(**values))
+
+    @cached_property
+    def _settled(self) -> dict[str, float]:
+        """The coordinates that are fixed, or nothing."""
+        absent = {"load", "current_offset", "delay", "current_lag"} - {*self._added()}
+        values = {**dict.fromkeys(absent, 0.0), **self.fixed}
+        return values | ({"vc_plus": 0.0, "vc_minus": 0.0} if self.friction == "none" else {})
 
     def _tied(self, z: Coordinates) -> Coordinates:
         """Return coordinates with the ties of this structure held."""

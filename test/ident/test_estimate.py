@@ -7,6 +7,7 @@ import independent
 import motors
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from smp_motor_control.motor.parameters import PHYSICAL
 from smp_motor_ident.diagnosis import validation
@@ -270,3 +271,15 @@ def test_a_load_that_is_stronger_than_friction_is_no_reason_to_refuse() -> None:
     }
     for name, true in truth.items():
         assert abs(found.combinations[name].value - true) < 0.005 * true, name
+
+
+def test_the_linear_algebra_of_an_estimate_runs_on_one_thread():
+    seen = []
+
+    def look(_):
+        seen.extend(pool["num_threads"] for pool in threadpool_info())
+
+    with threadpool_limits(2):
+        estimate(motors.record("rear_left", current=False, seconds=2.0), progress=look)
+        after = {pool["num_threads"] for pool in threadpool_info()}
+    assert set(seen) == {1} and after == {2}

@@ -6,8 +6,10 @@ import independent
 import motors
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from smp_motor_ident.likelihood.experiments import prepare
+from smp_motor_ident.likelihood.first_order_lag import lagged
 from smp_motor_ident.likelihood.noise import NO_GAIN, NoiseModel, deviance, kalman_gain
 from smp_motor_ident.likelihood.passes import answers, evaluate, gather
 from smp_motor_ident.model.coordinates import LOGARITHMS, NAMES, Coordinates
@@ -211,3 +213,54 @@ def test_the_deviance_of_two_outputs_is_that_of_their_covariance_however_far_off
     covariance = np.cov(first, second, bias=True) + np.outer(*[[first.mean(), second.mean()]] * 2)
     found = deviance(spread * np.repeat([size**2, 1.0], 3))
     assert found == pytest.approx(50 * (np.linalg.slogdet(covariance)[1] + 4 * np.log(size)))
+
+
+@pytest.mark.parametrize("delay", [False, True])
+def test_what_rests_leaves_no_numbers_below_the_normal_ones(delay):
+    """They cost ten times as much each, in whatever of a long rest is computed after them."""
+    t = 1e-3 * np.arange(20_000)
+    voltage = np.where(t < 1.0, 6.0, 0.0)
+    data = prepare([Record("m", t, voltage, velocity=np.zeros(t.size))], False)
+    data = replace(data, initial=np.zeros((1, 5)))
+    structure = SecondOrder(friction="none", delay=delay)
+    z = from_physical(1.0, 2e-3, 0.1, 1e-4, 1e-4).with_friction(0.0)
+    assert z.time_constant < 0.01  # the least number is 745 of them away
+    beside = np.where(t < 0.5, 1.0, 0.0)[None], np.zeros((0, 0, 0))
+    noise = NoiseModel()
+    shown = [
+        predict(data, structure, z)[:, :2],
+        answers(data, structure, z, data.initial, noise, beside, 1, False),
+        answers(data, structure, z, data.initial, noise, (np.zeros((0, 0)), beside[1]), 1, True),
+        lagged(voltage, 20.0),
+    ]
+    for values in shown:
+        size = np.abs(values)
+        assert size.max() > 1e-3 and not size[-1].any()
+        assert size[size > 0].min() > 1e-300
+
+
+def test_a_lag_is_that_of_a_filter_of_first_order():
+    values = np.random.default_rng(3).standard_normal(300)
+    keeps = np.exp(-1 / 7.5)
+    np.testing.assert_allclose(
+        lagged(values, 7.5), lfilter([1 - keeps], [1, -keeps], values), rtol=1e-12
+    )
+    assert lagged(values, 0.0) is values
+
+
+def test_sensitivities_of_each_sample_are_the_same_from_both_passes():
+    recording = motors.record("rear_left", current=False, seconds=2.0)
+    data = prepare([recording], False)
+    data.output[100:120] = np.nan
+    z = from_physical(*independent.TABLE_1["rear_left"]).with_friction(0.0)
+    none = np.zeros((0, 0)), np.zeros((0, 0, 0))
+    found = []
+    for delay in (False, True):
+        structure = SecondOrder(friction="none", load=True, delay=delay)
+        own = answers(data, structure, structure.complete(z), data.initial, NoiseModel(), none, 1,
+                      True)  # fmt: skip
+        free = [n for n, c in enumerate(structure.free) if c != "delay"]
+        found.append(own[:, 0, [*free, len(structure.free), len(structure.free) + 1]])
+    size = np.abs(found[0]).max(axis=0)
+    np.testing.assert_allclose(found[0] / size, found[1] / size, atol=1e-12)
+    assert not found[0][100:120].any()
