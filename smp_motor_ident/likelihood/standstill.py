@@ -48,6 +48,8 @@ def _stands(t: Array, y: Array, kind: Measurement, quantum: float) -> bool:
         nears = [1.5 * quantum, max(1.5 * quantum, slight)]
     else:
         away, treble = np.abs(y), 3.0
+        if int(np.argmax(away > SLOW * away.max())) < ROWS:  # beyond what is slow at most
+            return False
         nears = [SLOW * float(np.quantile(away, 0.98))]
     for near in nears:
         left, gone = int(np.argmax(away > near)), int(np.argmax(away > treble * near))
