@@ -55,11 +55,9 @@ def profiled(data: Experiments, fit: Fit, options: Options) -> Fit:
         target = RISE * float((std[i] / white[i]) ** 2)
         if coordinate == "vc_plus" and one_level(data, fit):
             ends = _range(data, fit, coordinate)
-            # A winding first builds up the torque that breaks loose: from rest that is late,
-            # and where its current is measured it tells friction.
-            if fit.structure.current:
-                found.append(_followed(data, fit, coordinate, float(std[i]), target, options))
-            elif fit.structure.order == 2:
+            # From rest a winding first builds up the torque that breaks loose, which is late. So are
+            # sensors, clocks, and friction that sticks more than it slides: nothing is read in it.
+            if fit.structure.order == 2:
                 both = [_fixed_at(data, fit, coordinate, f, options).z for f in ends]
                 found.append(Profile(coordinate, (both[0], both[1])))
             else:
