@@ -51,6 +51,20 @@ def consider_late(data: Experiments, fit: Fit, late: float) -> Fit:
     return fit.along(late * row)
 
 
+def consider_hold(data: Experiments, fit: Fit) -> Fit:
+    """Return the fit with its covariance widened by how a command ran that seems interpolated.
+
+    Its deviance alone tells that, of which a misfit has as much: a command that was held is half a
+    row ahead, in place of which a second lag is longer by anything up to that.
+    """
+    s = fit.structure
+    lags = [n for n in ("ln_a2", "ln_te") if n in s.free]
+    if s.held != "interpolated" or not lags:
+        return fit
+    longer = 0.5 * data.step / np.sqrt(3.0) / fit.z.second_lag
+    return fit.along(s.of_free(direction(**dict.fromkeys(lags, longer))))
+
+
 def consider_clock(data: Experiments, fit: Fit, share: float) -> Fit:
     """Return the fit with its covariance widened by a clock that is known to a share only.
 

@@ -12,12 +12,33 @@ from scipy.ndimage import uniform_filter1d
 from smp_motor_control.arrays import Array
 from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.fit import Fit
-from smp_motor_ident.likelihood.experiments import Experiments
+from smp_motor_ident.likelihood.experiments import Experiments, prepare
 from smp_motor_ident.model.driver import Rows
 from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.record import Record
 
+SUBSET, PIECES, LAGS = 5_000, 5, 10  # rows on which effects are ranked, in pieces of so many lags
 SMOOTHED, MOST_SMOOTHED = 0.2, 1_000  # of the motor's lag, and rows: a measured speed is its mean
+
+
+def pieces(group: Sequence[Record], step: float, lag: float) -> list[Record]:
+    """Return pieces of long records, all over them, that outlive a motor's lag."""
+    rows = sum(map(len, group))
+    length = int(np.clip(LAGS * lag / step, SUBSET / PIECES, SUBSET))
+    every = rows * length / SUBSET
+    if every < 2 * length:
+        return list(group)
+    return [
+        record.slice(a, a + length)
+        for record in group
+        for a in np.arange(0, len(record) - length + 1, every).astype(int)
+    ] or list(group)
+
+
+def commands_of(group: Sequence[Record], fit: Fit) -> Experiments:
+    """Return records as a driver meets them: a command for each row, without the current."""
+    data = prepare(group, False).measured_as(fit.structure.speed)
+    return data if fit.structure.held == "interpolated" else data.held(fit.structure.held)
 
 
 def with_voltages(group: Sequence[Record], voltage: Array) -> list[Record]:

@@ -17,7 +17,7 @@ from scipy.optimize import fminbound
 
 from smp_motor_control.arrays import Array
 from smp_motor_ident.diagnosis.limits import COLOURED
-from smp_motor_ident.estimation import fast_decay, prediction
+from smp_motor_ident.estimation import fast_decay
 from smp_motor_ident.estimation.candidate_starts import of_kind
 from smp_motor_ident.estimation.descent import (
     ROUGHLY,
@@ -26,11 +26,12 @@ from smp_motor_ident.estimation.descent import (
     refine,
 )
 from smp_motor_ident.estimation.driver_effect import DriverFit
-from smp_motor_ident.estimation.driver_rows import rows_of, with_voltages
+from smp_motor_ident.estimation.driver_rows import commands_of, pieces, rows_of, with_voltages
 from smp_motor_ident.estimation.fit import Fit, Options, solve
 from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.estimation.selection import POLICY, sandwich_factor
 from smp_motor_ident.estimation.thinning import thinned
+from smp_motor_ident.likelihood.driver_feedback import terminal_voltages
 from smp_motor_ident.likelihood.experiments import Experiments, prepare
 from smp_motor_ident.model.driver import CURRENT, EFFECTS, SLEW, Driver, DriverEffect
 from smp_motor_ident.model.structures import FirstOrder
@@ -42,7 +43,6 @@ RISE = 2.0  # of the deviance on both sides together, from which its curvature i
 PARABOLAS = 8  # that are laid through it at most
 CLOSE = 0.2  # standard deviations within which a size is the likeliest
 MOST = 25  # sizes that are tried between those of the table
-SUBSET, PIECES, LAGS = 5_000, 5, 10  # rows on which effects are ranked, in pieces of so many lags
 AROUND = 0.3  # e-folds of the size that these may be off by
 FINALISTS = 3  # that are held against each other on all of them
 FEW = 12  # passes of a descent while the size is sought
@@ -57,7 +57,7 @@ def likeliest(
 ) -> DriverFit | None:
     """Return the effect that explains the records best; None where none is worth its number."""
     step = group[0].sample_time
-    few = _pieces(group, step, fit.z.time_constant)
+    few = pieces(group, step, fit.z.time_constant)
     price, factor = POLICY.price(1, fit.samples), sandwich_factor(fit)
 
     def cost(one: DriverFit) -> float:
@@ -139,20 +139,6 @@ def _coasting(searches: Sequence[_Joint], most: float, coloured: bool) -> list[D
     return found
 
 
-def _pieces(group: Sequence[Record], step: float, lag: float) -> list[Record]:
-    """Return pieces of long records, all over them, that outlive a motor's lag."""
-    rows = sum(map(len, group))
-    length = int(np.clip(LAGS * lag / step, SUBSET / PIECES, SUBSET))
-    every = rows * length / SUBSET
-    if every < 2 * length:
-        return list(group)
-    return [
-        record.slice(a, a + length)
-        for record in group
-        for a in np.arange(0, len(record) - length + 1, every).astype(int)
-    ] or list(group)
-
-
 def _starts(
     group: Sequence[Record],
     fit: Fit,
@@ -205,7 +191,12 @@ class _Profile:
         effect: DriverEffect,
     ) -> None:
         self.group, self.hold, self.options, self.effect = group, hold, options, effect
-        self.data, self.near = _prepared(group, hold, fit), fit
+        self.data, self.near, self.commands = (
+            _prepared(group, hold, fit),
+            fit,
+            commands_of(group, fit),
+        )
+        self.full_duty = rows_of(self.data, group, fit).full_duty
         self.turns = TURNS if effect.follows_motion else 1
         self.size = math.nan  # logarithm of the likeliest, of those that were tried
         self.driver = Driver()
@@ -217,13 +208,23 @@ class _Profile:
         """Return the motor fitted for a size, and what it was fitted to."""
         data, fit, records = self.data, self.near, self.group
         for turn in range(self.turns):
-            rows = rows_of(data, self.group, fit, measured=self.turns > 1 and turn == 0)
-            voltage = rows.through(Driver(self.effect.kind, size, rows.full_duty))
-            records = with_voltages(self.group, voltage)
+            records = with_voltages(self.group, self._voltage(size, data, fit, turn == 0))
             data = _prepared(records, self.hold, self.near)
             start = fit.at(fit.z, initial_of(data, fit))
             fit = solve(data, fit.structure, start, self.options, passes, ROUGHLY, known)
         return fit, data, records
+
+    def _voltage(self, size: float, data: Experiments, fit: Fit, first: bool) -> Array:
+        """Return what the driver puts out, row by row, for the motion as measured or as it is run.
+
+        A motion that was taken as given may be one that none of it leads to.
+        """
+        if first:
+            rows = rows_of(data, self.group, fit, measured=self.turns > 1)
+            return rows.through(Driver(self.effect.kind, size, rows.full_duty))
+        driver = Driver(self.effect.kind, size, self.full_duty, _emf_share(fit))
+        voltage = terminal_voltages(self.commands, fit.structure, fit.z, fit.initial, driver)
+        return fast_decay.rows_of(self.commands, voltage)
 
     def deviance(self, logarithm: float) -> float:
         """Return the deviance at a size's logarithm; the next fit begins from the best so far.
@@ -309,8 +310,9 @@ class _Profile:
 
     def applied(self, records: Sequence[Record], fit: Fit) -> list[Record]:
         """Return other records of the motor with the voltage at the terminals."""
-        data = of_kind(prepare(records, False, hold=self.hold), fit)
-        rows = rows_of(data, records, prediction.settle(data, fit))
+        if self.effect.follows_motion:
+            return _applied(records, fit, self.driver._replace(emf_share=_emf_share(fit)))
+        rows = rows_of(_prepared(records, self.hold, fit), records, fit)
         return with_voltages(records, rows.through(self.driver))
 
     def _beside(self, x: float, away: float) -> tuple[float, float, bool]:
@@ -334,15 +336,10 @@ class _Joint:
         self.every = every
         self.found: fast_decay.Joint | None = None
 
-    def _data(self, records: Sequence[Record]) -> Experiments:
-        s = self.near.structure
-        data = prepare(records, False).measured_as(s.speed)
-        return data if s.held == "interpolated" else data.held(s.held)
-
     def best(self, most: float) -> DriverFit | None:
         """Return the likeliest driver; None where there is none, or beyond a deviance."""
         # Pieces do not tell the back-EMF's share, which steady speeds do.
-        data, few = thinned(self._data(self.every)), self._data(self.group)
+        data, few = thinned(commands_of(self.every, self.near)), commands_of(self.group, self.near)
         data = data if data.size <= SCREENING_SAMPLES else few
         supply = min(r.hardware.supply_voltage or 0.0 for r in self.group)
         full = max(float(np.abs(data.hold_value).max(initial=0.0)), supply)
@@ -354,7 +351,7 @@ class _Joint:
 
     def on(self, group: list[Record], most: float, behind: float) -> DriverFit | None:
         """Go on from there with more records."""
-        data = self._data(group)
+        data = commands_of(group, self.near)
         more = _Joint(group, group, self.near, self.options, self.effect)
         assert self.found is not None
         more.found = fast_decay.continued(data, self.found, self.options)
@@ -388,7 +385,15 @@ class _Joint:
     def applied(self, records: Sequence[Record], fit: Fit) -> list[Record]:
         """Return other records of the motor with the voltage at the terminals."""
         assert self.found is not None
-        data = self._data(records)
-        return with_voltages(
-            records, fast_decay.rows_of(data, fast_decay.voltage_of(data, self.found))
-        )
+        return _applied(records, self.found.fit, self.found.driver)
+
+
+def _applied(records: Sequence[Record], fit: Fit, driver: Driver) -> list[Record]:
+    data = commands_of(records, fit)
+    voltage = fast_decay.voltage_of(data, fit, driver)
+    return with_voltages(records, fast_decay.rows_of(data, voltage))
+
+
+def _emf_share(fit: Fit) -> float:
+    """Return what of the voltage at steady speed is back-EMF."""
+    return float(fit.structure.internal(fit.z)[0][2]) / fit.z.a0

@@ -113,12 +113,12 @@ def continued(data: Experiments, joint: Joint, options: Options) -> Joint | None
     return problem.joint(problem.descend(problem.start(joint.fit.z, joint.driver)), options)
 
 
-def voltage_of(data: Experiments, joint: Joint) -> Array:
-    """Return what the driver puts out in other data of the motor, by sections [V]."""
-    fit, voltage = joint.fit, data.hold_value
+def voltage_of(data: Experiments, fit: Fit, driver: Driver) -> Array:
+    """Return what a driver puts out in other data of the motor, by sections [V]."""
+    voltage = data.hold_value
     for _ in range(SETTLED):
         there = prediction.settle(replace(data, hold_value=voltage), fit)
-        voltage = terminal_voltages(data, fit.structure, fit.z, there.initial, joint.driver)
+        voltage = terminal_voltages(data, fit.structure, fit.z, there.initial, driver)
     return voltage
 
 

@@ -55,8 +55,8 @@ def profiled(data: Experiments, fit: Fit, options: Options) -> Fit:
         target = RISE * float((std[i] / white[i]) ** 2)
         if coordinate == "vc_plus" and one_level(data, fit):
             ends = _range(data, fit, coordinate)
-            # From rest a winding first builds up the torque that breaks loose, which is late. So are
-            # sensors, clocks, and friction that sticks more than it slides: nothing is read in it.
+            # A winding first builds up the torque that breaks loose, which is late. So are sensors,
+            # clocks, and friction that sticks more than it slides: nothing is read in it.
             if fit.structure.order == 2:
                 both = [_fixed_at(data, fit, coordinate, f, options).z for f in ends]
                 found.append(Profile(coordinate, (both[0], both[1])))

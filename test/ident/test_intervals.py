@@ -15,6 +15,7 @@ from smp_motor_ident.diagnosis.identifiability import what_next
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.estimation.consider_covariance import (
     above_zero,
+    consider_hold,
     consider_left_out,
     mean_square,
 )
@@ -319,3 +320,17 @@ def test_what_is_far_below_nothing_is_exponential_above_it():
     # The density falls by e in deviation^2 / |value|, and a mean square is twice that squared.
     for value in (-990.0, -1010.0):
         assert above_zero(value, 1.0) == pytest.approx(np.sqrt(2) / -value, rel=1e-4)
+
+
+def test_a_second_lag_hangs_on_how_a_command_ran_between_its_rows():
+    """Where a misfit is shown, a command that seems interpolated may be one that was held."""
+    data = prepare([motors.record("rear_left", current=False, seconds=2.0)], False)
+    fit = initial_fit(data, SecondOrder(friction="none"), Options())
+    assert fit is not None and consider_hold(data, fit) is fit
+    ran = replace(fit, structure=fit.structure.with_(held="interpolated"))
+    added = consider_hold(data, ran).added
+    assert added is not None
+    lag = np.sqrt(np.diag(added))[ran.structure.free.index("ln_a2")] * fit.z.second_lag
+    # Anything from none to half a row: the root of the mean square of that is half over root 3.
+    np.testing.assert_allclose(lag, 0.5 * data.step / np.sqrt(3))
+    assert np.count_nonzero(added) == 1

@@ -53,3 +53,12 @@ def test_five_steps_in_one_fit_tell_the_speed_filter_from_a_delay():
     assert result.value("averaging_window") == pytest.approx(0.032, abs=0.004)
     assert result.value("delay") < 0.004
     assert any(f.code == "averaged_speed" for f in result.findings)
+
+
+def test_ten_steps_in_one_fit_tell_the_friction_that_their_steady_speeds_do():
+    result = estimate([step(p) for p in sorted((DATA / "step_gearmotor").glob("*.csv"))])
+    assert 0.025 < result.value("time_constant") < 0.028
+    # Lines through the five steady speeds of each way: 13.9 and 14.5 rad/s/V, 1.07 and 1.15 V.
+    for name, known in (("dc_gain", 14.2), ("static_voltage", 1.11)):
+        q = result.combinations[name]
+        assert q.value == pytest.approx(known, rel=0.2) and abs(q.value - known) < 2 * q.std
