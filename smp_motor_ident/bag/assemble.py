@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from smp_motor_control.arrays import Array, Integers
 from smp_motor_control.motor.parameters import Gearbox
 from smp_motor_ident.bag import checks, clock, counter, mapping, units
-from smp_motor_ident.bag.axis import Motor, Series, on_one_axis, unwrapped
+from smp_motor_ident.bag.axis import Motor, Series, finite, on_one_axis, unwrapped
 from smp_motor_ident.bag.storage import Table
 from smp_motor_ident.diagnosis.stamps import find_beat, moves_on
 from smp_motor_ident.errors import BagError
@@ -37,8 +37,13 @@ def assemble(
         times = {topic: _on_beat(motor, topic, time) for topic, time in times.items()}
     given = {name: signal for name, signal in plan.signals.items() if name != "time"}
     series = {n: _series(motor, n, signal, times[signal.topic]) for n, signal in given.items()}
+    together = plan.signals["voltage"].topic == plan.signals[axis_name].topic
+    if together:
+        _drop_lost(motor, series, axis_name)
+    elif axis_name == "count":  # a whole number has no NaN
+        series["count"] = finite(series["count"])
     _check(motor, series)
-    if plan.signals["voltage"].topic == plan.signals[axis_name].topic:
+    if together:
         _drop_lost(motor, series, axis_name)
     return on_one_axis(motor, series, axis_name)
 
@@ -314,7 +319,8 @@ def _drop_lost(motor: Motor, series: dict[str, Series], axis_name: str) -> None:
         sound &= np.isfinite(values)
     if sound.all():
         return
-    text = f"{int((~sound).sum())} samples without a finite voltage were left out"
+    what = "count" if np.isfinite(voltage.value).all() else "voltage"
+    text = f"{int((~sound).sum())} samples without a finite {what} were left out"
     motor.tell("no_voltage", text, "warning")
     alike = [name for name, signal in series.items() if np.array_equal(signal.time, axis.time)]
     series.update({name: series[name].take(sound) for name in alike})

@@ -66,19 +66,21 @@ def on_one_axis(motor: Motor, series: dict[str, Series], axis_name: str) -> Reco
     """Make a record of signals that were sampled each at its own instants."""
     if "supply" in series:
         _times_supply(series)
-    voltage = _finite(series["voltage"])
+    voltage = finite(series["voltage"])
     axis = series[axis_name].time
     alike = np.array_equal(voltage.time, axis)
-    held = motor.plan.held or (_held(motor, voltage, series, axis_name) if alike else "after")
     keep = np.ones(axis.size, bool) if alike else _covered(motor, voltage, axis)
     if keep.sum() < 2:
         raise BagError(f"{motor.where}: fewer than 2 samples have a voltage and an output")
+    starts = _count_starts(motor, series, keep, axis_name)
+    held = motor.plan.held or (
+        _held(motor, voltage, series[axis_name], axis_name, starts) if alike else "after"
+    )
     axis = axis[keep]
     # Of each interval that ends at an instant of the axis
     values = voltage.value.copy() if alike else mean_held(voltage.time, voltage.value, held, axis)
     if alike and held == "after":
         values[1:] = voltage.value[:-1]
-    starts = _count_starts(motor, series, keep, axis_name)
     starts |= _gaps(motor, axis, alike, held, voltage, values)
     columns: dict[str, Any] = {
         name: _on_axis(motor, name, series[name], axis, keep)
@@ -103,11 +105,13 @@ def on_one_axis(motor: Motor, series: dict[str, Series], axis_name: str) -> Reco
     )
 
 
-def _held(motor: Motor, voltage: Series, series: Mapping[str, Series], name: str) -> str:
+def _held(motor: Motor, voltage: Series, output: Series, name: str, starts: Flags) -> str:
     """Return whether a voltage holds from its row on, or held up to it, as the motion tells."""
-    motion = series[name].value
+    motion = output.value.astype(np.float64)
     if name != "velocity":
         motion = np.diff(motion, prepend=motion[:1])
+    gap = rhythm(output.time).gap()
+    motion[starts | (np.diff(output.time, prepend=output.time[:1]) > gap)] = np.nan
     if not answers_in_its_row(voltage.value, motion):
         return "after"
     text = f"the {name} answers in the rows in which the voltage changes: it held up to its row"
@@ -115,14 +119,15 @@ def _held(motor: Motor, voltage: Series, series: Mapping[str, Series], name: str
     return "before"
 
 
-def _finite(series: Series) -> Series:
+def finite(series: Series) -> Series:
+    """Return the samples that are numbers."""
     sound = np.isfinite(series.value)
     return series if sound.all() else series.take(sound)
 
 
 def _times_supply(series: dict[str, Series]) -> None:
     """Multiply the duty cycle by the supply as it was measured."""
-    supply, voltage = _finite(series.pop("supply")), series["voltage"]
+    supply, voltage = finite(series.pop("supply")), series["voltage"]
     if not supply.time.size:
         raise BagError("the supply signal has no finite value")
     measured = np.interp(voltage.time - supply.time[0], supply.time - supply.time[0], supply.value)
@@ -230,7 +235,7 @@ def _on_axis(
     if series.time.size == keep.size and np.array_equal(series.time[keep], axis):
         values = series.value if keep.all() else series.value[keep]
     else:
-        sound = _finite(series)
+        sound = finite(series)
         if sound.time.size < 2:
             return None
         origin = sound.time[0]

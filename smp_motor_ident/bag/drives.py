@@ -40,15 +40,17 @@ def answers_in_its_row(u: Array, y: Array) -> bool:
 
     Then the command is that of the interval that ends at the row: what begins there cannot have
     moved anything yet.  The increments of a motion that is driven jump where the drive does; the
-    jumps at steps of a held command are held against those elsewhere (a normal test).
+    jumps at steps of a held command are held against those elsewhere (a normal test).  A motion
+    that is NaN, such as where another run begins, tells nothing.
     """
     steps, jumps = np.diff(u), np.diff(y, 2)
-    new = np.flatnonzero((steps[1:-1] != 0) & (steps[:-2] == 0))  # of one that was held before
+    held = (steps[1:-1] != 0) & (steps[:-2] == 0)  # a new command behind one that was held
+    new = np.flatnonzero(held & np.isfinite(jumps[:-1] + jumps[1:]))
     if new.size < LAGS:
         return False
     size = steps[new + 1]
     at_once, later = float(size @ jumps[new]), float(size @ jumps[new + 1])
-    scatter = float(np.std(np.delete(jumps, new)) * np.linalg.norm(size))
+    scatter = float(np.nanstd(np.delete(jumps, new)) * np.linalg.norm(size))
     return at_once > max(-float(ndtri(EXPLAINS.value)) * scatter, later)
 
 

@@ -16,10 +16,10 @@ MAP = ["voltage=u velocity=w time=t"]
 STEP = 0.01
 
 
-def run(n: int, seed: int, begin: float = 0.0) -> np.ndarray:
+def run(n: int, seed: int, begin: float = 0.0, hold: int = 10) -> np.ndarray:
     """Return rows of time, voltage and speed of a motor, 20 rad/s/V and 0.1 s, with noise."""
     rng = np.random.default_rng(seed)
-    voltage = np.repeat(rng.uniform(-6, 6, n // 10 + 1), 10)[:n]
+    voltage = np.repeat(rng.uniform(-6, 6, n // hold + 1), hold)[:n]
     speed = np.zeros(n)
     for k in range(1, n):
         speed[k] = speed[k - 1] + (1 - np.exp(-STEP / 0.1)) * (20 * voltage[k - 1] - speed[k - 1])
@@ -60,6 +60,29 @@ def test_runs_below_one_another_are_segments_of_their_own(
     found = [f for f in record.findings if f.code == "clock_set_back"]
     assert [f.evidence["times"] for f in found] == [len(parts) - 1]
     assert {"samples_reordered", "duplicate_samples"}.isdisjoint(codes(record))
+
+
+@pytest.mark.parametrize("pause", [0.0, 60.0])
+def test_where_another_run_begins_no_voltage_is_answered(tmp_path: Path, pause: float) -> None:
+    """Its first row has another voltage and another speed, and neither made the other."""
+    parts = [run(600, 6 + k, k * pause, hold=100) for k in range(3)]
+    record = read(tmp_path / "log.csv", np.concatenate(parts))
+    assert record.starts == (0, 600, 1200)
+    assert "held_before" not in codes(record)
+
+
+def test_a_run_that_was_cut_off_has_no_count_in_its_last_row(tmp_path: Path) -> None:
+    parts = run(200, 1), run(300, 2)
+    counts = [np.floor(50 * np.cumsum(STEP * part[:, 2])) for part in parts]
+    lines = [
+        f"{t:.2f},{u:g},{n:.0f}" for part, c in zip(parts, counts) for (t, u, _), n in zip(part, c)
+    ]
+    lines[199] = lines[199].rpartition(",")[0]
+    (tmp_path / "log.csv").write_text("\n".join(["t,u,n", *lines]))
+    record = read_records(tmp_path / "log.csv", ["voltage=u count=n time=t"])["motor"]
+    assert record.starts == (0, 199)
+    assert record.count is not None
+    np.testing.assert_array_equal(np.diff(record.count[199:]), np.diff(counts[1]))
 
 
 def test_a_gap_that_the_user_allows_does_not_join_runs(tmp_path: Path) -> None:
