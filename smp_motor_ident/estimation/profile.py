@@ -89,9 +89,11 @@ def one_level(data: Experiments, fit: Fit) -> bool:
     moving = np.abs(speed) > REST.value * np.abs(speed).max()
     driven = (voltage_at_samples(data) * np.sign(speed))[moving]  # braking is another level
     level = float(np.median(driven)) if driven.size else 0.0
-    other = int(np.count_nonzero(np.abs(driven - level) > SAME_LEVEL.value * level))
+    other = np.zeros(moving.size, np.int64)
+    other[moving] = np.abs(driven - level) > SAME_LEVEL.value * level
     # As many samples as a segment's own state has coordinates tell that state, and no more.
-    return other <= len(own_columns(data, fit.structure)) * (data.starts.size - 1)
+    each = np.add.reduceat(other, data.starts[:-1])
+    return bool(np.all(each <= len(own_columns(data, fit.structure))))
 
 
 def _followed(

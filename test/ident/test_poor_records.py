@@ -78,6 +78,15 @@ def test_a_single_level_of_voltage_gives_one_combination(rest):
     assert percent(measured, simulated) > 90
 
 
+def test_one_coast_tells_gain_from_friction_among_steps_to_one_level():
+    up = _record(np.full(60, 8.0), 40.0)
+    coast = _record(np.r_[np.full(60, 8.0), np.zeros(30)], 40.0)
+    found = estimate([up] * 3 + [coast] + [up] * 3)
+    for name in ("dc_gain", "static_voltage"):
+        q = found.combinations[name]
+        assert abs(q.value - TRUTH[name]) < 4 * q.std < TRUTH[name]  # one in 16,000
+
+
 def test_friction_that_delays_the_first_motion_is_in_the_lags_of_one_step():
     # From rest the winding first builds up the torque that friction holds: 0.6 V of 8 V are a
     # delay of 1.5 ms, which another winding and no friction explain as well.
