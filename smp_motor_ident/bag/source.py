@@ -2,7 +2,6 @@
 
 import os
 import re
-import tempfile
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -15,7 +14,7 @@ import yaml
 from smp_motor_ident.bag.readers import BAGS, PACKED, TABLES, is_table, open_source
 from smp_motor_ident.bag.readers.format import Messages, Tables
 from smp_motor_ident.bag.storage import TABLE, Batch, Channel, Table, damaged, found
-from smp_motor_ident.bag.unpack import Budget
+from smp_motor_ident.bag.unpack import Budget, folder_of
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.finding import Finding
 
@@ -53,8 +52,8 @@ class Recording:
         return Budget(self.name, sum(file.stat().st_size for file in self.files))
 
     @cached_property
-    def _folder(self) -> tempfile.TemporaryDirectory[str]:
-        return tempfile.TemporaryDirectory(prefix="smp_bag_")
+    def _folder(self) -> Path:
+        return folder_of(self)
 
     def channels(self) -> list[Channel]:
         """Return the channels of all files, one per topic, type and file."""
@@ -117,7 +116,7 @@ class Recording:
         """Open a file; where others remain, one that cannot be read becomes a finding."""
         if path not in self._sources:
             try:
-                source = open_source(path, Path(self._folder.name), self.budget)
+                source = open_source(path, self._folder, self.budget)
                 if is_table(path) is not self.is_table:
                     raise BagError(f"{path}: is of another kind than the other files")
                 self._sources[path] = source

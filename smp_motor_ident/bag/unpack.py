@@ -7,6 +7,9 @@ environment variable ``SMP_BAG_UNPACKED`` (bytes, or such as ``8G``) raises that
 
 import bz2
 import os
+import shutil
+import tempfile
+import weakref
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -44,6 +47,13 @@ class Budget:
                 f"{self.name}: unpacks to more than {self.limit / 1e6:.0f} MB, which a file of its "
                 f"size is not expected to hold; {VARIABLE}=8G in the environment allows 8 GB"
             )
+
+
+def folder_of(owner: object) -> Path:
+    """Return a new folder for what is unpacked or mended, which goes with its owner."""
+    folder = tempfile.mkdtemp(prefix="smp_bag_")
+    weakref.finalize(owner, shutil.rmtree, folder, ignore_errors=True)
+    return Path(folder)
 
 
 def _asked() -> int:

@@ -2,7 +2,6 @@
 
 import shutil
 import sqlite3
-import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +13,7 @@ from smp_motor_control.arrays import Integers
 from smp_motor_ident.bag.readers.format import Format, Messages
 from smp_motor_ident.bag.salvage import salvage
 from smp_motor_ident.bag.storage import Batch, Bytes, Channel, join, message_type
-from smp_motor_ident.bag.unpack import Budget
+from smp_motor_ident.bag.unpack import Budget, folder_of
 from smp_motor_ident.errors import BagError
 
 MAGIC = b"SQLite format 3\0"
@@ -27,7 +26,6 @@ class _SqliteFile(Messages):
 
     def __init__(self, path: Path, name: str, budget: Budget) -> None:
         super().__init__(path, name, budget)
-        self._folder: tempfile.TemporaryDirectory[str] | None = None
         self._cut_off = False
         self._path_read = self._with_journal()
         self._database = self._connect(self._path_read)
@@ -47,15 +45,14 @@ class _SqliteFile(Messages):
         journals = [path for path in beside if path.is_file() and path.stat().st_size]
         if not journals:
             return self.path
-        self._folder = tempfile.TemporaryDirectory(prefix="smp_bag_")
-        copy = Path(self._folder.name) / self.path.name
+        copy = folder_of(self) / self.path.name
         for original in (self.path, *journals):
             shutil.copyfile(original, copy.with_name(original.name))
         self._amiss(f"was not closed; its journal {journals[0].name} was applied to a copy")
         return copy
 
     def _connect(self, path: Path) -> sqlite3.Connection:
-        mode = "immutable=1" if self._folder is None else "mode=rw"
+        mode = "immutable=1" if path == self.path else "mode=rw"
         database = sqlite3.connect(f"file:{quote(str(path.resolve()))}?{mode}", uri=True)
         if hasattr(database, "setlimit"):  # limit 0 is that of a blob's length
             database.setlimit(0, path.stat().st_size + (1 << 20))
@@ -66,7 +63,7 @@ class _SqliteFile(Messages):
         page = int.from_bytes(head[16:18], "big")
         page = 65536 if page == 1 else page
         pages = int.from_bytes(head[28:32], "big")
-        if self._folder is None and size < pages * page:
+        if path == self.path and size < pages * page:
             self._amiss(f"cut off at byte {size} of {pages * page} that it had")
             self._cut_off = True
             # With this, SQLite reads a file that is shorter than its head says.
