@@ -300,7 +300,7 @@ class _Profile:
         if not self.effect.may_be(size, rows):
             return None
         self.driver = Driver(self.effect.kind, size, rows.full_duty)
-        self.beside = self.at(size * float(np.exp(std)))[2]
+        self.beside = self.at(size * float(np.exp(min(std, widest))))[2]
         return DriverFit(self.effect, self.driver, size * std, self.group, records, self, fit)
 
     def moves(self, fit: Fit) -> list[Array]:
