@@ -85,7 +85,9 @@ def answer(
         at = list(values.value).index("delay")
         joint[at, at] += (limits.INSTANT.value * structure.shift) ** 2
     spread = dict(zip(values.value, np.sqrt(np.maximum(np.diag(joint), 0.0)), strict=True))
-    one_level = spread["dc_gain"] > limits.LOOSE_QUANTITY.value * values.value["dc_gain"]
+    # At the upper end of what it may be, a gain of any size seems known: the middle tells, too.
+    gain = min(values.value["dc_gain"], float(np.mean(values.interval("dc_gain", conditional))))
+    one_level = spread["dc_gain"] > limits.LOOSE_QUANTITY.value * gain
     combinations = {}
     for name in reported:
         if name in FILTERS and "window" in structure.fixed:
