@@ -1,6 +1,7 @@
 """What fields are called: which signal of which wheel a name may mean, and in which unit."""
 
 import re
+from collections.abc import Sequence
 
 WORDS_OF_VOLTS = (
     r"volt|spannung|spanning|sp[äæ]nning|(?<!in)tens(?:i[oóu]|[ãa]o)|napi[eę]cie|nap[eěaä]t[ií]"
@@ -40,6 +41,21 @@ _SIDES = (
 _LETTER = re.compile(r"(.*?)[\W_]*([abclrABCLR]|\d)(?:[\W_]*[\[(].*)?")
 """A name that ends in the letter or digit of one motor of several, but for a unit behind it."""
 _LETTERS = {"l": "left", "r": "right"}
+
+
+_MOTOR = r"(?:motor|wheel|joint|actuator|servo|axis|axle)"
+_NUMBERED = re.compile(rf"{_MOTOR}[\W_]*(?:id|no|nr|num|number|idx|index|name)\W*", re.IGNORECASE)
+_NAMED = re.compile(_MOTOR, re.IGNORECASE)
+
+
+def tells_motors(column: str, words: Sequence[str] = ()) -> bool:
+    """Return whether a column says of which motor its rows are: ``motor_id``.
+
+    One that is called ``wheel`` alone does where its words are sides, letters or numbered.
+    """
+    sided = (wheel_of(word) or re.fullmatch(r".*\d|[A-Za-z]", word) for word in words)
+    named = bool(words and _NAMED.fullmatch(column.strip())) and all(sided)
+    return named or _NUMBERED.fullmatch(column.strip()) is not None
 
 
 def worded(name: str) -> str:

@@ -15,7 +15,7 @@ from smp_motor_ident.bag.decode import collect
 from smp_motor_ident.bag.mapping import MotorMap, Signal, SignalMap
 from smp_motor_ident.bag.source import Recording, recordings
 from smp_motor_ident.bag.storage import Channel, Table, found
-from smp_motor_ident.bag.tables import add_time_columns, resolved, self_described, timed
+from smp_motor_ident.bag.tables import add_time_columns, apart, resolved, self_described, timed
 from smp_motor_ident.bag.types import Types
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.finding import Finding
@@ -171,9 +171,10 @@ def _records(recording: Recording, asked: SignalMap, types: Types) -> list[Recor
         description, findings = _description(wheel, plan, descriptions, tables)
         plan = replace(plan, hardware={**description, **plan.hardware})
         try:
-            mine = timed(recording, plan, tables) if recording.is_table else tables
-            record = assemble(wheel, plan, hardware_of(plan.hardware), mine, recording.name)
-            records.append(replace(record, findings=(*findings, *record.findings)))
+            for name, mine in apart(recording, wheel, plan, tables):
+                mine = timed(recording, plan, mine) if recording.is_table else mine
+                record = assemble(name, plan, hardware_of(plan.hardware), mine, recording.name)
+                records.append(replace(record, findings=(*findings, *record.findings)))
         except BagError as error:
             if not plan.own:
                 raise

@@ -42,6 +42,8 @@ class Channel:
     fields: tuple[str, ...] = ()  # names of the columns of a table
     # What the file says of its columns' units
     units: Mapping[str, str] = field(default_factory=dict, hash=False)
+    # Words of a column that tells motors apart, in the order of the numbers that stand for them
+    words: Mapping[str, tuple[str, ...]] = field(default_factory=dict, hash=False)
     lengths: tuple[int, ...] = ()  # how many values each column has, where they differ
 
 

@@ -7,14 +7,15 @@ from itertools import product
 
 import numpy as np
 
-from smp_motor_control.arrays import Integers
+from smp_motor_control.arrays import Flags, Integers
 from smp_motor_ident.bag import clock, limits, units
 from smp_motor_ident.bag.mapping import DEFAULT_MOTOR, MotorMap, Signal, SignalMap
-from smp_motor_ident.bag.names import MOTIONS
+from smp_motor_ident.bag.names import MOTIONS, tells_motors
 from smp_motor_ident.bag.readers.grid import without_unit
 from smp_motor_ident.bag.source import Recording
 from smp_motor_ident.bag.storage import TABLE, Channel, Table, found
 from smp_motor_ident.errors import BagError
+from smp_motor_ident.finding import Finding
 
 TIME_NAMES = (
     r"time|stamp|^t(?:[\W_]*(?:s|sec|ms|us|µs|ns))?[\W_]*$|^(?:ms|us|sec(?:onds)?)$|millis|micros|zeit"
@@ -96,9 +97,10 @@ def self_described(recording: Recording, asked: SignalMap) -> dict[str, MotorMap
 def add_time_columns(
     recording: Recording, plans: Mapping[str, MotorMap], wanted: dict[str, list[str]]
 ) -> None:
-    """Ask for the column of time of every table that is wanted."""
+    """Ask for every wanted table's column of time, and those that tell motors apart."""
     for plan in plans.values():
         for topic in plan.topics:
+            wanted[topic] += [n for n in _telling(recording, topic) if n not in wanted[topic]]
             signal = _time_signal(recording, plan, topic)
             if signal is not None and signal.field not in wanted[topic]:
                 wanted[topic].append(signal.field)
@@ -122,6 +124,48 @@ def _time_signal(recording: Recording, plan: MotorMap, topic: str) -> Signal | N
     raise BagError(
         f"{recording.files[0]}: which column is the time? map {hint} or sample_time=SECONDS"
     )
+
+
+def apart(
+    recording: Recording, wheel: str, plan: MotorMap, tables: Mapping[str, Table]
+) -> list[tuple[str, Mapping[str, Table]]]:
+    """Return the tables of each motor that a column tells apart, by the motor's name.
+
+    Bags, and tables without such a column or with rows of one motor alone, are ``wheel``'s.
+    """
+    signals = [(signal.topic, signal.field) for signal in plan.signals.values()]
+    for topic in plan.topics if recording.is_table and len(plan.topics) == 1 else ():
+        for column, labels in _telling(recording, topic).items():
+            if (topic, column) in signals:
+                continue
+            of = tables[topic].columns[column]
+            numbers, counts = np.unique(of[np.isfinite(of)], return_counts=True)
+            stray = limits.STRAY_ROWS.value * of.size
+            numbers, counts = numbers[counts > stray], counts[counts > stray]
+            if numbers.size < 2 or of.size - counts.sum() > stray:
+                continue
+            own = [labels[int(n)] if labels else f"motor_{n:g}" for n in numbers]
+            own = [re.sub(r"\W+", "_", name).strip("_") for name in own]
+            text = f"{recording.name}: {column} tells {len(own)} motors apart: {', '.join(own)}"
+            told = found("several_motors", text, motors=len(own))
+            motors = [_rows(tables[topic], of == n, told) for n in numbers]
+            before = "" if wheel == DEFAULT_MOTOR else f"{wheel}_"
+            return [(before + n, {**tables, topic: rows}) for n, rows in zip(own, motors)]
+    return [(wheel, tables)]
+
+
+def _telling(recording: Recording, topic: str) -> dict[str, tuple[str, ...]]:
+    """Return the columns of a table that tell motors apart, with the words for their numbers."""
+    channel = next(c for c in recording.channels() if c.topic == topic)
+    words = {name: channel.words.get(name, ()) for name in channel.fields}
+    return {name: own for name, own in words.items() if tells_motors(name, own)}
+
+
+def _rows(table: Table, which: Flags, told: Finding) -> Table:
+    """Return some rows of a table as they are in the file."""
+    columns = {name: column[which] for name, column in table.columns.items()}
+    log = None if table.log is None else table.log[which]
+    return replace(table, log=log, columns=columns, findings=[*table.findings, told])
 
 
 def timed(recording: Recording, plan: MotorMap, tables: Mapping[str, Table]) -> dict[str, Table]:

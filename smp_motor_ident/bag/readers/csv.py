@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from smp_motor_ident.bag.names import tells_motors
 from smp_motor_ident.bag.readers import grid
 from smp_motor_ident.bag.readers.format import Format, Tables
 from smp_motor_ident.bag.storage import TABLE, Channel, Table
@@ -61,11 +62,31 @@ class _CsvFile(Tables):
         if above and not self._grid.named:
             self._grid = grid.head([*above, *rows[self._grid.first :]], str(path))
         self.problems += self._grid.findings
-        self._numeric = grid.numeric(self._grid.names, rows[self._grid.first :])
+        self._words = self._numbered()
+        known = grid.numeric(self._grid.names, rows[self._grid.first :])
+        self._numeric = tuple(n for n in self._grid.names if n in known or n in self._words)
 
     def channels(self) -> list[Channel]:
-        """Return the one table, without its columns of words."""
-        return [Channel(0, "", "", TABLE, fields=self._numeric, units=self._grid.units)]
+        """Return the one table, without its columns of words but those that tell motors apart."""
+        units, words = self._grid.units, self._words
+        return [Channel(0, "", "", TABLE, fields=self._numeric, units=units, words=words)]
+
+    def _numbered(self) -> dict[str, tuple[str, ...]]:
+        """Put numbers for the words of columns that tell motors apart; return the words."""
+        found = {}
+        # Words of one letter are such of any column
+        for j in [j for j, name in enumerate(self._grid.names) if tells_motors(name, "A")]:
+            rows = {k: _row(s, self._separator) for k, s in enumerate(self._lines)}
+            body = {k: row for k, row in rows.items() if k >= self._first and j < len(row)}
+            words = grid.words([row[j].strip() for row in body.values()])
+            if words and tells_motors(self._grid.names[j], words):
+                found[self._grid.names[j]] = words
+                for k, row in body.items():
+                    if row[j].strip() in words:
+                        row[j] = str(words.index(row[j].strip()))
+                        quoted = (f'"{c}"' if self._separator in c else c for c in row)
+                        self._lines[k] = self._separator.join(quoted)
+        return found
 
     def table(self, topic: str, fields: Sequence[str]) -> Table:
         """Return columns; cells that are empty are NaN."""

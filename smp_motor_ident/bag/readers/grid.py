@@ -1,6 +1,7 @@
 """Rows of cells as spreadsheets and loggers write them: names, units, numbers, times."""
 
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import date, datetime, time
@@ -81,6 +82,15 @@ def numeric(names: Sequence[str], rows: Sequence[Row]) -> tuple[str, ...]:
     return tuple(
         name for name, cells in zip(names, filled) if not cells or any(map(_readable, cells))
     )
+
+
+def words(cells: Sequence[str]) -> tuple[str, ...]:
+    """Return the words of a column, but for stray ones; none of numbers, states or one word."""
+    counts = Counter(filter(None, cells))
+    usual = tuple(c for c, n in counts.items() if n > STRAY_ROWS.value * len(cells))
+    if len(usual) < 2 or any(map(_sound, usual)) or all(c.lower() in _WORDS for c in usual):
+        return ()
+    return usual
 
 
 def without_unit(name: str) -> str:

@@ -85,6 +85,35 @@ def test_a_run_that_was_cut_off_has_no_count_in_its_last_row(tmp_path: Path) -> 
     np.testing.assert_array_equal(np.diff(record.count[199:]), np.diff(counts[1]))
 
 
+@pytest.mark.parametrize("order", ["below one another", "in turn"])
+@pytest.mark.parametrize(
+    "column, names, motors",
+    [
+        ("motor_id", ("0", "1"), ("motor_0", "motor_1")),
+        ("Wheel", ("L", "R"), ("L", "R")),
+        ("joint name", ("front left", "rear left"), ("front_left", "rear_left")),
+        ("wheel", ("0", "1"), ("motor",)),  # a number of it, or its speed
+        ("motor", ("ON", "OFF"), ("motor",)),
+        ("trial", ("a1", "a2"), ("motor",)),
+    ],
+)
+def test_rows_of_several_motors_are_told_apart_by_a_column_that_names_them(
+    tmp_path: Path, order: str, column: str, names: tuple[str, str], motors: tuple[str, ...]
+) -> None:
+    parts = [run(300, 1), run(300, 2)]
+    rows = [(row, name) for part, name in zip(parts, names) for row in part]
+    if order == "in turn":
+        rows = [rows[k + n] for k in range(300) for n in (0, 300)]
+    text = [f"t,{column},u,w", *(f"{t:g},{name},{u:.6f},{w:.6f}" for (t, u, w), name in rows)]
+    (tmp_path / "log.csv").write_text("\n".join(text))
+    records = read_records(tmp_path / "log.csv", MAP)
+    assert tuple(records) == motors
+    for name, part in zip(motors, parts):
+        if len(motors) > 1:
+            np.testing.assert_allclose(records[name].velocity, part[:, 2], atol=1e-6)
+            assert "several_motors" in codes(records[name])
+
+
 def test_a_gap_that_the_user_allows_does_not_join_runs(tmp_path: Path) -> None:
     rows = np.concatenate([run(300, 1), run(300, 2)])
     assert read(tmp_path / "log.csv", rows, [*MAP, "gap=30"]).starts == (0, 300)
