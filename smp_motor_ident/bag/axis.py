@@ -2,13 +2,14 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_control.arrays import Array, Flags, Integers
-from smp_motor_ident.bag.clock import mean_held, rhythm
+from smp_motor_ident.bag.clock import BEATS, mean_held, rhythm
 from smp_motor_ident.bag.counter import Unwrapped, unwrap
 from smp_motor_ident.bag.drives import answers_in_its_row
 from smp_motor_ident.bag.mapping import MotorMap
@@ -198,6 +199,10 @@ def _gaps(
     """Return where segments begin because samples are missing; bridge the voltage over a few."""
     beat = rhythm(axis)
     steps, missing = np.diff(axis), beat.missing(axis)
+    edges = [0, *(np.flatnonzero(steps > beat.gap()) + 1).tolist(), axis.size]
+    for a, b in pairwise(edges):  # runs below one another may each have a rate of their own
+        if (own := rhythm(axis[a:b])).regular and b - a > BEATS:
+            missing[a : b - 1] = own.missing(axis[a:b])
     if alike and voltage.number is not None:  # the publisher counted: nothing to be guessed
         missing = np.maximum(np.diff(voltage.number) - 1, 0)
     given = motor.plan.gap

@@ -26,7 +26,8 @@ _BEFORE = 1000
 """Rows before that are looked at in any case; all since the last fall, so that many cost little."""
 
 _SECOND = 1_000_000_000
-_BEATS = 32
+BEATS = 32
+"""Samples by which a beat is judged."""
 SAME_CLOCK = 50_000_000
 """Clocks of two topics whose offsets differ by less [ns] are one clock: latency explains it."""
 
@@ -140,7 +141,7 @@ class Rhythm:
         number = np.maximum(np.rint(steps / self.interval).astype(np.int64) - 1, 0)
         late = np.flatnonzero(number)
         behind = (time - time[0]) - self.interval * np.arange(time.size)
-        window = np.arange(_BEATS)
+        window = np.arange(BEATS)
         before = np.median(behind[np.maximum(late[:, None] - window, 0)], axis=1)
         after = np.median(behind[np.minimum(late[:, None] + 1 + window, steps.size)], axis=1)
         lasting = np.rint((after - before) / self.interval).astype(np.int64)

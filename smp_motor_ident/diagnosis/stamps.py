@@ -277,7 +277,10 @@ def bridged(record: Record) -> Record:
     step = np.diff(record.time)
     if step.size < 2 or any(f.code == "samples_missing" for f in record.findings):
         return record
-    share = step / float(np.median(step))
+    edges = [*record.starts, len(record)]  # segments may each have a rate of their own
+    inside = [step[min(a, max(b - 2, 0)) : max(b - 1, 1)] for a, b in pairwise(edges)]
+    usual = [np.median(part) for part in inside]
+    share = step / np.repeat(usual, np.diff(edges))[:-1]
     whole = np.rint(share)
     regular = np.abs(share - whole) < REGULAR
     few = (whole > 1) & (whole <= 1 + ROWS_LOST.value)

@@ -52,6 +52,14 @@ def test_the_mean_of_a_straight_line_is_that_of_its_held_samples():
     assert own[22.0] == 22.0 and own[33.0] == 33.0
 
 
+@pytest.mark.parametrize("begin", [40, 41, 60])
+def test_a_segment_at_another_rate_lost_nothing(begin):
+    """One of 2 s a row behind one of 1 s a row; the last of the first may be by itself."""
+    t = np.r_[np.arange(40.0), 50.0, 100.0 + 2 * np.arange(30)]
+    record = Record("motor", t, t.copy(), velocity=t, starts=tuple(sorted({0, 40, 41, begin})))
+    assert bridged(record) is record
+
+
 def test_what_lost_nothing_or_was_bridged_before_is_left_as_it_is():
     whole = ramps(0.0)
     assert bridged(whole) is whole

@@ -71,6 +71,15 @@ def test_where_another_run_begins_no_voltage_is_answered(tmp_path: Path, pause: 
     assert "held_before" not in codes(record)
 
 
+@pytest.mark.parametrize("slow", [60, 300])
+def test_runs_may_each_have_a_rate_of_their_own(tmp_path: Path, slow: int) -> None:
+    rows = np.concatenate([run(600, 1), run(slow, 2) * [2, 1, 1]])
+    record = read(tmp_path / "log.csv", rows)
+    assert record.starts == (0, 600)
+    assert "samples_missing" not in codes(record)
+    np.testing.assert_allclose(record.voltage[601:], rows[600:-1, 1], atol=1e-6)
+
+
 def test_a_run_that_was_cut_off_has_no_count_in_its_last_row(tmp_path: Path) -> None:
     parts = run(200, 1), run(300, 2)
     counts = [np.floor(50 * np.cumsum(STEP * part[:, 2])) for part in parts]
