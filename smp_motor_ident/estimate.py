@@ -343,7 +343,7 @@ def _stated(
     if not first:
         refuse_unidentifiable(group, chosen, said(chosen)[0])
     gear = group[0].hardware.gear_ratio
-    errors = regression(final, chosen, gear)
+    errors = regression(final, chosen, gear, bool(change.std))
     chosen, parts = dependent(chosen, errors)
     result, alike = said(chosen)
     refusal = _without_lag(group, chosen, result)

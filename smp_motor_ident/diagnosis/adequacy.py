@@ -25,8 +25,8 @@ from scipy.special import fdtrc
 
 from smp_motor_control.arrays import Array
 from smp_motor_ident.diagnosis import limits
+from smp_motor_ident.diagnosis.effect_regression import Regression
 from smp_motor_ident.diagnosis.effects import EFFECTS, Effect
-from smp_motor_ident.diagnosis.model_error import Regression
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.prediction import inverse
 from smp_motor_ident.estimation.quantities import Answer

@@ -24,9 +24,10 @@ from smp_motor_ident.diagnosis.adequacy import (
     matters,
     stated,
 )
+from smp_motor_ident.diagnosis.effect_regression import Regression
 from smp_motor_ident.diagnosis.effects import EFFECTS
 from smp_motor_ident.diagnosis.misfit import Said, widened_by_misfit
-from smp_motor_ident.diagnosis.model_error import Regression, motions, regression, signals
+from smp_motor_ident.diagnosis.model_error import motions, regression, signals
 from smp_motor_ident.diagnosis.noise_or_effect import in_place_of_noise
 from smp_motor_ident.diagnosis.residuals import residual_tests
 from smp_motor_ident.estimation import data_window
@@ -97,9 +98,9 @@ def _move(
     A current that is off is left out instead, and a number that would be lost is kept as it is.
     """
     there, now, errors = begin
-    first = said(fit)[0]
+    first, changing = said(fit)[0], errors is not None and errors.changing
     for _ in range(STEPS):
-        errors = errors or regression(there, now, gear)
+        errors = errors or regression(there, now, gear, changing)
         move = fit.structure.of_free(now.z.array - fit.z.array)
         wide = fit.along(move)
         answer = said(wide)[0]

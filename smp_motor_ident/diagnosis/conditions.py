@@ -20,8 +20,8 @@ import numpy as np
 from scipy.special import fdtrc
 
 from smp_motor_control.arrays import Array
+from smp_motor_ident.diagnosis.effect_regression import Regression
 from smp_motor_ident.diagnosis.limits import CONDITION_LEVEL, CONDITION_WEIGHT
-from smp_motor_ident.diagnosis.model_error import Regression
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.prediction import inverse
 from smp_motor_ident.finding import Finding

@@ -5,13 +5,14 @@ sensitivities are: they stick, are delayed and are corrected by the measurements
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
+from scipy.linalg import helmert
 
 from smp_motor_control.arrays import Array, Integers
+from smp_motor_ident.diagnosis.effect_regression import Regression
 from smp_motor_ident.diagnosis.effects import EFFECTS, Effect, Motion, slope
 from smp_motor_ident.diagnosis.limits import EFFECT_OWN
 from smp_motor_ident.diagnosis.sample_limits import ORDINARY_BEND
@@ -28,60 +29,14 @@ ROOM = 16_000_000  # numbers in a table of signals
 SEGMENTS = 20  # beyond which only the angle's offset of each is projected out
 
 
-@dataclass(frozen=True, eq=False)
-class Regression:
-    """Residuals and regressors of one fit, the model's own coordinates projected out."""
+def regression(
+    data: Experiments, fit: Fit, gear: float, changing: bool = False
+) -> Regression | None:
+    """Return residuals and responses, whitened, the model's coordinates projected out.
 
-    residual: Array  # shape (n,): of unit variance; the current's after the output's
-    # shape (n, r): responses to effects, the model's own coordinates projected out
-    regressors: Array
-    whole: Array  # shape (n, r): the same as they are
-    shifts: Array  # shape (f, r): change of the free coordinates for a unit of each
-    block: Integers  # shape (n,): which stretch of time a row belongs to
-    members: Sequence[tuple[Effect, tuple[int, ...]]]  # which columns are whose
-    own: Array  # shape (n, p): sensitivities to the free coordinates and initial states
-    n_free: int
-    # shape (n,) each: -1 in one half of the motion, 1 in the other
-    conditions: dict[str, Array] = field(default_factory=dict)
-    # effects that the model's own coordinates imitate: column, and size that is ordinary
-    hidden: Sequence[tuple[Effect, int, float]] = ()
-
-    @cached_property
-    def normal(self) -> Array:
-        """Products of the regressors, shape (r, r)."""
-        return np.asarray(self.regressors.T @ self.regressors)
-
-    @cached_property
-    def moved(self) -> Array:
-        """Products of regressors and residual, shape (r,)."""
-        return np.asarray(self.regressors.T @ self.residual)
-
-    @cached_property
-    def known(self) -> Array:
-        """1 for rows with a measurement, 0 for others: their residual is zero."""
-        return np.asarray(self.residual != 0.0, dtype=np.float64)
-
-    @cached_property
-    def weights(self) -> Array:
-        """What each block has of the regressors' squares, of the most of any; shape (b, r)."""
-        squares = self.by_block(np.square(self.regressors))
-        return np.asarray(squares / np.maximum(squares.max(axis=0), 1e-300))
-
-    def by_block(self, columns: Array) -> Array:
-        """Return the sums of columns, shape (n, c), over the rows of each block, shape (b, c)."""
-        begins = self._runs
-        sums: Array = np.zeros((int(self.block.max()) + 1, columns.shape[1]))
-        np.add.at(sums, self.block[begins], np.add.reduceat(columns, begins))
-        return sums
-
-    @cached_property
-    def _runs(self) -> Integers:
-        """Where runs of rows of one block begin."""
-        return np.flatnonzero(np.diff(self.block, prepend=-1))
-
-
-def regression(data: Experiments, fit: Fit, gear: float) -> Regression | None:
-    """Return residuals and responses, whitened, the model's coordinates projected out."""
+    Of a motor that changes from segment to segment those of each: that is in the intervals, and no
+    effect.
+    """
     if not fit.structure.free or data.size < 4 * BLOCKS:
         return None
     sections, samples = motions(data, fit, gear)
@@ -99,7 +54,9 @@ def regression(data: Experiments, fit: Fit, gear: float) -> Regression | None:
                          for s in several)  # fmt: skip
             yield from several
 
-    own = whitened(data, fit, own_responses(data, fit, together(data)))
+    sums = own_responses(data, fit, together(data))
+    apart = _apart(data, sums, len(fit.structure.free) if changing else 0)
+    own = whitened(data, fit, np.concatenate([sums, apart], axis=2))
     error = stacked(data, fit, measured(data) - predicted(data, fit))
     columns = [error, *own, *whitened(data, fit, responses(data, fit, made()))]
     table = np.array(columns).T  # columns stay together in memory
@@ -115,7 +72,18 @@ def regression(data: Experiments, fit: Fit, gear: float) -> Regression | None:
         for c in columns
         if effect.bends and c not in seen and peaks[c] > 0
     ]
-    return replace(whole, conditions=_conditions(data, samples), hidden=hidden)
+    conditions = _conditions(data, samples)
+    return replace(whole, conditions=conditions, hidden=hidden, changing=changing)
+
+
+def _apart(data: Experiments, sums: Array, count: int) -> Array:
+    """Return what the segments' own coordinates move around their means, shape (rows, o, c)."""
+    segments = len(data.starts) - 1
+    if not count or not 1 < segments <= SEGMENTS:
+        return sums[:, :, :0]
+    of = np.searchsorted(data.starts, row_starts(data, together(data)), side="right") - 1
+    own = sums[:, :, :count, None] * helmert(segments).T[of][:, None, None, :]
+    return np.asarray(own.reshape(*sums.shape[:2], -1))
 
 
 def _largest(values: Array) -> float:

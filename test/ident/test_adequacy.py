@@ -8,7 +8,7 @@ import motors
 import numpy as np
 import pytest
 
-from smp_motor_ident.diagnosis import adequacy, beside, model_error
+from smp_motor_ident.diagnosis import adequacy, beside, effect_regression, model_error
 from smp_motor_ident.diagnosis.conditions import dependent
 from smp_motor_ident.diagnosis.effects import EFFECTS
 from smp_motor_ident.estimate import estimate
@@ -114,7 +114,7 @@ def test_numbers_that_hang_on_the_size_of_the_voltage_cover_both_sizes():
     for lost in (0.0, 1.0):
         speed = (10.0 - lost * ~small) * volts + 0.5 * rng.standard_normal(4000)
         gain = float(speed @ volts / (volts @ volts))
-        errors = model_error.Regression(
+        errors = effect_regression.Regression(
             (speed - gain * volts) / 0.5, np.zeros((4000, 0)), np.zeros((4000, 0)),
             np.zeros((1, 0)), np.arange(4000) * 40 // 4000, [], volts[:, None] / 0.5, 1,
             {"size of the voltage": np.where(small, -1.0, 1.0)},
@@ -125,14 +125,14 @@ def test_numbers_that_hang_on_the_size_of_the_voltage_cover_both_sizes():
             assert 0.1 < float(np.sqrt(wider.added[0, 0])) < 1.0
 
 
-def error_with(deviations: float, seed: int) -> model_error.Regression:
+def error_with(deviations: float, seed: int) -> effect_regression.Regression:
     """White errors that show an effect by so many deviations; a unit of it moves a number by 1."""
     rng = np.random.default_rng(seed)
     shape, error = rng.standard_normal((2, 4000))
     shape /= np.linalg.norm(shape)
     if deviations:
         error += (deviations - shape @ error) * shape
-    return model_error.Regression(
+    return effect_regression.Regression(
         error, shape[:, None], shape[:, None], np.ones((1, 1)), np.arange(4000) * 40 // 4000,
         [(EFFECTS[0], (0,))], np.zeros((4000, 0)), 1,
     )  # fmt: skip
@@ -143,7 +143,7 @@ def held_against(deviations: float, value: float = 30.0, seed: int = 5):
     return found_of(error_with(deviations, seed), numbers)
 
 
-def found_of(errors: model_error.Regression, numbers: list[adequacy.Stated]):
+def found_of(errors: effect_regression.Regression, numbers: list[adequacy.Stated]):
     """Return the findings of white errors, and the move that is neither shown nor excluded."""
     shown, possible = adequacy.lacking(errors, white=True)
     notes, move = adequacy.farthest_possible(possible, numbers, 0.005)

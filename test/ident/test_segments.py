@@ -8,9 +8,17 @@ import numpy as np
 import pytest
 
 from smp_motor_ident.diagnosis import refusal
+from smp_motor_ident.diagnosis.adequacy import lacking
+from smp_motor_ident.diagnosis.model_error import regression
 from smp_motor_ident.errors import SignalError
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.estimation import segments
+from smp_motor_ident.estimation.fit import Options
+from smp_motor_ident.estimation.initialisation import initial_fit
+from smp_motor_ident.estimation.segments import heterogeneous
+from smp_motor_ident.likelihood.experiments import prepare
+from smp_motor_ident.likelihood.first_order_lag import lagged
+from smp_motor_ident.model.structures import FirstOrder
 from smp_motor_ident.record import Record
 
 
@@ -201,3 +209,20 @@ def test_repeats_of_a_step_whose_friction_changes_scatter_no_more_than_their_int
     assert scatter < steady.std < 1.5 * scatter
     same = [_one_step(gain, tau, 8.0, n) for n in range(8)]
     assert not any(f.code == "motor_changes" for f in estimate(same, "first_order").findings)
+
+
+def test_what_differs_from_day_to_day_is_no_effect_of_the_voltages_that_they_had() -> None:
+    rng = np.random.default_rng(0)
+    days = []
+    for top in (3.0, 4.5, 6.0, 7.5, 9.0):
+        gain, friction = 2.8 * (1 + 0.02 * rng.standard_normal()), rng.normal(0.22, 0.06)
+        v, noise = np.repeat(rng.choice([0.3, 1.0], 150), 10) * top, rng.standard_normal(1500)
+        w = lagged(gain * np.maximum(v - friction, 0.0), 2.0) + 0.02 * gain * top * noise
+        days.append(Record("motor", 0.02 * np.arange(1500), v, velocity=w))
+    data = prepare(days, False)
+    fit = initial_fit(data, FirstOrder(), Options())
+    assert fit is not None
+    fit, change = heterogeneous(data, fit)
+    assert change.std
+    alike, apart = (regression(data, fit, 1.0, changing) for changing in (False, True))
+    assert lacking(alike, True)[0] and not lacking(apart, True)[0]
