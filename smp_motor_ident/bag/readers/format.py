@@ -66,7 +66,10 @@ class Tables(Source):
     def _check(self, fields: Sequence[str], there: Collection[str]) -> None:
         for name in fields:
             if name not in there:
-                raise BagError(f"{self.path}: has no column {name!r}; it has {', '.join(there)}")
+                raise BagError(
+                    f"{self.path}: has no column {name!r}; it has {', '.join(there)}: map one of "
+                    "these in its place, or leave that signal out for all files"
+                )
 
 
 class ColumnFile(Tables):
