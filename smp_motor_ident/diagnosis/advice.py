@@ -7,6 +7,7 @@ import numpy as np
 
 from smp_motor_control.motor.parameters import PHYSICAL
 from smp_motor_ident.diagnosis import limits
+from smp_motor_ident.diagnosis.sample_limits import FIT_WITHOUT_NOISE
 from smp_motor_ident.diagnosis.sensors import sensors
 from smp_motor_ident.diagnosis.validation import within_resolution
 from smp_motor_ident.estimation import prediction, shape_constraint
@@ -28,7 +29,7 @@ def assess(data: Experiments, fit: Fit, percent: FitPercent, tests: ResidualTest
     """
     return [
         *_descent(data, fit),
-        *_fit(percent, tests, within_resolution(data, fit)),
+        *_fit(percent, tests, within_resolution(data, fit), fit.noise_ratio > 0),
         *_resolution(data, fit, tests),
         *sensors(data, fit),
         *_second_lag(data, fit),
@@ -84,14 +85,23 @@ def _descent(data: Experiments, fit: Fit) -> Iterator[Finding]:
     )
 
 
-def _fit(percent: FitPercent, tests: ResidualTests, closely: bool) -> Iterator[Finding]:
+def _fit(
+    percent: FitPercent, tests: ResidualTests, closely: bool, noisy: bool
+) -> Iterator[Finding]:
+    """Judge the share of the motion that a model explains.
+
+    ``closely``: as far as its sensor lets anything; ``noisy``: a torque noise explains the rest.
+    """
     estimation, validation = percent.estimation or 0.0, percent.validation
-    if estimation < limits.FIT_EXPLAINS.value and not closely:
+    no_noise = tests.white is False and not noisy
+    least = (FIT_WITHOUT_NOISE if no_noise else limits.FIT_EXPLAINS).value
+    if estimation < least and not closely:
         yield Finding(
             "poor_fit",
             "unreliable",
-            f"the model explains only {estimation:.0f} % of the speed",
-            {"fit_percent": estimation, "limit": limits.FIT_EXPLAINS.value},
+            f"the model explains only {estimation:.0f} % of the speed"
+            + (", and the rest is no noise" if no_noise else ""),
+            {"fit_percent": estimation, "limit": least},
             "look for what else drives the motor; record what the driver really puts out",
         )
     if validation is not None and validation < estimation - limits.FIT_HOLDS.value:

@@ -78,3 +78,9 @@ ORDINARY_BEND = Limit(
     "stall current; a transistor's 0.2 V of 12 V: every drive has one of them",
     "test_adequacy.py: what hides in the motors own numbers is no larger than ordinary",
 )  # fmt: skip
+FIT_WITHOUT_NOISE = Limit(
+    90.0, "% of the speed",
+    "a tenth of the motion that neither a sensor's nor a torque's noise explains is the model's "
+    "error, and its numbers are off by as much",
+    "test_findings.py",
+)  # fmt: skip

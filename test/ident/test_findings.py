@@ -48,19 +48,22 @@ def test_every_limit_names_a_test_that_exists() -> None:
 
 
 @pytest.mark.parametrize(
-    ("percent", "independent", "codes"),
+    ("percent", "white", "independent", "noisy", "codes"),
     [
-        (FitPercent(71.0, 70.0), True, []),
-        (FitPercent(69.0, 69.0), True, ["poor_fit"]),
-        (FitPercent(90.0, 74.0), True, ["validation"]),
-        (FitPercent(94.0, 94.0), False, ["residual_follows_voltage"]),
-        (FitPercent(96.0, 96.0), False, []),
+        (FitPercent(71.0, 70.0), True, True, False, []),
+        (FitPercent(69.0, 69.0), True, True, False, ["poor_fit"]),
+        (FitPercent(89.0, 89.0), False, True, False, ["poor_fit"]),  # no noise explains the rest
+        (FitPercent(89.0, 89.0), False, True, True, []),  # a torque's noise does
+        (FitPercent(91.0, 91.0), False, True, False, []),
+        (FitPercent(90.0, 74.0), True, True, False, ["validation"]),
+        (FitPercent(94.0, 94.0), True, False, False, ["residual_follows_voltage"]),
+        (FitPercent(96.0, 96.0), True, False, False, []),
     ],
 )
 def test_a_fit_is_judged_by_what_it_explains_and_whether_that_holds(
-    percent: FitPercent, independent: bool, codes: list[str]
+    percent: FitPercent, white: bool, independent: bool, noisy: bool, codes: list[str]
 ) -> None:
-    found = _fit(percent, ResidualTests(True, independent), closely=False)
+    found = _fit(percent, ResidualTests(white, independent), closely=False, noisy=noisy)
     assert [f.code for f in found] == codes
 
 
