@@ -31,7 +31,7 @@ from smp_motor_ident.diagnosis.model_error import motions, regression, signals
 from smp_motor_ident.diagnosis.noise_or_effect import in_place_of_noise
 from smp_motor_ident.diagnosis.residuals import residual_tests
 from smp_motor_ident.estimation import data_window
-from smp_motor_ident.estimation.consider_covariance import consider_hold
+from smp_motor_ident.estimation.consider_covariance import consider_current_lag, consider_hold
 from smp_motor_ident.estimation.descent import refine
 from smp_motor_ident.estimation.fit import Fit, Options
 from smp_motor_ident.finding import Finding
@@ -65,6 +65,8 @@ def held_against_effects(
     wide = fit if move is None else fit.along(move)
     if shown:
         wide = consider_hold(data, wide)
+    if any(e[0].effect.code == "current_lag" for e in shown):
+        wide = consider_current_lag(wide)
     move = _move(begin, wide, gear, said, options) if grave else None
     wide = wide if move is None else wide.along(move)
     answer, beside = widened_by_misfit(data, wide, said)

@@ -65,6 +65,15 @@ def consider_hold(data: Experiments, fit: Fit) -> Fit:
     return fit.along(s.of_free(direction(**dict.fromkeys(lags, longer))))
 
 
+def consider_current_lag(fit: Fit) -> Fit:
+    """Return the fit with its covariance widened by a lag of the current that is not its own.
+
+    What is late in the current is L/R, or its sensor's: where more of that shows than the model
+    has, nothing is known of the winding's but its size.
+    """
+    return fit.along(fit.structure.of_free(direction(ln_a2=1.0, ln_te=1.0)))
+
+
 def consider_clock(data: Experiments, fit: Fit, share: float) -> Fit:
     """Return the fit with its covariance widened by a clock that is known to a share only.
 
