@@ -226,7 +226,8 @@ def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) 
             left.append(replace(one, reason=f"refused: {refusal}", whole=False))
     assert refused is not None
     # A load hides what the others are: with it in every candidate they may be found.
-    loaded = None if request.loaded else _tried(group, replace(request, loaded=True), found)
+    again = not (request.loaded or request.within)
+    loaded = _tried(group, replace(request, loaded=True), found) if again else None
     if loaded and not loaded.unreliable:
         return loaded
     raise refused

@@ -49,6 +49,11 @@ class Request:
         return Options(huber=LOSSES[self.loss])
 
     @property
+    def within(self) -> bool:
+        """Whether it is asked of a motor behind a driver, or without what disturbed it."""
+        return self.driver is not None or not self.since
+
+    @property
     def may_leave_current(self) -> bool:
         """Whether an answer without the current is an answer to what was asked."""
         return self.use_current and self.model == "auto" and not self.bounds
