@@ -186,7 +186,7 @@ def on_beat(record: Record) -> Record:
     Stamps of one's own may be the samples' instants: the motion tells.
     """
     steps = np.diff(record.time)
-    if np.ptp(steps) < BEAT_JITTER.value * float(np.median(steps)):
+    if np.ptp(steps) < BEAT_JITTER.value * record.sample_time:
         return record
     arrival = np.rint(record.time * 1e9).astype(np.int64)
     motion = next(
@@ -236,7 +236,8 @@ def merge_bunches(record: Record) -> Record:
     if not within.any():
         return record
     near = BUNCHED.value * float(step[within].mean())
-    if float(np.median(step[within])) >= near:
+    usual = record.sample_time if within.all() else float(np.median(step[within]))
+    if usual >= near:
         return record
     last = np.append((step >= near) | ~within, True)
     kept = np.flatnonzero(last)
@@ -279,7 +280,7 @@ def bridged(record: Record) -> Record:
         return record
     edges = [*record.starts, len(record)]  # segments may each have a rate of their own
     inside = [step[min(a, max(b - 2, 0)) : max(b - 1, 1)] for a, b in pairwise(edges)]
-    usual = [np.median(part) for part in inside]
+    usual = [np.median(part) for part in inside] if len(inside) > 1 else [record.sample_time]
     share = step / np.repeat(usual, np.diff(edges))[:-1]
     whole = np.rint(share)
     regular = np.abs(share - whole) < REGULAR
