@@ -313,8 +313,6 @@ def _through_driver(
     hollow = any(f.code in emptied for f in e.findings)  # little is left of what was recorded
     fails = any(f.severity == "unreliable" and not blames_current(f) for f in e.findings)
     fails = fails or (leaves_torque_noise(e, fit) and not beside)
-    # Behind the effect that there is no more of it is shown.
-    fails = fails or any(map(driver.shows_again, e.findings))
     return (None if fails or hollow else through(e, driver)), driver
 
 

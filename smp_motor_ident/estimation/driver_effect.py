@@ -92,10 +92,6 @@ class DriverFit:
         least = min((evidence(plain, self.fit, c) for c in bent if c in both), default=math.inf)
         return least > price * self.effect.numbers
 
-    def shows_again(self, finding: Finding) -> bool:
-        """Tell whether a finding about the motor behind the driver is more of the same effect."""
-        return finding.code == self.effect.code and "explained_deviance" in finding.evidence
-
     def widened(self, fit: Fit) -> Fit:
         """Return a fit with its covariance widened by what is not known of the driver."""
         moves = self.search.moves(fit)

@@ -1,16 +1,12 @@
 """A voltage drop over brushes: told from friction by what brakes, and by nothing else."""
 
-from dataclasses import replace
-
 import numpy as np
 
-from smp_motor_ident.estimation.driver_effect import DriverFit
 from smp_motor_ident.estimation.driver_search import _Profile
 from smp_motor_ident.estimation.fit import Options
 from smp_motor_ident.estimation.initialisation import initial_fit
-from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import prepare
-from smp_motor_ident.model.driver import CLIP, DEAD_ZONE, DROP, EFFECTS, Driver
+from smp_motor_ident.model.driver import DEAD_ZONE, DROP, EFFECTS
 from smp_motor_ident.model.structures import FirstOrder
 from smp_motor_ident.record import Record
 
@@ -43,14 +39,3 @@ def test_a_motor_that_never_brakes_runs_behind_a_drop_as_behind_a_dead_zone():
         if effect.kind in (DROP, DEAD_ZONE)
     }
     assert abs(explained[DROP] - explained[DEAD_ZONE]) < 10.0
-
-
-def test_a_driver_behind_which_more_of_its_effect_shows_is_not_what_was_there():
-    group, clip = _steps(0), next(e for e in EFFECTS if e.kind == CLIP)
-    fit = initial_fit(prepare(group, False), FirstOrder(), Options())
-    assert fit is not None
-    profile = _Profile(group, "held", fit, Options(), clip)
-    found = DriverFit(clip, Driver(CLIP, 8.0), 0.1, group, group, profile, fit)
-    shown = Finding("clip", "note", "shown again", {"explained_deviance": 200.0})
-    assert found.shows_again(shown) and not found.shows_again(replace(shown, code="drag"))
-    assert not found.shows_again(replace(shown, evidence={"p_value": 0.01}))  # not excluded
