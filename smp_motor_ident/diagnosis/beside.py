@@ -4,7 +4,8 @@ A regression of the model's error names an effect and its size at the estimate. 
 what is given to the model the motor is fitted again, and its error may show a rest of the effect
 (Gauss-Newton steps) or another one.  Where, after a few of them, nothing that is shown moves a
 number beyond its interval, the first estimate was off by as much as these moved it: with that move
-as a standard deviation its intervals hold the motor.  Where something stays, nobody knows how much.
+as a standard deviation, and with the farthest by any other effect that is shown, its intervals hold
+the motor.  Where something stays, nobody knows how much.
 
 References
 ----------
@@ -68,7 +69,9 @@ def held_against_effects(
     if any(e[0].effect.code == "current_lag" for e in shown):
         wide = consider_current_lag(wide)
     move = _move(begin, wide, gear, said, options) if grave else None
-    wide = wide if move is None else wide.along(move)
+    if move is not None:  # and by what else is shown, of which any may be the one
+        other = farthest_possible([e for alike in shown for e in alike], numbers, data.step)[1]
+        wide = wide.along(move) if other is None else wide.along(move).along(other)
     answer, beside = widened_by_misfit(data, wide, said)
     held = stated(wide, answer[0])
     named = (

@@ -200,6 +200,18 @@ def test_a_motor_at_rest_turns_by_no_rounding_error():
     assert not motion.speed[: size // 2].any() and motion.speed[-1] == motion.fastest == 30.0
 
 
+def test_what_any_effect_that_is_shown_would_move_is_in_the_intervals(monkeypatch) -> None:
+    """Fitted beside the likeliest of them a motor may stay where it is; the others are as real."""
+    monkeypatch.setattr("smp_motor_ident.estimate.likeliest", lambda *_: None)
+    monkeypatch.setattr(beside, "_move", lambda _, fit, *__: np.zeros(len(fit.structure.free)))
+    found = estimate(commanded(top=6.0))
+    shown = [f for f in found.findings if f.evidence.get("shift_std", 0.0) > 2]
+    assert shown
+    for finding in shown:
+        quantity = found.combinations[finding.evidence["quantity"]]
+        assert quantity.std > 0.99 * finding.evidence["shift_share"] * abs(quantity.value)
+
+
 def test_an_effect_is_held_against_the_intervals_that_are_stated(monkeypatch) -> None:
     """What moves a number beyond the likelihood's interval may be within that of the answer."""
     record = commanded(top=6.0)
