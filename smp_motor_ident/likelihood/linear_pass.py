@@ -94,10 +94,8 @@ def march(
     te, k, be = par[TE], par[K], par[BE]
     back = k if te > 0.0 else k + be
     step, q, w, th, cq, cw, cth = x[0], x[1], x[2], x[3], x[4], x[5], x[6]
-    if abs(q) + abs(w) < DECAYED:
-        q = w = 0.0
-    if abs(cq) + abs(cw) < DECAYED:
-        cq = cw = 0.0
+    if abs(q) + abs(w) + abs(cq) + abs(cw) < DECAYED:
+        q = w = cq = cw = 0.0
     pq, pw, pth, rq, rw, rth = x[7], x[8], x[9], x[10], x[11], x[12]
     fades = abs(pw) > GONE * abs(x[13]) or abs(pq) > GONE
     fades = fades or abs(rq) > GONE * abs(x[14]) or abs(rw) > GONE
@@ -174,8 +172,7 @@ def squares_sliding(
 ) -> tuple[float, float]:
     """Return the sum of squared residuals and their number; note speed and output, if asked."""
     row, table = np.zeros(NUMBERS), tabulate(usual, par)
-    step = -1.0
-    total = count = 0.0
+    step, total, count = -1.0, 0.0, 0.0
     e00 = e01 = e10 = e11 = h0 = h1 = v0 = v1 = v2 = 0.0
     for g in range(starts.shape[0] - 1):
         first = starts[g]
@@ -275,15 +272,13 @@ def _gather(tile: Array, m: int, rows: Integers, squares: Array, scores: Array) 
 @compiled
 def _answer(tile: Array, c: Array, rows: Integers, answers: Array) -> None:
     """Put the sensitivities of the tile's samples, shape (m, p), from the basis."""
-    one = np.empty(TILE)
     for j in range(answers.shape[1]):
-        one[:] = 0.0
-        for a in range(rows.shape[0]):
-            signal, share = tile[rows[a]], c[rows[a], j]
+        one = np.zeros(TILE)
+        for row in rows:
+            share, signal = c[row, j], tile[row]
             for i in range(TILE):
                 one[i] += share * signal[i]
-        for i in range(answers.shape[0]):
-            answers[i, j] = one[i]
+        answers[:, j] = one[: answers.shape[0]]
 
 
 @compiled
@@ -391,8 +386,7 @@ def run_sliding(
                     rows = _rows(angle, loaded, False)
                 spread[3] += there
                 total += _gather(tile, end - begin, rows, squares, scores)
-                if answers.shape[0] > 0:
-                    _answer(tile, c, rows, answers[begin:end, 0])
+                _answer(tile, c, rows, answers[begin:end, 0])
                 begin = end
             for j in range(p):
                 score = 0.0

@@ -10,7 +10,7 @@ import pytest
 
 from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.estimation import driver_search, fast_decay
+from smp_motor_ident.estimation import fast_decay
 from smp_motor_ident.estimation.driver_effect import (
     DriverFit,
     driver_of,
@@ -394,9 +394,3 @@ def test_a_second_lag_that_nothing_shows_ends_at_a_thousandth_of_a_row():
     found = problem.descend(problem.start(motor, coasting), 3)
     z, _, _ = problem.unpacked(found.x)
     assert z.a2 / z.a1 > 0.9e-3 * STEP
-
-
-def test_a_size_of_which_nothing_is_known_is_tried_no_further_than_it_was_searched(monkeypatch):
-    monkeypatch.setattr(driver_search, "sandwich_factor", lambda _: 1e9)
-    found = estimate(recorded("clip_voltage", 0))  # an infinite size would be a RuntimeWarning
-    assert "clip_voltage" not in {n for n, q in found.combinations.items() if q.value is not None}

@@ -78,30 +78,6 @@ def test_a_single_level_of_voltage_gives_one_combination(rest):
     assert percent(measured, simulated) > 90
 
 
-def test_a_gain_that_came_out_at_the_upper_end_of_what_it_may_be_is_not_known():
-    """A step from rest tells the gain times what friction leaves of the voltage, and no more."""
-    gain, tau, friction = 11.45, 0.1967, 0.294
-    t = np.arange(60) / 20.0
-    voltage = np.where(t > 0.5, 4.8, 0.0)
-    on = np.maximum(t - 0.5, 0.0)
-    angle = gain * (4.8 - friction) * (on - tau * (1 - np.exp(-on / tau)))
-    step = 2 * np.pi / 1024
-    speed = np.diff(np.floor(angle / step), prepend=0.0) * step * 20.0
-    found = estimate(Record("motor", t, voltage, velocity=speed))
-    assert found.combinations["dc_gain"].value is None
-    steady = found.combinations["steady_speed"]
-    assert abs(steady.value - gain * (4.8 - friction)) < 4 * steady.std < 1.0
-
-
-def test_one_coast_tells_gain_from_friction_among_steps_to_one_level():
-    up = _record(np.full(60, 8.0), 40.0)
-    coast = _record(np.r_[np.full(60, 8.0), np.zeros(30)], 40.0)
-    found = estimate([up] * 3 + [coast] + [up] * 3)
-    for name in ("dc_gain", "static_voltage"):
-        q = found.combinations[name]
-        assert abs(q.value - TRUTH[name]) < 4 * q.std < TRUTH[name]  # one in 16,000
-
-
 def test_friction_that_delays_the_first_motion_is_in_the_lags_of_one_step():
     # From rest the winding first builds up the torque that friction holds: 0.6 V of 8 V are a
     # delay of 1.5 ms, which another winding and no friction explain as well.

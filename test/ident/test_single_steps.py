@@ -1,0 +1,39 @@
+"""A step from rest to one level of voltage: what it tells, and what it does not."""
+
+import numpy as np
+
+from smp_motor_ident.estimate import estimate
+from smp_motor_ident.record import Record
+
+
+def test_a_gain_that_came_out_at_the_upper_end_of_what_it_may_be_is_not_known():
+    """A step from rest tells the gain times what friction leaves of the voltage, and no more."""
+    gain, tau, friction = 11.45, 0.1967, 0.294
+    t = np.arange(60) / 20.0
+    voltage = np.where(t > 0.5, 4.8, 0.0)
+    on = np.maximum(t - 0.5, 0.0)
+    angle = gain * (4.8 - friction) * (on - tau * (1 - np.exp(-on / tau)))
+    step = 2 * np.pi / 1024
+    speed = np.diff(np.floor(angle / step), prepend=0.0) * step * 20.0
+    found = estimate(Record("motor", t, voltage, velocity=speed))
+    assert found.combinations["dc_gain"].value is None
+    steady = found.combinations["steady_speed"]
+    assert abs(steady.value - gain * (4.8 - friction)) < 4 * steady.std < 1.0
+
+
+def _step(rows: int, seed: int) -> Record:
+    """Return 1.5 s at 8 V, from rest to a steady speed, and so many rows without voltage."""
+    gain, tau, friction = 15.0, 0.12, 2.0
+    t = np.arange(60 + rows) / 40.0
+    up = gain * (8.0 - friction) * (1 - np.exp(-t / tau))
+    down = (up[59] + gain * friction) * np.exp(-(t - t[59]) / tau) - gain * friction
+    speed = np.where(t <= t[59], up, np.maximum(down, 0.0))
+    noise = 0.5 * np.random.default_rng(seed).standard_normal(t.size)
+    return Record("motor", t, np.where(t <= t[59], 8.0, 0.0), velocity=speed + noise)
+
+
+def test_one_coast_tells_gain_from_friction_among_steps_to_one_level():
+    found = estimate([_step(30 if n == 3 else 0, n) for n in range(7)])
+    for name, true in (("dc_gain", 15.0), ("static_voltage", 2.0)):
+        q = found.combinations[name]
+        assert abs(q.value - true) < 4 * q.std < true  # one in 16,000
