@@ -216,6 +216,7 @@ def _rest(c: Case, level: int) -> None:
     c.stamps["rest"] = (2.0, 5.0, 10.0)[level]
 
 
+ONE_STEP = "one_size_of_step"  # which hides how slowly it lets it rise
 ONE_SIZE = "one_size_of_voltage"  # which hides what a driver takes of the voltage
 SPEED = ("speed",)
 COUNTED = ("counts", "angle")
@@ -234,7 +235,7 @@ EFFECTS = (
     Effect("coast in every PWM period", _pwm, ("coast", ONE_SIZE)),
     Effect("coast at zero command", _drive("coast_zero", (1.0, 1.0, 1.0)), ("coast",)),
     Effect("slew limit", lambda c, n: c.drive.update(
-        slew=c.amplitude / ((0.3, 1.0, 3.0)[n] * c.tau)), ("slew", "lag", ONE_SIZE)),
+        slew=c.amplitude / ((0.3, 1.0, 3.0)[n] * c.tau)), ("slew", "lag", ONE_SIZE, ONE_STEP)),
     Effect("driver clock", _stamps("driver", (0.37, 0.83, 1.9), _step), ("timing", "lag")),
     Effect("command delay", _stamps("delay", (0.5, 1.5, 4.2), _step), ("delay", "lag")),
     Effect("two topics", _stamps("topics", (0.2, 0.6, 1.5), _step), ("timing", "lag")),

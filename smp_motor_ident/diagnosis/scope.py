@@ -24,6 +24,7 @@ from smp_motor_ident.record import Record
 from smp_motor_ident.result import Estimate
 
 FEWEST_SWINGS = 6  # of which it can be said that they are alike
+OFTEN = 0.2  # of the rows: a command that changes in more of them makes no steps
 
 
 def scope(
@@ -34,7 +35,7 @@ def scope(
     group: Sequence[Record],
 ) -> Iterator[Finding]:
     """Yield what a reader must know of the values' meaning."""
-    yield from _one_size_of_voltage(one_size_or_swing(data))
+    yield from _one_size_of_voltage(one_size_or_swing(data)) or _one_size_of_step(_one_step(data))
     if not result.level:
         yield from _one_direction(data, result)
     if alike:
@@ -137,7 +138,34 @@ def _one_swing(data: Experiments) -> float:
     return peak if float(alike.mean()) > 1 - SAME_LEVEL.value else 0.0
 
 
-def _one_size_of_voltage(top: float) -> Iterator[Finding]:
+def _one_step(data: Experiments) -> float:
+    """Return the size of a voltage's steps where they have only one, else 0."""
+    change = np.abs(np.diff(data.levels))
+    steps = change[change > REST.value * float(np.abs(data.levels).max())]
+    if not FEWEST_SWINGS <= steps.size < OFTEN * change.size:
+        return 0.0
+    size = float(np.median(steps))
+    alike = np.abs(steps - size) < SAME_LEVEL.value * size
+    return size if float(alike.mean()) > 1 - SAME_LEVEL.value else 0.0
+
+
+def _one_size_of_step(size: float) -> list[Finding]:
+    """Say what steps of one size cannot show: a ramp that is as long at each is a lag."""
+    if not size:
+        return []
+    return [
+        Finding(
+            "one_size_of_step",
+            "warning",
+            f"every step of the voltage has one size, {size:.3g} V: a driver that lets it rise "
+            "slowly is as late at each of them, and looks like a delay, a lag or a filter",
+            {"voltage": size},
+            "record the voltage at the motor's terminals, or add steps of other sizes",
+        )
+    ]
+
+
+def _one_size_of_voltage(top: float) -> list[Finding]:
     """Say what a voltage of one size both ways, or of one swing, cannot show.
 
     With a size U a driver that takes a share of it (a dead zone, a drop, a clip, pulses) is the
@@ -146,17 +174,19 @@ def _one_size_of_voltage(top: float) -> Iterator[Finding]:
     gain of the fundamental (its describing function), and the motor hides the harmonics.
     """
     if not top:
-        return
-    yield Finding(
-        "one_size_of_voltage",
-        "warning",
-        f"the voltage has one size, {top:.3g} V: a driver that puts out less of it (a dead "
-        "zone, a drop, a clip at the supply, coasting between its pulses) or lets it rise "
-        "slowly, and a drag by the square of the speed, look like a motor of another gain or "
-        "lag; the numbers hold for the voltage as it was recorded",
-        {"voltage": top},
-        "record the voltage at the motor's terminals, or add levels of other sizes",
-    )
+        return []
+    return [
+        Finding(
+            "one_size_of_voltage",
+            "warning",
+            f"the voltage has one size, {top:.3g} V: a driver that puts out less of it (a dead "
+            "zone, a drop, a clip at the supply, coasting between its pulses) or lets it rise "
+            "slowly, and a drag by the square of the speed, look like a motor of another gain or "
+            "lag; the numbers hold for the voltage as it was recorded",
+            {"voltage": top},
+            "record the voltage at the motor's terminals, or add levels of other sizes",
+        )
+    ]
 
 
 def _one_direction(data: Experiments, result: Answer) -> Iterator[Finding]:

@@ -3,6 +3,7 @@
 import numpy as np
 
 from smp_motor_ident.estimate import estimate
+from smp_motor_ident.likelihood.first_order_lag import lagged
 from smp_motor_ident.record import Record
 
 
@@ -37,3 +38,15 @@ def test_one_coast_tells_gain_from_friction_among_steps_to_one_level():
     for name, true in (("dc_gain", 15.0), ("static_voltage", 2.0)):
         q = found.combinations[name]
         assert abs(q.value - true) < 4 * q.std < true  # one in 16,000
+
+
+def test_steps_of_one_size_say_that_a_ramp_of_the_driver_would_not_show():
+    """A ramp that is as long at every step is a mean over that time, as a sensor's may be."""
+    rng, tau = np.random.default_rng(4), 0.02
+    for sizes, said in (((2.0,), True), ((1.0, 2.0, 4.0), False)):
+        steps = rng.choice(sizes, 24) * np.r_[np.ones(12), -np.ones(12)]
+        command = np.repeat(np.r_[0.0, np.cumsum(steps)], 100)
+        speed = lagged(8.0 * command, tau / 0.005) + 0.3 * rng.standard_normal(command.size)
+        t = 0.005 * np.arange(command.size)
+        codes = [f.code for f in estimate(Record("motor", t, command, velocity=speed)).findings]
+        assert ("one_size_of_step" in codes) is said and "one_size_of_voltage" not in codes
