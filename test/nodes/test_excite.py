@@ -69,8 +69,8 @@ def test_a_wheel_that_is_too_fast_or_is_not_heard_ends_the_signal(process, robot
     last = robot.commands["rear_left"]
     eventually(lambda: not last or last[-1].voltage == 0.0, 3.0, robot.spin, "no zero command")
     last.clear()
-    excite = process(*square, "-p", "wheels:=[rear_left]")
-    # Two seconds, in which it has heard the wheel, too.
+    excite = process(*square, "-p", "wheels:=[rear_left]", "-p", "duration:=60.0")
+    # Two seconds, in which it has heard the wheel, too; it would go on for longer than that waits.
     eventually(lambda: len(last) > 200, 20.0, robot.spin, excite.output)
     plant.send_signal(signal.SIGKILL)
     eventually(lambda: excite.returncode is not None, 20.0, robot.spin, excite.output)
