@@ -15,6 +15,7 @@ from smp_motor_ident.diagnosis.identifiability import what_next
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.estimation.consider_covariance import (
     above_zero,
+    consider_current_lag,
     consider_hold,
     consider_left_out,
     mean_square,
@@ -27,7 +28,7 @@ from smp_motor_ident.estimation.quantisation import widened
 from smp_motor_ident.estimation.thinning import thinned
 from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.model.measurement import ANGLE
-from smp_motor_ident.model.structures import FirstOrder, SecondOrder
+from smp_motor_ident.model.structures import Electromechanical, FirstOrder, SecondOrder
 from smp_motor_ident.record import Hardware, Record
 
 
@@ -334,3 +335,14 @@ def test_a_second_lag_hangs_on_how_a_command_ran_between_its_rows():
     # Anything from none to half a row: the root of the mean square of that is half over root 3.
     np.testing.assert_allclose(lag, 0.5 * data.step / np.sqrt(3))
     assert np.count_nonzero(added) == 1
+
+
+def test_a_current_that_is_later_than_its_model_leaves_the_windings_lag_unknown():
+    """L/R and a sensor's lag are one lag of the current: an e-fold of it is no value."""
+    data = prepare([motors.record("rear_left", seconds=2.0)], True)
+    fit = initial_fit(data, Electromechanical(), Options())
+    assert fit is not None
+    added = consider_current_lag(fit).added
+    assert added is not None
+    moved = dict(zip(fit.structure.free, np.sqrt(np.diag(added)), strict=True))
+    assert {name: m for name, m in moved.items() if m} == {"ln_a2": 1.0, "ln_te": 1.0}

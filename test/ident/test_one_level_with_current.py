@@ -7,7 +7,7 @@ from independent import simulate
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.estimation.fit import Options
 from smp_motor_ident.estimation.initialisation import initial_fit
-from smp_motor_ident.estimation.profile import one_level
+from smp_motor_ident.estimation.profile import _range, one_level, profiled
 from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.model.structures import Electromechanical
 from smp_motor_ident.record import Hardware, Record
@@ -148,3 +148,12 @@ def test_viscous_friction_that_came_out_negative_is_no_reason_to_refuse(seed: in
     assert low < k / (k * k + r * b) < high < 1.01 / k
     lag = found.combinations["time_constant"]
     assert abs(lag.value - (r * j + el * b) / (r * b + k * k)) < 4 * lag.std < 0.1 * lag.value
+
+
+def test_no_time_at_which_a_motor_breaks_loose_tells_its_friction() -> None:
+    """Sensors, clocks and stiction are late as well: friction is followed to both of its bounds."""
+    data = prepare([_step(0)], True)
+    fit = initial_fit(data, Electromechanical(friction="symmetric"), Options())
+    assert fit is not None
+    found = {p.coordinate: p for p in profiled(data, fit, Options()).profiles}["vc_plus"]
+    assert [z.vc_plus for z in found.ends] == pytest.approx(_range(data, fit, "vc_plus"))
