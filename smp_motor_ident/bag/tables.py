@@ -147,8 +147,8 @@ def apart(
             own = [labels[int(n)] if labels else f"motor_{n:g}" for n in numbers]
             own = [re.sub(r"\W+", "_", name).strip("_") for name in own]
             text = f"{recording.name}: {column} tells {len(own)} motors apart: {', '.join(own)}"
-            told = found("several_motors", text, motors=len(own))
-            motors = [_rows(tables[topic], of == n, told) for n in numbers]
+            finding = found("several_motors", text, motors=len(own))
+            motors = [_rows(tables[topic], of == n, finding) for n in numbers]
             before = "" if wheel == DEFAULT_MOTOR else f"{wheel}_"
             return [(before + n, {**tables, topic: rows}) for n, rows in zip(own, motors)]
     return [(wheel, tables)]
@@ -161,11 +161,11 @@ def _telling(recording: Recording, topic: str) -> dict[str, tuple[str, ...]]:
     return {name: own for name, own in words.items() if tells_motors(name, own)}
 
 
-def _rows(table: Table, which: Flags, told: Finding) -> Table:
+def _rows(table: Table, which: Flags, finding: Finding) -> Table:
     """Return some rows of a table as they are in the file."""
     columns = {name: column[which] for name, column in table.columns.items()}
     log = None if table.log is None else table.log[which]
-    return replace(table, log=log, columns=columns, findings=[*table.findings, told])
+    return replace(table, log=log, columns=columns, findings=[*table.findings, finding])
 
 
 def timed(recording: Recording, plan: MotorMap, tables: Mapping[str, Table]) -> dict[str, Table]:

@@ -61,4 +61,5 @@ def test_ten_steps_in_one_fit_tell_the_friction_that_their_steady_speeds_do():
     # Lines through the five steady speeds of each way: 13.9 and 14.5 rad/s/V, 1.07 and 1.15 V.
     for name, known in (("dc_gain", 14.2), ("static_voltage", 1.11)):
         q = result.combinations[name]
-        assert q.value == pytest.approx(known, rel=0.2) and abs(q.value - known) < 2 * q.std
+        # The two ways differ by 4 and 7 % themselves.
+        assert q.value == pytest.approx(known, rel=0.1) and abs(q.value - known) < 2 * q.std
