@@ -153,6 +153,12 @@ def _line(number: Array, value: Array) -> tuple[float, float]:
     return value[i] - slope * number[i], slope
 
 
+def _rounds(beat: Beat, arrival: Integers) -> bool:
+    """Tell whether arrivals are the beat rounded to the multiples that their stamps have."""
+    multiple = int(np.gcd.reduce(np.diff(arrival)))
+    return int(np.ptp(arrival - beat.time)) <= multiple
+
+
 def moves_on(beat: Beat, arrival: Integers, motion: Array) -> bool:
     """Return whether a motion was sampled on the beat, rather than when its samples arrived.
 
@@ -183,7 +189,8 @@ def _off_line(time: Integers, value: Array) -> Array:
 def on_beat(record: Record) -> Record:
     """Return a record whose stamps came late on the beat of its sender; any other as it is.
 
-    Stamps of one's own may be the samples' instants: the motion tells.
+    Stamps of one's own may be the samples' instants: the motion tells, but where all that they
+    differ by is their rounding.
     """
     steps = np.diff(record.time)
     if np.ptp(steps) < BEAT_JITTER.value * record.sample_time:
@@ -197,7 +204,7 @@ def on_beat(record: Record) -> Record:
     beat = find_beat(arrival)
     if beat is None:
         return record
-    if not beat.repeated and not moves_on(beat, arrival, motion):
+    if not (beat.repeated or _rounds(beat, arrival) or moves_on(beat, arrival, motion)):
         return record
     period, latency = beat.period * 1e-9, beat.latency * 1e-9
     finding = Finding(

@@ -110,7 +110,9 @@ def averaged(
     keep = np.flatnonzero(weight[1:] > CANDIDATE_WEIGHT.value)
     if not keep.size or not result.names:
         return result
-    share = np.concatenate([weight[:1], weight[1:][keep]])
+    # The choice keeps the least weight that leaves it inside of the interval of them all.
+    chosen = max(float(weight[0]), float(weight[1:][keep].sum()) / NORMAL_95**2)
+    share = np.concatenate([[chosen], weight[1:][keep]])
     share = share / share.sum()
     own = np.array([_value(result, n, 0.0) for n in result.names])
     values = np.array([own] + [[_value(others[k], n, v) for n, v in zip(result.names, own)]

@@ -40,11 +40,18 @@ def test_a_lag_that_may_be_a_delay_is_stated_with_both():
 
 def test_what_is_likelier_than_the_choice_and_knows_less_counts_with_what_it_knows():
     vague = replace(_answer(0.06, None), covariance=25e-6 * np.eye(1))
-    for weight in (0.2, 0.8):
+    for weight in (0.25, 0.75):
         both = averaged(_answer(0.05, 0.01), np.array([1 - weight, weight]), [vague])
-        within = 0.2 * 0.001**2 + 0.8 * 0.005**2 if weight > 0.5 else 0.001**2
+        within = 0.25 * 0.001**2 + 0.75 * 0.005**2 if weight > 0.5 else 0.001**2
         lag = both.combinations["time_constant"]
-        np.testing.assert_allclose(lag.std**2, within + 0.2 * 0.8 * 0.01**2)
+        np.testing.assert_allclose(lag.std**2, within + 0.25 * 0.75 * 0.01**2)
+
+
+def test_a_choice_that_is_all_but_rejected_stays_inside_of_the_interval():
+    both = averaged(_answer(0.05, 0.01), np.array([0.001, 0.999]), [_answer(0.06, None)])
+    lag = both.combinations["time_constant"]
+    off = abs(lag.value - 0.05)
+    assert 1.9 * lag.std < off < 1.96 * lag.std  # 95 % of a normal variable
 
 
 def test_a_candidate_that_is_rejected_changes_nothing():

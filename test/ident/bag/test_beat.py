@@ -122,6 +122,25 @@ def test_a_record_with_stamps_of_its_own_keeps_them() -> None:
     assert on_beat(record) is record
 
 
+@pytest.mark.parametrize("rounding", [np.floor, np.rint])
+def test_a_regular_time_that_was_only_rounded_is_put_back_whatever_the_motion_shows(
+    rounding,
+) -> None:
+    rng = np.random.default_rng(12)
+    period, multiple = 2.3e-3, 1e-3  # a loop by a clock of milliseconds
+    at = period * np.arange(3000)
+    speed = np.sin(3 * at) + rng.standard_normal(at.size)  # noise hides where samples lie
+    sampled_late = at + rng.uniform(0, 1.2e-3, at.size)
+
+    def stamped(time: np.ndarray) -> Record:
+        stamp = multiple * rounding(time / multiple)
+        return Record("m", stamp - stamp[0], np.sin(at), velocity=speed)
+
+    np.testing.assert_allclose(np.diff(on_beat(stamped(at)).time), period, rtol=1e-3)
+    late = stamped(sampled_late)
+    assert on_beat(late) is late
+
+
 def _stalled(seed: int, sampled_late: bool) -> Record:
     """Return a record of a machine that stood still now and then: in its stamps, or its samples."""
     rng = np.random.default_rng(seed)
