@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from smp_motor_control.arrays import Array, Flags, Integers
 from smp_motor_ident.bag.clock import BEATS, mean_held, rhythm
-from smp_motor_ident.bag.counter import Unwrapped, unwrap
+from smp_motor_ident.bag.counter import Unwrapped, angle_resets, reset_found, unwrap
 from smp_motor_ident.bag.drives import answers_in_its_row
 from smp_motor_ident.bag.mapping import MotorMap
 from smp_motor_ident.bag.storage import Table, found
@@ -155,7 +155,7 @@ def _covered(motor: Motor, voltage: Series, axis: Integers) -> Flags:
 
 
 def _count_starts(motor: Motor, series: dict[str, Series], keep: Flags, axis_name: str) -> Flags:
-    """Unwrap the counter in place; return which kept samples begin a segment by a reset."""
+    """Unwrap a counter in place; return which kept samples begin a segment by a reset."""
     flags = np.zeros(keep.size, bool)
     flags[0] = True
     if axis_name == "count":
@@ -163,9 +163,13 @@ def _count_starts(motor: Motor, series: dict[str, Series], keep: Flags, axis_nam
         motor.findings += counter.findings
         series["count"] = Series(series["count"].time, counter.count)
         flags[counter.resets] = True
+    elif axis_name == "position":
+        resets = angle_resets(series["position"].value)
+        motor.findings += [reset_found("angle", resets.size)] if resets.size else []
+        flags[resets] = True
     # A reset at a sample that is left out begins a segment at the next that is kept.
-    resets = np.cumsum(flags)[keep]
-    return np.concatenate([[True], np.diff(resets) > 0])
+    begun = np.cumsum(flags)[keep]
+    return np.concatenate([[True], np.diff(begun) > 0])
 
 
 def unwrapped(motor: Motor, series: dict[str, Series]) -> Unwrapped:

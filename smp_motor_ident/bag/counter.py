@@ -130,14 +130,19 @@ def unwrap(count: Integers, bits: int | None, expected: Array | None = None) -> 
         steps = near + (((steps - near) << shift) >> shift)
     resets = _resets(count, steps, guess, expected is not None) + 1
     if resets.size:
-        text = f"the encoder's counter was reset {resets.size} times; a new segment each"
-        findings.append(found("counter_reset", text, "warning", times=resets.size))
+        findings.append(reset_found("encoder's counter", resets.size))
         steps = steps.copy()
         steps[resets - 1] = np.diff(count)[resets - 1]
     whole = np.concatenate([count[:1], count[:1] + np.cumsum(steps)])
     for begin, end in zip(resets, [*resets[1:], count.size]):
         whole[begin:end] += count[begin] - whole[begin]
     return Unwrapped(whole, resets, findings)
+
+
+def reset_found(what: str, times: int) -> Finding:
+    """Say that a counter or an angle began anew."""
+    text = f"the {what} was reset {times} times; a new segment each"
+    return found("counter_reset", text, "warning", times=times)
 
 
 def _width_shown(count: Integers, steps: Integers, guess: Array) -> int:
@@ -186,18 +191,31 @@ def _width(steps: Integers, guess: Array) -> int:
 
 def _resets(count: Integers, steps: Integers, guess: Array, measured: bool) -> Integers:
     """Return the steps at which the counter fell to about zero without having turned there."""
-    rest = np.abs(steps - guess)
-    bound = _usual(steps, guess)
-    fell = (rest > bound) & (np.abs(count[1:]) < bound) & (np.abs(count[:-1]) > bound)
+    far = 0.0 if measured else 5 * max(float(np.quantile(np.abs(steps), 0.99)), 1.0)
+    return _falls(count, np.abs(steps - guess), _usual(steps, guess), far)
+
+
+def angle_resets(angle: Array) -> Integers:
+    """Return the samples at which an angle fell to about zero without having turned there."""
+    steps = np.abs(np.diff(angle))
+    moves = steps[steps > 0]
+    if not moves.size:
+        return np.zeros(0, np.int64)
+    usual, most = np.quantile(moves, (0.9, 0.99))
+    return _falls(angle, steps, 10 * float(usual), 5 * float(most)) + 1
+
+
+def _falls(value: Array | Integers, rest: Array, bound: float, far: float) -> Integers:
+    """Return the steps to about zero that are beyond a bound, and farther, than others are."""
+    fell = (rest > bound) & (np.abs(value[1:]) < bound) & (np.abs(value[:-1]) > bound)
     # A reset is one jump between usual steps: what jumps to and fro is noise, not a reset.
     usual = rest <= bound
     fell[1:] &= usual[:-1]
     fell[:-1] &= usual[1:]
     fell[[0, -1]] = False
-    if not measured:
-        fell &= rest > 5 * np.maximum(np.quantile(np.abs(steps), 0.99), 1.0)
+    fell &= rest > far
     found: Integers = np.flatnonzero(fell)
-    return found if found.size <= max(3, 0.01 * steps.size) else np.zeros(0, np.int64)
+    return found if found.size <= max(3, 0.01 * rest.size) else np.zeros(0, np.int64)
 
 
 def unwrap_angle(angle: Array) -> tuple[Array, float]:

@@ -111,18 +111,19 @@ def test_the_speed_of_each_section_is_that_of_its_own_record():
         assert speed == pytest.approx(np.full(400, 3.0 / STEP), rel=1e-4)  # counts are dithered
 
 
-def open_at_zero(seed: int, rests: int) -> tuple[Record, dict[str, float]]:
-    """Return a record of a bridge that brakes but at some commands of zero, and its truth."""
+def open_at_zero(command: np.ndarray, braked=()) -> tuple[Record, dict[str, float]]:
+    """Return a record of a bridge that is open at a command of zero, and its truth.
+
+    In the ``braked`` rows it drives at no voltage.
+    """
     constant, resistance, inertia, viscous, torque = 0.05, 2.0, 2e-4, 2e-4, 0.01
-    rng = np.random.default_rng(seed)
-    levels = rng.choice([4.0, 9.0, -4.0, -9.0], 40)
-    levels[np.linspace(5, 35, rests).astype(int)] = 0.0
-    command = np.repeat(levels, rng.integers(20, 60, 40))
+    rng = np.random.default_rng(command.size)
     fine, w = 100, 0.0
     speed = np.zeros(command.size)
     for k, volts in enumerate(command.tolist()[1:], 1):
         for _ in range(fine):
-            current = (volts - constant * w) / resistance if volts else 0.0
+            drives = volts or k in braked
+            current = (volts - constant * w) / resistance if drives else 0.0
             drive = constant * current - viscous * w
             drag = math.copysign(torque, w) if w else min(max(drive, -torque), torque)
             turned = w + 0.01 / fine / inertia * (drive - drag)
@@ -138,18 +139,39 @@ def open_at_zero(seed: int, rests: int) -> tuple[Record, dict[str, float]]:
     return Record("motor", 0.01 * np.arange(command.size), command, velocity=speed), truth
 
 
-@pytest.mark.parametrize("rests", [2, 8])
-def test_a_bridge_that_is_open_at_a_command_of_zero_is_estimated_with_its_motor(rests):
-    """Seldom it looks like a hand that turned the motor on, but one that a driver explains."""
-    record, truth = open_at_zero(rests, rests)
-    found = estimate(record)
-    assert "disturbed" not in {f.code for f in found.findings}
+def _holds(found, truth, share):
     assert not found.unreliable
     for name, value in truth.items():
         q = found.combinations[name]
         assert abs(q.value - value) < 4 * q.std, name
-        assert q.std < 0.05 * value
+        assert q.std < share * value
+
+
+@pytest.mark.parametrize("rests", [2, 8])
+def test_a_bridge_that_is_open_at_a_command_of_zero_is_estimated_with_its_motor(rests):
+    """Seldom it looks like a hand that turned the motor on, but one that a driver explains."""
+    rng = np.random.default_rng(rests)
+    levels = rng.choice([4.0, 9.0, -4.0, -9.0], 40)
+    levels[np.linspace(5, 35, rests).astype(int)] = 0.0
+    record, truth = open_at_zero(np.repeat(levels, rng.integers(20, 60, 40)))
+    found = estimate(record)
+    assert "disturbed" not in {f.code for f in found.findings}
+    _holds(found, truth, 0.05)
     assert driver_of(found).kind == driver.FREE
+
+
+def test_one_step_and_how_the_motor_runs_down_tell_a_bridge_that_is_open_then():
+    command = np.repeat([0.0, 9.0, 0.0], [50, 120, 250])
+    record, truth = open_at_zero(command)
+    found = estimate(record)
+    _holds(found, truth, 0.1)
+    codes = {f.code for f in found.findings}
+    assert codes >= {"coast", "one_size_of_voltage"}  # of 9 V it is all the same
+    record, truth = open_at_zero(command, range(170, 420))
+    del truth["coasting_share"]
+    braked = estimate(record)
+    _holds(braked, truth, 0.1)
+    assert "coast" not in {f.code for f in braked.findings}
 
 
 def test_a_bridge_that_coasts_is_found_in_few_simulations(monkeypatch):

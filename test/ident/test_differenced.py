@@ -50,6 +50,16 @@ def test_a_speed_of_one_count_a_sample_is_its_counts_and_no_loop_biases_them():
     assert found.value("averaging_window") == pytest.approx(STEP)
 
 
+def test_counts_are_seen_in_a_speed_of_a_motor_that_no_model_explains():
+    """A counter rounds whatever the motor does: what turns on when its command ends, too."""
+    t = STEP * np.arange(3000)
+    speed = np.where(t < 1.5, 1 - np.exp(-t / 0.05), np.exp(-(t - 1.5)) * np.cos(3 * t))
+    count = np.floor(np.cumsum(60.0 * speed) * STEP / TURN)
+    record = Record("motor", t, 6.0 * (t < 1.5), velocity=np.diff(count, prepend=0) * TURN / STEP)
+    (summed,) = counts_again([record])
+    np.testing.assert_allclose(summed.position / TURN, count, atol=1e-6)
+
+
 def test_a_speed_over_several_samples_is_no_difference_of_neighbouring_counts():
     record = looped(over=4)
     assert counts_again([record])[0] is record and rounding(record) == 0.0

@@ -141,3 +141,24 @@ def test_a_low_pass_that_is_known_is_taken_as_given():
     assert abs(q.value - truth["time_constant_product"]) < 4 * q.std
     assert found.value("sensor_lag") == pytest.approx(lag)
     assert found.combinations["sensor_lag"].status == "fixed"
+
+
+@pytest.mark.parametrize("static_voltage", [0.0, 0.6])
+def test_a_second_lag_of_a_speed_that_is_driven_one_way_may_be_its_filters(static_voltage):
+    """What no reversal shows: the motor's own time constant is the first alone."""
+    rng = np.random.default_rng(4)
+    voltage = np.repeat(rng.uniform(4.0, 10.0, 40), 40)
+    r, el, k, j = 2.0, 1e-3, 0.05, 5e-5
+    motor = j * r / k**2
+    held = np.repeat(voltage, FINE)
+    t = np.arange(held.size) * STEP / FINE
+    torque = static_voltage * k / r
+    out = independent.simulate(t, held, r, el, k, j, 0.0, torque, np.zeros(t.size), 1)
+    gone = np.exp(-STEP / FINE / (0.2 * motor))
+    speed = lfilter([1 - gone], [1, -gone], out[:, 1])[FINE - 1 :: FINE]
+    speed = speed + 1e-3 * np.ptp(speed) * rng.standard_normal(speed.size)
+    record = Record("motor", STEP * np.arange(speed.size), voltage, velocity=speed)
+    found = estimate(record).combinations["time_constant"]
+    # As a winding's the second lag makes the motor slower by a fifth.
+    assert found.value == pytest.approx(1.2 * motor, rel=0.05)
+    assert 1.0 < (found.value - motor) / found.std < 3.0

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from smp_motor_ident.bag import read_records
 from smp_motor_ident.bag.counter import is_full, unwrap, unwrap_angle
 from smp_motor_ident.errors import BagError
 
@@ -350,3 +351,15 @@ def test_a_counter_that_stays_at_the_end_of_its_width_is_full(last: int) -> None
     assert is_full(clipped) == last
     assert is_full(clipped[:302]) == 0, "it is there for two samples only"
     assert is_full(clipped - 3) == 0, "no width ends there"
+
+
+def test_an_angle_that_begins_anew_at_each_run_of_a_joined_log_begins_a_segment(tmp_path) -> None:
+    voltage = np.repeat([3.0, 6.0, 0.0], 100)
+    run = np.cumsum(voltage * 400.0) * 0.01  # degrees, from zero
+    table = np.column_stack([0.01 * np.arange(900), np.tile(voltage, 3), np.tile(run, 3)])
+    joined = tmp_path / "joined.csv"
+    np.savetxt(joined, table, delimiter=",", header="t,u,angle", comments="", fmt="%.6f")
+    record = read_records(joined, ["time=t", "voltage=u", "position=angle:deg"])["motor"]
+    assert record.starts == (0, 300, 600)
+    assert [f.evidence for f in record.findings if f.code == "counter_reset"] == [{"times": 2}]
+    np.testing.assert_allclose(record.position[300:600], np.deg2rad(run), atol=1e-9)
