@@ -17,7 +17,7 @@ from smp_motor_ident.estimation.selection import POLICY, FittedCandidate
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.passes import evaluate
-from smp_motor_ident.model.coordinates import Coordinates, direction
+from smp_motor_ident.model.coordinates import RINGS, Coordinates, direction, lag_share
 from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.result import FitPercent, ResidualTests
 
@@ -151,17 +151,17 @@ def _resolution(data: Experiments, fit: Fit, tests: ResidualTests) -> Iterator[F
 def _second_lag(data: Experiments, fit: Fit) -> Iterator[Finding]:
     """Say of a speed whose second lag is long for a winding's that it may be the sensor's.
 
-    With time constants T and cT, ``a2 a0 / a1^2 = c / (1 + c)^2``, and the sensor's lag is
-    ``c / (1 + c)`` of what is stated as the motor's.
+    With time constants T and cT the sensor's lag is ``c / (1 + c)`` of what is stated as the
+    motor's.
     """
     if fit.structure.order != 2 or fit.structure.current or data.kind == ANGLE:
         return
     row = direction(ln_a0=1.0, ln_a1=-2.0, ln_a2=1.0)
     free = row @ fit.structure.matrix
     ratio, spread = float(row @ fit.z.array), float(np.sqrt(free @ fit.covariance() @ free))
-    if ratio - limits.HALF_WIDTH.value * spread > np.log(0.25):  # it rings, which no lag does
+    if ratio - limits.HALF_WIDTH.value * spread > RINGS:  # which no lag does
         return
-    share, least = (_lag_share(ratio - k * spread) for k in (0.0, limits.HALF_WIDTH.value))
+    share, least = (lag_share(ratio - k * spread) for k in (0.0, limits.HALF_WIDTH.value))
     long = share >= limits.WINDING_LAG.value
     if not long and least < limits.RELEVANT_BIAS.value:
         return
@@ -195,12 +195,6 @@ def _resonance(fit: Fit) -> Iterator[Finding]:
         {"frequency": ring / (2 * np.pi), "lag": lag},
         "identify the shaft with --model flexible_shaft, or measure at the motor",
     )
-
-
-def _lag_share(log_ratio: float) -> float:
-    """Return c of ``c / (1 + c)^2 = exp(log_ratio)``, at most 1."""
-    root = np.sqrt(1 - 4 * min(float(np.exp(log_ratio)), 0.25))
-    return float((1 - root) / (1 + root))
 
 
 def _torque_noise(data: Experiments, fit: Fit) -> Iterator[Finding]:

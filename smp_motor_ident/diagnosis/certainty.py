@@ -11,6 +11,7 @@ from smp_motor_ident.estimation.consider_covariance import (
     consider_bound,
     consider_clock,
     consider_drop,
+    consider_filter,
     consider_friction,
     consider_left_out,
     consider_timing,
@@ -45,6 +46,7 @@ def certain(
         chosen = consider_bound(free, chosen)
     timed = consider_timing(final, chosen, instant_deviation(group, hold))
     timed = consider_drop(final, consider_clock(final, timed, clock_share(group)))
+    timed = consider_filter(final, timed, request.options)
     chosen, friction_std = consider_friction(final, consider_left_out(final, timed))
     if request.driver is not None:
         chosen = request.driver.widened(chosen)

@@ -20,14 +20,17 @@ from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.current_lag import LITTLE, with_lag
 from smp_motor_ident.estimation.descent import ROUGHLY, refine
 from smp_motor_ident.estimation.fit import Fit, Options
+from smp_motor_ident.estimation.selection import sandwich_factor
 from smp_motor_ident.likelihood.experiments import Experiments
-from smp_motor_ident.model.coordinates import direction
+from smp_motor_ident.model.coordinates import RINGS, direction, lag_share
+from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.model.physical import physical_gradients
-from smp_motor_ident.model.structures import Electromechanical, SecondOrder, Structure
+from smp_motor_ident.model.structures import Electromechanical, FirstOrder, SecondOrder, Structure
 
 POINTS = 64  # at which a lag may be
 SECOND_LAGS = (0.003, 0.03, 0.1, 0.3, 1.0)  # of the delay that may stand for them
 FAR = 1e3  # deviations beyond which what is left of a normal variable is exponential
+LARGEST = 1e100  # of which the square is a number
 SEEN, ROUNDING = 1e-6, 1e-11
 """Shares of a coordinate's information below which kinks, or rounding, decide what is left."""
 
@@ -72,6 +75,28 @@ def consider_current_lag(fit: Fit) -> Fit:
     has, nothing is known of the winding's but its size.
     """
     return fit.along(fit.structure.of_free(direction(ln_a2=1.0, ln_te=1.0)))
+
+
+def consider_filter(data: Experiments, fit: Fit, options: Options) -> Fit:
+    """Return the fit with its covariance widened by a filter of the speed for its second lag.
+
+    From voltage to speed the two answer the same, but where the motor rubs: how likely a filter
+    then is, its deviance tells.  The motor's lag is without it the first alone, and L/R is short.
+    """
+    s = fit.structure
+    if s.order != 2 or s.current or s.low_pass or data.kind == ANGLE or fit.z.log_ratio > RINGS:
+        return fit
+    longer = math.log1p(lag_share(fit.z.log_ratio))
+    odds = 1.0
+    if s.friction != "none":
+        late = "delay" not in s.fixed  # as is what is left of L/R beside a filter
+        filtered = FirstOrder.like(s).with_(window=True, low_pass=True, delay=late)
+        z = fit.z.with_(ln_a1=fit.z.ln_a1 - longer, window=2 * fit.z.second_lag)
+        there = data.measured_as(filtered.speed)
+        other = refine(there, filtered, fit, filtered.complete(z), options)
+        odds = math.exp(-0.5 * max(other.deviance - fit.deviance, 0.0) / sandwich_factor(fit))
+    row = s.of_free(direction(ln_a1=-longer, ln_a2=-1.0, ln_te=-1.0))
+    return fit.along(math.sqrt(odds / (1 + odds)) * row)
 
 
 def consider_clock(data: Experiments, fit: Fit, share: float) -> Fit:
@@ -263,4 +288,5 @@ def _beside(data: Experiments, fit: Fit, richer: Structure, coordinate: str) -> 
     if not left > ROUNDING * whole:  # the data say nothing of it
         return _Beside(answer, 0.0, math.inf, False)
     score = float(here.gradient[late] - here.gradient[keep] @ answer)
-    return _Beside(answer, score / left, 1 / left, left > SEEN * whole)
+    size = float(np.clip(score / left, -LARGEST, LARGEST))
+    return _Beside(answer, size, 1 / left, left > SEEN * whole)

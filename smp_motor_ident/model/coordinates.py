@@ -115,6 +115,11 @@ class Coordinates:
         return _exp(self.ln_a2 - self.ln_a1)
 
     @property
+    def log_ratio(self) -> float:
+        """``ln(a2 a0 / a1^2)``, above `RINGS` of a motor that rings."""
+        return self.ln_a0 - 2 * self.ln_a1 + self.ln_a2
+
+    @property
     def electrical_time_constant(self) -> float:
         """L/R [s]."""
         return _exp(self.ln_te)
@@ -170,3 +175,12 @@ def direction(**weights: float) -> Array:
 def _exp(x: float) -> float:
     """Return e^x, infinite where it overflows."""
     return math.inf if x > 709.0 else float(np.exp(x))
+
+
+RINGS = math.log(0.25)
+
+
+def lag_share(log_ratio: float) -> float:
+    """Return c of two lags T and cT, of which ``a2 a0 / a1^2 = c / (1 + c)^2``, at most 1."""
+    root = math.sqrt(1 - 4 * math.exp(min(log_ratio, RINGS)))
+    return (1 - root) / (1 + root)
