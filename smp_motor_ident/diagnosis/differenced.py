@@ -19,6 +19,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.signal import savgol_coeffs, savgol_filter
 
 from smp_motor_control.arrays import Array
 from smp_motor_ident.diagnosis.limits import FEWEST, NEIGHBOURS, ONE_COUNT, SIGN_SURE
@@ -31,6 +32,7 @@ from smp_motor_ident.model.structures import SecondOrder
 from smp_motor_ident.record import Record
 
 SMOOTH = 9  # samples of which a mean leaves the motion and hardly the rounding
+LOCAL = 15  # samples over which a motion is a cubic
 SLOW = 100  # counts an interval, of which the step in a speed is seen
 LONGER = 2.0  # times the usual interval: longer ones are gaps
 EVEN = 0.5  # of the usual interval: stamps that are off by more may hide a lost sample
@@ -54,7 +56,8 @@ def _summed(record: Record) -> Record:
     if np.abs(intervals - step).max() > EVEN * step or not _against_each_other(moved):
         return record
     angle = np.cumsum(moved) * quantum * step
-    if not _rounds_once(replace(record, position=angle, current=None), quantum * step):
+    again = replace(record, position=angle, current=None)
+    if not (_smooth_but_for_one(moved) or _rounds_once(again, quantum * step)):
         return record
     found = Finding(
         "speed_summed",
@@ -78,6 +81,17 @@ def rounding(record: Record) -> float:
     if found is None:
         return 0.0
     return float(found.evidence["quantum"] or 0.0) * record.velocity_window / 12**0.5
+
+
+def _smooth_but_for_one(moved: Array) -> bool:
+    """Tell whether counts, where they change, leave a cubic over some samples by one's rounding."""
+    if moved.size < LOCAL:
+        return False
+    count = np.cumsum(moved)
+    rest = count - savgol_filter(count, LOCAL, 3)
+    turns = np.convolve(moved != 0, np.ones(LOCAL), "same") > 1
+    left = 1 - float(savgol_coeffs(LOCAL, 3)[LOCAL // 2])  # of a white error
+    return bool(turns.any() and np.mean(np.square(rest[turns])) < ONE_COUNT.value * left / 12)
 
 
 def _rounds_once(record: Record, count: float) -> bool:
