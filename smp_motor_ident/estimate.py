@@ -32,6 +32,7 @@ from smp_motor_ident.diagnosis.scope import (
     contradicted,
     current_left_out,
     differing,
+    one_size_of_voltage,
     one_size_or_swing,
     scope,
 )
@@ -65,7 +66,7 @@ from smp_motor_ident.estimation.selection import FittedCandidate, in_turn
 from smp_motor_ident.estimation.subset import excitation
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import Experiments
-from smp_motor_ident.model.driver import EFFECTS, RAMPS, DriverEffect
+from smp_motor_ident.model.driver import AT_ZERO, EFFECTS, RAMPS, DriverEffect
 from smp_motor_ident.one_thread import one_thread
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import Estimate, FitPercent
@@ -296,7 +297,10 @@ def _through_driver(
 
     A ramp is sought beside torque noise, which stands for none of it.
     """
-    if request.driver is not None or one_size_or_swing(data) or hides_driver(group):
+    one_size = one_size_or_swing(data)
+    if one_size:  # which tells of a driver what it does at no command
+        effects = [e for e in effects if e in AT_ZERO]
+    if request.driver is not None or not effects or hides_driver(group):
         return None, None
     request.say("what the driver makes of its command")
     beside = effects is RAMPS
@@ -309,11 +313,12 @@ def _through_driver(
     e = _tried(driver.records, replace(request, driver=driver, validation=kept), found)
     if e is None:
         return None, driver
-    emptied = {"implausible_motor", "one_level", "one_size_of_voltage"}
-    hollow = any(f.code in emptied for f in e.findings)  # little is left of what was recorded
+    emptied = {"implausible_motor", *(() if one_size else ("one_level", "one_size_of_voltage"))}
+    hollow = emptied & {f.code for f in e.findings}  # little is left of what was recorded
     fails = any(f.severity == "unreliable" and not blames_current(f) for f in e.findings)
     fails = fails or (leaves_torque_noise(e, fit) and not beside)
-    return (None if fails or hollow else through(e, driver)), driver
+    said = *e.findings, *one_size_of_voltage(one_size)
+    return (None if fails or hollow else through(replace(e, findings=said), driver)), driver
 
 
 def _stated(

@@ -35,7 +35,7 @@ def scope(
     group: Sequence[Record],
 ) -> Iterator[Finding]:
     """Yield what a reader must know of the values' meaning."""
-    yield from _one_size_of_voltage(one_size_or_swing(data)) or _one_size_of_step(_one_step(data))
+    yield from one_size_of_voltage(one_size_or_swing(data)) or _one_size_of_step(_one_step(data))
     if not result.level:
         yield from _one_direction(data, result)
     if alike:
@@ -165,7 +165,7 @@ def _one_size_of_step(size: float) -> list[Finding]:
     ]
 
 
-def _one_size_of_voltage(top: float) -> list[Finding]:
+def one_size_of_voltage(top: float) -> list[Finding]:
     """Say what a voltage of one size both ways, or of one swing, cannot show.
 
     With a size U a driver that takes a share of it (a dead zone, a drop, a clip, pulses) is the

@@ -106,7 +106,8 @@ def through(estimate: Estimate, found: DriverFit) -> Estimate:
     size, std = found.driver.size, found.std
     interval = max(size - NORMAL_95 * std, 0.0), size + NORMAL_95 * std
     unit = UNITS[found.effect.quantity]
-    words = f"the records show {found.effect.cause}: {size:.3g} ± {std:.2g} {unit}"
+    words = f"the records show {found.effect.cause}: {size:.3g} ± {std:.2g}"
+    words += f" {unit}" if unit != "1" else ""
     return _behind(estimate, found.effect, Quantity(size, std, interval, unit), words, found.driver)
 
 

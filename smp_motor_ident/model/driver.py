@@ -227,5 +227,8 @@ EFFECTS = (
 RAMPS = tuple(e for e in EFFECTS if e.kind == SLEW)
 """What is no more than a delay to first order: it takes a search to see it."""
 
+AT_ZERO = tuple(e for e in EFFECTS if e.kind == FREE)
+"""What shows under one size of voltage, too."""
+
 DECLARABLE: Mapping[str, DriverEffect] = {e.quantity: e for e in EFFECTS if not e.follows_motion}
 """What a user may know of a driver: the command alone tells its voltage."""
