@@ -21,6 +21,7 @@ from smp_motor_ident.diagnosis.refusal import (
     lag_unknown,
     no_candidate,
     of_which,
+    only_lag_unknown,
     refuse_unexplained,
     refuse_unidentifiable,
 )
@@ -59,7 +60,7 @@ from smp_motor_ident.estimation.driver_effect import (
 )
 from smp_motor_ident.estimation.driver_search import likeliest, run_free
 from smp_motor_ident.estimation.fit import Fit
-from smp_motor_ident.estimation.hold_choice import chosen_hold, otherwise
+from smp_motor_ident.estimation.hold_choice import chosen_hold, earlier_command, otherwise
 from smp_motor_ident.estimation.quantities import Answer, answer, driven_longest, without_lag
 from smp_motor_ident.estimation.request import Request, base_structure, checked
 from smp_motor_ident.estimation.selection import FittedCandidate, in_turn
@@ -200,6 +201,10 @@ def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) 
     if not candidates:
         raise no_candidate(group)
     data, hold, candidates = otherwise(group, base, request, data, hold, candidates)
+    if ahead := earlier_command(group, request, data, hold, candidates[-1].fit):
+        records, asked, said = ahead
+        if early := _tried(records, asked, [*found, said]):
+            return early
     refused: SmpError | None = None
     left = list(candidates)
     for one in in_turn(candidates):
@@ -352,7 +357,7 @@ def _stated(
     errors = regression(final, chosen, gear, bool(change.std))
     chosen, parts = dependent(chosen, errors)
     result, alike = said(chosen)
-    refusal = _without_lag(group, chosen, result)
+    refusal = only_lag_unknown(group, chosen, result)
     request.say("validating")
     own, common = validate.validated(group, request, final, chosen, hold)
     percent = FitPercent(fitted, own)
@@ -388,12 +393,3 @@ def _stated(
         refusal.estimate = estimate
         raise refusal
     return estimate
-
-
-def _without_lag(group: list[Record], fit: Fit, result: Answer) -> UnknownLagError | None:
-    """Refuse what cannot be stated; return the refusal of which the lag alone is the reason."""
-    try:
-        refuse_unidentifiable(group, fit, result)
-    except UnknownLagError as refusal:
-        return refusal
-    return None

@@ -153,3 +153,12 @@ def _refuse_offset(group: Sequence[Record], fit: Fit) -> None:
             f"{where_of(group)}: current has an offset of {fit.z.current_offset:.3g} A where it "
             f"reaches {largest:.3g} A; zero the current sensor at rest and record again"
         )
+
+
+def only_lag_unknown(group: Sequence[Record], fit: Fit, result: Answer) -> UnknownLagError | None:
+    """Refuse what cannot be stated; return the refusal of which the lag alone is the reason."""
+    try:
+        refuse_unidentifiable(group, fit, result)
+    except UnknownLagError as refusal:
+        return refusal
+    return None

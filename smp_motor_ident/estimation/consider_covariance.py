@@ -20,7 +20,7 @@ from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.current_lag import LITTLE, with_lag
 from smp_motor_ident.estimation.descent import ROUGHLY, refine
 from smp_motor_ident.estimation.fit import Fit, Options
-from smp_motor_ident.estimation.selection import sandwich_factor
+from smp_motor_ident.estimation.selection import POLICY, sandwich_factor
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.coordinates import RINGS, direction, lag_share
 from smp_motor_ident.model.measurement import ANGLE
@@ -33,6 +33,16 @@ FAR = 1e3  # deviations beyond which what is left of a normal variable is expone
 LARGEST = 1e100  # of which the square is a number
 SEEN, ROUNDING = 1e-6, 1e-11
 """Shares of a coordinate's information below which kinks, or rounding, decide what is left."""
+
+
+def asks_for_earlier(data: Experiments, fit: Fit) -> bool:
+    """Tell whether the score asks for a delay below none, by more than what one costs."""
+    s = fit.structure
+    if s.delay or "delay" in s.fixed or not s.free:
+        return False
+    beside = _beside(data, fit, s.with_(delay=True), "delay")
+    price = POLICY.price(1, fit.samples) * sandwich_factor(fit)
+    return beside.seen and beside.size < 0 and beside.size**2 > price * beside.variance
 
 
 def consider_timing(data: Experiments, fit: Fit, instant: float) -> Fit:

@@ -9,6 +9,7 @@ import numpy as np
 from smp_motor_ident.diagnosis import limits
 from smp_motor_ident.estimation import order_selection
 from smp_motor_ident.estimation.candidate_starts import of_kind
+from smp_motor_ident.estimation.consider_covariance import asks_for_earlier
 from smp_motor_ident.estimation.data_window import extend, grow
 from smp_motor_ident.estimation.descent import ROUGHLY, refine, restate, screening_subset
 from smp_motor_ident.estimation.fit import Fit, Options
@@ -17,6 +18,7 @@ from smp_motor_ident.estimation.request import Request
 from smp_motor_ident.estimation.selection import POLICY, FittedCandidate
 from smp_motor_ident.estimation.thinning import thinned
 from smp_motor_ident.estimation.trials import LAGS, tried
+from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import Experiments, prepare
 from smp_motor_ident.likelihood.hold import between_samples
 from smp_motor_ident.model.coordinates import Coordinates, direction
@@ -111,6 +113,43 @@ def otherwise(
         candidates = [*(r for r in candidates[:-1] if r.hold != beside.hold), candidates[-1]]
         candidates = [beside, *candidates]
     return data, hold, candidates
+
+
+def earlier_command(
+    group: Sequence[Record], request: Request, data: Experiments, hold: str, best: Fit
+) -> tuple[list[Record], Request, Finding] | None:
+    """Return records whose commands ran an interval earlier, where the motor answers that early.
+
+    Rows that have the command which held up to them are read so by mistake where no edge shows it.
+    """
+    if request.within or request.earlier or not asks_for_earlier(of_kind(data, best), best):
+        return None
+    records = [_an_interval_earlier(r) for r in group]
+    structure = best.structure.with_(held="before")
+    there = prepare(records, structure.current, hold=hold).measured_as(best.kind)
+    later = best.z.ln_a1 + float(np.log1p(data.step / best.z.time_constant))  # by as much a lag is
+    found = initial_fit(there, structure, request.options, [best.z, best.z.with_(ln_a1=later)])
+    if not found or found.deviance > best.deviance - POLICY.price(1, best.samples):
+        return None
+    known = request.validation
+    kept = None if known is None else [_an_interval_earlier(r) for r in known]
+    said = Finding(
+        "held_before",
+        "note",
+        "the motion is ahead of the command as it was read: each row has the command that held up "
+        "to it, and was taken so",
+        {"shift": -data.step},
+        "map held=before; else compare the clocks of command and motion",
+    )
+    return records, replace(request, earlier=True, validation=kept), said
+
+
+def _an_interval_earlier(record: Record) -> Record:
+    """Return a record with each row's command in the row before; a segment's last stays."""
+    voltage = np.roll(record.voltage, -1)
+    last = np.array([*record.starts[1:], len(record)]) - 1
+    voltage[last] = record.voltage[last]
+    return replace(record, voltage=voltage)
 
 
 def _explored(data: Experiments, base: Structure, request: Request) -> list[FittedCandidate]:

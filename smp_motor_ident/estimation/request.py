@@ -42,6 +42,7 @@ class Request:
     since: tuple[float, ...] = ()
     suspected: bool = False  # whether the driver is sought although nothing is lacking
     loaded: bool = False  # whether every candidate has a constant load
+    earlier: bool = False  # whether the command was taken an interval earlier
 
     @property
     def options(self) -> Options:

@@ -31,6 +31,24 @@ def right(record: Record, truth: dict[str, float]) -> None:
             assert abs(q.value - true) < max(5 * q.std, floor), (name, q.value, q.std, true)
 
 
+@pytest.mark.parametrize("current", [False, True])
+def test_a_motor_that_answers_before_its_command_was_read_an_interval_late(current):
+    """A smooth command shows no edge by which a reader of rows would see that it held up to them."""
+    rng = np.random.default_rng(6)
+    t = np.arange(3000) / 100
+    tones = rng.uniform(0.1, 2.0, 8)
+    v = 2.5 * np.sin(2 * np.pi * np.outer(t, tones) + rng.uniform(0, 6, 8)).sum(axis=1)
+    out = simulate(t, v, R, L, K, J, B, TC, np.zeros(t.size), 100)
+    count = np.floor(out[:, 2] * 500 / (2 * np.pi)).astype(np.int64)
+    amps = out[:, 0] + 0.02 * rng.standard_normal(t.size) if current else None
+    late = np.concatenate([v[:1], v[:-1]])
+    found = estimate(Record("motor", t, late, amps, count=count, hardware=Hardware(1.0, 500.0)))
+    assert not found.unreliable and "held_before" in [f.code for f in found.findings]
+    for name in ("dc_gain", "time_constant", "static_voltage"):
+        q = found.combinations[name]
+        assert abs(q.value - TRUTH[name]) < 4 * q.std and q.std < 0.02 * TRUTH[name]
+
+
 @pytest.mark.parametrize("kind", ["square", "fourier", "sine"])
 def test_a_command_that_is_logged_before_it_runs_is_no_slower_motor(kind):
     t = np.arange(3000) / 200
