@@ -53,6 +53,12 @@ EFFECT_SHOWN = Limit(
     "beyond it the 95 % interval holds a driver without that effect",
     "test_driver_effect.py: a size that may be nothing is not stated",
 )  # fmt: skip
+DRIVER_TOLERANCE = Limit(
+    0.01, "of its size",
+    "physical: the reference of a current's limit holds to a percent, and the drop of a transistor "
+    "or a brush changes by that in two kelvin",
+    "test_driver_effect.py: a driver that limits the current is found and designed for",
+)  # fmt: skip
 SLEW_SEEN = Limit(
     0.5, "sample",
     "physical: a voltage that is there within half a sample lacks a quarter of one row at most: a "

@@ -15,11 +15,11 @@ import numpy as np
 
 from smp_motor_control.arrays import Array
 from smp_motor_ident.diagnosis.limits import HALF_EXPLAINED
-from smp_motor_ident.diagnosis.sample_limits import EFFECT_SHOWN, SLEW_SEEN
+from smp_motor_ident.diagnosis.sample_limits import DRIVER_TOLERANCE, EFFECT_SHOWN, SLEW_SEEN
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.fitted import NORMAL_95
 from smp_motor_ident.estimation.selection import evidence
-from smp_motor_ident.finding import Finding
+from smp_motor_ident.finding import Finding, Severity
 from smp_motor_ident.likelihood.experiments import output_of
 from smp_motor_ident.model.driver import (
     CLIP,
@@ -27,6 +27,7 @@ from smp_motor_ident.model.driver import (
     DECLARABLE,
     EFFECTS,
     RAMPS,
+    SAG,
     SLEW,
     Driver,
     DriverEffect,
@@ -103,12 +104,21 @@ class DriverFit:
 
 def through(estimate: Estimate, found: DriverFit) -> Estimate:
     """Return the estimate of a motor behind a driver, with what is known of the driver."""
-    size, std = found.driver.size, found.std
+    size = found.driver.size
+    tolerance = DRIVER_TOLERANCE.value * size if found.effect.follows_motion else 0.0
+    std = math.hypot(found.std, tolerance)
     interval = max(size - NORMAL_95 * std, 0.0), size + NORMAL_95 * std
     unit = UNITS[found.effect.quantity]
     words = f"the records show {found.effect.cause}: {size:.3g} ± {std:.2g}"
     words += f" {unit}" if unit != "1" else ""
-    return _behind(estimate, found.effect, Quantity(size, std, interval, unit), words, found.driver)
+    quantity = Quantity(size, std, interval, unit)
+    supply = [r.hardware.supply_voltage for r in found.before]
+    if all(supply) or found.effect.kind not in (COAST, SAG):
+        return _behind(estimate, found.effect, quantity, words, found.driver)
+    words += f", were it always on at {found.driver.full_duty:.3g} V, the largest command"
+    # The motor itself is of another gain behind one that coasts for another part of its periods.
+    severity: Severity = "unreliable" if found.effect.kind == COAST else "warning"
+    return _behind(estimate, found.effect, quantity, words, found.driver, severity)
 
 
 def suspecting(estimate: Estimate, found: DriverFit | None, fit: Fit) -> Estimate:
@@ -180,16 +190,26 @@ def _driven(record: Record, driver: Driver) -> Record:
 
 
 def _behind(
-    estimate: Estimate, effect: DriverEffect, quantity: Quantity, words: str, driver: Driver
+    estimate: Estimate,
+    effect: DriverEffect,
+    quantity: Quantity,
+    words: str,
+    driver: Driver,
+    unknown_supply: Severity | None = None,
 ) -> Estimate:
+    """Return an estimate with a driver, of one of an unknown supply with as severe a finding."""
+    fixed = quantity.status == "fixed"
+    advice = "record the voltage at the motor's terminals to see it, or declare it with --fix "
+    advice += f"{effect.quantity}="
+    if unknown_supply:
+        advice = "state the supply's voltage (supply_voltage=), at which the driver is always on"
     finding = Finding(
         effect.code,
-        "warning" if quantity.status == "estimated" else "note",
+        unknown_supply or ("note" if fixed else "warning"),
         f"{words}; the motor is estimated behind it, and a controller meets both",
         {"quantity": effect.quantity, "std": quantity.std, "size": driver.size,
          "full_duty": driver.full_duty, "emf_share": driver.emf_share},
-        "" if quantity.status == "fixed" else "record the voltage at the motor's terminals to see "
-        f"it, or declare it with --fix {effect.quantity}=",
+        "" if fixed else advice,
     )  # fmt: skip
     combinations = {**estimate.combinations, effect.quantity: quantity}
     return replace(estimate, combinations=combinations, findings=(finding, *estimate.findings))

@@ -96,9 +96,17 @@ def test_a_coasting_bridge_is_fitted_together_with_its_motor(seed, viscous, puls
         assert abs(q.value - value) < max(4 * q.std, 0.02 * value), name
         assert q.std < 0.2 * value
     behind = driver_of(found)
+    assert not [f for f in found.findings if "supply_voltage" in f.advice]
     constant = 0.05 / (0.05 + 2.0 * viscous / 0.05)
     assert (behind.kind, behind.full_duty) == (driver.COAST, 12.0)
     assert behind.emf_share == pytest.approx(constant, abs=0.03)
+
+
+def test_what_share_of_a_period_a_bridge_is_on_asks_for_the_supply():
+    record, _ = coasting(0, 1e-5)
+    assert not record.hardware.supply_voltage
+    (found,) = [f for f in estimate(record).findings if f.code == "coast"]
+    assert found.severity == "unreliable" and "supply_voltage" in found.advice
 
 
 def test_the_speed_of_each_section_is_that_of_its_own_record():

@@ -33,7 +33,7 @@ def right(record: Record, truth: dict[str, float]) -> None:
 
 @pytest.mark.parametrize("current", [False, True])
 def test_a_motor_that_answers_before_its_command_was_read_an_interval_late(current):
-    """A smooth command shows no edge by which a reader of rows would see that it held up to them."""
+    """A smooth command shows no edge by which a reader would see that it held up to its rows."""
     rng = np.random.default_rng(6)
     t = np.arange(3000) / 100
     tones = rng.uniform(0.1, 2.0, 8)

@@ -188,6 +188,7 @@ def test_a_driver_that_limits_the_current_is_found_and_designed_for():
     for name, value in truth.items():
         q = found.combinations[name]
         assert abs(q.value - value) < max(4 * q.std, 0.01 * value) and q.std < 0.02 * value, name
+    assert found.combinations["current_limit_voltage"].std > 0.01 * 4.0  # as it is built
     one = design(found, Loop(sample_time=STEP, gear_ratio=1.0, counts_per_revolution=None))
     able = (4.0 - STATIC) * GAIN / TAU  # rad/s^2 from the current there is
     assert 0.8 * able < one.reference.max_acceleration < able
