@@ -173,8 +173,8 @@ def _set_back(
     least = clock.pause_between(stamp, parts, motor.plan.gap)
     pauses = [max(int(log[begin] - log[begin - 1]), least) for begin, _ in parts[1:]]
     time = clock.one_after_another([stamp], [parts], pauses)[0]
-    text = f"{topic}: the clock of the header stamps was set back {len(parts) - 1} times"
-    motor.tell("clock_set_back", f"{text}; a new segment each", "warning")
+    text = f"{topic}: the clock of the header stamps was set back {len(pauses)} times"
+    motor.tell("clock_set_back", f"{text}; a new segment each", "warning", times=len(pauses))
     return {topic: time}
 
 

@@ -224,7 +224,8 @@ def _gaps(
         text = f"{int(missing[bridged].sum())} samples missing in {int(bridged.sum())} places"
         text += "; their voltage was interpolated" if alike else "; the voltage there is known"
         motor.tell("samples_missing", text, samples=int(missing[bridged].sum()))
-    if cut.any():
+    apart = [f.evidence for f in motor.findings if f.code == "clock_set_back"]  # by the reader
+    if cut.sum() > sum(float(e.get("times") or 0.0) for e in apart):
         text = f"{int(cut.sum())} gaps of up to {steps[cut].max() * 1e-9:.3g} s"
         text += f" ({int(missing[cut].sum())} samples missing)" if beat.regular else ""
         motor.tell("gaps", f"{text}; a new segment behind each", gaps=int(cut.sum()))

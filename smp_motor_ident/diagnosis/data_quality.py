@@ -69,7 +69,8 @@ def _length(records: Sequence[Record], where: str) -> None:
         duration = sum(r.duration for r in records)
         raise InsufficientExcitationError(
             f"{where}: too short, {samples} samples in {duration:.3g} s; record at least "
-            f"{limits.FEWEST.value:.0f} samples, better 20 s or more with a changing voltage"
+            f"{limits.FEWEST.value:.0f} samples (faster, or the same again), better 20 s or more "
+            "with a changing voltage"
         )
 
 
