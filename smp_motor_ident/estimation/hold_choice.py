@@ -36,6 +36,8 @@ HOLDS = {
     "switched": "switched inside its intervals",
     "middle": "switched in the middle of its intervals",
 }
+TAKEN_BACK = 0.75
+"""Samples of delay: between half of one, by which a speed over a row is late, and a whole one."""
 EARLIER = {"before": -0.5, "after": 1.0, "interpolated": 0.5}
 """Samples of delay that a hold takes the place of: a command up to its row, with means that moved
 its switches before; one from its row on; one straight from row to row."""
@@ -125,11 +127,13 @@ def earlier_command(
     if request.within or request.earlier or not asks_for_earlier(of_kind(data, best), best):
         return None
     records = [_an_interval_earlier(r) for r in group]
-    structure = best.structure.with_(held="before")
+    structure = best.structure.with_(held="before", delay=True)  # which would take it back
     there = prepare(records, structure.current, hold=hold).measured_as(best.kind)
     later = best.z.ln_a1 + float(np.log1p(data.step / best.z.time_constant))  # by as much a lag is
     found = initial_fit(there, structure, request.options, [best.z, best.z.with_(ln_a1=later)])
-    if not found or found.deviance > best.deviance - POLICY.price(1, best.samples):
+    if not found or found.deviance > best.deviance - POLICY.price(2, best.samples):
+        return None
+    if found.z.delay > TAKEN_BACK * data.step:
         return None
     known = request.validation
     kept = None if known is None else [_an_interval_earlier(r) for r in known]
