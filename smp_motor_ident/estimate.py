@@ -304,8 +304,8 @@ def _through_driver(
     """
     one_size = one_size_or_swing(data)
     if one_size:  # which tells of a driver what it does at no command
-        effects = [e for e in effects if e in AT_ZERO]
-    if request.driver is not None or not effects or hides_driver(group):
+        effects = AT_ZERO
+    if request.driver is not None or hides_driver(group):
         return None, None
     request.say("what the driver makes of its command")
     beside = effects is RAMPS

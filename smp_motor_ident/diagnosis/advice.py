@@ -17,7 +17,7 @@ from smp_motor_ident.estimation.selection import POLICY, FittedCandidate
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.passes import evaluate
-from smp_motor_ident.model.coordinates import RINGS, Coordinates, direction, lag_share
+from smp_motor_ident.model.coordinates import RINGS, Coordinates, lag_share
 from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.result import FitPercent, ResidualTests
 
@@ -156,9 +156,7 @@ def _second_lag(data: Experiments, fit: Fit) -> Iterator[Finding]:
     """
     if fit.structure.order != 2 or fit.structure.current or data.kind == ANGLE:
         return
-    row = direction(ln_a0=1.0, ln_a1=-2.0, ln_a2=1.0)
-    free = row @ fit.structure.matrix
-    ratio, spread = float(row @ fit.z.array), float(np.sqrt(free @ fit.covariance() @ free))
+    ratio, spread = fit.log_ratio()
     if ratio - limits.HALF_WIDTH.value * spread > RINGS:  # which no lag does
         return
     share, least = (lag_share(ratio - k * spread) for k in (0.0, limits.HALF_WIDTH.value))

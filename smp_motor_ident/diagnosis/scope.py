@@ -298,7 +298,8 @@ OF_CURRENT = {effect.code: effect for effect in EFFECTS if effect.place == "curr
 
 def blames_current(finding: Finding) -> bool:
     """Tell whether a finding says that the current, not the motion, is off."""
-    return finding.severity == "unreliable" and finding.code in OF_CURRENT
+    of_current = finding.code in OF_CURRENT or finding.code == "poor_fit_of_current"
+    return finding.severity == "unreliable" and of_current
 
 
 UNDECIDED = "undecided"

@@ -20,6 +20,7 @@ from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.current_lag import LITTLE, with_lag
 from smp_motor_ident.estimation.descent import ROUGHLY, refine
 from smp_motor_ident.estimation.fit import Fit, Options
+from smp_motor_ident.estimation.fitted import NORMAL_95
 from smp_motor_ident.estimation.selection import POLICY, sandwich_factor
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.coordinates import RINGS, direction, lag_share
@@ -90,21 +91,27 @@ def consider_current_lag(fit: Fit) -> Fit:
 def consider_filter(data: Experiments, fit: Fit, options: Options) -> Fit:
     """Return the fit with its covariance widened by a filter of the speed for its second lag.
 
-    From voltage to speed the two answer the same, but where the motor rubs: how likely a filter
-    then is, its deviance tells.  The motor's lag is without it the first alone, and L/R is short.
+    From voltage to speed the two answer the same, but where the motor rubs and turns back: how
+    likely a filter then is, its deviance tells.  The motor's lag is without it the first alone.
     """
     s = fit.structure
-    if s.order != 2 or s.current or s.low_pass or data.kind == ANGLE or fit.z.log_ratio > RINGS:
+    if s.order != 2 or s.current or s.low_pass or data.kind == ANGLE:
         return fit
-    longer = math.log1p(lag_share(fit.z.log_ratio))
+    ratio, spread = fit.log_ratio()
+    if ratio - NORMAL_95 * spread > RINGS:  # which no two lags do
+        return fit
+    longer = math.log1p(lag_share(ratio))
     odds = 1.0
-    if s.friction != "none":
+    if s.friction != "none" and not data.one_way:
         late = "delay" not in s.fixed  # as is what is left of L/R beside a filter
-        filtered = FirstOrder.like(s).with_(window=True, low_pass=True, delay=late)
         z = fit.z.with_(ln_a1=fit.z.ln_a1 - longer, window=2 * fit.z.second_lag)
-        there = data.measured_as(filtered.speed)
-        other = refine(there, filtered, fit, filtered.complete(z), options)
-        odds = math.exp(-0.5 * max(other.deviance - fit.deviance, 0.0) / sandwich_factor(fit))
+        least = math.inf
+        for ticks in (0, 1):  # samples of the filter a row, or a continuous one
+            filtered = FirstOrder.like(s).with_(window=True, low_pass=True, delay=late, ticks=ticks)
+            there = data.measured_as(filtered.speed)
+            other = refine(there, filtered, fit, filtered.complete(z), options)
+            least = min(least, other.deviance)
+        odds = math.exp(-0.5 * max(least - fit.deviance, 0.0) / sandwich_factor(fit))
     row = s.of_free(direction(ln_a1=-longer, ln_a2=-1.0, ln_te=-1.0))
     return fit.along(math.sqrt(odds / (1 + odds)) * row)
 

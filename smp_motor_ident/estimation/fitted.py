@@ -11,7 +11,7 @@ import numpy as np
 
 from smp_motor_control.arrays import Array
 from smp_motor_ident.likelihood.noise import NoiseModel
-from smp_motor_ident.model.coordinates import PLAUSIBLE, Coordinates
+from smp_motor_ident.model.coordinates import PLAUSIBLE, Coordinates, direction
 from smp_motor_ident.model.measurement import Measurement
 from smp_motor_ident.model.structures import Structure
 
@@ -121,6 +121,12 @@ class Fit(Start):
     def along(self, move: Array) -> "Fit":
         """Return the fit with its covariance widened by a move of the free coordinates."""
         return self.wider(np.outer(move, move).astype(np.float64))
+
+    def log_ratio(self) -> tuple[float, float]:
+        """Return ``ln(a2 a0 / a1^2)``, above `RINGS` of a motor that rings, and its deviation."""
+        row = direction(ln_a0=1.0, ln_a1=-2.0, ln_a2=1.0)
+        free = row @ self.structure.matrix
+        return float(row @ self.z.array), float(np.sqrt(free @ self.covariance() @ free))
 
     def noise_model(self) -> NoiseModel:
         """Return how the residuals weigh."""

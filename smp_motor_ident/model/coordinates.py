@@ -115,11 +115,6 @@ class Coordinates:
         return _exp(self.ln_a2 - self.ln_a1)
 
     @property
-    def log_ratio(self) -> float:
-        """``ln(a2 a0 / a1^2)``, above `RINGS` of a motor that rings."""
-        return self.ln_a0 - 2 * self.ln_a1 + self.ln_a2
-
-    @property
     def electrical_time_constant(self) -> float:
         """L/R [s]."""
         return _exp(self.ln_te)
