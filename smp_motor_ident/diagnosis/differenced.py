@@ -32,6 +32,7 @@ from smp_motor_ident.model.structures import SecondOrder
 from smp_motor_ident.record import Record
 
 SMOOTH = 9  # samples of which a mean leaves the motion and hardly the rounding
+FEW = 2  # counts a sample at most, of which no speed can be read
 LOCAL = 15  # samples over which a motion is a cubic
 SLOW = 100  # counts an interval, of which the step in a speed is seen
 LONGER = 2.0  # times the usual interval: longer ones are gaps
@@ -84,8 +85,11 @@ def rounding(record: Record) -> float:
 
 
 def _smooth_but_for_one(moved: Array) -> bool:
-    """Tell whether counts, where they change, leave a cubic over some samples by one's rounding."""
-    if moved.size < LOCAL:
+    """Tell whether counts, where they change, leave a cubic over some samples by one's rounding.
+
+    Of more than a few counts a sample the speed itself can be read, whatever else moves the motor.
+    """
+    if moved.size < LOCAL or np.abs(moved).max() > FEW:
         return False
     count = np.cumsum(moved)
     rest = count - savgol_filter(count, LOCAL, 3)
