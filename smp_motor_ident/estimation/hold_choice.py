@@ -36,8 +36,8 @@ HOLDS = {
     "switched": "switched inside its intervals",
     "middle": "switched in the middle of its intervals",
 }
-TAKEN_BACK = 0.75
-"""Samples of delay: between half of one, by which a speed over a row is late, and a whole one."""
+TAKEN_BACK = 0.25
+"""Samples of delay: between none and half of one, by which a digital filter is ahead of a lag."""
 EARLIER = {"before": -0.5, "after": 1.0, "interpolated": 0.5}
 """Samples of delay that a hold takes the place of: a command up to its row, with means that moved
 its switches before; one from its row on; one straight from row to row."""

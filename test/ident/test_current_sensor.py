@@ -15,10 +15,7 @@ import pytest
 from scipy.signal import lfilter
 from test_recursion import exact, predict
 
-from smp_motor_ident.diagnosis.sensors import sensors
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.estimation.fit import Options
-from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.likelihood.noise import NO_GAIN, NoiseModel, kalman_gain
 from smp_motor_ident.likelihood.passes import gather
@@ -249,15 +246,3 @@ def test_a_current_is_not_given_up_for_a_speed_that_is_a_mean():
         q = (found.parameters | found.combinations)[name]
         assert abs(q.value - true) < max(5 * q.std, 5e-3 * true), name
     assert not found.unreliable
-
-
-def test_a_lag_of_the_currents_sensor_beyond_the_motors_own_is_not_believed():
-    record = simulated(200.0, "fourier", 2.0, "low_passed", 2e-3)
-    data = prepare([record], True)
-    fit = initial_fit(data, Electromechanical(current_sensor="low_passed"), Options())
-    said = {}
-    for share in (0.5, 2.0):
-        lag = share * fit.z.time_constant
-        found = sensors(data, replace(fit, z=fit.z.with_(current_lag=lag)))
-        said[share] = next(f.severity for f in found if f.code == "current_lag")
-    assert said == {0.5: "note", 2.0: "unreliable"}
