@@ -15,7 +15,7 @@ from smp_motor_ident.estimation.descent import ROUGHLY, refine, restate, screeni
 from smp_motor_ident.estimation.fit import Fit, Options
 from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.estimation.request import Request
-from smp_motor_ident.estimation.selection import POLICY, FittedCandidate
+from smp_motor_ident.estimation.selection import POLICY, FittedCandidate, sandwich_factor
 from smp_motor_ident.estimation.thinning import thinned
 from smp_motor_ident.estimation.trials import LAGS, tried
 from smp_motor_ident.finding import Finding
@@ -133,7 +133,10 @@ def earlier_command(
     found = initial_fit(there, structure, request.options, [best.z, best.z.with_(ln_a1=later)])
     if not found or found.deviance > best.deviance - POLICY.price(2, best.samples):
         return None
-    if found.z.delay > TAKEN_BACK * data.step:
+    # A smaller part of what is left coloured is another effect's.
+    left = float(np.exp((found.deviance - best.deviance) / best.samples))
+    coloured = sandwich_factor(found) > limits.COLOURED.value
+    if found.z.delay > TAKEN_BACK * data.step or (coloured and left > limits.HALF_EXPLAINED.value):
         return None
     known = request.validation
     kept = None if known is None else [_an_interval_earlier(r) for r in known]
