@@ -23,7 +23,7 @@ from scipy.signal import savgol_coeffs, savgol_filter
 
 from smp_motor_control.arrays import Array
 from smp_motor_ident.diagnosis.limits import FEWEST, NEIGHBOURS, ONE_COUNT, SIGN_SURE
-from smp_motor_ident.diagnosis.sample_limits import BEAT_JITTER, NOMINAL_PERIOD
+from smp_motor_ident.diagnosis.sample_limits import BEAT_JITTER, COUNTS_A_SAMPLE, NOMINAL_PERIOD
 from smp_motor_ident.estimation.fit import Options
 from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.finding import Finding
@@ -32,7 +32,6 @@ from smp_motor_ident.model.structures import SecondOrder
 from smp_motor_ident.record import Record
 
 SMOOTH = 9  # samples of which a mean leaves the motion and hardly the rounding
-FEW = 2  # counts a sample at most, of which no speed can be read
 LOCAL = 15  # samples over which a motion is a cubic
 SLOW = 100  # counts an interval, of which the step in a speed is seen
 LONGER = 2.0  # times the usual interval: longer ones are gaps
@@ -89,7 +88,7 @@ def _smooth_but_for_one(moved: Array) -> bool:
 
     Of more than a few counts a sample the speed itself can be read, whatever else moves the motor.
     """
-    if moved.size < LOCAL or np.abs(moved).max() > FEW:
+    if moved.size < LOCAL or np.abs(moved).max() > COUNTS_A_SAMPLE.value:
         return False
     count = np.cumsum(moved)
     rest = count - savgol_filter(count, LOCAL, 3)

@@ -47,6 +47,19 @@ HELD = Limit(
     "test_edge_timer.py: a speed from counts rounded or held is none of a timer",
 )  # fmt: skip
 
+COMMAND_AHEAD = Limit(
+    0.25, "sample",
+    "cost: between no delay and half a sample, by which a filter that firmware runs row by row is "
+    "ahead of two lags; a longer one takes back that a command was read an interval late",
+    "test_findings.py: a speed that is filtered as slowly as the motor turns",
+)  # fmt: skip
+COUNTS_A_SAMPLE = Limit(
+    2.0, "counts",
+    "cost: of that many at most a difference of counts is no speed, and they are summed whatever "
+    "moves the motor; of more it can be read, and a motor has to leave one count's rounding",
+    "test_differenced.py: counts are seen in a speed of a motor that no model explains",
+)  # fmt: skip
+
 # A driver's effect on its command.
 EFFECT_SHOWN = Limit(
     0.5, "relative standard deviation",

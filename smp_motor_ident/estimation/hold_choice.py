@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from smp_motor_ident.diagnosis import limits
+from smp_motor_ident.diagnosis.sample_limits import COMMAND_AHEAD
 from smp_motor_ident.estimation import order_selection
 from smp_motor_ident.estimation.candidate_starts import of_kind
 from smp_motor_ident.estimation.consider_covariance import asks_for_earlier
@@ -36,8 +37,6 @@ HOLDS = {
     "switched": "switched inside its intervals",
     "middle": "switched in the middle of its intervals",
 }
-TAKEN_BACK = 0.25
-"""Samples of delay: between none and half of one, by which a digital filter is ahead of a lag."""
 EARLIER = {"before": -0.5, "after": 1.0, "interpolated": 0.5}
 """Samples of delay that a hold takes the place of: a command up to its row, with means that moved
 its switches before; one from its row on; one straight from row to row."""
@@ -133,10 +132,11 @@ def earlier_command(
     found = initial_fit(there, structure, request.options, [best.z, best.z.with_(ln_a1=later)])
     if not found or found.deviance > best.deviance - POLICY.price(2, best.samples):
         return None
-    # A smaller part of what is left coloured is another effect's.
+    # What leaves most of an error that is coloured is a part of another effect's.
     left = float(np.exp((found.deviance - best.deviance) / best.samples))
     coloured = sandwich_factor(found) > limits.COLOURED.value
-    if found.z.delay > TAKEN_BACK * data.step or (coloured and left > limits.HALF_EXPLAINED.value):
+    taken_back = found.z.delay > COMMAND_AHEAD.value * data.step
+    if taken_back or (coloured and left > limits.HALF_EXPLAINED.value):
         return None
     known = request.validation
     kept = None if known is None else [_an_interval_earlier(r) for r in known]
