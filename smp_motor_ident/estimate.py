@@ -53,6 +53,7 @@ from smp_motor_ident.estimation.disturbance import disturbance
 from smp_motor_ident.estimation.driver_effect import (
     DriverFit,
     declared,
+    explains_no_more,
     leaves_torque_noise,
     suspecting,
     suspects_driver,
@@ -321,7 +322,7 @@ def _through_driver(
     emptied = {"implausible_motor", *(() if one_size else ("one_level", "one_size_of_voltage"))}
     hollow = emptied & {f.code for f in e.findings}  # little is left of what was recorded
     fails = any(f.severity == "unreliable" and not blames_current(f) for f in e.findings)
-    fails = fails or (leaves_torque_noise(e, fit) and not beside)
+    fails = fails or (leaves_torque_noise(e, fit) and not beside) or explains_no_more(e, fit)
     said = *e.findings, *one_size_of_voltage(one_size)
     return (None if fails or hollow else through(replace(e, findings=said), driver)), driver
 

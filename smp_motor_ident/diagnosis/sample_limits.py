@@ -103,3 +103,10 @@ FIT_WITHOUT_NOISE = Limit(
     "error, and its numbers are off by as much",
     "test_findings.py",
 )  # fmt: skip
+FRICTION_MOST = Limit(
+    0.5, "of the largest voltage",
+    "physical: geared motors start at a tenth to a third of what they are driven with; where less "
+    "is left to move one than friction takes, the numbers are those of friction's own law, or of a "
+    "driver that coasts between its pulses",
+    "test_coasting_driver.py: a motor that friction nearly holds is unreliable",
+)  # fmt: skip

@@ -13,6 +13,7 @@ from smp_motor_ident.diagnosis.limits import (
     REST,
     SAME_LEVEL,
 )
+from smp_motor_ident.diagnosis.sample_limits import FRICTION_MOST
 from smp_motor_ident.estimation.prediction import voltage_at_samples
 from smp_motor_ident.estimation.quantities import Answer
 from smp_motor_ident.estimation.segments import Change
@@ -42,9 +43,27 @@ def scope(
         yield _alike(alike)
     if result.level:
         yield _one_level(result, _turns_at_others(data, abs(result.level)))
+    yield from _friction_dominates(result, float(np.abs(data.voltage).max()))
     yield from _current_scale(result, group[0].hardware.resistance, _one_size(data) > 0)
     if change.std:
         yield _motor_changes(change, group, float(np.abs(data.voltage).max()))
+
+
+def _friction_dominates(result: Answer, top: float) -> Iterator[Finding]:
+    """Say of a friction that takes most of the voltage what else it may be."""
+    static = result.combinations.get("static_voltage")
+    if static is None or static.value is None or static.value <= FRICTION_MOST.value * top:
+        return
+    yield Finding(
+        "friction_dominates",
+        "unreliable",
+        f"{static.value:.3g} V of the {top:.3g} V at most hold the motor and do not move it: a "
+        "driver that coasts between its pulses, a dead zone or a gear that jams look like that, "
+        "and gain and time constant of what is left need not be the motor's",
+        {"static_voltage": static.value, "largest": top},
+        "drive with more voltage, let the driver brake between its pulses (slow decay), or record "
+        "the voltage at the motor's terminals",
+    )
 
 
 def _motor_changes(change: Change, group: Sequence[Record], top: float) -> Finding:

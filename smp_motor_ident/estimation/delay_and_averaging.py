@@ -24,6 +24,10 @@ WINDOWS = (1.0, 4.0)  # samples at which a low-pass is begun
 SHARES = (0.6, 0.2)  # of a time constant that are the motor's, beside a filter's of its speed
 TICKS = (1, 2, 5, 10)  # samples that a digital low-pass takes a row
 WINDING = 0.05  # of a motor's time constant, as which a second lag is begun
+NEAR, BEYOND = (
+    0.25,
+    0.1,
+)  # samples from a whole delay, from which the other side is tried, and where
 DELAYS = (0.3, 1.5, 3.5)  # samples at which a delay is begun that torque noise may have hidden
 
 
@@ -38,7 +42,7 @@ def settled(
 ) -> Fit:
     """Carry a first fit on to all data, and to its torque noise."""
     fit = data_window.grow(data, first.structure, first, options, near, rival)
-    return _snap(data, fit, options) if first.structure.delay else fit
+    return snapped(data, fit, options) if first.structure.delay else fit
 
 
 def first_with_delay(
@@ -56,11 +60,12 @@ def first_with_delay(
     return first_fit(data, delayed, options, starts, keep=4, own=False)
 
 
-def _snap(data: Experiments, fit: Fit, options: Options) -> Fit:
-    """Try a whole number of samples of delay: the surface has a kink there.
+def snapped(data: Experiments, fit: Fit, options: Options) -> Fit:
+    """Try whole numbers of samples of delay, and what is beyond: the surface has a kink at each.
 
     A switch of the input that falls on a sampling instant makes the derivative by the delay
-    jump; a descent that comes near such a point stays short of it.
+    jump; a descent that comes near such a point stays short of it, and so does one whose own
+    minimum lies beyond.
     """
     best = fit
     for n in {int(fit.z.delay / data.step), int(fit.z.delay / data.step) + 1}:
@@ -68,6 +73,17 @@ def _snap(data: Experiments, fit: Fit, options: Options) -> Fit:
         other = descent.refine(data, whole, fit, fit.z, options, known=best)
         if other.deviance < best.deviance - 1:
             best = descent.restate(data, fit.structure, other, options)
+    for _ in DELAYS:
+        samples = best.z.delay / data.step
+        kink = round(samples)
+        across = kink + math.copysign(BEYOND, kink - samples)
+        if abs(samples - kink) > NEAR or across < 0:
+            break
+        z = best.z.with_(delay=across * data.step)
+        other = descent.refine(data, fit.structure, best, z, options, known=best)
+        if other.deviance > best.deviance - 1:
+            break
+        best = other
     return best
 
 

@@ -18,7 +18,7 @@ from smp_motor_ident.diagnosis.limits import HALF_EXPLAINED
 from smp_motor_ident.diagnosis.sample_limits import DRIVER_TOLERANCE, EFFECT_SHOWN, SLEW_SEEN
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.fitted import NORMAL_95
-from smp_motor_ident.estimation.selection import evidence
+from smp_motor_ident.estimation.selection import bic, evidence
 from smp_motor_ident.finding import Finding, Severity
 from smp_motor_ident.likelihood.experiments import output_of
 from smp_motor_ident.model.driver import (
@@ -152,6 +152,16 @@ def leaves_torque_noise(estimate: Estimate, fit: Fit) -> bool:
     intensity = [f.evidence["intensity"] for f in estimate.findings if f.code == "torque_noise"]
     most = HALF_EXPLAINED.value * fit.noise_ratio
     return any(isinstance(left, float) and left > most for left in intensity)
+
+
+def explains_no_more(estimate: Estimate, fit: Fit) -> bool:
+    """Tell whether a motor behind a driver, under torque noise, is no likelier than one without.
+
+    Both have a torque noise of their own then, and only the price of the driver's number between.
+    """
+    noisy = any(f.code == "torque_noise" for f in estimate.findings)
+    behind = next(c.bic for c in estimate.candidates if c.chosen)
+    return fit.noise_ratio > 0 and noisy and behind is not None and behind >= bic(fit)
 
 
 def declared(

@@ -38,14 +38,19 @@ class FittedCandidate:
 
     @property
     def bic(self) -> float:
-        """Bayesian information criterion: deviance + parameters x ln(samples)."""
-        return self.fit.deviance + self.fit.structure.size * float(np.log(self.fit.samples))
+        """Bayesian information criterion."""
+        return bic(self.fit)
 
     def contains(self, other: "FittedCandidate") -> bool:
         """Tell whether another, fitted to all data, is this one with fewer free coordinates."""
         free = set(self.fit.structure.free)
         settled = other.whole and other.fit.converged and other.fit.kind == self.fit.kind
         return settled and set(other.fit.structure.free) < free
+
+
+def bic(fit: Fit) -> float:
+    """Return the Bayesian information criterion: deviance + parameters x ln(samples)."""
+    return fit.deviance + fit.structure.size * float(np.log(fit.samples))
 
 
 def sandwich_factor(fit: Fit) -> float:

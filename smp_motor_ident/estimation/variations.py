@@ -10,6 +10,7 @@ from smp_motor_ident.estimation.candidate_starts import of_kind
 from smp_motor_ident.estimation.current_lag import with_current_lag
 from smp_motor_ident.estimation.delay_and_averaging import (
     delay_without_noise,
+    snapped,
     with_digital_filter,
     with_filter_for_lag,
     with_low_pass,
@@ -66,6 +67,8 @@ def _with_addition(
     other = descent.refine(data, richer, best, z, options)
     other = min(other, hidden or other, key=lambda f: f.deviance)
     verdict, reason = POLICY.preferred(best, other)
+    if verdict and "delay" in change:
+        other = snapped(data, other, options)
     if verdict and "delay" in change and other.z.delay < 0.03 * data.step:
         verdict, reason = False, "a delay of hundredths of a sample is how the input was held"
     if verdict:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from independent import simulate
 
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.estimation import fast_decay
@@ -197,3 +198,17 @@ def test_a_bridge_that_coasts_is_found_in_few_simulations(monkeypatch):
     found = fast_decay.fitted(data, near, Driver(driver.COAST, 1.0, 12.0), options)
     assert found.driver.size == pytest.approx(truth["fast_decay_ratio"], rel=0.05)
     assert runs["simulations"] < 1000
+
+
+@pytest.mark.parametrize(("friction", "unreliable"), [(7.0, True), (3.0, False)])
+def test_a_motor_that_friction_nearly_holds_is_unreliable(friction, unreliable):
+    """Of 12 V at most: what is left of a bridge that coasts moves a motor as a great friction."""
+    rng = np.random.default_rng(2)
+    v = np.repeat(rng.uniform(-12.0, 12.0, 60), rng.integers(20, 60, 60))
+    made = simulate(np.arange(v.size) * STEP, v, 2.0, 1e-3, 0.05, 2e-4, 1e-5, friction * 0.025,
+                    np.zeros(v.size), 40)  # fmt: skip
+    speed = made[:, 1] + 0.3 * rng.standard_normal(v.size)
+    found = estimate(Record("motor", np.arange(v.size) * STEP, v, velocity=speed))
+    assert found.value("static_voltage") == pytest.approx(friction, abs=0.1)  # a hundredth of 12 V
+    assert ("friction_dominates" in [f.code for f in found.findings]) is unreliable
+    assert found.unreliable is unreliable

@@ -14,6 +14,7 @@ from smp_motor_ident.estimation import fast_decay
 from smp_motor_ident.estimation.driver_effect import (
     DriverFit,
     driver_of,
+    explains_no_more,
     leaves_torque_noise,
     suspects_driver,
 )
@@ -226,6 +227,21 @@ def test_what_leaves_most_of_the_torque_noise_is_no_driver(before, behind, leave
     found, fit = SimpleNamespace(findings=(noise,)), SimpleNamespace(noise_ratio=before)
     assert leaves_torque_noise(found, fit) is leaves
     assert not leaves_torque_noise(SimpleNamespace(findings=()), fit)
+
+
+@pytest.mark.parametrize(
+    ("before", "behind", "codes", "no_more"),
+    # Two numbers, e^5 samples: both cost 10. Without torque noise a motor is held against its own.
+    [(0.1, -90.0, ["torque_noise"], True), (0.1, -91.0, ["torque_noise"], False),
+     (0.1, -50.0, [], False), (0.0, -50.0, ["torque_noise"], False)],
+)  # fmt: skip
+def test_a_driver_under_torque_noise_has_to_be_likelier_than_none(before, behind, codes, no_more):
+    chosen = SimpleNamespace(chosen=True, bic=behind)
+    found = SimpleNamespace(findings=tuple(Finding(c, "warning", "") for c in codes),
+                            candidates=(chosen,))  # fmt: skip
+    fit = SimpleNamespace(noise_ratio=before, deviance=-100.0, samples=math.exp(5.0),
+                          structure=SimpleNamespace(size=2))  # fmt: skip
+    assert explains_no_more(found, fit) is no_more
 
 
 @pytest.mark.parametrize(
