@@ -136,7 +136,8 @@ def earlier_command(
     left = float(np.exp((found.deviance - best.deviance) / best.samples))
     coloured = sandwich_factor(found) > limits.COLOURED.value
     taken_back = found.z.delay > COMMAND_AHEAD.value * data.step
-    if taken_back or (coloured and left > limits.HALF_EXPLAINED.value):
+    of_current = found.noise[0, 0] > best.noise[0, 0]  # whose rounding, or lag, is no motion's
+    if taken_back or of_current or (coloured and left > limits.HALF_EXPLAINED.value):
         return None
     known = request.validation
     kept = None if known is None else [_an_interval_earlier(r) for r in known]
