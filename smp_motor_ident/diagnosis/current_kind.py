@@ -12,6 +12,7 @@ import numpy as np
 from smp_motor_control.arrays import Array
 from smp_motor_ident.diagnosis.data_quality import of_the_winding, offset_of_current
 from smp_motor_ident.diagnosis.limits import CURRENT_KIND, FEWEST, METER, REST
+from smp_motor_ident.estimation.fitted import NORMAL_95
 from smp_motor_ident.record import Record
 
 ARMATURE, UNSIGNED, SUPPLY = "armature", "current_unsigned", "current_of_supply"
@@ -42,8 +43,14 @@ def current_kind(group: Sequence[Record]) -> str:
 
 
 def _one_sign(v: Array, i: Array) -> bool:
-    """Tell whether the current flows forward, and never back, while the motor is driven back."""
-    back = i[v < -REST.value * np.abs(v).max()]
+    """Tell whether the current flows forward, and never back, while the motor is driven back.
+
+    Of a motor that is only driven back this is so, too, where the sensor's leads are swapped.
+    """
+    top = np.abs(v).max()
+    back = i[v < -REST.value * top]
+    if back.size >= FEWEST.value and v.max() <= REST.value * top:
+        return bool(back.mean() > NORMAL_95 * back.std() / np.sqrt(back.size))
     low, high = np.percentile(i, [1, 99])
     if back.size < FEWEST.value or low < -METER.value * high:
         return False

@@ -76,6 +76,20 @@ def test_the_size_of_a_current_is_left_out_where_the_motor_is_driven_back_only(s
     assert kind == (ARMATURE if sign > 0 else UNSIGNED)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_small_current_of_the_supply_is_left_out_where_the_motor_is_driven_back_only(seed):
+    """At a low duty the supply's is a fraction of the armature's, next to nothing in the noise."""
+    step = np.r_[np.zeros(20), np.full(160, -6.0)]
+    back = motors.record("rear_left", voltage=step, seconds=0.9)
+    noise = 0.004 * 12.0 / 3.28 * np.random.default_rng(seed).standard_normal(len(back))
+    record = replace(back, current=back.current * back.voltage / 12.0 + noise)
+    found = estimate(record)
+    assert "current_left_out" in {f.code for f in found.findings}
+    true = motors.truth("rear_left", 0.3)["time_constant"]
+    lag = found.combinations["time_constant"]
+    assert abs(lag.value - true) < 4 * lag.std + 0.005 * true  # four deviations
+
+
 def test_a_coarse_encoder_does_not_hide_that_a_current_has_no_sign():
     coarse = replace(GOOD, velocity=None, count=GOOD.count // 20 * 20, current=np.abs(GOOD.current))
     assert current_kind([coarse]) == UNSIGNED
