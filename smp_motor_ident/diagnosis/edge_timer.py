@@ -13,7 +13,7 @@ import numpy as np
 
 from smp_motor_control.arrays import Array
 from smp_motor_ident.diagnosis.limits import HALF_EXPLAINED
-from smp_motor_ident.diagnosis.sample_limits import EDGES, HELD
+from smp_motor_ident.diagnosis.sample_limits import EDGE_SPEED, EDGES, HELD
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import speed_quantum
 from smp_motor_ident.record import Record
@@ -69,10 +69,11 @@ def _count_of(record: Record, velocity: Array) -> float:
     step = record.sample_time
     tells = held > ROWS * step
     best, most = 0.0, EDGES.value - 1
+    least = EDGE_SPEED.value * ROWS * step * float(np.abs(speed).max())
     for count in np.percentile((held * after)[tells], TRIED) if tells.any() else ():
         slow = count / after > ROWS * step
         alike = np.abs(held - count / after)[slow] < ALIKE * step
-        if np.unique(after[slow]).size < HALF_EXPLAINED.value * alike.size:
+        if count < least or np.unique(after[slow]).size < HALF_EXPLAINED.value * alike.size:
             continue  # levels of a rounded speed
         if alike.sum() > most and alike.mean() > HELD.value:
             best, most = float(count), int(alike.sum())

@@ -47,6 +47,12 @@ HELD = Limit(
     "test_edge_timer.py: a speed from counts rounded or held is none of a timer",
 )  # fmt: skip
 
+EDGE_SPEED = Limit(
+    1e-3, "of the largest speed",
+    "cost: readings that are held below it are late by nothing that moves a number; the tail of a "
+    "filter decays through as many small readings as one likes",
+    "test_edge_timer.py: the tail of a filter is none of a timer",
+)  # fmt: skip
 COMMAND_AHEAD = Limit(
     0.25, "sample",
     "cost: between no delay and half a sample, by which a filter that firmware runs row by row is "

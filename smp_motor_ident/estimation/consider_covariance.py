@@ -111,7 +111,9 @@ def consider_filter(data: Experiments, fit: Fit, options: Options) -> Fit:
             there = data.measured_as(filtered.speed)
             other = refine(there, filtered, fit, filtered.complete(z), options)
             least = min(least, other.deviance)
-        odds = math.exp(-0.5 * max(least - fit.deviance, 0.0) / sandwich_factor(fit))
+        # The shape of stick and slip is a number that no choice has been charged for.
+        price = POLICY.price(1, fit.samples) * ("ln_te" in s.free)
+        odds = math.exp(-0.5 * max(least - fit.deviance - price, 0.0) / sandwich_factor(fit))
     row = s.of_free(direction(ln_a1=-longer, ln_a2=-1.0, ln_te=-1.0))
     return fit.along(math.sqrt(odds / (1 + odds)) * row)
 

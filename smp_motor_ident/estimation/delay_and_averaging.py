@@ -236,8 +236,8 @@ def with_filter_for_lag(
                 there = there or descent.refine(part, s, best, best.z, options)
                 tried = _filtered(part, structure, there, z, options)
             z = tried.z.with_second_lag(WINDING * tried.z.time_constant)
-            if far or there is None or not POLICY.replaces(there, tried)[0]:
-                continue
+            if far or there is None or tried.deviance > there.deviance:
+                continue  # all of the data decide where a part leaves it open
             there = tried
             if part is not data:
                 tried = _filtered(data, structure, best, tried.z, options)

@@ -15,7 +15,12 @@ import numpy as np
 
 from smp_motor_control.arrays import Array
 from smp_motor_ident.diagnosis.limits import HALF_EXPLAINED
-from smp_motor_ident.diagnosis.sample_limits import DRIVER_TOLERANCE, EFFECT_SHOWN, SLEW_SEEN
+from smp_motor_ident.diagnosis.sample_limits import (
+    DRIVER_TOLERANCE,
+    EFFECT_SHOWN,
+    ORDINARY_BEND,
+    SLEW_SEEN,
+)
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.fitted import NORMAL_95
 from smp_motor_ident.estimation.selection import bic, evidence
@@ -24,6 +29,7 @@ from smp_motor_ident.likelihood.experiments import output_of
 from smp_motor_ident.model.driver import (
     CLIP,
     COAST,
+    DEAD_ZONE,
     DECLARABLE,
     EFFECTS,
     RAMPS,
@@ -74,12 +80,18 @@ class DriverFit:
 
     @property
     def shown(self) -> bool:
-        """Whether its 95 % interval holds nothing that is no effect, nor is over between rows."""
+        """Whether its 95 % interval holds nothing that is no effect, nor is over between rows.
+
+        A dead zone that is no larger than what every drive has is friction's.
+        """
         size, kind = self.driver.size, self.effect.kind
         if kind == COAST:  # of which the size may be anything, as long as it coasts
             return True
+        top = max(float(np.abs(r.voltage).max()) for r in self.before)
         if kind == CLIP:
-            size = max(float(np.abs(r.voltage).max()) for r in self.before) - size
+            size = top - size
+        if kind == DEAD_ZONE and size < ORDINARY_BEND.value * top:
+            return False
         if kind == SLEW:
             rise = max(float(np.abs(np.diff(r.voltage)).max()) for r in self.before) / size
             if rise < SLEW_SEEN.value * min(r.sample_time for r in self.before):

@@ -35,6 +35,7 @@ def varied(
     best = with_low_pass(data, best, options, candidates, say)
     best = with_digital_filter(data, best, options, candidates, say)
     data = data.measured_as(best.kind)
+    sensed = best.structure
     before = None
     while before != best.structure:  # what was added may have hidden that the rest is there, too
         before = best.structure
@@ -42,6 +43,9 @@ def varied(
             if "friction" in change and data.one_way:  # of the other direction nothing shows
                 continue
             best = _with_addition(data, best, change, options, candidates, say)
+    if best.structure != sensed:  # without it either lag may have stood for what was missing
+        best = with_filter_for_lag(data, best, options, candidates, say)
+        data = data.measured_as(best.kind)
     if best.structure != candidates[0].fit.structure:  # what was added may have hidden it
         best = with_current_lag(data, best, options, candidates, say)
     return _without_friction(data, best, options, candidates)

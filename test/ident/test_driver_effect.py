@@ -280,9 +280,21 @@ def test_a_plain_driver_has_no_effect():
     assert not set(DRIVERS) & set(found.combinations)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_dead_zone_of_a_hundredth_of_the_voltage_is_frictions(seed):
+    """A transistor's drop is as large, and a coarse speed's rounding looks like it."""
+    command = commands(seed)
+    speed = run(np.sign(command) * np.maximum(np.abs(command) - 0.12, 0.0), seed)
+    found = estimate(Record("motor", np.arange(command.size) * STEP, command, velocity=speed))
+    assert "dead_zone" not in found.combinations and not found.unreliable
+    static, gain = found.combinations["static_voltage"], found.combinations["dc_gain"]
+    assert abs(static.value - STATIC - 0.12) < 4 * static.std + 0.02  # a sixth of the zone
+    assert abs(gain.value - GAIN) < 4 * gain.std + 1e-3 * GAIN
+
+
 def test_a_driver_that_explains_hardly_more_than_none_leaves_room_for_none():
     command = commands(2)
-    speed = run(np.sign(command) * np.maximum(np.abs(command) - 0.023, 0.0), 2, noise=2.0)
+    speed = run(np.sign(command) * np.maximum(np.abs(command) - 0.23, 0.0), 2, noise=20.0)
     record = Record("motor", np.arange(command.size) * STEP, command, velocity=speed)
     plain = initial_fit(prepare([record], False), FirstOrder(), Options())
     found = likeliest([record], plain, "held", Options())
