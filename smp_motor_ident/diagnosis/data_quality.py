@@ -11,7 +11,11 @@ from smp_motor_ident.diagnosis.glitches import glitches_of
 from smp_motor_ident.diagnosis.saturation import saturation
 from smp_motor_ident.diagnosis.signs import likeness, lost_sign
 from smp_motor_ident.diagnosis.silence import silent
-from smp_motor_ident.diagnosis.units import cause_of_ratio, implausible_voltage
+from smp_motor_ident.diagnosis.units import (
+    cause_of_ratio,
+    implausible_voltage,
+    one_unit_of_time,
+)
 from smp_motor_ident.errors import CurrentError, InsufficientExcitationError, SignalError
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.first_order_lag import lagged
@@ -26,6 +30,7 @@ def screen(records: Sequence[Record]) -> list[Finding]:
     """Refuse records that cannot lead to a right answer; name the reason and the remedy."""
     warnings = implausible_voltage(records)
     where = where_of(records)
+    one_unit_of_time(records)
     _length(records, where)
     for record in records:
         warnings += _lost(record)

@@ -12,6 +12,7 @@ from smp_motor_ident.diagnosis.limits import (
     LOW_VOLTAGE,
 )
 from smp_motor_ident.diagnosis.sample_limits import FAST_MOTOR, HIGHEST_SPEED
+from smp_motor_ident.errors import SignalError
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.model.coordinates import Coordinates
 from smp_motor_ident.record import Hardware, Record
@@ -39,6 +40,19 @@ def cause_of_ratio(ratio: float, hardware: Hardware) -> str:
         f"wrong gear ratio (now {hardware.gear_ratio:g}) or counts per revolution (now "
         f"{hardware.counts_per_revolution or 0:g}), correct the motor description"
     )
+
+
+def one_unit_of_time(records: Sequence[Record]) -> None:
+    """Refuse records of which one has its samples a thousand times as far apart as the others."""
+    usual = float(np.median([r.sample_time for r in records]))
+    for record in records:
+        for factor in (1e-6, 1e-3, 1e3, 1e6):
+            if abs(record.sample_time / usual / factor - 1) < EXACT:
+                raise SignalError(
+                    f"{record.source or 'a record'}: a sample every {record.sample_time:.3g} s, "
+                    f"{factor:g} times as long as in the other recordings: the time of one is in "
+                    "another unit; map it with its own, such as time=COLUMN:ms, or leave it out"
+                )
 
 
 def implausible_voltage(records: Sequence[Record]) -> list[Finding]:

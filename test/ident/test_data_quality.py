@@ -9,6 +9,7 @@ from scipy.signal import lfilter
 
 from smp_motor_ident.diagnosis.data_quality import screen
 from smp_motor_ident.diagnosis.identifiability import what_next
+from smp_motor_ident.diagnosis.units import one_unit_of_time
 from smp_motor_ident.errors import InsufficientExcitationError, SignalError
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.record import Record
@@ -229,3 +230,10 @@ def test_a_speed_of_few_counts_of_another_motor_is_refused():
     except (InsufficientExcitationError, SignalError):
         return
     assert found.unreliable
+
+
+def test_a_record_in_another_unit_of_time_is_named_among_others():
+    milliseconds = replace(GOOD, time=1000.0 * GOOD.time, source="third.csv")
+    with pytest.raises(SignalError, match=r"third\.csv: a sample every 5 s, 1000 times.*:ms"):
+        screen([GOOD, GOOD, milliseconds])
+    one_unit_of_time([GOOD, replace(GOOD, time=100.0 * GOOD.time)])  # 2 Hz beside 200 Hz may be
