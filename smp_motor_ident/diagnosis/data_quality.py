@@ -275,9 +275,9 @@ def _signs(records: Sequence[Record], where: str, late: bool = True) -> None:
             and found.wrong > limits.SIGN_NEARER.value * found.right
         ):
             raise InsufficientExcitationError(
-                f"{where}: the voltage changes too fast for its sampling, {_period(records):.2g} "
-                "samples a period: a speed that comes late looks like one of the other sign; "
-                "excite more slowly, or sample faster"
+                f"{where}: the voltage changes too fast, every {_period(records):.2g} samples there "
+                "and back: a speed that comes late, by its sampling, a filter or a window, looks "
+                "like one of the other sign; excite more slowly"
             )
 
 
