@@ -207,30 +207,34 @@ def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) 
         if early := _tried(records, asked, [*found, said]):
             return early
     refused: SmpError | None = None
+    driver: DriverFit | None = None
     left = list(candidates)
     for one in in_turn(candidates):
         left = [r for r in left if r.fit is not one.fit]
         try:
             words = [*found, *fallen_back(refused, one.label)]
             plain = _stated(group, request, words, data, hold, [*left, one], refused is None)
-            if not (request.suspected or lacks_something(plain)):
-                if refused is not None or not one.fit.noise_ratio > 0:
-                    return plain
-                ramped, _ = _through_driver(group, request, found, data, hold, one.fit, RAMPS)
-                return ramped or plain
-            noisy = refused is None and (is_moved(plain) or one.fit.noise_ratio > 0)
-            held, driver = _beside_model(group, request, found, data, hold, one.fit, plain, noisy)
-            return held or suspecting(plain, driver, one.fit)
         except (SignalError, InsufficientExcitationError) as refusal:
-            if refused is None and (
-                held := _beside_model(group, request, found, data, hold, one.fit, None, True)[0]
-            ):
-                return held
+            if refused is None:
+                held, driver = _beside_model(group, request, found, data, hold, one.fit, None, True)
+                if held:
+                    return held
             refused = refused or refusal
             # What was refused, and what is richer, is no rival that another's answer must cover.
             most = one.fit.structure.size
             left = [replace(r, whole=r.whole and r.fit.structure.size <= most) for r in left]
             left.append(replace(one, reason=f"refused: {refusal}", whole=False))
+            continue
+        if refused is not None:
+            return suspecting(plain, driver, one.fit)
+        if not (request.suspected or lacks_something(plain)):
+            if not one.fit.noise_ratio > 0:
+                return plain
+            ramped, _ = _through_driver(group, request, found, data, hold, one.fit, RAMPS)
+            return ramped or plain
+        noisy = is_moved(plain) or one.fit.noise_ratio > 0
+        held, driver = _beside_model(group, request, found, data, hold, one.fit, plain, noisy)
+        return held or suspecting(plain, driver, one.fit)
     assert refused is not None
     # A load hides what the others are: with it in every candidate they may be found.
     again = not (request.loaded or request.within)
@@ -357,8 +361,7 @@ def _stated(
     gear = group[0].hardware.gear_ratio
     errors = regression(final, chosen, gear, bool(change.std))
     chosen, parts = dependent(chosen, errors)
-    result, alike = said(chosen)
-    refusal = only_lag_unknown(group, chosen, result)
+    refusal = only_lag_unknown(group, chosen, said(chosen)[0])
     request.say("validating")
     own, common = validate.validated(group, request, final, chosen, hold)
     percent = FitPercent(fitted, own)
@@ -366,6 +369,7 @@ def _stated(
     (result, alike), lacks = held_against_effects(
         final, chosen, gear, errors, tests.white is True, said, request.options
     )
+    refusal = refusal or only_lag_unknown(group, chosen, result)  # in an interval so wide
     result = without_lag(result) if refusal else result
     findings = [
         *found,

@@ -45,9 +45,9 @@ def screen(records: Sequence[Record]) -> list[Finding]:
         silent(record, where_of([record]))
     _motion(records, where)
     _signs(records, where)
+    for record in _turning(records):  # the many do not hide the one
+        _signs([record], where_of([record]), late=False)
     for record in records:
-        if len(records) > 1:  # the many do not hide the one
-            _signs([record], where_of([record]), late=False)
         _offset(record)
     read = [finding for record in records for finding in record.findings]
     return [*warnings, *(f for k, f in enumerate(read) if f not in read[:k])]
@@ -275,10 +275,20 @@ def _signs(records: Sequence[Record], where: str, late: bool = True) -> None:
             and found.wrong > limits.SIGN_NEARER.value * found.right
         ):
             raise InsufficientExcitationError(
-                f"{where}: the voltage changes too fast, every {_period(records):.2g} samples there "
-                "and back: a speed that comes late, by its sampling, a filter or a window, looks "
+                f"{where}: the voltage changes too fast, there and back in {_period(records):.2g} "
+                "samples: a speed that comes late, by its sampling, a filter or a window, looks "
                 "like one of the other sign; excite more slowly"
             )
+
+
+def _turning(records: Sequence[Record]) -> list[Record]:
+    """Return those of several records whose motor turned: of others an offset has a sign."""
+    scatter = [float(np.nanstd(measured_speed(r))) for r in records]
+    return [
+        r
+        for r, s in zip(records, scatter, strict=True)
+        if len(records) > 1 and s > limits.REST.value * max(scatter)
+    ]
 
 
 def _period(records: Sequence[Record]) -> float:

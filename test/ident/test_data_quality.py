@@ -237,3 +237,9 @@ def test_a_record_in_another_unit_of_time_is_named_among_others():
     with pytest.raises(SignalError, match=r"third\.csv: a sample every 5 s, 1000 times.*:ms"):
         screen([GOOD, GOOD, milliseconds])
     one_unit_of_time([GOOD, replace(GOOD, time=100.0 * GOOD.time)])  # 2 Hz beside 200 Hz may be
+
+
+def test_one_record_of_a_motor_that_stands_has_no_sign_among_others():
+    """Its speed is an offset of the sensor, which runs against a voltage of the other sign."""
+    still = replace(GOOD, voltage=np.full(N, 0.4), count=None, velocity=np.full(N, -1e-4))
+    screen([replace(GOOD, count=None), still])
