@@ -369,11 +369,11 @@ def _stated(
     (result, alike), lacks = held_against_effects(
         final, chosen, gear, errors, tests.white is True, said, request.options
     )
-    refusal = refusal or only_lag_unknown(group, chosen, result)  # in an interval so wide
-    result = without_lag(result) if refusal else result
+    unknown = refusal or only_lag_unknown(group, chosen, result)
+    result = without_lag(result) if unknown else result
     findings = [
         *found,
-        *lag_unknown(result, refusal, data.step),
+        *lag_unknown(result, unknown, data.step),
         *assess(final, chosen, FitPercent(fitted, common), tests),
         *implausible_motor(group, chosen.z),
         *lacks,

@@ -7,6 +7,7 @@ WORDS_OF_VOLTS = (
     r"volt|spannung|spanning|sp[äæ]nning|(?<!in)tens(?:i[oóu]|[ãa]o)|napi[eę]cie|nap[eěaä]t[ií]"
     r"|gerilim|feszülts|напряж|电压|電圧|전압"
 )
+WORDS_OF_RADIANS = r"rad|omega|ω|(?:^|\W|_)w(?:$|\W|_)"
 ROLES = {
     # What a field or its topic is called, the most telling first.
     "direction": r"(?:^|\W|_)dir(?:ection)?(?:$|\W|_)|richtung|sentido|direcci",

@@ -211,6 +211,12 @@ def _asked(chosen: list[_Candidate], time: _Candidate | None, table: bool) -> di
         asked["wheel_radius"] = _RADIUS
     if any(c.role == "count" or c.unit.startswith(":ticks") for c in chosen):
         asked["counts_per_revolution"] = "of the motor shaft"
+    speed = next((c for c in chosen if c.role == "velocity" and not c.unit), None)
+    if table and speed and not re.search(names.WORDS_OF_RADIANS, names.worded(speed.path), re.I):
+        asked["velocity"] = (
+            f"its unit, {speed.source}:rpm or {speed.source}:deg/s, unless it is rad/s "
+            f"(position={speed.source} if it is an angle)"
+        )
     if time is None:
         asked |= {"sample_time": "in seconds, between rows: no column is a time"} if table else {}
     elif not time.unit and time.value.size > 1:

@@ -80,6 +80,17 @@ def implausible_voltage(records: Sequence[Record]) -> list[Finding]:
 def implausible_motor(records: Sequence[Record], found: Coordinates) -> Iterator[Finding]:
     """Say of a motor that cannot be, or hardly, that a unit may be another."""
     lag, gain = found.time_constant, found.dc_gain
+    longest = max(r.duration for r in records)
+    if lag > longest:
+        yield Finding(
+            "never_steady",
+            "unreliable",
+            f"the speed changes for as long as there is a voltage: a time constant of {lag:.3g} s "
+            f"in {longest:.3g} s of record tells gain over lag alone ({gain / lag:.3g} rad/s^2 per "
+            "volt), and neither of the two",
+            {"time_constant": lag, "duration": longest, "acceleration": gain / lag},
+            "map the speed as position if it is an angle, else record until the speed is steady",
+        )
     top = max(
         max(float(np.abs(r.voltage).max()), r.hardware.supply_voltage or 0.0) for r in records
     )

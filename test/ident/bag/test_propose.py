@@ -213,7 +213,7 @@ def test_the_interval_of_a_table_without_time_is_asked_for(tmp_path: Path) -> No
     path = write(tmp_path / "log.csv", **dict(zip("uy", motor(12))))
     listing = list_topics(path)[0]
     assert listing.suggestion == ["voltage=u", "velocity=y"]
-    assert asked(listing) == ["sample_time"]
+    assert asked(listing) == ["velocity", "sample_time"]  # "w" would be in rad/s
     assert len(read_records(path, [*listing.suggestion, "sample_time=0.01"])["motor"]) == N
 
 
