@@ -301,13 +301,25 @@ def _turns_at_others(data: Experiments, level: float) -> bool:
 
 def _one_level(result: Answer, contradicted: bool) -> Finding:
     speed = result.combinations["steady_speed"]
+    known = f"only the steady speed at {result.level:.3g} V is known, {speed.value:.4g} rad/s"
+    evidence: dict[str, float | str | None] = {
+        "voltage": result.level, "steady_speed": speed.value
+    }  # fmt: skip
+    if contradicted:
+        return Finding(
+            "one_level",
+            "unreliable",
+            f"of gain and static voltage {known}, though the motor turned at other voltages, too: "
+            "no line goes through its speeds, and what bends it is not in the model",
+            evidence,
+            "record the voltage at the motor's terminals, or levels among which the motor will run",
+        )
     return Finding(
         "one_level",
-        "unreliable" if contradicted else "warning",
-        f"of gain and static voltage only the steady speed at {result.level:.3g} V is "
-        f"known, {speed.value:.4g} rad/s: every pair with this product "
+        "warning",
+        f"of gain and static voltage {known}: every pair with this product "
         "dc_gain (voltage - static_voltage) moves the motor alike",
-        {"voltage": result.level, "steady_speed": speed.value},
+        evidence,
         "record two levels of voltage, or a reversal, to know gain and friction apart",
     )
 
