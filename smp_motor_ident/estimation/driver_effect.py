@@ -31,6 +31,7 @@ from smp_motor_ident.model.driver import (
     COAST,
     DEAD_ZONE,
     DECLARABLE,
+    DROP,
     EFFECTS,
     RAMPS,
     SAG,
@@ -82,7 +83,7 @@ class DriverFit:
     def shown(self) -> bool:
         """Whether its 95 % interval holds nothing that is no effect, nor is over between rows.
 
-        A dead zone that is no larger than what every drive has is friction's.
+        A dead zone or a drop that is no larger than what every drive has is friction's.
         """
         size, kind = self.driver.size, self.effect.kind
         if kind == COAST:  # of which the size may be anything, as long as it coasts
@@ -90,7 +91,7 @@ class DriverFit:
         top = max(float(np.abs(r.voltage).max()) for r in self.before)
         if kind == CLIP:
             size = top - size
-        if kind == DEAD_ZONE and size < ORDINARY_BEND.value * top:
+        if kind in (DEAD_ZONE, DROP) and size < ORDINARY_BEND.value * top:
             return False
         if kind == SLEW:
             rise = max(float(np.abs(np.diff(r.voltage)).max()) for r in self.before) / size
