@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 
 from smp_motor_control.arrays import Array
-from smp_motor_ident.diagnosis.limits import LEAST_FIT, UNEXPLAINED
+from smp_motor_ident.diagnosis.limits import LEAST_FIT, REST, UNEXPLAINED
 from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.candidate_starts import of_kind
 from smp_motor_ident.estimation.descent import ROUGHLY
@@ -121,12 +121,15 @@ def held_out(records: Sequence[Record], fit: Fit, hold: str, scatter: float) -> 
     Of their own scatter, and of that of the records that the fit has seen: where the motor
     hardly moves, its own scatter is what the sensor adds.  The latter is NaN where the motion is
     followed as closely as the sensor lets anything: what is left then is the sensor's, not the
-    motor's, and differences of few counts make a large speed of it.
+    motor's, and differences of few counts make a large speed of it.  The former is, where the motor
+    hardly moves beside how it did: what is left is no share of anything.
     """
     kind = "speed" if fit.kind != ANGLE else "auto"
     data = prepare(records, False, kind, hold).measured_as(fit.kind).held(fit.structure.held)
     settled = prediction.settle(data, fit)
     own = speed_fit(records, data, settled)
+    if prediction.simulate(data, settled)[:, 0].std() < REST.value * scatter:
+        own = float("nan")
     if within_resolution(data, settled):
         return own, float("nan")
     return own, speed_fit(records, data, settled, scatter)
