@@ -24,10 +24,9 @@ WINDOWS = (1.0, 4.0)  # samples at which a low-pass is begun
 SHARES = (0.6, 0.2)  # of a time constant that are the motor's, beside a filter's of its speed
 TICKS = (1, 2, 5, 10)  # samples that a digital low-pass takes a row
 WINDING = 0.05  # of a motor's time constant, as which a second lag is begun
-NEAR, BEYOND = (
-    0.25,
-    0.1,
-)  # samples from a whole delay, from which the other side is tried, and where
+NEAR = 0.25  # samples from a whole delay within which its other side is tried
+BEYOND = 0.1  # samples from it on the other side, where that is begun
+CROSSINGS = 3  # of whole delays at most: a first delay is off by a sample or two
 DELAYS = (0.3, 1.5, 3.5)  # samples at which a delay is begun that torque noise may have hidden
 
 
@@ -73,7 +72,7 @@ def snapped(data: Experiments, fit: Fit, options: Options) -> Fit:
         other = descent.refine(data, whole, fit, fit.z, options, known=best)
         if other.deviance < best.deviance - 1:
             best = descent.restate(data, fit.structure, other, options)
-    for _ in DELAYS:
+    for _ in range(CROSSINGS):
         samples = best.z.delay / data.step
         kink = round(samples)
         across = kink + math.copysign(BEYOND, kink - samples)

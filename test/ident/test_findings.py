@@ -18,8 +18,10 @@ from smp_motor_ident.diagnosis import limits
 from smp_motor_ident.diagnosis import sample_limits as samples
 from smp_motor_ident.diagnosis import wheel_limits as wheels
 from smp_motor_ident.diagnosis.advice import _fit
+from smp_motor_ident.diagnosis.units import implausible_motor
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.finding import Finding
+from smp_motor_ident.model.coordinates import Coordinates, direction
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import FitPercent, ResidualTests
 from smp_motor_ident.tune import limits as gains
@@ -181,3 +183,24 @@ def test_a_shaft_that_rings_is_no_motor_behind_a_slow_filter() -> None:
     (shaft,) = [f for f in found if f.code == "compliance"]
     assert shaft.severity == "unreliable"
     np.testing.assert_allclose([shaft.evidence[n] for n in ("frequency", "lag")], [40.0, lag], 0.01)
+
+
+def test_a_lag_that_the_intervals_leave_open_is_not_stated(monkeypatch):
+    """What the model lacks may move it by an e-fold, which is found last."""
+
+    def wide(data, fit, gear, errors, white, said, options):
+        return said(fit.along(fit.structure.of_free(direction(ln_a1=1.0)))), []
+
+    monkeypatch.setattr("smp_motor_ident.estimate.held_against_effects", wide)
+    found = estimate(motors.record("rear_left", current=False, seconds=3.0))
+    assert found.combinations["time_constant"].value is None
+    assert found.combinations["dc_gain"].value is not None
+    assert [f.severity for f in found.findings if f.code == "lag_unknown"] == ["unreliable"]
+
+
+def test_a_speed_that_is_never_steady_tells_gain_over_lag_alone():
+    record = motors.record("rear_left", current=False, seconds=3.0)
+    for lag, codes in ((2.9, []), (30.0, ["never_steady"])):
+        found = Coordinates(ln_a0=-np.log(20.0), ln_a1=np.log(lag / 20.0))
+        said = [f.code for f in implausible_motor([record], found)]
+        assert [code for code in said if code == "never_steady"] == codes

@@ -162,3 +162,30 @@ def test_a_second_lag_of_a_speed_that_is_driven_one_way_may_be_its_filters(stati
     # As a winding's the second lag makes the motor slower by a fifth.
     assert found.value == pytest.approx(1.2 * motor, rel=0.05)
     assert 1.0 < (found.value - motor) / found.std < 3.0
+
+
+def test_a_load_does_not_hide_which_of_two_lags_is_the_filters():
+    """Friction that is greater one way looks like a load; without that a winding fits better."""
+    rng = np.random.default_rng(4)
+    rate, gain, lag, smooth = 5000.0, 25.0, 0.36, 0.17
+    levels = (0.0, 9.0, 0.0, -9.5, 0.0, -20.0, 0.0, 10.0, 0.0, 17.0, 0.0)  # a part shows two
+    volts = np.repeat(levels, (1000, *(5000, 3500) * 5))
+    fine, w, seen, out = 2, 0.0, 0.0, np.zeros(volts.size)
+    keep, hold = np.exp(-1 / rate / fine / lag), np.exp(-1 / rate / fine / smooth)
+    for k in range(1, volts.size):
+        for _ in range(fine):
+            way = np.sign(w) if w else np.sign(volts[k])
+            static = 0.58 if way > 0 else 0.42
+            if w == 0.0 and abs(volts[k]) <= static:
+                after = 0.0
+            else:
+                after = keep * w + (1 - keep) * gain * (volts[k] - static * way)
+            w = 0.0 if after * way < 0.0 else after
+            seen = hold * seen + (1 - hold) * w
+        out[k] = seen
+    speed = out + 0.5 * rng.standard_normal(volts.size)
+    found = estimate(Record("motor", np.arange(volts.size) / rate, volts, velocity=speed))
+    for name, true in (("time_constant", lag), ("sensor_lag", smooth), ("dc_gain", gain)):
+        q = found.combinations[name]
+        assert abs(q.value - true) < 4 * q.std + 1e-3 * true  # four deviations, and the fine steps'
+        assert q.std < 0.05 * true
