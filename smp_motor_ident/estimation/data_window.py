@@ -4,6 +4,7 @@ Derivation: docs/derivations.md, sections 7 and 10.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from smp_motor_ident.estimation.descent import (
     bandwidth,
     initial_of,
     noise_ratio_of,
+    refine,
 )
 from smp_motor_ident.estimation.fit import Fit, Options, solve
 from smp_motor_ident.estimation.selection import POLICY
@@ -72,6 +74,14 @@ def grown(data: Experiments, fit: Fit, options: Options) -> Fit:
         return fit
     again = grow(data, fit.structure, fit, options)
     return again if again.deviance < fit.deviance + TORQUE_NOISE.value else fit
+
+
+def quieted(data: Experiments, fit: Fit, options: Options) -> Fit:
+    """Return the free run where it leaves nothing for torque noise, which brought a fit near."""
+    if not fit.noise_ratio > 0:
+        return fit
+    free_run = refine(data, fit.structure, replace(fit, noise_ratio=0.0), fit.z, options)
+    return free_run if free_run.deviance < fit.deviance + TORQUE_NOISE.value else fit
 
 
 def extend(

@@ -299,7 +299,7 @@ def _on_all(data: Experiments, fit: Fit, known: list[Fit], options: Options) -> 
     for start in starts[1:]:
         other = data_window.extend(every, fit.structure, start, options, best)
         best = min(best, other, key=lambda f: f.deviance)
-    fit = best
+    fit = data_window.quieted(every, best, options)
     fit = other_starts(every, fit, RANDOM, options)
     return no_worse(every, fit, known, options)
 
