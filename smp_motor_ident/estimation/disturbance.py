@@ -26,6 +26,7 @@ from smp_motor_control.arrays import Array, Flags
 from smp_motor_ident.diagnosis.limits import DISTURBED, LEFT_OUT
 from smp_motor_ident.estimation.fit import Fit, Options, Start, solve
 from smp_motor_ident.estimation.initialisation import first_fit
+from smp_motor_ident.estimation.prediction import simulate
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import Experiments, angle_of, prepare
 from smp_motor_ident.likelihood.passes import gather
@@ -183,16 +184,27 @@ def _explained(blocks: list[Record], kept: Flags, every: Experiments) -> tuple[A
 
 
 def _settled(data: Experiments, structure: FirstOrder, start: Start) -> Fit:
-    """Return the free run; of each block that which it begins moving or at rest, as it fits."""
+    """Return the free run; each block begins moving, at rest, or as it was left, as it fits."""
     options, rest = Options(), start.initial.copy()
     rest[:, :2] = 0.0
-    moving, resting = (
-        solve(data, structure, start.at(start.z, x), options, 20) for x in (start.initial, rest)
-    )
-    still = _mean_squares(data, resting) < _mean_squares(data, moving)
-    initial = np.where(still[:, None], resting.initial, moving.initial)
-    best = min(moving, resting, key=lambda f: f.deviance)
+    tried = [solve(data, structure, start.at(start.z, x), options, 20)
+             for x in (start.initial, rest)]  # fmt: skip
+    best = min(tried, key=lambda f: f.deviance)
+    tried.append(solve(data, structure, best.at(best.z, _as_left(data, best)), options, 20))
+    likeliest = np.argmin([_mean_squares(data, f) for f in tried], axis=0)
+    initial = np.array([tried[n].initial[b] for b, n in enumerate(likeliest)])
+    best = min(tried, key=lambda f: f.deviance)
     return solve(data, structure, best.at(best.z, initial), options)
+
+
+def _as_left(data: Experiments, fit: Fit) -> Array:
+    """Return initial states of which each is as the motor left the block before.
+
+    Where a block begins next to a reversal, a descent may not find which way it turned.
+    """
+    initial, begins = fit.initial.copy(), data.starts[1:-1]
+    initial[1:, 1] = simulate(data, fit)[begins - 1, 0]
+    return initial
 
 
 def _mean_squares(data: Experiments, fit: Fit) -> Array:
