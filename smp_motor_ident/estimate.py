@@ -14,6 +14,7 @@ from smp_motor_ident.diagnosis.certainty import certain
 from smp_motor_ident.diagnosis.conditions import dependent
 from smp_motor_ident.diagnosis.current_kind import ARMATURE, current_kind
 from smp_motor_ident.diagnosis.data_quality import screen
+from smp_motor_ident.diagnosis.left_out import under_own_loads, undisturbed
 from smp_motor_ident.diagnosis.model_error import regression
 from smp_motor_ident.diagnosis.provenance import provenance
 from smp_motor_ident.diagnosis.refusal import (
@@ -32,7 +33,6 @@ from smp_motor_ident.diagnosis.scope import (
     blames_current,
     contradicted,
     current_left_out,
-    differing,
     one_size_of_voltage,
     one_size_or_swing,
     scope,
@@ -49,7 +49,6 @@ from smp_motor_ident.estimation import flexible_shaft, order_selection
 from smp_motor_ident.estimation.averaging import candidate_weights, covering
 from smp_motor_ident.estimation.candidate_starts import of_kind
 from smp_motor_ident.estimation.constraint import constrained
-from smp_motor_ident.estimation.disturbance import disturbance
 from smp_motor_ident.estimation.driver_effect import (
     DriverFit,
     declared,
@@ -266,32 +265,13 @@ def _beside_model(
 
     What a driver explains without an accident is none.
     """
+    if apart := under_own_loads(_tried, group, request, found, data, fit):
+        return apart, None
     behind, driver = _through_driver(group, request, found, data, hold, fit)
     accident = behind is not None and any(f.code == "disturbed" for f in behind.findings)
     if noisy and (behind is None or accident):
-        behind = _undisturbed(group, request, found, fit, plain) or behind
+        behind = undisturbed(_tried, group, request, found, fit, plain) or behind
     return behind, driver
-
-
-def _undisturbed(
-    group: list[Record],
-    request: Request,
-    found: Sequence[Finding],
-    fit: Fit,
-    noisy: Estimate | None,
-) -> Estimate | None:
-    """Return the estimate without what something else did to the motor, if it holds.
-
-    One that took that for torque noise is not contradicted: if so, the part that tells was lost.
-    """
-    request.say("what else moved the motor")
-    there = disturbance(group, request.since) if request.since else None
-    if there is None:
-        return None
-    e = _tried(there.records, replace(request, since=()), [*found, there.finding()])
-    if e is None or e.unreliable or leaves_torque_noise(e, fit):
-        return None
-    return None if noisy and not noisy.unreliable and differing(noisy, e) else e
 
 
 def _through_driver(

@@ -91,7 +91,7 @@ def disturbance(group: Sequence[Record], since: Sequence[float]) -> Disturbance 
         for a, b in zip(ends[::2], ends[1::2], strict=True):
             spans.append((begin + float(record.time[a]), begin + float(record.time[b - 1])))
         if rows.any():
-            records.append(_of_rows(record, rows))
+            records.append(of_rows(record, rows))
     return Disturbance(records, spans) if _as_far(records, blocks) else None
 
 
@@ -117,7 +117,7 @@ def _in_blocks(record: Record, rows: int) -> Record:
     return replace(record, starts=tuple(cuts))
 
 
-def _of_rows(record: Record, rows: Flags) -> Record:
+def of_rows(record: Record, rows: Flags) -> Record:
     """Return some rows of a record, in segments where others are missing."""
     at = np.flatnonzero(rows)
     starts = {0, *(np.flatnonzero(np.diff(at) > 1) + 1), *np.searchsorted(at, record.starts)}
@@ -173,7 +173,7 @@ def _explained(blocks: list[Record], kept: Flags, every: Experiments) -> tuple[A
     structure, rows = FirstOrder(), np.repeat(kept, np.diff(every.starts))
     ends = np.cumsum([len(r) for r in blocks])[:-1]
     parts = zip(blocks, np.split(rows, ends), strict=True)
-    data = prepare([_of_rows(r, own) for r, own in parts if own.any()], use_current=False)
+    data = prepare([of_rows(r, own) for r, own in parts if own.any()], use_current=False)
     first = first_fit(data, structure, Options())
     if first is None:
         return np.full(kept.size, np.inf), np.inf

@@ -42,6 +42,7 @@ class Request:
     since: tuple[float, ...] = ()
     suspected: bool = False  # whether the driver is sought although nothing is lacking
     loaded: bool = False  # whether every candidate has a constant load
+    own_loads: bool = False  # whether every segment has a constant load of its own
     earlier: bool = False  # whether the command was taken an interval earlier
 
     @property
@@ -160,11 +161,12 @@ def base_structure(request: Request, group: Sequence[Record]) -> Structure:
     candidate = model.removesuffix("_asymmetric")
     asymmetric = model.endswith("_asymmetric")
     friction = "asymmetric" if asymmetric else "symmetric"
-    load = asymmetric or request.loaded
+    own = request.own_loads
+    load = (asymmetric or request.loaded) and not own
     if use_current:
-        return Electromechanical(friction, load, low_pass=low_pass, fixed=fixed)
+        return Electromechanical(friction, load, low_pass=low_pass, fixed=fixed, own_load=own)
     if candidate in ("auto", "electromechanical"):
         candidate = "second_order"
-    structure = CANDIDATES[candidate](friction, load, low_pass=low_pass, fixed=fixed)
+    structure = CANDIDATES[candidate](friction, load, low_pass=low_pass, fixed=fixed, own_load=own)
     # How friction is felt depends on L/R, which the linear response leaves open.
     return structure.with_(shape=True) if isinstance(structure, SecondOrder) else structure

@@ -34,7 +34,7 @@ from smp_motor_ident.estimation.prediction import positive_part, simulate
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.passes import gather
 from smp_motor_ident.model.coordinates import LOGARITHMS, PLAUSIBLE, Coordinates
-from smp_motor_ident.model.measurement import ANGLE
+from smp_motor_ident.model.measurement import ANGLE, MEAN_SPEED
 from smp_motor_ident.model.structures import sensor_of
 
 FEWEST = 4  # parts of which a scatter can be taken
@@ -299,7 +299,8 @@ def _parted(data: Experiments, fit: Fit, parts: int) -> Experiments:
     first = np.empty(starts.size - 1, dtype=np.int64)
     initial = np.zeros((starts.size - 1, 5))
     predicted = simulate(data, fit, gain=True)
-    current = data.current.copy()
+    output, current = data.output.copy(), data.current.copy()
+    window = fit.z.window * (data.kind == MEAN_SPEED)
     reach = 2 * fit.z.current_lag * (sensor_of(fit.structure) == "averaged")
     for n, (begin, g) in enumerate(zip(starts[:-1], owner, strict=True)):
         a = int(data.hold_start[g])
@@ -308,9 +309,11 @@ def _parted(data: Experiments, fit: Fit, parts: int) -> Experiments:
         if begin == data.starts[g]:
             initial[n] = fit.initial[g]
             continue
-        if current.size:  # of which a mean is that of the part before
-            end = int(np.searchsorted(data.time[begin : starts[n + 1]], data.time[begin] + reach))
-            current[begin : begin + end] = np.nan
+        # A mean that reaches back into the part before is not of this one's motion.
+        own = data.time[begin : starts[n + 1]] - data.time[begin]
+        output[begin : begin + int(np.searchsorted(own, window))] = np.nan
+        if current.size:
+            current[begin : begin + int(np.searchsorted(own, reach))] = np.nan
         voltage = data.hold_value[min(int(first[n]), last - 1)]
         initial[n] = (
             voltage - fit.z.load,
@@ -324,4 +327,4 @@ def _parted(data: Experiments, fit: Fit, parts: int) -> Experiments:
         if data.kind.low_passed:
             initial[n, 2] = predicted[begin, 1] - predicted[begin, 0]
     return replace(data, starts=starts, hold_start=np.append(first, data.hold_start[-1]),
-                   initial=initial, current=current)  # fmt: skip
+                   initial=initial, output=output, current=current)  # fmt: skip

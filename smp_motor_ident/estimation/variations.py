@@ -86,16 +86,17 @@ def _with_addition(
 def _additions(s: Structure) -> list[dict[str, object]]:
     """Return what may be added to a structure, in the order in which it is tried."""
     trials: list[dict[str, object]] = []
+    load = not s.own_load  # of which a common one is no addition
     if s.current:
         trials.append({"offset": True})
         if "delay" not in s.fixed and not s.delay:
             trials.append({"delay": True})
-    if s.friction != "asymmetric":
+    if s.friction != "asymmetric" and load:
         trials.append({"load": True})
-    if s.current:  # an offset of the driver is both at once, and may be neither alone
+    if s.current and load:  # an offset of the driver is both at once, and may be neither alone
         trials.append({"offset": True, "load": True})
     if s.friction == "symmetric":
-        trials.append({"friction": "asymmetric", "load": True})
+        trials.append({"friction": "asymmetric", "load": load})
     return trials
 
 

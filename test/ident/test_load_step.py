@@ -1,0 +1,58 @@
+"""A load that comes or goes while a motor is recorded hides none of its numbers."""
+
+from __future__ import annotations
+
+import independent
+import motors
+import numpy as np
+import pytest
+
+from smp_motor_ident.estimate import estimate
+from smp_motor_ident.record import Hardware, Record
+
+RATE, SECONDS, WINDOW, STATIC = 500, 16, 10, 0.4
+R, L, K, J, B = independent.TABLE_1["rear_left"]
+
+
+def recorded(load: np.ndarray, *, counts: bool, seed: int) -> Record:
+    """Return a motor under a load [of its friction], its speed a mean over ten rows, or counts."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(RATE * SECONDS) / RATE
+    voltage = np.repeat(rng.uniform(-9.0, 9.0, 100), 83)[: time.size]
+    friction = STATIC * K / R
+    out = independent.simulate(time, voltage, R, L, K, J, B, friction, friction * load, 40)
+    if counts:
+        count = np.floor(out[:, 2] / motors.QUANTUM).astype(np.int64)
+        return Record("motor", time, voltage, count=count, hardware=Hardware(1.0, 500.0))
+    angle = np.concatenate([np.zeros(WINDOW), out[:, 2]])
+    speed = (angle[WINDOW:] - angle[:-WINDOW]) * RATE / WINDOW
+    speed += 0.2 * rng.standard_normal(time.size)
+    current = out[:, 0] + 0.01 * rng.standard_normal(time.size)
+    return Record("motor", time, voltage, current=current, velocity=speed)
+
+
+def stepped(at: float) -> np.ndarray:
+    return np.where(np.arange(RATE * SECONDS) < at * RATE, 0.0, 0.7)
+
+
+@pytest.mark.parametrize("at", [4.1, 9.3])
+@pytest.mark.parametrize("counts", [False, True])
+def test_a_load_that_steps_is_found_and_moves_no_number(counts: bool, at: float) -> None:
+    found = estimate(recorded(stepped(at), counts=counts, seed=3))
+    (words,) = [f for f in found.findings if f.code == "load_step"]
+    assert words.evidence["begin"] <= at <= words.evidence["end"]
+    assert words.evidence["end"] - words.evidence["begin"] < 0.06 * SECONDS  # two of forty parts
+    true = motors.truth("rear_left", STATIC)
+    assert not found.unreliable
+    for name in ("dc_gain", "static_voltage", *(() if counts else ("resistance", "inductance"))):
+        quantity = {**found.combinations, **found.parameters}[name]
+        # the simulator's own steps leave parts in a thousand
+        assert abs(quantity.value - true[name]) < 4 * quantity.std + 2e-3 * true[name]
+        assert quantity.std < 0.05 * true[name]
+
+
+@pytest.mark.parametrize("most", [0.0, 0.7])
+def test_a_load_that_is_constant_or_grows_is_no_step(most: float) -> None:
+    load = np.linspace(0.0, most, RATE * SECONDS)
+    found = estimate(recorded(load, counts=False, seed=4))
+    assert "load_step" not in {f.code for f in found.findings}
