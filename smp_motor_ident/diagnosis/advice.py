@@ -1,6 +1,5 @@
 """What is found about a result, and what to record or measure to know more."""
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
@@ -9,6 +8,7 @@ from smp_motor_control.motor.parameters import PHYSICAL
 from smp_motor_ident.diagnosis import limits
 from smp_motor_ident.diagnosis.sample_limits import FIT_WITHOUT_NOISE
 from smp_motor_ident.diagnosis.sensors import sensors
+from smp_motor_ident.diagnosis.smoothed_friction import acceleration_noise
 from smp_motor_ident.diagnosis.validation import within_resolution
 from smp_motor_ident.estimation import prediction, shape_constraint
 from smp_motor_ident.estimation.fit import Fit
@@ -212,17 +212,8 @@ def _torque_noise(data: Experiments, fit: Fit) -> Iterator[Finding]:
         "warning",
         "the motion scatters beyond the counter's resolution (a load that fluctuates, or a "
         "command that switches between samples)",
-        {"intensity": float(fit.noise_ratio), "acceleration": _acceleration_noise(fit)},
+        {"intensity": float(fit.noise_ratio), "acceleration": acceleration_noise(fit)},
     )
-
-
-def _acceleration_noise(fit: Fit) -> float:
-    """Return how fast the torque noise makes the speed wander [rad/s per square root of s].
-
-    Of the innovations' variance the counter's own share is what its gain on the angle leaves.
-    """
-    own = float(fit.noise[0, 0] * (1.0 - fit.gain[2, 0]))
-    return math.sqrt(max(fit.noise_ratio * own, 0.0))
 
 
 def _plain_square(data: Experiments, fit: Fit) -> bool:

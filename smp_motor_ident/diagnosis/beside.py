@@ -72,7 +72,7 @@ def held_against_effects(
     if move is not None:  # and by what else is shown, of which any may be the one
         other = farthest_possible([e for alike in shown for e in alike], numbers, data.step)[1]
         wide = wide.along(move) if other is None else wide.along(move).along(other)
-    answer, beside = widened_by_misfit(data, wide, said)
+    answer, beside = widened_by_misfit(data, wide, said, options)
     held = stated(wide, answer[0])
     named = (
         _covered(as_finding(e[0], e, numbers, data.step))

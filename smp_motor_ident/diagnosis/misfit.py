@@ -1,9 +1,10 @@
 """What the intervals take up of a model that is not all of the motor, beside what is named.
 
-That are numbers which hang on how closely an observer follows, and commands that took effect at
-instants that scatter, which the variance of the residuals tests.  A driver on its own clock, a bus
-or arrival stamps put every change of the command off by a time of its own.  With independent times
-of mean zero and variance s2, residuals ``e`` of variance one have the variance
+That are numbers which hang on how closely an observer follows, friction that a load's fluctuations
+smooth, and commands that took effect at instants that scatter, which the variance of the residuals
+tests.  A driver on its own clock, a bus or arrival stamps put every change of the command off by a
+time of its own.  With independent times of mean zero and variance s2, residuals ``e`` of variance
+one have the variance
 
     1 + s2 x,   x_t = sum_k (d yhat_t / d t_k)^2,
 
@@ -32,8 +33,9 @@ from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident.diagnosis.limits import CONDITION_LEVEL
 from smp_motor_ident.diagnosis.model_error import ROWS, answered, carried, measured, predicted
 from smp_motor_ident.diagnosis.observers import slower
+from smp_motor_ident.diagnosis.smoothed_friction import smoothed
 from smp_motor_ident.estimation.consider_covariance import consider_late
-from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.estimation.fit import Fit, Options
 from smp_motor_ident.estimation.quantities import Answer
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import Experiments
@@ -43,14 +45,15 @@ Said = tuple[Answer, dict[str, float]]
 
 
 def widened_by_misfit(
-    data: Experiments, fit: Fit, said: Callable[[Fit], Said]
+    data: Experiments, fit: Fit, said: Callable[[Fit], Said], options: Options
 ) -> tuple[Said, list[Finding]]:
-    """Return what is stated with what two tests show, and say so.
+    """Return what is stated with what three tests show, and say so.
 
     Where a number would be lost in an interval so wide, it stays as it is and is unreliable.
     """
     wide, slow = slower(data, fit)
     wide, late = jittered(data, wide)
+    wide, held = smoothed(data, wide, options)
     before = said(fit)
     if wide is fit:
         return before, []
@@ -61,11 +64,11 @@ def widened_by_misfit(
         if quantity.value is not None and after[0].combinations[name].value is None
     ]
     if not lost:
-        return after, [*slow, *late]
+        return after, [*slow, *late, *held]
     words = f"; that leaves nothing of {' and '.join(lost)}, which the intervals do not cover"
     return before, [
         replace(f, severity="unreliable", message=f.message.partition(":")[0] + words)
-        for f in (*slow, *late)
+        for f in (*slow, *late, *held)
     ]
 
 
