@@ -56,3 +56,11 @@ def test_a_load_that_is_constant_or_grows_is_no_step(most: float) -> None:
     load = np.linspace(0.0, most, RATE * SECONDS)
     found = estimate(recorded(load, counts=False, seed=4))
     assert "load_step" not in {f.code for f in found.findings}
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_an_angle_that_wanders_under_torque_noise_shows_no_step(seed: int) -> None:
+    rng = np.random.default_rng(20 + seed)
+    found = estimate(recorded(3.0 * rng.standard_normal(RATE * SECONDS), counts=True, seed=seed))
+    codes = {f.code for f in found.findings}
+    assert "torque_noise" in codes and "load_step" not in codes
