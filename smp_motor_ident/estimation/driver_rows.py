@@ -59,10 +59,18 @@ def rows_of(data: Experiments, group: Sequence[Record], fit: Fit, measured: bool
     middle, interval = speed.copy(), np.full(data.size, data.step)
     middle[1:] = np.where(first[1:], speed[1:], 0.5 * (speed[1:] + speed[:-1]))
     interval[1:] = np.where(first[1:], data.step, np.diff(data.time))
-    back = float(fit.structure.internal(fit.z)[0][2])
+    back = emf_share(fit) * fit.z.a0
     command = np.concatenate([r.voltage for r in group])
     supply = min((r.hardware.supply_voltage or 0.0 for r in group), default=0.0)
     return Rows(command, back * middle, interval, first, fit.z.time_constant, supply)
+
+
+def emf_share(fit: Fit) -> float:
+    """Return what of the voltage at steady speed is back-EMF, between none and all of it.
+
+    A descent may pass motors that viscous friction drives: behind a driver these run away.
+    """
+    return float(np.clip(fit.structure.internal(fit.z)[0][2] / fit.z.a0, 0.0, 1.0))
 
 
 def measured_speed(data: Experiments, lag: float) -> Array:

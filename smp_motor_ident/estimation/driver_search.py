@@ -26,7 +26,13 @@ from smp_motor_ident.estimation.descent import (
     refine,
 )
 from smp_motor_ident.estimation.driver_effect import DriverFit
-from smp_motor_ident.estimation.driver_rows import commands_of, pieces, rows_of, with_voltages
+from smp_motor_ident.estimation.driver_rows import (
+    commands_of,
+    emf_share,
+    pieces,
+    rows_of,
+    with_voltages,
+)
 from smp_motor_ident.estimation.fit import Fit, Options, solve
 from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.estimation.selection import POLICY, sandwich_factor
@@ -222,7 +228,7 @@ class _Profile:
         if first:
             rows = rows_of(data, self.group, fit, measured=self.turns > 1)
             return rows.through(Driver(self.effect.kind, size, rows.full_duty))
-        driver = Driver(self.effect.kind, size, self.full_duty, _emf_share(fit))
+        driver = Driver(self.effect.kind, size, self.full_duty, emf_share(fit))
         voltage = terminal_voltages(self.commands, fit.structure, fit.z, fit.initial, driver)
         return fast_decay.rows_of(self.commands, voltage)
 
@@ -311,7 +317,7 @@ class _Profile:
     def applied(self, records: Sequence[Record], fit: Fit) -> list[Record]:
         """Return other records of the motor with the voltage at the terminals."""
         if self.effect.follows_motion:
-            return _applied(records, fit, self.driver._replace(emf_share=_emf_share(fit)))
+            return _applied(records, fit, self.driver._replace(emf_share=emf_share(fit)))
         rows = rows_of(_prepared(records, self.hold, fit), records, fit)
         return with_voltages(records, rows.through(self.driver))
 
@@ -392,8 +398,3 @@ def _applied(records: Sequence[Record], fit: Fit, driver: Driver) -> list[Record
     data = commands_of(records, fit)
     voltage = fast_decay.voltage_of(data, fit, driver)
     return with_voltages(records, fast_decay.rows_of(data, voltage))
-
-
-def _emf_share(fit: Fit) -> float:
-    """Return what of the voltage at steady speed is back-EMF."""
-    return float(fit.structure.internal(fit.z)[0][2]) / fit.z.a0

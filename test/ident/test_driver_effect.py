@@ -18,17 +18,19 @@ from smp_motor_ident.estimation.driver_effect import (
     leaves_torque_noise,
     suspects_driver,
 )
-from smp_motor_ident.estimation.driver_rows import measured_speed
+from smp_motor_ident.estimation.driver_rows import emf_share, measured_speed
 from smp_motor_ident.estimation.driver_search import likeliest
 from smp_motor_ident.estimation.fit import Fit, Options
 from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.finding import Finding
+from smp_motor_ident.likelihood.driver_feedback import terminal_voltages
 from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.model import driver
 from smp_motor_ident.model.coordinates import Coordinates
 from smp_motor_ident.model.driver import Driver, terminal_voltage
 from smp_motor_ident.model.measurement import SPEED
-from smp_motor_ident.model.structures import FirstOrder, SecondOrder
+from smp_motor_ident.model.physical import from_physical
+from smp_motor_ident.model.structures import Electromechanical, FirstOrder, SecondOrder
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune.designer import design
@@ -423,3 +425,18 @@ def test_a_second_lag_that_nothing_shows_ends_at_a_thousandth_of_a_row():
     found = problem.descend(problem.start(motor, coasting), 3)
     z, _, _ = problem.unpacked(found.x)
     assert z.a2 / z.a1 > 0.9e-3 * STEP
+
+
+def test_a_motor_that_viscous_friction_would_drive_does_not_run_away_behind_a_driver():
+    """A descent may pass one: its back-EMF is more than the voltage that its speed needs."""
+    t = np.arange(2000) / 200.0
+    voltage = 6.0 * np.sign(np.sin(t))
+    data = prepare([Record("motor", t, voltage, velocity=100.0 * np.sin(t))], False)
+    z = from_physical(4.0, 0.01, 0.02, 2.4e-6, -5e-5, 0.01)
+    motor = SimpleNamespace(structure=Electromechanical(), z=z)
+    assert z.a0 < 0.6 * 0.02
+    assert emf_share(motor) == 1.0
+    limited = Driver(driver.CURRENT, 2.5, 6.0, emf_share(motor))
+    found = terminal_voltages(data, motor.structure, z, data.initial, limited)
+    # The command, and what it brakes by beside it, are all that there is.
+    assert np.abs(found).max() < 2 * 6.0
