@@ -18,6 +18,7 @@ from smp_motor_ident.estimation.descent import (
     refine,
 )
 from smp_motor_ident.estimation.fit import Fit, Options, solve
+from smp_motor_ident.estimation.profile import most_friction, one_level, rubbing
 from smp_motor_ident.estimation.selection import POLICY
 from smp_motor_ident.estimation.trials import RIDGE, tried
 from smp_motor_ident.likelihood.experiments import Experiments
@@ -28,6 +29,7 @@ FLOOR = 1.3  # residual variance over that of quantisation, below which there is
 WALK = 0.6  # step of the logarithm of the bandwidth while its best is not bracketed
 CLOSE = 0.15  # spacing of the same at which the best is known well enough
 SLOW = 0.03  # of the motor's own bandwidth: what follows no faster runs as good as free
+ALONG = 12  # passes along friction, after which it is known to a hundredth of what it may be
 MOST = 5.0  # farthest from the motor's own bandwidth
 
 
@@ -44,6 +46,7 @@ def grow(
     What a rival on the same data is far above then is not sought along its ridges.
     """
     part = data.data_window(min(SCREENING_SAMPLES * data.step, 60.0))
+    first = _with_friction_of(part, structure, first, options)
     best = _find_noise_ratio(part, structure, first, options, near)
     least = rival.deviance if rival is not None and rival.samples == part.size else np.inf
     if POLICY.rejects_on_subset(best, least):
@@ -95,10 +98,43 @@ def extend(
     # The last stretch is at most six times the one before, as those in between are.
     while 1.5 * samples < data.size and best.noise_ratio == 0:
         longer = data.data_window(samples * data.step)
+        best = _with_friction_of(longer, structure, best, options)
         best = solve(longer, structure, best.at(best.z, initial_of(longer, best)), options, 8)
         samples *= 6
+    best = _with_friction_of(data, structure, best, options)
     start = best.at(best.z, initial_of(data, best))
     return solve(data, structure, start, options, 25, known=known)
+
+
+def _with_friction_of(data: Experiments, structure: Structure, fit: Fit, options: Options) -> Fit:
+    """Return a fit with the friction that more data ask for, if its own were of one level.
+
+    Gain and friction trade exactly there, and it has any of them: from afar a descent on motion
+    at another level ends at a kink.
+    """
+    few = data.first(fit.samples)
+    if few is data or structure.friction != "symmetric" or "vc_plus" not in structure.free:
+        return fit
+    if not one_level(few, fit) or one_level(data, fit):
+        return fit
+    from scipy.optimize import minimize_scalar  # takes a while to load, and is seldom needed
+
+    near = replace(fit, initial=initial_of(data, fit))
+    tried = [solve(data, structure, near, options, 1)]
+
+    def deviance(friction: float) -> float:
+        z, initials = rubbing(data, near, friction)
+        alike = [near.at(structure.complete(z), initial) for initial in initials]
+        there = [solve(data, structure, start, options, 1) for start in alike]
+        tried.append(min(there, key=lambda f: f.deviance))
+        return tried[-1].deviance
+
+    most = most_friction(data, near)
+    minimize_scalar(  # type: ignore[call-overload]  # the stubs want arguments that have defaults
+        deviance, bounds=(0.0, most), method="bounded", options={"maxiter": ALONG}
+    )
+    best = min(tried, key=lambda f: f.deviance)
+    return replace(fit, z=best.z, initial=best.initial)
 
 
 def _find_noise_ratio(

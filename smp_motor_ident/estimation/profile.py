@@ -138,14 +138,19 @@ def _range(data: Experiments, fit: Fit, coordinate: str) -> tuple[float, float]:
     if coordinate == "ln_a1":
         return value - FARTHEST, value + FARTHEST
     if coordinate == "vc_plus":
-        full = float(np.abs(data.hold_value).max())
-        if not fit.structure.current:
-            return 0.0, MOST_FRICTION.value * full
-        # The current tells the back-EMF: friction is what viscous friction may be, at most.
-        back = _back_emf(fit.z) / fit.z.a0
-        return 0.0, min(MOST_FRICTION.value * full, value + (1 - back) * max(full - value, 0.0))
+        return 0.0, most_friction(data, fit)
     longest = max(value, SLOWEST * fit.z.time_constant)  # after which nothing is left of a motion
     return (0.0 if coordinate == "delay" else 1e-9), min(longest, float(np.ptp(data.time)))
+
+
+def most_friction(data: Experiments, fit: Fit) -> float:
+    """Return the friction [V] that a motor may have which moves alike at one level of voltage."""
+    full = float(np.abs(data.hold_value).max())
+    if not fit.structure.current:
+        return MOST_FRICTION.value * full
+    # The current tells the back-EMF: friction is what viscous friction may be, at most.
+    back, value = _back_emf(fit.z) / fit.z.a0, fit.z.vc_plus
+    return min(MOST_FRICTION.value * full, value + (1 - back) * max(full - value, 0.0))
 
 
 def _end(

@@ -130,6 +130,12 @@ class Experiments:
             left -= span
         return self
 
+    def first(self, samples: int) -> Experiments:
+        """Return the first so many samples, of all segments together."""
+        if samples >= self.size:
+            return self
+        return self._cut(int(np.searchsorted(self.starts, samples)), samples)
+
     @cached_property
     def _lead(self) -> float:
         """Return how long [s] it takes until a twentieth of the largest voltage is exceeded."""
