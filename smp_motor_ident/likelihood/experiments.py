@@ -26,6 +26,11 @@ FINEST_SENSOR = 1e-4
 """Of its range: what shunt amplifiers and tachometers are linear to at best."""
 FEW = 2_000
 """Samples that tell whether a speed repeats its values."""
+MANY = 30
+"""Levels of moves that tell a step by being near whole ones on the mean, each off by a part of it
+as a log of seven digits makes them: five deviations from chance."""
+UNIFORM = 0.25
+"""Of a step, what a move of any size is off a whole number of steps on the mean."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,7 +236,7 @@ def angle_quantum(angle: Array) -> float:
     moves = moves[:: -(-moves.size // FEW)]
     for parts in (1, 2, 3):  # a motor that is fast in every sample may show no single step
         quantum = float(moves[0]) / parts
-        for reach in (10.0, np.inf):  # the longer moves tell it better
+        for reach in (4.0, 20.0, 100.0, np.inf):  # the longer moves tell it better
             near = moves[moves < reach * quantum]
             whole = np.round(near / quantum)
             quantum = float(near @ whole / (whole @ whole))
@@ -241,7 +246,15 @@ def angle_quantum(angle: Array) -> float:
         single = levels == 2 or (levels == 1 and rests)
         if (levels > 2 and np.mean(off < 0.05) > 0.95) or (single and off.max() < 0.005):
             return quantum
+        if levels > MANY and _mean_of_each(whole, off) < 0.5 * UNIFORM:
+            return quantum
     return 0.0
+
+
+def _mean_of_each(level: Array, off: Array) -> float:
+    """Return the mean over levels of the mean at each: a speed that stays counts once."""
+    _, which, often = np.unique(level, return_inverse=True, return_counts=True)
+    return float(np.mean(np.bincount(which, off) / often))
 
 
 def speed_quantum(velocity: Array) -> float:

@@ -65,6 +65,19 @@ def test_an_angle_that_comes_in_steps_is_a_count(per_turn):
         assert found.combinations[name].value == pytest.approx(q.value, abs=0.02 * (q.std or 0.0))
 
 
+@pytest.mark.parametrize("decimals", [6, 5])
+def test_a_log_of_seven_digits_leaves_the_steps_of_its_angle(decimals):
+    """Of 2000 counts before a gear of 50 the last digit is a sixth of one."""
+    rng = np.random.default_rng(3)
+    step = 2 * np.pi / 2000 / 50
+    t = np.arange(8000) / 500
+    turned = np.cumsum(0.012 * (1 - np.cos(t)))
+    logged = np.round(step * np.floor(turned / step), decimals)
+    assert angle_quantum(logged) == pytest.approx(step, rel=1e-4)
+    # A sensor whose noise is a third of that has none.
+    assert angle_quantum(turned + 0.3 * step * rng.standard_normal(t.size)) == 0.0
+
+
 def test_a_smooth_angle_comes_in_no_steps():
     rng = np.random.default_rng(0)
     t = np.arange(5000) / 200
