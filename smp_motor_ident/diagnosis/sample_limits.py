@@ -70,7 +70,7 @@ COUNTS_A_SAMPLE = Limit(
 EFFECT_SHOWN = Limit(
     0.5, "relative standard deviation",
     "beyond it the 95 % interval holds a driver without that effect",
-    "test_driver_effect.py: a size that may be nothing is not stated",
+    "test_driver_evidence.py: a size that may be nothing is not stated",
 )  # fmt: skip
 DRIVER_TOLERANCE = Limit(
     0.01, "of its size",
@@ -82,7 +82,7 @@ SLEW_SEEN = Limit(
     0.5, "sample",
     "physical: a voltage that is there within half a sample lacks a quarter of one row at most: a "
     "clock or a delay of that much is no less likely",
-    "test_driver_effect.py: a rise that is over between two rows is not stated",
+    "test_driver_evidence.py: a rise that is over between two rows is not stated",
 )  # fmt: skip
 
 # What no motor does, whatever the units of a recording say.

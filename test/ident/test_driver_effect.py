@@ -2,26 +2,32 @@
 
 import math
 from dataclasses import replace
-from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from driven import (
+    DRIVERS,
+    GAIN,
+    NOISE,
+    STATIC,
+    STEP,
+    TAU,
+    commands,
+    estimated,
+    recorded,
+    run,
+    slewed,
+)
 
 from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.estimation import fast_decay
 from smp_motor_ident.estimation.driver_effect import (
-    DriverFit,
     driver_of,
-    explains_no_more,
-    leaves_torque_noise,
-    suspects_driver,
 )
 from smp_motor_ident.estimation.driver_rows import emf_share, measured_speed
-from smp_motor_ident.estimation.driver_search import likeliest
-from smp_motor_ident.estimation.fit import Fit, Options
-from smp_motor_ident.estimation.initialisation import initial_fit
+from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.driver_feedback import terminal_voltages
 from smp_motor_ident.likelihood.experiments import prepare
@@ -30,76 +36,11 @@ from smp_motor_ident.model.coordinates import Coordinates
 from smp_motor_ident.model.driver import Driver, terminal_voltage
 from smp_motor_ident.model.measurement import SPEED
 from smp_motor_ident.model.physical import from_physical
-from smp_motor_ident.model.structures import Electromechanical, FirstOrder, SecondOrder
+from smp_motor_ident.model.structures import Electromechanical, SecondOrder
 from smp_motor_ident.record import Record
-from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune.designer import design
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.writing import parameters
-
-GAIN, TAU, STATIC, STEP = 20.0, 0.08, 0.4, 0.005
-NOISE = 0.3  # rad/s
-
-
-def commands(seed: int) -> np.ndarray:
-    rng = np.random.default_rng(seed)
-    return np.repeat(rng.uniform(-12.0, 12.0, 60), rng.integers(20, 40, 60))
-
-
-def run(voltage: np.ndarray, seed: int, most: float = math.inf, noise: float = NOISE) -> np.ndarray:
-    """Return the speed of a motor of first order with friction, exactly but for its stops.
-
-    Its driver gives no more than ``most`` volts beyond the back-EMF.
-    """
-    fine, w, out = 100, 0.0, np.zeros(voltage.size)
-    keep = math.exp(-STEP / fine / TAU)
-    for k, command in enumerate(voltage.tolist()[1:], 1):
-        for _ in range(fine):
-            volts = w / GAIN + min(max(command - w / GAIN, -most), most)
-            if w == 0.0 and abs(volts) <= STATIC:
-                break
-            direction = math.copysign(1.0, w or volts)
-            after = keep * w + (1 - keep) * GAIN * (volts - STATIC * direction)
-            w = 0.0 if after * direction < 0.0 else after
-        out[k] = w
-    return out + noise * np.random.default_rng(1000 + seed).standard_normal(out.size)
-
-
-def dead(u: np.ndarray) -> np.ndarray:
-    return np.where(np.abs(u) > 1.0, u - np.sign(u), 0.0)
-
-
-def clipped(u: np.ndarray) -> np.ndarray:
-    return np.clip(u, -9.0, 9.0)
-
-
-def slewed(u: np.ndarray, rate: float = 200.0) -> np.ndarray:
-    """Return the means of a voltage that rises at a rate, from nothing, by a fine grid."""
-    fine, now, out = 200, 0.0, np.zeros(u.size)
-    most = rate * STEP / fine
-    for k, target in enumerate(u.tolist()[1:], 1):
-        total = 0.0
-        for _ in range(fine):
-            before = now
-            now += min(max(target - now, -most), most)
-            total += 0.5 * (before + now)
-        out[k] = total / fine
-    return out
-
-
-DRIVERS = {"dead_zone": (dead, 1.0), "clip_voltage": (clipped, 9.0), "slew_rate": (slewed, 200.0)}
-
-
-@cache
-def recorded(name: str, seed: int) -> Record:
-    command = commands(seed)
-    time = np.arange(command.size) * STEP
-    return Record("motor", time, command, velocity=run(DRIVERS[name][0](command), seed))
-
-
-@cache
-def estimated(name: str, seed: int) -> Estimate:
-    return estimate(recorded(name, seed))
 
 
 @pytest.mark.parametrize("name", DRIVERS)
@@ -197,64 +138,6 @@ def test_a_driver_that_limits_the_current_is_found_and_designed_for():
     assert 0.8 * able < one.reference.max_acceleration < able
 
 
-def sized(kind: int, size: float, std: float) -> DriverFit:
-    """Return an effect of a size beside a command of 5 V, switched every 10 ms and both ways."""
-    effect = next(e for e in driver.EFFECTS if e.kind == kind)
-    switched = np.tile([5.0, -5.0], 10)
-    record = Record("motor", 0.01 * np.arange(20), switched, velocity=np.zeros(20))
-    return DriverFit(effect, Driver(kind, size), std, [record], [record], None, None)
-
-
-@pytest.mark.parametrize("kind", [driver.DEAD_ZONE, driver.SLEW, driver.SAG, driver.DROP])
-def test_a_size_that_may_be_nothing_is_not_stated(kind):
-    assert sized(kind, 0.5, 0.2).shown
-    assert not sized(kind, 0.5, 0.3).shown
-
-
-def test_a_clip_that_may_be_above_the_command_is_not_stated():
-    assert sized(driver.CLIP, 4.5, 0.2).shown
-    assert not sized(driver.CLIP, 4.5, 0.3).shown
-
-
-def test_a_rise_that_is_over_between_two_rows_is_not_stated():
-    assert sized(driver.SLEW, 10.0 / 0.006, 1.0).shown
-    assert not sized(driver.SLEW, 10.0 / 0.004, 1.0).shown
-
-
-@pytest.mark.parametrize(
-    "before, behind, leaves", [(100.0, 10.0, False), (100.0, 90.0, True), (0.0, 1.0, True)]
-)
-def test_what_leaves_most_of_the_torque_noise_is_no_driver(before, behind, leaves):
-    noise = Finding("torque_noise", "warning", "", {"intensity": behind})
-    found, fit = SimpleNamespace(findings=(noise,)), SimpleNamespace(noise_ratio=before)
-    assert leaves_torque_noise(found, fit) is leaves
-    assert not leaves_torque_noise(SimpleNamespace(findings=()), fit)
-
-
-@pytest.mark.parametrize(
-    ("before", "behind", "codes", "no_more"),
-    # Two numbers, e^5 samples: both cost 10. Without torque noise a motor is held against its own.
-    [(0.1, -90.0, ["torque_noise"], True), (0.1, -91.0, ["torque_noise"], False),
-     (0.1, -50.0, [], False), (0.0, -50.0, ["torque_noise"], False)],
-)  # fmt: skip
-def test_a_driver_under_torque_noise_has_to_be_likelier_than_none(before, behind, codes, no_more):
-    chosen = SimpleNamespace(chosen=True, bic=behind)
-    found = SimpleNamespace(findings=tuple(Finding(c, "warning", "") for c in codes),
-                            candidates=(chosen,))  # fmt: skip
-    fit = SimpleNamespace(noise_ratio=before, deviance=-100.0, samples=math.exp(5.0),
-                          structure=SimpleNamespace(size=2))  # fmt: skip
-    assert explains_no_more(found, fit) is no_more
-
-
-@pytest.mark.parametrize(
-    ("code", "severity", "suspected"),
-    [("slew", "unreliable", True), ("slew", "note", False), ("current_lag", "unreliable", False)],
-)
-def test_a_driver_is_suspected_where_an_estimate_is_unreliable_for_one(code, severity, suspected):
-    found = Finding(code, severity, "")
-    assert suspects_driver(SimpleNamespace(findings=(found,))) is suspected
-
-
 def test_the_motion_of_each_record_is_its_own():
     record = recorded("dead_zone", 0)
     for one in (record, replace(record, velocity=None, position=np.cumsum(record.velocity) * STEP)):
@@ -280,30 +163,6 @@ def test_a_plain_driver_has_no_effect():
     found = estimate(Record("motor", time, command, velocity=run(command, 5)))
     assert driver_of(found).kind == driver.NOTHING
     assert not set(DRIVERS) & set(found.combinations)
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_a_dead_zone_of_a_hundredth_of_the_voltage_is_frictions(seed):
-    """A transistor's drop is as large, and a coarse speed's rounding looks like it."""
-    command = commands(seed)
-    speed = run(np.sign(command) * np.maximum(np.abs(command) - 0.12, 0.0), seed)
-    found = estimate(Record("motor", np.arange(command.size) * STEP, command, velocity=speed))
-    assert "dead_zone" not in found.combinations and not found.unreliable
-    static, gain = found.combinations["static_voltage"], found.combinations["dc_gain"]
-    assert abs(static.value - STATIC - 0.12) < 4 * static.std + 0.02  # a sixth of the zone
-    assert abs(gain.value - GAIN) < 4 * gain.std + 1e-3 * GAIN
-
-
-def test_a_driver_that_explains_hardly_more_than_none_leaves_room_for_none():
-    command = commands(2)
-    speed = run(np.sign(command) * np.maximum(np.abs(command) - 0.23, 0.0), 2, noise=20.0)
-    record = Record("motor", np.arange(command.size) * STEP, command, velocity=speed)
-    plain = initial_fit(prepare([record], False), FirstOrder(), Options())
-    found = likeliest([record], plain, "held", Options())
-    friction = plain.structure.free.index("vc_plus")
-    std = math.sqrt(found.widened(found.fit).covariance()[friction, friction])
-    # What lies between the two is within one deviation.
-    assert abs(plain.z.vc_plus - found.fit.z.vc_plus) <= std
 
 
 def test_a_declared_driver_is_taken_for_known():
