@@ -291,9 +291,9 @@ def test_a_motor_that_viscous_friction_would_drive_does_not_run_away_behind_a_dr
     t = np.arange(2000) / 200.0
     voltage = 6.0 * np.sign(np.sin(t))
     data = prepare([Record("motor", t, voltage, velocity=100.0 * np.sin(t))], False)
-    z = from_physical(4.0, 0.01, 0.02, 2.4e-6, -5e-5, 0.01)
+    z = from_physical(4.0, 0.01, 0.02, 2.4e-6, -7e-5, 0.01)
     motor = SimpleNamespace(structure=Electromechanical(), z=z)
-    assert z.a0 < 0.6 * 0.02
+    assert z.a0 < 0.02 / 3
     assert emf_share(motor) == 1.0
     limited = Driver(driver.CURRENT, 2.5, 6.0, emf_share(motor))
     found = terminal_voltages(data, motor.structure, z, data.initial, limited)
