@@ -263,13 +263,15 @@ def _beside_model(
 ) -> tuple[Estimate | None, DriverFit | None]:
     """Return the estimate beside what no motor does, if one holds, and the likeliest driver.
 
-    What a driver explains without an accident is none.
+    What a driver explains without an accident is none, and no step of a load.
     """
+    behind, driver = _through_driver(group, request, found, data, hold, fit)
+    codes = {f.code for f in behind.findings} if behind else set()
+    if behind is not None and not codes & {"disturbed", "load_step"}:
+        return behind, driver
     if apart := under_own_loads(_tried, group, request, found, data, fit):
         return apart, None
-    behind, driver = _through_driver(group, request, found, data, hold, fit)
-    accident = behind is not None and any(f.code == "disturbed" for f in behind.findings)
-    if noisy and (behind is None or accident):
+    if noisy:
         behind = undisturbed(_tried, group, request, found, fit, plain) or behind
     return behind, driver
 
