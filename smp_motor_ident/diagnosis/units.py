@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
+from statistics import median_low
 
 import numpy as np
 
@@ -44,7 +45,7 @@ def cause_of_ratio(ratio: float, hardware: Hardware) -> str:
 
 def one_unit_of_time(records: Sequence[Record]) -> None:
     """Refuse records of which one has its samples a thousand times as far apart as the others."""
-    usual = float(np.median([r.sample_time for r in records]))
+    usual = median_low([r.sample_time for r in records])
     for record in records:
         for factor in (1e-6, 1e-3, 1e3, 1e6):
             if abs(record.sample_time / usual / factor - 1) < EXACT:

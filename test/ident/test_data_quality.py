@@ -234,8 +234,9 @@ def test_a_speed_of_few_counts_of_another_motor_is_refused():
 
 def test_a_record_in_another_unit_of_time_is_named_among_others():
     milliseconds = replace(GOOD, time=1000.0 * GOOD.time, source="third.csv")
-    with pytest.raises(SignalError, match=r"third\.csv: a sample every 5 s, 1000 times.*:ms"):
-        screen([GOOD, GOOD, milliseconds])
+    for others in ([GOOD], [GOOD, GOOD]):
+        with pytest.raises(SignalError, match=r"third\.csv: a sample every 5 s, 1000 times.*:ms"):
+            screen([*others, milliseconds])
     one_unit_of_time([GOOD, replace(GOOD, time=100.0 * GOOD.time)])  # 2 Hz beside 200 Hz may be
 
 

@@ -88,7 +88,7 @@ def test_a_speed_from_counts_rounded_or_held_is_none_of_a_timer():
 
 def test_the_tail_of_a_filter_is_none_of_a_timer():
     """Written with a few digits, it passes through all sizes, and stays at some for rows."""
-    shown = np.repeat(300.0 * np.exp(-np.arange(2000) / 90.0), 1)
+    shown = 300.0 * np.exp(-np.arange(2000) / 90.0)
     tail = np.array([float(f"{w:.4g}") for w in shown])
     tail[tail < 2e-6] = np.repeat(tail[tail < 2e-6][::3], 3)[: (tail < 2e-6).sum()]
     record = Record("motor", STEP * np.arange(tail.size), np.zeros(tail.size), velocity=tail)
