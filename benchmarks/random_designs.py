@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
 import time
 import traceback
 from concurrent.futures import ProcessPoolExecutor
@@ -87,7 +88,12 @@ def main() -> int:
     begin = time.perf_counter()
     seeds = range(arguments.seed * 1_000_000, arguments.seed * 1_000_000 + arguments.count)
     with ProcessPoolExecutor(arguments.jobs) as pool:
-        found = list(pool.map(attempt, seeds, chunksize=20))
+        found = []
+        for one in pool.map(attempt, seeds, chunksize=20):
+            found.append(one)
+            if len(found) % 250 == 0:
+                spent = time.perf_counter() - begin
+                print(f"{len(found)} of {arguments.count}, {spent:.0f} s", file=sys.stderr)
     crashes = [one for one in found if one.startswith("crash")]
     refused = [one for one in found if one.startswith("refused")]
     print(
