@@ -61,7 +61,7 @@ class LoopSettings:
     noise: ObserverNoise = nested(ObserverNoise(), prefix="observer.")
     implausible_jump: float = described(
         0.0, "Feedback that jumps for one sample by this, beyond what the motor can change by, is "
-        "left out [rad/s, wheel]; 0: half of the top speed.", minimum=0.0
+        "left out [rad/s, wheel]; 0: half of the top speed, and a count.", minimum=0.0
     )  # fmt: skip
 
     def __post_init__(self) -> None:
@@ -163,11 +163,18 @@ class WheelLoop:
     def speed(self, dt: float, velocity: float, count: int, voltage: float) -> float:
         """Return the wheel's speed after one more sample, NaN where it is not known or jumps."""
         speed = self._speed_of(dt, velocity, count, voltage)
-        if speed != speed or self._plausible.accepts(speed, dt, voltage):
+        if speed != speed or self._plausible.accepts(speed, dt, voltage, self._one_count(dt)):
             return speed
         self.jumps += 1
         self._restart()
         return math.nan
+
+    def _one_count(self, dt: float) -> float:
+        """Return what one count more adds to a speed that is differenced from counts [rad/s]."""
+        if self._count is None or self._gearbox is None or self._encoder is None or not dt > 0.0:
+            return 0.0
+        over = 1 if self._differenced is None else self.settings.difference_window
+        return self._gearbox.to_wheel(self._encoder.angle_per_count) / (over * dt)
 
     def _measured(self, dt: float, velocity: float, count: int, voltage: float) -> float:
         self.source = "measured"

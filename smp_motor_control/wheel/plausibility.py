@@ -58,18 +58,21 @@ class PlausibleSpeed:
         self._kept = self._last = math.nan
         self._drive = 0.0  # most voltage that accelerated the motor, fading with what it lags by
 
-    def _most(self, voltage: float, dt: float) -> float:
+    def _most(self, voltage: float, dt: float, count: float) -> float:
         """Return the largest change within a sample that is believed."""
         if not self._jump:
-            return max(self.gross, self.rate * dt)
+            return max(self.gross, self.rate * dt) + count
         drive = abs(voltage - self._back_emf * self._kept) + self._load
         faded = self._drive + dt / (2.0 * (self._lag + dt)) * (drive - self._drive)
         self._drive = drive if not drive < faded else faded  # NaN: the first
         return self._jump + self._drive / self._inertia * dt
 
-    def accepts(self, speed: float, dt: float, voltage: float = 0.0) -> bool:
-        """Tell whether a speed [rad/s] is to be believed under a voltage."""
-        most = self._most(voltage, dt)
+    def accepts(self, speed: float, dt: float, voltage: float = 0.0, count: float = 0.0) -> bool:
+        """Tell whether a speed [rad/s] is to be believed under a voltage.
+
+        ``count`` [rad/s] is what one count more adds to it.
+        """
+        most = self._most(voltage, dt, count)
         last, self._last = self._last, speed
         change = abs(speed - last)  # NaN: the first
         beyond = (change / most if change < most else 1.0) - self._usual

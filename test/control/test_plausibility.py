@@ -11,7 +11,7 @@ from smp_motor_control.pid import PidGains
 from smp_motor_control.reference.profile import Drive
 from smp_motor_control.wheel.controller import WheelController, WheelSettings
 from smp_motor_control.wheel.faults import FaultLimits
-from smp_motor_control.wheel.loop import LoopSettings
+from smp_motor_control.wheel.loop import LoopSettings, WheelLoop
 
 STEP = 0.01
 GAINS = PidGains(p=2.0, feedforward_acceleration=2.0, u_clamp_min=-12.0, u_clamp_max=12.0)
@@ -63,3 +63,19 @@ def test_readings_in_coarse_steps_jump_all_the_time_and_are_believed(steps: floa
     wheel, left_out = driven(steps * (rng.random(2000) < 0.3))
     assert np.mean(left_out) < 0.01
     assert not any(left_out[100:])
+
+
+@pytest.mark.parametrize(("source", "window"), [("measured", 1), ("difference", 2)])
+@pytest.mark.parametrize(("counts", "jumps"), [(1, 0), (3, 1)])
+def test_the_first_counts_of_a_coarse_encoder_are_no_jumps(source, window, counts, jumps) -> None:
+    """One of eight counts in 10 ms is 79 rad/s, over two samples 39, and the top speed 10."""
+    quantum = 2 * np.pi / 8
+    loop = LoopSettings(gains=GAINS, drive=DRIVE, speed_source=source, difference_window=window)
+    wheel, count = WheelLoop(loop, Gearbox(1.0), Encoder(8.0)), 1
+    for k in range(400):
+        more = counts if k >= 200 and k % 50 == 0 else 0
+        count += more
+        wheel.speed(STEP, quantum * more / STEP, count, 0.0)
+        if k == 200:
+            assert wheel.jumps == jumps
+    assert bool(wheel.jumps) == bool(jumps)
