@@ -24,7 +24,7 @@ from smp_motor_ident.estimation.fitted import NORMAL_95
 from smp_motor_ident.estimation.quantities import Answer, answer
 from smp_motor_ident.estimation.selection import POLICY, FittedCandidate
 from smp_motor_ident.likelihood.experiments import Experiments
-from smp_motor_ident.result import Quantity
+from smp_motor_ident.result import UNITS, Quantity
 
 BLOCKS = 60
 DRAWS = 400
@@ -128,12 +128,23 @@ def averaged(
     ])  # fmt: skip
     factor = np.sqrt(np.maximum(share @ each / variance, 1.0))
     shift = dict(zip(result.names, zip(mean, np.diag(between), factor)))
+    known = _shifted(result.combinations, shift)
+    if "time_constant_product" not in known:
+        known |= _second_lag_of([others[k] for k in keep])
     return replace(
         result,
-        combinations=_shifted(result.combinations, shift),
+        combinations={n: known[n] for n in UNITS if n in known},
         parameters=_shifted(result.parameters, shift),
         covariance=result.covariance * np.outer(factor, factor) + between,
     )
+
+
+def _second_lag_of(others: Sequence[Answer]) -> dict[str, Quantity]:
+    """Return what a choice of one lag leaves open of a second, which others have."""
+    name = "time_constant_product"
+    there = [o.combinations[name] for o in others if name in o.combinations]
+    up = [q.ci95[1] for q in there if q.ci95 is not None]
+    return {name: Quantity(None, None, (0.0, max(up)), UNITS[name], "unidentifiable")} if up else {}
 
 
 def candidate_weights(data: Experiments, candidates: Sequence[FittedCandidate]) -> dict[int, float]:

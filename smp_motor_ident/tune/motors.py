@@ -123,13 +123,15 @@ def draw_motors(
 
     What is positive by nature is drawn log-normally, what may be zero normally from there up.
     An unreliable estimate is drawn at least as wide as what it leaves unexplained, gain and lag
-    from one size of voltage as wide as they may be at others.
+    from one size of voltage as wide as they may be at others.  A second lag that the record hides
+    is anything up to the first that it leaves open.
     """
     names = _names(estimate)
     mean = np.array([estimate.value(name) for name in names])
     covariance = _covariance(estimate, names, mean)
     wide = friction is not None and friction.high > friction.low
-    if not np.any(np.diag(covariance) > 0) and not wide:
+    hidden = _hidden_lag(estimate)
+    if not np.any(np.diag(covariance) > 0) and not wide and not hidden:
         return None
     positive = np.array([name in _POSITIVE for name in names])
     scale = np.where(positive, np.where(positive, mean, 1.0), 1.0)
@@ -143,6 +145,8 @@ def draw_motors(
         name: mean[k] * np.exp(draws[k]) if positive[k] else np.maximum(draws[k], 0.0)
         for k, name in enumerate(names)
     }
+    if hidden and "dc_gain" in names:
+        values["time_constant_product"] = rng.uniform(*hidden, n)
     motors = _motors(estimate, values)
     if friction is not None:
         static = np.clip(motors.static_voltage, friction.low, friction.high)
@@ -150,6 +154,15 @@ def draw_motors(
             static = rng.uniform(friction.low, friction.high, n)
         motors = replace(motors, static_voltage=static)
     return motors
+
+
+def _hidden_lag(estimate: Estimate) -> tuple[float, float] | None:
+    """Return within what a product of lags [s^2] lies that no value is stated of."""
+    product = estimate.combinations.get("time_constant_product")
+    if product is None or product.value is not None or product.ci95 is None:
+        return None
+    low, high = product.ci95
+    return low, max(low, min(high, 0.25 * estimate.value("time_constant") ** 2))
 
 
 def one_size_of_voltage(estimate: Estimate) -> Finding | None:

@@ -59,6 +59,18 @@ def test_a_candidate_that_is_rejected_changes_nothing():
     assert averaged(alone, np.array([0.999, 0.001]), [_answer(0.06, None)]) is alone
 
 
+def test_a_second_lag_that_the_choice_does_not_have_is_left_open_as_far_as_another_has_it():
+    second = _answer(0.05, None)
+    second.combinations["time_constant_product"] = Quantity(2e-4, 1e-4, (0.0, 4e-4), "s^2")
+    both = averaged(_answer(0.05, 0.01), np.array([0.8, 0.2]), [second])
+    product = both.combinations["time_constant_product"]
+    assert product.value is None and product.status == "unidentifiable"
+    assert product.ci95 == (0.0, 4e-4)
+    assert list(both.combinations) == ["delay", "time_constant", "time_constant_product"]
+    rejected = averaged(_answer(0.05, 0.01), np.array([0.999, 0.001]), [second])
+    assert "time_constant_product" not in rejected.combinations
+
+
 def test_a_candidate_that_only_the_current_rejects_has_no_weight():
     data = prepare([motors.record("rear_left", seconds=2.0)], True)
     fit = initial_fit(data, Electromechanical(), Options())

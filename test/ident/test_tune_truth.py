@@ -16,6 +16,9 @@ from smp_motor_ident.finding import Finding
 from smp_motor_ident.report.document import identification_document
 from smp_motor_ident.result import Estimate, Quantity
 from smp_motor_ident.tune import design
+from smp_motor_ident.tune.margins import loop_margins
+from smp_motor_ident.tune.motors import motors_of
+from smp_motor_ident.tune.plant import sample
 
 DOUBT = Finding("dead_zone", "unreliable", "a dead zone of 2 V", {}, "record slow ramps")
 
@@ -100,6 +103,28 @@ def test_drives_within_the_uncertainty_stay_within_the_specified_bands():
     assert spec.settling.low <= one.performance.settling <= spec.settling.high
     assert spec.phase_margin.low >= 0.99 * 60
     assert spec.samples == 300
+
+
+def test_a_second_lag_that_the_record_hides_is_within_the_stated_margins():
+    one_lag = estimate(time_constant_product=0.0)
+    product = Quantity(None, None, (0.0, 4e-4), "s^2", "unidentifiable")
+    hidden = replace(
+        one_lag, combinations={**one_lag.combinations, "time_constant_product": product}
+    )
+    aware, ignorant = design(hidden, LOOP), design(one_lag, LOOP)
+    motor = motors_of(estimate(time_constant_product=3.5e-4))
+
+    def of_true(made):
+        return loop_margins(sample(motor, made.loop), made.feedback)
+
+    assert of_true(aware).phase > aware.specification.phase_margin.low > 59.0
+    assert of_true(aware).gain > aware.specification.gain_margin.low
+    assert of_true(aware).sensitivity < aware.specification.sensitivity.high
+    assert of_true(ignorant).phase < ignorant.specification.phase_margin.low - 3.0
+    # No more is taken for open than two lags of one motor can be.
+    product = replace(product, ci95=(0.0, 1.0))
+    wide = replace(hidden, combinations={**hidden.combinations, "time_constant_product": product})
+    assert design(wide, LOOP).margins.stable
 
 
 def test_unreliable_identification_is_refused_and_widens_what_is_designed_on_it():
