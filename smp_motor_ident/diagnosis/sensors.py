@@ -8,6 +8,8 @@ from smp_motor_ident.diagnosis.limits import FIT_EXPLAINS, INSTANT, LONG_DELAY, 
 from smp_motor_ident.diagnosis.residuals import coloured
 from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.estimation.fitted import NORMAL_95
+from smp_motor_ident.estimation.lag_exchange import exchanged
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.structures import Electromechanical
@@ -76,13 +78,29 @@ def _filtered_speed(fit: Fit) -> Finding:
         if low
         else f"averaged over {1e3 * window:.3g} ms"
     )
+    whose = f"{1e3 * lag:.3g} ms of what looks like a delay is that filter, not the motor"
+    either = low and _may_be_the_motors(fit)
+    if either:
+        whose = "which of the lags is the filter's and which the motor's the data do not tell"
     return Finding(
         "low_passed_speed" if low else "averaged_speed",
         "warning",
-        f"the speed is {how}: {1e3 * lag:.3g} ms of what looks like a delay is that filter, not "
-        "the motor",
+        f"the speed is {how}: {whose}",
         {"lag": lag, "samples_per_row": ticks} if low else {"window": window},
+        "reverse the motor while recording, or record encoder counts or the current"
+        if either
+        else "",
     )
+
+
+def _may_be_the_motors(fit: Fit) -> bool:
+    """Tell whether the interval of a filter's lag reaches the slowest of the motor's."""
+    if "window" not in fit.structure.free or fit.structure.current:
+        return False
+    slowest = max(0.5 * z.window for z in exchanged(fit.z, fit.structure.order))
+    i = fit.structure.free.index("window")
+    reach = 0.5 * NORMAL_95 * float(np.sqrt(fit.covariance()[i, i]))
+    return reach > abs(0.5 * fit.z.window - slowest)
 
 
 def _fit_of_current(data: Experiments, fit: Fit) -> Iterator[Finding]:

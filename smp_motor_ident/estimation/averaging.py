@@ -22,7 +22,7 @@ from smp_motor_ident.estimation.candidate_starts import of_kind
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.fitted import NORMAL_95
 from smp_motor_ident.estimation.quantities import Answer, answer
-from smp_motor_ident.estimation.selection import POLICY, FittedCandidate
+from smp_motor_ident.estimation.selection import POLICY, FittedCandidate, slowly_filtered
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.result import UNITS, Quantity
 
@@ -67,7 +67,7 @@ def weights(data: Sequence[Experiments], fits: Sequence[Fit], seed: int = 0) -> 
         for own, s in zip(data, (f.structure for f in fits), strict=True)
     ]
     price = np.array([POLICY.price(n, f.samples) for n, f in zip(sizes, fits, strict=True)])
-    price += np.array([POLICY.second_lag * _slowly_filtered(f) for f in fits])
+    price += np.array([POLICY.second_lag * slowly_filtered(f) for f in fits])
     total = shares @ runs.T + price
     each = np.exp(-0.5 * (total - total.min(axis=1, keepdims=True)))
     each = _of_both_odds(each, data, fits)
@@ -87,11 +87,6 @@ def _of_both_odds(each: Array, data: Sequence[Experiments], fits: Sequence[Fit])
     out = each.copy()
     out[:, either] = 0.5 * (even + odds * as_much)
     return out
-
-
-def _slowly_filtered(fit: Fit) -> bool:
-    """Tell whether a speed's filter is slower than the motor, which few are."""
-    return fit.structure.low_pass and 0.5 * fit.z.window > fit.z.time_constant
 
 
 def _late_without_lag(data: Experiments, fit: Fit) -> bool:

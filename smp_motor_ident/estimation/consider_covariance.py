@@ -21,6 +21,7 @@ from smp_motor_ident.estimation.current_lag import LITTLE, with_lag
 from smp_motor_ident.estimation.descent import ROUGHLY, refine
 from smp_motor_ident.estimation.fit import Fit, Options
 from smp_motor_ident.estimation.fitted import NORMAL_95
+from smp_motor_ident.estimation.lag_exchange import consider_exchange
 from smp_motor_ident.estimation.selection import POLICY, sandwich_factor
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.coordinates import RINGS, direction, lag_share
@@ -95,7 +96,9 @@ def consider_filter(data: Experiments, fit: Fit, options: Options) -> Fit:
     likely a filter then is, its deviance tells.  The motor's lag is without it the first alone.
     """
     s = fit.structure
-    if s.order != 2 or s.current or s.low_pass or data.kind == ANGLE:
+    if s.low_pass:
+        return consider_exchange(data, fit, options)
+    if s.order != 2 or s.current or data.kind == ANGLE:
         return fit
     ratio, spread = fit.log_ratio()
     if ratio - NORMAL_95 * spread > RINGS:  # which no two lags do

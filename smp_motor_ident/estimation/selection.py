@@ -124,9 +124,11 @@ class SelectionPolicy:
         """Decide whether a candidate of as many parameters or more takes the place of the best."""
         if other.structure.size > best.structure.size:
             return self.needed(best, other)
-        # Every motor has a second lag, few have a delay: alike, the lag is believed.
-        lag = other.structure.order - best.structure.order
-        better = other.deviance < best.deviance + self.second_lag * sandwich_factor(other) * lag
+        # Every motor has a second lag, few have a delay, and few filters are slower than the
+        # motor: alike, the likelier is believed.
+        odds = other.structure.order - best.structure.order
+        odds += slowly_filtered(best) - slowly_filtered(other)
+        better = other.deviance < best.deviance + self.second_lag * sandwich_factor(other) * odds
         return better, f"fits {'better' if better else 'worse'} than {best.structure.label}"
 
     def likelier(self, other: FittedCandidate, best: FittedCandidate) -> bool:
@@ -181,6 +183,11 @@ class SelectionPolicy:
             if name == "ln_a2" and std > self.loose:
                 return "second time constant"
         return ""
+
+
+def slowly_filtered(fit: Fit) -> bool:
+    """Tell whether a speed's filter is slower than the motor, which few are."""
+    return fit.structure.low_pass and 0.5 * fit.z.window > fit.z.time_constant
 
 
 def _delayed_instead(simple: Fit, rich: Fit) -> bool:

@@ -17,8 +17,14 @@ from smp_motor_ident.estimation.delay_and_averaging import (
 )
 from smp_motor_ident.estimation.fit import Fit, Options, solve
 from smp_motor_ident.estimation.initialisation import beginning, initial_fit
+from smp_motor_ident.estimation.lag_exchange import with_quicker_filter
 from smp_motor_ident.estimation.profile import RISE, one_level, rubbing
-from smp_motor_ident.estimation.selection import POLICY, FittedCandidate, sandwich_factor
+from smp_motor_ident.estimation.selection import (
+    POLICY,
+    FittedCandidate,
+    sandwich_factor,
+    slowly_filtered,
+)
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.structures import Structure
 
@@ -35,6 +41,8 @@ def varied(
     best = with_low_pass(data, best, options, candidates, say)
     best = with_digital_filter(data, best, options, candidates, say)
     data = data.measured_as(best.kind)
+    if slowly_filtered(best):
+        best = with_quicker_filter(data, best, options, candidates)
     sensed = best.structure
     before = None
     while before != best.structure:  # what was added may have hidden that the rest is there, too

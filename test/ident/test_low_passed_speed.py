@@ -164,6 +164,29 @@ def test_a_second_lag_of_a_speed_that_is_driven_one_way_may_be_its_filters(stati
     assert 1.0 < (found.value - motor) / found.std < 3.0
 
 
+@pytest.mark.parametrize("lags", [(0.037, 0.008, 0.008), (0.03, 0.005, 0.06)])
+def test_whose_of_a_speed_s_lags_is_whose_is_open_where_the_motor_never_turns_back(lags):
+    """Lags in a row answer alike in any order: each may be the filter's, the others the motor's."""
+    rate, fine, rng = 1000, 20, np.random.default_rng(1)
+    volts = np.repeat([1.6, 6.4, 3.0, 5.0, 2.0], 1000)
+    speed = 26.0 * np.repeat(volts - 0.3, fine)
+    for lag in lags:
+        gone = np.exp(-1 / rate / fine / lag)
+        speed = lfilter([1 - gone], [1, -gone], speed, zi=[gone * speed[0]])[0]
+    shown = np.r_[speed[0], speed[fine - 1 :: fine][:-1]] + 0.1 * rng.standard_normal(volts.size)
+    held = np.r_[volts[0], volts[:-1]]
+    found = estimate(Record("motor", np.arange(volts.size) / rate, held, velocity=shown))
+    assert not found.unreliable
+    q, sensor = (found.combinations[n] for n in ("time_constant", "sensor_lag"))
+    for own in lags:
+        assert abs(sensor.value - own) < 2.5 * sensor.std
+        assert abs(q.value - (sum(lags) - own)) < 2.5 * q.std
+    # Few filters are slower than their motor: of all of them that is the least likely.
+    assert sensor.value < q.value
+    said = next(f for f in found.findings if f.code == "low_passed_speed")
+    assert "do not tell" in said.message and said.advice
+
+
 def test_a_load_does_not_hide_which_of_two_lags_is_the_filters():
     """Friction that is greater one way looks like a load; without that a winding fits better."""
     rng = np.random.default_rng(4)
