@@ -58,6 +58,17 @@ def test_fields_of_a_matlab_structure_and_columns_of_a_matrix_have_paths(tmp_pat
     assert_motor(read_records(path, mapping)["motor"])
 
 
+def test_signals_of_a_simulink_scope_and_cells_have_their_places_as_paths(tmp_path: Path) -> None:
+    path = tmp_path / "log.mat"
+    kinds = [("values", object), ("dimensions", object), ("label", object)]
+    signals = np.array([(VOLTAGE, 1, "u"), (SPEED, 1, "w")], dtype=kinds)
+    cells = np.array([VOLTAGE, SPEED[:-1]], dtype=object)
+    scipy.io.savemat(path, {"scope": {"time": TIME, "signals": signals}, "cells": cells})
+    mapping = "velocity=scope.signals[1].values:rad/s time=scope.time voltage="
+    for voltage in ("scope.signals[0].values", "cells[0]"):
+        assert_motor(read_records(path, [mapping + voltage])["motor"])
+
+
 def matlab_object(name: str, kind: str, order: str = "<") -> bytes:
     """Return an object as MATLAB saves it: texts and references, without dimensions."""
 

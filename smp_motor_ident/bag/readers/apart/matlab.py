@@ -106,11 +106,10 @@ def _columns(
     prefix: str, value: Any, depth: int, objects: list[str]
 ) -> Iterator[tuple[str, np.ndarray[Any, Any]]]:
     """Yield the vectors of a structure by their paths; note its objects."""
-    if isinstance(value, Mapping):
-        for key, inner in value.items():
-            if depth < _DEEPEST:
-                path = f"{prefix}.{key}" if prefix else str(key)
-                yield from _columns(path, inner, depth + 1, objects)
+    parts = _parts(prefix, value)
+    if parts is not None:
+        for path, inner in parts if depth < _DEEPEST else []:
+            yield from _columns(path, inner, depth + 1, objects)
         return
     if not isinstance(value, np.ndarray):
         return
@@ -127,6 +126,15 @@ def _columns(
         if rows.shape[1] <= _WIDEST:
             for k in range(rows.shape[1]):
                 yield f"{prefix}[{k}]", rows[:, k]
+
+
+def _parts(prefix: str, value: Any) -> list[tuple[str, Any]] | None:
+    """Return what a structure, or an array of structures or cells, is made of, by their paths."""
+    if isinstance(value, Mapping):
+        return [(f"{prefix}.{k}" if prefix else str(k), inner) for k, inner in value.items()]
+    if isinstance(value, list) or (isinstance(value, np.ndarray) and value.dtype == object):
+        return [(f"{prefix}[{k}]", inner) for k, inner in enumerate(np.ravel(value)[:_WIDEST])]
+    return None
 
 
 def _printable(text: Any) -> str:
