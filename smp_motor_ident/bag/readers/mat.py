@@ -51,7 +51,7 @@ def _advice(objects: list[str]) -> str:
     return (
         "holds MATLAB objects, such as a timeseries or a Simulink Dataset, which only MATLAB can "
         f"read: {some}; save its Time and Data as arrays there: "
-        "t = x.Time; y = x.Data; save('log.mat', 't', 'y')"
+        "t = x.Time; y = x.Data; save('log.mat', 't', 'y'), where of a Dataset x = data{1}.Values"
     )
 
 

@@ -109,6 +109,23 @@ def test_objects_of_matlab_are_named_and_the_other_variables_read(
         list_topics(path)
 
 
+def test_objects_of_version_7_3_are_named_and_the_other_variables_read(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    path = tmp_path / "log.mat"
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, values in {"t": TIME, "u": VOLTAGE, "y": SPEED}.items():
+            file[name] = values[None]
+        file["data"] = np.array([[0xDD000000, 2, 1, 1, 1, 2]], dtype=np.uint32)
+        file["data"].attrs["MATLAB_class"] = np.bytes_("Simulink.SimulationData.Dataset")
+        file["data"].attrs["MATLAB_object_decode"] = np.int32(3)
+    with path.open("r+b") as raw:
+        raw.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM")
+    record = read_records(path, MAP)["motor"]
+    assert_motor(record)
+    said = [f.message for f in record.findings if f.code == "matlab_object"]
+    assert len(said) == 1 and "data (Simulink.SimulationData.Dataset)" in said[0]
+
+
 def test_a_matlab_file_of_version_4_has_signals_in_its_rows(tmp_path: Path) -> None:
     path = tmp_path / "log.mat"
     content = {"data": np.stack([TIME, VOLTAGE, SPEED]), "note": "QUARC", "fs": np.float32(100)}

@@ -32,7 +32,7 @@ def main() -> None:
     head: dict[str, Any] = {"error": "", "too_large": False, "objects": [], "columns": []}
     columns: dict[str, np.ndarray[Any, Any]] = {}
     try:
-        for content in _contents(data):
+        for content in _contents(data, head["objects"]):
             columns |= _columns("", content, 0, head["objects"])
     except Unreadable as error:
         head["error"] = str(error)
@@ -50,8 +50,11 @@ def main() -> None:
         sys.stdout.buffer.write(answer.getbuffer())
 
 
-def _contents(data: bytes) -> Iterator[dict[str, Any]]:
-    """Yield the variables of a file by their names, as the library of its version gives them."""
+def _contents(data: bytes, objects: list[str]) -> Iterator[dict[str, Any]]:
+    """Yield the variables of a file by their names, as its version's library gives them.
+
+    Note the objects of version 7.3.
+    """
     if data.startswith(b"MATLAB 7.3 MAT"):
         try:
             import h5py
@@ -64,7 +67,11 @@ def _contents(data: bytes) -> Iterator[dict[str, Any]]:
         taken: dict[str, Any] = {}
 
         def take(key: str, item: Any) -> None:
-            if isinstance(item, h5py.Dataset) and item.dtype.kind in "fiub" and "#" not in key:
+            if not isinstance(item, h5py.Dataset) or "#" in key:
+                return
+            if "MATLAB_object_decode" in item.attrs:  # references, in whole numbers
+                objects.append(f"{key} ({_printable(item.attrs.get('MATLAB_class', b''))})")
+            elif item.dtype.kind in "fiub":
                 taken[key.replace("/", ".")] = np.asarray(item).T  # MATLAB counts columns first
 
         with h5py.File(io.BytesIO(data)) as file:
