@@ -85,6 +85,13 @@ def _descent(data: Experiments, fit: Fit) -> Iterator[Finding]:
     )
 
 
+def _left_of(validation: float) -> str:
+    """Return in words what of held-out data is left; more than all of them is no share."""
+    if validation < 0:
+        return "held-out data are left unexplained, further from the model than from their mean"
+    return f"held-out data are left unexplained by {100 - validation:.0f} % of the motion"
+
+
 def _fit(
     percent: FitPercent, tests: ResidualTests, closely: bool, noisy: bool
 ) -> Iterator[Finding]:
@@ -108,8 +115,7 @@ def _fit(
         yield Finding(
             "validation",
             "unreliable",
-            f"held-out data are left unexplained by {100 - validation:.0f} % of the motion, "
-            f"the fitted ones by {100 - estimation:.0f} %; the "
+            f"{_left_of(validation)}, the fitted ones by {100 - estimation:.0f} %; the "
             "motor or its load changed, or the excitation was too poor",
             {"estimation": estimation, "validation": validation},
             "record 20 s or more of one excitation under one load",

@@ -69,6 +69,15 @@ def test_a_fit_is_judged_by_what_it_explains_and_whether_that_holds(
     assert [f.code for f in found] == codes
 
 
+@pytest.mark.parametrize(("validation", "words"), [(-4e11, "from their mean"), (60.0, "by 40 %")])
+def test_what_a_model_leaves_of_held_out_data_is_no_share_where_it_is_more_than_all(
+    validation: float, words: str
+) -> None:
+    percent = FitPercent(90.0, validation)
+    (said,) = _fit(percent, ResidualTests(True, True), closely=False, noisy=False)
+    assert words in said.message and len(said.message) < 200
+
+
 def test_clean_data_have_no_finding_beyond_a_note() -> None:
     result = estimate(motors.record("rear_left", seconds=8.0))
     assert [f for f in result.findings if f.severity != "note"] == []
