@@ -80,19 +80,20 @@ def with_both_filters(
 ) -> Fit:
     """Return the fit with a lag of the current, a speed that is averaged, or both: as asked for.
 
-    Left out, the one is taken for another shape of the other, so that both orders are tried.
+    Left out, the one is taken for another shape of the other, so that both orders are tried; and
+    both left out may hide each other, so that neither alone is wanted.
     """
     best = with_average(
         data, with_current_lag(data, first, options, candidates, say), options, candidates, say
     )
-    if not best.structure.has("current_lag"):
-        return best
-    with_average(data, first, options, candidates, say)
+    lagged = best.structure.has("current_lag")
+    if lagged:
+        with_average(data, first, options, candidates, say)
     structure = first.structure.with_(window=True)
     mean = next((r.fit for r in candidates if r.fit.structure == structure), first)
     if mean is first:  # which could not be fitted
         return best
-    other = with_current_lag(of_kind(data, mean), mean, options, candidates, say, surely=True)
+    other = with_current_lag(of_kind(data, mean), mean, options, candidates, say, surely=lagged)
     return other if POLICY.replaces(best, other)[0] else best
 
 

@@ -246,3 +246,26 @@ def test_a_current_is_not_given_up_for_a_speed_that_is_a_mean():
         q = (found.parameters | found.combinations)[name]
         assert abs(q.value - true) < max(5 * q.std, 5e-3 * true), name
     assert not found.unreliable
+
+
+def test_a_mean_speed_and_a_mean_current_do_not_hide_each_other():
+    """A slow logger's means of both: neither alone explains the rows better than a greater L."""
+    r, el, k, j, b, step, fine = 1.0, 5.5e-4, 0.51, 0.032, 9e-3, 0.01, 100
+    rng = np.random.default_rng(3)
+    volts = np.repeat(rng.uniform(-9.0, 9.0, 24), 50)
+    every = np.concatenate([volts[:1], np.repeat(volts[1:], fine)])
+    time = step / fine * np.arange(every.size)
+    out = independent.simulate(time, every, r, el, k, j, b, 0.33, np.zeros(time.size), 2)
+    count = np.floor(out[::fine, 2] * 1496 / (2 * np.pi) + 0.3)
+    speed = np.diff(count, prepend=count[0]) * 2 * np.pi / 1496 / step
+    amps = shown(out[:, 0], step / fine, "averaged", 0.5 * step, fine)
+    amps += 0.03 * rng.standard_normal(amps.size)
+    found = estimate(Record("motor", step * np.arange(volts.size), volts, amps, speed))
+    assert not found.unreliable
+    true = {"resistance": r, "inductance": el, "motor_constant": k, "inertia": j}
+    for name, value in true.items():
+        q = found.parameters[name]
+        if q.value is not None:
+            assert abs(q.value - value) < 4 * q.std + 2e-3 * value, name  # as above
+    lag = found.combinations["current_lag"]
+    assert abs(lag.value - 0.5 * step) < 4 * lag.std + 1e-3 * step
