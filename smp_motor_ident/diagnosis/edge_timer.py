@@ -7,11 +7,12 @@ longer than the samples between, what is held is late by up to that time, and sa
 comes to rest how fast it was: friction seems to be none, and a dead zone takes its place.
 """
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
 
-from smp_motor_control.arrays import Array
+from smp_motor_control.arrays import Array, Flags, Integers
 from smp_motor_ident.diagnosis.limits import HALF_EXPLAINED
 from smp_motor_ident.diagnosis.sample_limits import EDGE_SPEED, EDGES, HELD
 from smp_motor_ident.finding import Finding
@@ -22,13 +23,14 @@ ROWS = 2.05  # for which a reading is held at least where that tells how long
 ALIKE = 1.05  # rows by which that is known
 TRIED = np.arange(1.0, 100.0)  # percentiles of what a count may be
 TICK, NEAR = 1e-6, 0.05  # of a timer [s], and the share of it that a published speed is rounded by
+NEIGHBOURS = 2.5  # rows between two readings that are read off between: with one row left out
 QUICK = 0.25  # rows of a count: a motor that is as fast does not come to rest between two rows
 
 
 def between_edges(record: Record) -> Record:
     """Return a record whose speed is timed between edges without what is held; others as they are.
 
-    A reading of a count that took longer than the rows between is put in the middle of that time.
+    Readings are put in the middles of the times that they are of, and read off there by the rows.
     """
     velocity = record.velocity
     if velocity is None or record.count is not None or record.position is not None:
@@ -87,18 +89,75 @@ def _ticks(period: Array) -> bool:
 
 
 def _centred(record: Record, velocity: Array, count: float) -> tuple[Array, float]:
-    """Return readings in the middles of the times that they are of, and the share of none."""
-    speed = np.nan_to_num(velocity)
-    before = np.append(np.nan, speed[:-1])
-    before[list(record.starts)] = np.nan
+    """Return what the readings in the middles of their times say of the rows, and the share of
+    rows of which none does.
+    """
+    speed, step = np.nan_to_num(velocity), record.sample_time
+    out = np.full(speed.size, np.nan)
     with np.errstate(divide="ignore"):
-        took = count / np.abs(speed) / record.sample_time  # rows
-    # After a rest, or back over the same edge, that time is not one of a count.
-    fresh = (speed * before > 0) & ((speed != before) | (took < QUICK))
-    rows = np.flatnonzero(fresh)
-    to = rows - np.rint(took[rows] / 2).astype(np.int64)
-    first = np.array(record.starts)[np.searchsorted(record.starts, rows, side="right") - 1]
-    out = np.where((speed == 0) & np.isfinite(velocity), 0.0, np.nan)
-    out[to[to >= first]] = speed[rows[to >= first]]
+        took = count / np.abs(speed)
+    longest = float(took[speed != 0].max(initial=0.0))
+    for begin, end in itertools.pairwise((*record.starts, speed.size)):
+        rows = slice(begin, end)
+        when, said, time = record.time[rows], speed[rows], took[rows]
+        before = np.append(np.nan, said[:-1])
+        # After a rest, or back over the same edge, that time is not one of a count.
+        fresh = (said * before > 0) & ((said != before) | (time < QUICK * step))
+        # The last edge was up to a row ago, or up to a count where that takes less.
+        middle = when - 0.5 * (time + np.minimum(time, step))
+        at, most = np.flatnonzero(fresh), NEIGHBOURS * step
+        out[rows] = _between(when, middle[at], said[at], most)
+        close = _close(middle[at], said[at], most)
+        # Before a reversal or a rest the last edge may be longer ago than by that.
+        own = at[1:-1][close[:-1] & close[1:] & (time[at[1:-1]] <= step)]
+        out[rows][own] = _ahead(when, middle, said, own, at)
+        zero = (said == 0) & np.isfinite(velocity[rows])
+        out[rows][_rests(when, zero, 2 * longest + step)] = 0.0
     lost = np.isfinite(velocity) & ~np.isfinite(out)
     return out, float(lost.mean())
+
+
+def _close(middle: Array, said: Array, most: float) -> Flags:
+    """Tell which readings are close behind the one before, and of its sign."""
+    apart = np.diff(middle)
+    return np.asarray((apart > 0) & (apart < most) & (said[1:] * said[:-1] > 0))
+
+
+def _ahead(when: Array, middle: Array, said: Array, own: Integers, at: Integers) -> Array:
+    """Return readings as far ahead as they are late, along the way from the one before.
+
+    The voltage may change in a reading's own row, so that what follows tells of another motion.
+    """
+    before = at[np.searchsorted(at, own) - 1]
+    slope = (said[own] - said[before]) / (middle[own] - middle[before])
+    return np.asarray(said[own] + (when[own] - middle[own]) * slope)
+
+
+def _between(when: Array, middle: Array, said: Array, most: float) -> Array:
+    """Return what readings say of rows: linear between two that are close, else of the nearest.
+
+    In the nearest row a reading is off by up to half of one, in which a quick motor reverses.
+    """
+    out = np.full(when.size, np.nan)
+    if middle.size < 2:
+        return out
+    middle = np.maximum.accumulate(middle)
+    close = _close(middle, said, most)
+    alone = ~(np.append(close, False) | np.append(False, close)) & (middle >= when[0])
+    row = np.interp(middle[alone], when, np.arange(when.size))
+    out[np.rint(row).astype(np.int64)] = said[alone]
+    after = np.searchsorted(middle, when, side="right")
+    inside = (after > 0) & (after < middle.size)
+    inside[inside] = close[after[inside] - 1]
+    out[inside] = np.interp(when[inside], middle, said)
+    return out
+
+
+def _rests(when: Array, zero: Flags, longest: float) -> Flags:
+    """Return the rows of a rest: one that is over sooner may be a reversal, within two counts."""
+    edges = np.flatnonzero(np.diff(zero.astype(np.int8), prepend=0, append=0))
+    out = np.zeros(when.size, dtype=np.bool_)
+    for first, after in zip(edges[::2], edges[1::2], strict=True):
+        if first == 0 or after == when.size or when[after] - when[first] > longest:
+            out[first:after] = True
+    return out
