@@ -56,6 +56,8 @@ def with_current_lag(
         say(f"trying {richer.label}")
         starts = _leading(data, direct, richer, options) + [best.z] * best.structure.lags
         starts += exchanged
+        if own.window and sensor == "averaged":  # what takes the mean of one takes that of both
+            starts.append(richer.complete(best.z.with_(current_lag=0.5 * best.z.window)))
         # What looks like torque noise may be this.
         near = [best] if best.noise_ratio == 0 else [best, replace(best, noise_ratio=0.0)]
         tried = [descent.refine(data, richer, n, z, options) for z in starts for n in near]
