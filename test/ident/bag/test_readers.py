@@ -9,6 +9,7 @@ import zlib
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import openpyxl
 import pytest
@@ -110,7 +111,6 @@ def test_objects_of_matlab_are_named_and_the_other_variables_read(
 
 
 def test_objects_of_version_7_3_are_named_and_the_other_variables_read(tmp_path: Path) -> None:
-    h5py = pytest.importorskip("h5py")
     path = tmp_path / "log.mat"
     with h5py.File(path, "w", userblock_size=512) as file:
         for name, values in {"t": TIME, "u": VOLTAGE, "y": SPEED}.items():
