@@ -67,7 +67,7 @@ from smp_motor_ident.estimation.selection import FittedCandidate, in_turn
 from smp_motor_ident.estimation.subset import excitation
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import Experiments
-from smp_motor_ident.model.driver import AT_ZERO, EFFECTS, RAMPS, DriverEffect
+from smp_motor_ident.model.driver import AT_ONE_SIZE, EFFECTS, RAMPS, DriverEffect
 from smp_motor_ident.one_thread import one_thread
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import Estimate, FitPercent
@@ -227,10 +227,8 @@ def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) 
         if refused is not None:
             return suspecting(plain, driver, one.fit)
         if not (request.suspected or lacks_something(plain)):
-            if not one.fit.noise_ratio > 0:
-                return plain
-            ramped, _ = _through_driver(group, request, found, data, hold, one.fit, RAMPS)
-            return ramped or plain
+            behind = _in_place_of_noise(group, request, found, data, hold, one.fit)
+            return behind or plain
         noisy = is_moved(plain) or one.fit.noise_ratio > 0
         held, driver = _beside_model(group, request, found, data, hold, one.fit, plain, noisy)
         return held or suspecting(plain, driver, one.fit)
@@ -276,6 +274,22 @@ def _beside_model(
     return behind, driver
 
 
+def _in_place_of_noise(
+    group: list[Record],
+    request: Request,
+    found: Sequence[Finding],
+    data: Experiments,
+    hold: str,
+    fit: Fit,
+) -> Estimate | None:
+    """Return the estimate behind what torque noise stands for though nothing else shows it."""
+    for effects in (RAMPS, EFFECTS) if fit.noise_ratio > 0 else ():
+        behind, _ = _through_driver(group, request, found, data, hold, fit, effects)
+        if behind is not None:
+            return behind
+    return None
+
+
 def _through_driver(
     group: list[Record],
     request: Request,
@@ -291,7 +305,7 @@ def _through_driver(
     """
     one_size = one_size_or_swing(data)
     if one_size:  # which tells of a driver what it does at no command
-        effects = AT_ZERO
+        effects = AT_ONE_SIZE
     if request.driver is not None or hides_driver(group):
         return None, None
     request.say("what the driver makes of its command")
@@ -309,7 +323,8 @@ def _through_driver(
     hollow = emptied & {f.code for f in e.findings}  # little is left of what was recorded
     fails = any(f.severity == "unreliable" and not blames_current(f) for f in e.findings)
     fails = fails or (leaves_torque_noise(e, fit) and not beside) or explains_no_more(e, fit)
-    said = *e.findings, *one_size_of_voltage(one_size)
+    codes = {f.code for f in e.findings}
+    said = *e.findings, *(f for f in one_size_of_voltage(one_size) if f.code not in codes)
     return (None if fails or hollow else through(replace(e, findings=said), driver)), driver
 
 

@@ -46,6 +46,7 @@ UNITS: Mapping[str, str] = {
     "source_resistance_ratio": "1",
     "brush_drop": "V",
     "current_limit_voltage": "V",
+    "quadratic_drag": "1/V",
     "fast_decay_ratio": "1",
     "coasting_share": "1",
     "resonance_frequency": "rad/s",

@@ -92,7 +92,23 @@ def _hidden(errors: Regression, effect: Effect, column: int, ordinary: float) ->
     variance /= normal * normal
     kept = ordinary**2 / (ordinary**2 + variance)
     size = min(math.sqrt(kept * variance + (kept * found) ** 2), ordinary)
-    return Evidence(effect, 1.0, 0.0, errors.shifts[:, column] * size, (column,), np.array([size]))
+    chance = math.erfc(abs(found) / math.sqrt(2 * variance))
+    return Evidence(
+        effect, chance, 0.0, errors.shifts[:, column] * size, (column,), np.array([size])
+    )
+
+
+def hinted(imitated: Sequence[Evidence]) -> list[Finding]:
+    """Say which effect the error asks for though the model's own coordinates nearly imitate it."""
+    level = limits.EFFECT_COVERED.value / max(len(imitated), 1)
+    first = min(imitated, key=lambda e: e.p_value, default=None)
+    if first is None or first.p_value > level:
+        return []
+    message = (
+        f"neither shown nor excluded: {first.effect.cause}; the motor's own numbers imitate it"
+    )
+    evidence: dict[str, float | str | None] = {"p_value": first.p_value}
+    return [Finding(first.effect.code, "note", message, evidence, first.effect.advice)]
 
 
 def farthest_possible(

@@ -21,6 +21,7 @@ from smp_motor_ident.diagnosis.adequacy import (
     as_finding,
     farthest_possible,
     hidden,
+    hinted,
     lacking,
     matters,
     stated,
@@ -54,8 +55,9 @@ def held_against_effects(
     first = said(fit)[0]
     numbers = stated(fit, first)
     shown, possible = lacking(errors, white)
-    if not first.level:  # of one level no line is stated that could be bent
-        possible += hidden(errors)
+    # Of one level no line is stated that could be bent.
+    imitated = [] if first.level else hidden(errors)
+    possible += imitated
     begin = data, fit, errors
     grave = any(matters(e[0], numbers, data.step) for e in shown)
     if not grave and (instead := in_place_of_noise(data, fit, gear, options)):
@@ -64,6 +66,7 @@ def held_against_effects(
             grave, begin, shown = True, (there, now, None), [*shown, [evidence]]
     notes, move = farthest_possible(possible, numbers, data.step)
     wide = fit if move is None else fit.along(move)
+    notes = notes or hinted(imitated)
     if shown:
         wide = consider_hold(data, wide)
     if any(e[0].effect.code == "current_lag" for e in shown):

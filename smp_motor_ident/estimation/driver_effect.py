@@ -33,7 +33,6 @@ from smp_motor_ident.model.driver import (
     DECLARABLE,
     DROP,
     EFFECTS,
-    RAMPS,
     SAG,
     SLEW,
     Driver,
@@ -80,6 +79,11 @@ class DriverFit:
         return self.fit.deviance / factor + price * (self.fit.structure.size + self.effect.numbers)
 
     @property
+    def tolerance(self) -> float:
+        """By how much its size is another in another record."""
+        return DRIVER_TOLERANCE.value * self.driver.size if self.effect.follows_motion else 0.0
+
+    @property
     def shown(self) -> bool:
         """Whether its 95 % interval holds nothing that is no effect, nor is over between rows.
 
@@ -101,7 +105,7 @@ class DriverFit:
 
     def beyond_chance(self, plain: Fit, price: float) -> bool:
         """Tell whether errors of few steady speeds, or of few changes, hardly look like it."""
-        bent = ("ln_a1",) if self.effect in RAMPS else ("ln_a0", "vc_plus")
+        bent = ("ln_a1",) if self.effect.kind == SLEW else ("ln_a0", "vc_plus")
         both = set(plain.structure.free) & set(self.fit.structure.free)
         least = min((evidence(plain, self.fit, c) for c in bent if c in both), default=math.inf)
         return least > price * self.effect.numbers
@@ -117,9 +121,7 @@ class DriverFit:
 
 def through(estimate: Estimate, found: DriverFit) -> Estimate:
     """Return the estimate of a motor behind a driver, with what is known of the driver."""
-    size = found.driver.size
-    tolerance = DRIVER_TOLERANCE.value * size if found.effect.follows_motion else 0.0
-    std = math.hypot(found.std, tolerance)
+    size, std = found.driver.size, math.hypot(found.std, found.tolerance)
     interval = max(size - NORMAL_95 * std, 0.0), size + NORMAL_95 * std
     unit = UNITS[found.effect.quantity]
     words = f"the records show {found.effect.cause}: {size:.3g} ± {std:.2g}"

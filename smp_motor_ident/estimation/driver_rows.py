@@ -11,6 +11,7 @@ from scipy.ndimage import uniform_filter1d
 
 from smp_motor_control.arrays import Array
 from smp_motor_ident.estimation import prediction
+from smp_motor_ident.estimation.descent import initial_of
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.likelihood.experiments import Experiments, prepare
 from smp_motor_ident.model.driver import Rows
@@ -45,6 +46,32 @@ def with_voltages(group: Sequence[Record], voltage: Array) -> list[Record]:
     """Return records with other voltages, one after the other."""
     ends = np.cumsum([0, *map(len, group)])
     return [replace(r, voltage=voltage[a:b]) for r, (a, b) in zip(group, pairwise(ends))]
+
+
+def under_drag(
+    records: Sequence[Record], data: Experiments, fit: Fit, size: float, measured: bool = False
+) -> list[Record]:
+    """Return records of which the voltage is that behind a drag without its current.
+
+    A load torque T is a voltage ``-(R T + L dT/dt) / K`` beside a current ``T / K``.
+    """
+    if measured:
+        speed = measured_speed(data, fit.z.time_constant)
+    else:
+        speed = prediction.simulate(data, replace(fit, initial=initial_of(data, fit)))[:, 0]
+    steady = fit.z.a0 * speed
+    lost = size * steady * np.abs(steady)
+    rise = np.concatenate([
+        np.gradient(lost[a:b], data.time[a:b]) if b - a > 1 else np.zeros(b - a)
+        for a, b in pairwise(data.starts)
+    ])  # fmt: skip
+    late, current = fit.z.electrical_time_constant * rise, lost / float(np.exp(fit.z.ln_r))
+    ends = np.cumsum([0, *map(len, records)])
+    return [
+        replace(r, voltage=r.voltage - late[a:b], current=r.current - current[a:b])
+        for r, (a, b) in zip(records, pairwise(ends), strict=True)
+        if r.current is not None
+    ]
 
 
 def rows_of(data: Experiments, group: Sequence[Record], fit: Fit, measured: bool = False) -> Rows:

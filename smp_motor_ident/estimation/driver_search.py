@@ -31,6 +31,7 @@ from smp_motor_ident.estimation.driver_rows import (
     emf_share,
     pieces,
     rows_of,
+    under_drag,
     with_voltages,
 )
 from smp_motor_ident.estimation.fit import Fit, Options, solve
@@ -39,11 +40,13 @@ from smp_motor_ident.estimation.selection import POLICY, sandwich_factor
 from smp_motor_ident.estimation.thinning import thinned
 from smp_motor_ident.likelihood.driver_feedback import terminal_voltages
 from smp_motor_ident.likelihood.experiments import Experiments, prepare
-from smp_motor_ident.model.driver import CURRENT, EFFECTS, SLEW, Driver, DriverEffect
+from smp_motor_ident.model.driver import CURRENT, DRAG, EFFECTS, SLEW, Driver, DriverEffect
 from smp_motor_ident.model.structures import FirstOrder
 from smp_motor_ident.record import Record
 
-TURNS = 3  # of a motion that the effect asks for, and that follows from it
+# Turns of a motion that the effect asks for, and that follows from it: while a size is sought, and
+# at the likeliest; a drag of a fifth of the voltage is off by some hundredths after three
+TURNS, SETTLED = 3, 6
 NEAR = 0.02  # e-folds of the size at which its deviance is first looked at beside the best
 RISE = 2.0  # of the deviance on both sides together, from which its curvature is read
 PARABOLAS = 8  # that are laid through it at most
@@ -203,22 +206,30 @@ class _Profile:
             commands_of(group, fit),
         )
         self.full_duty = rows_of(self.data, group, fit).full_duty
-        self.turns = TURNS if effect.follows_motion else 1
+        self.follows = effect.follows_motion
         self.size = math.nan  # logarithm of the likeliest, of those that were tried
         self.driver = Driver()
         self.beside: list[Record] = []  # with the voltage for a size one standard deviation greater
 
     def at(
-        self, size: float, passes: int = 30, known: Fit | None = None
+        self, size: float, turns: int = SETTLED, passes: int = 30, known: Fit | None = None
     ) -> tuple[Fit, Experiments, list[Record]]:
         """Return the motor fitted for a size, and what it was fitted to."""
         data, fit, records = self.data, self.near, self.group
-        for turn in range(self.turns):
+        for turn in range(turns if self.follows else 1):
             records = with_voltages(self.group, self._voltage(size, data, fit, turn == 0))
             data = _prepared(records, self.hold, self.near)
+            if self._has_current:
+                records = under_drag(records, data, fit, size, turn == 0)
+                data = _prepared(records, self.hold, self.near)
             start = fit.at(fit.z, initial_of(data, fit))
             fit = solve(data, fit.structure, start, self.options, passes, ROUGHLY, known)
         return fit, data, records
+
+    @property
+    def _has_current(self) -> bool:
+        """Whether the effect draws a current that is measured."""
+        return self.effect.kind == DRAG and self.near.structure.current
 
     def _voltage(self, size: float, data: Experiments, fit: Fit, first: bool) -> Array:
         """Return what the driver puts out, row by row, for the motion as measured or as it is run.
@@ -226,7 +237,7 @@ class _Profile:
         A motion that was taken as given may be one that none of it leads to.
         """
         if first:
-            rows = rows_of(data, self.group, fit, measured=self.turns > 1)
+            rows = rows_of(data, self.group, fit, measured=self.follows)
             return rows.through(Driver(self.effect.kind, size, rows.full_duty))
         driver = Driver(self.effect.kind, size, self.full_duty, emf_share(fit))
         voltage = terminal_voltages(self.commands, fit.structure, fit.z, fit.initial, driver)
@@ -238,7 +249,7 @@ class _Profile:
         One that does not come near that is given up; it was another voltage's, and no end of this.
         """
         best = replace(self.near, converged=False)
-        fit, data, _ = self.at(float(np.exp(logarithm)), FEW, best)
+        fit, data, _ = self.at(float(np.exp(logarithm)), TURNS, FEW, best)
         if fit.deviance < self.near.deviance:
             self.near, self.data, self.size = fit, data, logarithm
         return fit.deviance if np.isfinite(fit.deviance) else 1e300
@@ -306,8 +317,10 @@ class _Profile:
         if not self.effect.may_be(size, rows):
             return None
         self.driver = Driver(self.effect.kind, size, rows.full_duty)
-        self.beside = self.at(size * float(np.exp(min(std, widest))))[2]
-        return DriverFit(self.effect, self.driver, size * std, self.group, records, self, fit)
+        found = DriverFit(self.effect, self.driver, size * std, self.group, records, self, fit)
+        unsure = math.hypot(min(std, widest), found.tolerance / size)
+        self.beside = self.at(size * float(np.exp(unsure)))[2]
+        return found
 
     def moves(self, fit: Fit) -> list[Array]:
         """Return the move of a motor with the size, one standard deviation of it."""
@@ -317,7 +330,11 @@ class _Profile:
     def applied(self, records: Sequence[Record], fit: Fit) -> list[Record]:
         """Return other records of the motor with the voltage at the terminals."""
         if self.effect.follows_motion:
-            return _applied(records, fit, self.driver._replace(emf_share=emf_share(fit)))
+            driver = self.driver._replace(emf_share=emf_share(fit))
+            behind = _applied(records, fit, driver)
+            if not self._has_current:
+                return behind
+            return under_drag(behind, _prepared(behind, self.hold, fit), fit, driver.size)
         rows = rows_of(_prepared(records, self.hold, fit), records, fit)
         return with_voltages(records, rows.through(self.driver))
 

@@ -20,7 +20,7 @@ import numpy as np
 from smp_motor_control.arrays import Array, Flags
 from smp_motor_ident._compile import compiled, inlined
 
-NOTHING, DEAD_ZONE, CLIP, SLEW, SAG, DROP, COAST, CURRENT, FREE = range(9)
+NOTHING, DEAD_ZONE, CLIP, SLEW, SAG, DROP, COAST, CURRENT, FREE, DRAG = range(10)
 REST = 0.05
 """Back-EMF of a motor that begins at rest, of the largest command at most."""
 
@@ -88,7 +88,8 @@ def terminal_voltage(
     beginning; only a slew limit remembers it.
     """
     kind, size, full_duty, share = driver
-    out, back_emf = command, share * back_emf
+    steady, back_emf = back_emf, share * back_emf
+    out = command
     if kind == DEAD_ZONE:
         out = _beyond(command, size)
     elif kind == CLIP:
@@ -109,6 +110,8 @@ def terminal_voltage(
         out = _fast_decay(size, command, back_emf, full_duty)
     elif kind == FREE and command == 0.0:  # open: the terminals show the back-EMF
         out = back_emf
+    elif kind == DRAG:  # a load that is as much less voltage
+        out = command - size * steady * abs(steady)
     return out, out
 
 
@@ -173,12 +176,14 @@ class DriverEffect:
         """Return what the shares are of."""
         if self.kind == SLEW:
             return rows.top / rows.time_constant
+        if self.kind == DRAG:
+            return 1 / rows.top
         return 1.0 if self.kind == SAG else rows.top
 
     def may_be(self, size: float, rows: Rows) -> bool:
         """Tell whether there is anything of it, and anything left of the command."""
         most = 2 * rows.top if self.kind == CURRENT else rows.top  # what brakes is twice as much
-        return self.kind in (SLEW, SAG) or not self.shares or size < most
+        return self.kind in (SLEW, SAG, DRAG) or not self.shares or size < most
 
     @property
     def numbers(self) -> int:
@@ -188,7 +193,7 @@ class DriverEffect:
     @property
     def follows_motion(self) -> bool:
         """Whether it depends on how the motor runs."""
-        return self.kind in (SAG, DROP, CURRENT) or not self.shares
+        return self.kind in (SAG, DROP, CURRENT, DRAG) or not self.shares
 
 
 EFFECTS = (
@@ -216,6 +221,10 @@ EFFECTS = (
         (1.7, 1.2, 0.8, 0.5, 0.3, 0.15),
     ),
     DriverEffect(
+        DRAG, "drag", "quadratic_drag", "a drag that grows with the square of the speed",
+        (0.01, 0.03, 0.1, 0.3),
+    ),
+    DriverEffect(
         COAST, "coast", "fast_decay_ratio", "a driver that lets the motor coast (fast decay)", ()
     ),
     DriverEffect(
@@ -227,7 +236,7 @@ EFFECTS = (
 RAMPS = tuple(e for e in EFFECTS if e.kind == SLEW)
 """What is no more than a delay to first order: it takes a search to see it."""
 
-AT_ZERO = tuple(e for e in EFFECTS if e.kind == FREE)
+AT_ONE_SIZE = tuple(e for e in EFFECTS if e.kind in (FREE, DRAG))
 """What shows under one size of voltage, too."""
 
 DECLARABLE: Mapping[str, DriverEffect] = {e.quantity: e for e in EFFECTS if not e.follows_motion}
