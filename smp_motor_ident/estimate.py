@@ -7,14 +7,13 @@ from dataclasses import replace
 from typing import cast
 
 from smp_motor_ident.diagnosis import validation as validate
-from smp_motor_ident.diagnosis.adequacy import is_moved, lacks_something
 from smp_motor_ident.diagnosis.advice import advise, assess, unsettled_rival
+from smp_motor_ident.diagnosis.alternatives import Alternatives
 from smp_motor_ident.diagnosis.beside import held_against_effects
 from smp_motor_ident.diagnosis.certainty import certain
 from smp_motor_ident.diagnosis.conditions import dependent
 from smp_motor_ident.diagnosis.current_kind import ARMATURE, current_kind
 from smp_motor_ident.diagnosis.data_quality import screen
-from smp_motor_ident.diagnosis.left_out import under_own_loads, undisturbed
 from smp_motor_ident.diagnosis.model_error import regression
 from smp_motor_ident.diagnosis.provenance import provenance
 from smp_motor_ident.diagnosis.refusal import (
@@ -26,15 +25,13 @@ from smp_motor_ident.diagnosis.refusal import (
     refuse_unexplained,
     refuse_unidentifiable,
 )
-from smp_motor_ident.diagnosis.repair import hides_driver, repaired
+from smp_motor_ident.diagnosis.repair import repaired
 from smp_motor_ident.diagnosis.residuals import residual_tests
 from smp_motor_ident.diagnosis.scope import (
     UNDECIDED,
     blames_current,
     contradicted,
     current_left_out,
-    one_size_of_voltage,
-    one_size_or_swing,
     scope,
 )
 from smp_motor_ident.diagnosis.units import implausible_motor
@@ -52,13 +49,9 @@ from smp_motor_ident.estimation.constraint import constrained
 from smp_motor_ident.estimation.driver_effect import (
     DriverFit,
     declared,
-    explains_no_more,
-    leaves_torque_noise,
     suspecting,
     suspects_driver,
-    through,
 )
-from smp_motor_ident.estimation.driver_search import likeliest, run_free
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.hold_choice import chosen_hold, earlier_command, otherwise
 from smp_motor_ident.estimation.quantities import Answer, answer, driven_longest, without_lag
@@ -67,7 +60,6 @@ from smp_motor_ident.estimation.selection import FittedCandidate, in_turn
 from smp_motor_ident.estimation.subset import excitation
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import Experiments
-from smp_motor_ident.model.driver import AT_ONE_SIZE, EFFECTS, RAMPS, DriverEffect
 from smp_motor_ident.one_thread import one_thread
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import Estimate, FitPercent
@@ -215,7 +207,8 @@ def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) 
             plain = _stated(group, request, words, data, hold, [*left, one], refused is None)
         except (SignalError, InsufficientExcitationError) as refusal:
             if refused is None:
-                held, driver = _beside_model(group, request, found, data, hold, one.fit, None, True)
+                other = Alternatives(_tried, group, request, found, data, hold, one.fit)
+                held, driver = other.beside_model(None, True)
                 if held:
                     return held
             refused = refused or refusal
@@ -226,12 +219,14 @@ def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) 
             continue
         if refused is not None:
             return suspecting(plain, driver, one.fit)
-        if not (request.suspected or lacks_something(plain)):
-            behind = _in_place_of_noise(group, request, found, data, hold, one.fit)
-            return behind or plain
-        noisy = is_moved(plain) or one.fit.noise_ratio > 0
-        held, driver = _beside_model(group, request, found, data, hold, one.fit, plain, noisy)
-        return held or suspecting(plain, driver, one.fit)
+        other = Alternatives(_tried, group, request, found, data, hold, one.fit)
+        held, driver = other.instead_of(plain)
+        if held or driver is None:
+            return held or plain
+        if driver.as_likely:
+            rivals = [*left, *driver.as_likely, one]
+            plain = _stated(group, request, words, data, hold, rivals, refused is None)
+        return suspecting(plain, driver, one.fit)
     assert refused is not None
     # A load hides what the others are: with it in every candidate they may be found.
     again = not (request.loaded or request.within)
@@ -247,85 +242,6 @@ def _tried(group: list[Record], request: Request, found: Sequence[Finding]) -> E
         return _estimated(group, request, found)
     except (SignalError, InsufficientExcitationError):
         return None
-
-
-def _beside_model(
-    group: list[Record],
-    request: Request,
-    found: Sequence[Finding],
-    data: Experiments,
-    hold: str,
-    fit: Fit,
-    plain: Estimate | None,
-    noisy: bool,
-) -> tuple[Estimate | None, DriverFit | None]:
-    """Return the estimate beside what no motor does, if one holds, and the likeliest driver.
-
-    What a driver explains without an accident is none, and no step of a load.
-    """
-    behind, driver = _through_driver(group, request, found, data, hold, fit)
-    codes = {f.code for f in behind.findings} if behind else set()
-    if behind is not None and not codes & {"disturbed", "load_step"}:
-        return behind, driver
-    if apart := under_own_loads(_tried, group, request, found, data, fit):
-        return apart, None
-    if noisy:
-        behind = undisturbed(_tried, group, request, found, fit, plain) or behind
-    return behind, driver
-
-
-def _in_place_of_noise(
-    group: list[Record],
-    request: Request,
-    found: Sequence[Finding],
-    data: Experiments,
-    hold: str,
-    fit: Fit,
-) -> Estimate | None:
-    """Return the estimate behind what torque noise stands for though nothing else shows it."""
-    for effects in (RAMPS, EFFECTS) if fit.noise_ratio > 0 else ():
-        behind, _ = _through_driver(group, request, found, data, hold, fit, effects)
-        if behind is not None:
-            return behind
-    return None
-
-
-def _through_driver(
-    group: list[Record],
-    request: Request,
-    found: Sequence[Finding],
-    data: Experiments,
-    hold: str,
-    fit: Fit,
-    effects: Sequence[DriverEffect] = EFFECTS,
-) -> tuple[Estimate | None, DriverFit | None]:
-    """Return the estimate behind the likeliest driver, if it holds, and that driver.
-
-    A ramp is sought beside torque noise, which stands for none of it.
-    """
-    one_size = one_size_or_swing(data)
-    if one_size:  # which tells of a driver what it does at no command
-        effects = AT_ONE_SIZE
-    if request.driver is not None or hides_driver(group):
-        return None, None
-    request.say("what the driver makes of its command")
-    beside = effects is RAMPS
-    start = fit if beside else run_free(group, fit, hold, request.options)
-    driver = likeliest(group, start, hold, request.options, effects)
-    if driver is None:
-        return None, None
-    known = request.validation
-    kept = None if known is None else driver.search.applied(known, driver.fit)
-    e = _tried(driver.records, replace(request, driver=driver, validation=kept), found)
-    if e is None:
-        return None, driver
-    emptied = {"implausible_motor", *(() if one_size else ("one_level", "one_size_of_voltage"))}
-    hollow = emptied & {f.code for f in e.findings}  # little is left of what was recorded
-    fails = any(f.severity == "unreliable" and not blames_current(f) for f in e.findings)
-    fails = fails or (leaves_torque_noise(e, fit) and not beside) or explains_no_more(e, fit)
-    codes = {f.code for f in e.findings}
-    said = *e.findings, *(f for f in one_size_of_voltage(one_size) if f.code not in codes)
-    return (None if fails or hollow else through(replace(e, findings=said), driver)), driver
 
 
 def _stated(

@@ -35,12 +35,15 @@ ABSENT = (
 """Quantities that are nothing in a structure that does not have them."""
 
 
-def weights(data: Sequence[Experiments], fits: Sequence[Fit], seed: int = 0) -> Array:
+def weights(
+    data: Sequence[Experiments], fits: Sequence[Fit], beside: Sequence[int] = (), seed: int = 0
+) -> Array:
     """Return the weight of each candidate, the choice first, by a Bayesian bootstrap of runs.
 
     What costs nothing is a mean over a window where the speed comes in coarse steps, a difference
     of counts by its making, and a friction that the choice was found to do without.  What is late
     is as likely as a second lag, or has the odds of the choice against it: half of the weight each.
+    ``beside``: how many numbers each has beside those of its structure.
     """
     rows = []
     for own, fit in zip(data, fits, strict=True):
@@ -66,6 +69,7 @@ def weights(data: Sequence[Experiments], fits: Sequence[Fit], seed: int = 0) -> 
         - (own.quantum > 0 and s.window)
         for own, s in zip(data, (f.structure for f in fits), strict=True)
     ]
+    sizes = np.array(sizes) + np.array(beside or [0] * len(sizes))
     price = np.array([POLICY.price(n, f.samples) for n, f in zip(sizes, fits, strict=True)])
     price += np.array([POLICY.second_lag * slowly_filtered(f) for f in fits])
     total = shares @ runs.T + price
@@ -156,7 +160,11 @@ def candidate_weights(data: Experiments, candidates: Sequence[FittedCandidate]) 
         return {}
     places = [last, *places]
     there = [candidates[n] for n in places]
-    found = weights([of_kind(r.on or data, r.fit) for r in there], [r.fit for r in there])
+    found = weights(
+        [of_kind(r.on or data, r.fit) for r in there],
+        [r.fit for r in there],
+        [r.numbers for r in there],
+    )
     return dict(zip(places, map(float, found), strict=True))
 
 

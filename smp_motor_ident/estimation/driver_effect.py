@@ -23,7 +23,7 @@ from smp_motor_ident.diagnosis.sample_limits import (
 )
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.fitted import NORMAL_95
-from smp_motor_ident.estimation.selection import bic, evidence
+from smp_motor_ident.estimation.selection import FittedCandidate, bic, evidence
 from smp_motor_ident.finding import Finding, Severity
 from smp_motor_ident.likelihood.experiments import output_of
 from smp_motor_ident.model.driver import (
@@ -73,6 +73,7 @@ class DriverFit:
     fit: Fit  # the motor behind it, roughly
     # the same of other effects that explain the records as well
     rivals: tuple[Fit, ...] = ()
+    as_likely: tuple[FittedCandidate, ...] = ()  # if the records do not decide about it
 
     def cost(self, price: float, factor: float) -> float:
         """Return the deviance over a sandwich factor, with a price for each number."""

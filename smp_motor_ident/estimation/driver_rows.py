@@ -51,7 +51,7 @@ def with_voltages(group: Sequence[Record], voltage: Array) -> list[Record]:
 def under_drag(
     records: Sequence[Record], data: Experiments, fit: Fit, size: float, measured: bool = False
 ) -> list[Record]:
-    """Return records of which the voltage is that behind a drag without its current.
+    """Return records of which the voltage is that behind a drag, for a winding without its current.
 
     A load torque T is a voltage ``-(R T + L dT/dt) / K`` beside a current ``T / K``.
     """
@@ -65,12 +65,17 @@ def under_drag(
         np.gradient(lost[a:b], data.time[a:b]) if b - a > 1 else np.zeros(b - a)
         for a, b in pairwise(data.starts)
     ])  # fmt: skip
-    late, current = fit.z.electrical_time_constant * rise, lost / float(np.exp(fit.z.ln_r))
+    known = fit.structure.current
+    late = (fit.z if known else fit.z.undamped()).electrical_time_constant * rise
+    current = lost / float(np.exp(fit.z.ln_r)) if known else np.zeros(lost.size)
     ends = np.cumsum([0, *map(len, records)])
     return [
-        replace(r, voltage=r.voltage - late[a:b], current=r.current - current[a:b])
+        replace(
+            r,
+            voltage=r.voltage - late[a:b],
+            current=None if r.current is None else r.current - current[a:b],
+        )
         for r, (a, b) in zip(records, pairwise(ends), strict=True)
-        if r.current is not None
     ]
 
 

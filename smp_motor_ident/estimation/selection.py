@@ -30,16 +30,19 @@ class FittedCandidate:
     # What it was fitted to, if not the data of the choice: a part of them, or under another hold
     on: Experiments | None = None
     hold: str = ""  # the other hold, in words
+    behind: str = ""  # an effect beside the motor, in words
+    numbers: int = 0  # that describe it
 
     @property
     def label(self) -> str:
         """Name of the structure with what was added to it."""
-        return self.fit.structure.label + (f", command {self.hold}" if self.hold else "")
+        hold = f", command {self.hold}" if self.hold else ""
+        return self.fit.structure.label + hold + (f", behind {self.behind}" if self.behind else "")
 
     @property
     def bic(self) -> float:
         """Bayesian information criterion."""
-        return bic(self.fit)
+        return bic(self.fit) + self.numbers * float(np.log(self.fit.samples))
 
     def contains(self, other: "FittedCandidate") -> bool:
         """Tell whether another, fitted to all data, is this one with fewer free coordinates."""

@@ -4,7 +4,7 @@ import numpy as np
 
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.estimation import driver_search
-from smp_motor_ident.estimation.driver_search import _Profile
+from smp_motor_ident.estimation.driver_profile import Profile
 from smp_motor_ident.estimation.fit import Options
 from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.likelihood.experiments import prepare
@@ -37,7 +37,7 @@ def test_a_motor_that_never_brakes_runs_behind_a_drop_as_behind_a_dead_zone():
     fit = initial_fit(prepare(group, False), FirstOrder(), Options())
     assert fit is not None
     explained = {
-        effect.kind: _Profile(group, "held", fit, Options(), effect).at(FRICTION)[0].deviance
+        effect.kind: Profile(group, "held", fit, Options(), effect).at(FRICTION)[0].deviance
         for effect in EFFECTS
         if effect.kind in (DROP, DEAD_ZONE)
     }
