@@ -44,10 +44,12 @@ FEW = 12  # passes of a descent while the size is sought
 
 
 def prepared(group: Sequence[Record], hold: str, fit: Fit) -> Experiments:
+    """Return records as a fit sees them."""
     return of_kind(prepare(group, fit.structure.current, hold=hold), fit)
 
 
 def applied(records: Sequence[Record], fit: Fit, driver: Driver) -> list[Record]:
+    """Return records with the voltage of a driver that follows the motion."""
     data = commands_of(records, fit)
     voltage = fast_decay.voltage_of(data, fit, driver)
     return with_voltages(records, fast_decay.rows_of(data, voltage))
@@ -161,6 +163,8 @@ class Profile:
             else:
                 here, best = x, tried
             fit, data, records = best
+            if not np.isfinite(fit.deviance):
+                return None
             self.near, self.data = fit, data
             low, high, settled = self._beside(x, away)
             while low + high - 2 * fit.deviance < RISE and away < widest:

@@ -110,8 +110,10 @@ def terminal_voltage(
         out = _fast_decay(size, command, back_emf, full_duty)
     elif kind == FREE and command == 0.0:  # open: the terminals show the back-EMF
         out = back_emf
-    elif kind == DRAG:  # a load that is as much less voltage
-        out = command - size * steady * abs(steady)
+    elif kind == DRAG:  # a load that is as much less voltage; a search passes some of any size
+        out = command - math.copysign(
+            min(size * steady * steady, abs(command) + abs(steady)), steady
+        )
     return out, out
 
 

@@ -48,7 +48,7 @@ def test_what_a_clipped_command_moves_is_in_the_intervals_or_unreliable(
     monkeypatch, settles: bool
 ) -> None:
     """Without its driver the motor is fitted beside effects that its error shows."""
-    monkeypatch.setattr("smp_motor_ident.estimate.likeliest", lambda *_: None)
+    monkeypatch.setattr("smp_motor_ident.diagnosis.alternatives.likeliest", lambda *_: None)
     if not settles:
         monkeypatch.setattr(beside, "_fitted", lambda data, fit, options: fit)
     found = estimate(commanded(top=6.0))
@@ -202,7 +202,7 @@ def test_a_motor_at_rest_turns_by_no_rounding_error():
 
 def test_what_any_effect_that_is_shown_would_move_is_in_the_intervals(monkeypatch) -> None:
     """Fitted beside the likeliest of them a motor may stay where it is; the others are as real."""
-    monkeypatch.setattr("smp_motor_ident.estimate.likeliest", lambda *_: None)
+    monkeypatch.setattr("smp_motor_ident.diagnosis.alternatives.likeliest", lambda *_: None)
     monkeypatch.setattr(beside, "_move", lambda _, fit, *__: np.zeros(len(fit.structure.free)))
     found = estimate(commanded(top=6.0))
     shown = [f for f in found.findings if f.evidence.get("shift_std", 0.0) > 2]
@@ -215,7 +215,7 @@ def test_what_any_effect_that_is_shown_would_move_is_in_the_intervals(monkeypatc
 def test_an_effect_is_held_against_the_intervals_that_are_stated(monkeypatch) -> None:
     """What moves a number beyond the likelihood's interval may be within that of the answer."""
     record = commanded(top=6.0)
-    monkeypatch.setattr("smp_motor_ident.estimate.likeliest", lambda *_: None)
+    monkeypatch.setattr("smp_motor_ident.diagnosis.alternatives.likeliest", lambda *_: None)
     monkeypatch.setattr(beside, "_move", lambda *_: None)
 
     def unreliable() -> set[str]:
