@@ -22,7 +22,7 @@ from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.request import Request
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import Experiments
-from smp_motor_ident.model.driver import AT_ONE_SIZE, EFFECTS, RAMPS, DriverEffect
+from smp_motor_ident.model.driver import AT_ONE_SIZE, DRAGS, EFFECTS, RAMPS, DriverEffect
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import Estimate
 
@@ -61,7 +61,7 @@ class Alternatives:
         """Return the same in place of an estimate; of one that shows nothing, but of its noise."""
         if self.request.suspected or lacks_something(plain):
             return self.beside_model(plain, is_moved(plain) or self.fit.noise_ratio > 0)
-        for effects in (RAMPS, EFFECTS) if self.fit.noise_ratio > 0 else ():
+        for effects in (RAMPS, DRAGS) if self.fit.noise_ratio > 0 else ():
             behind, _ = self._through_driver(effects)
             if behind is not None:
                 return behind, None

@@ -46,16 +46,16 @@ def with_current_lag(
     own = direct.structure
     if not isinstance(own, Electromechanical) or own.lags:
         return best
-    exchanged = _exchanged(data, direct, options)
-    if not surely and not exchanged and not _asked_for(data, direct):
-        return best
-    for sensor in SENSORS[1:]:
+    exchanged, ahead = _exchanged(data, direct, options)
+    asked = surely or ahead > 0 or _asked_for(data, direct)
+    # What a filter has of the winding's pole is its own, as long as that is not excluded.
+    for sensor in SENSORS[1:] if asked else ("smoothed",) if exchanged else ():
         richer = own.with_(current_sensor=sensor)
         if any(r.fit.structure == richer for r in candidates):
             continue
         say(f"trying {richer.label}")
-        starts = _leading(data, direct, richer, options) + [best.z] * best.structure.lags
-        starts += exchanged
+        starts = _leading(data, direct, richer, options) if asked else []
+        starts += [best.z] * best.structure.lags + ([exchanged.z] if exchanged else [])
         if own.window and sensor == "averaged":  # what takes the mean of one takes that of both
             starts.append(richer.complete(best.z.with_(current_lag=0.5 * best.z.window)))
         # What looks like torque noise may be this.
@@ -126,17 +126,18 @@ def _price(direct: Fit) -> float:
     return float(np.log(direct.samples)) * sandwich_factor(direct)
 
 
-def _exchanged(data: Experiments, direct: Fit, options: Options) -> list[Coordinates]:
-    """Return a start at which a digital filter has the winding's pole, if a few passes favour it.
+def _exchanged(data: Experiments, direct: Fit, options: Options) -> tuple[Fit | None, float]:
+    """Return a fit by few passes in which a digital filter has the winding's pole, and its lead.
 
     Under a held voltage the current steps alike behind either, and no score leads from the one to
-    the other.  Both run freely: where the data correct the state, either follows them.
+    the other.  Both run freely: where the data correct the state, either follows them.  The lead is
+    in deviance, beyond the price of the filter's lag; one that is as far behind is excluded.
     """
     te = direct.z.electrical_time_constant
     # Of the same pole: e^(-T/te) = lag / (T + lag).
     lag = float(-data.step * np.exp(-data.step / te) / np.expm1(-data.step / te))
     if not lag > LITTLE * data.step:
-        return []
+        return None, -np.inf
     richer = direct.structure.with_(current_sensor="smoothed")
     free = replace(direct, noise_ratio=0.0)
     starts = [
@@ -147,8 +148,13 @@ def _exchanged(data: Experiments, direct: Fit, options: Options) -> list[Coordin
     other = min(tried, key=lambda f: f.deviance)
     if direct.noise_ratio > 0:
         free = solve(data, direct.structure, free, options, FEW)
-    ahead = free.deviance - other.deviance > _price(direct)
-    return [other.z] if ahead and other.z.current_lag > LITTLE * data.step else []
+    hopeless = POLICY.hopeless * sandwich_factor(direct)
+    if not other.converged and other.deviance < free.deviance + hopeless:
+        other = solve(data, richer, other, options)  # along a narrow valley
+    ahead, price = free.deviance - other.deviance, _price(direct)
+    if ahead < -price or not other.z.current_lag > LITTLE * data.step:
+        return None, -np.inf
+    return other, ahead - price
 
 
 def _predicted(data: Experiments, fit: Fit, structure: Structure) -> float:

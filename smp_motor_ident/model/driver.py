@@ -238,6 +238,9 @@ EFFECTS = (
 RAMPS = tuple(e for e in EFFECTS if e.kind == SLEW)
 """What is no more than a delay to first order: it takes a search to see it."""
 
+DRAGS = tuple(e for e in EFFECTS if e.kind == DRAG)
+"""What is nearly a motor of another gain: beside torque noise it takes a search, too."""
+
 AT_ONE_SIZE = tuple(e for e in EFFECTS if e.kind in (FREE, DRAG))
 """What shows under one size of voltage, too."""
 

@@ -23,7 +23,7 @@ from smp_motor_ident.model.coordinates import LOGARITHMS
 from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.model.physical import from_physical
 from smp_motor_ident.model.structures import SENSORS, Electromechanical
-from smp_motor_ident.record import Record
+from smp_motor_ident.record import Hardware, Record
 
 WHEEL = "rear_left"
 R, L, K, J, B = independent.TABLE_1[WHEEL]
@@ -175,6 +175,27 @@ def test_where_winding_and_sensor_look_alike_the_interval_covers_both():
     result = estimate(simulated(200.0, "square", 6.0, "low_passed", 3e-4, small))
     q = result.parameters["inductance"]
     assert q.value is None or q.ci95[0] <= small <= q.ci95[1]
+
+
+@pytest.mark.parametrize("seed", [0, 2, 6])
+def test_a_step_of_a_few_rows_leaves_open_whether_winding_or_filter_is_slow(seed):
+    # L/R of 0.19 ms behind a digital filter of 2.4 ms: the current steps as behind 4.2 ms of L/R.
+    step, fast, rng = 0.005, 1.25e-4, np.random.default_rng(seed)
+    v = np.where(np.arange(172) > 8, 3.24, 0.0)
+    fine = np.concatenate([v[:1], np.repeat(v[1:], FINE)])
+    time = step / FINE * np.arange(fine.size)
+    load = np.zeros(time.size)
+    motion = independent.simulate(
+        time, fine, 0.658, fast, 0.0263, 8.3e-5, 4.1e-4, 0.0174, load, 2
+    )  # fmt: skip
+    current = shown(motion[:, 0], step / FINE, "smoothed", 2.4e-3, FINE)
+    current += 0.01 * rng.standard_normal(current.size)
+    count = np.floor(motion[::FINE, 2] * 28 / (2 * np.pi) + rng.uniform()).astype(np.int64)
+    coarse = Hardware(1.0, 28.0, 0, None, None)
+    q = estimate(Record("motor", time[::FINE], v, current, count=count, hardware=coarse))
+    found = q.parameters["inductance"]
+    assert found.value is None or abs(found.value - fast) < 4 * found.std
+    assert abs(q.parameters["resistance"].value - 0.658) < 4 * q.parameters["resistance"].std
 
 
 @pytest.mark.parametrize("sensor", ["low_passed", "smoothed"])
