@@ -31,6 +31,7 @@ from smp_motor_ident.model.driver import (
     COAST,
     DEAD_ZONE,
     DECLARABLE,
+    DRAG,
     DROP,
     EFFECTS,
     SAG,
@@ -225,8 +226,11 @@ def _behind(
 ) -> Estimate:
     """Return an estimate with a driver, of one of an unknown supply with as severe a finding."""
     fixed = quantity.status == "fixed"
-    advice = "record the voltage at the motor's terminals to see it, or declare it with --fix "
-    advice += f"{effect.quantity}="
+    advice = "record the voltage at the motor's terminals to see it"
+    if effect.quantity in DECLARABLE:
+        advice += f", or declare it with --fix {effect.quantity}="
+    if effect.kind == DRAG:
+        advice = "record at the speeds at which the motor will run; look for stiff grease"
     if unknown_supply:
         advice = "state the supply's voltage (supply_voltage=), at which the driver is always on"
     finding = Finding(

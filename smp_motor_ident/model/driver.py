@@ -1,4 +1,4 @@
-"""What a driver puts out for a command, each effect by one number: a Hammerstein model's input.
+"""What drivers, and a drag, leave of a command, each by one number: a Hammerstein model's input.
 
 Derivation: docs/derivations.md, section 13.
 

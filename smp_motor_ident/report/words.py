@@ -29,6 +29,7 @@ EXPLAINED: Mapping[str, tuple[str, str, str]] = {
     "slew_rate": ("dv/dt", "Slew rate", "how fast the driver's voltage rises"),
     "source_resistance_ratio": ("ρ", "Source resistance", "of the supply, over the armature's"),
     "brush_drop": ("vb", "Brush drop", "over brushes or transistors, whatever the current"),
+    "quadratic_drag": ("c", "Quadratic drag", "voltage that it takes, over back-EMF squared"),
     "current_limit_voltage": (
         "vi",
         "Current limit",
