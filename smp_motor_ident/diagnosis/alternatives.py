@@ -86,6 +86,10 @@ class Alternatives:
         driver = likeliest(group, start, self.hold, request.options, effects)
         if driver is None or driver.as_likely:
             return None, driver
+        if driver.effect in DRAGS and effects is not EFFECTS:  # which then stands for no other
+            best = likeliest(group, start, self.hold, request.options, EFFECTS)
+            if best is None or best.effect not in DRAGS:
+                return None, None
         known = request.validation
         kept = None if known is None else driver.search.applied(known, driver.fit)
         asked = replace(request, driver=driver, validation=kept)
