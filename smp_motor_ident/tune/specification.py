@@ -11,7 +11,7 @@ from smp_motor_control.wheel.plausibility import LOAD
 from smp_motor_ident.tune.case import Case
 from smp_motor_ident.tune.ensemble import SHARE
 from smp_motor_ident.tune.feedback import Feedback
-from smp_motor_ident.tune.limits import JUMP
+from smp_motor_ident.tune.limits import JUMP, STATED_GAIN_MARGIN
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.margins import BatchMargins, Margins
 from smp_motor_ident.tune.plant import Plant, sample
@@ -110,7 +110,7 @@ def figures_of(
         overshoot=band(figures.overshoot, [one.overshoot for one in each], 100 * more),
         settling=band(figures.settling, [one.settling for one in each], longer),
         phase_margin=band(margins.phase, found.phase),
-        gain_margin=band(margins.gain, found.gain),
+        gain_margin=_stated(band(margins.gain, found.gain)),
         sensitivity=band(margins.sensitivity, found.sensitivity),
     )
 
@@ -223,6 +223,11 @@ def band(value: float, over: Sequence[float] | Array, added: float = 0.0) -> Ban
     beyond = int((1 - SHARE) * (rising.size - 1))
     low, high = np.fmin(rising[beyond], value), np.maximum(rising[-1 - beyond], value)
     return Band(value, float(low), float(high) + added)
+
+
+def _stated(gain: Band) -> Band:
+    """Return a gain margin's band, whose low end is no larger than a record can vouch for."""
+    return replace(gain, low=min(gain.low, STATED_GAIN_MARGIN.value))
 
 
 def _instants(problem: Problem, fb: Feedback, reference: Reference) -> Array:

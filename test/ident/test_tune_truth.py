@@ -236,3 +236,13 @@ def test_of_a_fast_loop_no_more_delay_is_asked_than_it_bears():
     assert one.margins.delay < 2 * fast.delay_doubt
     assert one.reference.doubt == pytest.approx(0.5 * one.margins.delay)
     assert one.reference.transition_time < 0.1
+
+
+def test_no_gain_margin_is_vouched_for_beyond_the_band_of_the_record():
+    """Half a row of delay, that no record excludes, is all that such a crossing depends on."""
+    loop = replace(LOOP, sample_time=0.001, delay=None, counts_per_revolution=28.0)
+    one = design(estimate(time_constant=0.03, time_constant_product=0.0), loop)
+    band = one.specification.gain_margin
+    late = motors_of(estimate(time_constant=0.03, time_constant_product=0.0, delay=0.0005))
+    true = loop_margins(sample(late, one.loop), one.feedback).gain
+    assert 10.0 == band.low < true < 0.97 * band.value
