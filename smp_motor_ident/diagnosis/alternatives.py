@@ -22,7 +22,14 @@ from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.request import Request
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import Experiments
-from smp_motor_ident.model.driver import AT_ONE_SIZE, DRAGS, EFFECTS, RAMPS, DriverEffect
+from smp_motor_ident.model.driver import (
+    AT_ONE_LEVEL,
+    AT_ONE_SIZE,
+    DRAGS,
+    EFFECTS,
+    RAMPS,
+    DriverEffect,
+)
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import Estimate
 
@@ -77,7 +84,7 @@ class Alternatives:
         group, request, fit = self.group, self.request, self.fit
         one_size = one_size_or_swing(self.data)
         if one_size:  # which tells of a driver what it does at no command
-            effects = AT_ONE_SIZE
+            effects = AT_ONE_LEVEL if self.data.one_way else AT_ONE_SIZE
         if request.driver is not None or hides_driver(group):
             return None, None
         request.say("what the driver makes of its command")

@@ -241,8 +241,9 @@ RAMPS = tuple(e for e in EFFECTS if e.kind == SLEW)
 DRAGS = tuple(e for e in EFFECTS if e.kind == DRAG)
 """What is nearly a motor of another gain: beside torque noise it takes a search, too."""
 
-AT_ONE_SIZE = tuple(e for e in EFFECTS if e.kind in (FREE, DRAG))
-"""What shows under one size of voltage, too."""
+AT_ONE_LEVEL = tuple(e for e in EFFECTS if e.kind == FREE)
+AT_ONE_SIZE = AT_ONE_LEVEL + DRAGS
+"""What shows under one voltage, too, and under one size of it both ways."""
 
 DECLARABLE: Mapping[str, DriverEffect] = {e.quantity: e for e in EFFECTS if not e.follows_motion}
 """What a user may know of a driver: the command alone tells its voltage."""
