@@ -223,9 +223,9 @@ def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) 
         held, driver = other.instead_of(plain)
         if held or driver is None:
             return held or plain
-        if driver.as_likely:
+        if driver.as_likely:  # the answer covers both
             rivals = [*left, *driver.as_likely, one]
-            plain = _stated(group, request, words, data, hold, rivals, refused is None)
+            return _stated(group, request, words, data, hold, rivals, refused is None)
         return suspecting(plain, driver, one.fit)
     assert refused is not None
     # A load hides what the others are: with it in every candidate they may be found.

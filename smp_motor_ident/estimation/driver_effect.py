@@ -140,7 +140,7 @@ def through(estimate: Estimate, found: DriverFit) -> Estimate:
 
 def suspecting(estimate: Estimate, found: DriverFit | None, fit: Fit) -> Estimate:
     """Return an estimate, unreliable for a driver that explains most of what it does not itself."""
-    if found is None:
+    if found is None or found.as_likely:
         return estimate
     left = math.exp((found.fit.deviance - fit.deviance) / fit.samples)
     codes = {f.code for f in estimate.findings if f.severity != "note"}
