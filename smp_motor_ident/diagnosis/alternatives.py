@@ -5,12 +5,14 @@ from dataclasses import dataclass, replace
 
 from smp_motor_ident.diagnosis.adequacy import is_moved, lacks_something
 from smp_motor_ident.diagnosis.left_out import Tried, under_own_loads, undisturbed
+from smp_motor_ident.diagnosis.noise_or_effect import instead_of_drag
 from smp_motor_ident.diagnosis.repair import hides_driver
 from smp_motor_ident.diagnosis.scope import (
     blames_current,
     one_size_of_voltage,
     one_size_or_swing,
 )
+from smp_motor_ident.estimation.candidate_starts import of_kind
 from smp_motor_ident.estimation.driver_effect import (
     DriverFit,
     explains_no_more,
@@ -97,6 +99,12 @@ class Alternatives:
             best = likeliest(group, start, self.hold, request.options, EFFECTS)
             if best is None or best.effect not in DRAGS:
                 return None, None
+        if driver.effect in DRAGS:
+            gained, gear = start.deviance - driver.fit.deviance, group[0].hardware.gear_ratio
+            rivals = instead_of_drag(of_kind(self.data, start), start, gained, gear)
+            if rivals is None:
+                return None, None
+            driver = replace(driver, rivals=(*driver.rivals, *rivals))
         known = request.validation
         kept = None if known is None else driver.search.applied(known, driver.fit)
         asked = replace(request, driver=driver, validation=kept)

@@ -248,6 +248,13 @@ EFFECTS = (
 )  # fmt: skip
 """Explanations in the order in which they are named where the data like them equally."""
 
+FALLING_FRICTION = Effect(
+    "stribeck", "torque", "friction that falls with speed (Stribeck)", "",
+    lambda m: [np.where(m.speed == 0.0, _sign(m.voltage), _sign(m.speed))
+               * np.exp(-np.square(m.speed / (c * m.fastest))) for c in (0.03, 0.1, 0.3)],
+)  # fmt: skip
+"""The same for a motor that sticks and breaks away, and of any shape that falls."""
+
 
 def _lagged(signal: Array, m: Motion, factor: float) -> Array:
     """Return a signal through a first-order lag that is faster or slower than the motor's."""

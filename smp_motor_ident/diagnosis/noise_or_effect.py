@@ -21,7 +21,7 @@ import numpy as np
 
 from smp_motor_control.arrays import Array
 from smp_motor_ident.diagnosis.adequacy import Evidence
-from smp_motor_ident.diagnosis.effects import EFFECTS, Effect
+from smp_motor_ident.diagnosis.effects import EFFECTS, FALLING_FRICTION, Effect
 from smp_motor_ident.diagnosis.limits import EFFECT_LEVEL
 from smp_motor_ident.diagnosis.model_error import (
     Signal,
@@ -40,6 +40,7 @@ from smp_motor_ident.estimation.fit import Fit, Options
 from smp_motor_ident.estimation.selection import sandwich_factor
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.coordinates import LOGARITHMS
+from smp_motor_ident.model.driver import EFFECTS as DRIVERS
 
 COST = 20_000  # samples of all runs in which effects are tried beyond their linear ranking
 STEPS = 12  # of Levenberg and Marquardt at most
@@ -71,6 +72,26 @@ def in_place_of_noise(
     moved = np.linalg.lstsq(fit.structure.matrix, again.z.array - fit.z.array, rcond=None)[0]
     shown = Evidence(effect, chance, gain, np.asarray(-moved, dtype=np.float64), ())
     return shown, run.data, again
+
+
+def instead_of_drag(data: Experiments, fit: Fit, gained: float, gear: float) -> list[Fit] | None:
+    """Return the motors beside effects that explain as much as a drag; None if one explains more.
+
+    Friction that falls with speed, above all, bends the line of steady speeds as a drag does.
+    ``gained``: deviance that the drag explains.
+    """
+    searched = {e.code for e in DRIVERS} | {FALLING_FRICTION.code}
+    tried = [FALLING_FRICTION, *(e for e in EFFECTS if e.code not in searched)]
+    here = _linearised(data, replace(fit, gain=np.zeros_like(fit.gain)), tried, gear)
+    if here is None:
+        return []
+    without, price = here.fitted(list(range(here.own)))[1], float(np.log(data.size))
+    others = [_settled(here, e, gear) for e in here.most_likely()]
+    ahead = [without - o.deviance - price * (len(o.signals) - 1) - gained for o in others]
+    if max(ahead) > 0:
+        return None
+    near = price * sandwich_factor(fit)
+    return [replace(fit, z=o.fit.z) for o, by in zip(others, ahead, strict=True) if by > -near]
 
 
 @dataclass(frozen=True, eq=False)

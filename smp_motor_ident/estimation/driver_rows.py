@@ -60,7 +60,8 @@ def under_drag(
     else:
         speed = prediction.simulate(data, replace(fit, initial=initial_of(data, fit)))[:, 0]
     steady = fit.z.a0 * speed
-    lost = size * steady * np.abs(steady)
+    most = np.abs(np.concatenate([r.voltage for r in records])) + np.abs(steady)
+    lost = np.sign(steady) * np.minimum(size * np.square(steady), most)  # as `terminal_voltage`
     rise = np.concatenate([
         np.gradient(lost[a:b], data.time[a:b]) if b - a > 1 else np.zeros(b - a)
         for a, b in pairwise(data.starts)
