@@ -85,10 +85,10 @@ class Alternatives:
         """
         group, request, fit = self.group, self.request, self.fit
         one_size = one_size_or_swing(self.data)
+        if request.driver is not None or hides_driver(group) or (one_size and effects is RAMPS):
+            return None, None
         if one_size:  # which tells of a driver what it does at no command
             effects = AT_ONE_LEVEL if self.data.one_way else AT_ONE_SIZE
-        if request.driver is not None or hides_driver(group):
-            return None, None
         request.say("what the driver makes of its command")
         beside = effects is RAMPS
         start = fit if beside else run_free(group, fit, self.hold, request.options)

@@ -150,7 +150,7 @@ def _exchanged(data: Experiments, direct: Fit, options: Options) -> tuple[Fit | 
         free = solve(data, direct.structure, free, options, FEW)
     hopeless = POLICY.hopeless * sandwich_factor(direct)
     if not other.converged and other.deviance < free.deviance + hopeless:
-        other = solve(data, richer, other, options)  # along a narrow valley
+        other = solve(data, richer, other, options)  # slowly, while lag and L/R trade
     ahead, price = free.deviance - other.deviance, _price(direct)
     if ahead < -price or not other.z.current_lag > LITTLE * data.step:
         return None, -np.inf
