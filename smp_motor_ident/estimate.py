@@ -43,7 +43,7 @@ from smp_motor_ident.errors import (
     UnknownLagError,
 )
 from smp_motor_ident.estimation import flexible_shaft, order_selection
-from smp_motor_ident.estimation.averaging import candidate_weights, covering
+from smp_motor_ident.estimation.averaging import candidate_weights, covering, left_open
 from smp_motor_ident.estimation.candidate_starts import of_kind
 from smp_motor_ident.estimation.constraint import constrained
 from smp_motor_ident.estimation.driver_effect import (
@@ -301,6 +301,7 @@ def _stated(
         combinations=result.combinations,
         names=result.names,
         covariance=result.covariance,
+        alternatives=left_open(final, chosen, weight, candidates),
         fit_percent=percent,
         candidates=validate.candidates_of(candidates, chosen, group, data),
         residuals=tests,

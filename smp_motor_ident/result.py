@@ -150,6 +150,9 @@ class Estimate:
         Quantities that ``covariance`` is about, in its order.
     covariance : ndarray, shape (p, p)
         Covariance of the estimation error of ``names``, in their own units squared.
+    alternatives : tuple of mapping of str to float
+        Motors of other structures, and with other delays, that the data do not exclude: the
+        combinations of each, without those that it does not have.
     speed_noise : float
         Standard deviation [rad/s] of the noise on the recorded speed that the model was fitted to;
         0 where it was fitted to an angle.
@@ -167,6 +170,7 @@ class Estimate:
     combinations: Mapping[str, Quantity]
     names: tuple[str, ...] = ()
     covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    alternatives: tuple[Mapping[str, float], ...] = ()
     fit_percent: FitPercent = FitPercent()
     candidates: tuple[Candidate, ...] = ()
     residuals: ResidualTests = ResidualTests()
@@ -299,7 +303,7 @@ class Estimate:
 
 _WRITTEN = (
     "model", "parameters", "identifiable", "unidentifiable", "combinations", "covariance",
-    "fit_percent", "candidates", "residuals", "findings", "warnings", "advice", "samples",
+    "alternatives", "fit_percent", "candidates", "residuals", "findings", "warnings", "advice", "samples",
     "duration", "sample_time", "speed_noise", "speed_step", "angle_noise", "largest_voltage",
     "sources", "hardware",
 )  # fmt: skip

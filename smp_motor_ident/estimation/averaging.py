@@ -19,11 +19,14 @@ from smp_motor_control.arrays import Array
 from smp_motor_ident.diagnosis.limits import CANDIDATE_WEIGHT
 from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.candidate_starts import of_kind
+from smp_motor_ident.estimation.consider_covariance import latest
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.fitted import NORMAL_95
 from smp_motor_ident.estimation.quantities import Answer, answer
 from smp_motor_ident.estimation.selection import POLICY, FittedCandidate, slowly_filtered
 from smp_motor_ident.likelihood.experiments import Experiments
+from smp_motor_ident.model.coordinates import Coordinates
+from smp_motor_ident.model.structures import Structure
 from smp_motor_ident.result import UNITS, Quantity
 
 BLOCKS = 60
@@ -181,6 +184,29 @@ def covering(
     found = averaged(result, np.array(list(weight.values())), others, own)
     likely = {candidates[n].label: w for n, w in weight.items() if w > CANDIDATE_WEIGHT.value}
     return found, likely if len(likely) > 1 else {}
+
+
+def left_open(
+    data: Experiments,
+    fit: Fit,
+    weight: Mapping[int, float],
+    candidates: Sequence[FittedCandidate],
+) -> tuple[dict[str, float], ...]:
+    """Return the motors that the data do not exclude beside the one of a fit.
+
+    The structures that explain the data as well, and the longest delay where the fit has none: on
+    it hangs what a loop bears far beyond the motor's own frequencies, which nothing else shows.
+    """
+    rivals = [candidates[n].fit for n in list(weight)[1:] if weight[n] > CANDIDATE_WEIGHT.value]
+    motors = [(f.structure, f.z) for f in rivals]
+    late = latest(data, fit)
+    return tuple(_reported(*motor) for motor in (*motors, *([late] if late else [])))
+
+
+def _reported(structure: Structure, z: Coordinates) -> dict[str, float]:
+    """Return what voltage and speed tell of a motor, as far as its structure has it."""
+    found = structure.combinations(z)
+    return {n: float(found[n][0]) for n in structure.separates() if n in found}
 
 
 def _variances(answer: Answer, names: Sequence[str], own: Array) -> Array:

@@ -24,7 +24,7 @@ from smp_motor_ident.estimation.fitted import NORMAL_95
 from smp_motor_ident.estimation.lag_exchange import consider_exchange
 from smp_motor_ident.estimation.selection import POLICY, sandwich_factor
 from smp_motor_ident.likelihood.experiments import Experiments
-from smp_motor_ident.model.coordinates import RINGS, direction, lag_share
+from smp_motor_ident.model.coordinates import RINGS, Coordinates, direction, lag_share
 from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.model.physical import physical_gradients
 from smp_motor_ident.model.structures import Electromechanical, FirstOrder, SecondOrder, Structure
@@ -45,6 +45,24 @@ def asks_for_earlier(data: Experiments, fit: Fit) -> bool:
     beside = _beside(data, fit, s.with_(delay=True), "delay")
     price = POLICY.price(1, fit.samples) * sandwich_factor(fit)
     return beside.seen and beside.size < 0 and beside.size**2 > price * beside.variance
+
+
+def latest(data: Experiments, fit: Fit) -> tuple[Structure, Coordinates] | None:
+    """Return the motor with the longest delay that the data leave open, where the fit has none.
+
+    Whatever else makes a motor late is shorter then, by as much as the score says.  Where nobody
+    can tell, a driver takes up a command within a sample.
+    """
+    s = fit.structure
+    if s.delay or "delay" in s.fixed or not s.free:
+        return None
+    late = s.with_(delay=True)
+    beside = _beside(data, fit, late, "delay")
+    loose = NORMAL_95 * math.sqrt(sandwich_factor(fit) * beside.variance)
+    delay = max(beside.size, 0.0) + min(loose, data.step)
+    delay = min(delay, _room(s, "delay", beside.answer))
+    z = fit.z.moved(s.matrix @ (-delay * beside.answer))
+    return late, z.with_(delay=delay, window=max(z.window, 0.0))
 
 
 def consider_timing(data: Experiments, fit: Fit, instant: float) -> Fit:

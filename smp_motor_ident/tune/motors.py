@@ -21,6 +21,9 @@ from smp_motor_ident.tune.loop import Loop
 SENSOR = ("delay", "averaging_window", "sensor_lag")
 """What stands between the motor's speed and the one that is reported: [s] each."""
 
+_ABSENT = (*SENSOR, "time_constant_product")
+"""What is nothing of a motor that is not said to have it."""
+
 _POSITIVE = ("dc_gain", "time_constant", "resistance", "inductance", "motor_constant", "inertia")
 
 
@@ -124,14 +127,15 @@ def draw_motors(
     What is positive by nature is drawn log-normally, what may be zero normally from there up.
     An unreliable estimate is drawn at least as wide as what it leaves unexplained, gain and lag
     from one size of voltage as wide as they may be at others.  A second lag that the record hides
-    is anything up to the first that it leaves open.
+    is anything up to the first that it leaves open, and the motor anything between the stated one
+    and each of the alternatives that it leaves open, of which it may be any.
     """
     names = _names(estimate)
     mean = np.array([estimate.value(name) for name in names])
     covariance = _covariance(estimate, names, mean)
     wide = friction is not None and friction.high > friction.low
     hidden = _hidden_lag(estimate)
-    if not np.any(np.diag(covariance) > 0) and not wide and not hidden:
+    if not (np.any(np.diag(covariance) > 0) or wide or hidden or estimate.alternatives):
         return None
     positive = np.array([name in _POSITIVE for name in names])
     scale = np.where(positive, np.where(positive, mean, 1.0), 1.0)
@@ -147,6 +151,7 @@ def draw_motors(
     }
     if hidden and "dc_gain" in names:
         values["time_constant_product"] = rng.uniform(*hidden, n)
+    values = _towards_alternatives(estimate, values, rng)
     motors = _motors(estimate, values)
     if friction is not None:
         static = np.clip(motors.static_voltage, friction.low, friction.high)
@@ -154,6 +159,26 @@ def draw_motors(
             static = rng.uniform(friction.low, friction.high, n)
         motors = replace(motors, static_voltage=static)
     return motors
+
+
+def _towards_alternatives(
+    estimate: Estimate, values: dict[str, Array], rng: np.random.Generator
+) -> dict[str, Array]:
+    """Return draws of which each is moved a part of the way to an alternative, or to none."""
+    if not estimate.alternatives:
+        return values
+    n = next(iter(values.values())).size
+    one, share = rng.integers(1 + len(estimate.alternatives), size=n), rng.uniform(size=n)
+    out = {}
+    for name, drawn in values.items():
+        stated = estimate.value(name)
+        absent = 0.0 if name in _ABSENT else stated
+        ends = np.array([stated, *(e.get(name, absent) for e in estimate.alternatives)])[one]
+        if name in _POSITIVE:
+            out[name] = drawn * (1 + share * (ends / stated - 1))
+        else:
+            out[name] = np.maximum(drawn + share * (ends - stated), 0.0)
+    return out
 
 
 def _hidden_lag(estimate: Estimate) -> tuple[float, float] | None:
