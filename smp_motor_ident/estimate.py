@@ -301,13 +301,15 @@ def _stated(
         combinations=result.combinations,
         names=result.names,
         covariance=result.covariance,
-        alternatives=left_open(final, chosen, weight, candidates),
         fit_percent=percent,
         candidates=validate.candidates_of(candidates, chosen, group, data),
         residuals=tests,
         findings=tuple(findings),
         **provenance(group, data, chosen),
     )
+    late = estimate.evidence("command_jitter", "delay")
+    alternatives = left_open(final, chosen, weight, candidates, late)
+    estimate = replace(estimate, alternatives=alternatives)
     if refusal is not None:
         refusal.estimate = estimate
         raise refusal

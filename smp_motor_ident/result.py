@@ -150,9 +150,6 @@ class Estimate:
         Quantities that ``covariance`` is about, in its order.
     covariance : ndarray, shape (p, p)
         Covariance of the estimation error of ``names``, in their own units squared.
-    alternatives : tuple of mapping of str to float
-        Motors of other structures, and with other delays, that the data do not exclude: the
-        combinations of each, without those that it does not have.
     speed_noise : float
         Standard deviation [rad/s] of the noise on the recorded speed that the model was fitted to;
         0 where it was fitted to an angle.
@@ -162,6 +159,9 @@ class Estimate:
         Standard deviation [rad] of the noise on the angle that was recorded, or that a recorded
         speed is the difference of; 0 where that was counts, whose quantisation is known, or a speed
         that is none.
+    alternatives : tuple of mapping of str to float
+        Motors of other structures, and with other delays, that the data do not exclude: the
+        combinations of each, without those that it does not have.
     """
 
     wheel: str
@@ -170,7 +170,6 @@ class Estimate:
     combinations: Mapping[str, Quantity]
     names: tuple[str, ...] = ()
     covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    alternatives: tuple[Mapping[str, float], ...] = ()
     fit_percent: FitPercent = FitPercent()
     candidates: tuple[Candidate, ...] = ()
     residuals: ResidualTests = ResidualTests()
@@ -184,6 +183,7 @@ class Estimate:
     largest_voltage: float = 0.0
     sources: tuple[str, ...] = ()
     hardware: Hardware = Hardware()
+    alternatives: tuple[Mapping[str, float], ...] = ()
 
     @property
     def unidentifiable(self) -> tuple[str, ...]:

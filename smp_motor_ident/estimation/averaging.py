@@ -191,16 +191,18 @@ def left_open(
     fit: Fit,
     weight: Mapping[int, float],
     candidates: Sequence[FittedCandidate],
+    late: float = 0.0,
 ) -> tuple[dict[str, float], ...]:
     """Return the motors that the data do not exclude beside the one of a fit.
 
     The structures that explain the data as well, and the longest delay where the fit has none: on
     it hangs what a loop bears far beyond the motor's own frequencies, which nothing else shows.
+    ``late``: see `latest`.
     """
     rivals = [candidates[n].fit for n in list(weight)[1:] if weight[n] > CANDIDATE_WEIGHT.value]
     motors = [(f.structure, f.z) for f in rivals]
-    late = latest(data, fit)
-    return tuple(_reported(*motor) for motor in (*motors, *([late] if late else [])))
+    last = latest(data, fit, late)
+    return tuple(_reported(*motor) for motor in (*motors, *([last] if last else [])))
 
 
 def _reported(structure: Structure, z: Coordinates) -> dict[str, float]:

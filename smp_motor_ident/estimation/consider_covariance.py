@@ -47,22 +47,23 @@ def asks_for_earlier(data: Experiments, fit: Fit) -> bool:
     return beside.seen and beside.size < 0 and beside.size**2 > price * beside.variance
 
 
-def latest(data: Experiments, fit: Fit) -> tuple[Structure, Coordinates] | None:
+def latest(data: Experiments, fit: Fit, late: float) -> tuple[Structure, Coordinates] | None:
     """Return the motor with the longest delay that the data leave open, where the fit has none.
 
     Whatever else makes a motor late is shorter then, by as much as the score says.  Where nobody
-    can tell, a driver takes up a command within a sample.
+    can tell, a driver takes up a command within a sample.  ``late``: what commands may be late on
+    average [s] that scatter, of which the score says nothing.
     """
     s = fit.structure
     if s.delay or "delay" in s.fixed or not s.free:
         return None
-    late = s.with_(delay=True)
-    beside = _beside(data, fit, late, "delay")
+    richer = s.with_(delay=True)
+    beside = _beside(data, fit, richer, "delay")
     loose = NORMAL_95 * math.sqrt(sandwich_factor(fit) * beside.variance)
     delay = max(beside.size, 0.0) + min(loose, data.step)
-    delay = min(delay, _room(s, "delay", beside.answer))
+    delay = max(min(delay, _room(s, "delay", beside.answer)), late)
     z = fit.z.moved(s.matrix @ (-delay * beside.answer))
-    return late, z.with_(delay=delay, window=max(z.window, 0.0))
+    return richer, z.with_(delay=delay, window=max(z.window, 0.0))
 
 
 def consider_timing(data: Experiments, fit: Fit, instant: float) -> Fit:

@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.estimation.averaging import averaged, candidate_weights, covering, weights
+from smp_motor_ident.estimation.averaging import (
+    averaged,
+    candidate_weights,
+    covering,
+    left_open,
+    weights,
+)
 from smp_motor_ident.estimation.fitted import Options
 from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.estimation.quantities import Answer, answer
@@ -112,6 +118,32 @@ def test_a_candidate_that_did_not_settle_is_covered_as_far_as_it_explains_the_da
     other = answer(unsettled.fit, {}).combinations["time_constant"].value
     assert after.std > before.std
     assert min(before.value, other) < after.value < max(before.value, other)
+
+
+def test_a_delay_that_the_choice_does_not_have_is_left_open_as_far_as_the_score_leaves_it():
+    command = motors.record("rear_left", seconds=2.0).voltage
+    late = np.repeat(command, 2)  # by half of a row: each holds up to its stamp
+    fine = motors.record("rear_left", current=False, rate=400.0, voltage=late)
+    one = Record("rear_left", fine.time[::2], command, count=fine.count[::2],
+                 hardware=fine.hardware)  # fmt: skip
+    data = prepare([one], False)
+    fit = initial_fit(data, SecondOrder(), Options())
+    candidates = [FittedCandidate(fit)]
+    (latest,) = left_open(data, fit, {0: 1.0}, candidates)
+    (scattered,) = left_open(data, fit, {0: 1.0}, candidates, 0.004)
+    assert scattered["delay"] == 0.004  # of which no score tells
+    product = answer(fit, {}).combinations["time_constant_product"].value
+    assert 0.0025 < latest["delay"] < 0.003
+    # It stood for a longer second lag: that of the motor has 20 ms, and a product of 8.2e-4.
+    assert latest["time_constant_product"] < 0.95 * product
+    assert abs(latest["time_constant_product"] - 8.2e-4) < abs(product - 8.2e-4)
+    known = initial_fit(data, SecondOrder(fixed={"delay": 0.0025}), Options())
+    assert left_open(data, known, {0: 1.0}, candidates) == ()
+    # What is rejected is none, what explains the data as well is one, after its structure.
+    both = left_open(data, fit, {0: 0.6, 1: 0.4}, [FittedCandidate(fit), FittedCandidate(known)])
+    assert [one.get("delay") for one in both] == [0.0025, latest["delay"]]
+    rejected = left_open(data, fit, {0: 0.99, 1: 0.01}, [*candidates, FittedCandidate(known)])
+    assert rejected == (latest,)
 
 
 @pytest.mark.parametrize("seed", [0, 1])

@@ -127,6 +127,32 @@ def test_a_second_lag_that_the_record_hides_is_within_the_stated_margins():
     assert design(wide, LOOP).margins.stable
 
 
+@pytest.mark.parametrize(
+    ("stated", "other"),
+    [
+        ({"time_constant_product": 1e-3}, {"delay": 0.01, "time_constant": 0.09}),
+        ({"sensor_lag": 0.01}, {"averaging_window": 0.02}),
+    ],
+    ids=["a delay for a second lag", "a mean for a filter"],
+)
+def test_what_the_record_does_not_exclude_is_within_the_stated_margins(stated, other):
+    loop = replace(LOOP, sample_time=0.005, delay=0.005)
+    motor = {"time_constant": 0.1, "time_constant_product": 0.0}
+    known = estimate(std=0.002, **{**motor, **stated})
+    left_open = {**motor, "dc_gain": known.value("dc_gain"), **other}
+    del left_open["time_constant_product"]  # what it does not have is nothing
+    aware, ignorant = design(replace(known, alternatives=(left_open,)), loop), design(known, loop)
+    true = motors_of(estimate(**{**motor, **other}))
+
+    def of_true(made):
+        return loop_margins(sample(true, made.loop), made.feedback)
+
+    assert of_true(aware).gain > aware.specification.gain_margin.low
+    assert of_true(aware).sensitivity < aware.specification.sensitivity.high
+    assert of_true(ignorant).gain < 0.9 * ignorant.specification.gain_margin.low
+    assert of_true(ignorant).sensitivity > ignorant.specification.sensitivity.high + 0.03
+
+
 def test_unreliable_identification_is_refused_and_widens_what_is_designed_on_it():
     with pytest.raises(DesignError, match=r"unreliable: a dead zone of 2 V \(record slow ramps\)"):
         design(estimate(findings=[DOUBT]), LOOP)
