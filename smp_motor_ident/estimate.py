@@ -293,7 +293,7 @@ def _stated(
         *parts,
         *unsettled_rival(candidates, result, request.known),
         *advise(chosen, result, request.known),
-        *scope(final, result, change, alike, group),
+        *scope(final, result, change, alike, group, chosen),
     ]
     estimate = Estimate(
         model=chosen.structure.title,

@@ -303,9 +303,9 @@ class Estimate:
 
 _WRITTEN = (
     "model", "parameters", "identifiable", "unidentifiable", "combinations", "covariance",
-    "alternatives", "fit_percent", "candidates", "residuals", "findings", "warnings", "advice", "samples",
-    "duration", "sample_time", "speed_noise", "speed_step", "angle_noise", "largest_voltage",
-    "sources", "hardware",
+    "alternatives", "fit_percent", "candidates", "residuals", "findings", "warnings", "advice",
+    "samples", "duration", "sample_time", "speed_noise", "speed_step", "angle_noise",
+    "largest_voltage", "sources", "hardware",
 )  # fmt: skip
 """What of an estimate stands in ``identification.json``."""
 

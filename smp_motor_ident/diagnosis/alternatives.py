@@ -6,12 +6,9 @@ from dataclasses import dataclass, replace
 from smp_motor_ident.diagnosis.adequacy import is_moved, lacks_something
 from smp_motor_ident.diagnosis.left_out import Tried, under_own_loads, undisturbed
 from smp_motor_ident.diagnosis.noise_or_effect import instead_of_drag
+from smp_motor_ident.diagnosis.one_size import one_size_of_voltage, one_size_or_swing
 from smp_motor_ident.diagnosis.repair import hides_driver
-from smp_motor_ident.diagnosis.scope import (
-    blames_current,
-    one_size_of_voltage,
-    one_size_or_swing,
-)
+from smp_motor_ident.diagnosis.scope import blames_current
 from smp_motor_ident.estimation.candidate_starts import of_kind
 from smp_motor_ident.estimation.driver_effect import (
     DriverFit,

@@ -6,6 +6,7 @@ Derivation: docs/derivations.md, sections 9 and 13.
 from collections.abc import Sequence
 
 from smp_motor_ident.diagnosis.limits import PROFILED
+from smp_motor_ident.diagnosis.one_size import consider_weaker_side
 from smp_motor_ident.diagnosis.stamps import clock_share
 from smp_motor_ident.estimation.consider_covariance import (
     consider_bound,
@@ -46,7 +47,7 @@ def certain(
         chosen = consider_bound(free, chosen)
     timed = consider_timing(final, chosen, instant_deviation(group, hold))
     timed = consider_drop(final, consider_clock(final, timed, clock_share(group)))
-    timed = consider_filter(final, timed, request.options)
+    timed = consider_weaker_side(final, consider_filter(final, timed, request.options))
     chosen, friction_std = consider_friction(final, consider_left_out(final, timed))
     if request.driver is not None:
         chosen = request.driver.widened(chosen)

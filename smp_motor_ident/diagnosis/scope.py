@@ -13,7 +13,9 @@ from smp_motor_ident.diagnosis.limits import (
     REST,
     SAME_LEVEL,
 )
+from smp_motor_ident.diagnosis.one_size import one_size, size_of_voltage
 from smp_motor_ident.diagnosis.sample_limits import FRICTION_MOST
+from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.prediction import voltage_at_samples
 from smp_motor_ident.estimation.quantities import Answer
 from smp_motor_ident.estimation.segments import Change
@@ -24,9 +26,6 @@ from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import Estimate
 
-FEWEST_SWINGS = 6  # of which it can be said that they are alike
-OFTEN = 0.2  # of the rows: a command that changes in more of them makes no steps
-
 
 def scope(
     data: Experiments,
@@ -34,9 +33,10 @@ def scope(
     change: Change,
     alike: Mapping[str, float],
     group: Sequence[Record],
+    fit: Fit,
 ) -> Iterator[Finding]:
     """Yield what a reader must know of the values' meaning."""
-    yield from one_size_of_voltage(one_size_or_swing(data)) or _one_size_of_step(_one_step(data))
+    yield from one_size(data, fit)
     if not result.level:
         yield from _one_direction(data, result)
     if alike:
@@ -44,7 +44,7 @@ def scope(
     if result.level:
         yield _one_level(result, _turns_at_others(data, abs(result.level)))
     yield from _friction_dominates(result, float(np.abs(data.voltage).max()))
-    yield from _current_scale(result, group[0].hardware.resistance, _one_size(data) > 0)
+    yield from _current_scale(result, group[0].hardware.resistance, size_of_voltage(data) > 0)
     if change.std:
         yield _motor_changes(change, group, float(np.abs(data.voltage).max()))
 
@@ -117,95 +117,6 @@ def _alike(weights: Mapping[str, float]) -> Finding:
         "sample faster, and excite with sharp steps of several sizes: a delay, an averaged "
         "speed and a second lag differ in the first samples after a step",
     )
-
-
-def one_size_or_swing(data: Experiments) -> float:
-    """Return the voltage's only size, or that of its only swing; 0 where there are more."""
-    return _one_size(data) or _one_swing(data)
-
-
-def _one_size(data: Experiments) -> float:
-    """Return the size of a voltage that is only switched between one size both ways, else 0.
-
-    A single row between two levels is no third: the voltage is the mean over a row in which it
-    was switched, or was interpolated over rows that were lost there.
-    """
-    levels = data.levels
-    top = float(np.abs(levels).max())
-    other = (top - np.abs(levels) > SAME_LEVEL.value * top) & (np.abs(levels) > REST.value * top)
-    change = np.diff(levels)
-    between = (change[:-1] * change[1:] > 0) & ~other[:-2] & ~other[2:]
-    other[1:-1] &= ~between
-    return 0.0 if other.any() else top
-
-
-def _one_swing(data: Experiments) -> float:
-    """Return the peak of a voltage that swings there and back always as far and as long, else 0.
-
-    A sine of one amplitude and frequency, above all; what begins and ends it does not count.
-    """
-    value = data.hold_value
-    turns = np.flatnonzero(np.diff(value >= 0)) + 1
-    if turns.size < FEWEST_SWINGS:
-        return 0.0
-    peaks = np.maximum.reduceat(np.abs(value), turns)[:-1]
-    lengths = np.diff(data.hold_end[turns - 1])
-    peak, length = float(np.median(peaks)), float(np.median(lengths))
-    alike = (np.abs(peaks - peak) < SAME_LEVEL.value * peak) & (
-        np.abs(lengths - length) < SAME_LEVEL.value * length + 1.5 * data.step
-    )
-    return peak if float(alike.mean()) > 1 - SAME_LEVEL.value else 0.0
-
-
-def _one_step(data: Experiments) -> float:
-    """Return the size of a voltage's steps where they have only one, else 0."""
-    change = np.abs(np.diff(data.levels))
-    steps = change[change > REST.value * float(np.abs(data.levels).max())]
-    if not FEWEST_SWINGS <= steps.size < OFTEN * change.size:
-        return 0.0
-    size = float(np.median(steps))
-    alike = np.abs(steps - size) < SAME_LEVEL.value * size
-    return size if float(alike.mean()) > 1 - SAME_LEVEL.value else 0.0
-
-
-def _one_size_of_step(size: float) -> list[Finding]:
-    """Say what steps of one size cannot show: a ramp that is as long at each is a lag."""
-    if not size:
-        return []
-    return [
-        Finding(
-            "one_size_of_step",
-            "warning",
-            f"every step of the voltage has one size, {size:.3g} V: a driver that lets it rise "
-            "slowly is as late at each of them, and looks like a delay, a lag or a filter",
-            {"voltage": size},
-            "record the voltage at the motor's terminals, or add steps of other sizes",
-        )
-    ]
-
-
-def one_size_of_voltage(top: float) -> list[Finding]:
-    """Say what a voltage of one size both ways, or of one swing, cannot show.
-
-    With a size U a driver that takes a share of it (a dead zone, a drop, a clip, pulses) is the
-    motor of another gain under U: no residual tells the two apart, and next to none a drag by
-    the square of a speed that is of one size, too.  Under a sine it is another
-    gain of the fundamental (its describing function), and the motor hides the harmonics.
-    """
-    if not top:
-        return []
-    return [
-        Finding(
-            "one_size_of_voltage",
-            "warning",
-            f"the voltage has one size, {top:.3g} V: a driver that puts out less of it (a dead "
-            "zone, a drop, a clip at the supply, coasting between its pulses) or lets it rise "
-            "slowly, and a drag by the square of the speed, look like a motor of another gain or "
-            "lag; the numbers hold for the voltage as it was recorded",
-            {"voltage": top},
-            "record the voltage at the motor's terminals, or add levels of other sizes",
-        )
-    ]
 
 
 def _one_direction(data: Experiments, result: Answer) -> Iterator[Finding]:

@@ -9,7 +9,7 @@ import pytest
 from independent import simulate
 from scipy.signal import lfilter
 
-from smp_motor_ident.diagnosis import refusal, scope
+from smp_motor_ident.diagnosis import one_size, refusal
 from smp_motor_ident.diagnosis.validation import percent
 from smp_motor_ident.errors import DesignError, SignalError
 from smp_motor_ident.estimate import estimate
@@ -257,12 +257,34 @@ def test_a_voltage_of_one_size_says_that_a_clip_would_not_show(levels, said):
         assert abs(clip.value - 7.0) < 3 * clip.std
 
 
+@pytest.mark.parametrize(("levels", "covers"), [([8.0, -8.0], True), ([8.0, -8.0, 4.0], False)])
+def test_a_side_that_is_weaker_is_no_load_alone_under_one_size(levels, covers):
+    """Under one size it is a load of 0.4 V and a gain of 5 % less."""
+    rng = np.random.default_rng(14)
+    rate, keep = 200.0, np.exp(-1 / 200.0 / TRUTH["time_constant"])
+    voltage = np.repeat(rng.choice(levels, 80), 20)
+    put_out = np.where(voltage < 0, 0.9 * voltage, voltage)
+    w = np.zeros(voltage.size)
+    for k in range(1, w.size):
+        w[k] = keep * w[k - 1] + (1 - keep) * TRUTH["dc_gain"] * put_out[k]
+    t = np.arange(w.size) / rate
+    noisy = w + 0.3 * rng.standard_normal(w.size)
+    found = estimate(Record("motor", t, voltage, velocity=noisy))
+    gain, lag = found.combinations["dc_gain"], found.combinations["time_constant"]
+    said = [f for f in found.findings if "the intervals cover both" in f.message]
+    assert [f.code for f in said] == ["asymmetry"] * covers
+    if covers:
+        assert 2 * gain.std < abs(gain.value - TRUTH["dc_gain"]) / 0.5 < 4 * gain.std
+        assert gain.ci95[0] < TRUTH["dc_gain"] < gain.ci95[1]
+        assert abs(lag.value - TRUTH["time_constant"]) < 4 * lag.std < 0.02 * lag.value
+
+
 @pytest.mark.parametrize("how", ["before", "interpolated"])
 def test_one_size_is_seen_however_the_command_ran(how):
     voltage = np.repeat([0.0, 8.0, -8.0, 8.0], 30)
     t = np.arange(voltage.size) / 200.0
     data = prepare([Record("motor", t, voltage, velocity=voltage)], False).held(how)
-    assert scope._one_size(data) == 8.0
+    assert one_size.size_of_voltage(data) == 8.0
 
 
 def test_a_row_in_which_the_voltage_was_switched_is_no_other_size():
@@ -270,10 +292,10 @@ def test_a_row_in_which_the_voltage_was_switched_is_no_other_size():
     voltage[[30, 60, 90]] = 4.0, 5.6, -4.0  # means over a switch, or over rows that were lost
     t = np.arange(voltage.size) / 200.0
     one = Record("motor", t, voltage, velocity=voltage)
-    assert scope._one_size(prepare([one], False)) == 8.0
+    assert one_size.size_of_voltage(prepare([one], False)) == 8.0
     voltage[75] = 4.0  # between rows of one level it is a level of its own
     other = Record("motor", t, voltage.copy(), velocity=voltage)
-    assert scope._one_size(prepare([other], False)) == 0.0
+    assert one_size.size_of_voltage(prepare([other], False)) == 0.0
 
 
 def test_rows_lost_at_a_switch_of_one_size_make_no_drop_of_the_driver():
