@@ -31,7 +31,7 @@ def sensors(data: Experiments, fit: Fit) -> Iterator[Finding]:
     if isinstance(s, Electromechanical) and s.lags:
         yield _current_lag(s.current_sensor, fit.z.current_lag)
     if s.has("window") and fit.z.window > INSTANT.value * data.step:
-        yield _filtered_speed(fit)
+        yield _late_speed(0.5 * fit.z.window) if s.late else _filtered_speed(fit)
     if s.shift > 0:
         yield _late_command(s.shift)
     yield from _long_delay(data, fit)
@@ -65,6 +65,17 @@ def _late_command(shift: float) -> Finding:
         {"shift": shift},
         "where a row has the command of the interval that follows it, that is no delay but how it "
         "was logged: map it with held=after",
+    )
+
+
+def _late_speed(lag: float) -> Finding:
+    """Say that the speed alone comes late."""
+    return Finding(
+        "late_speed",
+        "note",
+        f"the speed comes {1e3 * lag:.3g} ms later than the current: that is in the delay",
+        {"lag": lag},
+        "stamp both where they are measured",
     )
 
 

@@ -200,6 +200,28 @@ def with_digital_filter(
     return best
 
 
+def with_late_speed(
+    data: Experiments,
+    best: Fit,
+    options: Options,
+    candidates: list[FittedCandidate],
+    say: Callable[[str], None],
+) -> Fit:
+    """Return the fit, or one whose speed is late as it is, where its current is not.
+
+    To first order it is the mean over a window, or the low-pass, that stands for it.
+    """
+    s = best.structure
+    if not s.current or "window" not in s.free or data.quantum > 0:
+        return best
+    structure = s.with_(late=True, low_pass=False, ticks=0)
+    say(f"trying {structure.label}")
+    other = _filtered(data, structure, best, best.z, options)
+    verdict, reason = POLICY.preferred(best, other)
+    candidates.append(FittedCandidate(other, reason))
+    return other if verdict else best
+
+
 def with_filter_for_lag(
     data: Experiments,
     best: Fit,

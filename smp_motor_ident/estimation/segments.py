@@ -34,7 +34,7 @@ from smp_motor_ident.estimation.prediction import positive_part, simulate
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.passes import gather
 from smp_motor_ident.model.coordinates import LOGARITHMS, PLAUSIBLE, Coordinates
-from smp_motor_ident.model.measurement import ANGLE, MEAN_SPEED
+from smp_motor_ident.model.measurement import ANGLE, LATE_SPEED, MEAN_SPEED
 from smp_motor_ident.model.structures import sensor_of
 
 FEWEST = 4  # parts of which a scatter can be taken
@@ -300,7 +300,7 @@ def _parted(data: Experiments, fit: Fit, parts: int) -> Experiments:
     initial = np.zeros((starts.size - 1, 5))
     predicted = simulate(data, fit, gain=True)
     output, current = data.output.copy(), data.current.copy()
-    window = fit.z.window * (data.kind == MEAN_SPEED)
+    window = fit.z.window * (data.kind in (MEAN_SPEED, LATE_SPEED))
     reach = 2 * fit.z.current_lag * (sensor_of(fit.structure) == "averaged")
     for n, (begin, g) in enumerate(zip(starts[:-1], owner, strict=True)):
         a = int(data.hold_start[g])

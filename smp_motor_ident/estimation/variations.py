@@ -13,6 +13,7 @@ from smp_motor_ident.estimation.delay_and_averaging import (
     snapped,
     with_digital_filter,
     with_filter_for_lag,
+    with_late_speed,
     with_low_pass,
 )
 from smp_motor_ident.estimation.fit import Fit, Options, solve
@@ -40,6 +41,7 @@ def varied(
     best = with_filter_for_lag(data, best, options, candidates, say)
     best = with_low_pass(data, best, options, candidates, say)
     best = with_digital_filter(data, best, options, candidates, say)
+    best = with_late_speed(data, best, options, candidates, say)
     data = data.measured_as(best.kind)
     if slowly_filtered(best):
         best = with_quicker_filter(data, best, options, candidates)

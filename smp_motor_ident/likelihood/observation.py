@@ -58,7 +58,37 @@ def recall(ring: Array, k: int, first: int, t: float, p: int, past: Array) -> fl
     return float(d * (b[1] - a[1]) + (1 - u) * (1 - 3 * u) * a[2] + u * (3 * u - 2) * b[2])
 
 
+@compiled
+def recall_speed(ring: Array, k: int, first: int, t: float, p: int, past: Array) -> float:
+    """Put the speed at time t and its sensitivities into `past`; return the acceleration there."""
+    n = ring.shape[0]
+    oldest = max(first, k - n + 1)
+    a = ring[oldest % n]
+    if t <= a[0]:  # before the record: the speed it began with
+        past[0] = a[2]
+        for j in range(p):
+            past[1 + j] = a[3 + p + j]
+        return 0.0
+    before, i = oldest, k
+    while i - before > 1:
+        middle = (before + i) // 2
+        if ring[middle % n, 0] > t:
+            i = middle
+        else:
+            before = middle
+    a, b = ring[before % n], ring[i % n]
+    h = b[0] - a[0]
+    u = (t - a[0]) / h
+    mean, d0, d1 = 6 * u * (1 - u) / h, (1 - u) * (1 - 3 * u), u * (3 * u - 2)
+    past[0] = mean * (b[1] - a[1]) + d0 * a[2] + d1 * b[2]
+    for j in range(p):
+        past[1 + j] = mean * (b[3 + j] - a[3 + j]) + d0 * a[3 + p + j] + d1 * b[3 + p + j]
+    bend = 6 * (1 - 2 * u) / h * (b[1] - a[1])
+    return float((bend + (6 * u - 4) * a[2] + (6 * u - 2) * b[2]) / h)
+
+
 ANGLE, MEAN_SPEED = measurement.ANGLE.code, measurement.MEAN_SPEED.code
+LATE_SPEED = measurement.LATE_SPEED.code
 LOW_PASSED = measurement.LOW_PASSED.code
 ON_OFFSET, ON_R = SLOPE + OFFSET * LANES, SLOPE + LN_R * LANES
 ON_WINDOW = SLOPE + WINDOW * LANES
@@ -79,6 +109,13 @@ def observe(
         for j in range(p):
             m[D0 + j] = (m[ST + j] - past[1 + j] + (speed - y) * m[ON_WINDOW + j]) / width
         return y
+    if kind == LATE_SPEED:
+        remember(ring, k, t, x, m)
+        p = past.shape[0] - 1
+        acceleration = recall_speed(ring, k, first, t - 0.5 * par[WINDOW], p, past)
+        for j in range(p):
+            m[D0 + j] = past[1 + j] - 0.5 * acceleration * m[ON_WINDOW + j]
+        return float(past[0])
     if kind >= LOW_PASSED:
         lag, ticks, p = 0.5 * par[WINDOW], kind - LOW_PASSED, past.shape[0] - 1
         return low_passed(k == first, t, lag, ticks, x, m, ring, p)

@@ -23,7 +23,7 @@ from smp_motor_ident.likelihood.normal_equations import eliminate
 from smp_motor_ident.likelihood.sensitivities import LANES
 from smp_motor_ident.model.columns import CURRENT_LAG, WINDOW
 from smp_motor_ident.model.coordinates import Coordinates
-from smp_motor_ident.model.measurement import ANGLE, MEAN_SPEED, SPEED
+from smp_motor_ident.model.measurement import ANGLE, LATE_SPEED, MEAN_SPEED, SPEED
 from smp_motor_ident.model.structures import SENSORS, Structure, sensor_of
 
 LEAST_LAG = 1e-3  # of a sample: of a sensor that shows the current as good as at once
@@ -189,7 +189,7 @@ def _ring(data: Experiments, par: Array, p: int) -> Array:
     """Return the memory for the filter of a speed."""
     if data.kind.low_passed:
         return np.zeros((2, max(4 + 3 * p, LOW_PASS_WEIGHTS)))
-    if data.kind != MEAN_SPEED:
+    if data.kind not in (MEAN_SPEED, LATE_SPEED):
         return np.zeros((0, 0))
     return np.zeros((_depth(data, par[WINDOW]), 3 + 2 * p))
 

@@ -25,7 +25,9 @@ ANGLE = Measurement("angle", 1, 1)
 """The angle, or counts times their resolution [rad]."""
 MEAN_SPEED = Measurement("mean speed", 2)
 """The mean of the speed over a trailing window [rad/s]."""
-LOW_PASSED = Measurement("low-passed speed", 3)
+LATE_SPEED = Measurement("late speed", 3)
+"""The speed that was, as long ago as the mean over a window is late [rad/s]."""
+LOW_PASSED = Measurement("low-passed speed", 4)
 """A first-order low-pass of the speed that is as late as the mean over a window [rad/s]."""
 
 

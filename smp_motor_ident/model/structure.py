@@ -16,7 +16,7 @@ import numpy as np
 
 from smp_motor_control.arrays import Array
 from smp_motor_ident.model.coordinates import NAMES, Coordinates, direction, place
-from smp_motor_ident.model.measurement import MEAN_SPEED, SPEED, Measurement, smoothed
+from smp_motor_ident.model.measurement import LATE_SPEED, MEAN_SPEED, SPEED, Measurement, smoothed
 
 S = TypeVar("S", bound="Structure")
 Gradients = dict[str, tuple[float, Array]]
@@ -48,6 +48,7 @@ class Structure(ABC):
     window: bool = False
     low_pass: bool = False  # whether a low-pass of half the window's lag stands in its place
     ticks: int = 0  # samples of the speed that a digital one takes a row
+    late: bool = False  # whether the speed that was then, by the same lag, stands in its place
     # How the command ran: a row's value before it, after it, or interpolated from row to row
     held: str = "before"
     shift: float = 0.0  # by how much later than recorded such a command ran as a whole [s]
@@ -74,6 +75,8 @@ class Structure(ABC):
         """What the sensor shows of the speed."""
         if not self.has("window"):
             return SPEED
+        if self.late:
+            return LATE_SPEED
         return smoothed(self.ticks) if self.low_pass else MEAN_SPEED
 
     @property
@@ -169,7 +172,8 @@ class Structure(ABC):
         yield self.friction == "asymmetric", "asymmetric friction"
         yield self.load, "load"
         yield self.delay, "delay"
-        yield self.window and not self.low_pass, "averaged speed"
+        yield self.late, "late speed"
+        yield self.window and not (self.low_pass or self.late), "averaged speed"
         yield self.window and self.low_pass and not self.ticks, "low-passed speed"
         yield self.window and self.ticks > 0, f"speed smoothed {self.ticks} times a row"
         yield self.held == "after", "command held after its row"
@@ -190,7 +194,8 @@ class Structure(ABC):
             "current_lag": "current_lag",
         }
         found |= {n: (z.value(c), direction(**{c: 1.0})) for n, c in reported.items()}
-        found["delay"] = self.shift + z.delay, direction(delay=1.0)
+        late = 0.5 * self.late
+        found["delay"] = self.shift + z.delay + late * z.window, direction(delay=1.0, window=late)
         return found | {"sensor_lag": (0.5 * z.window, direction(window=0.5))}
 
     def _lags_of(self, z: Coordinates) -> Gradients:
@@ -212,9 +217,9 @@ class Structure(ABC):
         if self.load:
             yield "load_voltage"
         yield "steady_speed"
-        if self.has("delay") or self.shift > 0:
+        if self.has("delay") or self.shift > 0 or self.late:
             yield "delay"
-        if self.has("window"):
+        if self.has("window") and not self.late:
             yield "sensor_lag" if self.low_pass else "averaging_window"
         if self.lags:
             yield "current_lag"

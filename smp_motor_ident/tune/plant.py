@@ -55,6 +55,11 @@ class Plant:
         return int(self.phi.shape[0])
 
     @property
+    def window_length(self) -> Array:
+        """Length of the window over which each motor's measured speed is averaged, (n,), [s]."""
+        return 1 / self.average[:, 0] if self.window else np.zeros(len(self))
+
+    @property
     def window(self) -> int:
         """Steps over which the measured speed is averaged."""
         return int(self.average.shape[1])
@@ -169,11 +174,10 @@ def _window(motors: Motors, loop: Loop) -> Array:
     own = np.full(len(motors), loop.difference_window * loop.sample_time)
     if not loop.reports_speed or loop.averaging_given:
         return own
-    identified = np.broadcast_to(motors.averaging_window, len(motors))
-    if not np.any(identified > 0):
-        # A filter that was identified is all that the sensor does.
-        return np.where(motors.sensor_lag > 0, 0.0, own) if np.any(motors.sensor_lag > 0) else own
-    return np.maximum(identified, 0.01 * loop.sample_time)
+    # A filter that was identified is all that the sensor does.
+    plain = np.where(motors.sensor_lag > 0, 0.0, own)
+    found = np.where(motors.averaging_window > 0, motors.averaging_window, plain)
+    return np.maximum(found, 0.01 * loop.sample_time) if np.any(found > 0) else found
 
 
 def _average(window: Array, tail: Array, T: float) -> Array:

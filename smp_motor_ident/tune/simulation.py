@@ -58,11 +58,14 @@ class Inputs:
     angle_noise: Array | None = None  # [rad]: on the angle that it is made from, shape (n, k)
 
 
-def white(deviation: float, shape: tuple[int, int], seed: int = 0) -> Array | None:
-    """Return white noise, the same every time; None where there is none."""
+def white(
+    deviation: float, shape: tuple[int, int], seed: int = 0, of: NDArray[np.bool_] | None = None
+) -> Array | None:
+    """Return white noise, the same every time, ``of`` some motors or all; None where is none."""
     if deviation == 0.0:
         return None
-    return np.asarray(deviation * np.random.default_rng(seed).standard_normal(shape))
+    noise = np.asarray(deviation * np.random.default_rng(seed).standard_normal(shape))
+    return noise if of is None else noise * of[:, None]
 
 
 def simulate(
@@ -70,9 +73,9 @@ def simulate(
     controller: Controller,
     inputs: Inputs,
     *,
-    count_angle: float = 0.0,
+    count_angle: Array | float = 0.0,
     speed_step: float = 0.0,
-    eccentric: float = 0.0,
+    eccentric: Array | float = 0.0,
     friction: Array | None = None,
     modelled: float = 0.0,
     driver: Driver = NO_EFFECT,
@@ -101,8 +104,8 @@ def simulate(
         none if inputs.forward is None else inputs.forward,
         still if inputs.load is None else np.broadcast_to(inputs.load, (n, steps)),
         np.zeros(n) if friction is None else np.ascontiguousarray(friction),
-        modelled, count_angle, speed_step, eccentric, np.ascontiguousarray(noise),
-        np.ascontiguousarray(of_angle), driver,
+        modelled, np.full(n, count_angle), speed_step, np.full(n, eccentric),
+        np.ascontiguousarray(noise), np.ascontiguousarray(of_angle), driver,
         np.broadcast_to(plant.motors.a0, n),
     )  # fmt: skip
     return Response(*found)
@@ -177,9 +180,9 @@ def _run(
     load: Array,
     friction: Array,
     modelled: float,
-    count_angle: float,
+    count_angles: Array,
     speed_step: float,
-    eccentric: float,
+    eccentrics: Array,
     noise: Array,
     angle_noise: Array,
     driver: Driver,
@@ -191,6 +194,7 @@ def _run(
     contradicted, memory = np.zeros(n, dtype=np.bool_), min(T / INNOVATION_MEMORY, 1.0)
     for j in range(n):
         p, i, d, filter_time, weight, weight_d, limit, back = controllers[j]
+        count_angle, eccentric = count_angles[j], eccentrics[j]
         x, following, past, put_out = np.zeros(s), np.zeros(s), np.zeros(m), np.zeros(m)
         angle = np.full(window + 1, count_angle * ((0.5 + 0.618034 * j) % 1.0))
         observer, place = np.zeros(by_angle.size), angle[0]

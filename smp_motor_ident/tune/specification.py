@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from smp_motor_control.arrays import Array
 from smp_motor_control.wheel.plausibility import LOAD
@@ -124,7 +125,7 @@ def _runs(
     motors = drawn if case.drawn else nominal
     plant = sample(motors, loop, believed=nominal)
     shape = (len(plant), time.size)
-    filtered = bool(np.any(plant.motors.sensor_lag > 0))
+    counted = _counted(plant, case.problem.plant)
     forward = plan.forward + case.swallowed * plan.friction
     late = _late(case, loop, shape)
     run = simulate(
@@ -135,11 +136,11 @@ def _runs(
             forward=forward,
             load=_load(case, plant.motors.static_voltage, shape) + late * _change(forward),
             noise=_reported_noise(case, loop, shape) + late * _change(plan.reference),
-            angle_noise=white(0.0 if filtered else loop.angle_noise, shape),
+            angle_noise=white(loop.angle_noise, shape, of=counted),
         ),
-        count_angle=0.0 if filtered else loop.count_angle,
+        count_angle=np.where(counted, loop.count_angle, 0.0),
         speed_step=loop.rounding,
-        eccentric=0.0 if filtered else case.eccentric,
+        eccentric=np.where(counted, case.eccentric, 0.0),
         friction=motors.static_voltage if case.drawn else np.array([case.friction.known]),
         modelled=case.swallowed,
         driver=case.driver,
@@ -153,6 +154,17 @@ def _runs(
         replace(one, settling=math.nan) if other else one
         for one, other in zip(each, run.contradicted, strict=True)
     ]
+
+
+def _counted(plant: Plant, nominal: Plant) -> NDArray[np.bool_]:
+    """Tell of which motors the measured speed is made from counts in the running loop.
+
+    A filter's is not, nor that of an alternative with a window so much shorter than the nominal
+    one's: what counts make of it would have been seen.
+    """
+    shortest = 0.5 * nominal.window_length[0]
+    made = (shortest > 0) & (plant.window_length >= shortest) & (plant.motors.sensor_lag == 0)
+    return np.asarray(made | (plant.observer is not None))
 
 
 def _load(case: Case, friction: Array, shape: tuple[int, int]) -> Array:
