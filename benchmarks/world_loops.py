@@ -16,6 +16,7 @@ from __future__ import annotations
 import os
 import sys
 import traceback
+from itertools import pairwise
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -78,9 +79,11 @@ class Drive:
         c, s, at = self.c, self.c.sensor, k * self.every
         y = self.out[at, 3]
         if s.get("lowpass"):
-            share = 1 - np.exp(-self.fine / s["lowpass"])
-            for w in self.out[max(at - self.every, 0) + 1 : at + 1, 3]:
-                self.filtered += share * (w - self.filtered)
+            kept = np.exp(-self.fine / s["lowpass"])
+            mean = s["lowpass"] / self.fine * (1 - kept)
+            for before, w in pairwise(self.out[max(at - self.every, 0) : at + 1, 3]):
+                straight = (1 - mean) * w + (mean - kept) * before
+                self.filtered = kept * self.filtered + straight
             y = self.filtered
         if s.get("window") or s.get("late"):
             grid = np.arange(at + 1) * self.fine

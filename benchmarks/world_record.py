@@ -105,6 +105,15 @@ def filtered(x: np.ndarray, a: float) -> np.ndarray:
     return lfilter([a], [1, a - 1], x)
 
 
+def low_passed(x: np.ndarray, step: float, lag: float) -> np.ndarray:
+    """Return the first-order low-pass of what runs straight between its samples, from rest."""
+    from scipy.signal import lfilter
+
+    kept = np.exp(-step / lag)
+    mean = lag / step * (1 - kept)
+    return lfilter([1 - mean, mean - kept], [1, -kept], x)
+
+
 def _window(integral: np.ndarray, fine: float, span: float, at: np.ndarray) -> np.ndarray:
     """Return means over the ``span`` before each instant from a running integral."""
     grid = np.arange(integral.size) * fine
@@ -131,7 +140,7 @@ def _speed(
 ) -> np.ndarray:
     s = c.sensor
     if s.get("lowpass"):
-        w = filtered(w, 1 - np.exp(-fine / s["lowpass"]))
+        w = low_passed(w, fine, s["lowpass"])
     if s.get("window"):
         y = _window(angle, fine, s["window"], at)
     else:
@@ -169,9 +178,7 @@ def _current(
     s = c.sensor
     i = out[:, 0]
     if s.get("i_lowpass"):
-        # The current runs straight between fine samples: half of each is of the one before.
-        middle = 0.5 * (i + np.concatenate(([0.0], i[:-1])))
-        i = filtered(middle, 1 - np.exp(-fine / s["i_lowpass"]))
+        i = low_passed(i, fine, s["i_lowpass"])
     y = i[::every]
     span = s.get("i_window", c.step if c.drive.get("pwm") or s.get("i_supply") else 0.0)
     if span:

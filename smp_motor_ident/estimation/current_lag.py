@@ -99,6 +99,31 @@ def with_both_filters(
     return other if POLICY.replaces(best, other)[0] else best
 
 
+def without_current_lag(
+    data: Experiments,
+    best: Fit,
+    options: Options,
+    candidates: list[FittedCandidate],
+    say: Callable[[str], None],
+) -> Fit:
+    """Return the fit, or one whose winding has its lag back: of a speed that was not yet filtered
+    as it is, the current's sensor may have taken it.
+    """
+    s = best.structure
+    if not (isinstance(s, Electromechanical) and s.lags and s.window):
+        return best
+    plain = s.with_(current_sensor="")
+    if any(r.fit.structure == plain for r in candidates):
+        return best
+    say(f"trying {plain.label}")
+    te = best.z.electrical_time_constant + best.z.current_lag
+    z = plain.complete(slower_winding(best.z, float(np.log(te))))
+    other = descent.refine(data.measured_as(plain.speed), plain, best, z, options)
+    needed, reason = POLICY.needed(other, best)
+    candidates.append(FittedCandidate(other, "" if needed else f"a lag of the current: {reason}"))
+    return best if needed else other
+
+
 def with_lag(fit: Fit, lag: float) -> Fit:
     """Return a fit at another lag of the current's sensor [s]."""
     return replace(fit, z=fit.z.with_(current_lag=lag))

@@ -8,12 +8,19 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from smp_motor_ident.estimation.descent import refine
+from smp_motor_ident.diagnosis.limits import RELEVANT_BIAS
+from smp_motor_ident.estimation.candidate_starts import of_kind
+from smp_motor_ident.estimation.descent import refine, screening_subset
 from smp_motor_ident.estimation.fit import Fit, Options
+from smp_motor_ident.estimation.prediction import positive_part
+from smp_motor_ident.estimation.profile import RISE
 from smp_motor_ident.estimation.selection import POLICY, FittedCandidate, sandwich_factor
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.coordinates import LOGARITHMS, Coordinates, lag_share, place
+from smp_motor_ident.model.measurement import ANGLE
+from smp_motor_ident.model.structures import FirstOrder
 
+RUBS = 0.03  # of the largest voltage: the friction at which a descent begins
 _LOGARITHMS = [place(n) for n in LOGARITHMS]
 
 
@@ -40,15 +47,48 @@ def consider_exchange(data: Experiments, fit: Fit, options: Options) -> Fit:
         move = other.z.array - fit.z.array
         # As far as what is stated moves, which is no logarithm.
         move[_LOGARITHMS] = np.expm1(move[_LOGARITHMS])
-        fit = fit.along(math.sqrt(one / (1 + sum(odds))) * fit.structure.of_free(move))
+        share, own = one / (1 + sum(odds)), fit.covariance()
+        fit = fit.along(math.sqrt(share) * fit.structure.of_free(move))
+        fit = fit.wider(share * positive_part(other.covariance() - own, own))
     return fit
+
+
+def rubs_behind_filter(data: Experiments, fit: Fit, options: Options) -> bool:
+    """Tell whether a motor that rubs explains as much if one of two lags is the speed's filter.
+
+    A filter hides where the motor stands: behind it the score of a linear motor's friction tells
+    nothing, nor does that of a motor whose own lag is the filter's.
+    """
+    s, slow = fit.structure, fit.z.time_constant
+    quick = fit.z.second_lag * (s.order == 2) + 0.5 * fit.z.window * s.window
+    if s.current or data.quantum > 0 or data.kind == ANGLE or s.has("window") > s.window:
+        return False
+    if quick < RELEVANT_BIAS.value * slow or slow > np.ptp(data.time):
+        return False
+    part = of_kind(screening_subset(data), fit)
+    known = refine(part, s, fit, fit.z, options)
+    rubs, starts = s.with_(friction="symmetric"), list(exchanged(fit.z, s.order))
+    if not s.low_pass:
+        rubs = FirstOrder.like(rubs).with_(window=True, low_pass=True)
+        either = (quick, slow), (slow, quick)
+        starts = [fit.z.with_(ln_a1=fit.z.ln_a0 + math.log(m), window=2 * f) for m, f in either]
+    some = RUBS * float(np.abs(data.hold_value).max())
+    for z in starts:
+        there, begun = part.measured_as(rubs.speed), rubs.complete(z.with_friction(some))
+        other = refine(there, rubs, known, begun, options, known=known)
+        if other.deviance < known.deviance + RISE * sandwich_factor(known):
+            return True
+    return False
 
 
 def _exchanged_fits(data: Experiments, fit: Fit, options: Options) -> Iterator[Fit]:
     s = fit.structure
     if s.current or not s.low_pass or "window" not in s.free:
         return
+    least = RUBS * float(np.abs(data.hold_value).max())
     for z in exchanged(fit.z, s.order):
+        if s.friction == "symmetric" and z.vc_plus < least:  # as the other order hides it
+            z = z.with_friction(least)
         yield refine(data, s, fit, s.complete(z), options)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from smp_motor_ident.diagnosis.limits import LITTLE_FRICTION
 from smp_motor_ident.estimation import data_window, descent, prediction
 from smp_motor_ident.estimation.candidate_starts import of_kind
-from smp_motor_ident.estimation.current_lag import with_current_lag
+from smp_motor_ident.estimation.current_lag import with_current_lag, without_current_lag
 from smp_motor_ident.estimation.delay_and_averaging import (
     delay_without_noise,
     snapped,
@@ -18,7 +18,7 @@ from smp_motor_ident.estimation.delay_and_averaging import (
 )
 from smp_motor_ident.estimation.fit import Fit, Options, solve
 from smp_motor_ident.estimation.initialisation import beginning, initial_fit
-from smp_motor_ident.estimation.lag_exchange import with_quicker_filter
+from smp_motor_ident.estimation.lag_exchange import rubs_behind_filter, with_quicker_filter
 from smp_motor_ident.estimation.profile import RISE, one_level, rubbing
 from smp_motor_ident.estimation.selection import (
     POLICY,
@@ -42,6 +42,7 @@ def varied(
     best = with_low_pass(data, best, options, candidates, say)
     best = with_digital_filter(data, best, options, candidates, say)
     best = with_late_speed(data, best, options, candidates, say)
+    best = without_current_lag(data, best, options, candidates, say)
     data = data.measured_as(best.kind)
     if slowly_filtered(best):
         best = with_quicker_filter(data, best, options, candidates)
@@ -184,8 +185,11 @@ def may_rub(data: Experiments, fit: Fit, options: Options) -> bool:
         if few.size < data.size:
             there = descent.refine(few, fit.structure, fit, fit.z, options)
             if _lost_by_rubbing(few, there, options) > POLICY.hopeless:
-                return False
-    return _lost_by_rubbing(data, fit, options) < RISE
+                break
+    else:
+        if _lost_by_rubbing(data, fit, options) < RISE:
+            return True
+    return rubs_behind_filter(data, fit, options)
 
 
 def _lost_by_rubbing(data: Experiments, fit: Fit, options: Options) -> float:
