@@ -132,6 +132,16 @@ def test_a_motor_is_found_behind_a_filter_that_is_slower_than_it(current):
         assert q.std < 0.1 * truth[name]
 
 
+def test_a_filter_that_is_slower_than_the_motor_does_not_hide_its_friction():
+    """Of a sine it leaves next to none of what friction makes, and a linear motor asks for none."""
+    lag = 60 * STEP
+    found = estimate(replace(filtered(lag, 0.3, noise=0.1, kind="sine"), current=None))
+    truth = motors.truth("rear_left", 0.3) | {"sensor_lag": lag}
+    for name in ("sensor_lag", "dc_gain", "time_constant", "static_voltage"):
+        q = found.combinations[name]
+        assert abs(q.value - truth[name]) < 4 * q.std < 0.15 * truth[name], name
+
+
 def test_a_low_pass_that_is_known_is_taken_as_given():
     lag = 2 * STEP
     record = replace(filtered(lag, 0.3, noise=0.1), current=None)

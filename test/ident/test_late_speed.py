@@ -1,0 +1,80 @@
+"""A speed that comes late where the current does not: predicted exactly, and found."""
+
+from dataclasses import replace
+
+import independent
+import motors
+import numpy as np
+import pytest
+
+from smp_motor_ident.estimate import estimate
+from smp_motor_ident.likelihood.experiments import prepare
+from smp_motor_ident.likelihood.noise import NoiseModel
+from smp_motor_ident.likelihood.passes import gather
+from smp_motor_ident.model.physical import from_physical
+from smp_motor_ident.model.structures import Electromechanical
+from smp_motor_ident.record import Record
+from smp_motor_ident.tune import motors as tuned
+
+STEP = 5e-3
+FINE = 50
+WHEEL = "rear_left"
+
+
+def late(lag: float, noise: float = 0.0, seconds: float = 10.0) -> Record:
+    """Return a record of a motor of Table 1 whose speed, alone, is the one that was."""
+    n = int(seconds / STEP)
+    voltage = independent.excitation(np.arange(n) * STEP, "fourier", 10.0)
+    held = np.concatenate([[voltage[0]], np.repeat(voltage[1:], FINE)])  # a row's ran before it
+    t = np.arange(held.size) * STEP / FINE
+    r, el, k, j, b = independent.TABLE_1[WHEEL]
+    out = independent.simulate(t, held, r, el, k, j, b, 0.3 * k / r, np.zeros(t.size), 4)
+    rng = np.random.default_rng(3)
+    speed = np.interp(t[::FINE] - lag, t, out[:, 1]) + noise * rng.standard_normal(n)
+    amps = out[::FINE, 0] + 0.01 * rng.standard_normal(n)
+    return Record("motor", t[::FINE], voltage, amps, speed, source="bag")
+
+
+@pytest.mark.parametrize("lag", [0.1 * STEP, STEP, 7.3 * STEP])
+def test_prediction_is_the_speed_that_was(lag):
+    record = late(lag)
+    p = independent.TABLE_1[WHEEL]
+    structure = Electromechanical(window=True, late=True)
+    data = prepare([record], True).measured_as(structure.speed)
+    data = replace(data, initial=np.zeros((1, 5)))
+    z = structure.complete(from_physical(*p, 0.3 * p[2] / p[0])).with_(window=2 * lag)
+    out = np.zeros((data.size, 3))
+    gather(data, structure, z, data.initial, NoiseModel(), out, differentiate=False)
+    # Where friction bends the speed between two samples, a parabola is off by that much.
+    assert np.abs(out[:, 1] - record.velocity).max() < 2e-3 * np.ptp(record.velocity)
+    assert np.median(np.abs(out[:, 1] - record.velocity)) < 2e-5 * np.ptp(record.velocity)
+
+
+@pytest.mark.parametrize("lag", [0.1 * STEP, 1.3 * STEP, 7.3 * STEP])  # between its bends
+def test_gradient_is_that_of_finite_differences(lag):
+    structure = Electromechanical(friction="none", window=True, late=True)
+    data = prepare([late(STEP, 1.0, 3.0)], True).measured_as(structure.speed)
+    z = structure.complete(from_physical(*independent.TABLE_1[WHEEL])).with_(window=2 * lag)
+    matrix = structure.matrix
+    gradient = gather(data, structure, z, data.initial).gradient[0]
+    for j in range(matrix.shape[1]):
+        step = 1e-6 * (lag if structure.free[j] == "window" else 1.0)
+        up, down = (
+            gather(data, structure, z.moved(way * step * matrix[:, j]), data.initial).cost[0]
+            for way in (1, -1)
+        )
+        scale = np.abs(gradient[j])
+        assert gradient[j] == pytest.approx(-0.5 * (up - down) / (2 * step), abs=1e-4 * scale)
+
+
+@pytest.mark.parametrize("lag", [0.6 * STEP, 2 * STEP, 7.3 * STEP])
+def test_a_speed_that_is_later_than_the_current_moves_no_number(lag):
+    found = estimate(late(lag, 0.1, 20.0))
+    assert [f.severity for f in found.findings if f.code == "late_speed"] == ["note"]
+    truth = motors.truth(WHEEL, 0.3) | {"delay": lag}
+    for name in ("delay", "dc_gain", "time_constant", "resistance", "inductance"):
+        q = (found.parameters | found.combinations)[name]
+        assert abs(q.value - truth[name]) < 4 * q.std < 0.02 * truth[name], name
+    assert not found.unreliable and "averaging_window" not in found.combinations
+    # Gains are of that speed.
+    assert tuned.motors_of(found).delay[0] == pytest.approx(lag, rel=0.05)
