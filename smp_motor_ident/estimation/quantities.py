@@ -3,6 +3,7 @@
 Derivation: docs/derivations.md, sections 9 and 11.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -72,10 +73,18 @@ class _Values:
 
 
 def answer(
-    fit: Fit, fixed: Mapping[str, float], friction_std: float = 0.0, level: float = 0.0
+    fit: Fit,
+    fixed: Mapping[str, float],
+    friction_std: float = 0.0,
+    level: float = 0.0,
+    one_way: bool = False,
 ) -> Answer:
-    """Turn a fit into quantities."""
+    """Turn a fit into quantities.
+
+    ``level``: the voltage [V] at which the motor was driven longest, ``one_way`` if always so.
+    """
     structure, conditional = fit.structure, fit.conditional()
+    held = one_way and structure.own_load  # of friction and loads only the sums are known
     reported = list(structure.separates())
     values = _values(fit, fixed, reported, level)
     joint = values.covariance(conditional)
@@ -94,15 +103,20 @@ def answer(
             combinations[name] = Quantity(values.value[name], unit=UNITS[name], status="fixed")
             continue
         interval = values.interval(name, conditional)
+        if held and name == "static_voltage":
+            most = fit.z.vc_plus + float(np.max(math.copysign(1.0, level) * fit.initial[:, 3]))
+            interval = 0.0, max(most, 0.0)
         if friction_std > 0 or (name == "delay" and structure.shift > 0):
             reach = NORMAL_95 * spread[name]
             interval = values.value[name] - reach, values.value[name] + reach
-        if (one_level and name in TRADED) or _hidden(name, values.value[name], spread[name], fit):
+        lost = (one_level and name in TRADED) or (held and name == "static_voltage")
+        if lost or _hidden(name, values.value[name], spread[name], fit):
             combinations[name] = Quantity(None, None, _positive(name, interval), UNITS[name],
                                           "unidentifiable")  # fmt: skip
         elif name != "steady_speed" or one_level:
             combinations[name] = _quantity(name, values.value[name], spread[name], interval)
-    parameters, loose = _parameters(fit, fixed, values, spread, combinations)
+    mixed = ("coulomb_friction",) if held else ()
+    parameters, loose = _parameters(fit, fixed, values, spread, combinations, mixed)
     keep = [
         i
         for i, n in enumerate(values.value)
@@ -174,6 +188,7 @@ def _parameters(
     values: _Values,
     spread: Mapping[str, float],
     combinations: Mapping[str, Quantity],
+    mixed: tuple[str, ...],
 ) -> tuple[dict[str, Quantity], tuple[str, ...]]:
     parameters: dict[str, Quantity] = {}
     loose = []
@@ -184,7 +199,11 @@ def _parameters(
     for name in names:
         if name in fixed:
             parameters[name] = Quantity(float(fixed[name]), unit=UNITS[name], status="fixed")
-        elif name in values.value and not _too_loose(name, values.value[name], spread[name], fit):
+        elif (
+            name in values.value
+            and name not in mixed
+            and not _too_loose(name, values.value[name], spread[name], fit)
+        ):
             interval = values.interval(name, conditional)
             parameters[name] = _quantity(name, values.value[name], spread[name], interval)
         else:

@@ -14,11 +14,11 @@ RATE, SECONDS, WINDOW, STATIC = 500, 16, 10, 0.4
 R, L, K, J, B = independent.TABLE_1["rear_left"]
 
 
-def recorded(load: np.ndarray, *, counts: bool, seed: int) -> Record:
+def recorded(load: np.ndarray, *, counts: bool, seed: int, least: float = -9.0) -> Record:
     """Return a motor under a load [of its friction], its speed a mean over ten rows, or counts."""
     rng = np.random.default_rng(seed)
     time = np.arange(RATE * SECONDS) / RATE
-    voltage = np.repeat(rng.uniform(-9.0, 9.0, 100), 83)[: time.size]
+    voltage = np.repeat(rng.uniform(least, 9.0, 100), 83)[: time.size]
     friction = STATIC * K / R
     out = independent.simulate(time, voltage, R, L, K, J, B, friction, friction * load, 40)
     if counts:
@@ -49,6 +49,19 @@ def test_a_load_that_steps_is_found_and_moves_no_number(counts: bool, at: float)
         # the simulator's own steps leave parts in a thousand
         assert abs(quantity.value - true[name]) < 4 * quantity.std + 2e-3 * true[name]
         assert quantity.std < 0.05 * true[name]
+
+
+@pytest.mark.parametrize("counts", [False, True])
+def test_of_a_motor_that_turns_one_way_the_friction_is_not_told_from_loads(counts: bool) -> None:
+    found = estimate(recorded(stepped(9.3), counts=counts, seed=5, least=3.0))
+    assert "load_step" in {f.code for f in found.findings}
+    static = found.combinations["static_voltage"]
+    assert static.value is None and static.status == "unidentifiable"
+    # It is what takes the voltage before the step, or a part of that: 0.7 of it comes then.
+    assert static.ci95[0] == 0.0 and STATIC < static.ci95[1] < 1.8 * STATIC
+    assert found.parameters["coulomb_friction"].value is None
+    gain, true = found.combinations["dc_gain"], motors.truth("rear_left", STATIC)["dc_gain"]
+    assert abs(gain.value - true) < 4 * gain.std + 2e-3 * true
 
 
 @pytest.mark.parametrize("most", [0.0, 0.7])
