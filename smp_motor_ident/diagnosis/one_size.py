@@ -1,5 +1,6 @@
 """What a voltage of one size, or steps of one, cannot show."""
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -41,13 +42,22 @@ def consider_weaker_side(data: Experiments, fit: Fit) -> Fit:
     volts = {n: fit.z.value(n) for n in ("vc_plus", "vc_minus", "load")}
     row = direction(ln_a0=1.0, ln_a1=1.0, ln_a2=1.0, ln_r=1.0, **volts)
     # Of none of it and all of it, each as likely, the root mean square.
-    return fit.along(share / np.sqrt(2.0) * fit.structure.of_free(row))
+    return fit.along(share / math.sqrt(2.0) * fit.structure.of_free(row))
 
 
 def _weaker_side(data: Experiments, fit: Fit) -> float:
-    """Return the load's share of a voltage of one size both ways, 0 where there is neither."""
-    top = 0.0 if data.one_way or "load" not in fit.structure.free else size_of_voltage(data)
-    return abs(fit.z.load) / top if top else 0.0
+    """Return the load's share of a voltage of one size both ways, 0 where there is neither.
+
+    A load that draws a current is one; what a side puts out less is an offset of the current, too.
+    """
+    free = fit.structure.free
+    if data.one_way or "load" not in free or not (top := size_of_voltage(data)):
+        return 0.0
+    volts = abs(fit.z.load)
+    if fit.structure.current:
+        offset = fit.z.current_offset if "current_offset" in free else 0.0
+        volts = min(volts, math.exp(fit.z.ln_r) * abs(offset))
+    return volts / top
 
 
 def one_size_or_swing(data: Experiments) -> float:
