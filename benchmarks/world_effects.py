@@ -298,7 +298,7 @@ EFFECTS = (
     Effect("field weakens with current", _drive("k_sag", (0.02, 0.08, 0.2)), ("saturation",)),
     Effect("wheel on the ground", _ground, ("load", "torque_noise")),
     Effect("blocked half-way", lambda c, n: c.drive.update(
-        stall_time=(0.9, 0.7, 0.4)[n] * c.samples * c.step), ("disturbed",), "refuse"),
+        stall_time=(0.9, 0.7, 0.4)[n] * c.samples * c.step), ("disturbed", "load_step"), "refuse"),
     Effect("swapped sign", _swapped, (), "refuse"),
     Effect("standing motor", _standing, (), "refuse"),
     Effect("current smoothed", _sensor("i_smooth", (0.5, 2.0, 8.0)), ("current_lag",),
