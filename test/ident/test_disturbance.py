@@ -126,9 +126,9 @@ def test_a_part_that_begins_where_the_motor_turns_back_is_no_accident(before):
 
 
 def test_a_motor_that_something_holds_half_of_the_time_is_not_mended():
-    held = [(n, n + 0.5) for n in range(20)]
+    held = [(n, n + 0.5) for n in range(8)]
     with pytest.raises(SignalError):
-        estimate(recorded(20, held=held))
+        estimate(recorded(8, held=held))
 
 
 def test_what_tells_the_motor_is_not_left_out_as_a_disturbance():
