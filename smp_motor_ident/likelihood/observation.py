@@ -27,6 +27,19 @@ def remember(ring: Array, k: int, t: float, x: Array, m: Array) -> None:
 
 
 @compiled
+def _last_before(ring: Array, k: int, oldest: int, t: float) -> int:
+    """Return which of the kept samples, up to the one before the last, is the last before t."""
+    before, after, n = oldest, k, ring.shape[0]
+    while after - before > 1:  # a window may span thousands of samples
+        middle = (before + after) // 2
+        if ring[middle % n, 0] > t:
+            after = middle
+        else:
+            before = middle
+    return before
+
+
+@compiled
 def recall(ring: Array, k: int, first: int, t: float, p: int, past: Array) -> float:
     """Put the angle at time t and its sensitivities into `past`; return the speed there."""
     n = ring.shape[0]
@@ -37,14 +50,8 @@ def recall(ring: Array, k: int, first: int, t: float, p: int, past: Array) -> fl
             past[1 + j] = a[3 + j] + (t - a[0]) * a[3 + p + j]
         past[0] = a[1] + (t - a[0]) * a[2]
         return float(a[2])
-    before, i = oldest, k
-    while i - before > 1:  # a window may span thousands of samples
-        middle = (before + i) // 2
-        if ring[middle % n, 0] > t:
-            i = middle
-        else:
-            before = middle
-    a, b = ring[before % n], ring[i % n]
+    before = _last_before(ring, k, oldest, t)
+    a, b = ring[before % n], ring[(before + 1) % n]
     h = b[0] - a[0]
     u = (t - a[0]) / h
     h00 = (1 + 2 * u) * (1 - u) * (1 - u)
@@ -69,14 +76,8 @@ def recall_speed(ring: Array, k: int, first: int, t: float, p: int, past: Array)
         for j in range(p):
             past[1 + j] = a[3 + p + j]
         return 0.0
-    before, i = oldest, k
-    while i - before > 1:
-        middle = (before + i) // 2
-        if ring[middle % n, 0] > t:
-            i = middle
-        else:
-            before = middle
-    a, b = ring[before % n], ring[i % n]
+    before = _last_before(ring, k, oldest, t)
+    a, b = ring[before % n], ring[(before + 1) % n]
     h = b[0] - a[0]
     u = (t - a[0]) / h
     mean, d0, d1 = 6 * u * (1 - u) / h, (1 - u) * (1 - 3 * u), u * (3 * u - 2)

@@ -1,16 +1,14 @@
 """A speed that comes late where the current does not: predicted exactly, and found."""
 
-from dataclasses import replace
 
 import independent
 import motors
 import numpy as np
+import passes
 import pytest
 
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.likelihood.experiments import prepare
-from smp_motor_ident.likelihood.noise import NoiseModel
-from smp_motor_ident.likelihood.passes import gather
 from smp_motor_ident.model.physical import from_physical
 from smp_motor_ident.model.structures import Electromechanical
 from smp_motor_ident.record import Record
@@ -37,17 +35,7 @@ def late(lag: float, noise: float = 0.0, seconds: float = 10.0) -> Record:
 
 @pytest.mark.parametrize("lag", [0.1 * STEP, STEP, 7.3 * STEP])
 def test_prediction_is_the_speed_that_was(lag):
-    record = late(lag)
-    p = independent.TABLE_1[WHEEL]
-    structure = Electromechanical(window=True, late=True)
-    data = prepare([record], True).measured_as(structure.speed)
-    data = replace(data, initial=np.zeros((1, 5)))
-    z = structure.complete(from_physical(*p, 0.3 * p[2] / p[0])).with_(window=2 * lag)
-    out = np.zeros((data.size, 3))
-    gather(data, structure, z, data.initial, NoiseModel(), out, differentiate=False)
-    # Where friction bends the speed between two samples, a parabola is off by that much.
-    assert np.abs(out[:, 1] - record.velocity).max() < 2e-3 * np.ptp(record.velocity)
-    assert np.median(np.abs(out[:, 1] - record.velocity)) < 2e-5 * np.ptp(record.velocity)
+    passes.assert_predicts(late(lag), Electromechanical(window=True, late=True), lag)
 
 
 @pytest.mark.parametrize("lag", [0.1 * STEP, 1.3 * STEP, 7.3 * STEP])  # between its bends
@@ -55,16 +43,7 @@ def test_gradient_is_that_of_finite_differences(lag):
     structure = Electromechanical(friction="none", window=True, late=True)
     data = prepare([late(STEP, 1.0, 3.0)], True).measured_as(structure.speed)
     z = structure.complete(from_physical(*independent.TABLE_1[WHEEL])).with_(window=2 * lag)
-    matrix = structure.matrix
-    gradient = gather(data, structure, z, data.initial).gradient[0]
-    for j in range(matrix.shape[1]):
-        step = 1e-6 * (lag if structure.free[j] == "window" else 1.0)
-        up, down = (
-            gather(data, structure, z.moved(way * step * matrix[:, j]), data.initial).cost[0]
-            for way in (1, -1)
-        )
-        scale = np.abs(gradient[j])
-        assert gradient[j] == pytest.approx(-0.5 * (up - down) / (2 * step), abs=1e-4 * scale)
+    passes.assert_gradient(data, structure, z)
 
 
 @pytest.mark.parametrize("lag", [0.6 * STEP, 2 * STEP, 7.3 * STEP])

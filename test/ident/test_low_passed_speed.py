@@ -5,6 +5,7 @@ from dataclasses import replace
 import independent
 import motors
 import numpy as np
+import passes
 import pytest
 from scipy.signal import lfilter
 
@@ -14,8 +15,6 @@ from smp_motor_ident.estimation.fit import Options
 from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.estimation.simulation import simulate
 from smp_motor_ident.likelihood.experiments import prepare
-from smp_motor_ident.likelihood.noise import NoiseModel
-from smp_motor_ident.likelihood.passes import gather
 from smp_motor_ident.model.physical import from_physical
 from smp_motor_ident.model.structures import Electromechanical, SecondOrder
 from smp_motor_ident.record import Record
@@ -57,17 +56,11 @@ def filtered(
 @pytest.mark.parametrize("ticks", [0, 1, 5])
 @pytest.mark.parametrize("lag", [0.1 * STEP, STEP, 30 * STEP])
 def test_prediction_is_that_of_a_filter_in_small_steps(lag, ticks):
-    record = filtered(lag, 0.3, ticks=ticks)
-    p = independent.TABLE_1["rear_left"]
-    structure = Electromechanical(window=True, low_pass=True, ticks=ticks)
-    data = prepare([record], True).measured_as(structure.speed)
-    data = replace(data, initial=np.zeros((1, 5)))
-    z = structure.complete(from_physical(*p, 0.3 * p[2] / p[0])).with_(window=2 * lag)
-    out = np.zeros((data.size, 3))
-    gather(data, structure, z, data.initial, NoiseModel(), out, differentiate=False)
-    # Where friction bends the speed between two samples, a parabola is off by that much.
-    assert np.abs(out[:, 1] - record.velocity).max() < 2e-3 * np.ptp(record.velocity)
-    assert np.median(np.abs(out[:, 1] - record.velocity)) < 2e-5 * np.ptp(record.velocity)
+    passes.assert_predicts(
+        filtered(lag, 0.3, ticks=ticks),
+        Electromechanical(window=True, low_pass=True, ticks=ticks),
+        lag,
+    )
 
 
 @pytest.mark.parametrize("ticks", [0, 1, 5])
@@ -77,16 +70,7 @@ def test_gradient_is_that_of_finite_differences(lag, ticks):
     structure = SecondOrder(friction="none", window=True, low_pass=True, ticks=ticks)
     data = prepare([record], False).measured_as(structure.speed)
     z = structure.complete(from_physical(*independent.TABLE_1["rear_left"])).with_(window=2 * lag)
-    matrix = structure.matrix
-    gradient = gather(data, structure, z, data.initial).gradient[0]
-    for j in range(matrix.shape[1]):
-        step = 1e-6 * (lag if structure.free[j] == "window" else 1.0)
-        up, down = (
-            gather(data, structure, z.moved(way * step * matrix[:, j]), data.initial).cost[0]
-            for way in (1, -1)
-        )
-        scale = np.abs(gradient[j])
-        assert gradient[j] == pytest.approx(-0.5 * (up - down) / (2 * step), abs=1e-4 * scale)
+    passes.assert_gradient(data, structure, z)
 
 
 @pytest.mark.parametrize(

@@ -239,18 +239,21 @@ def test_an_angle_that_is_given_as_a_speed_is_recognised():
         estimate(Record("motor", t, voltage, velocity=noisy))
 
 
-@pytest.mark.parametrize(("levels", "said"), [([8.0, -8.0], True), ([8.0, -8.0, 4.0], False)])
-def test_a_voltage_of_one_size_says_that_a_clip_would_not_show(levels, said):
-    rng = np.random.default_rng(12)
+def _behind(voltage: np.ndarray, put_out: np.ndarray, rng: np.random.Generator) -> Record:
+    """Return a record of a motor without friction whose driver puts out something else."""
     rate, keep = 200.0, np.exp(-1 / 200.0 / TRUTH["time_constant"])
-    voltage = np.repeat(rng.choice(levels, 40), 30)
-    put_out = np.clip(voltage, -7.0, 7.0)  # the driver's supply
     w = np.zeros(voltage.size)
     for k in range(1, w.size):
         w[k] = keep * w[k - 1] + (1 - keep) * TRUTH["dc_gain"] * put_out[k]
-    t = np.arange(w.size) / rate
     noisy = w + 0.3 * rng.standard_normal(w.size)
-    found = estimate(Record("motor", t, voltage, velocity=noisy))
+    return Record("motor", np.arange(w.size) / rate, voltage, velocity=noisy)
+
+
+@pytest.mark.parametrize(("levels", "said"), [([8.0, -8.0], True), ([8.0, -8.0, 4.0], False)])
+def test_a_voltage_of_one_size_says_that_a_clip_would_not_show(levels, said):
+    rng = np.random.default_rng(12)
+    voltage = np.repeat(rng.choice(levels, 40), 30)
+    found = estimate(_behind(voltage, np.clip(voltage, -7.0, 7.0), rng))  # the driver's supply
     assert ("one_size_of_voltage" in [f.code for f in found.findings]) is said
     if not said:  # with another size the clip itself shows
         clip = found.combinations["clip_voltage"]
@@ -261,15 +264,8 @@ def test_a_voltage_of_one_size_says_that_a_clip_would_not_show(levels, said):
 def test_a_side_that_is_weaker_is_no_load_alone_under_one_size(levels, covers):
     """Under one size it is a load of 0.4 V and a gain of 5 % less."""
     rng = np.random.default_rng(14)
-    rate, keep = 200.0, np.exp(-1 / 200.0 / TRUTH["time_constant"])
     voltage = np.repeat(rng.choice(levels, 80), 20)
-    put_out = np.where(voltage < 0, 0.9 * voltage, voltage)
-    w = np.zeros(voltage.size)
-    for k in range(1, w.size):
-        w[k] = keep * w[k - 1] + (1 - keep) * TRUTH["dc_gain"] * put_out[k]
-    t = np.arange(w.size) / rate
-    noisy = w + 0.3 * rng.standard_normal(w.size)
-    found = estimate(Record("motor", t, voltage, velocity=noisy))
+    found = estimate(_behind(voltage, np.where(voltage < 0, 0.9 * voltage, voltage), rng))
     gain, lag = found.combinations["dc_gain"], found.combinations["time_constant"]
     said = [f for f in found.findings if "the intervals cover both" in f.message]
     assert [f.code for f in said] == ["asymmetry"] * covers
