@@ -202,7 +202,8 @@ def left_open(
     rivals = [candidates[n].fit for n in list(weight)[1:] if weight[n] > CANDIDATE_WEIGHT.value]
     motors = [(f.structure, f.z) for f in rivals]
     last = latest(data, fit, late)
-    return tuple(_reported(*motor) for motor in (*motors, *([last] if last else [])))
+    found = [_reported(*motor) for motor in (*motors, *([last] if last else []))]
+    return tuple(one for one in found if np.isfinite(list(one.values())).all())
 
 
 def _reported(structure: Structure, z: Coordinates) -> dict[str, float]:

@@ -106,7 +106,7 @@ def answer(
         if held and name == "static_voltage":
             most = fit.z.vc_plus + float(np.max(math.copysign(1.0, level) * fit.initial[:, 3]))
             interval = 0.0, max(most, 0.0)
-        if friction_std > 0 or (name == "delay" and structure.shift > 0):
+        elif friction_std > 0 or (name == "delay" and structure.shift > 0):
             reach = NORMAL_95 * spread[name]
             interval = values.value[name] - reach, values.value[name] + reach
         lost = (one_level and name in TRADED) or (held and name == "static_voltage")

@@ -142,6 +142,8 @@ def test_a_delay_that_the_choice_does_not_have_is_left_open_as_far_as_the_score_
     # What is rejected is none, what explains the data as well is one, after its structure.
     both = left_open(data, fit, {0: 0.6, 1: 0.4}, [FittedCandidate(fit), FittedCandidate(known)])
     assert [one.get("delay") for one in both] == [0.0025, latest["delay"]]
+    lost = replace(fit, z=fit.z.with_(ln_a1=800.0))  # of a time constant that is no number
+    assert left_open(data, fit, {0: 0.6, 1: 0.4}, [*candidates, FittedCandidate(lost)]) == (latest,)
     rejected = left_open(data, fit, {0: 0.99, 1: 0.01}, [*candidates, FittedCandidate(known)])
     assert rejected == (latest,)
 

@@ -1,6 +1,5 @@
 """A speed that comes late where the current does not: predicted exactly, and found."""
 
-
 import independent
 import motors
 import numpy as np
