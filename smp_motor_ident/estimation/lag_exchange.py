@@ -12,6 +12,7 @@ from smp_motor_ident.diagnosis.limits import RELEVANT_BIAS
 from smp_motor_ident.estimation.candidate_starts import of_kind
 from smp_motor_ident.estimation.descent import refine, screening_subset
 from smp_motor_ident.estimation.fit import Fit, Options
+from smp_motor_ident.estimation.initialisation import beginning
 from smp_motor_ident.estimation.prediction import positive_part
 from smp_motor_ident.estimation.profile import RISE
 from smp_motor_ident.estimation.selection import POLICY, FittedCandidate, sandwich_factor
@@ -20,7 +21,8 @@ from smp_motor_ident.model.coordinates import LOGARITHMS, Coordinates, lag_share
 from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.model.structures import FirstOrder
 
-RUBS = 0.03  # of the largest voltage: the friction at which a descent begins
+# Of the largest voltage: the friction at which a descent begins, and one that is as good as none
+RUBS, HARDLY = 0.03, 0.002
 _LOGARITHMS = [place(n) for n in LOGARITHMS]
 
 
@@ -65,20 +67,27 @@ def rubs_behind_filter(data: Experiments, fit: Fit, options: Options) -> bool:
         return False
     if quick < RELEVANT_BIAS.value * slow or slow > np.ptp(data.time):
         return False
-    part = of_kind(screening_subset(data), fit)
-    known = refine(part, s, fit, fit.z, options)
     rubs, starts = s.with_(friction="symmetric"), list(exchanged(fit.z, s.order))
     if not s.low_pass:
         rubs = FirstOrder.like(rubs).with_(window=True, low_pass=True)
         either = (quick, slow), (slow, quick)
         starts = [fit.z.with_(ln_a1=fit.z.ln_a0 + math.log(m), window=2 * f) for m, f in either]
-    some = RUBS * float(np.abs(data.hold_value).max())
-    for z in starts:
-        there, begun = part.measured_as(rubs.speed), rubs.complete(z.with_friction(some))
-        other = refine(there, rubs, known, begun, options, known=known)
-        if other.deviance < known.deviance + RISE * sandwich_factor(known):
-            return True
-    return False
+    top = float(np.abs(data.hold_value).max())
+    part = of_kind(screening_subset(data), fit)
+    for few in (of_kind(beginning(part), fit), part):
+        known = refine(few, s, fit, fit.z, options)
+        left = []
+        for z in starts:
+            there, begun = few.measured_as(rubs.speed), rubs.complete(z.with_friction(RUBS * top))
+            other = refine(there, rubs, known, begun, options, known=known)
+            ahead = (known.deviance - other.deviance) / sandwich_factor(known)
+            if ahead > RISE or (
+                ahead > -(RISE if few is part else POLICY.hopeless)
+                and other.z.vc_plus > HARDLY * top
+            ):
+                left.append(z)
+        starts = left
+    return bool(starts)
 
 
 def _exchanged_fits(data: Experiments, fit: Fit, options: Options) -> Iterator[Fit]:
