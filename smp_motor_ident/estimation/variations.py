@@ -180,16 +180,18 @@ def may_rub(data: Experiments, fit: Fit, options: Options) -> bool:
     """
     if one_level(data, fit) or friction_shows(data, fit, True):
         return True
+    return _rubs_as_well(data, fit, options) or rubs_behind_filter(data, fit, options)
+
+
+def _rubs_as_well(data: Experiments, fit: Fit, options: Options) -> bool:
+    """Tell whether a friction that is just not little explains the data as well; a part first."""
     subset = of_kind(descent.screening_subset(data), fit)
     for few in (beginning(subset), subset):
         if few.size < data.size:
             there = descent.refine(few, fit.structure, fit, fit.z, options)
             if _lost_by_rubbing(few, there, options) > POLICY.hopeless:
-                break
-    else:
-        if _lost_by_rubbing(data, fit, options) < RISE:
-            return True
-    return rubs_behind_filter(data, fit, options)
+                return False
+    return _lost_by_rubbing(data, fit, options) < RISE
 
 
 def _lost_by_rubbing(data: Experiments, fit: Fit, options: Options) -> float:
