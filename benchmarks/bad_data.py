@@ -16,7 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from known_motors import TABLE_1, independent, table
+from known_motors import EXACT, TABLE_1, independent, table
 
 from smp_motor_ident.errors import SmpError
 from smp_motor_ident.estimate import estimate
@@ -92,7 +92,7 @@ def sound(
     counted = signals.startswith("counts")
     made = Record(
         "motor", t - t[0], v, current, velocity, position, count if counted else None,
-        hardware=Hardware(30.0, turn if counted else None, 0, supply, None),
+        hardware=Hardware(30.0, turn if counted else None, 0, supply, None, *EXACT),
         source=f"record {seed}",
     )  # fmt: skip
     z = from_physical(r, el, k, j, b, static * k / r)

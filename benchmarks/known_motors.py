@@ -21,6 +21,7 @@ from smp_motor_ident.record import Hardware, Record  # noqa: E402
 
 QUANTUM = 2 * np.pi / 500
 CURRENT_NOISE = 0.01
+EXACT = 0.0, 0.0  # accuracy of current and voltage: what the tables are about is scatter
 TABLE_1 = independent.TABLE_1
 
 
@@ -76,7 +77,7 @@ def recording(
     out = independent.simulate(t, v, r, el, k, j, b, static_voltage * k / r, load, steps)
     count = np.floor(out[:, 2] / QUANTUM + rng.uniform()).astype(np.int64)
     amps = out[:, 0] + CURRENT_NOISE * rng.standard_normal(t.size) if current else None
-    hardware = Hardware(1.0, 500.0 if counts else None, 0, amplitude, None)
+    hardware = Hardware(1.0, 500.0 if counts else None, 0, amplitude, None, *EXACT)
     made = Record(
         "motor",
         t,

@@ -89,7 +89,7 @@ def record(wheel, wave, current):
         voltage=voltage,
         current=states[:, 0] + noise if current else None,
         count=np.floor(states[:, 2] * 500 / (2 * np.pi)).astype(np.int64),
-        hardware=Hardware(RATIO, 500.0, 0, SUPPLY, R),
+        hardware=Hardware(RATIO, 500.0, 0, SUPPLY, R, 0.0, 0.0),
         source="simulated",
     )
 

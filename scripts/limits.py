@@ -5,8 +5,13 @@ from __future__ import annotations
 import sys
 
 from smp_motor_ident.bag import limits as recordings
+from smp_motor_ident.diagnosis import (
+    instrument_limits,
+    response_limits,
+    sample_limits,
+    wheel_limits,
+)
 from smp_motor_ident.diagnosis import limits as estimates
-from smp_motor_ident.diagnosis import response_limits, sample_limits, wheel_limits
 from smp_motor_ident.report import limits as fleets
 from smp_motor_ident.tune import limits as gains
 
@@ -15,6 +20,7 @@ TABLES = {
     "Samples": sample_limits,
     "Estimates": estimates,
     "Response over frequency": response_limits,
+    "Instruments": instrument_limits,
     "Wheels on blocks": wheel_limits,
     "Gains and loops": gains,
     "Many robots": fleets,

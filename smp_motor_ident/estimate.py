@@ -34,6 +34,7 @@ from smp_motor_ident.diagnosis.scope import (
     current_left_out,
     scope,
 )
+from smp_motor_ident.diagnosis.systematic import with_systematic
 from smp_motor_ident.diagnosis.units import implausible_motor
 from smp_motor_ident.errors import (
     CurrentError,
@@ -120,10 +121,16 @@ def estimate(
     docs/derivations.md; Ljung, System Identification, 2nd ed., sections 7.4 and 9.
     """
     group = [records] if isinstance(records, Record) else list(records)
+    rigid = "second_order" if model == flexible_shaft.NAME else model
+    request = checked(group, rigid, fixed, bounds, loss, validation, progress)
+    found = _as_recorded(group, request)
     if model == flexible_shaft.NAME:
-        rigid = estimate(group, "second_order", fixed=fixed, loss=loss, progress=progress)
-        return flexible_shaft.flexible_shaft(group, rigid)
-    request = checked(group, model, fixed, bounds, loss, validation, progress)
+        found = flexible_shaft.flexible_shaft(group, found)
+    return with_systematic(found)
+
+
+def _as_recorded(group: list[Record], request: Request) -> Estimate:
+    """Estimate with the uncertainty that the records themselves show."""
     group = repaired(group)
 
     def behind(records: list[Record], kept: Sequence[Record] | None) -> Estimate:

@@ -18,7 +18,8 @@ from smp_motor_ident.errors import SignalError
 from smp_motor_ident.finding import Finding
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
-"""A number of a file that must be so; what programs make is not checked."""
+NotNegative = Annotated[float, msgspec.Meta(ge=0)]
+"""Numbers of a file that must be so; what programs make is not checked."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,10 @@ class Hardware:
         [V].
     resistance : float or None
         Armature resistance [ohm] as measured with an ohmmeter.
+    current_accuracy : float or None
+        Relative standard deviation of the scale of the current's sensor.
+    voltage_accuracy : float or None
+        Relative standard deviation of the recorded voltage against that at the terminals.
     """
 
     gear_ratio: Positive = 1.0
@@ -44,6 +49,8 @@ class Hardware:
     encoder_bits: Annotated[int, msgspec.Meta(ge=0, le=64)] = 0
     supply_voltage: Positive | None = None
     resistance: Positive | None = None
+    current_accuracy: NotNegative | None = None
+    voltage_accuracy: NotNegative | None = None
 
 
 @dataclass(frozen=True, eq=False)

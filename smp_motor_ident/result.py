@@ -6,20 +6,19 @@ Plain data, written to and read from ``identification.json`` without loss.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
 
 from smp_motor_control.arrays import Array
 from smp_motor_ident.finding import Finding, gravest
-from smp_motor_ident.record import Hardware
+from smp_motor_ident.record import Hardware, NotNegative
 
 Status = Literal["estimated", "fixed", "unidentifiable"]
-NotNegative = Annotated[float, msgspec.Meta(ge=0)]
-"""A number of a file, where it must be so."""
 
 UNITS: Mapping[str, str] = {
     "resistance": "ohm",
@@ -133,6 +132,28 @@ class ResidualTests:
 
 
 @dataclass(frozen=True)
+class Systematic:
+    """An error that no record shows, and that is the same in all of them.
+
+    Attributes
+    ----------
+    cause : str
+        Code of the finding that says so, such as ``current_scale``.
+    share : float
+        Its standard deviation, relative.
+    moves : mapping of str to float
+        By how much that moves each number, in its own unit.
+    one_sided : bool
+        Whether it moves the numbers this way only.
+    """
+
+    cause: str
+    share: float
+    moves: Mapping[str, float]
+    one_sided: bool = False
+
+
+@dataclass(frozen=True)
 class Estimate:
     """The answer for one motor; keys and meanings of ``identification.json``.
 
@@ -162,6 +183,8 @@ class Estimate:
     alternatives : tuple of mapping of str to float
         Motors of other structures, and with other delays, that the data do not exclude: the
         combinations of each, without those that it does not have.
+    systematic : tuple of Systematic
+        What ``std``, ``ci95`` and ``covariance`` hold beside the scatter of the records.
     """
 
     wheel: str
@@ -184,6 +207,7 @@ class Estimate:
     sources: tuple[str, ...] = ()
     hardware: Hardware = Hardware()
     alternatives: tuple[Mapping[str, float], ...] = ()
+    systematic: tuple[Systematic, ...] = ()
 
     @property
     def unidentifiable(self) -> tuple[str, ...]:
@@ -227,6 +251,27 @@ class Estimate:
         """
         quantity = self.combinations.get(name) or self.parameters.get(name)
         return default if quantity is None or quantity.value is None else quantity.value
+
+    def random_std(self, name: str) -> float:
+        """Return the standard deviation of a number by the scatter of the records alone.
+
+        Records of the same instruments and voltages differ by that much.
+
+        Parameters
+        ----------
+        name : str
+            Such as ``resistance``.
+
+        Returns
+        -------
+        float
+            In the unit of ``UNITS[name]``; 0 where the estimate states none.
+        """
+        quantity = self.combinations.get(name) or self.parameters.get(name)
+        if quantity is None or quantity.std is None:
+            return 0.0
+        common = sum(one.moves.get(name, 0.0) ** 2 for one in self.systematic)
+        return math.sqrt(max(quantity.std**2 - common, 0.0))
 
     def evidence(self, code: str, name: str) -> float:
         """Return the largest number of that name in the findings of a code, 0 where there is none.
@@ -303,9 +348,9 @@ class Estimate:
 
 _WRITTEN = (
     "model", "parameters", "identifiable", "unidentifiable", "combinations", "covariance",
-    "alternatives", "fit_percent", "candidates", "residuals", "findings", "warnings", "advice",
-    "samples", "duration", "sample_time", "speed_noise", "speed_step", "angle_noise",
-    "largest_voltage", "sources", "hardware",
+    "systematic", "alternatives", "fit_percent", "candidates", "residuals", "findings",
+    "warnings", "advice", "samples", "duration", "sample_time", "speed_noise", "speed_step",
+    "angle_noise", "largest_voltage", "sources", "hardware",
 )  # fmt: skip
 """What of an estimate stands in ``identification.json``."""
 

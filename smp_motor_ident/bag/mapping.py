@@ -18,7 +18,10 @@ from smp_motor_ident.bag.units import check_unit
 from smp_motor_ident.errors import BagError, ParameterError
 
 SIGNALS = ("voltage", "current", "velocity", "position", "count", "supply", "direction", "time")
-HARDWARE = ("gear_ratio", "counts_per_revolution", "encoder_bits", "supply_voltage", "resistance")
+DESCRIBED = ("gear_ratio", "counts_per_revolution", "encoder_bits", "supply_voltage", "resistance")
+"""What a ``motor_description`` tells of the hardware."""
+ACCURACIES = ("current_accuracy", "voltage_accuracy")
+HARDWARE = (*DESCRIBED, *ACCURACIES)
 _CHOICES = {
     "held": ("after", "before"),
     "clock": ("auto", "header", "log"),
@@ -184,7 +187,7 @@ def _motor(entry: Any, where: str, defaults: MotorMap | None = None) -> MotorMap
         if key in SIGNALS:
             signals[key] = _signal(key, value, place)
         elif key in HARDWARE:
-            hardware[key] = _positive(value, place, zero=key == "encoder_bits")
+            hardware[key] = _positive(value, place, zero=key in ("encoder_bits", *ACCURACIES))
         elif key in (*_SECONDS, *_SCALES):
             options[key] = _positive(value, place, zero=key in _SECONDS)
         elif key in _CHOICES:

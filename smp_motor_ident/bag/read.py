@@ -160,7 +160,7 @@ def _records(recording: Recording, asked: SignalMap, types: Types) -> list[Recor
     for topic, name in dict.fromkeys((signal.topic, signal.field) for signal in signals):
         wanted.setdefault(topic, []).append(name)
     descriptions = [c.topic for c in channels if c.type == DESCRIPTION]
-    wanted.update({topic: list(mappings.HARDWARE) for topic in descriptions})
+    wanted.update({topic: list(mappings.DESCRIBED) for topic in descriptions})
     if recording.is_table:
         add_time_columns(recording, plans, wanted)
     tables = collect(recording, wanted, types)
@@ -257,10 +257,12 @@ def _description(
 
 def described(message: Any) -> Hardware:
     """Return what a ``motor_description`` tells of the hardware."""
-    return hardware_of({name: float(getattr(message, name)) for name in mappings.HARDWARE})
+    return hardware_of({name: float(getattr(message, name)) for name in mappings.DESCRIBED})
 
 
 def hardware_of(known: Mapping[str, float]) -> Hardware:
     """Return what is known of the hardware; what no hardware can have is not known."""
-    sound: dict[str, Any] = {n: v for n, v in known.items() if math.isfinite(v) and v > 0}
+    sound: dict[str, Any] = {
+        n: v for n, v in known.items() if math.isfinite(v) and (v > 0 or n in mappings.ACCURACIES)
+    }
     return Hardware(**{**sound, "encoder_bits": int(sound.get("encoder_bits", 0))})

@@ -40,13 +40,18 @@ def estimate_table(estimate: Estimate) -> Table:
         title.append(f"fit {fit.estimation:.2f} %")
     if fit.validation is not None:
         title.append(f"held out {fit.validation:.2f} %")
-    made = table(", ".join(title), "quantity", "value", "std", "95 % interval", "unit", "status")
-    made.columns[4].justify = made.columns[5].justify = "left"
+    # Beside the whole, what other records of the same instruments and voltages scatter by.
+    apart = ["of it random"] if estimate.systematic else []
+    columns = ("quantity", "value", "std", *apart, "95 % interval", "unit", "status")
+    made = table(", ".join(title), *columns)
+    made.columns[-2].justify = made.columns[-1].justify = "left"
     for name, quantity in {**estimate.combinations, **estimate.parameters}.items():
+        random = words.spread(estimate.random_std(name)) if quantity.std else ""
         made.add_row(
             name,
             words.number(quantity.value, quantity.std),
             words.spread(quantity.std),
+            *(random for _ in apart),
             words.interval(quantity),
             quantity.unit,
             Text(words.status(quantity), style=_COLOR[quantity.status]),

@@ -62,13 +62,13 @@ def show(
         made = table(title, "", "true", "identified", "std", "error/std", "unit")
         made.columns[5].justify = "left"
         for name, true, quantity in _compared(truth[wheel], estimate):
-            std = quantity.std or 0.0
+            std = estimate.random_std(name)  # sensors of a simulated motor have no error of scale
             error = (quantity.value or 0.0) - true
             made.add_row(
                 name,
                 words.number(true),
-                words.number(quantity.value, quantity.std),
-                words.spread(quantity.std) if quantity.status == "estimated" else "given",
+                words.number(quantity.value, std),
+                words.spread(std) if quantity.status == "estimated" else "given",
                 f"{error / std:+.1f}" if std else "",
                 quantity.unit,
             )
@@ -98,7 +98,7 @@ def check_estimates(
             if name == "dc_gain":
                 gain.append((100.0 * error / true, wheel))
             if quantity.status == "estimated":
-                deviations = error / (quantity.std or 1e-300)
+                deviations = error / (estimates[wheel].random_std(name) or 1e-300)
                 deviation.append((deviations, f"{wheel} {name}"))
                 if not deviations <= MOST_DEVIATIONS:
                     beyond.add(wheel)

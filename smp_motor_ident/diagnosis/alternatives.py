@@ -9,6 +9,7 @@ from smp_motor_ident.diagnosis.noise_or_effect import instead_of_drag
 from smp_motor_ident.diagnosis.one_size import one_size_of_voltage, one_size_or_swing
 from smp_motor_ident.diagnosis.repair import hides_driver
 from smp_motor_ident.diagnosis.scope import blames_current
+from smp_motor_ident.diagnosis.systematic import of_one_size
 from smp_motor_ident.estimation.candidate_starts import of_kind
 from smp_motor_ident.estimation.driver_effect import (
     DriverFit,
@@ -113,5 +114,6 @@ class Alternatives:
         hollow = emptied & codes  # little is left of what was recorded
         fails = any(f.severity == "unreliable" and not blames_current(f) for f in e.findings)
         fails = fails or (leaves_torque_noise(e, fit) and not beside) or explains_no_more(e, fit)
-        said = *e.findings, *(f for f in one_size_of_voltage(one_size) if f.code not in codes)
+        hides = one_size_of_voltage(one_size, of_one_size(group[0].hardware))
+        said = *e.findings, *(f for f in hides if f.code not in codes)
         return (None if fails or hollow else through(replace(e, findings=said), driver)), driver

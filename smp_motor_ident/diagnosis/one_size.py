@@ -15,9 +15,10 @@ FEWEST_SWINGS = 6  # of which it can be said that they are alike
 OFTEN = 0.2  # of the rows: a command that changes in more of them makes no steps
 
 
-def one_size(data: Experiments, fit: Fit) -> Iterator[Finding]:
+def one_size(data: Experiments, fit: Fit, accuracy: float) -> Iterator[Finding]:
     """Yield what is to be said of a voltage, or of steps, of one size."""
-    yield from one_size_of_voltage(one_size_or_swing(data)) or _one_size_of_step(_one_step(data))
+    said = one_size_of_voltage(one_size_or_swing(data), accuracy)
+    yield from said or _one_size_of_step(_one_step(data))
     share = _weaker_side(data, fit)
     if share > 0:
         yield Finding(
@@ -125,8 +126,10 @@ def _one_size_of_step(size: float) -> list[Finding]:
     ]
 
 
-def one_size_of_voltage(top: float) -> list[Finding]:
+def one_size_of_voltage(top: float, accuracy: float) -> list[Finding]:
     """Say what a voltage of one size both ways, or of one swing, cannot show.
+
+    ``accuracy``: how well gain and lag are known at other voltages, relative.
 
     With a size U a driver that takes a share of it (a dead zone, a drop, a clip, pulses) is the
     motor of another gain under U: no residual tells the two apart, and next to none a drag by
@@ -142,8 +145,9 @@ def one_size_of_voltage(top: float) -> list[Finding]:
             f"the voltage has one size, {top:.3g} V: a driver that puts out less of it (a dead "
             "zone, a drop, a clip at the supply, coasting between its pulses) or lets it rise "
             "slowly, and a drag by the square of the speed, look like a motor of another gain or "
-            "lag; the numbers hold for the voltage as it was recorded",
+            f"lag, each of which is taken as known to {accuracy:.2g}",
             {"voltage": top},
-            "record the voltage at the motor's terminals, or add levels of other sizes",
+            "add levels of other sizes, or record the voltage at the motor's terminals and state "
+            "its accuracy (`voltage_accuracy`)",
         )
     ]

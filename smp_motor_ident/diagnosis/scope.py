@@ -15,6 +15,7 @@ from smp_motor_ident.diagnosis.limits import (
 )
 from smp_motor_ident.diagnosis.one_size import one_size, size_of_voltage
 from smp_motor_ident.diagnosis.sample_limits import FRICTION_MOST
+from smp_motor_ident.diagnosis.systematic import BY_CURRENT, of_current, of_one_size
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.prediction import voltage_at_samples
 from smp_motor_ident.estimation.quantities import Answer
@@ -23,7 +24,7 @@ from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.coordinates import LOGARITHMS, STANDS_FOR
 from smp_motor_ident.model.measurement import ANGLE
-from smp_motor_ident.record import Record
+from smp_motor_ident.record import Hardware, Record
 from smp_motor_ident.result import Estimate
 
 
@@ -36,7 +37,7 @@ def scope(
     fit: Fit,
 ) -> Iterator[Finding]:
     """Yield what a reader must know of the values' meaning."""
-    yield from one_size(data, fit)
+    yield from one_size(data, fit, of_one_size(group[0].hardware))
     if not result.level:
         yield from _one_direction(data, result)
     if alike:
@@ -44,7 +45,7 @@ def scope(
     if result.level:
         yield _one_level(result, _turns_at_others(data, abs(result.level)))
     yield from _friction_dominates(result, float(np.abs(data.voltage).max()))
-    yield from _current_scale(result, group[0].hardware.resistance, size_of_voltage(data) > 0)
+    yield from _current_scale(result, group[0].hardware, size_of_voltage(data) > 0)
     if change.std:
         yield _motor_changes(change, group, float(np.abs(data.voltage).max()))
 
@@ -130,7 +131,7 @@ def _one_direction(data: Experiments, result: Answer) -> Iterator[Finding]:
         "one_direction",
         "warning",
         "the motor was driven one way only: static_voltage is friction and a constant load "
-        "together, and the other way may have its own",
+        "together, of which its interval leaves open how much is which",
         {"voltage": float(data.hold_value[np.argmax(np.abs(data.hold_value))])},
         "drive both directions",
     )
@@ -159,24 +160,29 @@ def _driving_load(data: Experiments, result: Answer) -> Iterator[Finding]:
     )
 
 
-OF_SCALE = ("resistance", "inductance", "inertia", "viscous_friction", "coulomb_friction")
-"""``v = R i + L di/dt + K w`` and ``J dw/dt = K i - ...``: with a current that is s times too
-large the same motion and voltage are those of R/s, L/s, s J, s b and s Tc, and of the same K."""
-
-
-def _current_scale(result: Answer, ohmmeter: float | None, one_size: bool) -> Iterator[Finding]:
+def _current_scale(result: Answer, hardware: Hardware, one_size: bool) -> Iterator[Finding]:
     """Say what only the current's own scale determines, held against an ohmmeter if there is one.
 
     No record of voltage, current and motion shows that scale; under a voltage of one size the
     supply's current, ``i |v| / supply``, is another scale and no more.
     """
-    known = {n: q for n in OF_SCALE if (q := result.parameters[n]).status == "estimated"}
+    known = {
+        n: q for n in BY_CURRENT
+        if (q := result.parameters.get(n)) is not None and q.status == "estimated"
+    }  # fmt: skip
     if not known:
         return
-    words = f"the scale of the current's sensor, which no record shows, is in {', '.join(known)}"
+    ohmmeter = hardware.resistance
+    words = (
+        f"the scale of the current's sensor, which no record shows, is in {', '.join(known)}, "
+        f"whose intervals take it as known to {of_current(hardware):.2g}"
+    )
     found = known.get("resistance")
     if found is None or found.value is None or not ohmmeter:
-        advice = "state the resistance by ohmmeter (`resistance`), which shows the scale"
+        advice = (
+            "state the sensor's accuracy (`current_accuracy`), or the resistance by ohmmeter "
+            "(`resistance`), which shows the scale"
+        )
         evidence: dict[str, float | str | None] = {"of_the_scale": ", ".join(known)}
         if one_size:
             words += (

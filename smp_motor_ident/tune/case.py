@@ -23,7 +23,6 @@ from smp_motor_ident.tune.motors import (
     lag_in_sensor,
     lag_of_sensor,
     motors_of,
-    one_size_of_voltage,
     outliers_of,
     scatter_of,
     torque_noise_of,
@@ -90,7 +89,7 @@ def prepare(estimate: Estimate, loop: Loop, method: str, targets: dict[str, Any]
     loop = _behind(driver, loop)
     friction = friction_of(estimate, loop.supply_voltage)
     lag = lag_of_sensor(estimate) if loop.reports_speed else None
-    level = one_size_of_voltage(estimate)
+    level = next((f for f in estimate.findings if f.code == "one_size_of_voltage"), None)
     findings += [one for one in (friction.finding, lag, level) if one is not None]
     # The reference leaves room for all of it.
     load = abs(estimate.value("load_voltage"))

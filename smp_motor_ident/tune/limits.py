@@ -27,13 +27,6 @@ UNRELIABLE_SPREAD = Limit(
     "data leaves more of the motion unexplained",
     "test_tune_truth.py",
 )
-ONE_SIZE_SPREAD = Limit(
-    0.1,
-    "relative standard deviation",
-    "of gain and lag at voltages that were not recorded: a bipolar bridge drops some 2 V of 12, "
-    "so that the gain at half the voltage is less by about as much",
-    "test_tune_truth.py",
-)
 STATED_GAIN_MARGIN = Limit(
     10.0,
     "times the gain",

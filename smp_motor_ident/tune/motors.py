@@ -13,7 +13,6 @@ from smp_motor_ident.result import Estimate, Quantity
 from smp_motor_ident.tune.limits import (
     FRICTION_KNOWN,
     FRICTION_RANGE,
-    ONE_SIZE_SPREAD,
     UNRELIABLE_SPREAD,
 )
 from smp_motor_ident.tune.loop import Loop
@@ -125,10 +124,9 @@ def draw_motors(
     """Draw motors from the distribution of the estimation error.
 
     What is positive by nature is drawn log-normally, what may be zero normally from there up.
-    An unreliable estimate is drawn at least as wide as what it leaves unexplained, gain and lag
-    from one size of voltage as wide as they may be at others.  A second lag that the record hides
-    is anything up to the first that it leaves open, and the motor anything between the stated one
-    and each of the alternatives that it leaves open, of which it may be any.
+    An unreliable estimate is drawn at least as wide as what it leaves unexplained.  A second lag
+    that the record hides is anything up to the first that it leaves open, and the motor anything
+    between the stated one and each of the alternatives that it leaves open, of which it may be any.
     """
     names = _names(estimate)
     mean = np.array([estimate.value(name) for name in names])
@@ -188,21 +186,6 @@ def _hidden_lag(estimate: Estimate) -> tuple[float, float] | None:
         return None
     low, high = product.ci95
     return low, max(low, min(high, 0.25 * estimate.value("time_constant") ** 2))
-
-
-def one_size_of_voltage(estimate: Estimate) -> Finding | None:
-    """Return what is to be said where the motor was recorded at one size of voltage alone."""
-    found = next((f for f in estimate.findings if f.code == "one_size_of_voltage"), None)
-    if found is None:
-        return None
-    return Finding(
-        found.code,
-        "warning",
-        "the motor was recorded at one size of voltage: at others its gain and its lag are taken "
-        f"as known to {ONE_SIZE_SPREAD.value:.0%}",
-        {"spread": ONE_SIZE_SPREAD.value},
-        found.advice,
-    )
 
 
 def lag_of_sensor(estimate: Estimate) -> Finding | None:
@@ -290,8 +273,6 @@ def _covariance(estimate: Estimate, names: tuple[str, ...], mean: Array) -> Arra
     index = [estimate.names.index(names[k]) for k in known]
     covariance[np.ix_(known, known)] = estimate.covariance[np.ix_(index, index)]
     spread = np.zeros(len(names))
-    if one_size_of_voltage(estimate) is not None:
-        spread[:] = [ONE_SIZE_SPREAD.value * (n in ("dc_gain", "time_constant")) for n in names]
     if estimate.unreliable:
         spread[:] = unreliable_spread(estimate)
     covariance += np.diag((spread * mean) ** 2)

@@ -11,6 +11,7 @@ import pytest
 from drives import LOOP, TRUE, change, estimate, overshoot
 
 from smp_motor_ident.cli.tune import main as tune
+from smp_motor_ident.diagnosis.systematic import with_systematic
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.report.document import identification_document
@@ -78,7 +79,9 @@ def test_changes_are_no_faster_than_the_driver():
 def test_gains_from_one_size_of_voltage_hold_at_others():
     """A driver that is clipped where it was recorded has a fifth more gain at half the speed."""
     level = Finding("one_size_of_voltage", "warning", "the voltage has one size, 12 V")
-    aware, ignorant = design(estimate(findings=[level]), LOOP), design(estimate(), LOOP)
+    hardware = replace(estimate().hardware, voltage_accuracy=0.1)
+    stated = with_systematic(replace(estimate(findings=[level]), hardware=hardware))
+    aware, ignorant = design(stated, LOOP), design(estimate(), LOOP)
     more = {**TRUE, "dc_gain": 1.2 * TRUE["dc_gain"]}
     assert overshoot(ignorant, more) > ignorant.specification.overshoot.high + 2.0
     assert overshoot(aware, more) <= aware.specification.overshoot.high + 0.25

@@ -1,0 +1,21 @@
+"""What is taken of instruments and drivers whose accuracy nobody states.
+
+Printed with the others in ``docs/limits.md``.
+"""
+
+from smp_motor_ident.diagnosis.limits import Limit
+
+CURRENT_ACCURACY = Limit(
+    0.03,
+    "of the current's scale, a standard deviation",
+    "physical: a Hall sensor's sensitivity is sold to 4 % (ACS712, 96 to 104 mV/A) and follows a "
+    "supply of 5 V that is known to as much: 5 % either way, uniformly",
+    "test_systematic.py: the scale of a current is in the interval",
+)
+ONE_SIZE_ACCURACY = Limit(
+    0.1,
+    "of gain and lag, a standard deviation",
+    "physical: a bipolar bridge drops some 2 V of 12, so that the gain at half the voltage is less "
+    "by about as much; of one size of voltage nothing shows it",
+    "test_systematic.py: what one size of voltage hides is in the interval",
+)

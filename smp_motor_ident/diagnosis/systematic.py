@@ -1,0 +1,115 @@
+"""What no record shows, in the numbers that are stated: Type B uncertainty.
+
+JCGM 100:2008 (GUM), section 4.3.  An error that is a symmetry of the motor's equations leaves no
+residual: it moves numbers and is seen in none of them.
+"""
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from smp_motor_ident.diagnosis.instrument_limits import CURRENT_ACCURACY, ONE_SIZE_ACCURACY
+from smp_motor_ident.estimation.fitted import NORMAL_95
+from smp_motor_ident.record import Hardware
+from smp_motor_ident.result import Estimate, Quantity, Systematic
+
+BY_CURRENT: Mapping[str, float] = {
+    "resistance": -1.0, "inductance": -1.0, "inertia": 1.0, "viscous_friction": 1.0,
+    "coulomb_friction": 1.0, "coulomb_friction_reverse": 1.0,
+}  # fmt: skip
+"""``v = R i + L di/dt + K w`` and ``J dw/dt = K i - ...``: with a current that is s times too
+large the same motion and voltage are those of R/s, L/s, s J, s b and s Tc, and of the same K."""
+BY_VOLTAGE: Mapping[str, float] = {
+    "dc_gain": -1.0, "static_voltage": 1.0, "static_voltage_reverse": 1.0, "load_voltage": 1.0,
+    "motor_constant": 1.0, "resistance": 1.0, "inductance": 1.0, "inertia": 1.0,
+    "viscous_friction": 1.0, "coulomb_friction": 1.0, "coulomb_friction_reverse": 1.0,
+}  # fmt: skip
+"""With a voltage that is s times as large the same motion and current are those of a motor with
+s K, s R, s L, s J, s b and s Tc."""
+BY_LAG: Mapping[str, float] = {
+    "time_constant": 1.0, "time_constant_product": 1.0, "inertia": 1.0,
+}  # fmt: skip
+"""What a driver that answers slowly, or through a resistance, adds to the motor's own lag."""
+BY_LOAD: Mapping[str, float] = {"static_voltage": -1.0, "coulomb_friction": -1.0}
+"""What is a constant load's, one way, is none of the friction's."""
+NOT_SIGNED = ("load_voltage", "steady_speed")
+
+
+def of_current(hardware: Hardware) -> float:
+    """Return how well the scale of a current is known, relative."""
+    stated = hardware.current_accuracy
+    return CURRENT_ACCURACY.value if stated is None else stated
+
+
+def of_one_size(hardware: Hardware) -> float:
+    """Return how well gain and lag at other voltages are known from one size of it, relative."""
+    stated = hardware.voltage_accuracy
+    return ONE_SIZE_ACCURACY.value if stated is None else stated
+
+
+def with_systematic(estimate: Estimate) -> Estimate:
+    """Return an estimate whose intervals hold what its records could not show."""
+    for one in _unseen(estimate):
+        estimate = _widened(estimate, one)
+    return estimate
+
+
+def _unseen(estimate: Estimate) -> Iterator[Systematic]:
+    """Yield the errors that the findings speak of, in the numbers that are estimated."""
+    codes = {f.code for f in estimate.findings}
+    hardware = estimate.hardware
+    resistance = estimate.parameters.get("resistance")
+    if "current_scale" in codes and resistance and resistance.status == "estimated":
+        yield _moved(estimate, "current_scale", of_current(hardware), BY_CURRENT)
+    if "one_size_of_voltage" in codes:
+        for by in (BY_VOLTAGE, BY_LAG):
+            yield _moved(estimate, "one_size_of_voltage", of_one_size(hardware), by)
+    if "one_direction" in codes:  # of none to all of it, each as likely, the root mean square
+        share = 1.0 / math.sqrt(3.0)
+        yield replace(_moved(estimate, "one_direction", share, BY_LOAD), one_sided=True)
+
+
+def _moved(estimate: Estimate, cause: str, share: float, by: Mapping[str, float]) -> Systematic:
+    known = {**estimate.parameters, **estimate.combinations}
+    moves = {
+        name: share * power * quantity.value
+        for name, power in by.items()
+        if (quantity := known.get(name)) is not None
+        and quantity.status == "estimated"
+        and quantity.value is not None
+    }
+    return Systematic(cause, share, moves)
+
+
+def _widened(estimate: Estimate, one: Systematic) -> Estimate:
+    if not any(one.moves.values()):
+        return estimate
+    row = np.array([one.moves.get(name, 0.0) for name in estimate.names])
+    groups = (
+        {n: _wider(n, q, one) if n in one.moves else q for n, q in group.items()}
+        for group in (estimate.parameters, estimate.combinations)
+    )
+    parameters, combinations = groups
+    return replace(
+        estimate,
+        parameters=parameters,
+        combinations=combinations,
+        covariance=estimate.covariance + np.outer(row, row),
+        systematic=(*estimate.systematic, one),
+    )
+
+
+def _wider(name: str, quantity: Quantity, one: Systematic) -> Quantity:
+    """Return a quantity with an error beside those that its interval holds, in quadrature."""
+    value, move = quantity.value, one.moves[name]
+    assert value is not None
+    reach = NORMAL_95 * abs(move)
+    low, high = quantity.ci95 or (value, value)
+    if move < 0 or not one.one_sided:
+        low = value - math.hypot(value - low, reach)
+    if move > 0 or not one.one_sided:
+        high = value + math.hypot(high - value, reach)
+    low = low if name in NOT_SIGNED else max(low, 0.0)
+    return replace(quantity, std=math.hypot(quantity.std or 0.0, move), ci95=(low, high))
