@@ -273,7 +273,7 @@ def _stated(
     weight = candidate_weights(data, candidates)
 
     def said(fit: Fit) -> tuple[Answer, dict[str, float]]:
-        own = answer(fit, request.known, friction_std, driven_longest(final), final.one_way)
+        own = answer(fit, request.known, friction_std, driven_longest(final), final.ways)
         return covering(weight, candidates, own, request.known)
 
     if not first:

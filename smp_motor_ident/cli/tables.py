@@ -41,7 +41,7 @@ def estimate_table(estimate: Estimate) -> Table:
     if fit.validation is not None:
         title.append(f"held out {fit.validation:.2f} %")
     # Beside the whole, what other records of the same instruments and voltages scatter by.
-    apart = ["of it random"] if estimate.systematic else []
+    apart = ["random"] if estimate.systematic else []
     columns = ("quantity", "value", "std", *apart, "95 % interval", "unit", "status")
     made = table(", ".join(title), *columns)
     made.columns[-2].justify = made.columns[-1].justify = "left"

@@ -82,10 +82,12 @@ def _late_speed(lag: float) -> Finding:
 def _filtered_speed(fit: Fit) -> Finding:
     """Say over what the speed's sensor averages, or how it low-passes."""
     window, lag = fit.z.window, 0.5 * fit.z.window
-    low, ticks = fit.structure.low_pass, fit.structure.ticks
+    low, ticks, mean = fit.structure.low_pass, fit.structure.ticks, fit.structure.mean
+    of = "differences" if mean else "samples"
+    pole = lag - 0.5 * mean
     how = (
-        f"low-passed with a time constant of {1e3 * lag:.3g} ms"
-        + (f", by {ticks} samples a row" if ticks else "")
+        f"low-passed with a time constant of {1e3 * pole:.3g} ms"
+        + (f", by {ticks} {of} a row" if ticks else "")
         if low
         else f"averaged over {1e3 * window:.3g} ms"
     )

@@ -128,8 +128,10 @@ def consider_filter(data: Experiments, fit: Fit, options: Options) -> Fit:
         late = "delay" not in s.fixed  # as is what is left of L/R beside a filter
         z = fit.z.with_(ln_a1=fit.z.ln_a1 - longer, window=2 * fit.z.second_lag)
         least = math.inf
-        for ticks in (0, 1):  # samples of the filter a row, or a continuous one
-            filtered = FirstOrder.like(s).with_(window=True, low_pass=True, delay=late, ticks=ticks)
+        rubs = FirstOrder.like(s).with_(window=True, low_pass=True, delay=late)
+        # A continuous filter, one of samples, and one of differences from row to row.
+        for ticks, mean in ((0, 0.0), (1, 0.0), (1, data.step)):
+            filtered = rubs.with_(ticks=ticks, mean=mean)
             there = data.measured_as(filtered.speed)
             other = refine(there, filtered, fit, filtered.complete(z), options)
             least = min(least, other.deviance)

@@ -6,6 +6,7 @@ Derivation: docs/derivations.md, section 10.
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 
@@ -23,6 +24,7 @@ HARDLY = 0.01  # of a sample: a window that is as good as none, for the score
 WINDOWS = (1.0, 4.0)  # samples at which a low-pass is begun
 SHARES = (0.6, 0.2)  # of a time constant that are the motor's, beside a filter's of its speed
 TICKS = (1, 2, 5, 10)  # samples that a digital low-pass takes a row
+FEW = 2  # up to which means since the one before are another filter than samples are
 WINDING = 0.05  # of a motor's time constant, as which a second lag is begun
 NEAR = 0.25  # samples from a whole delay within which its other side is tried
 BEYOND = 0.1  # samples from it on the other side, where that is begun
@@ -190,8 +192,10 @@ def with_digital_filter(
     s = best.structure
     if not (s.window and s.low_pass):
         return best
-    for ticks in TICKS:
-        structure = s.with_(ticks=ticks)
+    for ticks, means in product(TICKS, (False, True)):
+        if means and ticks > FEW:
+            continue
+        structure = s.with_(ticks=ticks, mean=data.step / ticks * means)
         say(f"trying {structure.label}")
         tried = _filtered(data, structure, best, best.z, options)
         verdict, reason = POLICY.preferred(best, tried)
@@ -214,7 +218,7 @@ def with_late_speed(
     s = best.structure
     if not s.current or "window" not in s.free or data.quantum > 0:
         return best
-    structure = s.with_(late=True, low_pass=False, ticks=0)
+    structure = s.with_(late=True, low_pass=False, ticks=0, mean=0.0)
     say(f"trying {structure.label}")
     other = _filtered(data, structure, best, best.z, options)
     verdict, reason = POLICY.preferred(best, other)

@@ -205,9 +205,12 @@ def _fixed_at(data: Experiments, near: Fit, coordinate: str, value: float, optio
     if coordinate == "vc_plus" and "ln_te" in structure.free and not structure.current:
         # Without friction L/R is any; with it, what is late in the response is the winding.
         starts.append(structure.complete(z.undamped()))
-    tried = [
-        solve(data, structure, near.at(z, i), options, 10, 0.05) for z in starts for i in initials
-    ]
+    begun = [(z, i) for z in starts for i in initials]
+    if coordinate == "vc_plus" and structure.own_load:  # which is as much less one way
+        loads = near.initial.copy()
+        loads[:, 3] -= data.ways * (value - near.z.vc_plus)
+        begun.append((structure.complete(near.z.with_friction(value)), loads))
+    tried = [solve(data, structure, near.at(z, i), options, 10, 0.05) for z, i in begun]
     return min(tried, key=lambda f: f.deviance)
 
 

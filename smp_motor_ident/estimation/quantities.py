@@ -3,7 +3,6 @@
 Derivation: docs/derivations.md, sections 9 and 11.
 """
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -24,7 +23,7 @@ from smp_motor_ident.result import UNITS, Quantity
 TRADED = ("dc_gain", "static_voltage", "static_voltage_reverse", "load_voltage")
 """Of a steady speed at one level of voltage only ``dc_gain (level - static_voltage)`` is known."""
 FILTERS = ("averaging_window", "sensor_lag")
-"""What the record or the user may give of a speed's filter."""
+"""What the record, the user or a difference of counts may give of a speed's filter."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,14 +76,14 @@ def answer(
     fixed: Mapping[str, float],
     friction_std: float = 0.0,
     level: float = 0.0,
-    one_way: bool = False,
+    ways: Array | None = None,
 ) -> Answer:
     """Turn a fit into quantities.
 
-    ``level``: the voltage [V] at which the motor was driven longest, ``one_way`` if always so.
+    ``level``: the voltage [V] at which the motor was driven longest; ``ways``: shape (g,), 1 or -1,
+    which way each segment drives it.
     """
     structure, conditional = fit.structure, fit.conditional()
-    held = one_way and structure.own_load  # of friction and loads only the sums are known
     reported = list(structure.separates())
     values = _values(fit, fixed, reported, level)
     joint = values.covariance(conditional)
@@ -94,18 +93,23 @@ def answer(
         at = list(values.value).index("delay")
         joint[at, at] += (limits.INSTANT.value * structure.shift) ** 2
     spread = dict(zip(values.value, np.sqrt(np.maximum(np.diag(joint), 0.0)), strict=True))
+    # Where each segment turns one way, of friction and its own load only the sum is known.
+    held = ways is not None and structure.own_load and "static_voltage" in spread
+    held = held and spread["static_voltage"] > limits.LOOSE_QUANTITY.value * fit.z.vc_plus
     # At the upper end of what it may be, a gain of any size seems known: the middle tells, too.
     gain = min(values.value["dc_gain"], float(np.mean(values.interval("dc_gain", conditional))))
     one_level = spread["dc_gain"] > limits.LOOSE_QUANTITY.value * gain
     combinations = {}
     for name in reported:
-        if name in FILTERS and "window" in structure.fixed:
+        of_counts = name == "averaging_window" and structure.mean > 0
+        if (name in FILTERS and "window" in structure.fixed) or of_counts:
             combinations[name] = Quantity(values.value[name], unit=UNITS[name], status="fixed")
             continue
         interval = values.interval(name, conditional)
-        if held and name == "static_voltage":
-            most = fit.z.vc_plus + float(np.max(math.copysign(1.0, level) * fit.initial[:, 3]))
-            interval = 0.0, max(most, 0.0)
+        if held and ways is not None and name == "static_voltage":
+            most = fit.z.vc_plus + float(np.max(ways * fit.initial[:, 3]))
+            share = NORMAL_95 * spread["dc_gain"] / values.value["dc_gain"]  # of the voltage
+            interval = 0.0, max(most, 0.0) + share * abs(level)
         elif friction_std > 0 or (name == "delay" and structure.shift > 0):
             reach = NORMAL_95 * spread[name]
             interval = values.value[name] - reach, values.value[name] + reach

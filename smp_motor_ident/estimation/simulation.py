@@ -51,7 +51,8 @@ def _motor(estimate: Estimate) -> Fit:
     kind = SecondOrder if second else StaticGain if instant else FirstOrder
     filtered = estimate.value("sensor_lag") > 0
     ticks = int(estimate.evidence("low_passed_speed", "samples_per_row"))
-    structure = kind("asymmetric", low_pass=filtered, ticks=ticks, fixed=fixed)
+    mean = estimate.value("averaging_window") if filtered else 0.0
+    structure = kind("asymmetric", low_pass=filtered, ticks=ticks, mean=mean, fixed=fixed)
     nothing = np.zeros((0, 0))
     return Fit(
         structure=structure,
@@ -83,7 +84,7 @@ def coordinates(estimate: Estimate) -> Coordinates:
         vc_minus=estimate.value("static_voltage_reverse", forward),
         load=estimate.value("load_voltage"),
         delay=estimate.value("delay"),
-        window=estimate.value("averaging_window") or 2 * estimate.value("sensor_lag"),
+        window=2 * estimate.value("sensor_lag") or estimate.value("averaging_window"),
     )
     if not product > 0:
         return z

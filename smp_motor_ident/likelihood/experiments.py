@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -80,16 +81,25 @@ class Experiments:
         """Whether the command drives the motor in one direction only."""
         return not self.hold_value.min() < 0 < self.hold_value.max()
 
+    @property
+    def ways(self) -> Array:
+        """Which way each segment drives the motor most, shape (g,): 1 or -1."""
+        return np.array(
+            [np.copysign(1.0, self.voltage[a:b].sum()) for a, b in pairwise(self.starts)]
+        )
+
     @cached_property
     def known_initial(self) -> Array:
         """What is known of each segment's initial state beforehand: precisions around zero.
 
         Over a winding there is no more than the largest voltage and as much of back-EMF, and in
-        a motor that stands no more than what its friction holds, shape (g, 5).
+        a motor that stands no more than what its friction holds; a load of a segment's own takes
+        no more than that voltage either.  Shape (g, 5).
         """
         known = np.zeros(self.initial.shape)
         largest = max(float(np.abs(self.voltage).max(initial=0.0)), 1e-150)
         known[:, 0] = 1 / np.square(np.where(self.stood, HELD, 2.0) * largest)
+        known[:, 3] = 1 / largest**2
         return known
 
     @property

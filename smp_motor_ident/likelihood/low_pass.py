@@ -2,7 +2,7 @@
 
 Between two samples the speed is taken for the parabola that has its values at both and the angle
 between them for its integral: the low-pass answers that exactly, as does a digital one that takes
-equally many samples of it in each interval.
+equally many samples of it in each interval, or of means over equal parts of it.
 Derivation: docs/derivations.md, section 4.
 """
 
@@ -16,12 +16,14 @@ from smp_motor_control.arrays import Array
 from smp_motor_ident._compile import compiled
 from smp_motor_ident.likelihood.sensitivities import D0, LANES, SLOPE, ST, SW
 from smp_motor_ident.model.columns import WINDOW
+from smp_motor_ident.model.measurement import MEANS
 
 # Interval [s]; weights of the output before, of the speed before and now and of the mean speed
 # between, and the derivatives of these four by the lag [1/s].
 LOW_PASS_WEIGHTS = 9
 SHORT = 0.5  # of an interval, in lags: below it the moments are summed as series
 TERMS = 9
+LEAST_POLE = 1e-3  # of an interval: a low-pass that passes each mean on as it is
 
 
 @compiled
@@ -45,22 +47,33 @@ def _moments(x: float, moment: Array, slope: Array) -> None:
 
 @compiled
 def _sampled_moments(x: float, ticks: int, moment: Array, slope: Array) -> None:
-    """Put the same of ``y += a (w - y)``, ``a = x / (x + ticks)``, at the ends of equal parts."""
+    """Put the same of ``y += a (w - y)``, ``a = x / (x + ticks)``, at the ends of equal parts.
+
+    From `MEANS` on w is the mean over each part.
+    """
+    means = ticks >= MEANS
+    ticks -= MEANS * means
     a, by_x = x / (x + ticks), ticks / (x + ticks) ** 2
     moment[:], slope[:] = 0.0, 0.0
     for left in range(ticks):
         kept = (1 - a) ** left
         weight, change = a * kept, (kept - a * left * kept / (1 - a)) * by_x
-        u = (ticks - left) / ticks
+        u, before = (ticks - left) / ticks, (ticks - left - 1) / ticks
         for n in range(3):
-            moment[n] += weight * u**n
-            slope[n] += change * u**n
+            power = ticks * (u ** (n + 1) - before ** (n + 1)) / (n + 1) if means else u**n
+            moment[n] += weight * power
+            slope[n] += change * power
 
 
 @compiled
 def weigh(h: float, lag: float, ticks: int, weights: Array) -> None:
-    """Put the weights of a step of the low-pass, and their derivatives by the lag."""
+    """Put the weights of a step of the low-pass, and their derivatives by the lag.
+
+    Of means that is the low-pass's and half of the time that each of them is over.
+    """
     moment, slope = np.empty(3), np.empty(3)
+    if ticks >= MEANS:
+        lag = max(lag - 0.5 * h / (ticks - MEANS), LEAST_POLE * h)
     x = h / lag
     if ticks:
         _sampled_moments(x, ticks, moment, slope)

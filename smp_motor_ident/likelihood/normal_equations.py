@@ -87,6 +87,7 @@ def eliminate(  # noqa: C901 - plain loops
     normal: Array,
     gradient: Array,
     away: Array,
+    near: Array,
     value: Array,
     known: Array,
     size: int,
@@ -100,8 +101,8 @@ def eliminate(  # noqa: C901 - plain loops
     """Eliminate each segment's own columns from the normal equations.
 
     They are zero to within a precision that is known of each.  A wide prior around where they
-    began keeps a motor at rest, whose speed the data do not touch, solvable; it weighs a
-    hundredth of a sample's information at most.
+    began keeps a motor at rest, whose speed the data do not touch, solvable; it weighs ``near``
+    of a sample's information at most.
     """
     f, own = score.shape[0], away.shape[1]
     total = decrease = 0.0
@@ -112,7 +113,7 @@ def eliminate(  # noqa: C901 - plain loops
     for g in range(normal.shape[0]):
         for j in range(own):
             d = f + j
-            precision = 1e-2 * max(1e-12, normal[g, d, d] / size) + 1e-9
+            precision = near[j] * max(1e-12, normal[g, d, d] / size) + 1e-9
             total += precision * away[g, j] * away[g, j] + known[g, j] * value[g, j] * value[g, j]
             gradient[g, d] -= precision * away[g, j] + known[g, j] * value[g, j]
             normal[g, d, d] += precision + known[g, j]

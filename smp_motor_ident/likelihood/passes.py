@@ -27,6 +27,9 @@ from smp_motor_ident.model.measurement import ANGLE, LATE_SPEED, MEAN_SPEED, SPE
 from smp_motor_ident.model.structures import SENSORS, Structure, sensor_of
 
 LEAST_LAG = 1e-3  # of a sample: of a sensor that shows the current as good as at once
+NEAR = np.array([1e-2, 1e-2, 1e-2, 0.0, 1e-2])
+"""Of a sample's information, by which each of (q, w, angle, load, earlier current) stays where it
+began: not a load, which friction would then be known by where both are one sum."""
 BLOCKS = 60  # runs of samples whose scores are summed, for the covariance of coloured residuals
 
 
@@ -253,8 +256,8 @@ def evaluate(
     places = list(own)
     value = initial[:, places]
     prior, decrease = eliminate(
-        sums.normal, sums.gradient, value - start[:, places], value, known[:, places], data.size,
-        common, score, step, local_gain, sums.scores, sums.owner,
+        sums.normal, sums.gradient, value - start[:, places], NEAR[places], value,
+        known[:, places], data.size, common, score, step, local_gain, sums.scores, sums.owner,
     )  # fmt: skip
     total += prior
     if not (math.isfinite(total) and all(np.isfinite(x).all() for x in (common, score, step))):

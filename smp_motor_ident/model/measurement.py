@@ -31,6 +31,13 @@ LOW_PASSED = Measurement("low-passed speed", 4)
 """A first-order low-pass of the speed that is as late as the mean over a window [rad/s]."""
 
 
-def smoothed(ticks: int) -> Measurement:
-    """Return a low-pass that takes so many samples of the speed a row; continuous for none."""
-    return Measurement(LOW_PASSED.name, LOW_PASSED.code + ticks)
+MEANS = 100
+"""Added to the samples a row of a low-pass: each is the mean since the one before."""
+
+
+def smoothed(ticks: int, means: bool = False) -> Measurement:
+    """Return a low-pass that takes so many samples of the speed a row; continuous for none.
+
+    ``means``: whether each is the mean since the one before, as a difference of counts is.
+    """
+    return Measurement(LOW_PASSED.name, LOW_PASSED.code + ticks + MEANS * means)

@@ -48,6 +48,7 @@ class Structure(ABC):
     window: bool = False
     low_pass: bool = False  # whether a low-pass of half the window's lag stands in its place
     ticks: int = 0  # samples of the speed that a digital one takes a row
+    mean: float = 0.0  # over which each of these is a mean, as a difference of counts is [s]
     late: bool = False  # whether the speed that was then, by the same lag, stands in its place
     # How the command ran: a row's value before it, after it, or interpolated from row to row
     held: str = "before"
@@ -77,7 +78,7 @@ class Structure(ABC):
             return SPEED
         if self.late:
             return LATE_SPEED
-        return smoothed(self.ticks) if self.low_pass else MEAN_SPEED
+        return smoothed(self.ticks, self.mean > 0) if self.low_pass else MEAN_SPEED
 
     @property
     def lags(self) -> bool:
@@ -175,7 +176,8 @@ class Structure(ABC):
         yield self.late, "late speed"
         yield self.window and not (self.low_pass or self.late), "averaged speed"
         yield self.window and self.low_pass and not self.ticks, "low-passed speed"
-        yield self.window and self.ticks > 0, f"speed smoothed {self.ticks} times a row"
+        of = "difference" if self.mean else "speed"
+        yield self.window and self.ticks > 0, f"{of} smoothed {self.ticks} times a row"
         yield self.held == "after", "command held after its row"
         yield self.held == "interpolated", "command interpolated"
 
@@ -190,11 +192,12 @@ class Structure(ABC):
             "static_voltage": "vc_plus",
             "static_voltage_reverse": "vc_minus",
             "load_voltage": "load",
-            "averaging_window": "window",
             "current_lag": "current_lag",
         }
         found |= {n: (z.value(c), direction(**{c: 1.0})) for n, c in reported.items()}
         late = 0.5 * self.late
+        by_window = direction(window=float(not self.mean))
+        found["averaging_window"] = self.mean or z.window, by_window
         found["delay"] = self.shift + z.delay + late * z.window, direction(delay=1.0, window=late)
         return found | {"sensor_lag": (0.5 * z.window, direction(window=0.5))}
 
@@ -220,7 +223,8 @@ class Structure(ABC):
         if self.has("delay") or self.shift > 0 or self.late:
             yield "delay"
         if self.has("window") and not self.late:
-            yield "sensor_lag" if self.low_pass else "averaging_window"
+            yield from ("sensor_lag",) * self.low_pass
+            yield from ("averaging_window",) * (not self.low_pass or self.mean > 0)
         if self.lags:
             yield "current_lag"
 

@@ -23,7 +23,7 @@ EXPLAINED: Mapping[str, tuple[str, str, str]] = {
     "static_voltage_reverse": ("v0−", "Static voltage, reverse", "turning backwards"),
     "load_voltage": ("vl", "Load voltage", "offset that a constant load or sensor makes"),
     "averaging_window": ("w", "Averaging window", "over which the sensor averages the speed"),
-    "sensor_lag": ("τs", "Sensor lag", "time constant of the speed's low-pass"),
+    "sensor_lag": ("τs", "Sensor lag", "by which the speed's low-pass is late"),
     "dead_zone": ("vd", "Dead zone", "command for which the driver puts out nothing"),
     "clip_voltage": ("vc", "Clip voltage", "the most that the driver puts out"),
     "slew_rate": ("dv/dt", "Slew rate", "how fast the driver's voltage rises"),

@@ -317,4 +317,6 @@ def _motors(estimate: Estimate, value: dict[str, Array]) -> Motors:
         )
     sensor = (np.maximum(value[name], 0.0) for name in SENSOR)
     delay, window, lag = sensor
+    # A low-pass of means is late by its time constant and half of what each mean is over.
+    lag = np.maximum(lag - 0.5 * window, 0.0)
     return Motors(a0, a1, a2, delay, np.abs(static), window, lag)

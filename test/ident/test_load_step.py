@@ -14,11 +14,17 @@ RATE, SECONDS, WINDOW, STATIC = 500, 16, 10, 0.4
 R, L, K, J, B = independent.TABLE_1["rear_left"]
 
 
-def recorded(load: np.ndarray, *, counts: bool, seed: int, least: float = -9.0) -> Record:
-    """Return a motor under a load [of its friction], its speed a mean over ten rows, or counts."""
+def recorded(
+    load: np.ndarray, *, counts: bool, seed: int, least: float = -9.0, back: float = SECONDS
+) -> Record:
+    """Return a motor under a load [of its friction], its speed a mean over ten rows, or counts.
+
+    From ``back`` [s] on it is driven the other way.
+    """
     rng = np.random.default_rng(seed)
     time = np.arange(RATE * SECONDS) / RATE
     voltage = np.repeat(rng.uniform(least, 9.0, 100), 83)[: time.size]
+    voltage = np.where(time < back, voltage, -voltage)
     friction = STATIC * K / R
     out = independent.simulate(time, voltage, R, L, K, J, B, friction, friction * load, 40)
     if counts:
@@ -51,9 +57,13 @@ def test_a_load_that_steps_is_found_and_moves_no_number(counts: bool, at: float)
         assert quantity.std < 0.05 * true[name]
 
 
+@pytest.mark.parametrize("back", [SECONDS, 9.3])
 @pytest.mark.parametrize("counts", [False, True])
-def test_of_a_motor_that_turns_one_way_the_friction_is_not_told_from_loads(counts: bool) -> None:
-    found = estimate(recorded(stepped(9.3), counts=counts, seed=5, least=3.0))
+def test_of_a_motor_that_turns_one_way_the_friction_is_not_told_from_loads(
+    counts: bool, back: float
+) -> None:
+    """One way all the time, or one way before the load steps and the other way after."""
+    found = estimate(recorded(stepped(9.3), counts=counts, seed=5, least=3.0, back=back))
     assert "load_step" in {f.code for f in found.findings}
     static = found.combinations["static_voltage"]
     assert static.value is None and static.status == "unidentifiable"

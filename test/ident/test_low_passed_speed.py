@@ -25,11 +25,12 @@ FINE = 50  # parts of a sample in which the tests' own motor and filter run
 
 
 def filtered(
-    lag, static_voltage, seconds=10.0, noise=0.0, kind="fourier", wheel="rear_left", ticks=0
-):
+    lag, static_voltage, seconds=10.0, noise=0.0, kind="fourier", wheel="rear_left", ticks=0,
+    means=False,
+):  # fmt: skip
     """Return a record of a motor of Table 1 whose speed went through a low-pass, or a digital one.
 
-    That takes so many samples of the speed a row.
+    That takes so many samples of the speed a row, or means since the one before.
     """
     n = int(seconds / STEP)
     t = np.arange(n * FINE) * STEP / FINE
@@ -46,47 +47,66 @@ def filtered(
     speed = np.concatenate([[0.0], lfilter([1 - gone], [1, -gone], mean)])[::FINE]
     if ticks:
         a = STEP / (STEP + ticks * lag)
-        speed = lfilter([a], [1, a - 1], out[:: FINE // ticks, 1])[::ticks]
+        taken, angle = out[:: FINE // ticks, 1], out[:: FINE // ticks, 2]
+        if means:  # as a firmware has that counts
+            taken = np.diff(angle, prepend=angle[0]) * ticks / STEP
+        speed = lfilter([a], [1, a - 1], taken)[::ticks]
     rng = np.random.default_rng(2)
     speed = speed + noise * rng.standard_normal(n)
     amps = out[::FINE, 0] + 0.01 * rng.standard_normal(n)
     return Record("motor", np.arange(n) * STEP, voltage, amps, speed, source="bag")
 
 
-@pytest.mark.parametrize("ticks", [0, 1, 5])
+SAMPLED = pytest.mark.parametrize(
+    ("ticks", "means"), [(0, False), (1, False), (5, False), (1, True), (5, True)]
+)
+
+
+@SAMPLED
 @pytest.mark.parametrize("lag", [0.1 * STEP, STEP, 30 * STEP])
-def test_prediction_is_that_of_a_filter_in_small_steps(lag, ticks):
+def test_prediction_is_that_of_a_filter_in_small_steps(lag, ticks, means):
+    mean = STEP / ticks if means else 0.0
     passes.assert_predicts(
-        filtered(lag, 0.3, ticks=ticks),
-        Electromechanical(window=True, low_pass=True, ticks=ticks),
-        lag,
+        filtered(lag, 0.3, ticks=ticks, means=means),
+        Electromechanical(window=True, low_pass=True, ticks=ticks, mean=mean),
+        lag + 0.5 * mean,
     )
 
 
-@pytest.mark.parametrize("ticks", [0, 1, 5])
+@SAMPLED
 @pytest.mark.parametrize("lag", [0.1 * STEP, STEP, 30 * STEP])
-def test_gradient_is_that_of_finite_differences(lag, ticks):
+def test_gradient_is_that_of_finite_differences(lag, ticks, means):
     record = filtered(STEP, 0.0, 3.0, noise=1.0)
-    structure = SecondOrder(friction="none", window=True, low_pass=True, ticks=ticks)
+    mean = STEP / ticks if means else 0.0
+    structure = SecondOrder(friction="none", window=True, low_pass=True, ticks=ticks, mean=mean)
     data = prepare([record], False).measured_as(structure.speed)
-    z = structure.complete(from_physical(*independent.TABLE_1["rear_left"])).with_(window=2 * lag)
+    z = structure.complete(from_physical(*independent.TABLE_1["rear_left"]))
+    z = z.with_(window=2 * lag + mean)
     passes.assert_gradient(data, structure, z)
 
 
 @pytest.mark.parametrize(
-    ("lag", "ticks"), [(0.4 * STEP, 0), (3 * STEP, 0), (3 * STEP, 1), (STEP, 5)]
-)
-def test_a_motor_with_current_is_found_behind_its_speed_s_low_pass(lag, ticks):
-    record = filtered(lag, 0.3, 20.0, noise=0.1, ticks=ticks)
+    ("lag", "ticks", "means"),
+    [
+        (0.4 * STEP, 0, False), (3 * STEP, 0, False), (3 * STEP, 1, False), (STEP, 5, False),
+        (1.5 * STEP, 1, True), (3 * STEP, 2, True),
+    ],
+)  # fmt: skip
+def test_a_motor_with_current_is_found_behind_its_speed_s_low_pass(lag, ticks, means):
+    """Means that a firmware counts come half of their time late: of L/R if nobody knows."""
+    record = filtered(lag, 0.3, 20.0, noise=0.1, ticks=ticks, means=means)
     found = estimate(record)
     assert "low_passed_speed" in [f.code for f in found.findings]
-    truth = motors.truth("rear_left", 0.3) | {"sensor_lag": lag}
+    late = lag + 0.5 * STEP / ticks if means else lag
+    truth = motors.truth("rear_left", 0.3) | {"sensor_lag": late}
     for name in ("sensor_lag", "dc_gain", "time_constant", "resistance", "inductance"):
         q = (found.parameters | found.combinations)[name]
         assert abs(q.value - truth[name]) < max(4 * q.std, 5e-3 * truth[name]), name
         assert q.std < 3e-3 * truth[name]
     # What gains are computed for is that motor behind that filter.
-    assert tuned.motors_of(found).sensor_lag[0] == pytest.approx(lag, rel=0.05)
+    motor = tuned.motors_of(found)
+    behind = motor.sensor_lag[0] + 0.5 * motor.averaging_window[0]
+    assert behind == pytest.approx(late, rel=0.05)
     # What it would have done is seen through the filter that was found: but for noise the same.
     measured, simulated = simulate(found, record)
     assert np.std(measured - simulated) < 1.03 * 0.1
