@@ -303,4 +303,6 @@ EFFECTS = (
     Effect("standing motor", _standing, (), "refuse"),
     Effect("current smoothed", _sensor("i_smooth", (0.5, 2.0, 8.0)), ("current_lag",),
            current=True),
+    Effect("counts smoothed", _sensor("count_ema", (0.5, 0.25, 0.1)), ("lag", "second_lag"),
+           signals=SPEED),
 )  # fmt: skip

@@ -139,6 +139,10 @@ def _speed(
     c: Case, w: np.ndarray, angle: np.ndarray, at: np.ndarray, fine: float, rng: np.random.Generator
 ) -> np.ndarray:
     s = c.sensor
+    if s.get("count_ema"):  # as firmware has it that counts: differences, exponentially smoothed
+        quantum = 2 * np.pi / c.turn
+        exact = np.interp(at, np.arange(len(angle)) * fine, angle) / quantum + rng.uniform()
+        return filtered(np.diff(np.floor(exact), prepend=0.0) * quantum / c.step, s["count_ema"])
     if s.get("lowpass"):
         w = low_passed(w, fine, s["lowpass"])
     if s.get("window"):

@@ -15,7 +15,7 @@ OPTIONS: dict[str, Any] = {
     "cache": True,
     "error_model": "numpy",
     "nogil": True,
-    "fastmath": {"contract", "nsz", "arcp", "reassoc"},
+    "fastmath": {"nsz"},
 }
 
 
@@ -62,7 +62,9 @@ def _without_typing(cache: Any) -> Callable[[Any, Any], Any]:
 def compiled(function: F) -> F:
     """Compile a function to machine code on its first call and keep it on disk.
 
-    Floating-point sums may be regrouped; NaN keeps its meaning.
+    Sums are not regrouped and products not fused with them: a function is also compiled into its
+    callers, and which copy runs hangs on which was loaded first, so that the last digits of the
+    first run would not be those of the next.  A descent on data that no motor fits ends elsewhere.
     """
     return cast(F, _stamped(numba.njit(**OPTIONS)(function)))
 

@@ -55,7 +55,13 @@ from smp_motor_ident.estimation.driver_effect import (
 )
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.hold_choice import chosen_hold, earlier_command, otherwise
-from smp_motor_ident.estimation.quantities import Answer, answer, driven_longest, without_lag
+from smp_motor_ident.estimation.quantities import (
+    Answer,
+    answer,
+    driven_longest,
+    ways,
+    without_lag,
+)
 from smp_motor_ident.estimation.request import Request, base_structure, checked
 from smp_motor_ident.estimation.selection import FittedCandidate, in_turn
 from smp_motor_ident.estimation.subset import excitation
@@ -273,7 +279,7 @@ def _stated(
     weight = candidate_weights(data, candidates)
 
     def said(fit: Fit) -> tuple[Answer, dict[str, float]]:
-        own = answer(fit, request.known, friction_std, driven_longest(final), final.ways)
+        own = answer(fit, request.known, friction_std, driven_longest(final), ways(final))
         return covering(weight, candidates, own, request.known)
 
     if not first:

@@ -92,7 +92,8 @@ def disturbance(group: Sequence[Record], since: Sequence[float]) -> Disturbance 
             spans.append((begin + float(record.time[a]), begin + float(record.time[b - 1])))
         if rows.any():
             records.append(of_rows(record, rows))
-    return Disturbance(records, spans) if _as_far(records, blocks) else None
+    left = _as_far(records, blocks) and _as_moved(blocks, kept)
+    return Disturbance(records, spans) if left else None
 
 
 def _as_far(records: Sequence[Record], whole: Sequence[Record]) -> bool:
@@ -102,6 +103,16 @@ def _as_far(records: Sequence[Record], whole: Sequence[Record]) -> bool:
     return bool(
         left.max() >= every.max() - NEAR * largest and left.min() <= every.min() + NEAR * largest
     )
+
+
+def _as_moved(blocks: Sequence[Record], kept: Flags) -> bool:
+    """Tell whether most of the voltage's changes are in what is left: the rest tells no lag.
+
+    A record that begins with a voltage begins with a change.
+    """
+    rows = np.repeat(kept, np.concatenate([np.diff([*r.starts, len(r)]) for r in blocks]))
+    change = np.concatenate([np.abs(np.diff(r.voltage, prepend=0.0)) for r in blocks])
+    return bool(change[rows].sum() > 0.5 * change.sum())
 
 
 def _in_blocks(record: Record, rows: int) -> Record:

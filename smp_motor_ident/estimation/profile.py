@@ -22,6 +22,7 @@ from smp_motor_ident.estimation.descent import initial_of
 from smp_motor_ident.estimation.fit import Fit, Options, solve
 from smp_motor_ident.estimation.fitted import NORMAL_95, Profile
 from smp_motor_ident.estimation.prediction import simulate, voltage_at_samples
+from smp_motor_ident.estimation.quantities import ways
 from smp_motor_ident.estimation.trials import slower_winding
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.passes import own_columns
@@ -208,7 +209,7 @@ def _fixed_at(data: Experiments, near: Fit, coordinate: str, value: float, optio
     begun = [(z, i) for z in starts for i in initials]
     if coordinate == "vc_plus" and structure.own_load:  # which is as much less one way
         loads = near.initial.copy()
-        loads[:, 3] -= data.ways * (value - near.z.vc_plus)
+        loads[:, 3] -= ways(data) * (value - near.z.vc_plus)
         begun.append((structure.complete(near.z.with_friction(value)), loads))
     tried = [solve(data, structure, near.at(z, i), options, 10, 0.05) for z, i in begun]
     return min(tried, key=lambda f: f.deviance)

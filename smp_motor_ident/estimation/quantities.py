@@ -5,6 +5,7 @@ Derivation: docs/derivations.md, sections 9 and 11.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.fitted import NORMAL_95
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.coordinates import Coordinates, direction
+from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.model.physical import physical, physical_gradients
 from smp_motor_ident.model.structure import Gradients
 from smp_motor_ident.model.structures import Structure
@@ -76,12 +78,12 @@ def answer(
     fixed: Mapping[str, float],
     friction_std: float = 0.0,
     level: float = 0.0,
-    ways: Array | None = None,
+    turns: Array | None = None,
 ) -> Answer:
     """Turn a fit into quantities.
 
-    ``level``: the voltage [V] at which the motor was driven longest; ``ways``: shape (g,), 1 or -1,
-    which way each segment drives it.
+    ``level``: the voltage [V] at which the motor was driven longest; ``turns``: the `ways` in which
+    it turned.
     """
     structure, conditional = fit.structure, fit.conditional()
     reported = list(structure.separates())
@@ -94,8 +96,7 @@ def answer(
         joint[at, at] += (limits.INSTANT.value * structure.shift) ** 2
     spread = dict(zip(values.value, np.sqrt(np.maximum(np.diag(joint), 0.0)), strict=True))
     # Where each segment turns one way, of friction and its own load only the sum is known.
-    held = ways is not None and structure.own_load and "static_voltage" in spread
-    held = held and spread["static_voltage"] > limits.LOOSE_QUANTITY.value * fit.z.vc_plus
+    held = turns is not None and structure.own_load and bool(turns.all())
     # At the upper end of what it may be, a gain of any size seems known: the middle tells, too.
     gain = min(values.value["dc_gain"], float(np.mean(values.interval("dc_gain", conditional))))
     one_level = spread["dc_gain"] > limits.LOOSE_QUANTITY.value * gain
@@ -106,8 +107,8 @@ def answer(
             combinations[name] = Quantity(values.value[name], unit=UNITS[name], status="fixed")
             continue
         interval = values.interval(name, conditional)
-        if held and ways is not None and name == "static_voltage":
-            most = fit.z.vc_plus + float(np.max(ways * fit.initial[:, 3]))
+        if held and turns is not None and name == "static_voltage":
+            most = fit.z.vc_plus + float(np.max(turns * fit.initial[:, 3]))
             share = NORMAL_95 * spread["dc_gain"] / values.value["dc_gain"]  # of the voltage
             interval = 0.0, max(most, 0.0) + share * abs(level)
         elif friction_std > 0 or (name == "delay" and structure.shift > 0):
@@ -286,6 +287,16 @@ def driven_longest(data: Experiments) -> float:
     value = np.abs(data.hold_value)
     driven = data.hold_value[value > 0.5 * value.max()]
     return float(np.copysign(np.median(np.abs(driven)), driven.sum()))
+
+
+def ways(data: Experiments) -> Array:
+    """Return which way the motor turns in each segment, shape (g,): 1, -1, or 0 where both ways."""
+    moved = [
+        np.nan_to_num(np.diff(data.output[a:b]) if data.kind == ANGLE else data.output[a:b])
+        for a, b in pairwise(data.starts)
+    ]
+    net, gross = (np.array([f(m).sum() for m in moved]) for f in (np.asarray, np.abs))
+    return np.where(np.abs(net) >= (1 - 2 * limits.REST.value) * gross, np.sign(net), 0.0)
 
 
 RESPONSE = ("ln_a0", "ln_a1", "ln_a2")

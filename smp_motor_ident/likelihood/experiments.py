@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise
 
 import numpy as np
 
@@ -80,13 +79,6 @@ class Experiments:
     def one_way(self) -> bool:
         """Whether the command drives the motor in one direction only."""
         return not self.hold_value.min() < 0 < self.hold_value.max()
-
-    @property
-    def ways(self) -> Array:
-        """Which way each segment drives the motor most, shape (g,): 1 or -1."""
-        return np.array(
-            [np.copysign(1.0, self.voltage[a:b].sum()) for a, b in pairwise(self.starts)]
-        )
 
     @cached_property
     def known_initial(self) -> Array:

@@ -124,9 +124,9 @@ def test_elimination_is_the_schur_complement():
     common, score = np.zeros((f, f)), np.zeros(f)
     step, gain = np.zeros((segments, own)), np.zeros((segments, own, f))
     no_scores = np.zeros((0, f + own)), np.zeros(0, dtype=np.int64)
-    nothing = [np.zeros((segments, own))] * 3  # neither moved nor known beforehand
-    eliminate(normal, gradient, *nothing, 10**9, common, score, step, gain,
-              *no_scores)  # fmt: skip
+    nothing = np.zeros((segments, own))  # neither moved nor known beforehand
+    eliminate(normal, gradient, nothing, np.full(own, 1e-2), nothing, nothing, 10**9, common, score,
+              step, gain, *no_scores)  # fmt: skip
     # The prior weighs 1e-11 of a segment's information here.
     expected = np.linalg.inv(np.linalg.inv(whole)[:f, :f])
     np.testing.assert_allclose(common, expected, rtol=1e-7)
@@ -141,8 +141,9 @@ def test_a_column_of_which_only_rounding_is_left_counts_as_unknown():
     normal[0, 1, 1] -= 1e-15  # the second common column is the segment's own
     gradient = np.ones((1, 3))
     no_scores = np.zeros((0, 3)), np.zeros(0, dtype=np.int64)
-    eliminate(normal, gradient, *[np.zeros((1, 1))] * 3, 10**18, common, score, np.zeros((1, 1)),
-              np.zeros((1, 1, 2)), *no_scores)  # fmt: skip
+    nothing = np.zeros((1, 1))
+    eliminate(normal, gradient, nothing, np.full(1, 1e-2), nothing, nothing, 10**18, common, score,
+              np.zeros((1, 1)), np.zeros((1, 1, 2)), *no_scores)  # fmt: skip
     assert common[1, 1] == 0.0 or common[1, 1] > 1e-12
     step, _ = damped_step(common, score, 1e-9, np.eye(12, 2), np.zeros(12),
                           np.full(12, -np.inf), np.full(12, np.inf))  # fmt: skip

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from smp_motor_ident._compile import OPTIONS
 from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.likelihood.first_order_lag import lagged
 from smp_motor_ident.likelihood.noise import NO_GAIN, NoiseModel, deviance, kalman_gain
@@ -264,3 +265,8 @@ def test_sensitivities_of_each_sample_are_the_same_from_both_passes():
     size = np.abs(found[0]).max(axis=0)
     np.testing.assert_allclose(found[0] / size, found[1] / size, atol=1e-12)
     assert not found[0][100:120].any()
+
+
+def test_sums_keep_their_order_wherever_a_function_was_compiled_into() -> None:
+    """Else the first run, which compiles, and the next, which loads, differ in the last digit."""
+    assert set(OPTIONS["fastmath"]) <= {"nsz", "nnan", "ninf"}

@@ -66,7 +66,9 @@ def test_a_winding_begins_with_no_more_than_what_drives_it() -> None:
     # A tenth of the largest voltage where friction holds the motor, else twice it.
     assert stood.known_initial[0, 0] == pytest.approx(1 / 0.8**2)
     assert moved.known_initial[0, 0] == pytest.approx(1 / 16.0**2)
-    assert not stood.known_initial[:, 1:].any()
+    assert not stood.known_initial[:, [1, 2, 4]].any()
+    # A load of its own takes no more than the voltage.
+    assert stood.known_initial[0, 3] == pytest.approx(1 / 8.0**2)
 
 
 def test_a_winding_that_may_begin_as_it_likes_has_its_price() -> None:
