@@ -192,15 +192,19 @@ def with_digital_filter(
     s = best.structure
     if not (s.window and s.low_pass):
         return best
-    for ticks, means in product(TICKS, (False, True)):
-        if means and ticks > FEW:
-            continue
-        structure = s.with_(ticks=ticks, mean=data.step / ticks * means)
-        say(f"trying {structure.label}")
-        tried = _filtered(data, structure, best, best.z, options)
-        verdict, reason = POLICY.preferred(best, tried)
-        candidates.append(FittedCandidate(tried, reason))
-        best = tried if verdict else best
+    ways = [way for way in product(TICKS, (False, True)) if way[0] <= FEW or not way[1]]
+    near = None
+    while near is not best:  # from a better one others go on that had ended elsewhere
+        near = best
+        for ticks, means in ways:
+            structure = s.with_(ticks=ticks, mean=data.step / ticks * means)
+            if structure == best.structure:
+                continue
+            say(f"trying {structure.label}")
+            tried = _filtered(data, structure, best, best.z, options)
+            verdict, reason = POLICY.preferred(best, tried)
+            candidates.append(FittedCandidate(tried, reason))
+            best = tried if verdict else best
     return best
 
 
