@@ -11,7 +11,7 @@ from smp_motor_ident.diagnosis.advice import advise, assess, unsettled_rival
 from smp_motor_ident.diagnosis.alternatives import Alternatives
 from smp_motor_ident.diagnosis.beside import held_against_effects
 from smp_motor_ident.diagnosis.certainty import certain
-from smp_motor_ident.diagnosis.conditions import dependent
+from smp_motor_ident.diagnosis.conditions import dependent, rubbing_std
 from smp_motor_ident.diagnosis.current_kind import ARMATURE, current_kind
 from smp_motor_ident.diagnosis.data_quality import screen
 from smp_motor_ident.diagnosis.model_error import regression
@@ -287,6 +287,8 @@ def _stated(
     gear = group[0].hardware.gear_ratio
     errors = regression(final, chosen, gear, bool(change.std))
     chosen, parts = dependent(chosen, errors)
+    if parts and friction_std > 0:  # which hangs on the same
+        friction_std = rubbing_std(final, chosen, gear, friction_std, request.options)
     refusal = only_lag_unknown(group, chosen, said(chosen)[0])
     request.say("validating")
     own, common = validate.validated(group, request, final, chosen, hold)

@@ -22,9 +22,12 @@ from scipy.special import fdtrc
 from smp_motor_control.arrays import Array
 from smp_motor_ident.diagnosis.effect_regression import Regression
 from smp_motor_ident.diagnosis.limits import CONDITION_LEVEL, CONDITION_WEIGHT
-from smp_motor_ident.estimation.fit import Fit
+from smp_motor_ident.diagnosis.model_error import regression
+from smp_motor_ident.estimation.descent import refine
+from smp_motor_ident.estimation.fit import Fit, Options
 from smp_motor_ident.estimation.prediction import inverse
 from smp_motor_ident.finding import Finding
+from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.coordinates import STANDS_FOR
 
 
@@ -65,6 +68,17 @@ def dependent(fit: Fit, errors: Regression | None) -> tuple[Fit, list[Finding]]:
             "record as the motor will run: those speeds, voltages and directions",
         )
     ]
+
+
+def rubbing_std(
+    data: Experiments, fit: Fit, gear: float, least: float, options: Options
+) -> float:
+    """Return how well the friction [V] is known that a fit leaves out, at least so well."""
+    structure = fit.structure.with_(friction="symmetric")
+    rubs = refine(data, structure, fit, structure.complete(fit.z), options)
+    wide, _ = dependent(rubs, regression(data, rubs, gear, False))
+    at = structure.free.index("vc_plus")
+    return max(least, float(np.sqrt(wide.covariance()[at, at])))
 
 
 def _by_chance(errors: Regression, rows: Array, move: Array) -> Array:

@@ -346,3 +346,23 @@ def test_a_current_that_is_later_than_its_model_leaves_the_windings_lag_unknown(
     assert added is not None
     moved = dict(zip(fit.structure.free, np.sqrt(np.diag(added)), strict=True))
     assert {name: m for name, m in moved.items() if m} == {"ln_a2": 1.0, "ln_te": 1.0}
+
+
+def test_friction_that_a_play_before_the_encoder_hides_is_not_known_to_be_none() -> None:
+    """Crossing the play after each reversal stands for friction: less than none would fit best."""
+    rate, fine, n, tau, gain, friction, play = 200.0, 50, 2600, 0.079, 1.95, 0.6, 0.02
+    volts = np.repeat(np.where((np.arange(n) // 80) % 2, -7.4, 7.4), fine)
+    step = 1 / rate / fine
+    keep, w = np.exp(-step / tau), np.zeros(volts.size)
+    for k in range(1, w.size):
+        push = volts[k] - friction * np.sign(w[k - 1] or volts[k])
+        w[k] = keep * w[k - 1] + (1 - keep) * gain * push
+    angle, seen = np.cumsum(w) * step, np.zeros(w.size)
+    for k in range(1, w.size):
+        seen[k] = min(max(seen[k - 1], angle[k] - play), angle[k] + play)
+    speed = np.diff(seen[::fine], prepend=0.0) * rate
+    noisy = speed + 0.05 * np.random.default_rng(0).standard_normal(n)
+    found = estimate(Record("motor", np.arange(n) / rate, volts[::fine], velocity=noisy))
+    static = found.combinations["static_voltage"]
+    assert "conditions" in {f.code for f in found.findings} and not found.unreliable
+    assert abs(static.value - friction) < 3 * static.std < 3 * friction
