@@ -92,7 +92,7 @@ def disturbance(group: Sequence[Record], since: Sequence[float]) -> Disturbance 
             spans.append((begin + float(record.time[a]), begin + float(record.time[b - 1])))
         if rows.any():
             records.append(of_rows(record, rows))
-    left = _as_far(records, blocks) and _as_moved(blocks, kept)
+    left = _as_far(records, blocks) and _as_moved(blocks, beside)
     return Disturbance(records, spans) if left else None
 
 
