@@ -70,9 +70,7 @@ def dependent(fit: Fit, errors: Regression | None) -> tuple[Fit, list[Finding]]:
     ]
 
 
-def rubbing_std(
-    data: Experiments, fit: Fit, gear: float, least: float, options: Options
-) -> float:
+def rubbing_std(data: Experiments, fit: Fit, gear: float, least: float, options: Options) -> float:
     """Return how well the friction [V] is known that a fit leaves out, at least so well."""
     structure = fit.structure.with_(friction="symmetric")
     rubs = refine(data, structure, fit, structure.complete(fit.z), options)
