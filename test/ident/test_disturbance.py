@@ -161,3 +161,15 @@ def test_torque_noise_that_brought_a_fit_near_is_believed_only_where_there_is_so
     assert brought.noise_ratio > 0
     settled = order_selection._on_all(data, brought, [], Options())
     assert (settled.noise_ratio > 0) == (noise > 0)
+
+
+def test_the_only_step_of_a_record_is_not_left_out_as_a_disturbance():
+    """What follows a step for long, as a winding that heats, would be the motor's answer else."""
+    rate, n, tau = 200.0, 4600, 0.45
+    t = np.arange(n) / rate
+    warm = 1 - 0.2 * (1 - np.exp(-3 * t / t[-1]))
+    speed = 700 * warm * (1 - np.exp(-t / tau))
+    noisy = speed + np.random.default_rng(6).standard_normal(n)
+    record = Record("motor", t, np.full(n, 10.0), velocity=noisy)
+    there = disturbance([record], [0.0])
+    assert there is None or there.spans[0][0] > 5 * tau
