@@ -109,6 +109,11 @@ FIT_WITHOUT_NOISE = Limit(
     "error, and its numbers are off by as much",
     "test_findings.py",
 )  # fmt: skip
+STILL_EXCITED = Limit(
+    0.5, "of the voltage's changes",
+    "cost: what is left tells the lags from as many transients as what is lost, or more",
+    "test_disturbance.py: the only step of a record is not left out as a disturbance",
+)  # fmt: skip
 FRICTION_MOST = Limit(
     0.5, "of the largest voltage",
     "physical: geared motors start at a tenth to a third of what they are driven with; where less "

@@ -163,14 +163,15 @@ def _driving_load(data: Experiments, result: Answer) -> Iterator[Finding]:
 def _current_scale(result: Answer, hardware: Hardware, one_size: bool) -> Iterator[Finding]:
     """Say what only the current's own scale determines, held against an ohmmeter if there is one.
 
-    No record of voltage, current and motion shows that scale; under a voltage of one size the
-    supply's current, ``i |v| / supply``, is another scale and no more.
+    A resistance that is given determines it.  No record of voltage, current and motion shows that
+    scale; under a voltage of one size the supply's current, ``i |v| / supply``, is another scale
+    and no more.
     """
     known = {
         n: q for n in BY_CURRENT
         if (q := result.parameters.get(n)) is not None and q.status == "estimated"
     }  # fmt: skip
-    if not known:
+    if not known or result.parameters["resistance"].status == "fixed":
         return
     ohmmeter = hardware.resistance
     words = (

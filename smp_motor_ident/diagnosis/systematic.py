@@ -60,8 +60,7 @@ def _unseen(estimate: Estimate) -> Iterator[Systematic]:
     """Yield the errors that the findings speak of, in the numbers that are estimated."""
     codes = {f.code for f in estimate.findings}
     hardware = estimate.hardware
-    resistance = estimate.parameters.get("resistance")
-    if "current_scale" in codes and resistance and resistance.status == "estimated":
+    if "current_scale" in codes:
         yield _moved(estimate, "current_scale", of_current(hardware), BY_CURRENT)
     if "one_size_of_voltage" in codes:
         for by in (BY_VOLTAGE, BY_LAG):

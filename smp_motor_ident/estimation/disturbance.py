@@ -24,6 +24,7 @@ from scipy.special import chdtri
 
 from smp_motor_control.arrays import Array, Flags
 from smp_motor_ident.diagnosis.limits import DISTURBED, LEFT_OUT
+from smp_motor_ident.diagnosis.sample_limits import STILL_EXCITED
 from smp_motor_ident.estimation.fit import Fit, Options, Start, solve
 from smp_motor_ident.estimation.initialisation import first_fit
 from smp_motor_ident.estimation.prediction import simulate
@@ -112,7 +113,7 @@ def _as_moved(blocks: Sequence[Record], kept: Flags) -> bool:
     """
     rows = np.repeat(kept, np.concatenate([np.diff([*r.starts, len(r)]) for r in blocks]))
     change = np.concatenate([np.abs(np.diff(r.voltage, prepend=0.0)) for r in blocks])
-    return bool(change[rows].sum() > 0.5 * change.sum())
+    return bool(change[rows].sum() > STILL_EXCITED.value * change.sum())
 
 
 def _in_blocks(record: Record, rows: int) -> Record:

@@ -59,6 +59,12 @@ def test_a_calibrated_sensor_is_taken_at_its_word() -> None:
             assert q.std == pytest.approx(usual.random_std(name), rel=1e-6), name
 
 
+def test_a_resistance_that_is_given_shows_the_scale() -> None:
+    found = estimate(_recorded(), fixed={"resistance": motors.truth(WHEEL, 0.3)["resistance"]})
+    assert found.parameters["inertia"].status == "estimated" and not found.systematic
+    assert "current_scale" not in {f.code for f in found.findings}
+
+
 def test_the_scale_of_a_current_leaves_the_answer_to_a_voltage_alone() -> None:
     """Gains hang on combinations, which are the same whatever the scale."""
     exact, usual = estimate(_recorded(current_accuracy=0.0)), estimate(_recorded())
