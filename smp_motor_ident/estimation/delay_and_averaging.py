@@ -230,6 +230,25 @@ def with_late_speed(
     return other if verdict else best
 
 
+def as_averaged(
+    data: Experiments,
+    best: Fit,
+    options: Options,
+    candidates: list[FittedCandidate],
+    say: Callable[[str], None],
+) -> Fit:
+    """Return the fit of a late speed, or one of a mean over a row whose command is late."""
+    if not best.structure.late or "delay" in best.structure.fixed:
+        return best
+    structure = best.structure.with_(late=False, delay=True)
+    say(f"trying {structure.label}")
+    late = max(best.z.delay + 0.5 * (best.z.window - data.step), 0.0)
+    other = _filtered(data, structure, best, best.z.with_(window=data.step, delay=late), options)
+    verdict, reason = POLICY.preferred(best, other)
+    candidates.append(FittedCandidate(other, reason))
+    return other if verdict else best
+
+
 def with_filter_for_lag(
     data: Experiments,
     best: Fit,

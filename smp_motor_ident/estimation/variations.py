@@ -9,6 +9,7 @@ from smp_motor_ident.estimation import data_window, descent, prediction
 from smp_motor_ident.estimation.candidate_starts import of_kind
 from smp_motor_ident.estimation.current_lag import with_current_lag, without_current_lag
 from smp_motor_ident.estimation.delay_and_averaging import (
+    as_averaged,
     delay_without_noise,
     snapped,
     with_digital_filter,
@@ -42,6 +43,7 @@ def varied(
     best = with_low_pass(data, best, options, candidates, say)
     best = with_digital_filter(data, best, options, candidates, say)
     best = with_late_speed(data, best, options, candidates, say)
+    best = as_averaged(data, best, options, candidates, say)
     best = without_current_lag(data, best, options, candidates, say)
     data = data.measured_as(best.kind)
     if slowly_filtered(best):
@@ -56,6 +58,7 @@ def varied(
             best = _with_addition(data, best, change, options, candidates, say)
     if best.structure != sensed:  # without it either lag may have stood for what was missing
         best = with_filter_for_lag(data, best, options, candidates, say)
+        best = as_averaged(data, best, options, candidates, say)
         data = data.measured_as(best.kind)
     if best.structure != candidates[0].fit.structure:  # what was added may have hidden it
         best = with_current_lag(data, best, options, candidates, say)

@@ -56,3 +56,23 @@ def test_a_speed_that_is_later_than_the_current_moves_no_number(lag):
     assert not found.unreliable and "averaging_window" not in found.combinations
     # Gains are of that speed.
     assert tuned.motors_of(found).delay[0] == pytest.approx(lag, rel=0.05)
+
+
+@pytest.mark.parametrize("share", [0.6, 0.8])
+def test_a_mean_over_a_row_under_a_late_command_is_not_surely_a_late_speed(share):
+    """To first order the speed comes half a row later than the current either way."""
+    n, rows = 600, np.arange(600) * STEP
+    voltage = 8.0 * np.sin(2 * np.pi * (0.3 * rows + 5.7 / 2 / rows[-1] * rows**2))
+    fine = np.arange(n * FINE) * STEP / FINE
+    taken = np.floor(fine / STEP - share + 1e-9).astype(int)  # rows from which the command is
+    held = np.where(taken < 0, 0.0, voltage[np.maximum(taken, 0)])
+    ran = np.concatenate([held[:1], held[:-1]])
+    r, el, k, j, b = independent.TABLE_1[WHEEL]
+    out = independent.simulate(fine, ran, r, el, k, j, b, 0.3 * k / r, np.zeros(fine.size), 4)
+    rng = np.random.default_rng(3)
+    count = np.floor(out[::FINE, 2] / (2 * np.pi / 4096) + rng.uniform())
+    speed = np.diff(count, prepend=count[0]) * 2 * np.pi / 4096 / STEP
+    amps = out[::FINE, 0] + 0.05 * rng.standard_normal(n)
+    found = estimate(Record("motor", rows, voltage, amps, speed, source="bag"))
+    q = found.combinations["time_constant"]
+    assert abs(q.value - motors.truth(WHEEL, 0.3)["time_constant"]) < 4 * q.std < 0.01 * q.value
