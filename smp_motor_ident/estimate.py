@@ -17,6 +17,7 @@ from smp_motor_ident.diagnosis.data_quality import screen
 from smp_motor_ident.diagnosis.model_error import regression
 from smp_motor_ident.diagnosis.provenance import provenance
 from smp_motor_ident.diagnosis.refusal import (
+    explains,
     fallen_back,
     lag_unknown,
     no_candidate,
@@ -50,9 +51,11 @@ from smp_motor_ident.estimation.constraint import constrained
 from smp_motor_ident.estimation.driver_effect import (
     DriverFit,
     declared,
+    leaves_most,
     suspecting,
     suspects_driver,
 )
+from smp_motor_ident.estimation.driver_search import beside_driver
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.hold_choice import chosen_hold, earlier_command, otherwise
 from smp_motor_ident.estimation.quantities import (
@@ -197,19 +200,15 @@ def _answered(group: list[Record], request: Request, found: Sequence[Finding]) -
 
 def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) -> Estimate:
     """Choose a structure, fit it, and say how far it can be trusted."""
-    base = base_structure(request, group)
-    data, hold, first = chosen_hold(group, base, request.options, request.say)
-    data = data.measured_as(base.speed)
-    candidates = order_selection.explore(
-        data, base, request.options, request.model == "auto", request.say, first
-    )
-    if not candidates:
-        raise no_candidate(group)
-    data, hold, candidates = otherwise(group, base, request, data, hold, candidates)
+    data, hold, candidates = _candidates(group, request)
     if ahead := earlier_command(group, request, data, hold, candidates[-1].fit):
         records, asked, said = ahead
         if early := _tried(records, asked, [*found, said]):
-            return early
+            if early.residuals.white:
+                return early
+            as_read = _tried(group, replace(request, earlier=True), found)
+            better = as_read and not as_read.unreliable and leaves_most(early, as_read)
+            return as_read if as_read and better else early
     refused: SmpError | None = None
     driver: DriverFit | None = None
     left = list(candidates)
@@ -247,6 +246,25 @@ def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) 
     if loaded and not loaded.unreliable:
         return loaded
     raise refused
+
+
+def _candidates(
+    group: list[Record], request: Request
+) -> tuple[Experiments, str, list[FittedCandidate]]:
+    """Return the data, how the command was held, and what was fitted to them, the choice last."""
+    base = base_structure(request, group)
+    data, hold, first = chosen_hold(group, base, request.options, request.say)
+    data = data.measured_as(base.speed)
+    candidates = order_selection.explore(
+        data, base, request.options, request.model == "auto", request.say, first
+    )
+    if not candidates:
+        raise no_candidate(group)
+    if request.driver is not None:
+        candidates = beside_driver(data, request.driver, request.options, candidates)
+    if explains(group, data, candidates):  # else no hold between the samples does
+        data, hold, candidates = otherwise(group, base, request, data, hold, candidates)
+    return data, hold, candidates
 
 
 def _tried(group: list[Record], request: Request, found: Sequence[Finding]) -> Estimate | None:

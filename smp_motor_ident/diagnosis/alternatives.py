@@ -14,7 +14,9 @@ from smp_motor_ident.estimation.candidate_starts import of_kind
 from smp_motor_ident.estimation.driver_effect import (
     DriverFit,
     explains_no_more,
+    leaves_most,
     leaves_torque_noise,
+    shows_another,
     through,
 )
 from smp_motor_ident.estimation.driver_search import likeliest, run_free
@@ -51,14 +53,16 @@ class Alternatives:
     ) -> tuple[Estimate | None, DriverFit | None]:
         """Return the estimate beside what no motor does, if one holds, and the likeliest driver.
 
-        What a driver explains without an accident is none, and no step of a load.
+        What a driver explains without an accident is none, and no step of a load; nor is it the
+        step alone where most of what it leaves is a driver's.
         """
         asked = self.tried, self.group, self.request, self.found
         behind, driver = self._through_driver(EFFECTS)
         codes = {f.code for f in behind.findings} if behind else set()
         if behind is not None and not codes & {"disturbed", "load_step"}:
             return behind, driver
-        if apart := under_own_loads(*asked, self.data, self.fit):
+        apart = under_own_loads(*asked, self.data, self.fit)
+        if apart and not (behind and leaves_most(apart, behind)):
             return apart, None
         if noisy:
             behind = undisturbed(*asked, self.fit, plain) or behind
@@ -114,6 +118,7 @@ class Alternatives:
         hollow = emptied & codes  # little is left of what was recorded
         fails = any(f.severity == "unreliable" and not blames_current(f) for f in e.findings)
         fails = fails or (leaves_torque_noise(e, fit) and not beside) or explains_no_more(e, fit)
+        fails = fails or shows_another(e, driver)
         hides = one_size_of_voltage(one_size, of_one_size(group[0].hardware))
         said = *e.findings, *(f for f in hides if f.code not in codes)
         return (None if fails or hollow else through(replace(e, findings=said), driver)), driver

@@ -50,6 +50,6 @@ def certain(
     timed = consider_weaker_side(final, consider_filter(final, timed, request.options))
     chosen, friction_std = consider_friction(final, consider_left_out(final, timed))
     if request.driver is not None:
-        chosen = request.driver.widened(chosen)
+        chosen, friction_std = request.driver.widened(chosen, friction_std)
     chosen, change = heterogeneous(final, chosen)
     return chosen, friction_std, change

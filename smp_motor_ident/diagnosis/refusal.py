@@ -14,9 +14,11 @@ from smp_motor_ident.errors import (
     SmpError,
     UnknownLagError,
 )
+from smp_motor_ident.estimation.candidate_starts import of_kind
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.prediction import simulate
 from smp_motor_ident.estimation.quantities import Answer
+from smp_motor_ident.estimation.selection import FittedCandidate
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.record import Record
@@ -53,9 +55,17 @@ def of_which(
     return type(refusal)(f"{refusal}; {words}")
 
 
+def explains(
+    group: Sequence[Record], data: Experiments, candidates: Sequence[FittedCandidate]
+) -> bool:
+    """Tell whether the last of the candidates explains the motion."""
+    fit = candidates[-1].fit
+    return _enough(speed_fit(group, of_kind(data, fit), fit))
+
+
 def refuse_unexplained(group: Sequence[Record], data: Experiments, fit: Fit, fitted: float) -> None:
     """Refuse what the model does not explain."""
-    explained = np.isfinite(fitted) and fitted >= WORST_FIT.value
+    explained = _enough(fitted)
     if not explained and stands(data, fit):
         raise InsufficientExcitationError(
             f"{where_of(group)}: the motor stands: what its angle moves is the sensor's scatter, "
@@ -119,6 +129,10 @@ def lag_unknown(result: Answer, refusal: UnknownLagError | None, step: float) ->
         {"low": float(low), "high": float(high), "sample_time": step},
         "sample faster" if quick else advice,
     )
+
+
+def _enough(fitted: float) -> bool:
+    return bool(np.isfinite(fitted)) and fitted >= WORST_FIT.value
 
 
 def _follows(group: Sequence[Record], data: Experiments, fit: Fit) -> bool:

@@ -25,7 +25,8 @@ from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.fitted import NORMAL_95
 from smp_motor_ident.estimation.selection import FittedCandidate, bic, evidence
 from smp_motor_ident.finding import Finding, Severity
-from smp_motor_ident.likelihood.experiments import output_of
+from smp_motor_ident.likelihood.experiments import Experiments, output_of
+from smp_motor_ident.model.coordinates import place
 from smp_motor_ident.model.driver import (
     CLIP,
     COAST,
@@ -44,9 +45,18 @@ from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import UNITS, Estimate, Quantity
 
+FRICTION = place("vc_plus")
+
 
 class Search(Protocol):
     """What found a driver, and knows how it follows other records."""
+
+    data: Experiments  # what the motor behind it was fitted to
+
+    @property
+    def numbers(self) -> int:
+        """How many numbers of the driver were sought."""
+        ...
 
     def on(self, group: list[Record], most: float, behind: float) -> DriverFit | None:
         """Return what is found with more records."""
@@ -78,7 +88,7 @@ class DriverFit:
 
     def cost(self, price: float, factor: float) -> float:
         """Return the deviance over a sandwich factor, with a price for each number."""
-        return self.fit.deviance / factor + price * (self.fit.structure.size + self.effect.numbers)
+        return self.fit.deviance / factor + price * (self.fit.structure.size + self.search.numbers)
 
     @property
     def tolerance(self) -> float:
@@ -110,15 +120,20 @@ class DriverFit:
         bent = ("ln_a1",) if self.effect.kind == SLEW else ("ln_a0", "vc_plus")
         both = set(plain.structure.free) & set(self.fit.structure.free)
         least = min((evidence(plain, self.fit, c) for c in bent if c in both), default=math.inf)
-        return least > price * self.effect.numbers
+        return least > price * self.search.numbers
 
-    def widened(self, fit: Fit) -> Fit:
-        """Return a fit with its covariance widened by what is not known of the driver."""
+    def widened(self, fit: Fit, friction_std: float) -> tuple[Fit, float]:
+        """Return a fit with its covariance widened by what is not known of the driver.
+
+        And so the standard deviation of a friction [V] that it leaves out.
+        """
         moves = self.search.moves(fit)
         moves += [rival.z.array - self.fit.z.array for rival in self.rivals]
         for move in moves:
             fit = fit.along(fit.structure.of_free(move))
-        return fit
+        if fit.structure.friction == "none":
+            friction_std = math.hypot(friction_std, *(move[FRICTION] for move in moves))
+        return fit, friction_std
 
 
 def through(estimate: Estimate, found: DriverFit) -> Estimate:
@@ -155,6 +170,15 @@ def suspecting(estimate: Estimate, found: DriverFit | None, fit: Fit) -> Estimat
     return replace(estimate, findings=(finding, *estimate.findings))
 
 
+def shows_another(estimate: Estimate, found: DriverFit) -> bool:
+    """Tell whether the error of a motor behind a driver shows that another does more than that."""
+    others = {effect.code for effect in EFFECTS if effect.kind != DRAG} - {found.effect.code}
+    return any(
+        f.code in others and f.severity == "warning" and "shift_std" in f.evidence
+        for f in estimate.findings
+    )
+
+
 def suspects_driver(estimate: Estimate) -> bool:
     """Tell whether an estimate is unreliable for what a driver may do."""
     codes = {effect.code for effect in EFFECTS}
@@ -169,6 +193,12 @@ def leaves_torque_noise(estimate: Estimate, fit: Fit) -> bool:
     intensity = [f.evidence["intensity"] for f in estimate.findings if f.code == "torque_noise"]
     most = HALF_EXPLAINED.value * fit.noise_ratio
     return any(isinstance(left, float) and left > most for left in intensity)
+
+
+def leaves_most(plain: Estimate, other: Estimate) -> bool:
+    """Tell whether another estimate, as behind a driver, explains most of the error of one."""
+    left, more = (100.0 - (e.fit_percent.estimation or 0.0) for e in (plain, other))
+    return more**2 < HALF_EXPLAINED.value * left**2
 
 
 def explains_no_more(estimate: Estimate, fit: Fit) -> bool:

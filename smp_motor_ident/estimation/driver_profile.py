@@ -13,7 +13,7 @@ import numpy as np
 from scipy.optimize import fminbound
 
 from smp_motor_control.arrays import Array
-from smp_motor_ident.estimation import fast_decay
+from smp_motor_ident.estimation import driver_joint
 from smp_motor_ident.estimation.candidate_starts import of_kind
 from smp_motor_ident.estimation.descent import ROUGHLY, initial_of, refine
 from smp_motor_ident.estimation.driver_effect import DriverFit
@@ -51,12 +51,14 @@ def prepared(group: Sequence[Record], hold: str, fit: Fit) -> Experiments:
 def applied(records: Sequence[Record], fit: Fit, driver: Driver) -> list[Record]:
     """Return records with the voltage of a driver that follows the motion."""
     data = commands_of(records, fit)
-    voltage = fast_decay.voltage_of(data, fit, driver)
-    return with_voltages(records, fast_decay.rows_of(data, voltage))
+    voltage = driver_joint.voltage_of(data, fit, driver)
+    return with_voltages(records, driver_joint.rows_of(data, voltage))
 
 
 class Profile:
     """The profile of the likelihood along one effect's size."""
+
+    numbers = 1
 
     def __init__(
         self,
@@ -108,7 +110,7 @@ class Profile:
             return rows.through(Driver(self.effect.kind, size, rows.full_duty))
         driver = Driver(self.effect.kind, size, self.full_duty, emf_share(fit))
         voltage = terminal_voltages(self.commands, fit.structure, fit.z, fit.initial, driver)
-        return fast_decay.rows_of(self.commands, voltage)
+        return driver_joint.rows_of(self.commands, voltage)
 
     def deviance(self, logarithm: float) -> float:
         """Return the deviance at a size's logarithm; the next fit begins from the best so far.

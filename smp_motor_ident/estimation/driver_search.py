@@ -17,7 +17,8 @@ from scipy.special import chdtri
 
 from smp_motor_control.arrays import Array
 from smp_motor_ident.diagnosis.limits import COLOURED, EFFECT_COVERED
-from smp_motor_ident.estimation import fast_decay
+from smp_motor_ident.estimation import driver_joint
+from smp_motor_ident.estimation.candidate_starts import of_kind
 from smp_motor_ident.estimation.descent import (
     ROUGHLY,
     SCREENING_SAMPLES,
@@ -28,6 +29,7 @@ from smp_motor_ident.estimation.driver_profile import Profile, applied, prepared
 from smp_motor_ident.estimation.driver_rows import (
     commands_of,
     pieces,
+    rows_of,
     with_voltages,
 )
 from smp_motor_ident.estimation.fit import Fit, Options
@@ -35,7 +37,17 @@ from smp_motor_ident.estimation.initialisation import initial_fit
 from smp_motor_ident.estimation.selection import POLICY, FittedCandidate, sandwich_factor
 from smp_motor_ident.estimation.thinning import thinned
 from smp_motor_ident.likelihood.experiments import Experiments
-from smp_motor_ident.model.driver import CURRENT, EFFECTS, SLEW, Driver, DriverEffect
+from smp_motor_ident.model.driver import (
+    COAST,
+    COASTING,
+    CURRENT,
+    DROP,
+    EFFECTS,
+    FREE,
+    SLEW,
+    Driver,
+    DriverEffect,
+)
 from smp_motor_ident.model.structures import FirstOrder
 from smp_motor_ident.record import Record
 
@@ -62,19 +74,20 @@ def likeliest(
     behind = POLICY.hopeless * factor
     most = without.deviance + behind
     known: list[tuple[Fit, str]] = []
-    profiles = [
-        Profile(few, how, start, options, effect)
-        for effect in effects
-        if effect.shares
-        for start, how in _starts(few, fit, hold, options, effect, known)
-    ]
-    joints = [_Joint(few, list(group), fit, options, e) for e in effects if not e.shares]
+    profiles, joints = list[Profile](), list[_Joint]()
+    for effect in effects:
+        for start, how in _starts(few, fit, hold, options, effect, known):
+            if effect.feeds_back:
+                joints.append(_Joint(few, list(group), start, options, effect))
+            else:
+                profiles.append(Profile(few, how, start, options, effect))
     found = _polished(profiles, joints, most, behind)
     if found and sum(map(len, few)) < sum(map(len, group)):
         least = min(d.fit.deviance for d in found)
         most = fit.deviance + behind
         every: list[DriverFit] = []
-        for d in sorted(found, key=cost)[:FINALISTS]:
+        likeliest_of = {d.effect: d for d in sorted(found, key=cost, reverse=True)}
+        for d in sorted(likeliest_of.values(), key=cost)[:FINALISTS]:
             if d.fit.deviance > least + behind:
                 continue
             if (there := d.search.on(list(group), most, behind)) is not None:
@@ -85,6 +98,10 @@ def likeliest(
     likelier = [d for d in found if cost(d) < plain and d.beyond_chance(fit, price)]
     if not likelier:
         return _as_likely(found, fit.deviance - factor * float(chdtri(1, EFFECT_COVERED.value)))
+    if free := next((d for d in likelier if d.effect.kind == FREE), None):
+        # A drop that no back-EMF exceeds lets a motor coast, too, and takes what no driver does.
+        most = cost(free) - price
+        likelier = [d for d in likelier if d.effect.kind != DROP or cost(d) < most]
     best, *others = likelier
     near = [d.fit for d in others if cost(d) < cost(best) + price]
     if plain < cost(best) + price:  # there may be none of them
@@ -97,16 +114,26 @@ def _as_likely(found: Sequence[DriverFit], most: float) -> DriverFit | None:
 
     It explains more than nothing would by chance.
     """
-    left = [d for d in found if isinstance(d.search, Profile) and d.fit.deviance < most]
+    left = [d for d in found if d.effect.kind not in COASTING and d.fit.deviance < most]
     words = "the records do not decide about it"
     rivals = [
         FittedCandidate(
-            d.fit, words, on=d.search.data, behind=d.effect.cause, numbers=d.effect.numbers
+            d.fit, words, on=d.search.data, behind=d.effect.cause, numbers=d.search.numbers
         )
         for d in left
-        if isinstance(d.search, Profile)
     ]
     return replace(left[0], as_likely=tuple(rivals)) if left else None
+
+
+def beside_driver(
+    data: Experiments, driver: DriverFit, options: Options, candidates: list[FittedCandidate]
+) -> list[FittedCandidate]:
+    """Return candidates, the choice last, with the motor that was found together with a driver."""
+    fit = driver.fit
+    again = refine(of_kind(data, fit), fit.structure, fit, fit.z, options)
+    found = FittedCandidate(again, f"as found with {driver.effect.cause}")
+    better = POLICY.likelier(found, candidates[-1])
+    return [*candidates, found] if better else [found, *candidates]
 
 
 def run_free(group: Sequence[Record], fit: Fit, hold: str, options: Options) -> Fit:
@@ -122,32 +149,29 @@ def _polished(
 ) -> list[DriverFit]:
     """Return the likeliest sizes of the effects that are not far behind the best of them.
 
-    Whether the best of them leaves colour is not asked of a limited current, which is as a bridge
-    that coasts, nearly.
+    A driver that coasts is sought where the best of the others leaves colour, which of a drop or a
+    limited current is not asked: these are as a bridge that coasts, nearly.
     """
+    coasting = [j for j in joints if j.effect.kind in COASTING]
+    found = [one for j in joints if j not in coasting and (one := j.best(most)) is not None]
     sought = [(s, size) for s in searches if (size := s.sought()) is not None]
     sought.sort(key=lambda one: one[0].near.deviance)
-    found: list[DriverFit] = []
     for search, size in sought:
         if search.near.deviance > min((d.fit.deviance for d in found), default=math.inf) + behind:
             break
-        if (one := search.polished(size, most)) is None:
-            continue
-        found.append(one)
-        if search.effect.kind != CURRENT and joints:
-            found += _coasting(joints, most, sandwich_factor(one.fit) > COLOURED.value)
-            joints = ()
-    return found + _coasting(joints, most, True)
-
-
-def _coasting(searches: Sequence[_Joint], most: float, coloured: bool) -> list[DriverFit]:
-    """Return the drivers that coast, those of several numbers only where others leave colour."""
-    found: list[DriverFit] = []
-    for search in sorted(searches, key=lambda s: s.effect.numbers):
-        if (coloured or search.effect.numbers == 1) and (one := search.best(most)) is not None:
+        if (one := search.polished(size, most)) is not None:
             found.append(one)
-            coloured = coloured and sandwich_factor(one.fit) > COLOURED.value
+    best = min(found, key=lambda d: d.fit.deviance, default=None)
+    coloured = best is None or best.effect.kind in (DROP, CURRENT) or _coloured(best)
+    for joint in sorted(coasting, key=lambda j: j.effect.kind == COAST):  # of several numbers
+        if (coloured or joint.effect.kind == FREE) and (one := joint.best(most)) is not None:
+            found.append(one)
+            coloured = coloured and _coloured(one)
     return found
+
+
+def _coloured(found: DriverFit) -> bool:
+    return sandwich_factor(found.fit) > COLOURED.value
 
 
 def _starts(
@@ -187,7 +211,7 @@ def _starts(
 
 
 class _Joint:
-    """A driver that coasts, sought together with the motor."""
+    """A driver that follows the motion, sought together with the motor."""
 
     def __init__(
         self,
@@ -199,7 +223,13 @@ class _Joint:
     ) -> None:
         self.group, self.near, self.options, self.effect = group, fit, options, effect
         self.every = every
-        self.found: fast_decay.Joint | None = None
+        self.found: driver_joint.Joint | None = None
+        self.data = prepared(group, "held", fit)
+
+    @property
+    def numbers(self) -> int:
+        """How many numbers of the driver were sought."""
+        return len(self.found.numbers) if self.found else 0
 
     def best(self, most: float) -> DriverFit | None:
         """Return the likeliest driver; None where there is none, or beyond a deviance."""
@@ -209,29 +239,40 @@ class _Joint:
         supply = min(r.hardware.supply_voltage or 0.0 for r in self.group)
         full = max(float(np.abs(data.hold_value).max(initial=0.0)), supply)
         driver = Driver(self.effect.kind, 1.0, full)
-        self.found = fast_decay.fitted(data, self.near, driver, self.options)
+        rows = rows_of(prepared(self.group, "held", self.near), self.group, self.near)
+        sizes = self.effect.scale(rows) * np.array(self.effect.shares)
+        self.found = driver_joint.fitted(data, self.near, driver, self.options, sizes.tolist())
         if data is few or self.found is None:
             return self._driver_fit(self.found, data, most)
-        return self._driver_fit(fast_decay.continued(few, self.found, self.options), few, most)
+        return self._continued(few, self.found, most)
 
     def on(self, group: list[Record], most: float, behind: float) -> DriverFit | None:
         """Go on from there with more records."""
         data = commands_of(group, self.near)
         more = _Joint(group, group, self.near, self.options, self.effect)
         assert self.found is not None
-        more.found = fast_decay.continued(data, self.found, self.options)
-        return more._driver_fit(more.found, data, most)
+        return more._continued(data, self.found, most)
+
+    def _continued(
+        self, data: Experiments, joint: driver_joint.Joint, most: float
+    ) -> DriverFit | None:
+        self.found = driver_joint.continued(
+            data, joint.fit, joint.driver, self.options, joint.numbers
+        )
+        return self._driver_fit(self.found, data, most)
 
     def _driver_fit(
-        self, joint: fast_decay.Joint | None, data: Experiments, most: float
+        self, joint: driver_joint.Joint | None, data: Experiments, most: float
     ) -> DriverFit | None:
         if joint is None:
             return None
-        records = with_voltages(self.group, fast_decay.rows_of(data, joint.voltage))
+        records = with_voltages(self.group, driver_joint.rows_of(data, joint.voltage))
         fit = self._with_current(records, joint.fit) if self.near.structure.current else joint.fit
-        if fit.deviance > most:
+        rows = rows_of(data, self.group, self.near)
+        if fit.deviance > most or not self.effect.may_be(joint.driver.size, rows):
             return None
-        return DriverFit(self.effect, joint.driver, joint.std[0], self.group, records, self, fit)
+        self.data = prepared(records, "held", fit)
+        return DriverFit(self.effect, joint.driver, joint.std, self.group, records, self, fit)
 
     def _with_current(self, records: list[Record], fit: Fit) -> Fit:
         """Return the motor that a measured current shows under the voltage that was found."""

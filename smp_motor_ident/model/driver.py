@@ -21,6 +21,9 @@ from smp_motor_control.arrays import Array, Flags
 from smp_motor_ident._compile import compiled, inlined
 
 NOTHING, DEAD_ZONE, CLIP, SLEW, SAG, DROP, COAST, CURRENT, FREE, DRAG = range(10)
+COASTING = (COAST, FREE)
+LARGEST_DROP = 0.4
+"""Of the largest command: two Darlington transistors of a bridge take 4.9 V of 12 (L298, 2 A)."""
 REST = 0.05
 """Back-EMF of a motor that begins at rest, of the largest command at most."""
 
@@ -170,8 +173,7 @@ class DriverEffect:
     quantity: str  # name of the number that it is described by
     cause: str
     # Sizes between which its own is looked for, in the unit or as shares of `scale`, the mildest
-    # first: the motor behind each is where the search for the next begins; none where it is sought
-    # together with the motor
+    # first: the motor behind each is where the search for the next begins
     shares: tuple[float, ...]
 
     def scale(self, rows: Rows) -> float:
@@ -180,22 +182,23 @@ class DriverEffect:
             return rows.top / rows.time_constant
         if self.kind == DRAG:
             return 1 / rows.top
-        return 1.0 if self.kind == SAG else rows.top
+        return 1.0 if self.kind in (SAG, *COASTING) else rows.top
 
     def may_be(self, size: float, rows: Rows) -> bool:
         """Tell whether there is anything of it, and anything left of the command."""
-        most = 2 * rows.top if self.kind == CURRENT else rows.top  # what brakes is twice as much
-        return self.kind in (SLEW, SAG, DRAG) or not self.shares or size < most
-
-    @property
-    def numbers(self) -> int:
-        """How many numbers describe it: the size, and of one that coasts the back-EMF's share."""
-        return 2 if self.kind == COAST else 1
+        # What brakes is twice as much as what drives.
+        most = {CURRENT: 2.0, DROP: LARGEST_DROP}.get(self.kind, 1.0) * rows.top
+        return self.kind in (SLEW, SAG, DRAG, *COASTING) or size < most
 
     @property
     def follows_motion(self) -> bool:
         """Whether it depends on how the motor runs."""
-        return self.kind in (SAG, DROP, CURRENT, DRAG) or not self.shares
+        return self.feeds_back or self.kind == DRAG
+
+    @property
+    def feeds_back(self) -> bool:
+        """Whether its voltage and the motion follow each other: it is sought with the motor."""
+        return self.kind in (SAG, DROP, CURRENT, *COASTING)
 
 
 EFFECTS = (
@@ -227,11 +230,12 @@ EFFECTS = (
         (0.01, 0.03, 0.1, 0.3),
     ),
     DriverEffect(
-        COAST, "coast", "fast_decay_ratio", "a driver that lets the motor coast (fast decay)", ()
+        COAST, "coast", "fast_decay_ratio", "a driver that lets the motor coast (fast decay)",
+        (0.05, 0.3, 1.0, 3.0, 30.0),
     ),
     DriverEffect(
         FREE, "coast", "coasting_share", "a driver that lets the motor coast at a command of zero",
-        (),
+        (1.0,),
     ),
 )  # fmt: skip
 
@@ -241,9 +245,12 @@ RAMPS = tuple(e for e in EFFECTS if e.kind == SLEW)
 DRAGS = tuple(e for e in EFFECTS if e.kind == DRAG)
 """What is nearly a motor of another gain: beside torque noise it takes a search, too."""
 
-AT_ONE_LEVEL = tuple(e for e in EFFECTS if e.kind == FREE)
+AT_ONE_LEVEL = tuple(e for e in EFFECTS if e.kind in (FREE, DROP))
 AT_ONE_SIZE = AT_ONE_LEVEL + DRAGS
-"""What shows under one voltage, too, and under one size of it both ways."""
+"""What shows under one voltage, too, and under one size of it both ways, or one swing.
+
+A limited current takes as long at each of steps of one size, and looks like a lag.
+"""
 
 DECLARABLE: Mapping[str, DriverEffect] = {e.quantity: e for e in EFFECTS if not e.follows_motion}
 """What a user may know of a driver: the command alone tells its voltage."""

@@ -9,7 +9,7 @@ import pytest
 from independent import simulate
 
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.estimation import fast_decay
+from smp_motor_ident.estimation import driver_joint
 from smp_motor_ident.estimation.driver_effect import driver_of
 from smp_motor_ident.estimation.fit import Options
 from smp_motor_ident.estimation.initialisation import initial_fit
@@ -17,7 +17,7 @@ from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.model import driver
 from smp_motor_ident.model.driver import Driver, terminal_voltage
 from smp_motor_ident.model.structures import FirstOrder
-from smp_motor_ident.record import Record
+from smp_motor_ident.record import Hardware, Record
 
 STEP = 0.005
 
@@ -116,7 +116,7 @@ def test_the_speed_of_each_section_is_that_of_its_own_record():
     one = prepare([record, record], False)  # the second begins at the instant 0 again
     at_once = prepare([replace(record, time=t + t[-1]), record], False)
     for data in (one, at_once):
-        speed = fast_decay._section_speeds(data, 10 * STEP)
+        speed = driver_joint._section_speeds(data, 10 * STEP)
         assert speed == pytest.approx(np.full(400, 3.0 / STEP), rel=1e-4)  # counts are dithered
 
 
@@ -184,19 +184,51 @@ def test_one_step_and_how_the_motor_runs_down_tell_a_bridge_that_is_open_then():
     assert "coast" not in {f.code for f in braked.findings}
 
 
+@pytest.mark.parametrize(
+    ("volts", "per_turn", "phase"), [(8.0, 44, 0.0), (8.0, 64, 0.2), (7.0, 44, 0.2)]
+)
+def test_a_motor_that_runs_down_open_is_under_no_load_that_steps_nor_ahead(volts, per_turn, phase):
+    """Of a step of forty rows either explains much of what few counts show."""
+    resistance, constant, inertia, viscous, torque = 2.1735, 0.011288, 3.639e-6, 2.157e-6, 4.772e-3
+    command, fine, w = np.repeat([0.0, volts, 0.0], [11, 50, 39]), 200, 0.0
+    angle = np.zeros(command.size)
+    for k, v in enumerate(command.tolist()[1:], 1):
+        turned = 0.0
+        for _ in range(fine):
+            current = (v - constant * w) / resistance if v else 0.0
+            drive = constant * current - viscous * w
+            drag = math.copysign(torque, w) if w else min(max(drive, -torque), torque)
+            after = w + 0.01 / fine / inertia * (drive - drag)
+            after = 0.0 if w * after < 0.0 else after
+            turned += 0.5 * (w + after) * 0.01 / fine
+            w = after
+        angle[k] = angle[k - 1] + turned
+    count = np.floor(angle * per_turn / (2 * np.pi) + phase).astype(np.int64)
+    speed = np.diff(count, prepend=count[0]) * 2 * np.pi / per_turn / 0.01
+    hardware = Hardware(1.0, float(per_turn))
+    time = 0.01 * np.arange(command.size)
+    found = estimate(Record("motor", time, command, velocity=speed, count=count, hardware=hardware))
+    a0 = constant + resistance * viscous / constant
+    truth = {"dc_gain": 1 / a0, "time_constant": resistance * inertia / constant / a0}
+    for name, value in truth.items():
+        assert found.value(name) == pytest.approx(value, rel=0.02), name
+    assert "coast" in {f.code for f in found.findings} and not found.unreliable
+
+
 def test_a_bridge_that_coasts_is_found_in_few_simulations(monkeypatch):
     """Begun at motors of a regression, descents agree: several hundred, not several thousand."""
     record, truth = coasting(0, 1e-5)
     data, options, runs = prepare([record], False), Options(), Counter()
     near = initial_fit(data, FirstOrder(), options)
-    whole = fast_decay.terminal_voltages
+    whole = driver_joint.terminal_voltages
 
     def counted(*args):
         runs["simulations"] += 1
         return whole(*args)
 
-    monkeypatch.setattr(fast_decay, "terminal_voltages", counted)
-    found = fast_decay.fitted(data, near, Driver(driver.COAST, 1.0, 12.0), options)
+    monkeypatch.setattr(driver_joint, "terminal_voltages", counted)
+    sizes = next(e.shares for e in driver.EFFECTS if e.kind == driver.COAST)
+    found = driver_joint.fitted(data, near, Driver(driver.COAST, 1.0, 12.0), options, sizes)
     assert found.driver.size == pytest.approx(truth["fast_decay_ratio"], rel=0.05)
     assert runs["simulations"] < 1000
 

@@ -104,6 +104,6 @@ def test_a_driver_that_explains_hardly_more_than_none_leaves_room_for_none():
     plain = initial_fit(prepare([record], False), FirstOrder(), Options())
     found = likeliest([record], plain, "held", Options())
     friction = plain.structure.free.index("vc_plus")
-    std = math.sqrt(found.widened(found.fit).covariance()[friction, friction])
+    std = math.sqrt(found.widened(found.fit, 0.0)[0].covariance()[friction, friction])
     # What lies between the two is within one deviation.
     assert abs(plain.z.vc_plus - found.fit.z.vc_plus) <= std

@@ -1,13 +1,14 @@
-"""A driver that coasts, fitted together with the motor by least squares.
+"""A driver whose voltage follows the motion, fitted together with the motor by least squares.
 
-Its voltage follows the motion and the motion that voltage: neither can be fixed while the other is
-sought.  Of one that coasts in every PWM period two numbers describe it, L/R in PWM periods and how
-much of the voltage at steady speed is back-EMF; of one that coasts at a command of zero the second.
+The motion follows that voltage, too: neither can be fixed while the other is sought.  Two numbers
+describe it, its size (of one that coasts in every PWM period L/R in such periods) and how much of
+the voltage at steady speed is back-EMF; of one that coasts at a command of zero the second.
 Derivation: docs/derivations.md, section 13.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise, product
@@ -27,11 +28,10 @@ from smp_motor_ident.likelihood.driver_feedback import terminal_voltages
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.passes import own_columns
 from smp_motor_ident.model.coordinates import Coordinates
-from smp_motor_ident.model.driver import COAST, FREE, Driver, Rows
+from smp_motor_ident.model.driver import COAST, COASTING, FREE, Driver, Rows
 from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.model.structures import FirstOrder, SecondOrder, Structure
 
-SIZES = (0.05, 0.3, 1.0, 3.0, 30.0)  # of L/R in PWM periods, for which motors are regressed
 BACK = (0.9, 0.6, 0.4, 0.25, 0.15)  # of the full voltage: back-EMF at the largest speed, the same
 BANDS = 4  # cut-offs of their filters
 APART = 0.3  # e-folds by which starts differ of which the descents may end apart
@@ -40,6 +40,7 @@ SPAN = 20  # samples over which an angle that is predicted drifts little
 MOVES, SEEN = 0.02, 5  # of the largest speed, and sections, above which coasting shows
 FASTEST = 0.999  # quantile of the speed that is the largest
 LEAST = 0.3  # of the voltage at steady speed, what is back-EMF of a motor
+FAR = 4.0  # e-folds of a size, beyond which it is nothing or all
 WEAKER = 3.0  # how much less a current drives that rises for L/R of a period
 LAGS, VOLTS = ("ln_a1", "ln_a2"), ("vc_plus", "vc_minus", "load")
 ALLOWED = {"size": (np.log1p(WEAKER * 1e-3), np.log1p(WEAKER * 1e4))}
@@ -59,7 +60,8 @@ class Joint:
 
     fit: Fit  # the motor, under the voltage of the driver
     driver: Driver
-    std: tuple[float, ...]  # of L/R in PWM periods, if it is one of its numbers, and of the share
+    numbers: tuple[str, ...]  # of the driver that were sought
+    std: float  # of the first of them
     voltage: Array  # by sections of the command [V]
     # shape (12,) each: how much less is known of the motor than under a voltage that is known
     moves: tuple[Array, ...]
@@ -67,50 +69,73 @@ class Joint:
     @property
     def cost(self) -> float:
         """The deviance with a price for each number."""
-        return self.fit.deviance + POLICY.price(1, self.fit.samples) * self.fit.structure.size
+        numbers = self.fit.structure.size + len(self.numbers)
+        return self.fit.deviance + POLICY.price(1, self.fit.samples) * numbers
 
 
-def fitted(data: Experiments, near: Fit, driver: Driver, options: Options) -> Joint | None:
-    """Return a motor behind a coasting driver from a fit that knows of none.
+def fitted(
+    data: Experiments, near: Fit, driver: Driver, options: Options, sizes: Sequence[float]
+) -> Joint | None:
+    """Return a motor behind a driver from a fit that knows of none.
 
-    The first order is sought from motors that are regressed on what drivers would put out, until
-    two descents end alike; from its answer what is richer, if a score says that it may show.
+    The first order is sought from motors that are regressed on what drivers of some ``sizes`` would
+    put out, until two descents end alike; from its answer what is richer, if a score says that it
+    may show.  Of a driver that drives all the time a motor without viscous friction is tried, too.
     """
     first = near.structure.with_(delay=False, load=False, shift=0.0)
     first = FirstOrder.like(first, friction="symmetric")
     problem = _Problem(data, replace(near, structure=first, initial=data.initial), driver)
-    ends: list[optimize.OptimizeResult] = []
-    for p in problem.starts()[:BEGUN]:
-        ends.append(problem.descend(p))
-        if any(not problem.apart(e.x, ends[-1].x) for e in ends[:-1]):
-            break
-    if not ends:
+    if (found := problem.sought(sizes)) is None:
         return None
-    found = min(ends, key=lambda r: float(r.cost))
-    found = found if found.status else problem.descend(found.x, LONGEST)
+    joints = [problem.joint(found, options), _richer(problem, found, near, options)]
+    if driver.kind not in COASTING:
+        joints += [continued(data, j.fit, j.driver, options, ("size",)) for j in joints if j]
+        joints += [
+            _like(near, j, data, options) for j in joints if j and not near.structure.current
+        ]
+    return min((j for j in joints if j), key=lambda j: j.cost, default=None)
+
+
+def _richer(
+    problem: _Problem, found: optimize.OptimizeResult, near: Fit, options: Options
+) -> Joint | None:
+    """Return the motor with a delay or a second lag, if the score of one says that it may show."""
+    data, first = problem.data, problem.structure
     z, initial, driver = problem.unpacked(found.x)
     second, lag = SecondOrder.like(first), z.time_constant
     begins: list[tuple[Structure, Coordinates]] = [
         (first.with_(delay=True), z.with_(delay=LATE * data.step)),
         *((second, z.with_second_lag(s * lag)) for s in SECOND),
     ]
-    joints, most, more = [problem.joint(found, options)], 0.5 * float(np.log(data.size)), None
+    most, more = 0.5 * float(np.log(data.size)), None
     for structure, z in begins:
         other = _Problem(data, replace(near, structure=structure, initial=initial), driver)
         p = other.start(z, driver)
         if (score := problem.score(found, other.misses(p))) > most:
             more, most = (other, p), score
-    if more:
-        richer, p = more
-        joints.append(richer.joint(richer.descend(p), options))
-    return min((j for j in joints if j), key=lambda j: j.cost, default=None)
+    return more and more[0].joint(more[0].descend(more[1]), options)
 
 
-def continued(data: Experiments, joint: Joint, options: Options) -> Joint | None:
-    """Return the same of more data."""
-    near = replace(joint.fit, initial=initial_of(data, joint.fit))
-    problem = _Problem(data, near, joint.driver)
-    return problem.joint(problem.descend(problem.start(joint.fit.z, joint.driver)), options)
+def _like(near: Fit, joint: Joint, data: Experiments, options: Options) -> Joint | None:
+    """Return the motor with all that was found without its driver, if that is more."""
+    if near.structure.size <= joint.fit.structure.size:
+        return None
+    z = near.z.with_(ln_a0=joint.fit.z.ln_a0, ln_a1=joint.fit.z.ln_a1)
+    z = near.structure.complete(z.with_friction(joint.fit.z.vc_plus))
+    there = replace(near, z=z, initial=joint.fit.initial)
+    return continued(data, there, joint.driver, options, joint.numbers)
+
+
+def continued(
+    data: Experiments, fit: Fit, driver: Driver, options: Options, numbers: tuple[str, ...]
+) -> Joint | None:
+    """Return where the descent leads from a motor and its driver, in other data, too.
+
+    Without the ``share`` among its numbers all of the voltage at steady speed is back-EMF.
+    """
+    driver = driver if "share" in numbers else driver._replace(emf_share=1.0)
+    problem = _Problem(data, replace(fit, initial=initial_of(data, fit)), driver, numbers)
+    return problem.joint(problem.descend(problem.start(fit.z, driver)), options)
 
 
 def voltage_of(data: Experiments, fit: Fit, driver: Driver) -> Array:
@@ -144,11 +169,18 @@ def _section_speeds(data: Experiments, lag: float) -> Array:
 class _Problem:
     """The errors by the motor's free coordinates, the driver's numbers and the initial states."""
 
-    def __init__(self, data: Experiments, near: Fit, driver: Driver) -> None:
+    def __init__(
+        self,
+        data: Experiments,
+        near: Fit,
+        driver: Driver,
+        numbers: tuple[str, ...] = ("size", "share"),
+    ) -> None:
         self.data, self.near, self.driver = data, near, driver
         self.structure = near.structure
         self.own = list(own_columns(data, near.structure))
-        self.numbers = ("size", "share") if driver.kind == COAST else ("share",)
+        self.numbers = ("share",) if driver.kind == FREE else numbers
+        self.coasts = driver.kind == COAST
         self.names = (*near.structure.free, *self.numbers)
         self.there = np.isfinite(data.output)
         segments = len(data.starts) - 1
@@ -156,7 +188,7 @@ class _Problem:
         self.weight = 1 / np.sqrt(near.noise[0, 0])
         self.last: tuple[Array, Array] = np.zeros(0), np.zeros(0)
 
-    def starts(self) -> list[Array]:
+    def starts(self, sizes: Sequence[float]) -> list[Array]:
         """Return parameters to begin with, the likeliest first.
 
         What a driver would put out at the measured speed is a known voltage, to which a motor's
@@ -165,7 +197,6 @@ class _Problem:
         data, full, found = self.data, self.driver.full_duty, list[Array]()
         first = np.zeros(data.hold_end.size, dtype=np.bool_)
         first[data.hold_start[: len(data.starts) - 1]] = True
-        sizes = SIZES if "size" in self.numbers else BACK[:1]
         for cutoff in cutoffs(data, BANDS):
             speed = _section_speeds(data, BANDS / cutoff)
             fastest = float(np.quantile(np.abs(speed), FASTEST)) or 1.0
@@ -189,6 +220,16 @@ class _Problem:
                 out.append(p)
         return out
 
+    def sought(self, sizes: Sequence[float]) -> optimize.OptimizeResult | None:
+        """Return the best of descents from several starts, of which no more end elsewhere."""
+        ends: list[optimize.OptimizeResult] = []
+        for p in self.starts(sizes)[:BEGUN]:
+            ends.append(self.descend(p))
+            if any(not self.apart(e.x, ends[-1].x) for e in ends[:-1]):
+                break
+        best = min(ends, key=lambda r: float(r.cost), default=None)
+        return best if best is None or best.status else self.descend(best.x, LONGEST)
+
     def apart(self, one: Array, other: Array) -> bool:
         """Tell whether the motors or drivers of two differ by more than some e-folds."""
         logarithms = [k for k, n in enumerate(self.names) if n.startswith("ln_") or n == "size"]
@@ -208,8 +249,9 @@ class _Problem:
         lag, friction and what is lost to it are multiplied, lest all of them follow the size.
         """
         z, initial = self.structure.complete(z), initial_of(self.data, self.near)
-        h = float(np.log1p(WEAKER * driver.size)) if "size" in self.numbers else 0.0
-        there = {n: z.value(n) for n in self.structure.free} | {"size": h}
+        h = float(np.log1p(WEAKER * driver.size)) if self.coasts else 0.0
+        there = {n: z.value(n) for n in self.structure.free}
+        there["size"] = h if self.coasts else float(np.log(driver.size))
         there |= {n: there[n] + h for n in LAGS if n in there}
         there |= {n: there[n] * np.exp(h) for n in VOLTS if n in there}
         if "ln_a0" in there:
@@ -220,8 +262,10 @@ class _Problem:
     def unpacked(self, p: Array) -> tuple[Coordinates, Array, Driver]:
         """Return the motor, its initial states, and its driver."""
         there, k = dict(zip(self.names, map(float, p))), len(self.names)
-        h = there.pop("size", 0.0)
-        share = 1 / (1 + there.pop("share") * float(np.exp(-h)))
+        logarithm = there.pop("size", 0.0)
+        h = logarithm if self.coasts else 0.0
+        own = there.pop("share", 1 / self.driver.emf_share - 1)
+        share = 1 / (1 + own * float(np.exp(-h)))
         there |= {n: there[n] - h for n in LAGS if n in there}
         there |= {n: there[n] * float(np.exp(-h)) for n in VOLTS if n in there}
         if "ln_a0" in there:
@@ -229,14 +273,16 @@ class _Problem:
         initial = initial_of(self.data, self.near)
         initial[:, self.own] = p[k:].reshape(-1, len(self.own))
         z = self.structure.complete(self.near.z.with_(**there))
-        size = float(np.expm1(h)) / WEAKER if "size" in self.numbers else share
+        size = float(np.expm1(h)) / WEAKER if self.coasts else float(np.exp(logarithm))
+        size = share if self.driver.kind == FREE else size
         return z, initial, self.driver._replace(size=size, emf_share=share)
 
     def _values(self, p: Array) -> Array:
-        """Return the motor's coordinates, the size if it is one, and the share."""
+        """Return the motor's coordinates, and the driver's numbers."""
         z, _, driver = self.unpacked(p)
-        own = [driver.size] if "size" in self.numbers else []
-        return np.array([*(z.value(n) for n in self.structure.free), *own, driver.emf_share])
+        own = {"size": driver.size, "share": driver.emf_share}
+        motor = [z.value(n) for n in self.structure.free]
+        return np.array([*motor, *(own[n] for n in self.numbers)])
 
     def explained(self, before: float, after: float) -> float:
         """Return the deviance between two sums of squares."""
@@ -299,6 +345,8 @@ class _Problem:
         low, high = np.full(p.size, -np.inf), np.full(p.size, np.inf)
         for j, name in enumerate(self.names):
             low[j], high[j] = ALLOWED.get(name, (-np.inf, np.inf))
+            if name == "size" and not self.coasts:  # without an end it would be nothing
+                low[j], high[j] = p[j] - FAR, p[j] + FAR
             if name == "window":
                 low[j] = SHORTEST
             if name == "ln_a2":  # a shorter second lag shows in nothing, and friction chatters
@@ -327,10 +375,10 @@ class _Problem:
         inverse = prediction.inverse(slopes.T @ slopes)[:k, :k]
         together = variance * turn.T @ inverse @ turn
         k = len(self.structure.free)
-        *of_size, share = map(float, np.sqrt(np.diag(together)[k:]))
+        std = float(np.sqrt(together[k, k]))
         known = sandwich_factor(fit) * fit.white()
         moves = [fit.structure.matrix @ m for m in _beyond(together[:k, :k], known)]
-        return Joint(fit, driver, (*of_size, share), data.hold_value, tuple(moves))
+        return Joint(fit, driver, self.numbers, std, data.hold_value, tuple(moves))
 
 
 def _beyond(whole: Array, part: Array) -> list[Array]:
