@@ -8,6 +8,7 @@ Derivation: docs/derivations.md, section 13.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -74,13 +75,19 @@ class Joint:
 
 
 def fitted(
-    data: Experiments, near: Fit, driver: Driver, options: Options, sizes: Sequence[float]
+    data: Experiments,
+    near: Fit,
+    driver: Driver,
+    options: Options,
+    sizes: Sequence[float],
+    most: float = math.inf,
 ) -> Joint | None:
     """Return a motor behind a driver from a fit that knows of none.
 
     The first order is sought from motors that are regressed on what drivers of some ``sizes`` would
     put out, until two descents end alike; from its answer what is richer, if a score says that it
-    may show.  Of a driver that drives all the time a motor without viscous friction is tried, too.
+    may show.  Of a driver that drives all the time and leaves no more than ``most`` deviance, a
+    motor without viscous friction is tried, too, and one of the structure of the fit.
     """
     first = near.structure.with_(delay=False, load=False, shift=0.0)
     first = FirstOrder.like(first, friction="symmetric")
@@ -88,11 +95,14 @@ def fitted(
     if (found := problem.sought(sizes)) is None:
         return None
     joints = [problem.joint(found, options), _richer(problem, found, near, options)]
-    if driver.kind not in COASTING:
-        joints += [continued(data, j.fit, j.driver, options, ("size",)) for j in joints if j]
-        joints += [
-            _like(near, j, data, options) for j in joints if j and not near.structure.current
-        ]
+    best = _cheapest(joints)
+    if best is None or driver.kind in COASTING or best.fit.deviance > most:
+        return best
+    best = _cheapest([best, continued(data, best.fit, best.driver, options, ("size",))])
+    return _cheapest([best, _like(near, best, data, options)]) if best else None
+
+
+def _cheapest(joints: Sequence[Joint | None]) -> Joint | None:
     return min((j for j in joints if j), key=lambda j: j.cost, default=None)
 
 
@@ -118,7 +128,7 @@ def _richer(
 
 def _like(near: Fit, joint: Joint, data: Experiments, options: Options) -> Joint | None:
     """Return the motor with all that was found without its driver, if that is more."""
-    if near.structure.size <= joint.fit.structure.size:
+    if near.structure.current or near.structure.size <= joint.fit.structure.size:
         return None
     z = near.z.with_(ln_a0=joint.fit.z.ln_a0, ln_a1=joint.fit.z.ln_a1)
     z = near.structure.complete(z.with_friction(joint.fit.z.vc_plus))

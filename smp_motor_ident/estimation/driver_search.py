@@ -241,7 +241,10 @@ class _Joint:
         driver = Driver(self.effect.kind, 1.0, full)
         rows = rows_of(prepared(self.group, "held", self.near), self.group, self.near)
         sizes = self.effect.scale(rows) * np.array(self.effect.shares)
-        self.found = driver_joint.fitted(data, self.near, driver, self.options, sizes.tolist())
+        least = most if data is few else math.inf  # which is of those data
+        self.found = driver_joint.fitted(
+            data, self.near, driver, self.options, sizes.tolist(), least
+        )
         if data is few or self.found is None:
             return self._driver_fit(self.found, data, most)
         return self._continued(few, self.found, most)
