@@ -23,7 +23,7 @@ from smp_motor_ident._compile import compiled, inlined
 NOTHING, DEAD_ZONE, CLIP, SLEW, SAG, DROP, COAST, CURRENT, FREE, DRAG = range(10)
 COASTING = (COAST, FREE)
 LARGEST_DROP = 0.4
-"""Of the largest command: two Darlington transistors of a bridge take 4.9 V of 12 (L298, 2 A)."""
+"""Of the supply: two Darlington transistors of a bridge take 4.9 V of 12 (L298, 2 A)."""
 REST = 0.05
 """Back-EMF of a motor that begins at rest, of the largest command at most."""
 
@@ -186,8 +186,9 @@ class DriverEffect:
 
     def may_be(self, size: float, rows: Rows) -> bool:
         """Tell whether there is anything of it, and anything left of the command."""
-        # What brakes is twice as much as what drives.
-        most = {CURRENT: 2.0, DROP: LARGEST_DROP}.get(self.kind, 1.0) * rows.top
+        most = 2 * rows.top if self.kind == CURRENT else rows.top  # what brakes is twice as much
+        if self.kind == DROP:
+            most = min(most, LARGEST_DROP * rows.full_duty)
         return self.kind in (SLEW, SAG, DRAG, *COASTING) or size < most
 
     @property
