@@ -47,10 +47,12 @@ from smp_motor_ident.model.driver import (
     SLEW,
     Driver,
     DriverEffect,
+    Rows,
 )
 from smp_motor_ident.model.structures import FirstOrder
 from smp_motor_ident.record import Record
 
+BRAKES, BRAKED = 0.05, 5  # of the largest command, by which a motor runs ahead, and rows of that
 FINALISTS = 3  # that are held against each other on all of them
 
 
@@ -170,6 +172,12 @@ def _polished(
     return found
 
 
+def _brakes(rows: Rows) -> bool:
+    """Tell whether the motor brakes now and then: of one that is only driven a drop is friction."""
+    ahead = np.abs(rows.back_emf) - np.sign(rows.back_emf) * rows.command
+    return int(np.count_nonzero(ahead > BRAKES * rows.top)) > BRAKED
+
+
 def _coloured(found: DriverFit) -> bool:
     return sandwich_factor(found.fit) > COLOURED.value
 
@@ -240,6 +248,8 @@ class _Joint:
         full = max(float(np.abs(data.hold_value).max(initial=0.0)), supply)
         driver = Driver(self.effect.kind, 1.0, full)
         rows = rows_of(prepared(self.group, "held", self.near), self.group, self.near)
+        if self.effect.kind == DROP and not _brakes(rows):
+            return None
         sizes = self.effect.scale(rows) * np.array(self.effect.shares)
         least = most if data is few else math.inf  # which is of those data
         self.found = driver_joint.fitted(
