@@ -78,7 +78,7 @@ def _told_of_a_plain_square(wheel: str, voltage: np.ndarray) -> bool:
     return any(f.code == "plain_square" for f in estimate(made).findings)
 
 
-@pytest.mark.parametrize("wheel", WHEELS[:1])
+@pytest.mark.parametrize("wheel", WHEELS[::3])
 def test_a_plain_square_under_a_load_that_fluctuates_is_unreliable(wheel):
     t = np.arange(4000) / 200.0
     square = np.where(np.sin(2 * np.pi * 0.9173 * t + 0.2) > 0, 10.0, -9.0)

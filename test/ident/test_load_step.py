@@ -41,7 +41,8 @@ def stepped(at: float) -> np.ndarray:
     return np.where(np.arange(RATE * SECONDS) < at * RATE, 0.0, 0.7)
 
 
-@pytest.mark.parametrize(("counts", "at"), [(False, 4.1), (True, 9.3)])
+@pytest.mark.parametrize("at", [4.1, 9.3])
+@pytest.mark.parametrize("counts", [False, True])
 def test_a_load_that_steps_is_found_and_moves_no_number(counts: bool, at: float) -> None:
     found = estimate(recorded(stepped(at), counts=counts, seed=3))
     (words,) = [f for f in found.findings if f.code == "load_step"]
