@@ -103,6 +103,18 @@ ORDINARY_BEND = Limit(
     "stall current; a transistor's 0.2 V of 12 V: every drive has one of them",
     "test_adequacy.py: what hides in the motors own numbers is no larger than ordinary",
 )  # fmt: skip
+LARGEST_DROP = Limit(
+    0.4, "of the supply",
+    "physical: two Darlington transistors of a bridge take 4.9 V of 12 (L298, 2 A); what looks "
+    "like more is a bridge that coasts",
+    "test_driver_effect.py: an effect in volts is smaller than the command",
+)  # fmt: skip
+BRAKES = Limit(
+    0.05, "of the largest command",
+    "as far as a motor runs ahead of its command by more than its sensor's noise: of one that is "
+    "only driven a drop is friction",
+    "test_driver_joint.py: a drop is sought only where the motor brakes",
+)  # fmt: skip
 FIT_WITHOUT_NOISE = Limit(
     90.0, "% of the speed",
     "a tenth of the motion that neither a sensor's nor a torque's noise explains is the model's "

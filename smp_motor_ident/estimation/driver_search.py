@@ -17,6 +17,7 @@ from scipy.special import chdtri
 
 from smp_motor_control.arrays import Array
 from smp_motor_ident.diagnosis.limits import COLOURED, EFFECT_COVERED
+from smp_motor_ident.diagnosis.sample_limits import BRAKES
 from smp_motor_ident.estimation import driver_joint
 from smp_motor_ident.estimation.candidate_starts import of_kind
 from smp_motor_ident.estimation.descent import (
@@ -52,7 +53,7 @@ from smp_motor_ident.model.driver import (
 from smp_motor_ident.model.structures import FirstOrder
 from smp_motor_ident.record import Record
 
-BRAKES, BRAKED = 0.05, 5  # of the largest command, by which a motor runs ahead, and rows of that
+BRAKED = 5  # rows in which a motor runs ahead of its command, beyond which it brakes
 FINALISTS = 3  # that are held against each other on all of them
 
 
@@ -175,7 +176,7 @@ def _polished(
 def _brakes(rows: Rows) -> bool:
     """Tell whether the motor brakes now and then: of one that is only driven a drop is friction."""
     ahead = np.abs(rows.back_emf) - np.sign(rows.back_emf) * rows.command
-    return int(np.count_nonzero(ahead > BRAKES * rows.top)) > BRAKED
+    return int(np.count_nonzero(ahead > BRAKES.value * rows.top)) > BRAKED
 
 
 def _coloured(found: DriverFit) -> bool:

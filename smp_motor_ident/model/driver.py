@@ -19,11 +19,10 @@ import numpy as np
 
 from smp_motor_control.arrays import Array, Flags
 from smp_motor_ident._compile import compiled, inlined
+from smp_motor_ident.diagnosis.sample_limits import LARGEST_DROP
 
 NOTHING, DEAD_ZONE, CLIP, SLEW, SAG, DROP, COAST, CURRENT, FREE, DRAG = range(10)
 COASTING = (COAST, FREE)
-LARGEST_DROP = 0.4
-"""Of the supply: two Darlington transistors of a bridge take 4.9 V of 12 (L298, 2 A)."""
 REST = 0.05
 """Back-EMF of a motor that begins at rest, of the largest command at most."""
 
@@ -188,7 +187,7 @@ class DriverEffect:
         """Tell whether there is anything of it, and anything left of the command."""
         most = 2 * rows.top if self.kind == CURRENT else rows.top  # what brakes is twice as much
         if self.kind == DROP:
-            most = min(most, LARGEST_DROP * rows.full_duty)
+            most = min(most, LARGEST_DROP.value * rows.full_duty)
         return self.kind in (SLEW, SAG, DRAG, *COASTING) or size < most
 
     @property

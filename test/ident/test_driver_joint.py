@@ -6,8 +6,13 @@ import numpy as np
 import pytest
 
 from smp_motor_ident.estimate import estimate
+from smp_motor_ident.estimation.driver_search import _Joint
+from smp_motor_ident.estimation.fit import Options
+from smp_motor_ident.estimation.initialisation import initial_fit
+from smp_motor_ident.likelihood.experiments import prepare
 from smp_motor_ident.model import driver
 from smp_motor_ident.model.driver import Driver, terminal_voltage
+from smp_motor_ident.model.structures import FirstOrder
 from smp_motor_ident.record import Record
 
 RESISTANCE, CONSTANT, INERTIA, TORQUE = 2.0, 0.05, 2e-4, 0.01
@@ -70,3 +75,16 @@ def test_a_step_and_how_it_ends_tell_a_drop_from_friction():
         assert found.value(name) == pytest.approx(truth[name], rel=0.05), name
     static = found.combinations["static_voltage"]
     assert abs(static.value - truth["static_voltage"]) < 4 * static.std
+
+
+@pytest.mark.parametrize(("levels", "brakes"), [((3, 5, 7, 9), False), ((9, 3, 7, 0), True)])
+def test_a_drop_is_sought_only_where_the_motor_brakes(levels, brakes):
+    """Of one that is only driven a drop and friction are one voltage."""
+    command = np.repeat(np.array([0.0, *levels]), 80)
+    record, _ = recorded(command, behind(driver.DROP, 1.2, 1e-4), 1e-4, 0.2)
+    options = Options()
+    fit = initial_fit(prepare([record], False), FirstOrder(), options)
+    assert fit is not None
+    drop = next(e for e in driver.EFFECTS if e.kind == driver.DROP)
+    found = _Joint([record], [record], fit, options, drop).best(math.inf)
+    assert (found is not None) is brakes
