@@ -268,7 +268,8 @@ def _behind(
         unknown_supply or ("note" if fixed else "warning"),
         f"{words}; the motor is estimated behind it, and a controller meets both",
         {"quantity": effect.quantity, "std": quantity.std, "size": driver.size,
-         "full_duty": driver.full_duty, "emf_share": driver.emf_share},
+         "full_duty": driver.full_duty, "emf_share": driver.emf_share,
+         "diode_drop": driver.diode_drop},
         "" if fixed else advice,
     )  # fmt: skip
     combinations = {**estimate.combinations, effect.quantity: quantity}
@@ -279,9 +280,9 @@ def driver_of(estimate: Estimate) -> Driver:
     """Return the driver behind which a motor was estimated."""
     for effect in EFFECTS:
         for finding in estimate.findings:
-            numbers = [finding.evidence.get(n) for n in Driver._fields[1:]]
+            numbers = [finding.evidence.get(n) for n in ("size", "full_duty", "emf_share")]
             known = [n for n in numbers if isinstance(n, float)]
             same = finding.evidence.get("quantity", effect.quantity) == effect.quantity
             if finding.code == effect.code and same and len(known) == len(numbers):
-                return Driver(effect.kind, *known)
+                return Driver(effect.kind, *known, estimate.evidence(effect.code, "diode_drop"))
     return Driver()

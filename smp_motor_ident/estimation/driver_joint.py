@@ -1,8 +1,9 @@
 """A driver whose voltage follows the motion, fitted together with the motor by least squares.
 
 The motion follows that voltage, too: neither can be fixed while the other is sought.  Two numbers
-describe it, its size (of one that coasts in every PWM period L/R in such periods) and how much of
-the voltage at steady speed is back-EMF; of one that coasts at a command of zero the second.
+describe it, its size (of one that coasts in every PWM period L/R in such periods, and what its
+diodes take) and how much of the voltage at steady speed is back-EMF; of one that coasts at a
+command of zero the second.
 Derivation: docs/derivations.md, section 13.
 """
 
@@ -46,6 +47,7 @@ WEAKER = 3.0  # how much less a current drives that rises for L/R of a period
 LAGS, VOLTS = ("ln_a1", "ln_a2"), ("vc_plus", "vc_minus", "load")
 ALLOWED = {"size": (np.log1p(WEAKER * 1e-3), np.log1p(WEAKER * 1e4))}
 ALLOWED |= dict.fromkeys(("share", "vc_plus", "vc_minus", "delay"), (0.0, np.inf))
+ALLOWED |= {"diodes": (0.0, 3.0)}  # V, of two
 SHORTEST = 1e-9  # s, of a window
 DIFFERENCE = 1e-5  # of each parameter's scale, over which a derivative is taken
 STEPS, LONGEST = 40, 100  # of a descent at most, and of the best
@@ -53,6 +55,7 @@ CLOSE = 0.01  # of the deviance, which a step gains where a descent ends
 SETTLED = 3  # turns of initial states and the voltage of other data
 SECOND = (0.02, 0.2)  # second lags that are tried, of the first
 LATE = 0.3  # samples of delay, the same
+DIODES = 1.0  # V that two diodes take, the same
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,6 +149,13 @@ def continued(
     driver = driver if "share" in numbers else driver._replace(emf_share=1.0)
     problem = _Problem(data, replace(fit, initial=initial_of(data, fit)), driver, numbers)
     return problem.joint(problem.descend(problem.start(fit.z, driver)), options)
+
+
+def with_diodes(data: Experiments, joint: Joint, options: Options) -> Joint:
+    """Return a bridge that is off now and then with what its diodes take, if that is more."""
+    there = joint.driver._replace(diode_drop=DIODES)
+    tried = continued(data, joint.fit, there, options, (*joint.numbers, "diodes"))
+    return _cheapest([joint, tried]) or joint
 
 
 def voltage_of(data: Experiments, fit: Fit, driver: Driver) -> Array:
@@ -267,6 +277,7 @@ class _Problem:
         if "ln_a0" in there:
             there["ln_a0"] += np.log(driver.emf_share)
         there["share"] = (1 / driver.emf_share - 1) * np.exp(h)
+        there["diodes"] = driver.diode_drop
         return np.array([*(there[n] for n in self.names), *initial[:, self.own].ravel()])
 
     def unpacked(self, p: Array) -> tuple[Coordinates, Array, Driver]:
@@ -274,6 +285,7 @@ class _Problem:
         there, k = dict(zip(self.names, map(float, p))), len(self.names)
         logarithm = there.pop("size", 0.0)
         h = logarithm if self.coasts else 0.0
+        diodes = there.pop("diodes", self.driver.diode_drop)
         own = there.pop("share", 1 / self.driver.emf_share - 1)
         share = 1 / (1 + own * float(np.exp(-h)))
         there |= {n: there[n] - h for n in LAGS if n in there}
@@ -285,12 +297,12 @@ class _Problem:
         z = self.structure.complete(self.near.z.with_(**there))
         size = float(np.expm1(h)) / WEAKER if self.coasts else float(np.exp(logarithm))
         size = share if self.driver.kind == FREE else size
-        return z, initial, self.driver._replace(size=size, emf_share=share)
+        return z, initial, self.driver._replace(size=size, emf_share=share, diode_drop=diodes)
 
     def _values(self, p: Array) -> Array:
         """Return the motor's coordinates, and the driver's numbers."""
         z, _, driver = self.unpacked(p)
-        own = {"size": driver.size, "share": driver.emf_share}
+        own = {"size": driver.size, "share": driver.emf_share, "diodes": driver.diode_drop}
         motor = [z.value(n) for n in self.structure.free]
         return np.array([*motor, *(own[n] for n in self.numbers)])
 
@@ -332,7 +344,7 @@ class _Problem:
         """Which parameters are moved at once for a derivative, and by how much."""
         top = float(np.abs(self.data.hold_value).max()) or 1.0
         fastest, lag = top * self.near.z.dc_gain, self.near.z.time_constant
-        scale = dict.fromkeys(("vc_plus", "vc_minus", "load"), top)
+        scale = dict.fromkeys((*VOLTS, "diodes"), top)
         scale |= dict.fromkeys(("delay", "window"), self.data.step)
         of_motor = [(np.array([j]), scale.get(n, 1.0)) for j, n in enumerate(self.names)]
         states, every = (top, fastest, fastest * lag, top), len(self.own)

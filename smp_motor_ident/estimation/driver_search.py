@@ -256,6 +256,8 @@ class _Joint:
         self.found = driver_joint.fitted(
             data, self.near, driver, self.options, sizes.tolist(), least
         )
+        if self.found and self.effect.kind == COAST and supply > 0:  # else they look like it
+            self.found = driver_joint.with_diodes(data, self.found, self.options)
         if data is few or self.found is None:
             return self._driver_fit(self.found, data, most)
         return self._continued(few, self.found, most)

@@ -34,6 +34,7 @@ class Driver(NamedTuple):
     size: float = 0.0
     full_duty: float = 1.0  # command [V] at which it is always on
     emf_share: float = 1.0  # of the voltage at steady speed that is back-EMF, not viscous friction
+    diode_drop: float = 0.0  # over both diodes by which a bridge that is off lets a current on [V]
 
     @property
     def threshold(self) -> float:
@@ -62,16 +63,18 @@ def _beyond(voltage: float, threshold: float) -> float:
 
 
 @inlined
-def _fast_decay(size: float, command: float, back_emf: float, supply: float) -> float:
+def _fast_decay(
+    size: float, command: float, back_emf: float, supply: float, diodes: float
+) -> float:
     """Return the mean voltage of a bridge that is off for the rest of each PWM period [V].
 
     The current that rose meanwhile falls against the supply, through the diodes, until it is none
     or the next period begins; without one the terminals show the back-EMF.  ``size``: the
-    electrical time constant in periods.
+    electrical time constant in periods.  ``diodes``: what they take [V].
     """
     duty = min(abs(command) / supply, 1.0)
     with_it = back_emf if command > 0 else -back_emf
-    drive, brake = supply - with_it, supply + with_it
+    drive, brake = supply - with_it, supply + diodes + with_it
     if drive <= 0.0 or brake <= 0.0:  # beyond what the supply can reach: as if it braked
         return command
     rise = drive * (1.0 - math.exp(-duty / size))
@@ -89,7 +92,7 @@ def terminal_voltage(
     ``back_emf``: what the speed needs if it runs steadily.  ``before``: the voltage at its
     beginning; only a slew limit remembers it.
     """
-    kind, size, full_duty, share = driver
+    kind, size, full_duty, share, diodes = driver
     steady, back_emf = back_emf, share * back_emf
     out = command
     if kind == DEAD_ZONE:
@@ -109,7 +112,7 @@ def terminal_voltage(
     elif kind == CURRENT:
         out = back_emf + min(max(command - back_emf, -size), size)
     elif kind == COAST:
-        out = _fast_decay(size, command, back_emf, full_duty)
+        out = _fast_decay(size, command, back_emf, full_duty, diodes)
     elif kind == FREE and command == 0.0:  # open: the terminals show the back-EMF
         out = back_emf
     elif kind == DRAG:  # a load that is as much less voltage; a search passes some of any size
