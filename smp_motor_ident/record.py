@@ -42,6 +42,8 @@ class Hardware:
         Relative standard deviation of the scale of the current's sensor.
     voltage_accuracy : float or None
         Relative standard deviation of the recorded voltage against that at the terminals.
+    timing_accuracy : float or None
+        Standard deviation [s] of when the instruments read, against the stamp of their row.
     """
 
     gear_ratio: Positive = 1.0
@@ -51,6 +53,7 @@ class Hardware:
     resistance: Positive | None = None
     current_accuracy: NotNegative | None = None
     voltage_accuracy: NotNegative | None = None
+    timing_accuracy: NotNegative | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ from smp_motor_ident.errors import BagError, ParameterError
 SIGNALS = ("voltage", "current", "velocity", "position", "count", "supply", "direction", "time")
 DESCRIBED = ("gear_ratio", "counts_per_revolution", "encoder_bits", "supply_voltage", "resistance")
 """What a ``motor_description`` tells of the hardware."""
-ACCURACIES = ("current_accuracy", "voltage_accuracy")
+ACCURACIES = ("current_accuracy", "voltage_accuracy", "timing_accuracy")
 HARDWARE = (*DESCRIBED, *ACCURACIES)
 _CHOICES = {
     "held": ("after", "before"),

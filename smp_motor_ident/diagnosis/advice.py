@@ -155,31 +155,40 @@ def _resolution(data: Experiments, fit: Fit, tests: ResidualTests) -> Iterator[F
 
 
 def _second_lag(data: Experiments, fit: Fit) -> Iterator[Finding]:
-    """Say of a speed whose second lag is long for a winding's that it may be the sensor's.
+    """Say of a second lag that it may be none of the winding's.
 
     With time constants T and cT the sensor's lag is ``c / (1 + c)`` of what is stated as the
-    motor's.
+    motor's; of one that is too long for a winding's it may be the motor's own, and the first what
+    answers slowly.  Counts have no filter, and of them only a long one is asked for.
     """
-    if fit.structure.order != 2 or fit.structure.current or data.kind == ANGLE:
+    if fit.structure.order != 2 or fit.structure.current:
         return
     ratio, spread = fit.log_ratio()
     if ratio - limits.HALF_WIDTH.value * spread > RINGS:  # which no lag does
         return
     share, least = (lag_share(ratio - k * spread) for k in (0.0, limits.HALF_WIDTH.value))
-    long = share >= limits.WINDING_LAG.value
-    if not long and least < limits.RELEVANT_BIAS.value:
-        return
+    second = share / (1 + share) * fit.z.time_constant
+    long = share >= limits.WINDING_LAG.value or second > limits.LONGEST_WINDING.value
+    if data.kind == ANGLE:
+        if not long or least < limits.RELEVANT_BIAS.value:
+            return
+        other = "a shaft's, a driver's, or a load's that settles slowly"
+    else:
+        seen = least >= limits.RELEVANT_BIAS.value or limits.HALF_WIDTH.value * spread < 1
+        if not long and not seen:
+            return
+        other = "a filter of the speed"
     may_be = "long for a winding's, it may be" if long else "a winding's, or"
     yield Finding(
         "second_lag",
         "warning" if long else "note",
-        f"the speed follows by two lags, the second {share:.2g} of the first: {may_be} a "
-        "filter of the speed, which is no part of the motor's time constant",
+        f"the speed follows by two lags, the second {share:.2g} of the first: {may_be} {other}, "
+        "which is no part of the motor's time constant",
         {
             "share": share,
             "limit": limits.WINDING_LAG.value,
             "quantity": "time_constant",
-            "shift_share": share / (1 + share),
+            "shift_share": (1.0 if long else share) / (1 + share),
         },
         "switch the filter of the firmware off, or record encoder counts or the current",
     )

@@ -19,3 +19,10 @@ ONE_SIZE_ACCURACY = Limit(
     "by about as much; of one size of voltage nothing shows it",
     "test_systematic.py: what one size of voltage hides is in the interval",
 )
+TIMING_ACCURACY = Limit(
+    0.02,
+    "of a sampling interval, a standard deviation",
+    "physical: a loop reads its instruments one after another; a conversion by an Arduino (0.1 ms) "
+    "or a transfer of 4 bytes by I2C at 400 kHz is a hundredth or two of 10 ms",
+    "test_systematic.py: when a loop reads its instruments is in the interval",
+)

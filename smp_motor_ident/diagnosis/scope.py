@@ -15,7 +15,7 @@ from smp_motor_ident.diagnosis.limits import (
 )
 from smp_motor_ident.diagnosis.one_size import one_size, size_of_voltage
 from smp_motor_ident.diagnosis.sample_limits import FRICTION_MOST
-from smp_motor_ident.diagnosis.systematic import BY_CURRENT, of_current, of_one_size
+from smp_motor_ident.diagnosis.systematic import BY_CURRENT, of_current, of_one_size, of_timing
 from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.prediction import voltage_at_samples
 from smp_motor_ident.estimation.quantities import Answer
@@ -46,6 +46,7 @@ def scope(
         yield _one_level(result, _turns_at_others(data, abs(result.level)))
     yield from _friction_dominates(result, float(np.abs(data.voltage).max()))
     yield from _current_scale(result, group[0].hardware, size_of_voltage(data) > 0)
+    yield from _timing(result, group[0].hardware, data.step)
     if change.std:
         yield _motor_changes(change, group, float(np.abs(data.voltage).max()))
 
@@ -205,6 +206,25 @@ def _current_scale(result: Answer, hardware: Hardware, one_size: bool) -> Iterat
         {"scale": scale, "ohmmeter": ohmmeter, "of_the_scale": ", ".join(known)},
         remedy if off else "",
     )
+
+
+def _timing(result: Answer, hardware: Hardware, step: float) -> Iterator[Finding]:
+    """Say that what is shorter than a sampling interval hangs on when the instruments read."""
+    seconds = of_timing(hardware, step)
+    known = {**result.parameters, **result.combinations}
+    times = {n: q.value for n, q in known.items() if q.status == "estimated" and q.value}
+    lag = times.get("time_constant_product", math.inf) / times.get("time_constant", 1.0)
+    short = {"L/R": lag, "delay": times.get("delay", math.inf)}
+    named = [n for n, long in short.items() if RELEVANT_BIAS.value * long < seconds]
+    if named:
+        yield Finding(
+            "timing",
+            "note",
+            f"when the instruments read against the stamp of their row, which no record shows, is "
+            f"in {', '.join(named)}, whose intervals take it as known to {1e3 * seconds:.2g} ms",
+            {"seconds": seconds},
+            "state how well that is known (`timing_accuracy`)",
+        )
 
 
 def _turns_at_others(data: Experiments, level: float) -> bool:

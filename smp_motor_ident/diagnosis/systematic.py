@@ -10,7 +10,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from smp_motor_ident.diagnosis.instrument_limits import CURRENT_ACCURACY, ONE_SIZE_ACCURACY
+from smp_motor_ident.diagnosis.effects import EFFECTS
+from smp_motor_ident.diagnosis.instrument_limits import (
+    CURRENT_ACCURACY,
+    ONE_SIZE_ACCURACY,
+    TIMING_ACCURACY,
+)
 from smp_motor_ident.estimation.fitted import NORMAL_95
 from smp_motor_ident.record import Hardware
 from smp_motor_ident.result import Estimate, Quantity, Systematic
@@ -35,6 +40,8 @@ BY_LAG: Mapping[str, float] = {
 BY_LOAD: Mapping[str, float] = {"static_voltage": -1.0, "coulomb_friction": -1.0}
 """What is a constant load's, one way, is none of the friction's."""
 NOT_SIGNED = ("load_voltage", "steady_speed")
+OF_ANYTHING = 1.0 / math.sqrt(3.0)
+"""Root mean square of what is anything from nothing to all of it, each as likely."""
 
 
 def of_current(hardware: Hardware) -> float:
@@ -47,6 +54,12 @@ def of_one_size(hardware: Hardware) -> float:
     """Return how well gain and lag at other voltages are known from one size of it, relative."""
     stated = hardware.voltage_accuracy
     return ONE_SIZE_ACCURACY.value if stated is None else stated
+
+
+def of_timing(hardware: Hardware, sample_time: float) -> float:
+    """Return how well it is known when a loop's instruments read [s]."""
+    stated = hardware.timing_accuracy
+    return TIMING_ACCURACY.value * sample_time if stated is None else stated
 
 
 def with_systematic(estimate: Estimate) -> Estimate:
@@ -65,9 +78,14 @@ def _unseen(estimate: Estimate) -> Iterator[Systematic]:
     if "one_size_of_voltage" in codes:
         for by in (BY_VOLTAGE, BY_LAG):
             yield _moved(estimate, "one_size_of_voltage", of_one_size(hardware), by)
-    if "one_direction" in codes:  # of none to all of it, each as likely, the root mean square
-        share = 1.0 / math.sqrt(3.0)
-        yield replace(_moved(estimate, "one_direction", share, BY_LOAD), one_sided=True)
+    if "one_direction" in codes:
+        yield replace(_moved(estimate, "one_direction", OF_ANYTHING, BY_LOAD), one_sided=True)
+    if _lag_is_open(estimate):
+        share = estimate.evidence("second_lag", "shift_share")
+        by = {"time_constant": -share, "time_constant_product": -1.0}
+        yield _beyond_random(estimate, _moved(estimate, "second_lag", OF_ANYTHING, by))
+    if "timing" in codes:
+        yield from _mistimed(estimate, of_timing(hardware, estimate.sample_time))
 
 
 def _moved(estimate: Estimate, cause: str, share: float, by: Mapping[str, float]) -> Systematic:
@@ -80,6 +98,42 @@ def _moved(estimate: Estimate, cause: str, share: float, by: Mapping[str, float]
         and quantity.value is not None
     }
     return Systematic(cause, share, moves)
+
+
+def _lag_is_open(estimate: Estimate) -> bool:
+    """Tell whether a second lag may be another's than a filter's, of which its odds are known.
+
+    It is too long for a winding's, or the records show what the model lacks.
+    """
+    grave = {f.code for f in estimate.findings if f.severity != "note"}
+    shown = any(f.code == "second_lag" for f in estimate.findings)
+    return shown and bool(grave & {"second_lag", *(e.code for e in EFFECTS)})
+
+
+def _beyond_random(estimate: Estimate, one: Systematic) -> Systematic:
+    """Return what moves one way, and of that what the scatter does not hold already."""
+    moves = {
+        name: math.copysign(math.sqrt(max(move**2 - estimate.random_std(name) ** 2, 0.0)), move)
+        for name, move in one.moves.items()
+    }
+    return replace(one, moves=moves, one_sided=True)
+
+
+def _mistimed(estimate: Estimate, seconds: float) -> Iterator[Systematic]:
+    """Yield what is late by some seconds: a current is a longer L/R, all together a delay.
+
+    ``v(t) = R i(t) + L i'(t) + K w(t)`` of a current that is read later by d is ``R i + (L + R d)
+    i' + K w`` to first order.
+    """
+    late = {"inductance": "resistance", "time_constant_product": "time_constant"}
+    moves = {name: seconds * estimate.value(of) for name, of in late.items()}
+    for every in (moves, {"delay": seconds}):
+        known = {**estimate.parameters, **estimate.combinations}
+        there = {
+            n: d for n, d in every.items()
+            if (q := known.get(n)) is not None and q.status == "estimated" and q.value is not None
+        }  # fmt: skip
+        yield Systematic("timing", seconds / estimate.sample_time, there)
 
 
 def _widened(estimate: Estimate, one: Systematic) -> Estimate:

@@ -272,6 +272,10 @@ def _covariance(estimate: Estimate, names: tuple[str, ...], mean: Array) -> Arra
     known = [k for k, name in enumerate(names) if name in estimate.names]
     index = [estimate.names.index(names[k]) for k in known]
     covariance[np.ix_(known, known)] = estimate.covariance[np.ix_(index, index)]
+    for one in estimate.systematic:
+        if one.cause == "second_lag":  # whose of the two lags is whose, `lag_in_sensor` draws
+            move = np.array([one.moves.get(name, 0.0) for name in names])
+            covariance -= np.outer(move, move)
     spread = np.zeros(len(names))
     if estimate.unreliable:
         spread[:] = unreliable_spread(estimate)

@@ -19,6 +19,6 @@ def exact_instruments() -> Iterator[None]:
     What is taken of instruments whose accuracy nobody states is asked for in test_systematic.py.
     """
     with pytest.MonkeyPatch.context() as patch:
-        for name in ("CURRENT_ACCURACY", "ONE_SIZE_ACCURACY"):
+        for name in ("CURRENT_ACCURACY", "ONE_SIZE_ACCURACY", "TIMING_ACCURACY"):
             patch.setattr(systematic, name, replace(getattr(systematic, name), value=0.0))
         yield

@@ -120,6 +120,24 @@ def test_a_speed_that_is_filtered_as_slowly_as_the_motor_turns_may_be_the_sensor
         assert all(abs(f.evidence["shift_share"] - due) < 0.3 * due for f in lags)
 
 
+def test_a_drift_is_no_winding() -> None:
+    """A motor that warms up after its only step: its own lag is the second, no winding's."""
+    rng, step, lag = np.random.default_rng(6), 0.004, 0.28
+    t = step * np.arange(1750)
+    voltage, speed = np.full(t.size, 8.0), np.zeros(t.size)
+    for k in range(1, t.size):
+        steady = 540.0 + 30.0 * (1 - np.exp(-t[k] / 2.5))
+        speed[k] = steady - (steady - speed[k - 1]) * np.exp(-step / lag)
+    angle = np.cumsum(speed) * step
+    found = estimate(
+        Record("motor", t, voltage, position=angle + 0.02 * rng.standard_normal(t.size))
+    )
+    (said,) = [f for f in found.findings if f.code == "second_lag"]
+    assert said.severity == "warning" and "a load's that settles" in said.message
+    q = found.combinations["time_constant"]
+    assert q.value > 1.0 and q.ci95[0] < lag
+
+
 def test_a_motor_that_rings_has_a_winding_and_no_filter() -> None:
     # Motor 1 of Table 1: L/R of 24 ms beside R J / (K^2 + R b) of 34 ms, damping 0.90.
     found = estimate(replace(motors.record("front_left", seconds=8.0), current=None)).findings

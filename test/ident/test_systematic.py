@@ -3,17 +3,21 @@
 from collections.abc import Mapping
 from dataclasses import replace
 
+import independent
 import motors
 import numpy as np
 import pytest
 
 from smp_motor_ident.diagnosis import instrument_limits, systematic
+from smp_motor_ident.diagnosis.systematic import with_systematic
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.record import Record
+from smp_motor_ident.finding import Finding
+from smp_motor_ident.record import Hardware, Record
 from smp_motor_ident.report.document import identification_document, read_identification
 from smp_motor_ident.result import to_json
 from smp_motor_ident.tune.designer import design
 from smp_motor_ident.tune.loop import Loop
+from smp_motor_ident.tune.motors import draw_motors
 
 WHEEL = "rear_left"
 
@@ -21,7 +25,7 @@ WHEEL = "rear_left"
 @pytest.fixture(autouse=True)
 def usual_instruments(monkeypatch: pytest.MonkeyPatch) -> None:
     """Take of instruments what is taken of a stranger's."""
-    for name in ("CURRENT_ACCURACY", "ONE_SIZE_ACCURACY"):
+    for name in ("CURRENT_ACCURACY", "ONE_SIZE_ACCURACY", "TIMING_ACCURACY"):
         monkeypatch.setattr(systematic, name, getattr(instrument_limits, name))
 
 
@@ -121,6 +125,70 @@ def test_one_way_the_friction_may_be_a_load(load: float) -> None:
     assert static.value == pytest.approx(2.0, abs=0.1)
     assert static.ci95[0] <= 2.0 - load <= static.ci95[1] < 2.2
     assert [one.cause for one in found.systematic] == ["one_direction"]
+
+
+FINE = 50
+
+
+def _sampled(late: float, **known: float) -> tuple[Record, dict[str, float]]:
+    """Return a record whose current shows what was, by a share of a row, and its truth."""
+    step, n = 0.01, 1200
+    rng = np.random.default_rng(14)
+    voltage = np.repeat(rng.uniform(-10.0, 10.0, n // 4), 4)
+    r, el, k, j, b, tc = 2.0, 2e-3, 0.05, 2e-4, 1e-5, 0.01
+    held = np.repeat(voltage, FINE)
+    t = np.arange(held.size) * step / FINE
+    out = independent.simulate(t, held, r, el, k, j, b, tc, np.zeros(t.size), 2)
+    ends = FINE * np.arange(1, n) - 1
+    amps = out[ends - round(late * FINE), 0] + 0.01 * rng.standard_normal(n - 1)
+    speed = out[ends, 1] + 0.02 * rng.standard_normal(n - 1)
+    hardware = Hardware(current_accuracy=0.0, **known)
+    record = Record("motor", t[ends], voltage[:-1], amps, speed, hardware=hardware)
+    return record, {"inductance": el, "resistance": r, "inertia": j}
+
+
+@pytest.mark.parametrize("late", [0.0, 0.02])
+def test_when_a_loop_reads_its_instruments_is_in_the_interval(late: float) -> None:
+    record, truth = _sampled(late)
+    found = estimate(record)
+    assert not found.unreliable
+    assert max(deviations(found.parameters, truth).values()) < 4.0
+    inductance, std = found.parameters["inductance"], found.random_std("inductance")
+    assert std < 0.3 * inductance.std
+    assert inductance.std == pytest.approx(0.02 * 0.01 * truth["resistance"], rel=0.1)
+    assert "timing" in {f.code for f in found.findings}
+
+
+def test_a_loop_that_is_timed_better_is_taken_at_its_word() -> None:
+    record, _ = _sampled(0.0, timing_accuracy=0.0)
+    found = estimate(record)
+    assert not found.systematic and "timing" not in {f.code for f in found.findings}
+
+
+def test_a_second_lag_may_be_what_the_records_show_that_the_model_lacks() -> None:
+    """Friction at reversals says that it is no filter; of a driver it says nothing."""
+    rate, lag, rng = 500.0, 0.05, np.random.default_rng(15)
+    voltage = np.repeat(rng.choice([-8.0, -4.0, 4.0, 8.0], 60), 40)
+    r, el, k, j = 2.0, 2e-3, 0.05, lag * 0.05**2 / 2.0
+    held = np.repeat(voltage, 4)
+    t = np.arange(held.size) / (4 * rate)
+    out = independent.simulate(t, held, r, el, k, j, 0.0, 0.02, np.zeros(t.size), 2)
+    speed = out[3::4, 1] + 0.02 * rng.standard_normal(voltage.size)
+    made = Record("motor", np.arange(voltage.size) / rate, voltage, velocity=speed)
+    found = estimate(replace(made, hardware=Hardware(timing_accuracy=0.0)))
+    assert "second_lag" in {f.code for f in found.findings} and not found.systematic
+    slew = Finding("slew", "warning", "the model's error shows a driver that limits the rise")
+    beside = with_systematic(replace(found, findings=(*found.findings, slew)))
+    whole, product = (beside.combinations[n] for n in ("time_constant", "time_constant_product"))
+    share = found.evidence("second_lag", "shift_share")
+    assert share == pytest.approx(el / r / (lag + el / r), rel=0.3)
+    assert whole.std == pytest.approx(share * whole.value / np.sqrt(3), rel=0.05)
+    assert product.std == pytest.approx(product.value / np.sqrt(3), rel=0.05)
+    assert whole.ci95[1] == found.combinations["time_constant"].ci95[1]  # it moves one way only
+    # Whose of them is whose moves no gains: what the loop is of is both.
+    a, b = (draw_motors(e, 200, np.random.default_rng(1)) for e in (found, beside))
+    assert a is not None and b is not None
+    np.testing.assert_allclose(a.a1, b.a1)
 
 
 def test_what_no_record_shows_is_in_the_file(tmp_path) -> None:
