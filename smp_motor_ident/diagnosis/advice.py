@@ -6,7 +6,7 @@ import numpy as np
 
 from smp_motor_control.motor.parameters import PHYSICAL
 from smp_motor_ident.diagnosis import limits
-from smp_motor_ident.diagnosis.sample_limits import FIT_WITHOUT_NOISE
+from smp_motor_ident.diagnosis.sample_limits import FIT_WITHOUT_NOISE, LONGEST_WINDING
 from smp_motor_ident.diagnosis.sensors import sensors
 from smp_motor_ident.diagnosis.smoothed_friction import acceleration_noise
 from smp_motor_ident.diagnosis.validation import within_resolution
@@ -168,7 +168,7 @@ def _second_lag(data: Experiments, fit: Fit) -> Iterator[Finding]:
         return
     share, least = (lag_share(ratio - k * spread) for k in (0.0, limits.HALF_WIDTH.value))
     second = share / (1 + share) * fit.z.time_constant
-    long = share >= limits.WINDING_LAG.value or second > limits.LONGEST_WINDING.value
+    long = share >= limits.WINDING_LAG.value or second > LONGEST_WINDING.value
     if data.kind == ANGLE:
         if not long or least < limits.RELEVANT_BIAS.value:
             return

@@ -212,12 +212,6 @@ WINDING_LAG = Limit(
     "tenth, and a wheel's inertia makes that smaller",
     "test_findings.py: a speed that is filtered as slowly as the motor turns",
 )  # fmt: skip
-LONGEST_WINDING = Limit(
-    0.1, "s",
-    "physical: four times the longest L/R of the paper's Table 1 (24 ms), which is long already; "
-    "catalogues of motors below a kilowatt have some milliseconds",
-    "test_findings.py: a drift is no winding",
-)  # fmt: skip
 SQUARE_LEVEL = Limit(
     0.03, "share of the level", "what a voltmeter scatters around a level", "test_estimate.py"
 )

@@ -5,6 +5,7 @@ from collections.abc import Iterable
 from smp_motor_ident.diagnosis.differenced import counts_again, over_real_intervals
 from smp_motor_ident.diagnosis.edge_timer import between_edges, held_of
 from smp_motor_ident.diagnosis.glitches import without_glitches
+from smp_motor_ident.diagnosis.silence import without_silences
 from smp_motor_ident.diagnosis.stamps import bridged, merge_bunches, on_beat
 from smp_motor_ident.record import Record
 
@@ -12,10 +13,11 @@ from smp_motor_ident.record import Record
 def repaired(records: Iterable[Record]) -> list[Record]:
     """Return records with their stamps, lost rows and readings put right as far as they show it.
 
-    Glitches come last: what a nominal period makes of a late interval looks like one.
+    Glitches come late: what a nominal period makes of a late interval looks like one.
     """
     stamped = [merge_bunches(on_beat(over_real_intervals(between_edges(r)))) for r in records]
-    return counts_again([without_glitches(bridged(r)) for r in stamped])
+    whole = counts_again([without_glitches(bridged(r)) for r in stamped])
+    return [without_silences(r) for r in whole]
 
 
 def hides_driver(records: Iterable[Record]) -> bool:

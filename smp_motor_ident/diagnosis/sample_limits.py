@@ -133,3 +133,14 @@ FRICTION_MOST = Limit(
     "driver that coasts between its pulses",
     "test_coasting_driver.py: a motor that friction nearly holds is unreliable",
 )  # fmt: skip
+LONGEST_WINDING = Limit(
+    0.1, "s",
+    "physical: four times the longest L/R of the paper's Table 1 (24 ms), which is long already; "
+    "catalogues of motors below a kilowatt have some milliseconds",
+    "test_findings.py: a drift is no winding",
+)  # fmt: skip
+LEFT_BY_SILENCE = Limit(
+    0.5, "share of a record",
+    "what does not show the motor in most of a record is an encoder to be mended",
+    "test_silence.py: a motor that is blocked for a while is estimated from the rest",
+)  # fmt: skip

@@ -1,5 +1,7 @@
 """A sensor that falls silent: dead, or of a motion too small for it to show."""
 
+from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -8,7 +10,10 @@ from scipy.optimize import minimize
 from smp_motor_control.arrays import Array, Flags
 from smp_motor_ident._compile import compiled
 from smp_motor_ident.diagnosis.limits import FEWEST, FLICKER, SILENT_SWING
+from smp_motor_ident.diagnosis.sample_limits import LEFT_BY_SILENCE
 from smp_motor_ident.errors import SignalError
+from smp_motor_ident.estimation.disturbance import of_rows
+from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.first_order_lag import lagged
 from smp_motor_ident.record import Record
 
@@ -18,6 +23,42 @@ FRICTIONS = (0.0, 0.1, 0.2, 0.35, 0.5, 0.7)  # of the largest voltage: to what h
 
 def silent(record: Record, where: str) -> None:
     """Refuse a sensor that stops half-way while the voltage goes on and would move the motor."""
+    for name, a, b in _silences(record):
+        raise SignalError(
+            f"{where}: dead encoder, the {name} stays at {getattr(record, name)[a + 1] + 0.0:.6g} "
+            f"from t = {record.time[a]:.4g} s to {record.time[b]:.4g} s while the voltage reaches "
+            f"{np.abs(record.voltage[a + 1 : b]).max():.3g} V; check the encoder's cable, or that "
+            "nothing blocks the motor"
+        )
+
+
+def without_silences(record: Record) -> Record:
+    """Return a record without what a sensor did not show that goes on later.
+
+    What is around it tells the motor, whether that was held or its encoder came loose.
+    """
+    least = LEFT_BY_SILENCE.value * len(record)
+    while found := next((s for s in _silences(record) if s[2] + 1 < len(record)), None):
+        name, a, b = found
+        rows = np.ones(len(record), dtype=np.bool_)
+        rows[a:b] = False
+        if rows.sum() < least:
+            break
+        begin, end = record.time[a], record.time[b]
+        said = Finding(
+            "blocked",
+            "warning",
+            f"the {name} stays from {begin:.4g} s to {end:.4g} s while the voltage would move the "
+            "motor: left out",
+            {"signal": name, "begin": float(begin), "end": float(end)},
+            "look for what held the motor then, or for a loose cable of the encoder",
+        )
+        record = replace(of_rows(record, rows), findings=(*record.findings, said))
+    return record
+
+
+def _silences(record: Record) -> Iterator[tuple[str, int, int]]:
+    """Yield of each signal its longest silence, if the voltage would have moved the motor."""
     for name in ("count", "position", "velocity"):
         values = getattr(record, name)
         if values is None or len(record) < 200:
@@ -34,12 +75,7 @@ def silent(record: Record, where: str) -> None:
         if np.abs(still).mean() <= 0.5 * np.abs(rest).mean():
             continue
         if _swing(record, name, a, b) > SILENT_SWING.value:
-            raise SignalError(
-                f"{where}: dead encoder, the {name} stays at {values[a + 1] + 0.0:.6g} from "
-                f"t = {record.time[a]:.4g} s to {record.time[b]:.4g} s while the voltage reaches "
-                f"{np.abs(still).max():.3g} V; check the encoder's cable, or that nothing "
-                "blocks the motor"
-            )
+            yield name, a, b
 
 
 def _swing(record: Record, name: str, a: int, b: int) -> float:

@@ -8,6 +8,7 @@ import pytest
 
 from smp_motor_ident.diagnosis.silence import silent
 from smp_motor_ident.errors import SignalError
+from smp_motor_ident.estimate import estimate
 
 RATE = 2000.0
 TIME = np.arange(int(10 * RATE)) / RATE
@@ -83,3 +84,23 @@ def test_what_stands_at_the_end_of_one_run_says_nothing_of_the_next():
     with pytest.raises(SignalError, match="dead encoder"):
         silent(replace(whole, count=kept), "record")
     silent(replace(whole, count=kept, starts=(0, 1000)), "two runs")  # 150 rows each: too few
+
+
+@pytest.mark.parametrize("span", [(800, 1200), (500, 1400)])
+def test_a_motor_that_is_blocked_for_a_while_is_estimated_from_the_rest(span) -> None:
+    """A fifth of the record, and nearly half of it: it had been refused as a dead encoder."""
+    volts = motors.independent.excitation(np.arange(2000) / 200.0, "fourier", 10.0)
+    whole = motors.record("rear_left", current=False, voltage=volts, rate=200.0)
+    whole = replace(whole, velocity=None)
+    a, b = span
+    stays = whole.count[a]
+    after = whole.count[b:] - whole.count[b] + stays
+    stands = np.concatenate([whole.count[:a], np.full(b - a, stays), after])
+    found, plain = estimate(replace(whole, count=stands)), estimate(whole)
+    assert not found.unreliable
+    (said,) = [f for f in found.findings if f.code == "blocked"]
+    assert said.evidence["begin"] == pytest.approx(a / 200.0, abs=0.02)
+    assert said.evidence["end"] == pytest.approx(b / 200.0, abs=0.02)
+    for name in ("dc_gain", "time_constant", "static_voltage"):
+        one, other = found.combinations[name], plain.combinations[name]
+        assert abs(one.value - other.value) < 4 * one.std < 0.2 * one.value, name
