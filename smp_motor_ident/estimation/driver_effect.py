@@ -284,5 +284,6 @@ def driver_of(estimate: Estimate) -> Driver:
             known = [n for n in numbers if isinstance(n, float)]
             same = finding.evidence.get("quantity", effect.quantity) == effect.quantity
             if finding.code == effect.code and same and len(known) == len(numbers):
-                return Driver(effect.kind, *known, estimate.evidence(effect.code, "diode_drop"))
+                diodes = estimate.evidence(effect.code, "diode_drop")
+                return Driver(effect.kind, *known)._replace(diode_drop=diodes)
     return Driver()
