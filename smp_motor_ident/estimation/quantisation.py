@@ -103,13 +103,20 @@ def _errors(
     spread: Array,
     rng: np.random.Generator,
 ) -> Array:
-    """Return what rounding an output does to the estimate, for motions near it, (replays, f).
+    """Return what rounding an output does to the estimate, for motions near it, (replays, f)."""
+    influence, slope = carried
+    return _replayed(data, fit, of, step, slope @ spread, rng) @ influence
+
+
+def _replayed(
+    data: Experiments, fit: Fit, of: int, step: float, moves: Array, rng: np.random.Generator
+) -> Array:
+    """Return the errors of a rounded output, for motions near the fitted one, (replays, n).
 
     Where a zero is free, a counter's or a current's of unknown offset, it may be anywhere.
     """
     noise = np.sqrt(max(fit.noise[of, of] - step**2 / 12, 0.0))
-    influence, slope = carried
-    there, moves = prediction.simulate(data, fit)[:, 1 + of], slope @ spread
+    there = prediction.simulate(data, fit)[:, 1 + of]
     measured = np.isfinite(data.current) if of else np.isfinite(data.output)
     anywhere = "current_offset" in fit.structure.free if of else data.kind == ANGLE
     errors = []
@@ -121,4 +128,14 @@ def _errors(
         shown += rng.uniform(-0.5, 0.5) * step * anywhere
         wrong = np.rint(shown / step) * step - true
         errors.append((wrong - wrong.mean() * anywhere) * measured)
-    return np.asarray(np.array(errors).reshape(-1, data.size) @ influence)
+    return np.array(errors).reshape(-1, data.size)
+
+
+def rounded(data: Experiments, fit: Fit, seed: int = 0) -> Array:
+    """Return the errors of a rounded motion near the fitted one, (replays, n); none if not so."""
+    step, _ = _steps(data, fit)
+    if fit.noise_ratio > 0 or not step:
+        return np.zeros((0, data.size))
+    slope = prediction.influence(data, fit)[1]
+    moves = slope @ _half(REACH**2 * fit.covariance())
+    return _replayed(data, fit, 0, step, moves, np.random.default_rng(seed))

@@ -31,6 +31,7 @@ from smp_motor_ident.estimation.fit import Fit
 from smp_motor_ident.estimation.fitted import NORMAL_95
 from smp_motor_ident.estimation.prediction import inverse as inverse_of
 from smp_motor_ident.estimation.prediction import positive_part, simulate
+from smp_motor_ident.estimation.quantisation import rounded
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.passes import gather
 from smp_motor_ident.model.coordinates import LOGARITHMS, PLAUSIBLE, Coordinates
@@ -94,6 +95,8 @@ def heterogeneous(data: Experiments, fit: Fit) -> tuple[Fit, Change]:
     level = HOMOGENEITY.value / (1 if whole is None else 3)
     unlike = _unlike(whole, parts, level)
     use = whole if unlike and (parts is None or len(data.starts) > FEWEST) else parts
+    if use is parts and parts and not unlike and _changed(parts, level):
+        use = parts = _as_rounded(data, fit, parts)
     if use is None or not (unlike or _changed(use, level)):
         return fit, Change()
     ordered = len(data.starts) - 1 < FEWEST and len(use.step) >= ORDERED  # no sequence of records
@@ -107,6 +110,28 @@ def heterogeneous(data: Experiments, fit: Fit) -> tuple[Fit, Change]:
     std = dict(zip(names, map(float, np.sqrt(np.diag(between))), strict=True))
     widened = added + (0.0 if fit.added is None else fit.added)
     return replace(fit, added=widened), _named(whole, parts, level, fit, Change(std))
+
+
+def _as_rounded(data: Experiments, fit: Fit, parts: Steps) -> Steps:
+    """Return steps that are as unsure as the same motor's, replayed through its counter.
+
+    A steady speed of a whole number of counts in a few samples is off by the same for as long.
+    """
+    seen = simulate(data, fit)
+    current = data.current
+    if current.size:
+        current = np.where(np.isfinite(current), seen[:, 2], np.nan)
+    squares = np.zeros_like(parts.step)
+    errors = rounded(data, fit)
+    for error in errors:
+        again = replace(data, output=seen[:, 1] + error, current=current)
+        steps = _steps(again, fit, int(SEGMENTS.value))
+        if steps is None or steps.step.shape != parts.step.shape:
+            return parts
+        squares += np.square(steps.step - steps.step.mean(axis=0)) / len(errors)
+    expected = np.maximum(np.einsum("bii->bi", parts.cov), 1e-300)
+    more = np.sqrt(np.maximum(squares / expected, 1.0))
+    return replace(parts, cov=parts.cov * more[:, :, None] * more[:, None, :])
 
 
 def _noise(use: Steps, parts: Steps | None, level: float) -> Array:

@@ -226,3 +226,17 @@ def test_what_differs_from_day_to_day_is_no_effect_of_the_voltages_that_they_had
     assert change.std
     alike, apart = (regression(data, fit, 1.0, changing) for changing in (False, True))
     assert lacking(alike, True)[0] and not lacking(apart, True)[0]
+
+
+@pytest.mark.parametrize("seed", [4, 30])
+def test_a_speed_of_whole_counts_a_sample_is_no_change_of_the_motor(seed: int) -> None:
+    """What a counter rounds away is the same for as long as such a speed lasts."""
+    rng = np.random.default_rng(seed)
+    levels = rng.uniform(2, 9, 14) * rng.choice([-1, 1], 14)
+    volts = np.repeat(levels, rng.integers(150, 600, 14))[:5000]
+    whole = motors.record("rear_left", voltage=volts, rate=2000.0, current=False)
+    found, truth = estimate(replace(whole, velocity=None)), motors.truth("rear_left", 0.3)
+    assert "motor_changes" not in {f.code for f in found.findings}
+    for name in ("dc_gain", "time_constant"):
+        q = found.combinations[name]
+        assert abs(q.value - truth[name]) < 4 * q.std < 0.01 * q.value, name
