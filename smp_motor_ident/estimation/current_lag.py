@@ -8,9 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 
+from smp_motor_ident.diagnosis.limits import COLOURED
 from smp_motor_ident.estimation import data_window, descent, prediction
 from smp_motor_ident.estimation.candidate_starts import of_kind
 from smp_motor_ident.estimation.delay_and_averaging import with_average
@@ -19,7 +21,7 @@ from smp_motor_ident.estimation.selection import POLICY, FittedCandidate, sandwi
 from smp_motor_ident.estimation.trials import slower_winding
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.coordinates import Coordinates
-from smp_motor_ident.model.structures import SENSORS, Electromechanical, Structure
+from smp_motor_ident.model.structures import SENSORS, Electromechanical, Structure, sensor_of
 
 LITTLE = 0.01  # of a sample: a lag that is as good as none, for the score
 BEYOND = 0.6  # of a sample: the mean lag of a window that reaches beyond the last change of voltage
@@ -28,6 +30,7 @@ SAMPLES = (0.25, 0.5, 1.5, 5.0)  # of lag at which a descent begins
 FEW, KEPT = 4, 2  # passes after which starts are ranked, and how many go on
 # What is left of a winding whose lag is the sensor's: samples or a share; passes it is given.
 QUICK, LEFT, SETTLED = 0.5, 0.1, 8
+DELAYS = (0.3, 1.0)  # samples of delay beside which another sensor is begun
 
 
 def with_current_lag(
@@ -97,6 +100,49 @@ def with_both_filters(
         return best
     other = with_current_lag(of_kind(data, mean), mean, options, candidates, say, surely=lagged)
     return other if POLICY.replaces(best, other)[0] else best
+
+
+def with_other_sensor(
+    data: Experiments,
+    best: Fit,
+    options: Options,
+    candidates: list[FittedCandidate],
+    say: Callable[[str], None],
+) -> Fit:
+    """Return the fit, or one whose current is filtered otherwise.
+
+    A delay hides how, and which part of the lags is the sensor's: it is tried together with each
+    where residuals are coloured.
+    """
+    s = best.structure
+    if not (isinstance(s, Electromechanical) and s.lags):
+        return best
+    ways = [s]
+    if not s.delay and "delay" not in s.fixed and sandwich_factor(best) > COLOURED.value:
+        ways.append(s.with_(delay=True))
+    for way, sensor in product(ways, SENSORS[1:]):
+        structure = way.with_(current_sensor=sensor)
+        if any(r.fit.structure == structure for r in candidates):
+            continue
+        say(f"trying {structure.label}")
+        known = [r.fit.z for r in candidates if sensor_of(r.fit.structure) == sensor]
+        starts = [best.z, *known]
+        if structure.delay and not s.delay:
+            starts = [_later(z, samples * data.step) for z in starts for samples in DELAYS]
+        tried = [
+            descent.refine(data, structure, best, structure.complete(z), options) for z in starts
+        ]
+        other = min(tried, key=lambda f: f.deviance)
+        verdict, reason = POLICY.preferred(best, other)
+        candidates.append(FittedCandidate(other, reason))
+        best = other if verdict else best
+    return best
+
+
+def _later(z: Coordinates, delay: float) -> Coordinates:
+    """Return a motor that answers later by so much less of its winding's lag."""
+    te = max(z.electrical_time_constant - delay, LEFT * z.electrical_time_constant)
+    return slower_winding(z, float(np.log(te))).with_(delay=delay)
 
 
 def without_current_lag(

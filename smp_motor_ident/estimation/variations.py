@@ -7,7 +7,11 @@ import numpy as np
 from smp_motor_ident.diagnosis.limits import LITTLE_FRICTION
 from smp_motor_ident.estimation import data_window, descent, prediction
 from smp_motor_ident.estimation.candidate_starts import of_kind
-from smp_motor_ident.estimation.current_lag import with_current_lag, without_current_lag
+from smp_motor_ident.estimation.current_lag import (
+    with_current_lag,
+    with_other_sensor,
+    without_current_lag,
+)
 from smp_motor_ident.estimation.delay_and_averaging import (
     as_averaged,
     delay_without_noise,
@@ -60,6 +64,7 @@ def varied(
         best = with_filter_for_lag(data, best, options, candidates, say)
         best = as_averaged(data, best, options, candidates, say)
         data = data.measured_as(best.kind)
+    best = with_other_sensor(data, best, options, candidates, say)
     if best.structure != candidates[0].fit.structure:  # what was added may have hidden it
         best = with_current_lag(data, best, options, candidates, say)
     return _without_friction(data, best, options, candidates)

@@ -294,3 +294,29 @@ def test_a_mean_speed_and_a_mean_current_do_not_hide_each_other(r, j, step, seed
             assert abs(q.value - value) < 4 * q.std + 2e-3 * value, name  # as above
     lag = found.combinations["current_lag"]
     assert abs(lag.value - 0.5 * step) < 4 * lag.std + 1e-3 * step
+
+
+@pytest.mark.parametrize("sensor", ["low_passed", "averaged"])
+def test_a_command_that_is_late_does_not_hide_how_the_current_is_filtered(sensor):
+    """Without the delay a mean had seemed likelier than a low-pass, and L seven times as large."""
+    r, el, k, j, b, step, fine, lag = 2.65, 1.44e-3, 1.457, 0.1235, 0.02, 2e-3, 50, 4e-3
+    up = np.arange(1, 6) * 1.8
+    levels = np.concatenate([up, up[-2::-1], [0.0], -up, -up[-2::-1], [0.0]])
+    volts = np.repeat(levels, 250)
+    every = np.concatenate([volts[:1], np.repeat(volts[1:], fine)])
+    time = step / fine * np.arange(every.size)
+    out = independent.simulate(time, every, r, el, k, j, b, 0.326, np.zeros(time.size), 2)
+    rng = np.random.default_rng(21)
+    amps = shown(out[:, 0], step / fine, sensor, lag, fine)
+    amps += 3e-3 * rng.standard_normal(amps.size)
+    speed = out[::fine, 1] + 3e-3 * rng.standard_normal(amps.size)
+    early = np.append(volts[1:], volts[-1])  # each row's command is in force after it
+    found = estimate(Record("motor", step * np.arange(volts.size), early, amps, speed))
+    assert not found.unreliable
+    true = {"resistance": r, "inductance": el, "motor_constant": k, "inertia": j}
+    for name, value in true.items():
+        q = found.parameters[name]
+        assert abs(q.value - value) < 4 * q.std + 2e-3 * value, name  # as above
+    assert found.parameters["inductance"].std < 0.2 * el
+    said = next(f for f in found.findings if f.code == "current_lag")
+    assert said.evidence["sensor"] == sensor
