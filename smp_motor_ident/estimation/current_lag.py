@@ -15,7 +15,7 @@ import numpy as np
 from smp_motor_ident.diagnosis.limits import COLOURED
 from smp_motor_ident.estimation import data_window, descent, prediction
 from smp_motor_ident.estimation.candidate_starts import of_kind
-from smp_motor_ident.estimation.delay_and_averaging import with_average
+from smp_motor_ident.estimation.delay_and_averaging import QUICKER, quicker, with_average
 from smp_motor_ident.estimation.fit import Fit, Options, solve
 from smp_motor_ident.estimation.selection import POLICY, FittedCandidate, sandwich_factor
 from smp_motor_ident.estimation.trials import slower_winding
@@ -30,6 +30,7 @@ SAMPLES = (0.25, 0.5, 1.5, 5.0)  # of lag at which a descent begins
 FEW, KEPT = 4, 2  # passes after which starts are ranked, and how many go on
 # What is left of a winding whose lag is the sensor's: samples or a share; passes it is given.
 QUICK, LEFT, SETTLED = 0.5, 0.1, 8
+NOT_WHITE = 1.5  # sandwich factor that residuals of a right model hardly have
 DELAYS = (0.3, 1.0)  # samples of delay beside which another sensor is begun
 
 
@@ -99,7 +100,40 @@ def with_both_filters(
     if mean is first:  # which could not be fitted
         return best
     other = with_current_lag(of_kind(data, mean), mean, options, candidates, say, surely=lagged)
-    return other if POLICY.replaces(best, other)[0] else best
+    best = other if POLICY.replaces(best, other)[0] else best
+    return _with_two_low_passes(data, best, first, options, candidates, say)
+
+
+def _with_two_low_passes(
+    data: Experiments,
+    best: Fit,
+    first: Fit,
+    options: Options,
+    candidates: list[FittedCandidate],
+    say: Callable[[str], None],
+) -> Fit:
+    """Return the fit, or where its residuals are coloured one with a low-pass of speed and current.
+
+    Each hides the other, and a motor as slow as both together hides them.
+    """
+    if sandwich_factor(best) < NOT_WHITE:
+        return best
+    for sensor in SENSORS[1:]:
+        richer = first.structure.with_(window=True, low_pass=True, current_sensor=sensor)
+        say(f"trying {richer.label}")
+        low, near = data.measured_as(richer.speed), replace(best, noise_ratio=0.0)
+        starts = [
+            richer.complete(_later(quicker(first.z, share), 0.0).with_(current_lag=n * data.step))
+            for share in QUICKER
+            for n in SAMPLES[1:]
+        ]
+        starts.sort(key=lambda z: solve(low, richer, near.at(z), options, FEW).deviance)
+        tried = [descent.refine(low, richer, near, z, options) for z in starts[:KEPT]]
+        other = min(tried, key=lambda f: f.deviance)
+        verdict, reason = POLICY.replaces(best, other)
+        candidates.append(FittedCandidate(other, reason))
+        best = other if verdict else best
+    return best
 
 
 def with_other_sensor(
@@ -117,8 +151,8 @@ def with_other_sensor(
     s = best.structure
     if not (isinstance(s, Electromechanical) and s.lags):
         return best
-    ways = [s]
-    if not s.delay and "delay" not in s.fixed and sandwich_factor(best) > COLOURED.value:
+    ways, coloured = [s], sandwich_factor(best) > COLOURED.value
+    if not s.delay and "delay" not in s.fixed and coloured:
         ways.append(s.with_(delay=True))
     for way, sensor in product(ways, SENSORS[1:]):
         structure = way.with_(current_sensor=sensor)
@@ -129,6 +163,8 @@ def with_other_sensor(
         starts = [best.z, *known]
         if structure.delay and not s.delay:
             starts = [_later(z, samples * data.step) for z in starts for samples in DELAYS]
+        elif coloured:  # the winding may have what is the sensor's
+            starts += _leading(data, best, structure, options)
         tried = [
             descent.refine(data, structure, best, structure.complete(z), options) for z in starts
         ]

@@ -22,7 +22,7 @@ from smp_motor_ident.model.structures import FirstOrder, SecondOrder, Structure
 
 HARDLY = 0.01  # of a sample: a window that is as good as none, for the score
 WINDOWS = (1.0, 4.0)  # samples at which a low-pass is begun
-SHARES = (0.6, 0.2)  # of a time constant that are the motor's, beside a filter's of its speed
+QUICKER = (0.6, 0.2)  # of a time constant that are the motor's, beside a filter's of its speed
 TICKS = (1, 2, 5, 10)  # samples that a digital low-pass takes a row
 FEW = 2  # up to which means since the one before are another filter than samples are
 WINDING = 0.05  # of a motor's time constant, as which a second lag is begun
@@ -161,7 +161,7 @@ def with_low_pass(
         lag = near.z.second_lag
         starts.append(near.z.with_second_lag(0.2 * lag).with_(window=1.6 * lag))
     elif s.current:  # which tells how fast the motor is, however slow the filter
-        starts += [_quicker(near.z, share) for share in SHARES]
+        starts += [quicker(near.z, share) for share in QUICKER]
     tried = [_filtered(low, richer, near, z, options) for z in starts]
     other = min(tried, key=lambda f: f.deviance)
     verdict, reason = POLICY.preferred(best, other)
@@ -308,7 +308,7 @@ def _filtered(
     return descent.refine(data, structure, near, structure.complete(z), options, known=known)
 
 
-def _quicker(z: Coordinates, share: float) -> Coordinates:
+def quicker(z: Coordinates, share: float) -> Coordinates:
     """Return a motor with a share of the time constant, whose rest is the filter's of the speed."""
     less, rest = math.log(share), (1 - share) * z.time_constant
     return z.with_(ln_a1=z.ln_a1 + less, ln_a2=z.ln_a2 + less, window=2 * rest)

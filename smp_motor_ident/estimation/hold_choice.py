@@ -11,6 +11,7 @@ from smp_motor_ident.diagnosis.sample_limits import COMMAND_AHEAD
 from smp_motor_ident.estimation import order_selection
 from smp_motor_ident.estimation.candidate_starts import of_kind
 from smp_motor_ident.estimation.consider_covariance import asks_for_earlier
+from smp_motor_ident.estimation.current_lag import with_other_sensor
 from smp_motor_ident.estimation.data_window import extend, grow
 from smp_motor_ident.estimation.descent import ROUGHLY, refine, restate, screening_subset
 from smp_motor_ident.estimation.fit import Fit, Options
@@ -101,6 +102,11 @@ def otherwise(
         whole = extend(of_kind(again, fit), fit.structure, fit, request.options)
         near = FittedCandidate(whole, f"as {candidates[-1].label}")
         first = not rivals or POLICY.likelier(near, rivals[-1])
+        if first:  # another hold may have hidden how the current is filtered
+            seen = of_kind(again, whole)
+            sensed = with_other_sensor(seen, whole, request.options, rivals, request.say)
+            near = replace(near, fit=sensed)
+            rivals = [r for r in rivals if r.fit is not sensed]
         rivals = [*rivals, near] if first else [near, *rivals]
         better = POLICY.likelier(rivals[-1], candidates[-1])
         if other == hold:

@@ -64,9 +64,9 @@ def varied(
         best = with_filter_for_lag(data, best, options, candidates, say)
         best = as_averaged(data, best, options, candidates, say)
         data = data.measured_as(best.kind)
-    best = with_other_sensor(data, best, options, candidates, say)
     if best.structure != candidates[0].fit.structure:  # what was added may have hidden it
         best = with_current_lag(data, best, options, candidates, say)
+    best = with_other_sensor(data, best, options, candidates, say)
     return _without_friction(data, best, options, candidates)
 
 
