@@ -30,7 +30,7 @@ SAMPLES = (0.25, 0.5, 1.5, 5.0)  # of lag at which a descent begins
 FEW, KEPT = 4, 2  # passes after which starts are ranked, and how many go on
 # What is left of a winding whose lag is the sensor's: samples or a share; passes it is given.
 QUICK, LEFT, SETTLED = 0.5, 0.1, 8
-NOT_WHITE = 1.5  # sandwich factor that residuals of a right model hardly have
+RECURS, SURE = 5, 4.0  # samples and deviations by which errors of a right model hardly correlate
 DELAYS = (0.3, 1.0)  # samples of delay beside which another sensor is begun
 
 
@@ -112,11 +112,11 @@ def _with_two_low_passes(
     candidates: list[FittedCandidate],
     say: Callable[[str], None],
 ) -> Fit:
-    """Return the fit, or where its residuals are coloured one with a low-pass of speed and current.
+    """Return the fit, or where its errors are no noise one with a low-pass of speed and current.
 
     Each hides the other, and a motor as slow as both together hides them.
     """
-    if sandwich_factor(best) < NOT_WHITE:
+    if data.quantum > 0 or not _errors_recur(of_kind(data, best), best):
         return best
     for sensor in SENSORS[1:]:
         richer = first.structure.with_(window=True, low_pass=True, current_sensor=sensor)
@@ -179,6 +179,18 @@ def _later(z: Coordinates, delay: float) -> Coordinates:
     """Return a motor that answers later by so much less of its winding's lag."""
     te = max(z.electrical_time_constant - delay, LEFT * z.electrical_time_constant)
     return slower_winding(z, float(np.log(te))).with_(delay=delay)
+
+
+def _errors_recur(data: Experiments, fit: Fit) -> bool:
+    """Tell whether what a fit leaves of speed or current is correlated from sample to sample."""
+    seen = prediction.simulate(data, fit, gain=True)
+    for error in (data.output - seen[:, 1], data.current - seen[:, 2]):
+        e = error[np.isfinite(error)]
+        e = e - e.mean()
+        most = SURE * float(e @ e) / e.size**0.5
+        if any(abs(float(e[k:] @ e[:-k])) > most for k in range(1, RECURS + 1)):
+            return True
+    return False
 
 
 def without_current_lag(
