@@ -122,13 +122,13 @@ def _with_two_low_passes(
         richer = first.structure.with_(window=True, low_pass=True, current_sensor=sensor)
         say(f"trying {richer.label}")
         low, near = data.measured_as(richer.speed), replace(best, noise_ratio=0.0)
-        starts = [
-            richer.complete(_later(quicker(first.z, share), 0.0).with_(current_lag=n * data.step))
-            for share in QUICKER
-            for n in SAMPLES[1:]
-        ]
-        starts.sort(key=lambda z: solve(low, richer, near.at(z), options, FEW).deviance)
-        tried = [descent.refine(low, richer, near, z, options) for z in starts[:KEPT]]
+        tried = []
+        for share in QUICKER:  # few passes rank how far the filters reach, not how quick it is
+            z = _later(quicker(first.z, share), 0.0)
+            starts = [richer.complete(z.with_(current_lag=n * data.step)) for n in SAMPLES[1:]]
+            soon = [solve(low, richer, near.at(z), options, FEW) for z in starts]
+            soon.sort(key=lambda f: f.deviance)
+            tried += [descent.refine(low, richer, near, f.z, options) for f in soon[:KEPT]]
         other = min(tried, key=lambda f: f.deviance)
         verdict, reason = POLICY.replaces(best, other)
         candidates.append(FittedCandidate(other, reason))
@@ -152,6 +152,8 @@ def with_other_sensor(
     if not (isinstance(s, Electromechanical) and s.lags):
         return best
     ways, coloured = [s], sandwich_factor(best) > COLOURED.value
+    if s.low_pass:  # of which the likeliest kind has been sought beside this sensor alone
+        ways += [s.with_(ticks=ticks, mean=0.0) for ticks in (0, 1) if ticks != s.ticks]
     if not s.delay and "delay" not in s.fixed and coloured:
         ways.append(s.with_(delay=True))
     for way, sensor in product(ways, SENSORS[1:]):
@@ -186,6 +188,8 @@ def _errors_recur(data: Experiments, fit: Fit) -> bool:
     seen = prediction.simulate(data, fit, gain=True)
     for error in (data.output - seen[:, 1], data.current - seen[:, 2]):
         e = error[np.isfinite(error)]
+        if e.size <= RECURS:
+            continue
         e = e - e.mean()
         most = SURE * float(e @ e) / e.size**0.5
         if any(abs(float(e[k:] @ e[:-k])) > most for k in range(1, RECURS + 1)):

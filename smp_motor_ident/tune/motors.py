@@ -274,7 +274,8 @@ def _covariance(estimate: Estimate, names: tuple[str, ...], mean: Array) -> Arra
     covariance[np.ix_(known, known)] = estimate.covariance[np.ix_(index, index)]
     for one in estimate.systematic:
         if one.cause == "second_lag":  # whose of the two lags is whose, `lag_in_sensor` draws
-            move = np.array([one.moves.get(name, 0.0) for name in names])
+            moves = {name: by for name, by in one.moves.items() if name in estimate.names}
+            move = np.array([moves.get(name, 0.0) for name in names])
             covariance -= np.outer(move, move)
     spread = np.zeros(len(names))
     if estimate.unreliable:
