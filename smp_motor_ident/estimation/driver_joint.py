@@ -1,9 +1,8 @@
 """A driver whose voltage follows the motion, fitted together with the motor by least squares.
 
 The motion follows that voltage, too: neither can be fixed while the other is sought.  Two numbers
-describe it, its size (of one that coasts in every PWM period L/R in such periods, and what its
-diodes take) and how much of the voltage at steady speed is back-EMF; of one that coasts at a
-command of zero the second.
+describe it, its size (of one that coasts in every PWM period L/R in such periods) and how much of
+the voltage at steady speed is back-EMF; of one that coasts at a command of zero the second.
 Derivation: docs/derivations.md, section 13.
 """
 
@@ -46,8 +45,7 @@ FAR = 4.0  # e-folds of a size, beyond which it is nothing or all
 WEAKER = 3.0  # how much less a current drives that rises for L/R of a period
 LAGS, VOLTS = ("ln_a1", "ln_a2"), ("vc_plus", "vc_minus", "load")
 ALLOWED = {"size": (np.log1p(WEAKER * 1e-3), np.log1p(WEAKER * 1e4))}
-ALLOWED |= dict.fromkeys(("share", "vc_plus", "vc_minus", "delay"), (0.0, np.inf))
-ALLOWED |= {"diodes": (0.0, 3.0)}  # V, of two
+ALLOWED |= dict.fromkeys(("share", *VOLTS[:2], "delay"), (0.0, np.inf)) | {"diodes": (0.0, 3.0)}
 SHORTEST = 1e-9  # s, of a window
 DIFFERENCE = 1e-5  # of each parameter's scale, over which a derivative is taken
 STEPS, LONGEST = 40, 100  # of a descent at most, and of the best
@@ -55,7 +53,6 @@ CLOSE = 0.01  # of the deviance, which a step gains where a descent ends
 SETTLED = 3  # turns of initial states and the voltage of other data
 SECOND = (0.02, 0.2)  # second lags that are tried, of the first
 LATE = 0.3  # samples of delay, the same
-DIODES = 1.0  # V that two diodes take, the same
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,13 +146,6 @@ def continued(
     driver = driver if "share" in numbers else driver._replace(emf_share=1.0)
     problem = _Problem(data, replace(fit, initial=initial_of(data, fit)), driver, numbers)
     return problem.joint(problem.descend(problem.start(fit.z, driver)), options)
-
-
-def with_diodes(data: Experiments, joint: Joint, options: Options) -> Joint:
-    """Return a bridge that is off now and then with what its diodes take, if that is more."""
-    there = joint.driver._replace(diode_drop=DIODES)
-    tried = continued(data, joint.fit, there, options, (*joint.numbers, "diodes"))
-    return _cheapest([joint, tried]) or joint
 
 
 def voltage_of(data: Experiments, fit: Fit, driver: Driver) -> Array:

@@ -54,6 +54,7 @@ from smp_motor_ident.model.structures import FirstOrder
 from smp_motor_ident.record import Record
 
 BRAKED = 5  # rows in which a motor runs ahead of its command, beyond which it brakes
+DIODES = 1.0  # V that two diodes take, where what they do is begun
 FINALISTS = 3  # that are held against each other on all of them
 
 
@@ -257,10 +258,16 @@ class _Joint:
             data, self.near, driver, self.options, sizes.tolist(), least
         )
         if self.found and self.effect.kind == COAST and supply > 0:  # else they look like it
-            self.found = driver_joint.with_diodes(data, self.found, self.options)
+            self.found = self._with_diodes(data, self.found)
         if data is few or self.found is None:
             return self._driver_fit(self.found, data, most)
         return self._continued(few, self.found, most)
+
+    def _with_diodes(self, data: Experiments, joint: driver_joint.Joint) -> driver_joint.Joint:
+        """Return a bridge that is off now and then with what its diodes take, if that is more."""
+        there, numbers = joint.driver._replace(diode_drop=DIODES), (*joint.numbers, "diodes")
+        tried = driver_joint.continued(data, joint.fit, there, self.options, numbers)
+        return tried if tried and tried.cost < joint.cost else joint
 
     def on(self, group: list[Record], most: float, behind: float) -> DriverFit | None:
         """Go on from there with more records."""
