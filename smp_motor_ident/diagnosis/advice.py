@@ -173,11 +173,13 @@ def _second_lag(data: Experiments, fit: Fit) -> Iterator[Finding]:
         if not long or least < limits.RELEVANT_BIAS.value:
             return
         other = "a shaft's, a driver's, or a load's that settles slowly"
+        advice = "record more steps, both ways; a drift answers to none of them"
     else:
         seen = least >= limits.RELEVANT_BIAS.value or limits.HALF_WIDTH.value * spread < 1
         if not long and not seen:
             return
         other = "a filter of the speed"
+        advice = "switch the filter of the firmware off, or record encoder counts or the current"
     may_be = "long for a winding's, it may be" if long else "a winding's, or"
     yield Finding(
         "second_lag",
@@ -190,7 +192,7 @@ def _second_lag(data: Experiments, fit: Fit) -> Iterator[Finding]:
             "quantity": "time_constant",
             "shift_share": (1.0 if long else share) / (1 + share),
         },
-        "switch the filter of the firmware off, or record encoder counts or the current",
+        advice,
     )
 
 

@@ -134,6 +134,7 @@ def test_a_drift_is_no_winding() -> None:
     )
     (said,) = [f for f in found.findings if f.code == "second_lag"]
     assert said.severity == "warning" and "a load's that settles" in said.message
+    assert "counts" not in said.advice  # which are what was recorded
     q = found.combinations["time_constant"]
     assert q.value > 1.0 and q.ci95[0] < lag
 
