@@ -1,4 +1,4 @@
-"""Install rules of the ROS package (colcon builds it as ament_python)."""
+"""Install rules: an ament_python package for colcon, and a Python package for pip."""
 
 import os
 import subprocess
@@ -7,11 +7,11 @@ from glob import glob
 from pathlib import Path
 
 from setuptools import find_packages, setup
-from setuptools.command.build_py import build_py
 from setuptools.command.develop import develop
 from setuptools.command.install import install
 
 NAME = "smp_motor_control"
+ROOT = Path(__file__).resolve().parent
 EXECUTABLES = (
     "wheel_pid",
     "motor_plant",
@@ -28,23 +28,78 @@ EXECUTABLES = (
     "serial_driver",
 )
 
+# The only list of run-time requirements: pip reads it here, and `make lock` pins it for `make setup`.
+REQUIRES = [
+    "numpy>=1.26,<3",
+    "scipy>=1.11",
+    "numba>=0.61.2,<0.62",  # compiles recursions that switch with friction; newer ones move its cache's interface
+    "control>=0.10.2,<0.11",  # margins and state-space algebra of the tuning
+    "threadpoolctl>=3",  # keeps linear algebra of small matrices on one thread
+    "rosbags>=0.11,<0.12",  # reads and writes bags of every storage without ROS
+    "mcap>=1.2,<2",  # reads on in an MCAP file whose end is missing; closes one at every flush
+    "lz4>=4",  # unpacks chunks and files of bags
+    "zstandard>=0.22",  # unpacks chunks, messages and files of bags
+    "msgspec>=0.19,<1",  # reads identification.json into the types of result.py
+    "jinja2>=3.1",  # templates of the pages
+    "rich>=13",  # progress and tables in the terminal
+    "pyyaml>=6",  # parameter files
+]
+EXTRAS = {
+    "ros": [  # what the nodes need, as wheels, where no ROS 2 Jazzy is sourced
+        "ros-jazzy-rclpy[fastrtps]",
+        "ros-jazzy-common-interfaces",
+    ],
+    "fleet": ["distributed>=2024", "pyarrow>=14"],  # identify --fleet on a cluster, tables as Parquet
+    "xlsx": ["openpyxl>=3.1"],  # Excel workbooks
+    "matlab": ["h5py>=3.10"],  # MATLAB files of version 7.3
+    "test": ["pytest>=7", "hypothesis>=6"],
+}
 
-def require_messages() -> None:
-    """Refuse to install half of the repository: executables that would not find their messages."""
-    prefixes = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
-    found = any(Path(p, "share/smp_interfaces/package.xml").is_file() for p in prefixes if p)
-    if "COLCON" in os.environ and not found:
-        here = Path(__file__).resolve().parent
-        raise SystemExit(
-            "smp_interfaces is not built yet, and colcon does not look for it below this package; "
-            f"type: colcon build --base-paths {here} {here}/smp_interfaces"
-        )
+
+def prefixes() -> list[Path]:
+    """Return the install prefixes of the sourced workspaces."""
+    named = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
+    return [Path(prefix) for prefix in named if prefix]
+
+
+def build_messages(build_base: Path) -> None:
+    """Build `smp_interfaces` into this package's prefix, unless another prefix has it.
+
+    colcon looks for no package below a folder that holds a package.xml.
+    """
+    prefix = Path(sys.prefix)  # colcon's, while it runs this file
+    if any((p / "share/smp_interfaces/package.xml").is_file() for p in prefixes() if p != prefix):
+        return
+    python_path = os.environ.get("PYTHONPATH", "").split(os.pathsep)
+    own = ("prefix_override", "colcon_distutils_commands")  # colcon's, for setuptools alone
+    env = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join(p for p in python_path if Path(p).name not in own),
+        "CMAKE_PREFIX_PATH": os.pathsep.join(
+            filter(None, [os.environ.get("CMAKE_PREFIX_PATH"), *map(str, prefixes())])
+        ),
+    }
+    folder = build_base / "smp_interfaces"
+    for command in (
+        ["cmake", "-S", str(ROOT / "smp_interfaces"), "-B", str(folder), f"-DCMAKE_INSTALL_PREFIX={prefix}",
+         f"-DPython3_EXECUTABLE={sys.executable}", "-DBUILD_TESTING=OFF"],
+        ["cmake", "--build", str(folder), "--parallel", str(os.cpu_count() or 1)],
+        ["cmake", "--install", str(folder)],
+    ):  # fmt: skip
+        try:
+            done = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
+        except FileNotFoundError:
+            raise SystemExit("smp_interfaces needs cmake: apt install cmake") from None
+        if done.returncode:
+            print(done.stdout, done.stderr, sep="\n")
+            raise SystemExit(
+                f"smp_interfaces cannot be built ({' '.join(command[:2])} failed, see above): "
+                "source ROS 2 Jazzy, or install it (rosdep install --from-paths src)"
+            )
 
 
 def compile_ahead(folder: str) -> None:
     """Compile for this machine what computes, or leave that to the first estimate."""
-    if "COLCON" not in os.environ:
-        return
     path = os.pathsep.join(p for p in (folder, os.environ.get("PYTHONPATH", "")) if p)
     done = subprocess.run(
         [sys.executable, "-m", "smp_motor_ident.compilation"],
@@ -55,45 +110,43 @@ def compile_ahead(folder: str) -> None:
         print(f"{NAME}: the first estimate will compile for half a minute ({reason})")
 
 
-class BuildPy(build_py):
-    """As colcon build asks for."""
-
-    def run(self) -> None:
-        """Build what is whole."""
-        require_messages()
-        super().run()
-
-
 class Develop(develop):
-    """As colcon build --symlink-install asks for."""
+    """As `colcon build --symlink-install` asks for."""
 
     def run(self) -> None:
-        """Link what is whole, and compile it."""
-        require_messages()
+        """Link into the source; under colcon, add the messages and compile."""
         super().run()
-        if not self.uninstall:
+        if "COLCON" in os.environ and not self.uninstall:
+            build_messages(Path.cwd())  # colcon runs this in its build folder
             compile_ahead(os.getcwd())
 
 
 class Install(install):
-    """As colcon build asks for, after it."""
+    """As `colcon build` asks for."""
 
     def run(self) -> None:
-        """Copy, and compile what was copied."""
+        """Copy; under colcon, add the messages and compile."""
         super().run()
-        compile_ahead(str(Path(self.install_lib or ".").resolve()))
+        if "COLCON" in os.environ:
+            build_messages(Path(self.get_finalized_command("build").build_base).resolve().parent)
+            compile_ahead(str(Path(self.install_lib or ".").resolve()))
 
 
 setup(
     name=NAME,
     version="0.1.0",
-    description="Identifies the DC motors of a robot from bags and controls its wheels.",
+    description="Identifies the DC motors of a robot from recordings and controls its wheels.",
+    long_description=(ROOT / "README.md").read_text(encoding="utf-8"),
+    long_description_content_type="text/markdown",
     license="Apache-2.0",
     maintainer="smp_motor_control maintainers",
     maintainer_email="maintainers@smp-motor-control.invalid",
     python_requires=">=3.10,<3.14",
     packages=find_packages(include=[f"{NAME}*", "smp_motor_ident*"]),
-    package_data={"": ["py.typed", "*.jinja", "*.css", "*.js", "LICENSE"]},
+    package_data={
+        "": ["py.typed"],
+        "smp_motor_ident.report": ["*.jinja", "*.css", "*.js", "uplot/*"],
+    },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (
@@ -108,9 +161,9 @@ setup(
         ),
         (f"share/{NAME}/docs/figures", glob("docs/figures/*.svg")),
     ],
-    install_requires=["setuptools"],
-    extras_require={"test": ["pytest", "hypothesis"]},  # by which colcon test runs pytest
-    cmdclass={"build_py": BuildPy, "develop": Develop, "install": Install},
+    install_requires=REQUIRES,
+    extras_require=EXTRAS,
+    cmdclass={"develop": Develop, "install": Install},
     zip_safe=False,
     entry_points={
         "console_scripts": [f"{name} = {NAME}.entry:{name}" for name in EXECUTABLES],
