@@ -28,11 +28,11 @@ EXECUTABLES = (
     "serial_driver",
 )
 
-# The only list of run-time requirements: pip reads it here, and `make lock` pins it for `make setup`.
+# The only list of run-time requirements: pip reads it, and `make lock` pins it for `make setup`.
 REQUIRES = [
     "numpy>=1.26,<3",
     "scipy>=1.11",
-    "numba>=0.61.2,<0.62",  # compiles recursions that switch with friction; newer ones move its cache's interface
+    "numba>=0.58,<0.62",  # compiles recursions that switch with friction
     "control>=0.10.2,<0.11",  # margins and state-space algebra of the tuning
     "threadpoolctl>=3",  # keeps linear algebra of small matrices on one thread
     "rosbags>=0.11,<0.12",  # reads and writes bags of every storage without ROS
@@ -49,7 +49,10 @@ EXTRAS = {
         "ros-jazzy-rclpy[fastrtps]",
         "ros-jazzy-common-interfaces",
     ],
-    "fleet": ["distributed>=2024", "pyarrow>=14"],  # identify --fleet on a cluster, tables as Parquet
+    "fleet": [
+        "distributed>=2024",
+        "pyarrow>=14",
+    ],  # identify --fleet on a cluster, tables as Parquet
     "xlsx": ["openpyxl>=3.1"],  # Excel workbooks
     "matlab": ["h5py>=3.10"],  # MATLAB files of version 7.3
     "test": ["pytest>=7", "hypothesis>=6"],
@@ -80,12 +83,16 @@ def build_messages(build_base: Path) -> None:
         ),
     }
     folder = build_base / "smp_interfaces"
+    options = (
+        f"-DCMAKE_INSTALL_PREFIX={prefix}",
+        "-DBUILD_TESTING=OFF",
+        f"-DPython3_EXECUTABLE={sys.executable}",
+    )
     for command in (
-        ["cmake", "-S", str(ROOT / "smp_interfaces"), "-B", str(folder), f"-DCMAKE_INSTALL_PREFIX={prefix}",
-         f"-DPython3_EXECUTABLE={sys.executable}", "-DBUILD_TESTING=OFF"],
+        ["cmake", "-S", str(ROOT / "smp_interfaces"), "-B", str(folder), *options],
         ["cmake", "--build", str(folder), "--parallel", str(os.cpu_count() or 1)],
         ["cmake", "--install", str(folder)],
-    ):  # fmt: skip
+    ):
         try:
             done = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
         except FileNotFoundError:

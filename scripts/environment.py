@@ -1,8 +1,7 @@
-"""Prepare the environment in three stages, each redone only when its inputs change.
+"""Prepare the environment in two stages, each redone only when its inputs change.
 
-1. ``.venv``: the pinned packages; with ROS 2 Jazzy sourced only what ROS does not bring.
-2. ``install/smp_interfaces``: the messages, built by colcon.
-3. ``install/smp_motor_control``: executables, launch files, configuration: links into the source.
+1. ``.venv``: the pinned packages; with ROS 2 Jazzy sourced only those that ROS lacks.
+2. ``install``: messages, executables, launch files, configuration, by colcon: links into the source.
 
 Only the standard library is used: this runs before anything is installed.
 """
@@ -30,7 +29,7 @@ READY = VENV / "ready"  # exists only while everything is in place; its first li
 STAMPS = VENV / "stamps.json"
 LOG = VENV / "setup.log"
 PYTHON = str(getattr(sys, "_base_executable", sys.executable))  # not that of a virtual environment
-LAYOUT = "1"  # to be raised when this file prepares something in another way
+LAYOUT = "2"  # to be raised when this file prepares something in another way
 CXX = ["c++", "g++", "clang++"]
 APT = ["numpy", "scipy", "matplotlib", "yaml"]  # left to apt where ROS is installed
 FOREIGN = {
@@ -135,17 +134,16 @@ def stage_keys(ros: str) -> dict[str, str]:
     """Return a key per stage over all that its result depends on."""
     python = fingerprint(LAYOUT, str(ROOT), sys.version, os.path.realpath(PYTHON), ros)
     packages = fingerprint(python, files=[requirements(ros)])
-    interfaces = fingerprint(
+    package = fingerprint(
         python,
         *(line for line in requirements(ros).read_text().splitlines() if line.startswith("ros")),
-        files=(path for path in (ROOT / "smp_interfaces").rglob("*") if path.is_file()),
-    )
-    package = fingerprint(
-        interfaces,
-        files=(ROOT / name for name in ("setup.py", "setup.cfg", "package.xml")),
+        files=[
+            *(path for path in (ROOT / "smp_interfaces").rglob("*") if path.is_file()),
+            *(ROOT / name for name in ("setup.py", "setup.cfg", "package.xml")),
+        ],
         names=[*ROOT.glob("launch/*"), *ROOT.glob("config/*"), *ROOT.glob("resource/*")],
     )
-    return {"python": python, "packages": packages, "interfaces": interfaces, "package": package}
+    return {"python": python, "packages": packages, "package": package}
 
 
 def requirements(ros: str) -> Path:
@@ -245,21 +243,14 @@ def patch_cmake_files(env: dict[str, str]) -> None:
             path.write_bytes(new)
 
 
-def build(package: str, ros: str, lock: IO[str]) -> None:
-    """Build one package; its Python and data files become links into the source."""
-    arguments = [f"-DPython3_EXECUTABLE={VENV}/bin/python", "-DBUILD_TESTING=OFF"]
+def build(ros: str, lock: IO[str]) -> None:
+    """Build the package and its messages; Python and data files become links into the source."""
     command = [f"{VENV}/bin/python", "-m", "colcon", "build", "--symlink-install"]
-    command += ["--packages-select", package, "--event-handlers", "console_direct+"]
-    run([*command, "--cmake-args", *arguments], environment(ros), lock)
-    for path in (ROOT / "install" / package).rglob("*"):
+    command += ["--event-handlers", "console_direct+"]
+    run(command, environment(ros), lock)
+    for path in (ROOT / "install").rglob("*"):
         if path.is_symlink() and not path.exists():
             path.unlink()  # its source is gone
-
-
-def build_interfaces(ros: str, lock: IO[str]) -> None:
-    for folder in ("build", "install"):
-        shutil.rmtree(ROOT / folder / "smp_interfaces", ignore_errors=True)
-    build("smp_interfaces", ros, lock)
 
 
 def verify(ros: str, lock: IO[str]) -> None:
@@ -279,9 +270,9 @@ def prepare(lock: IO[str]) -> bool:
         done = json.loads(STAMPS.read_text())
     except (OSError, ValueError):
         done = {}
-    for package, stage in (("smp_interfaces", "interfaces"), ("smp_motor_control", "package")):
-        if not (ROOT / "install" / package / "share" / package / "package.sh").is_file():
-            done.pop(stage, None)  # someone cleaned the workspace as one does with colcon
+    installed = ROOT / "install" / "smp_motor_control" / "share"
+    if not all((installed / name).exists() for name in ("smp_motor_control", "smp_interfaces")):
+        done.pop("package", None)  # someone cleaned the workspace as one does with colcon
     if READY.is_file() and done == keys:
         return False
     check_machine(ros)
@@ -293,10 +284,9 @@ def prepare(lock: IO[str]) -> bool:
             f"the packages of {requirements(ros).relative_to(ROOT)} (about a minute)",
             lambda: install_packages(ros, lock),
         ),
-        "interfaces": ("the messages of smp_interfaces", lambda: build_interfaces(ros, lock)),
         "package": (
-            "smp_motor_control, compiled for this machine (half a minute)",
-            lambda: build("smp_motor_control", ros, lock),
+            "messages and executables, compiled for this machine (a minute)",
+            lambda: build(ros, lock),
         ),
     }
     say(f"with ROS 2 of {ros}" if ros else "without ROS: real rclpy and DDS from wheels")

@@ -1,5 +1,6 @@
 #!/bin/sh
-# Resolve requirements/*.in into lock files that hold for Python 3.10 to 3.13: `make lock`. Needs uv (pip install uv).
+# Resolve the ranges of setup.py and requirements/*.in into lock files that hold for Python 3.10 to 3.13: `make lock`.
+# Needs uv (pip install uv).
 # Pins that are already in a lock file stay, unless `make lock ARGS=--upgrade`.
 set -eu
 cd -- "$(dirname -- "$0")/../requirements"
@@ -17,9 +18,9 @@ without() {
   awk -v pattern="$2" '/^[^ ]/ { kept = $0 !~ pattern } kept' "$1" >"$1.partial"
   mv "$1.partial" "$1"
 }
-lock wheels.txt 3.10 ros.in base.in dev.in "$@"
+lock wheels.txt 3.10 ../setup.py --extra ros --extra xlsx --extra matlab ros.in dev.in "$@"
 # With ROS 2 Jazzy the rest comes from apt, at apt's versions, and must not be hidden by others.
-lock jazzy.txt 3.12 base.in colcon.in dev.in "$@" --override jazzy-apt.in
+lock jazzy.txt 3.12 ../setup.py --extra xlsx --extra matlab colcon.in dev.in "$@" --override jazzy-apt.in
 packaged=$(sed -n 's/^\([a-z0-9-]*\)==.*/\1/p' jazzy-apt.in | paste -sd '|')
 without jazzy.txt "^($packaged)=="
 sed -i "1i # What Ubuntu 24.04 with ROS 2 Jazzy lacks; made by \`make lock\` from base.in, colcon.in, dev.in less jazzy-apt.in." jazzy.txt

@@ -4,6 +4,7 @@
 #   colcon  plain `colcon build` beside two other packages: a simulated robot is recorded, identified, tuned and driven.
 # Works in the shell of setup.bash and where ROS is sourced. WORKSPACE names the folder; default: a temporary one.
 set -eu
+export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST
 root=$(cd -- "$(dirname -- "${BASH_SOURCE[0]}")/.." && pwd -P)
 workspace=${WORKSPACE:-$(mktemp -d)}
 say() { echo "stranger: $*"; }

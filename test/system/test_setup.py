@@ -17,7 +17,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 INPUTS = ["scripts", "requirements", "smp_interfaces", "resource", "setup.py", "setup.cfg"]
-INPUTS += ["package.xml", "setup.bash", "colcon_defaults.yaml"]
+INPUTS += ["package.xml", "setup.bash"]
 BASE = str(getattr(sys, "_base_executable", sys.executable))
 # The ROS of the shell that runs the tests, if there is one.
 OF_ROS = ("ROS_DISTRO", "AMENT_PREFIX_PATH", "PYTHONPATH", "LD_LIBRARY_PATH")
@@ -137,7 +137,7 @@ def keys(clone):
     ("path", "stages"),
     [
         ("requirements/wheels.txt", {"packages"}),
-        ("smp_interfaces/msg/MotorState.msg", {"interfaces", "package"}),
+        ("smp_interfaces/msg/MotorState.msg", {"package"}),
         ("setup.py", {"package"}),
         ("config/new.yaml", {"package"}),
         ("smp_motor_control/motor.py", set()),

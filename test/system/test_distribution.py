@@ -1,0 +1,71 @@
+"""What pip and colcon install is what the repository holds."""
+
+from __future__ import annotations
+
+import runpy
+import subprocess
+import sys
+import tarfile
+import zipfile
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGES = ("smp_motor_control/", "smp_motor_ident/")
+
+
+@pytest.fixture(scope="module")
+def tracked() -> list[str]:
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True)
+    if listed.returncode:
+        pytest.skip("this tree is no clone")
+    return [name for name in listed.stdout.splitlines() if (ROOT / name).is_file()]
+
+
+@pytest.fixture(scope="module")
+def built(tracked, tmp_path_factory) -> Path:
+    """Return the folder of a source distribution and a wheel of the tracked files."""
+    folder = tmp_path_factory.mktemp("tree")
+    for name in tracked:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes((ROOT / name).read_bytes())
+    command = [sys.executable, "setup.py", "-q", "sdist", "bdist_wheel"]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return folder / "dist"
+
+
+def test_wheel_holds_every_tracked_file_of_the_packages(built, tracked):
+    with zipfile.ZipFile(next(built.glob("*.whl"))) as wheel:
+        held = set(wheel.namelist())
+    assert {name for name in tracked if name.startswith(PACKAGES)} <= held
+    assert not [name for name in held if name.startswith(("test/", "smp_interfaces/"))]
+
+
+def test_source_distribution_holds_every_tracked_file(built, tracked):
+    with tarfile.open(next(built.glob("*.tar.gz"))) as archive:
+        held = {name.partition("/")[2] for name in archive.getnames()}
+    assert not set(tracked) - held
+
+
+@pytest.mark.parametrize("lock", ["wheels.txt", "jazzy.txt"])
+def test_every_requirement_is_pinned_within_its_range(lock, monkeypatch):
+    given = {}
+    monkeypatch.setattr("setuptools.setup", lambda **keywords: given.update(keywords))
+    monkeypatch.chdir(ROOT)
+    runpy.run_path(str(ROOT / "setup.py"))
+    pins: dict[str, list[str]] = {}
+    for name in (lock, "jazzy-apt.in"):
+        for line in (ROOT / "requirements" / name).read_text().splitlines():
+            if line and line[0] not in " #":
+                pin = Requirement(line.removesuffix("\\"))
+                pins.setdefault(pin.name, []).append(str(pin.specifier).removeprefix("=="))
+    extras = ("xlsx", "matlab") if lock == "jazzy.txt" else ("xlsx", "matlab", "ros")
+    for text in [
+        *given["install_requires"],
+        *(t for e in extras for t in given["extras_require"][e]),
+    ]:
+        wanted = Requirement(text)
+        assert any(version in wanted.specifier for version in pins.get(wanted.name, ())), text
