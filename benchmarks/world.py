@@ -58,7 +58,7 @@ def errors(estimate, c: Case, random: bool = False) -> dict[str, float]:
             continue
         low, high = true[name]
         off = max(low - q.value, q.value - high, 0.0)
-        std = estimate.random_std(name) if random else q.std
+        std = q.std if random else q.total_std
         floor = SHARE * max(abs(low), abs(high))
         if name == "static_voltage":
             floor = max(floor, 0.005 * c.amplitude)

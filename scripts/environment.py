@@ -1,7 +1,7 @@
 """Prepare the environment in two stages, each redone only when its inputs change.
 
 1. ``.venv``: the pinned packages; with ROS 2 Jazzy sourced only those that ROS lacks.
-2. ``install``: messages, executables, launch files, configuration, by colcon: links into the source.
+2. ``install``: messages, executables, launch files and configuration, as links into the source.
 
 Only the standard library is used: this runs before anything is installed.
 """

@@ -20,6 +20,9 @@ from smp_motor_ident.record import Hardware, NotNegative
 
 Status = Literal["estimated", "fixed", "unidentifiable"]
 
+NORMAL_95 = 1.959964
+"""Half the 95 % interval of a normal distribution, in standard deviations."""
+
 UNITS: Mapping[str, str] = {
     "resistance": "ohm",
     "inductance": "H",
@@ -55,6 +58,28 @@ UNITS: Mapping[str, str] = {
 
 
 @dataclass(frozen=True)
+class Share:
+    """A systematic uncertainty of one number: the same in all recordings, and seen in none.
+
+    Attributes
+    ----------
+    cause : str
+        Code of the finding that explains it, such as ``current_scale``.
+    share : float or None
+        Its standard deviation relative to the number; None where the number is zero.
+    size : float
+        Its standard deviation in the number's unit.
+    side : {-1, 0, 1}
+        The only direction in which the number may move; 0 where it may move either way.
+    """
+
+    cause: str
+    share: NotNegative | None
+    size: NotNegative
+    side: Literal[-1, 0, 1] = 0
+
+
+@dataclass(frozen=True)
 class Quantity:
     """One estimated number.
 
@@ -63,13 +88,20 @@ class Quantity:
     value : float or None
         None where the data cannot tell it.
     std : float or None
-        Standard deviation; None where value is None or the user fixed it.
+        Random standard deviation, by which other recordings of the same motor would scatter; None
+        where value is None or the user fixed it.
     ci95 : tuple of float or None
-        95 % confidence interval; of an unidentifiable combination what the data leave open.
+        95 % confidence interval of the random uncertainty; of an unidentifiable combination the
+        range that the data leave open.
     unit : str
         SI unit.
     status : {'estimated', 'fixed', 'unidentifiable'}
         Where the number comes from.
+    systematic : tuple of Share
+        Uncertainties that no recording shows; never part of ``std`` and ``ci95``.
+    valid : mapping of str to (float, float), optional
+        Operating points at which the number was observed, such as ``voltage`` [V]; None where it
+        holds at others too.
     """
 
     value: float | None
@@ -77,6 +109,26 @@ class Quantity:
     ci95: tuple[float, float] | None = None
     unit: str = ""
     status: Status = "estimated"
+    systematic: tuple[Share, ...] = ()
+    valid: Mapping[str, tuple[float, float]] | None = None
+
+    @property
+    def total_std(self) -> float:
+        """Standard deviation of random and systematic uncertainty together, in ``unit``."""
+        return math.hypot(self.std or 0.0, *(one.size for one in self.systematic))
+
+    @property
+    def total_ci95(self) -> tuple[float, float] | None:
+        """95 % interval of random and systematic uncertainty together, in ``unit``."""
+        if self.ci95 is None or self.value is None:
+            return self.ci95
+        low, high = (
+            math.hypot(
+                end - self.value, *(NORMAL_95 * s.size for s in self.systematic if s.side != -side)
+            )
+            for end, side in zip(self.ci95, (-1, 1))
+        )
+        return self.value - low, self.value + high
 
 
 @dataclass(frozen=True)
@@ -133,18 +185,18 @@ class ResidualTests:
 
 @dataclass(frozen=True)
 class Systematic:
-    """An error that no record shows, and that is the same in all of them.
+    """A systematic error and the change of every number that it causes.
 
     Attributes
     ----------
     cause : str
-        Code of the finding that says so, such as ``current_scale``.
+        Code of the finding that explains it, such as ``current_scale``.
     share : float
         Its standard deviation, relative.
     moves : mapping of str to float
-        By how much that moves each number, in its own unit.
+        Change of each number by one standard deviation of it, in the number's own unit.
     one_sided : bool
-        Whether it moves the numbers this way only.
+        Whether it moves the numbers in this direction only.
     """
 
     cause: str
@@ -184,7 +236,7 @@ class Estimate:
         Motors of other structures, and with other delays, that the data do not exclude: the
         combinations of each, without those that it does not have.
     systematic : tuple of Systematic
-        What ``std``, ``ci95`` and ``covariance`` hold beside the scatter of the records.
+        Errors that no recording shows; ``std``, ``ci95`` and ``covariance`` leave them out.
     """
 
     wheel: str
@@ -251,27 +303,6 @@ class Estimate:
         """
         quantity = self.combinations.get(name) or self.parameters.get(name)
         return default if quantity is None or quantity.value is None else quantity.value
-
-    def random_std(self, name: str) -> float:
-        """Return the standard deviation of a number by the scatter of the records alone.
-
-        Records of the same instruments and voltages differ by that much.
-
-        Parameters
-        ----------
-        name : str
-            Such as ``resistance``.
-
-        Returns
-        -------
-        float
-            In the unit of ``UNITS[name]``; 0 where the estimate states none.
-        """
-        quantity = self.combinations.get(name) or self.parameters.get(name)
-        if quantity is None or quantity.std is None:
-            return 0.0
-        common = sum(one.moves.get(name, 0.0) ** 2 for one in self.systematic)
-        return math.sqrt(max(quantity.std**2 - common, 0.0))
 
     def evidence(self, code: str, name: str) -> float:
         """Return the largest number of that name in the findings of a code, 0 where there is none.

@@ -96,7 +96,7 @@ def identify_one(path: str, settings: tuple[Any, ...]) -> list[fleet.Row]:
             known = {
                 n: held[n] for n in held if n in fleet.QUANTITIES and held[n].value is not None
             }
-            values = {n: (float(q.value or 0.0), found.random_std(n)) for n, q in known.items()}
+            values = {n: (float(q.value or 0.0), float(q.std or 0.0)) for n, q in known.items()}
             verdict = dict(fit_percent=found.fit_percent.validation, unreliable=found.unreliable)
             rows.append(_row(path, wheel=wheel, values=values, **verdict))
     except SmpError as error:

@@ -90,7 +90,7 @@ def _open(estimate: Estimate) -> list[str]:
         for name in ("dc_gain", "time_constant", "resistance", "motor_constant", "inertia")
         if (one := known.get(name)) is not None
         and one.value
-        and estimate.random_std(name) > WANTED_ACCURACY.value * abs(one.value)
+        and (one.std or 0.0) > WANTED_ACCURACY.value * abs(one.value)
     ]
 
 

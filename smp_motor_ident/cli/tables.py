@@ -40,20 +40,19 @@ def estimate_table(estimate: Estimate) -> Table:
         title.append(f"fit {fit.estimation:.2f} %")
     if fit.validation is not None:
         title.append(f"held out {fit.validation:.2f} %")
-    # Beside the whole, what other records of the same instruments and voltages scatter by.
-    apart = ["random"] if estimate.systematic else []
-    columns = ("quantity", "value", "std", *apart, "95 % interval", "unit", "status")
+    apart = ["systematic"] if estimate.systematic else []
+    columns = ("quantity", "value", "std", "95 % interval", "unit", *apart, "status")
     made = table(", ".join(title), *columns)
-    made.columns[-2].justify = made.columns[-1].justify = "left"
+    for column in made.columns[4:]:
+        column.justify = "left"
     for name, quantity in {**estimate.combinations, **estimate.parameters}.items():
-        random = words.spread(estimate.random_std(name)) if quantity.std else ""
         made.add_row(
             name,
             words.number(quantity.value, quantity.std),
             words.spread(quantity.std),
-            *(random for _ in apart),
             words.interval(quantity),
             quantity.unit,
+            *(words.systematic(quantity) for _ in apart),
             Text(words.status(quantity), style=_COLOR[quantity.status]),
         )
     return made

@@ -62,7 +62,7 @@ def show(
         made = table(title, "", "true", "identified", "std", "error/std", "unit")
         made.columns[5].justify = "left"
         for name, true, quantity in _compared(truth[wheel], estimate):
-            std = estimate.random_std(name)  # sensors of a simulated motor have no error of scale
+            std = quantity.std or 0.0
             error = (quantity.value or 0.0) - true
             made.add_row(
                 name,
@@ -98,7 +98,7 @@ def check_estimates(
             if name == "dc_gain":
                 gain.append((100.0 * error / true, wheel))
             if quantity.status == "estimated":
-                deviations = error / (estimates[wheel].random_std(name) or 1e-300)
+                deviations = error / (quantity.std or 1e-300)
                 deviation.append((deviations, f"{wheel} {name}"))
                 if not deviations <= MOST_DEVIATIONS:
                     beyond.add(wheel)

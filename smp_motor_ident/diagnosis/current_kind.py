@@ -12,8 +12,8 @@ import numpy as np
 from smp_motor_control.arrays import Array
 from smp_motor_ident.diagnosis.data_quality import of_the_winding, offset_of_current
 from smp_motor_ident.diagnosis.limits import CURRENT_KIND, FEWEST, METER, REST
-from smp_motor_ident.estimation.fitted import NORMAL_95
 from smp_motor_ident.record import Record
+from smp_motor_ident.result import NORMAL_95
 
 ARMATURE, UNSIGNED, SUPPLY = "armature", "current_unsigned", "current_of_supply"
 OFFSET = "current_offset"  # of the sensor, or of the driver: an equation that is the same for both

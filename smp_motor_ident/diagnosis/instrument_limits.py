@@ -1,4 +1,4 @@
-"""What is taken of instruments and drivers whose accuracy nobody states.
+"""Accuracies assumed of instruments and drivers where the recording states none.
 
 Printed with the others in ``docs/limits.md``.
 """
@@ -10,19 +10,19 @@ CURRENT_ACCURACY = Limit(
     "of the current's scale, a standard deviation",
     "physical: a Hall sensor's sensitivity is sold to 4 % (ACS712, 96 to 104 mV/A) and follows a "
     "supply of 5 V that is known to as much: 5 % either way, uniformly",
-    "test_systematic.py: the scale of a current is in the interval",
+    "test_systematic.py: scale error of a current is within the systematic uncertainty",
 )
 ONE_SIZE_ACCURACY = Limit(
     0.1,
     "of gain and lag, a standard deviation",
     "physical: a bipolar bridge drops some 2 V of 12, so that the gain at half the voltage is less "
     "by about as much; of one size of voltage nothing shows it",
-    "test_systematic.py: what one size of voltage hides is in the interval",
+    "test_systematic.py: gain at one amplitude is sharp and states where it holds",
 )
 TIMING_ACCURACY = Limit(
     0.02,
     "of a sampling interval, a standard deviation",
     "physical: a loop reads its instruments one after another; a conversion by an Arduino (0.1 ms) "
     "or a transfer of 4 bytes by I2C at 400 kHz is a hundredth or two of 10 ms",
-    "test_systematic.py: when a loop reads its instruments is in the interval",
+    "test_systematic.py: reading time of a loop is a systematic uncertainty",
 )

@@ -8,11 +8,11 @@ from smp_motor_ident.diagnosis.limits import FIT_EXPLAINS, INSTANT, LONG_DELAY, 
 from smp_motor_ident.diagnosis.residuals import coloured
 from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.fit import Fit
-from smp_motor_ident.estimation.fitted import NORMAL_95
 from smp_motor_ident.estimation.lag_exchange import exchanged
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.structures import Electromechanical
+from smp_motor_ident.result import NORMAL_95
 
 
 def sensors(data: Experiments, fit: Fit) -> Iterator[Finding]:

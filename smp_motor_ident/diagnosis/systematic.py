@@ -1,14 +1,14 @@
-"""What no record shows, in the numbers that are stated: Type B uncertainty.
+"""Systematic uncertainty (Type B): errors that leave no residual in any recording.
 
-JCGM 100:2008 (GUM), section 4.3.  An error that is a symmetry of the motor's equations leaves no
-residual: it moves numbers and is seen in none of them.
+JCGM 100:2008 (GUM), section 4.3.  An error that is a symmetry of the motor's equations moves the
+numbers without a trace in the data.  It is stated with each number and never merged with the
+random uncertainty.
 """
 
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-
-import numpy as np
+from typing import Literal
 
 from smp_motor_ident.diagnosis.effects import EFFECTS
 from smp_motor_ident.diagnosis.instrument_limits import (
@@ -16,9 +16,8 @@ from smp_motor_ident.diagnosis.instrument_limits import (
     ONE_SIZE_ACCURACY,
     TIMING_ACCURACY,
 )
-from smp_motor_ident.estimation.fitted import NORMAL_95
 from smp_motor_ident.record import Hardware
-from smp_motor_ident.result import Estimate, Quantity, Systematic
+from smp_motor_ident.result import Estimate, Quantity, Share, Systematic
 
 BY_CURRENT: Mapping[str, float] = {
     "resistance": -1.0, "inductance": -1.0, "inertia": 1.0, "viscous_friction": 1.0,
@@ -39,7 +38,6 @@ BY_LAG: Mapping[str, float] = {
 """What a driver that answers slowly, or through a resistance, adds to the motor's own lag."""
 BY_LOAD: Mapping[str, float] = {"static_voltage": -1.0, "coulomb_friction": -1.0}
 """What is a constant load's, one way, is none of the friction's."""
-NOT_SIGNED = ("load_voltage", "steady_speed")
 OF_ANYTHING = 1.0 / math.sqrt(3.0)
 """Root mean square of what is anything from nothing to all of it, each as likely."""
 
@@ -63,9 +61,9 @@ def of_timing(hardware: Hardware, sample_time: float) -> float:
 
 
 def with_systematic(estimate: Estimate) -> Estimate:
-    """Return an estimate whose intervals hold what its records could not show."""
+    """State with every number the systematic uncertainties that the findings name."""
     for one in _unseen(estimate):
-        estimate = _widened(estimate, one)
+        estimate = _stated(estimate, one)
     return estimate
 
 
@@ -113,7 +111,7 @@ def _lag_is_open(estimate: Estimate) -> bool:
 def _beyond_random(estimate: Estimate, one: Systematic) -> Systematic:
     """Return what moves one way, and of that what the scatter does not hold already."""
     moves = {
-        name: math.copysign(math.sqrt(max(move**2 - estimate.random_std(name) ** 2, 0.0)), move)
+        name: math.copysign(math.sqrt(max(move**2 - _std(estimate, name) ** 2, 0.0)), move)
         for name, move in one.moves.items()
     }
     return replace(one, moves=moves, one_sided=True)
@@ -136,33 +134,34 @@ def _mistimed(estimate: Estimate, seconds: float) -> Iterator[Systematic]:
         yield Systematic("timing", seconds / estimate.sample_time, there)
 
 
-def _widened(estimate: Estimate, one: Systematic) -> Estimate:
+def _std(estimate: Estimate, name: str) -> float:
+    quantity = estimate.combinations.get(name) or estimate.parameters[name]
+    return quantity.std or 0.0
+
+
+def _stated(estimate: Estimate, one: Systematic) -> Estimate:
+    """Return the estimate with one more systematic error in the numbers that it moves."""
     if not any(one.moves.values()):
         return estimate
-    row = np.array([one.moves.get(name, 0.0) for name in estimate.names])
-    groups = (
-        {n: _wider(n, q, one) if n in one.moves else q for n, q in group.items()}
+    size = estimate.evidence("one_size_of_voltage", "voltage")
+    at = {"voltage": (-size, size)} if one.cause == "one_size_of_voltage" and size else None
+    parameters, combinations = (
+        {n: _with(q, one, one.moves[n], at) if one.moves.get(n) else q for n, q in group.items()}
         for group in (estimate.parameters, estimate.combinations)
     )
-    parameters, combinations = groups
     return replace(
         estimate,
         parameters=parameters,
         combinations=combinations,
-        covariance=estimate.covariance + np.outer(row, row),
         systematic=(*estimate.systematic, one),
     )
 
 
-def _wider(name: str, quantity: Quantity, one: Systematic) -> Quantity:
-    """Return a quantity with an error beside those that its interval holds, in quadrature."""
-    value, move = quantity.value, one.moves[name]
-    assert value is not None
-    reach = NORMAL_95 * abs(move)
-    low, high = quantity.ci95 or (value, value)
-    if move < 0 or not one.one_sided:
-        low = value - math.hypot(value - low, reach)
-    if move > 0 or not one.one_sided:
-        high = value + math.hypot(high - value, reach)
-    low = low if name in NOT_SIGNED else max(low, 0.0)
-    return replace(quantity, std=math.hypot(quantity.std or 0.0, move), ci95=(low, high))
+def _with(
+    quantity: Quantity, one: Systematic, move: float, at: Mapping[str, tuple[float, float]] | None
+) -> Quantity:
+    share = abs(move / quantity.value) if quantity.value else None
+    side: Literal[-1, 0, 1] = 0 if not one.one_sided else 1 if move > 0 else -1
+    added = Share(one.cause, share, abs(move), side)
+    valid = quantity.valid if at is None else at
+    return replace(quantity, systematic=(*quantity.systematic, added), valid=valid)

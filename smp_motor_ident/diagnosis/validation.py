@@ -224,7 +224,7 @@ def compare(estimates: Mapping[str, Estimate]) -> list[Comparison]:
             if q is not None and q.value is not None and q.std is not None:
                 wheels.append(wheel)
                 values.append(q.value)
-                stds.append(estimate.random_std(name))
+                stds.append(q.std)
         if len(wheels) < 2 or len(wheels) != len(estimates):
             continue
         v, s = np.array(values), np.array(stds)

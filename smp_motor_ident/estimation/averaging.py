@@ -21,13 +21,12 @@ from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.candidate_starts import of_kind
 from smp_motor_ident.estimation.consider_covariance import latest
 from smp_motor_ident.estimation.fit import Fit
-from smp_motor_ident.estimation.fitted import NORMAL_95
 from smp_motor_ident.estimation.quantities import Answer, answer
 from smp_motor_ident.estimation.selection import POLICY, FittedCandidate, slowly_filtered
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.coordinates import Coordinates
 from smp_motor_ident.model.structures import Structure
-from smp_motor_ident.result import UNITS, Quantity
+from smp_motor_ident.result import NORMAL_95, UNITS, Quantity
 
 BLOCKS = 60
 DRAWS = 400

@@ -20,7 +20,6 @@ from smp_motor_ident.estimation import prediction
 from smp_motor_ident.estimation.current_lag import LITTLE, with_lag
 from smp_motor_ident.estimation.descent import ROUGHLY, refine
 from smp_motor_ident.estimation.fit import Fit, Options
-from smp_motor_ident.estimation.fitted import NORMAL_95
 from smp_motor_ident.estimation.lag_exchange import consider_exchange
 from smp_motor_ident.estimation.selection import POLICY, sandwich_factor
 from smp_motor_ident.likelihood.experiments import Experiments
@@ -28,6 +27,7 @@ from smp_motor_ident.model.coordinates import RINGS, Coordinates, direction, lag
 from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.model.physical import physical_gradients
 from smp_motor_ident.model.structures import Electromechanical, FirstOrder, SecondOrder, Structure
+from smp_motor_ident.result import NORMAL_95
 
 POINTS = 64  # at which a lag may be
 SECOND_LAGS = (0.003, 0.03, 0.1, 0.3, 1.0)  # of the delay that may stand for them

@@ -22,7 +22,6 @@ from smp_motor_ident.diagnosis.sample_limits import (
     SLEW_SEEN,
 )
 from smp_motor_ident.estimation.fit import Fit
-from smp_motor_ident.estimation.fitted import NORMAL_95
 from smp_motor_ident.estimation.selection import FittedCandidate, bic, evidence
 from smp_motor_ident.finding import Finding, Severity
 from smp_motor_ident.likelihood.experiments import Experiments, output_of
@@ -43,7 +42,7 @@ from smp_motor_ident.model.driver import (
 )
 from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.record import Record
-from smp_motor_ident.result import UNITS, Estimate, Quantity
+from smp_motor_ident.result import NORMAL_95, UNITS, Estimate, Quantity
 
 FRICTION = place("vc_plus")
 

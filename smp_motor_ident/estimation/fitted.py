@@ -14,9 +14,7 @@ from smp_motor_ident.likelihood.noise import NoiseModel
 from smp_motor_ident.model.coordinates import PLAUSIBLE, Coordinates, direction
 from smp_motor_ident.model.measurement import Measurement
 from smp_motor_ident.model.structures import Structure
-
-NORMAL_95 = 1.96
-"""Half a 95 % interval of a normal variable, in its standard deviations."""
+from smp_motor_ident.result import NORMAL_95
 
 ROUNDING = 1e-13
 """Share of the information in which sums over thousands of samples are exact."""

@@ -30,12 +30,11 @@ from smp_motor_control.arrays import Array, Complex
 from smp_motor_ident._compile import compiled
 from smp_motor_ident.diagnosis.limits import LOOSE_QUANTITY
 from smp_motor_ident.errors import InsufficientExcitationError
-from smp_motor_ident.estimation.fitted import NORMAL_95
 from smp_motor_ident.estimation.simulation import simulate
 from smp_motor_ident.likelihood.experiments import output_of
 from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.record import Record
-from smp_motor_ident.result import UNITS, Candidate, Estimate, FitPercent, Quantity
+from smp_motor_ident.result import NORMAL_95, UNITS, Candidate, Estimate, FitPercent, Quantity
 
 NAME = "flexible_shaft"
 NONLINEAR = (

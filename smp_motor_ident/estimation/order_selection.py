@@ -22,7 +22,6 @@ from smp_motor_ident.estimation.delay_and_averaging import (
     with_delay,
 )
 from smp_motor_ident.estimation.fit import Fit, Options, solve
-from smp_motor_ident.estimation.fitted import NORMAL_95
 from smp_motor_ident.estimation.initialisation import beginning, first_fit, initial_fit, ranked_on
 from smp_motor_ident.estimation.memory import remembered
 from smp_motor_ident.estimation.selection import POLICY, FittedCandidate, sandwich_factor
@@ -33,6 +32,7 @@ from smp_motor_ident.estimation.variations import friction_shows, may_rub, varie
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.measurement import ANGLE, SPEED
 from smp_motor_ident.model.structures import FirstOrder, SecondOrder, Structure
+from smp_motor_ident.result import NORMAL_95
 
 Say = Callable[[str], None]
 

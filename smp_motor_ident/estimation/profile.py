@@ -20,7 +20,7 @@ from smp_motor_control.arrays import Array
 from smp_motor_ident.diagnosis.limits import MOST_FRICTION, PROFILE_FROM, REST, SAME_LEVEL
 from smp_motor_ident.estimation.descent import initial_of
 from smp_motor_ident.estimation.fit import Fit, Options, solve
-from smp_motor_ident.estimation.fitted import NORMAL_95, Profile
+from smp_motor_ident.estimation.fitted import Profile
 from smp_motor_ident.estimation.prediction import simulate, voltage_at_samples
 from smp_motor_ident.estimation.quantities import ways
 from smp_motor_ident.estimation.trials import slower_winding
@@ -28,6 +28,7 @@ from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.likelihood.passes import own_columns
 from smp_motor_ident.model.coordinates import Coordinates, direction
 from smp_motor_ident.model.second_order import internal
+from smp_motor_ident.result import NORMAL_95
 
 RISE = float(chdtri(1, 0.05))  # of the deviance at the end of a 95 % interval
 NONLINEAR = ("vc_plus", "ln_a1", "ln_a2", "delay", "window", "current_lag")

@@ -13,14 +13,13 @@ from smp_motor_control.arrays import Array
 from smp_motor_control.motor.parameters import PHYSICAL
 from smp_motor_ident.diagnosis import limits
 from smp_motor_ident.estimation.fit import Fit
-from smp_motor_ident.estimation.fitted import NORMAL_95
 from smp_motor_ident.likelihood.experiments import Experiments
 from smp_motor_ident.model.coordinates import Coordinates, direction
 from smp_motor_ident.model.measurement import ANGLE
 from smp_motor_ident.model.physical import physical, physical_gradients
 from smp_motor_ident.model.structure import Gradients
 from smp_motor_ident.model.structures import Structure
-from smp_motor_ident.result import UNITS, Quantity
+from smp_motor_ident.result import NORMAL_95, UNITS, Quantity
 
 TRADED = ("dc_gain", "static_voltage", "static_voltage_reverse", "load_voltage")
 """Of a steady speed at one level of voltage only ``dc_gain (level - static_voltage)`` is known."""

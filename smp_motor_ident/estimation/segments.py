@@ -28,7 +28,6 @@ from smp_motor_ident.diagnosis.limits import (
     TEMPERATURE,
 )
 from smp_motor_ident.estimation.fit import Fit
-from smp_motor_ident.estimation.fitted import NORMAL_95
 from smp_motor_ident.estimation.prediction import inverse as inverse_of
 from smp_motor_ident.estimation.prediction import positive_part, simulate
 from smp_motor_ident.estimation.quantisation import rounded
@@ -37,6 +36,7 @@ from smp_motor_ident.likelihood.passes import gather
 from smp_motor_ident.model.coordinates import LOGARITHMS, PLAUSIBLE, Coordinates
 from smp_motor_ident.model.measurement import ANGLE, LATE_SPEED, MEAN_SPEED
 from smp_motor_ident.model.structures import sensor_of
+from smp_motor_ident.result import NORMAL_95
 
 FEWEST = 4  # parts of which a scatter can be taken
 ORDERED = 6  # parts of which a drift is distinguishable from scatter

@@ -102,6 +102,27 @@ def interval(quantity: Quantity) -> str:
     return f"{low} … {high}"
 
 
+def systematic(quantity: Quantity) -> str:
+    """Return the systematic uncertainties of a number, each with its cause.
+
+    Examples
+    --------
+    >>> systematic(Quantity(12.9, 0.02, systematic=(Share("current_scale", 0.03, 0.39),)))
+    '± 3 % (current scale)'
+    """
+    signs = {-1: "−", 0: "± ", 1: "+"}
+    return ", ".join(
+        signs[one.side]
+        + (
+            f"{100 * one.share:.2g} %"
+            if one.share is not None
+            else f"{spread(one.size)} {quantity.unit}"
+        )
+        + f" ({one.cause.replace('_', ' ')})"
+        for one in quantity.systematic
+    )
+
+
 def typeset(unit: str) -> str:
     """Return a unit as one prints it."""
     return unit.replace("^2", "²").replace("ohm", "Ω")

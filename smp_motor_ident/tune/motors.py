@@ -79,13 +79,13 @@ def friction_of(estimate: Estimate, supply: float) -> Friction:
         return Friction(0.0, 0.0, 0.0, Finding("friction_unknown", "warning", words))
     if quantity.value is None or not math.isfinite(quantity.std or 0.0):
         low, high = (0.0, supply) if quantity.ci95 is None else quantity.ci95
-    elif quantity.ci95 is not None:
-        low, high = quantity.ci95
+    elif (interval := quantity.total_ci95) is not None:
+        low, high = interval
     else:
         half = 1.96 * (quantity.std or 0.0)
         low, high = quantity.value - half, quantity.value + half
     # Whoever turned the motor did so with less than the supply.
-    low, high = max(low, 0.0), high if quantity.std in (None, 0.0) else min(high, supply)
+    low, high = max(low, 0.0), high if quantity.total_std == 0.0 else min(high, supply)
     if high - low > FRICTION_RANGE.value * supply:
         raise DesignError(
             f"{estimate.wheel}: dry friction may take anything from {low:.3g} to {high:.3g} V of "
@@ -267,16 +267,16 @@ def every_other(motors: Motors, others: Motors) -> Motors:
 
 
 def _covariance(estimate: Estimate, names: tuple[str, ...], mean: Array) -> Array:
-    """Return the covariance of some quantities, zero where there is none, widened if unreliable."""
+    """Return the covariance of random and systematic errors, widened if unreliable."""
     covariance = np.zeros((len(names), len(names)))
     known = [k for k, name in enumerate(names) if name in estimate.names]
     index = [estimate.names.index(names[k]) for k in known]
     covariance[np.ix_(known, known)] = estimate.covariance[np.ix_(index, index)]
     for one in estimate.systematic:
-        if one.cause == "second_lag":  # whose of the two lags is whose, `lag_in_sensor` draws
+        if one.cause != "second_lag":  # `lag_in_sensor` draws which of the two lags is the motor's
             moves = {name: by for name, by in one.moves.items() if name in estimate.names}
             move = np.array([moves.get(name, 0.0) for name in names])
-            covariance -= np.outer(move, move)
+            covariance += np.outer(move, move)
     spread = np.zeros(len(names))
     if estimate.unreliable:
         spread[:] = unreliable_spread(estimate)

@@ -170,7 +170,7 @@ def _holds(found, truth, share):
     assert not found.unreliable
     for name, value in truth.items():
         q = found.combinations[name]
-        std = found.random_std(name)
+        std = q.std
         assert abs(q.value - value) < 4 * std, name
         assert std < share * value
 

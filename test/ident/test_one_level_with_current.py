@@ -180,4 +180,4 @@ def test_a_run_down_after_all_that_is_looked_at_first_tells_friction_from_gain(s
     every = {**found.combinations, **found.parameters}
     for name, true in truth.items():
         # 4 standard deviations (one in 16,000), of which each is a thousandth at most.
-        assert abs(every[name].value - true) < 4 * found.random_std(name) < 4e-3 * true, name
+        assert abs(every[name].value - true) < 4 * every[name].std < 4e-3 * true, name

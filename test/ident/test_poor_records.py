@@ -299,7 +299,8 @@ def test_an_offset_of_the_current_may_be_a_drop_of_the_driver_where_the_motor_tu
     angle = out[:, 2] + 1e-3 * rng.standard_normal(t.size)
     found = estimate(Record("motor", t, v + drop, current, position=angle))
     assert "current_offset" in [f.code for f in found.findings]
-    q, std = found.parameters["coulomb_friction"], found.random_std("coulomb_friction")
+    q = found.parameters["coulomb_friction"]
+    std = q.std
     # 5 standard deviations: what is wrong silently.
     assert abs(q.value - tc) < 5 * std
     assert std < tc

@@ -38,7 +38,7 @@ def test_one_coast_tells_gain_from_friction_among_steps_to_one_level():
     for name, true in (("dc_gain", 15.0), ("static_voltage", 2.0)):
         q = found.combinations[name]
         # Of friction that is no load; four deviations are one in 16,000.
-        assert abs(q.value - true) < 4 * found.random_std(name) < true
+        assert abs(q.value - true) < 4 * q.std < true
 
 
 def test_steps_of_one_size_say_that_a_ramp_of_the_driver_would_not_show():
