@@ -106,15 +106,20 @@ def judge(job: tuple[int, int, int, bool]) -> tuple[int, str, str]:
     codes = [f.code for f in e.findings if f.severity == "unreliable"]
     words = ", ".join(f"{n} {x:.0f} std" for n, x in wrong.items()) or "fine"
     words = f"{about}: {e.model}; {words}; {codes or ''}"
+    return number, outcome_of(e, effect, wrong, c), words
+
+
+def outcome_of(e, effect, wrong: dict[str, float], c: Case) -> str:
+    """Return the outcome of an estimate whose ``wrong`` numbers are known."""
     if e.unreliable:
-        named = bool(set(codes) & set(effect.causes))
-        return number, "cause" if named else "other", words
+        codes = {f.code for f in e.findings if f.severity == "unreliable"}
+        return "cause" if codes & set(effect.causes) else "other"
     if wrong or effect.expect == "refuse":
         said = [f for f in e.findings if f.code in effect.causes and _speaks_of(f, wrong)]
         if said and not wrong:  # what should be refused was left out, and said
-            return number, "right", words
-        return number, "warned" if said else "silent", f"{words} {[f.code for f in said] or ''}"
-    return number, "covered" if errors(e, c, random=True) else "right", words
+            return "right"
+        return "warned" if said else "silent"
+    return "covered" if errors(e, c, random=True) else "right"
 
 
 def recorded(c: Case, rng: np.random.Generator):
