@@ -159,6 +159,29 @@ class RobotClient:
             )
         return {w: (len(s) - 1) / (s[-1] - s[0]) for w, s in stamps.items()}
 
+    def refuse_second_reporters(self, wheels: Iterable[str]) -> None:
+        """Raise where two nodes publish one wheel's ``motor_state``, and name both.
+
+        A node that was killed stays in the graph for a while: it is waited for.
+        """
+        topics = [self._full(f"{wheel}/motor_state") for wheel in wheels]
+
+        def mixed() -> dict[str, list[str]]:
+            found = {topic: sorted(self._publishers(topic)) for topic in topics}
+            return {topic: names for topic, names in found.items() if len(names) > 1}
+
+        self.until(lambda: not mixed(), PATIENCE)
+        for topic, names in mixed().items():
+            raise RobotError(
+                f"{topic} has {len(names)} publishers, {' and '.join(names)}: their samples mix. "
+                "End all but one, or give each robot its namespace or ROS domain"
+            )
+
+    def runs_controller(self, wheel: str) -> bool:
+        """Tell whether a wheel's ``wheel_pid`` has been discovered."""
+        service = self.node.resolve_service_name(f"{controller_of(wheel)}/change_state")
+        return bool(self.node.count_services(service))
+
     def wait_for_nodes(self, nodes: Sequence[str], timeout: float) -> None:
         """Wait until every node can be asked for its parameters."""
         for node in nodes:
@@ -293,6 +316,15 @@ class RobotClient:
     def _commanders(self, wheel: str) -> list[str]:
         topic = self._full(f"{wheel}/motor_command")
         return [info.node_name for info in self.node.get_publishers_info_by_topic(topic)]
+
+    def _publishers(self, topic: str) -> list[str]:
+        """Return the full names of the nodes that publish a topic, UNKNOWN where not known yet."""
+        found = self.node.get_publishers_info_by_topic(topic)
+        return [
+            UNKNOWN if UNKNOWN in (one.node_name, one.node_namespace)
+            else f"{one.node_namespace.rstrip('/')}/{one.node_name}"
+            for one in found
+        ]  # fmt: skip
 
     @contextlib.contextmanager
     def paused(self, wheels: Sequence[str]) -> Any:

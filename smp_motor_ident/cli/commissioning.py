@@ -14,11 +14,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from smp_motor_control import WHEELS, controller_of
+from smp_motor_control import WHEELS
 from smp_motor_control.motor.file import load_motors
 from smp_motor_control.wheel.protection import Bounds
 from smp_motor_ident import bag
-from smp_motor_ident.cli import checking, commission, plan, protocol, steps, verifying
+from smp_motor_ident.cli import applying, checking, commission, plan, protocol, steps, verifying
 from smp_motor_ident.cli.processes import ProcessError, Processes, connect
 from smp_motor_ident.cli.protocol import Protocol
 from smp_motor_ident.diagnosis import validation_run, wheel_limits, winding
@@ -32,6 +32,7 @@ AMPLITUDE, DURATION = 6.0, 15.0
 """Largest voltage [V] and length of a signal [s], unless the user or an earlier run says so."""
 
 DRAFT = "recording"  # folder of a recording until it is whole
+ANSWER = 2.0  # a controller that runs is discovered by then [s]
 LOOKS, ALIKE = 15, 4
 """Wheels are looked for at most so often, until so many looks [1 s each] find the same."""
 
@@ -86,16 +87,21 @@ def _commission(arguments: argparse.Namespace, folder: Path, known: Mapping[str,
     bounds = {"max_speed": arguments.max_speed or 0.0, "max_current": arguments.max_current}
     # The client leaves last: who excites has ended when the controllers are given back.
     with connect(commission.NAME, ros) as client, Processes(folder / "logs") as processes:
+        _say("looking for the wheels that report, which takes some 5 s")
         wheels = tuple(dict.fromkeys(arguments.wheel or ())) or _found(client)
         robot = steps.Robot(processes, client, wheels or WHEELS, folder, ros, bounds)
         rates = client.wait_for_wheels(robot.wheels, timeout=15.0)
+        client.refuse_second_reporters(robot.wheels)
         print("; ".join(f"{wheel} reports at {rate:.0f} Hz" for wheel, rate in rates.items()))
         session = _begin(arguments, robot)
+        if session is None:
+            return 0
         with client.paused(robot.wheels), session.protocol.ending():
             _move(session, known)
             designed = _design(session)
             verdict = _verify(session, designed)
     session.protocol.end(True, verdict)
+    print("\n".join(session.protocol.summary()))
     print(f"{verdict}\nreport: {folder / 'report.html'}")
     if not arguments.apply:
         results = folder / "identification"
@@ -103,30 +109,50 @@ def _commission(arguments: argparse.Namespace, folder: Path, known: Mapping[str,
     return 0
 
 
-def _begin(arguments: argparse.Namespace, robot: steps.Robot) -> Session:
+def _begin(arguments: argparse.Namespace, robot: steps.Robot) -> Session | None:
     """Ask before anything moves; what was done at other voltages or of other wheels is not kept."""
     made = Protocol(robot.folder, arguments.accept)
     asked = {name: getattr(arguments, name) for name in ("amplitude", "duration")}
     asked["wheels"] = list(robot.wheels)
     same = made.document.get("asked") == asked
-    left = [one for one in _recordings(arguments, made) if not (same and _is_kept(robot, one))]
-    checked = same and made.checked
-    session = Session(arguments, robot, made, plan.schedule(robot.wheels, left, checked))
-    if left:
-        _confirm(arguments, robot.wheels, left, session.schedule)
+    if same and made.ended and not arguments.apply:
+        _say(f"nothing is left to do: it passed. {made.ended}")
+        return None
     if not same:
         if "asked" in made.document:
             _say("wheels, amplitude or duration are others than before: all of it is done anew")
+        made.begin(robot.wheels, asked)
+    left = [one for one in _recordings(arguments, made) if not (same and _is_kept(robot, one))]
+    if left or (arguments.tuning and not made.has("tuning_page")):
+        made.mark(identified=False, judged=False, tuned=False)
+    parts = {part: made.has(part) for part in ("checked", "identified", "tuned")}
+    schedule = plan.schedule(robot.wheels, left, **parts)
+    session = Session(arguments, robot, made, schedule)
+    _tell_controllers(arguments, robot)
+    _confirm(arguments, robot.wheels, left, schedule)
+    if not same:
         for name in (plan.FITTED, plan.HELD_OUT):
             shutil.rmtree(robot.folder / name, ignore_errors=True)
-        made.begin(robot.wheels, asked)
         made.write()
     return session
 
 
+def _tell_controllers(arguments: argparse.Namespace, robot: steps.Robot) -> None:
+    """Say which wheels drive on a controller of our own, which no gains can be left in."""
+    robot.client.until(lambda: not robot.uncontrolled(), ANSWER)
+    missing = ", ".join(robot.uncontrolled())
+    if missing and arguments.apply:
+        raise ParameterError(
+            f"no wheel_pid runs for {missing}: --apply has no controller to leave the gains in; "
+            "start it, or leave out --apply"
+        )
+    if missing:
+        _say(f"no wheel_pid runs for {missing}: one is started for the drive, and ended behind it")
+
+
 def _recordings(arguments: argparse.Namespace, made: Protocol) -> list[plan.Recording]:
     """Return what is recorded at the voltage that the checks found, or before them at the most."""
-    amplitude = made.document["amplitude"] if made.checked else arguments.amplitude
+    amplitude = made.document["amplitude"] if made.has("checked") else arguments.amplitude
     return plan.recordings(amplitude, arguments.duration)
 
 
@@ -137,7 +163,7 @@ def _is_kept(robot: steps.Robot, one: plan.Recording) -> bool:
 def _move(session: Session, known: Mapping[str, Any]) -> None:
     """Check the wheels, then record them excited, as far as that is not done."""
     arguments, made = session.arguments, session.protocol
-    if not made.checked:
+    if not made.has("checked"):
         _check(session, known)
     for one in _recordings(arguments, made):
         if not _is_kept(session.robot, one):
@@ -154,13 +180,14 @@ def _check(session: Session, known: Mapping[str, Any]) -> None:
     )  # fmt: skip
     made.checks(checked.figures, checked.amplitude, checked.speed)
     made.stop(made.add("checks", checked.findings))
-    made.document["checked"] = True
+    made.mark(checked=True)
     made.write()
 
 
 def _record(session: Session, one: plan.Recording) -> None:
     """Record the wheels while one signal moves them; whatever ends it, nobody moves them then."""
     arguments, robot = session.arguments, session.robot
+    robot.client.refuse_second_reporters(robot.wheels)
     speed = session.protocol.document.get("speed")
     if speed and not arguments.max_speed:
         fastest = wheel_limits.OVER_SPEED.value * float(speed)
@@ -173,9 +200,11 @@ def _record(session: Session, one: plan.Recording) -> None:
         steps.excite(robot, [one.excitation])
     finally:
         robot.processes.stop("excite", "record")
+    made = session.protocol
+    made.mark(identified=False, judged=False, tuned=False)
+    made.write()
     (robot.folder / one.folder).mkdir(exist_ok=True)
     draft.rename(robot.folder / one.folder / one.name)
-    made = session.protocol
     earlier = [r for r in _recordings(arguments, made) if r != one and _is_kept(robot, r)]
     made.stop(made.add(one.part, too_hot(robot.folder, earlier, one)))
 
@@ -190,64 +219,80 @@ def too_hot(folder: Path, earlier: Sequence[plan.Recording], last: plan.Recordin
 
 
 def _design(session: Session) -> verifying.Designed:
-    """Identify and tune; what they write appears as a whole, and is written anew."""
+    """Identify and tune, as far as that is not done; what they write appears as a whole."""
     arguments, robot, made = session.arguments, session.robot, session.protocol
-    folder, results = robot.folder, robot.folder / "identification"
-    fitted, held_out = folder / plan.FITTED, folder / plan.HELD_OUT
-    again = ["--force"]
-    again += ["--accept-unreliable"] if UNRELIABLE in arguments.accept else []
-    options = [*again, *(["--tuning"] if arguments.tuning else []), "--validate", str(held_out)]
-    options += [part for wheel in robot.wheels for part in ("--wheel", wheel)]
-
-    def identify(part: str) -> dict[str, Estimate]:
-        session.begin(part)
-        try:
-            return steps.identify_wheels(fitted, results, *options)
-        except ProcessError:
-            made.stop(made.add("identification", unreliable(results)))
-            raise
-
-    estimates = identify(plan.IDENTIFYING)
-    known = (fitted / plan.FURTHER).is_dir()
+    folder, gains = robot.folder, robot.folder / "gains.yaml"
+    known = (folder / plan.FITTED / plan.FURTHER).is_dir()
+    estimates = _identify(session, plan.IDENTIFYING)
     more = None if known else plan.further(estimates, arguments.amplitude)
     if more:
         session.schedule.add_further(more, len(robot.wheels))
         _record(session, more)
-        estimates = identify(plan.AGAIN)
-    made.stop(made.add("validation", validated(estimates, fitted, held_out)))
-    session.begin(plan.TUNING)
-    gains = steps.tune_wheels(results, folder / "gains.yaml", *again[:1])
+        estimates = _identify(session, plan.AGAIN)
+    if not made.has("judged"):
+        made.add("identification", unreliable(estimates))
+        made.add("validation", validated(estimates, folder / plan.FITTED, folder / plan.HELD_OUT))
+        made.mark(judged=True)
+        made.write()
+    made.stop(made.refused("identification") or made.refused("validation"))
+    if not made.has("tuned"):
+        session.begin(plan.TUNING)
+        accepted = ["--accept-unreliable"] if UNRELIABLE in arguments.accept else []
+        steps.tune_wheels(folder / "identification", gains, "--force", *accepted)
+        made.mark(tuned=True)
+        made.write()
     document = json.loads((folder / "gains.json").read_text("utf-8"))["wheels"]
-    return verifying.Designed(estimates, gains, document)
+    return verifying.Designed(estimates, applying.from_file(gains), document)
+
+
+def _identify(session: Session, part: str) -> dict[str, Estimate]:
+    """Identify from all recordings, unless that is done."""
+    robot, made, tuning = session.robot, session.protocol, session.arguments.tuning
+    results = robot.folder / "identification"
+    if made.has("identified"):
+        return read_identification(results)
+    session.begin(part)
+    options = ["--force", "--quiet", "--accept-unreliable", *(["--tuning"] if tuning else [])]
+    options += ["--validate", str(robot.folder / plan.HELD_OUT)]
+    options += [part for wheel in robot.wheels for part in ("--wheel", wheel)]
+    try:
+        estimates = steps.identify_wheels(robot.folder / plan.FITTED, results, *options)
+    except ProcessError:
+        if (results / "identification.json").is_file():
+            made.stop(made.add("identification", unreliable(read_identification(results))))
+        raise
+    made.mark(identified=True, tuning_page=bool(tuning), judged=False, tuned=False)
+    made.write()
+    return estimates
 
 
 def _verify(session: Session, designed: verifying.Designed) -> str:
     """Drive with the gains on trial, judge the drive, and return what became of them."""
-    arguments, robot, made = session.arguments, session.robot, session.protocol
-    missing = [w for w in robot.wheels if not _controlled(robot, w)]
-    if missing and arguments.apply:
-        raise ProcessError(f"{', '.join(missing)}: no wheel_pid runs that could take the gains")
-    if missing:
-        made.add("verification", [Finding(
-            "not_verified", "warning",
-            f"no wheel_pid runs for {', '.join(missing)}: the gains have not driven yet", {},
-            "start the controllers and commission again with --resume",
-        )])  # fmt: skip
-        return "Gains are designed, and have not driven yet."
+    robot, made = session.robot, session.protocol
+    robot.client.refuse_second_reporters(robot.wheels)
     session.schedule.add(plan.DRIVING, "drive", plan.START + sum(one[2] for one in designed.plan()))
     session.begin(plan.DRIVING)
-    with verifying.on_trial(robot.client, designed.gains) as trial:
-        changes, findings = verifying.drive_undisturbed(robot, designed, _say)
-        made.changes(changes)
-        refused = made.add("verification", findings)
-        trial.kept = arguments.apply and not refused
+    own = robot.uncontrolled()
+    try:
+        robot.start_controllers(own)
+        with verifying.on_trial(robot.client, designed.gains) as trial:
+            changes, findings = verifying.drive_undisturbed(robot, designed, _say)
+            made.changes(changes)
+            refused = made.add("verification", findings)
+            trial.kept = session.arguments.apply and not refused
+    finally:
+        robot.stop_controllers(own)
     if refused:
         print("the gains were taken back")
         refused += made.warned_of({f.evidence.get("wheel") for f in refused})
     made.stop(refused)
-    now = "the gains are set in the running controllers"
-    before = "the controllers have their former gains again"
-    return f"The wheels did as designed; {now if trial.kept else before}."
+    did = "The wheels drove as designed"
+    if accepted := [f for f in findings if f.severity == "refused"]:
+        did = f"The wheels drove, and {len(accepted)} findings of the drive were accepted"
+    now = "the controllers have their former gains again"
+    if own:
+        now = f"the wheel_pid that was started for {', '.join(own)} has ended"
+    return f"{did}; {'the gains are set in the running controllers' if trial.kept else now}."
 
 
 def _found(client: Any) -> tuple[str, ...]:
@@ -260,19 +305,11 @@ def _found(client: Any) -> tuple[str, ...]:
     return looks[-1]
 
 
-def _controlled(robot: steps.Robot, wheel: str) -> bool:
-    node = robot.client.node
-    service = node.resolve_service_name(f"{controller_of(wheel)}/change_state")
-    return bool(node.count_services(service))
-
-
-def unreliable(results: Path) -> list[Finding]:
+def unreliable(estimates: Mapping[str, Estimate]) -> list[Finding]:
     """Return why motors that were identified are not to be designed on."""
-    if not (results / "identification.json").is_file():
-        return []
     return [
         Finding(UNRELIABLE, "refused", f"{wheel}: {one.message}", one.evidence, one.advice)
-        for wheel, estimate in read_identification(results).items()
+        for wheel, estimate in estimates.items()
         for one in estimate.findings
         if one.severity in ("unreliable", "refused")
     ]
@@ -318,10 +355,10 @@ def _confirm(
     if not sys.stdin.isatty():
         raise ParameterError("the wheels would move: say --yes, or run this in a terminal")
     seconds = sum(one.excitation.duration for one in left)
+    excited = f"for {seconds:.0f} s at up to {arguments.amplitude:g} V, then " if left else ""
     print(
-        f"{', '.join(wheels)} will turn both ways for {seconds:.0f} s at up to "
-        f"{arguments.amplitude:g} V; all takes about {plan.words(schedule.left())}. "
-        "Is the robot on blocks and clear of people? [y/N] ",
+        f"{', '.join(wheels)} will turn both ways {excited}in a drive on the new gains; all takes "
+        f"about {plan.words(schedule.left())}. Is the robot on blocks and clear of people? [y/N] ",
         end="",
         flush=True,
     )

@@ -11,7 +11,7 @@ from typing import Any
 
 from smp_motor_control import LEFT, RIGHT, WHEELS, controller_of
 from smp_motor_control.motor.file import load_motors, paper_motors
-from smp_motor_ident.cli import demo, driving, steps, verdict
+from smp_motor_ident.cli import applying, demo, driving, steps, verdict
 from smp_motor_ident.cli.processes import Processes, connect, free_domain
 from smp_motor_ident.cli.workers import die_with_parent
 from smp_motor_ident.errors import ParameterError
@@ -90,14 +90,10 @@ def start(robot: steps.Robot, motors: Path, rate: float) -> steps.Robot:
     processes, client = robot.processes, robot.client
     given = ["--ros-args", "-p", f"motors_file:={motors.resolve()}", "-p", f"rate:={rate}"]
     processes.start("motor_plant", "motor_plant", *given, priority=1)
-    for wheel in WHEELS:
-        place = ["--ros-args", "-r", f"__ns:=/{wheel}", "-p", "autostart:=false"]
-        processes.start(f"{wheel}.wheel_pid", "wheel_pid", *place, priority=1)
     processes.start("skid_steer", "skid_steer", priority=1)
-    nodes = ["motor_plant", *robot.wheel_nodes(), "skid_steer"]
-    client.wait_for_nodes(nodes, timeout=steps.PATIENCE)
+    robot.start_controllers(WHEELS)
+    client.wait_for_nodes(["motor_plant", "skid_steer"], timeout=steps.PATIENCE)
     client.wait_for_wheels(robot.wheels, timeout=steps.PATIENCE)
-    robot.switch("configure")
     return robot
 
 
@@ -112,8 +108,8 @@ def learn(robot: steps.Robot, say: Any) -> tuple[dict[str, Estimate], dict[str, 
     results = robot.folder / "identification"
     estimates = steps.identify_wheels(bag, results, "--quiet")
     say("tuning")
-    gains = steps.tune_wheels(results, robot.folder / "gains.yaml")
-    return estimates, gains
+    steps.tune_wheels(results, robot.folder / "gains.yaml")
+    return estimates, applying.from_file(robot.folder / "gains.yaml")
 
 
 def drive(

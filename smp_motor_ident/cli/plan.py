@@ -153,15 +153,23 @@ class Schedule:
         return mean(self._took[n] - self._parts[n][1] for n in done) if done else 0.0
 
 
-def schedule(wheels: Sequence[str], parts: Iterable[Recording], checked: bool) -> Schedule:
+def schedule(
+    wheels: Sequence[str],
+    parts: Iterable[Recording],
+    checked: bool = False,
+    identified: bool = False,
+    tuned: bool = False,
+) -> Schedule:
     """Return the whole way of a commissioning, without what is done already."""
     made = Schedule()
     for wheel in () if checked else wheels:
         made.add(f"checking {wheel}", "check", CHECK)
     for part in parts:
         made.add(part.part, "signal", part.excitation.duration + START)
-    made.add(IDENTIFYING, "identify", COMPUTE * len(wheels))
-    made.add(TUNING, "tune", COMPUTE * len(wheels))
+    if not identified:
+        made.add(IDENTIFYING, "identify", COMPUTE * len(wheels))
+    if not tuned:
+        made.add(TUNING, "tune", COMPUTE * len(wheels))
     made.add(DRIVING, "drive", DRIVE)
     return made
 
@@ -192,7 +200,7 @@ def drawn(amplitude: float, duration: float, wheels: Sequence[str]) -> list[str]
         )
         lines.append(f"  {bars}")
         begin += part.duration
-    total = words(schedule(wheels, parts, False).left())
+    total = words(schedule(wheels, parts).left())
     accuracy = 100 * WANTED_ACCURACY.value
     lines += [
         f"then: identify; where a number is not known to {accuracy:g} %, one more Fourier signal "

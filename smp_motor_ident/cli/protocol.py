@@ -2,7 +2,7 @@
 
 import contextlib
 import json
-from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +11,17 @@ from smp_motor_ident.cli.processes import ProcessError
 from smp_motor_ident.diagnosis.wheel_test import Figures
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.report import commissioning as page
-from smp_motor_ident.report.document import now, write_together
+from smp_motor_ident.report.document import now, read_identification, write_together
 from smp_motor_ident.result import plain, to_json
 from smp_motor_ident.tune.verification import Change
 
 SCHEMA = 1
 NAME, REPORT = "commissioning.json", "report.html"
+PARTS = ("checked", "identified", "tuning_page", "judged", "tuned")
+"""Parts that are noted when they are done."""
+
+SUMMARY = ("DC gain", "Time constant", "Static voltage", "p", "i", "d", "Settles, driven")
+"""Rows of the page that the terminal shows."""
 
 
 class Protocol:
@@ -28,18 +33,25 @@ class Protocol:
         self.document: dict[str, Any] = {"schema": SCHEMA}
         if (folder / NAME).is_file():
             self.document = json.loads((folder / NAME).read_text("utf-8"))
+        drove = self.document.get("passed") and self.document.get("changes")
+        self.ended = str(self.document["verdict"]) if drove else ""
         self.document |= {"passed": None, "verdict": "It was cut off.", "accepted": [*accepted]}
 
     def begin(self, wheels: Sequence[str], asked: Mapping[str, Any]) -> None:
         """Forget what was found before: the wheels move anew."""
         self.document |= {
-            "wheels": list(wheels), "asked": asked, "checked": False, "findings": [], "changes": [],
+            "wheels": list(wheels), "asked": asked, "findings": [], "changes": [],
+            **dict.fromkeys(PARTS, False),
         }  # fmt: skip
+        self.ended = ""
 
-    @property
-    def checked(self) -> bool:
-        """Whether the wheels were checked, and nothing stopped at that."""
-        return bool(self.document.get("checked"))
+    def has(self, part: str) -> bool:
+        """Tell whether one of :data:`PARTS` is done."""
+        return bool(self.document.get(part))
+
+    def mark(self, **done: bool) -> None:
+        """Note which parts are done, so that ``--resume`` need not do them again."""
+        self.document |= done
 
     def checks(self, figures: Mapping[str, Figures], amplitude: float, speed: float) -> None:
         """Note what the test of the wheels showed, as :class:`~.checking.Checked` has it."""
@@ -50,7 +62,8 @@ class Protocol:
         self._changes = list(changes)
         self.document["changes"] = [
             dict(wheel=one.wheel, name=one.name, setpoint=one.setpoint)
-            | dict(reading=plain(one.reading), allowed=plain(one.bands))
+            | dict(reading=plain(one.reading), expected=plain(one.expected))
+            | dict(allowed=plain(one.bands))
             for one in changes
         ]
 
@@ -61,14 +74,27 @@ class Protocol:
         self.document["findings"] = kept + [{"step": step, **plain(f)} for f in new]
         for finding in new:
             print(f"{finding.severity}: {finding.message}", flush=True)
-        return [f for f in new if f.severity == "refused" and f.code not in self._accepted]
+        return self.refused(step)
+
+    def refused(self, step: str) -> list[Finding]:
+        """Return what a commissioning stops at of a step's findings."""
+        return self._noted(
+            lambda f: (
+                f["step"] == step and f["severity"] == "refused" and f["code"] not in self._accepted
+            )
+        )
 
     def warned_of(self, wheels: Container[object]) -> list[Finding]:
         """Return what earlier steps warned of these wheels: it may be the reason."""
+        return self._noted(
+            lambda f: f["severity"] == "warning" and f["evidence"].get("wheel") in wheels
+        )
+
+    def _noted(self, wanted: Callable[[dict[str, Any]], bool]) -> list[Finding]:
         return [
-            Finding(f["code"], "warning", f["message"], f["evidence"], f["advice"])
-            for f in self.document["findings"]
-            if f["severity"] == "warning" and f["evidence"].get("wheel") in wheels
+            Finding(f["code"], f["severity"], f["message"], f["evidence"], f["advice"])
+            for f in self.document.get("findings", [])
+            if wanted(f)
         ]
 
     def stop(self, findings: Sequence[Finding]) -> None:
@@ -97,6 +123,28 @@ class Protocol:
     def write(self) -> None:
         """Write both files, or none."""
         self.document["date"] = now()
-        shown = page.render(self.document, self._changes)
+        shown = page.render(self.document, self._changes, self.results(), self._parameters())
         files = {self._folder / NAME: to_json(self.document), self._folder / REPORT: shown}
         write_together(files, force=True)
+
+    def results(self) -> page.Results:
+        """Return what is known of the wheels so far: drive, gains and motors."""
+        if not self.has("identified"):
+            return {}
+        read = read_identification(self._folder / "identification")
+        estimates = {wheel: read[wheel] for wheel in self.document["wheels"]}
+        gains = {}
+        if self.has("tuned"):
+            gains = json.loads((self._folder / "gains.json").read_text("utf-8"))["wheels"]
+        return page.results(estimates, gains, self.document["changes"])
+
+    def summary(self) -> Iterator[str]:
+        """Return what a reader wants first, in a line for each wheel."""
+        rows = [row for group in self.results().values() for row in group if row.name in SUMMARY]
+        for k, wheel in enumerate(self.document["wheels"]):
+            told = (f"{row.name} {row.cells[k]} {row.unit}" for row in rows)
+            yield f"{wheel}: {', '.join(told)}"
+
+    def _parameters(self) -> str:
+        """Return the parameter file of the wheels' controllers, empty without gains."""
+        return (self._folder / "gains.yaml").read_text("utf-8") if self.has("tuned") else ""

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from smp_motor_control import controller_of
-from smp_motor_ident.cli import applying, identify, tune
+from smp_motor_ident.cli import identify, tune
 from smp_motor_ident.cli.processes import ProcessError, Processes
 from smp_motor_ident.report.document import read_identification
 from smp_motor_ident.result import Estimate
@@ -36,6 +36,25 @@ class Robot:
     def wheel_nodes(self) -> list[str]:
         """Return the names of the wheels' controllers."""
         return [controller_of(wheel) for wheel in self.wheels]
+
+    def uncontrolled(self) -> list[str]:
+        """Return the wheels that no ``wheel_pid`` controls."""
+        return [wheel for wheel in self.wheels if not self.client.runs_controller(wheel)]
+
+    def start_controllers(self, wheels: Sequence[str]) -> None:
+        """Start a ``wheel_pid`` for each wheel, which stays inactive."""
+        space = str(self.client.node.get_namespace()).rstrip("/")
+        for wheel in wheels:
+            place = ["--ros-args", "-r", f"__ns:={space}/{wheel}", "-p", "autostart:=false"]
+            given = [*place, *self.ros_arguments]
+            self.processes.start(f"{wheel}.wheel_pid", "wheel_pid", *given, priority=1)
+        nodes = [controller_of(wheel) for wheel in wheels]
+        self.client.wait_for_nodes(nodes, PATIENCE)
+        self.client.change_states(nodes, "configure")
+
+    def stop_controllers(self, wheels: Sequence[str]) -> None:
+        """Stop the controllers that were started here."""
+        self.processes.stop(*(f"{wheel}.wheel_pid" for wheel in wheels))
 
     def switch(self, transition: str) -> None:
         """Let every wheel's controller go through a lifecycle transition."""
@@ -77,10 +96,9 @@ def identify_wheels(bag: Path, output: Path, *options: str) -> dict[str, Estimat
     return read_identification(output)
 
 
-def tune_wheels(identified: Path, output: Path, *options: str) -> dict[str, dict[str, Any]]:
+def tune_wheels(identified: Path, output: Path, *options: str) -> None:
     """Run ``tune`` on an identification."""
     _succeed("tune", tune.main([str(identified), "--output", str(output), *options]))
-    return applying.from_file(output)
 
 
 def _succeed(tool: str, code: int) -> None:

@@ -1,13 +1,21 @@
-"""The page of a commissioning: the verdict first, what was checked, predicted and measured."""
+"""The page of a commissioning: verdict, motors and gains, predicted and measured drive, checks."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from smp_motor_control.arrays import Array
+from smp_motor_ident.finding import SEVERITIES
 from smp_motor_ident.report import words
 from smp_motor_ident.report.chart import Chart, Curve
 from smp_motor_ident.report.templates import page
+from smp_motor_ident.result import Estimate, Quantity
 
 if TYPE_CHECKING:
     from smp_motor_ident.tune.verification import Change
@@ -23,39 +31,153 @@ COLUMNS = (
 )
 """What the page shows of the test of the wheels."""
 
+GAINS = (
+    ("p", "V s/rad"),
+    ("i", "V/rad"),
+    ("d", "V s²/rad"),
+    ("feedforward_static", "V"),
+    ("feedforward_velocity", "V s/rad"),
+    ("feedforward_acceleration", "V s²/rad"),
+)
+"""What the page shows of a controller, per wheel rad/s."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One quantity of all wheels, in words."""
+
+    name: str
+    unit: str
+    cells: tuple[str, ...]  # by wheel, in the order of the wheels
+
+
+Results = Mapping[str, Sequence[Row]]
+"""What a commissioning came to, in groups: drive, gains and motor."""
+
+
+def results(
+    estimates: Mapping[str, Estimate],
+    gains: Mapping[str, Mapping[str, Any]],
+    changes: Sequence[Mapping[str, Any]],
+) -> Results:
+    """Return the drive, the gains as ``gains.json`` holds them, and the motors."""
+    groups = {"Motor": list(_motor(estimates))}
+    if gains:
+        entries = [gains[wheel] for wheel in estimates]
+        driven = [[c for c in changes if c["wheel"] == wheel] for wheel in estimates]
+        held = [
+            Row(name, unit, tuple(f"{one['gains'][name]:.4g}" for one in entries))
+            for name, unit in GAINS
+        ]
+        groups = {"Drive": list(_drive(entries, driven)), "Gains of wheel_pid": held, **groups}
+    return groups
+
+
+def _motor(estimates: Mapping[str, Estimate]) -> Iterator[Row]:
+    """Return every number that the records tell, with the digits that its scatter allows."""
+    held = [{**one.combinations, **one.parameters} for one in estimates.values()]
+    for name in dict.fromkeys(name for one in held for name in one):
+        found = [one.get(name, Quantity(None)) for one in held]
+        if any(one.value is not None for one in found):
+            unit = next(words.scaled(one).unit for one in found if one.value is not None)
+            stds = [one.random_std(name) for one in estimates.values()]
+            cells = tuple(_stated(one, std) for one, std in zip(found, stds))
+            yield Row(words.label(name), words.typeset(unit), cells)
+
+
+def _stated(quantity: Quantity, std: float) -> str:
+    shown = words.scaled(replace(quantity, std=std))
+    value = words.number(shown.value, shown.std)
+    if quantity.value is None or quantity.status != "estimated":
+        return value
+    return f"{value} ± {words.spread(shown.std)}"
+
+
+def _drive(
+    entries: Sequence[Mapping[str, Any]], driven: Sequence[Sequence[Mapping[str, Any]]]
+) -> Iterator[Row]:
+    """Return settling and overshoot: designed, and the largest that were measured."""
+    for name, title, scale, unit in (
+        ("settling", "Settles", 1e3, "ms"),
+        ("overshoot", "Overshoots", 1.0, "%"),
+    ):
+        designed = (_figure(scale, e["specification"][name]["high"]) for e in entries)
+        yield Row(f"{title}, designed at most", unit, tuple(designed))
+        if all(driven):
+            for key, of in (("allowed", "allowed in the drive"), ("reading", "driven")):
+                most = ([one[key][name] for one in changes] for changes in driven)
+                cells = (_figure(scale, None if None in m else max(m)) for m in most)
+                yield Row(f"{title}, {of}", unit, tuple(cells))
+
+
+def _figure(scale: float, value: float | None) -> str:
+    return "—" if value is None else f"{scale * value:.3g}"
+
 
 def charts(changes: Sequence[Change]) -> list[Chart]:
-    """Return one chart for each change of each wheel: measured, predicted and its band."""
-    return [
-        Chart(
-            name=f"{one.name}-{one.wheel}",
-            title=f"{words.label(one.wheel)}, {one.name}: closed loop predicted and measured",
-            x_label="time since the change of set-point [ms]",
-            y_label="wheel speed [rad/s]",
-            x=1e3 * one.time,
-            curves=(
-                Curve("predicted, all motors that may be", one.nominal, "simulated", "line",
-                      one.low, one.high),
-                Curve("measured", one.speed, "measured"),
-            ),
-            lines=(one.setpoint,),
-            group=one.name,
-            summary=f"Settles after {1e3 * one.reading.settling:.0f} ms, overshoots by "
-            f"{one.reading.overshoot:.2f} %.",
+    """Return one chart for each wheel: its changes of set-point measured, predicted, with band."""
+    made = []
+    for wheel, group in groupby(changes, lambda one: one.wheel):
+        mine = list(group)
+        time = max((one.time for one in mine), key=len)
+        curves = []
+        for one in mine:
+            on = partial(_on, time, one.time)
+            curves += [
+                Curve(f"{one.name}, predicted", on(one.nominal), "simulated", "line",
+                      on(one.low), on(one.high)),
+                Curve("measured", on(one.speed), "measured"),
+            ]  # fmt: skip
+        told = (
+            f"{one.name}: settles after {1e3 * one.reading.settling:.0f} ms, predicted "
+            f"{1e3 * one.expected.settling:.0f} ms; overshoots by {one.reading.overshoot:.2f} %."
+            for one in mine
         )
-        for one in changes
-    ]  # fmt: skip
+        made.append(Chart(
+            name=f"drive-{wheel}", title=f"{words.label(wheel)}: predicted and measured",
+            x_label="time since the change of set-point [ms]", y_label="wheel speed [rad/s]",
+            x=1e3 * time, curves=tuple(curves), lines=tuple(one.setpoint for one in mine),
+            group="drive", summary=" ".join(told),
+        ))  # fmt: skip
+    return made
 
 
-def render(document: Mapping[str, Any], changes: Sequence[Change]) -> str:
-    """Return the page of what ``commissioning.json`` holds and of the drive's curves."""
+def _on(time: Array, own: Array, values: Array) -> Array:
+    """Return a curve at other instants, NaN behind its end."""
+    return np.asarray(np.interp(time, own, values, right=np.nan))
+
+
+def render(
+    document: Mapping[str, Any],
+    changes: Sequence[Change],
+    known: Results,
+    parameters: str,
+) -> str:
+    """Return the page of what ``commissioning.json`` holds, of motors, gains and drive."""
+    findings = sorted(
+        document.get("findings", []), key=lambda one: -SEVERITIES.index(one["severity"])
+    )
     return page(
         "commissioning.html.jinja",
         charts(changes),
         document=document,
-        findings=document.get("findings", []),
+        verdict=_verdict(document),
+        findings=[one for one in findings if one["severity"] != "note"],
+        notes=[one for one in findings if one["severity"] == "note"],
+        results=known,
+        # What comments tell of their origin stands in the file, and in the identification.
+        parameters="\n".join(x for x in parameters.splitlines() if not x.startswith("#")),
         checks=document.get("checks", {}),
-        identified=any(f["step"] == "validation" for f in document.get("findings", [])),
         changes=document.get("changes", []),
         columns=COLUMNS,
     )
+
+
+def _verdict(document: Mapping[str, Any]) -> tuple[str, str]:
+    """Return a class and two words: "passed" is said of gains that drove."""
+    if document["passed"] is None:
+        return "fair", "Not finished."
+    if not document["passed"]:
+        return "poor", "Not passed."
+    borne = [f for f in document.get("findings", []) if f["severity"] == "refused"]
+    return ("fair", "Passed with accepted findings.") if borne else ("good", "Passed.")

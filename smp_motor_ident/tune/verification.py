@@ -78,6 +78,7 @@ class Change:
     nominal: Array  # as predicted for the motor as identified [rad/s]
     high: Array  # largest of the predictions [rad/s]
     reading: Reading  # of the measured speed
+    expected: Reading  # of the motor as identified, with this drive's own samples
     bands: Reading  # what it may be at most, with what its record cannot resolve
     excess: float  # overshoot of the nominal motor beyond the design's [% of the change]
 
@@ -239,12 +240,13 @@ def change_of(
     """Return a change with its reading and its bands."""
     # What a planned change may overshoot is not held against its settling.
     tolerance = SETTLED.value + OVERSHOOT.value + SIGMAS * unsure / abs(setpoint)
-    expected = read(time, rows[0], setpoint, tolerance).overshoot
+    expected = read(time, rows[0], setpoint, tolerance)
     return Change(
         wheel, name, setpoint, time, speed, rows.min(axis=0), rows[0], rows.max(axis=0),
         read(time, speed, setpoint, tolerance),
+        expected,
         bands_of(rows, time, setpoint, specification, unsure),
-        expected - _high(specification, "overshoot") - 100 * (tolerance - SETTLED.value),
+        expected.overshoot - _high(specification, "overshoot") - 100 * (tolerance - SETTLED.value),
     )  # fmt: skip
 
 

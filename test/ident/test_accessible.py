@@ -61,7 +61,7 @@ def commissioning_page(_: pytest.MonkeyPatch) -> str:
     speed = 2.0 * (1 - np.exp(-time / 0.1))
     change = Change(
         "front_left", "forward", 2.0, time, speed + 0.01, speed - 0.1, speed, speed + 0.1,
-        Reading(0.4, 1.0, 0.5), Reading(0.5, 2.0, 1.0), 0.0,
+        Reading(0.4, 1.0, 0.5), Reading(0.4, 1.0, 0.5), Reading(0.5, 2.0, 1.0), 0.0,
     )  # fmt: skip
     steps = [("checks", "warning"), ("validation", "note"), ("verification", "refused")]
     findings = [
@@ -75,10 +75,12 @@ def commissioning_page(_: pytest.MonkeyPatch) -> str:
         "amplitude": 6.0, "changes": [{
             "wheel": "front_left", "name": "forward", "setpoint": 2.0,
             "reading": {"settling": 0.4, "overshoot": 1.0, "error": None},
+            "expected": {"settling": 0.4, "overshoot": 1.0, "error": 0.0},
             "allowed": {"settling": 0.5, "overshoot": 2.0, "error": 1.0},
         }],
     }  # fmt: skip
-    return commissioning.render(document, [change])
+    rows = commissioning.results({"front_left": estimate()}, {}, document["changes"])
+    return commissioning.render(document, [change], rows, "/**/front_left/wheel_pid:\n  p: 1.0\n")
 
 
 def violations(browser: Browser) -> list[str]:

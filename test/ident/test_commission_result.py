@@ -51,6 +51,15 @@ class Robot:
     def paused(self, wheels: Sequence[str]) -> Any:
         return contextlib.nullcontext()
 
+    def refuse_second_reporters(self, wheels: Sequence[str]) -> None:
+        pass
+
+    def until(self, *_: object) -> bool:
+        return True
+
+    def runs_controller(self, wheel: str) -> bool:
+        return True
+
     def use(self) -> None:
         self.left -= 1
         if self.left < 0:

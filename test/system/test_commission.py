@@ -73,6 +73,47 @@ def test_it_checks_identifies_tunes_and_drives_the_running_robot(
     assert robot.velocity("front_left") == pytest.approx(1.0, abs=0.1)
 
 
+def test_gains_drive_on_a_controller_of_its_own_where_none_runs(
+    process: Process, robot: WheelRobot, eventually: Callable[..., None], tmp_path: Path
+) -> None:
+    namespace = ("--ros-args", "-r", "__ns:=/robot1")
+    process("motor_plant", *namespace)
+    heard = robot.node.count_publishers
+    eventually(lambda: heard("/robot1/rear_left/motor_state"), 60.0, robot.spin, "no robot")
+    accepted = [part for code in BUSY for part in ("--accept", code)]
+    tool = process(
+        "commission", "--output", "r", "--duration", "3", "--yes", "--wheel", "rear_left",
+        *accepted, *namespace,
+    )  # fmt: skip
+    assert tool.wait(600.0) == 0, tool.output
+    begin = tool.output.index("no wheel_pid runs for rear_left")
+    assert begin < tool.output.index("checking rear_left")  # said before anything moves
+    document = json.loads((tmp_path / "r" / "commissioning.json").read_text())
+    assert document["passed"] and [one["name"] for one in document["changes"]] == [
+        "forward", "reverse",
+    ]  # fmt: skip
+    # It has ended with the tool.
+    eventually(lambda: not heard("/robot1/rear_left/motor_command"), 30.0, robot.spin)
+    # What passed is not done again.
+    again = process("commission", "--output", "r", "--yes", "--resume", *namespace)
+    assert again.wait(60.0) == 0, again.output
+    assert "nothing is left to do" in again.output
+
+
+def test_two_robots_on_one_topic_are_named_before_anything_moves(
+    process: Process, robot: WheelRobot, eventually: Callable[..., None], tmp_path: Path
+) -> None:
+    process("motor_plant")
+    process("motor_plant", "--ros-args", "-r", "__node:=forgotten_plant")
+    count = robot.node.count_publishers
+    eventually(lambda: count("/rear_left/motor_state") == 2, 30.0, robot.spin, "no robots")
+    tool = process("commission", "--output", "r", "--yes", "--wheel", "rear_left")
+    assert tool.wait(120.0) == 1, tool.output
+    assert "/forgotten_plant and /motor_plant" in tool.output
+    assert all(abs(state.voltage) < 1e-9 for state in robot.states["rear_left"])
+    assert not (tmp_path / "r").exists()
+
+
 def test_a_killed_commission_leaves_the_controllers_as_they_were(
     process: Process, robot: WheelRobot, eventually: Callable[..., None]
 ) -> None:

@@ -1,0 +1,118 @@
+"""The page of a commissioning in a browser: what it opens with, its numbers, its widths."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from browser import CHROMIUM, Browser
+from results import estimate
+
+from smp_motor_control import WHEELS
+from smp_motor_ident.cli.protocol import Protocol
+from smp_motor_ident.diagnosis.wheel_test import Figures
+from smp_motor_ident.report.document import identification_document
+from smp_motor_ident.result import to_json
+from smp_motor_ident.tune.verification import Change, Reading
+
+pytestmark = pytest.mark.skipif(not CHROMIUM, reason="no Chromium on this machine")
+
+FIGURES = Figures(200.0, 0.001, 0, 0.0, 0.5941, 0.4508, 1.0, 1.0, 25.56, 0.4, 0.05, 5.0)
+GAINS = dict(p=2.675, i=87.97, d=0.06112, feedforward_static=0.45, feedforward_velocity=2.564,
+             feedforward_acceleration=0.1309)  # fmt: skip
+
+
+def change(wheel: str, name: str, setpoint: float) -> Change:
+    time = np.linspace(0.0, 0.9, 180)
+    speed = setpoint * np.clip(time / 0.145, 0.0, 1.0)
+    return Change(
+        wheel, name, setpoint, time, speed, speed - 0.01, speed, speed + 0.01,
+        Reading(0.149, 1.3, 0.02), Reading(0.144, 0.7, 0.0), Reading(0.16, 3.0, 2.4), 0.0,
+    )  # fmt: skip
+
+
+@pytest.fixture
+def passed(tmp_path: Path) -> Path:
+    """A folder with a commissioning that passed, of four wheels that drove both ways."""
+    estimates = {wheel: estimate(wheel) for wheel in WHEELS}
+    (tmp_path / "identification").mkdir()
+    text = to_json(identification_document(estimates))
+    (tmp_path / "identification" / "identification.json").write_text(text)
+    band = {"value": 0.145, "low": 0.145, "high": 0.15}
+    entry = {"gains": GAINS, "specification": {"settling": band, "overshoot": band}}
+    (tmp_path / "gains.json").write_text(json.dumps({"wheels": dict.fromkeys(WHEELS, entry)}))
+    nodes = {f"/**/{wheel}/wheel_pid": {"ros__parameters": GAINS} for wheel in WHEELS}
+    (tmp_path / "gains.yaml").write_text("# designed by tune\n" + yaml.safe_dump(nodes))
+    made = Protocol(tmp_path)
+    made.begin(WHEELS, {})
+    made.checks(dict.fromkeys(WHEELS, FIGURES), 6.0, 1.6)
+    made.changes(
+        [change(w, n, v) for w in WHEELS for n, v in (("forward", 1.2), ("reverse", -1.2))]
+    )
+    made.mark(identified=True, tuned=True)
+    made.end(True, "The wheels drove as designed.")
+    return tmp_path
+
+
+def shown(browser: Browser, where: str) -> list[str]:
+    """Return the texts of elements."""
+    text = f"[...document.querySelectorAll({where!r})].map(e => e.innerText.trim())"
+    found: list[str] = browser.value(text)
+    return found
+
+
+def test_page_opens_with_motors_and_gains_then_yaml_then_the_drive(
+    passed: Path, tmp_path: Path
+) -> None:
+    with Browser(tmp_path / "profile") as browser:
+        browser.open(passed / "report.html", 1280)
+        assert shown(browser, "main h2") == [
+            "Motors and gains", "Parameters of wheel_pid", "Verification drive",
+            "Checks of the wheels",
+        ]  # fmt: skip
+        assert shown(browser, ".verdict") == ["Passed. The wheels drove as designed."]
+        # The numbers are those of the JSON, each with the scatter of the records.
+        rows = {row.split("\t")[0]: row.split("\t")[1:] for row in shown(browser, "#results tr")}
+        assert rows["p V s/rad"] == ["2.675"] * 4 and rows["i V/rad"] == ["87.97"] * 4
+        assert rows["DC gain rad/s/V"] == ["25.50 ± 0.1"] * 4
+        assert rows["Settles, designed at most ms"] == ["150"] * 4
+        assert rows["Settles, driven ms"] == ["149"] * 4
+        # What is copied is the parameter file.
+        (copied,) = shown(browser, "#gains pre")
+        assert yaml.safe_load(copied) == yaml.safe_load((passed / "gains.yaml").read_text())
+        # Predicted and measured lie in one chart a wheel, each with both ways.
+        charts: list[dict[str, Any]] = browser.value(
+            "JSON.parse(document.getElementById('charts').textContent)"
+        )
+        assert [len(chart["curves"]) for chart in charts] == [4] * 4
+        assert browser.complaints == []
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+def test_no_table_is_cut_and_the_page_does_not_scroll_sideways(
+    passed: Path, tmp_path: Path, width: int
+) -> None:
+    with Browser(tmp_path / "profile") as browser:
+        browser.open(passed / "report.html", width)
+        assert browser.value("document.documentElement.scrollWidth") <= width
+        browser.value("document.querySelector('details').open = true")
+        ends = browser.value(
+            "[...document.querySelectorAll('table.stack td')].map(e => "
+            "[e.getBoundingClientRect().right, e.closest('section').getBoundingClientRect().right, "
+            "e.scrollWidth - e.clientWidth])"
+        )
+        assert ends and all(cell <= panel and over <= 0 for cell, panel, over in ends)
+
+
+def test_gains_that_have_not_driven_are_not_called_passed(passed: Path, tmp_path: Path) -> None:
+    made = Protocol(passed)
+    made.changes([])
+    made.end(False, "stopped: a wheel settles late")
+    with Browser(tmp_path / "profile") as browser:
+        browser.open(passed / "report.html", 1280)
+        text = browser.value("document.body.innerText")
+        assert "Not passed." in text and "These gains have passed no drive." in text
